@@ -1,0 +1,53 @@
+"""One exception tree. Every message is one line that states the value, its file and what would be accepted."""
+
+__all__ = [
+    "CacheError",
+    "ConfigError",
+    "DeviceError",
+    "HandError",
+    "LgraspError",
+    "ObjectError",
+    "OutputError",
+    "ShardError",
+    "StarvedError",
+]
+
+
+class LgraspError(Exception):
+    """Base of every error that lgrasp raises on purpose; the command line prints it on one line and exits."""
+
+    exit_code = 2
+
+
+class HandError(LgraspError):
+    """A hand (URDF, hand.yaml or name) cannot be used."""
+
+
+class ObjectError(LgraspError):
+    """An object mesh (file, scale or name) cannot be used."""
+
+
+class ConfigError(LgraspError):
+    """A pipeline, job config or option holds a wrong key or value."""
+
+
+class DeviceError(LgraspError):
+    """The compute device does not exist or is out of memory."""
+
+
+class OutputError(LgraspError):
+    """An output file or folder cannot be written, or belongs to another run."""
+
+
+class ShardError(LgraspError):
+    """A shard is truncated, corrupted or violates the format."""
+
+
+class CacheError(LgraspError):
+    """The cache folder cannot be used."""
+
+
+class StarvedError(LgraspError):
+    """Fewer grasps than asked were found after a bounded effort; what was found is kept."""
+
+    exit_code = 3

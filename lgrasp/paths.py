@@ -1,0 +1,35 @@
+"""Where shipped data, user data and caches live."""
+
+import os
+from pathlib import Path
+
+import platformdirs
+
+__all__ = ["cache_dir", "data_dirs"]
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def data_dirs(kind: str) -> list[Path]:
+    """Existing folders searched for declarations of one kind, first match wins.
+
+    Args:
+        kind: ``hands``, ``objects``, ``pipelines`` or ``configs``.
+
+    Returns:
+        The folders of ``LGRASP_PATH`` (separated as in ``PATH``), then the user's data folder, then the shipped one.
+    """
+    shipped = _PACKAGE / "_data" / kind
+    if not shipped.is_dir():
+        shipped = _PACKAGE.parent / kind
+    roots = [Path(p).expanduser() for p in os.environ.get("LGRASP_PATH", "").split(os.pathsep) if p]
+    roots.append(Path(platformdirs.user_data_dir("lgrasp")))
+    return [p for p in (*(root / kind for root in roots), shipped) if p.is_dir()]
+
+
+def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:
+    """The cache folder: ``override``, else ``LGRASP_CACHE_DIR``, else the platform's user cache folder."""
+    if override:
+        return Path(override).expanduser()
+    env = os.environ.get("LGRASP_CACHE_DIR")
+    return Path(env).expanduser() if env else Path(platformdirs.user_cache_dir("lgrasp"))
