@@ -1,0 +1,61 @@
+# Everything runs in .venv inside this checkout. `make demo` and `make test` set it up first.
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.setup-done
+
+# The first of these that is Python 3.11 or 3.12; or say which: make setup PYTHON=/path/to/python
+ifndef PYTHON
+PYTHON := $(shell for p in python3 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in [(3, 11), (3, 12)])' >/dev/null 2>&1 && echo $$p && break; done)
+endif
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check lint format type pytest bench wheel clean
+
+help:
+	@echo "make demo    set up, build the Allegro contact field, generate 1,000 grasps of the sample mug"
+	@echo "make test    set up, then the gate: ruff, pyright, pytest"
+	@echo "make setup | check | lint | format | type | pytest | bench | wheel | clean"
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "lgrasp needs Python 3.11 or 3.12; give its path: make setup PYTHON=..." >&2; exit 2; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0 hatchling editables
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-build-isolation -e ".[dev]"
+	@touch $@
+
+demo: setup
+	$(BIN)/lgrasp build-field allegro
+	$(BIN)/lgrasp generate --hand allegro --object mug -n 1000 --out grasps/demo
+	$(BIN)/lgrasp dataset info grasps/demo
+
+test: check
+
+check: lint type pytest
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+type: setup
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+pytest: setup
+	$(BIN)/python -m pytest
+
+bench: setup
+	$(BIN)/lgrasp bench
+
+wheel: setup
+	$(BIN)/python -m hatchling build -t wheel
+
+clean:
+	rm -rf dist build .pytest_cache .ruff_cache .hypothesis grasps/demo
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
