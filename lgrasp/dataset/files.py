@@ -1,0 +1,148 @@
+"""Whole-or-absent output files, and which files are shards."""
+
+import errno
+import hashlib
+import os
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+
+from lgrasp.errors import OutputError, ShardError
+
+__all__ = ["find_shards", "new_file", "new_shard_file", "sha256_file"]
+
+_LIBVER = ("v110", "v110")  # readable since HDF5 1.10; its metadata blocks carry checksums, the older layout's do not
+
+
+class _Sink:
+    """Binary file for HDF5 that remembers the first write error instead of raising it.
+
+    The HDF5 library aborts the process when a write fails while it closes a file (disk full). Here it sees every
+    write succeed, closes in peace, and :func:`new_shard_file` reports the error afterwards.
+    """
+
+    def __init__(self, file) -> None:
+        self._file = file
+        self.error: OSError | None = None
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def read(self, size: int = -1) -> bytes:
+        return self._file.read(size)
+
+    def readinto(self, buffer) -> int:
+        n = self._file.readinto(buffer)
+        buffer[n:] = bytes(len(buffer) - n)  # only short after a failed write
+        return len(buffer)
+
+    def write(self, data) -> int:
+        view = memoryview(data).cast("B")
+        done = 0
+        while done < len(view) and self.error is None:
+            try:
+                done += self._file.write(view[done:])
+            except OSError as error:
+                self.error = error
+        return len(view)
+
+    def truncate(self, size: int) -> int:
+        if self.error is None:
+            try:
+                self._file.truncate(size)
+            except OSError as error:
+                self.error = error
+        return size
+
+    def flush(self) -> None:
+        """Nothing is buffered here; :func:`new_file` fsyncs once, at the end."""
+
+
+@contextmanager
+def new_file(path: str | os.PathLike[str]) -> Iterator:
+    """A binary file that appears under its name only when the block ends without an error.
+
+    The bytes go to a unique ``*.tmp`` in the same folder, which is fsynced and renamed; then the folder is fsynced.
+    Missing parent folders are made. On any error the temporary file is removed.
+
+    Raises:
+        OutputError: The folder cannot be written or is full.
+    """
+    path = Path(path)
+    temporary = path.with_name(f"{path.stem}.{uuid.uuid4().hex[:12]}{path.suffix}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "x+b", buffering=0) as file:
+            yield file
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        if error.errno is None:  # not the operating system's: a reader's complaint passing through
+            raise
+        hint = " (free some space or choose another folder)" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+        raise OutputError(f"cannot write {path}: {error.strerror or error}{hint}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_shard_file(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
+    """An empty HDF5 file, open for writing, that appears as ``path`` only when the block ends without an error.
+
+    Raises:
+        OutputError: As :func:`new_file`.
+    """
+    with new_file(path) as raw:
+        sink = _Sink(raw)
+        with h5py.File(sink, "w", libver=_LIBVER) as file:
+            yield file
+        if sink.error is not None:
+            raise sink.error
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def find_shards(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """The shard files named by paths: a folder stands for its ``*.h5`` files, sorted by name, not recursive.
+
+    Raises:
+        ShardError: A path does not exist, or no shard is left.
+    """
+    given = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
+    found: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            found += sorted(path.glob("*.h5"))
+        elif path.exists():
+            found.append(path)
+        else:
+            raise ShardError(f"{path}: no such file or folder")
+    if not found:
+        raise ShardError(f"no shard (*.h5) in {', '.join(map(str, given)) or 'an empty list of paths'}")
+    return found
+
+
+def sha256_file(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file's bytes, 64 lower-case hex digits.
+
+    Raises:
+        ShardError: The file cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise ShardError(f"{path}: {error.strerror or error}") from error

@@ -1,0 +1,235 @@
+"""Reads shards: whole, or lazily by rows."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
+from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS
+from lgrasp.dataset.structure import expand, format_problem, structure_problems
+from lgrasp.errors import ShardError
+
+__all__ = ["ShardReader", "iter_grasps", "open_hdf5", "pose_matrix", "read_shard", "reading"]
+
+
+@contextmanager
+def reading(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn whatever HDF5 raises about a damaged file into a ShardError that names the file."""
+    try:
+        yield
+    except ShardError:
+        raise
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ShardError(f"{path}: cannot be read, it is damaged: {reason}") from error
+
+
+def open_hdf5(path: str | os.PathLike[str]) -> h5py.File:
+    """Open an HDF5 file for reading, without a lock (a shard never changes once it has its name).
+
+    Raises:
+        ShardError: No such file, not permitted, or not a whole HDF5 file.
+    """
+    try:
+        with open(path, "rb"):
+            return h5py.File(path, "r", locking=False)
+    except OSError as error:
+        reason = error.strerror or " ".join(str(error).split())
+        kind = "" if error.strerror else "not a whole HDF5 file: "
+        raise ShardError(f"{path}: {kind}{reason[:200]}") from error
+
+
+class ShardReader:
+    """One open shard; a context manager. Rows are read on demand; opening reads no row.
+
+    Raises:
+        ShardError: On opening, the file is truncated, foreign, of another format version or not of the format's
+            structure; on reading, a checksum does not match.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._file = open_hdf5(self.path)
+        try:
+            with reading(self.path):
+                problem = format_problem(self._file) or next(iter(structure_problems(self._file)), None)
+            if problem:
+                raise ShardError(f"{self.path}: {problem}")
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "ShardReader":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; closing twice is harmless."""
+        self._file.close()
+
+    def __len__(self) -> int:
+        return self._dataset("q").shape[0]
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """The root attributes as stored (``config`` is JSON text)."""
+        with reading(self.path):
+            return dict(self._file.attrs)
+
+    @property
+    def object_ids(self) -> list[str]:
+        """Sorted object ids; ``object_index`` counts in this list."""
+        return sorted(self._file["objects"])
+
+    @cached_property
+    def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+        """Shape and dtype of every row dataset by its flat name (``q``, ``metrics/gap``, ...)."""
+        names = list(GRASP_FIELDS)
+        for group in ("metrics", "physics"):
+            names += [path.removeprefix("grasps/") for path in expand(self._file, f"grasps/{group}/*")]
+        return {name: (self._dataset(name).shape, self._dataset(name).dtype) for name in names}
+
+    def column(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Rows ``start`` to ``stop`` of one dataset by its flat name.
+
+        Raises:
+            ShardError: The shard has no such dataset, or its bytes are damaged.
+        """
+        if name not in self.columns:
+            raise ShardError(f"{self.path}: no dataset {name!r}; it has {', '.join(self.columns)}")
+        with reading(self.path):
+            return self._dataset(name)[start:stop]
+
+    def rows(self, start: int = 0, stop: int | None = None) -> GraspRows:
+        """Rows ``start`` to ``stop`` of everything under ``/grasps``."""
+        values = {name: self.column(name, start, stop) for name in self.columns}
+        fields: dict[str, Any] = {name: values.pop(name) for name in GRASP_FIELDS}
+        for group, texts, attribute in (("metrics", "metric_units", "unit"), ("physics", "physics_protocols", "protocol")):
+            members = {n.partition("/")[2]: v for n, v in values.items() if n.startswith(f"{group}/")}
+            fields[group] = members
+            fields[texts] = {n: self._dataset(f"{group}/{n}").attrs[attribute] for n in members}
+        return GraspRows(**fields)
+
+    def blocks(self) -> Iterator[tuple[int, GraspRows]]:
+        """First row and rows of each chunk of the file: all rows in bounded memory."""
+        for start in range(0, len(self), CHUNK_ROWS):
+            yield start, self.rows(start, start + CHUNK_ROWS)
+
+    @property
+    def header(self) -> ShardHeader:
+        """Where the rows come from."""
+        attrs = self.attributes
+        with reading(self.path):
+            return ShardHeader(
+                pipeline=attrs["pipeline"],
+                seed=int(attrs["seed"]),
+                shard_index=int(attrs["shard_index"]),
+                config=json.loads(attrs["config"]),
+                created=attrs["created"],
+                lgrasp_version=attrs["lgrasp_version"],
+                merged_from=tuple(json.loads(attrs.get("merged_from", "[]"))),
+            )
+
+    def hand(self) -> HandRecord:
+        """The hand, with its mesh files."""
+        with reading(self.path):
+            group = self._file["hand"]
+            blobs = [group["meshes"][name] for name in sorted(group.get("meshes", ()), key=lambda n: (len(n), n))]
+            return HandRecord(
+                name=self._file.attrs["hand"],
+                base_link=group.attrs["base_link"],
+                urdf=group["urdf"].asstr()[()],
+                joint_names=tuple(group["joint_names"].asstr()[()]),
+                joint_lower=group["joint_lower"][()],
+                joint_upper=group["joint_upper"][()],
+                link_names=tuple(group["link_names"].asstr()[()]),
+                sha256=self._file.attrs["hand_sha256"],
+                meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
+            )
+
+    def object(self, object_id: str) -> ObjectRecord:
+        """One object with its mesh."""
+        with reading(self.path):
+            if object_id not in self.object_ids:
+                raise ShardError(f"{self.path}: no object {object_id!r}; it has {', '.join(self.object_ids)}")
+            group = self._file["objects"][object_id]
+            return ObjectRecord(
+                id=object_id,
+                name=group.attrs["name"],
+                scale=float(group.attrs["scale"]),
+                sha256=group.attrs["sha256"],
+                watertight=bool(group.attrs["watertight"]),
+                vertices=group["vertices"][()],
+                faces=group["faces"][()],
+            )
+
+    def objects(self) -> tuple[ObjectRecord, ...]:
+        """All objects, sorted by id."""
+        return tuple(self.object(i) for i in self.object_ids)
+
+    @property
+    def statistics(self) -> dict[str, int | float | str]:
+        """Counts and seconds per stage, device name."""
+        with reading(self.path):
+            attrs = self._file["statistics"].attrs
+            return {k: v.item() if isinstance(v, np.generic) else v for k, v in sorted(attrs.items())}
+
+    def _dataset(self, name: str) -> h5py.Dataset:
+        with reading(self.path):
+            return self._file[GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"]
+
+
+def read_shard(path: str | os.PathLike[str]) -> Shard:
+    """Read a whole shard.
+
+    Raises:
+        ShardError: The file is damaged, foreign or of another format version; the message says which.
+    """
+    with ShardReader(path) as reader:
+        return Shard(
+            header=reader.header,
+            hand=reader.hand(),
+            objects=reader.objects(),
+            grasps=reader.rows(),
+            statistics=reader.statistics,
+        )
+
+
+def iter_grasps(path: str | os.PathLike[str]) -> Iterator[GraspRows]:
+    """All rows of a shard in blocks of at most 4096, in bounded memory.
+
+    Raises:
+        ShardError: As :func:`read_shard`.
+    """
+    with ShardReader(path) as reader:
+        for _, rows in reader.blocks():
+            yield rows
+
+
+def pose_matrix(pose: np.ndarray) -> np.ndarray:
+    """Homogeneous transforms of poses.
+
+    Args:
+        pose: x y z [m] qw qx qy qz, shape [..., 7]; quaternions of any positive length. NaN gives NaN.
+
+    Returns:
+        ``T_base_object``, shape [..., 4, 4], dtype of ``pose``.
+    """
+    pose = np.asarray(pose)
+    w, x, y, z = np.moveaxis(pose[..., 3:] / np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True), -1, 0)
+    T = np.zeros((*pose.shape[:-1], 4, 4), dtype=pose.dtype)
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    T[..., 2, 0], T[..., 2, 1], T[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    T[..., :3, 3] = pose[..., :3]
+    T[..., 3, 3] = 1
+    return T

@@ -1,0 +1,116 @@
+"""The shard format 1.0 as data: the one place that names its groups, datasets, attributes, dtypes and shapes.
+
+Capital letters in a shape hold across the file (``N`` rows, ``K`` actuated joints, ``L`` links, ``O`` objects in a row,
+``C`` most contacts per object); lower-case letters are free per dataset; ``...`` is any number of further axes.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+__all__ = [
+    "ATTRIBUTES",
+    "CHUNK_ROWS",
+    "DATASETS",
+    "FORMAT",
+    "FORMAT_VERSION",
+    "GRASP_FIELDS",
+    "ROW_GROUPS",
+    "AttributeSpec",
+    "DatasetSpec",
+]
+
+FORMAT = "lgrasp-shard"
+FORMAT_VERSION = "1.0"
+CHUNK_ROWS = 4096
+
+
+@dataclass(frozen=True)
+class DatasetSpec:
+    """One dataset, or a family of them where the path holds ``*``."""
+
+    path: str
+    dtype: str
+    """NumPy dtype, ``text`` (UTF-8 string) or ``any`` (a boolean, integer or float)."""
+    shape: tuple[str | int, ...]
+    unit: str = ""
+    fill: float | int | None = None
+    """Padding value; None where padding is not allowed."""
+
+    @property
+    def numpy(self) -> np.dtype:
+        """The NumPy dtype of a numeric dataset."""
+        return np.dtype(self.dtype)
+
+
+@dataclass(frozen=True)
+class AttributeSpec:
+    """One attribute of a group, or of a family of groups or datasets where the path holds ``*``."""
+
+    path: str
+    name: str
+    kind: Literal["text", "json", "time", "sha256", "int", "float", "bool"]
+    required: bool = True
+
+
+_NAN = float("nan")
+
+GRASP_FIELDS: dict[str, DatasetSpec] = {
+    "q": DatasetSpec("grasps/q", "f4", ("N", "K"), "rad or m"),
+    "q_pregrasp": DatasetSpec("grasps/q_pregrasp", "f4", ("N", "K"), "rad or m"),
+    "q_squeeze": DatasetSpec("grasps/q_squeeze", "f4", ("N", "K"), "rad or m"),
+    "object_pose": DatasetSpec("grasps/object_pose", "f4", ("N", "O", 7), "m", _NAN),
+    "object_index": DatasetSpec("grasps/object_index", "i4", ("N", "O"), fill=-1),
+    "contact_points": DatasetSpec("grasps/contact_points", "f4", ("N", "O", "C", 3), "m", _NAN),
+    "contact_normals": DatasetSpec("grasps/contact_normals", "f4", ("N", "O", "C", 3), "", _NAN),
+    "contact_links": DatasetSpec("grasps/contact_links", "i2", ("N", "O", "C"), fill=-1),
+    "contact_forces": DatasetSpec("grasps/contact_forces", "f4", ("N", "O", "C", 3), "share of normal force", _NAN),
+    "candidate": DatasetSpec("grasps/provenance/candidate", "u8", ("N",)),
+}
+"""Row datasets by their name in :class:`lgrasp.dataset.GraspRows`."""
+
+ROW_GROUPS: dict[str, DatasetSpec] = {
+    "metrics": DatasetSpec("grasps/metrics/*", "f4", ("N",)),
+    "physics": DatasetSpec("grasps/physics/*", "any", ("N", "...")),
+}
+"""Families of row datasets by their name in :class:`lgrasp.dataset.GraspRows`."""
+
+DATASETS: tuple[DatasetSpec, ...] = (
+    DatasetSpec("hand/urdf", "text", ()),
+    DatasetSpec("hand/meshes/*", "u1", ("b",)),
+    DatasetSpec("hand/joint_names", "text", ("K",)),
+    DatasetSpec("hand/joint_lower", "f4", ("K",), "rad or m"),
+    DatasetSpec("hand/joint_upper", "f4", ("K",), "rad or m"),
+    DatasetSpec("hand/link_names", "text", ("L",)),
+    DatasetSpec("objects/*/vertices", "f4", ("v", 3), "m"),
+    DatasetSpec("objects/*/faces", "i4", ("f", 3)),
+    *GRASP_FIELDS.values(),
+    *ROW_GROUPS.values(),
+)
+"""Every dataset; a family may be empty (except ``objects``), all others are required."""
+
+ATTRIBUTES: tuple[AttributeSpec, ...] = (
+    AttributeSpec("", "format", "text"),
+    AttributeSpec("", "format_version", "text"),
+    AttributeSpec("", "lgrasp_version", "text"),
+    AttributeSpec("", "hand", "text"),
+    AttributeSpec("", "pipeline", "text"),
+    AttributeSpec("", "created", "time"),
+    AttributeSpec("", "seed", "int"),
+    AttributeSpec("", "shard_index", "int"),
+    AttributeSpec("", "config", "json"),
+    AttributeSpec("", "hand_sha256", "sha256"),
+    AttributeSpec("", "object_sha256", "sha256"),
+    AttributeSpec("", "complete", "int"),
+    AttributeSpec("", "merged_from", "json", required=False),
+    AttributeSpec("", "text_sha256", "sha256", required=False),
+    AttributeSpec("hand", "base_link", "text"),
+    AttributeSpec("hand/meshes/*", "path", "text"),
+    AttributeSpec("objects/*", "name", "text"),
+    AttributeSpec("objects/*", "scale", "float"),
+    AttributeSpec("objects/*", "sha256", "sha256"),
+    AttributeSpec("objects/*", "watertight", "bool"),
+    AttributeSpec("grasps/metrics/*", "unit", "text"),
+    AttributeSpec("grasps/physics/*", "protocol", "text"),
+)

@@ -1,0 +1,143 @@
+"""Compares an open HDF5 file with the schema: members, dtypes, shapes, attributes. Reads no array."""
+
+import hashlib
+import json
+import re
+from datetime import datetime
+from typing import Any
+
+import h5py
+import numpy as np
+
+from lgrasp.dataset.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION, AttributeSpec, DatasetSpec
+
+__all__ = ["expand", "format_problem", "structure_problems", "text_sha256"]
+
+
+def format_problem(file: h5py.File) -> str | None:
+    """Why a file is not a whole shard of a version that this package reads, or None."""
+    if file.attrs.get("format") != FORMAT:
+        return f"not a grasp shard (attribute format is {file.attrs.get('format')!r}, expected {FORMAT!r})"
+    version = str(file.attrs.get("format_version"))
+    major = FORMAT_VERSION.partition(".")[0]
+    if not re.fullmatch(rf"{major}\.\d+", version):
+        return f"format version {version} cannot be read by this lgrasp, which reads {major}.x; upgrade lgrasp"
+    if not np.array_equal(file.attrs.get("complete"), 1):
+        return f"incomplete (attribute complete is {file.attrs.get('complete')!r}, expected 1)"
+    return None
+
+
+def structure_problems(file: h5py.File) -> list[str]:
+    """All differences between a file and the schema, one line each; empty = the structure conforms."""
+    problems: list[str] = []
+    if not expand(file, "objects/*"):
+        problems.append("objects: no object")
+    dims: dict[str, int] = {}
+    for spec in DATASETS:
+        for path in expand(file, spec.path):
+            problems += _dataset_problems(file, path, spec, dims)
+    for attribute in ATTRIBUTES:
+        for path in expand(file, attribute.path):
+            if attribute.path in ("", *file) or path in file:
+                problems += _attribute_problems(file[path or "/"].attrs, path, attribute)
+    if "statistics" not in file:
+        problems.append("statistics: missing group")
+    return problems
+
+
+def expand(file: h5py.File, pattern: str) -> list[str]:
+    """The concrete paths of a schema path: ``*`` becomes each member of the group it is in, sorted."""
+    head, star, tail = pattern.partition("*")
+    if not star:
+        return [pattern]
+    group = file.get(head.rstrip("/"))
+    return [f"{head}{name}{tail}" for name in sorted(group)] if isinstance(group, h5py.Group) else []
+
+
+def _dataset_problems(file: h5py.File, path: str, spec: DatasetSpec, dims: dict[str, int]) -> list[str]:
+    dataset = file.get(path)
+    if not isinstance(dataset, h5py.Dataset):
+        return [f"{path}: missing dataset"]
+    if not _dtype_matches(dataset.dtype, spec.dtype):
+        return [f"{path}: dtype is {dataset.dtype}, must be {spec.dtype}"]
+    expected = spec.shape[:-1] if spec.shape[-1:] == ("...",) else spec.shape
+    actual = dataset.shape if len(expected) == len(spec.shape) else (dataset.shape or ())[: len(expected)]
+    if actual is None or len(actual) != len(expected):
+        return [f"{path}: shape is {dataset.shape}, must be [{', '.join(map(str, spec.shape))}]"]
+    problems = []
+    for axis, (size, symbol) in enumerate(zip(actual, expected, strict=True)):
+        if isinstance(symbol, str):
+            want = dims.setdefault(symbol, size) if symbol.isupper() else size
+        else:
+            want = symbol
+        if size != want:
+            name = f"{symbol} = {want}" if isinstance(symbol, str) else str(want)
+            problems.append(f"{path}: axis {axis} has length {size}, must be {name}")
+    return problems
+
+
+def _dtype_matches(actual: np.dtype, expected: str) -> bool:
+    if expected == "text":
+        return h5py.check_string_dtype(actual) is not None
+    if expected == "any":
+        return actual.kind in "biuf"
+    want = np.dtype(expected)
+    return actual.kind == want.kind and actual.itemsize == want.itemsize
+
+
+def _attribute_problems(attrs: Any, path: str, spec: AttributeSpec) -> list[str]:
+    where = f"{path or '/'}: attribute {spec.name}"
+    if spec.name not in attrs:
+        return [f"{where} is missing"] if spec.required else []
+    value = attrs[spec.name]
+    if not _kind_matches(value, spec.kind):
+        return [f"{where} is {str(value)[:80]!r}, must be {_KINDS[spec.kind]}"]
+    return []
+
+
+_KINDS = {
+    "text": "a string",
+    "json": "a JSON document",
+    "time": "an ISO 8601 time",
+    "sha256": "64 lower-case hex digits",
+    "int": "an integer",
+    "float": "a number",
+    "bool": "true or false",
+}
+
+
+def _kind_matches(value: Any, kind: str) -> bool:
+    if kind in ("int", "float", "bool"):
+        allowed = {"int": "iu", "float": "iuf", "bool": "biu"}[kind]
+        return np.ndim(value) == 0 and np.asarray(value).dtype.kind in allowed
+    if not isinstance(value, str):
+        return False
+    try:
+        if kind == "json":
+            json.loads(value)
+        elif kind == "time":
+            datetime.fromisoformat(value)
+    except ValueError:
+        return False
+    return kind != "sha256" or re.fullmatch("[0-9a-f]{64}", value) is not None
+
+
+def text_sha256(file: h5py.File) -> str:
+    """SHA-256 over every attribute (except ``text_sha256``) and every scalar string: what HDF5 keeps no checksum of.
+
+    The hash is of the JSON object, sorted keys, no spaces, ASCII escapes, that maps ``path@name`` to an attribute's
+    value and ``path`` to a scalar string dataset's text; paths have no leading slash.
+    """
+    texts: dict[str, Any] = {}
+
+    def visit(path: str, node: Any) -> None:
+        for name, value in node.attrs.items():
+            texts[f"{path}@{name}"] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        if isinstance(node, h5py.Dataset) and node.shape == () and h5py.check_string_dtype(node.dtype):
+            texts[path] = node.asstr()[()]
+
+    visit("", file)
+    file.visititems(visit)
+    texts.pop("@text_sha256", None)
+    document = json.dumps(texts, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.sha256(document.encode()).hexdigest()
