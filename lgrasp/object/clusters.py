@@ -1,0 +1,51 @@
+"""Spatially compact groups of points with bounding spheres."""
+
+import numpy as np
+
+__all__ = ["CLUSTER_SIZE", "bounding_spheres", "cluster_order"]
+
+CLUSTER_SIZE = 32
+
+
+def cluster_order(points: np.ndarray) -> np.ndarray:
+    """Order that makes every run of ``CLUSTER_SIZE`` points compact: recursive median split of the longest axis.
+
+    Args:
+        points: Points [m], shape (n, 3), n a multiple of ``CLUSTER_SIZE``.
+
+    Returns:
+        Permutation, shape (n,), int64; consecutive clusters are near each other as well.
+    """
+    runs: list[np.ndarray] = []
+    stack = [np.arange(len(points))]
+    while stack:
+        index = stack.pop()
+        if len(index) <= CLUSTER_SIZE:
+            runs.append(index)
+            continue
+        axis = int(np.argmax(np.ptp(points[index], axis=0)))
+        half = (len(index) // CLUSTER_SIZE + 1) // 2 * CLUSTER_SIZE
+        index = index[np.argsort(points[index, axis], kind="stable")]
+        stack += [index[half:], index[:half]]
+    return np.concatenate(runs)
+
+
+def bounding_spheres(points: np.ndarray, *, iterations: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Nearly smallest balls around runs of ``CLUSTER_SIZE`` points (Bădoiu–Clarkson core-set iteration).
+
+    Args:
+        points: Points [m], shape (n, 3), n a multiple of ``CLUSTER_SIZE``.
+        iterations: Steps toward the farthest point; the radius is within 1/iterations of the smallest.
+
+    Returns:
+        Centres [m], shape (n / CLUSTER_SIZE, 3), and radii [m], shape (n / CLUSTER_SIZE,), f32. The radii are rounded up.
+    """
+    group = np.asarray(points, np.float64).reshape(-1, CLUSTER_SIZE, 3)  # (k, c, 3)
+    center = group.mean(axis=1)
+    row = np.arange(len(group))
+    for step in range(1, iterations + 1):
+        far = np.argmax(((group - center[:, None]) ** 2).sum(-1), axis=1)
+        center += (group[row, far] - center) / (step + 1)
+    center = center.astype(np.float32)
+    radius = np.linalg.norm(group - center[:, None].astype(np.float64), axis=-1).max(axis=1)
+    return center, np.nextafter(radius.astype(np.float32) + np.float32(1e-7), np.float32(np.inf))

@@ -1,0 +1,268 @@
+"""Mesh files: read, merge, orient, close small holes, check units; every repair is put in words."""
+
+import contextlib
+import hashlib
+import io
+import logging
+import os
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from ..errors import ObjectError
+from .params import ObjectParams
+
+__all__ = ["MESH_SUFFIXES", "LoadedMesh", "load_mesh", "open_edges"]
+
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
+
+_FLAT = 1e-4  # thinner than this share of the largest side is a plane
+_UNITS = ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"))
+
+
+@dataclass(frozen=True)
+class LoadedMesh:
+    """A mesh in the user's frame, scaled to metres and repaired.
+
+    Attributes:
+        name: File stem, or the mesh's own name.
+        sha256: Hex digest of the source bytes.
+        vertices: Vertices [m], shape (v, 3), f64.
+        faces: Vertex indices, outward winding, shape (f, 3), int32.
+        closed: Whether every directed edge is matched by its opposite.
+        notes: What was repaired, one sentence each.
+    """
+
+    name: str
+    sha256: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    closed: bool
+    notes: tuple[str, ...]
+
+
+def load_mesh(
+    source: str | os.PathLike[str] | trimesh.Trimesh, *, scale: float = 1.0, params: ObjectParams | None = None
+) -> LoadedMesh:
+    """Read a mesh file (or take a trimesh), scale it to metres and repair what can be repaired safely.
+
+    Args:
+        source: Path of a mesh file (see ``MESH_SUFFIXES``), or a ``trimesh.Trimesh``.
+        scale: Factor from the file's unit to metres.
+        params: Limits of extents and holes.
+
+    Raises:
+        ObjectError: The file is missing or unreadable, or the mesh is empty, flat, not finite or of an unlikely size.
+    """
+    params = params or ObjectParams()
+    if not (np.isfinite(scale) and scale > 0.0):
+        raise ObjectError(f"scale {scale} cannot be used; a positive number such as 0.001 (millimetres to metres) is")
+    if isinstance(source, trimesh.Trimesh):
+        label = name = str(source.metadata.get("name") or "mesh")
+        vertices, faces, parts = np.asarray(source.vertices, np.float64), np.asarray(source.faces), 1
+        sha = hashlib.sha256(vertices.tobytes() + np.ascontiguousarray(faces, np.int64).tobytes()).hexdigest()
+    else:
+        path = Path(source)
+        label, name = str(path), path.stem
+        data = _read_bytes(path)
+        sha = hashlib.sha256(data).hexdigest()
+        vertices, faces, parts = _parse(path, data)
+    if not len(faces):
+        raise ObjectError(f"{label}: 0 faces; a triangle mesh of a solid is accepted")
+    used = np.zeros(len(vertices), bool)
+    used[faces.ravel()] = True
+    bad = int((~np.isfinite(vertices[used]).all(axis=1)).sum())
+    if bad:
+        raise ObjectError(f"{label}: {bad} of {int(used.sum())} vertices are NaN or infinite; finite coordinates are accepted")
+    notes = [f"joined {parts} geometries into one object"] if parts > 1 else []
+    vertices = vertices * scale
+    _check_size(label, vertices[used], scale, params)
+    vertices, faces = _weld(label, vertices, faces, notes)
+    faces = _orient(vertices, faces, notes)
+    vertices, faces = _close_holes(vertices, faces, params.hole_perimeter, notes)
+    loose = len(open_edges(faces))
+    if loose:
+        notes.append(f"not watertight ({loose} open edges): inside is decided by winding number")
+    return LoadedMesh(name, sha, vertices, faces.astype(np.int32), loose == 0, tuple(notes))
+
+
+def open_edges(faces: np.ndarray) -> np.ndarray:
+    """Directed edges, shape (n, 2), that no opposite edge matches; empty for a closed, consistently wound mesh."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    forward = edges[:, 0] < edges[:, 1]
+    key = edges.min(axis=1) * (int(faces.max()) + 1) + edges.max(axis=1)
+    unique, group = np.unique(key, return_inverse=True)
+    balance = np.bincount(group, weights=np.where(forward, 1.0, -1.0), minlength=len(unique))
+    return edges[(balance[group] != 0.0) & ((balance[group] > 0.0) == forward)]
+
+
+def _read_bytes(path: Path) -> bytes:
+    accepted = ", ".join(MESH_SUFFIXES)
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise ObjectError(f"{path}: {what}; a mesh file ({accepted}) is accepted")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise ObjectError(f"{path}: suffix '{path.suffix}' is unknown; accepted are {accepted}")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ObjectError(f"{path}: cannot be read ({error.strerror}); a readable mesh file is accepted") from error
+    if not data:
+        raise ObjectError(f"{path}: 0 bytes; a mesh file ({accepted}) is accepted")
+    return data
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep the mesh parsers from warning or logging: whatever matters is checked on their result."""
+    log = logging.getLogger("trimesh")
+    before, log.disabled = log.disabled, True
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.disabled = before
+
+
+def _parse(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray, int]:
+    """Vertices, faces and the number of geometries of a mesh file's bytes."""
+    kind = path.suffix.lower()[1:]
+    options = {"skip_materials": True} if kind == "obj" else {}
+    if kind == "gltf":
+        options["resolver"] = trimesh.resolvers.FilePathResolver(str(path))
+    try:
+        with _silence():
+            scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, **options)
+            meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
+    except Exception as error:  # the parsers raise anything on garbage
+        why = " ".join(str(error).split())[:120] or type(error).__name__
+        raise ObjectError(f"{path}: not a readable .{kind} mesh ({why}); a triangle mesh file is accepted") from error
+    if not meshes:
+        raise ObjectError(f"{path}: 0 faces; a .{kind} file with a triangle mesh of a solid is accepted")
+    starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
+    faces = np.concatenate([np.asarray(m.faces, np.int64) + start for m, start in zip(meshes, starts, strict=False)])
+    vertices = np.concatenate([np.asarray(m.vertices, np.float64) for m in meshes])
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise ObjectError(f"{path}: a face names vertex {faces.max()} of {len(vertices)}; existing vertices are accepted")
+    return vertices, faces, len(meshes)
+
+
+def _check_size(label: str, vertices: np.ndarray, scale: float, params: ObjectParams) -> None:
+    """Refuse extents that a unit mistake explains, and planes."""
+    extent = float(np.ptp(vertices, axis=0).max())
+    if extent > params.max_extent or extent < params.min_extent:
+        side = f"largest side is {extent:.4g} m" + ("" if scale == 1.0 else f" at scale {scale:g}")
+        accepted = f"{params.min_extent:g} to {params.max_extent:g} m is accepted"
+        raise ObjectError(f"{label}: {side}; {accepted}{_remedy(extent, scale)}")
+    spread = vertices - vertices.mean(axis=0)
+    axes = np.linalg.eigh(spread.T @ spread)[1]
+    thin = float(np.ptp(spread @ axes, axis=0).min())
+    if thin < _FLAT * extent:
+        raise ObjectError(f"{label}: flat mesh, {thin:.2g} m thick at {extent:.2g} m length; a solid is accepted")
+
+
+def _remedy(extent: float, scale: float) -> str:
+    raw = extent / scale
+    if extent == 0.0 or not np.isfinite(extent):
+        return ""
+    if scale != 1.0 and 0.02 <= raw <= 0.5:
+        return "; it is in metres already: use --scale 1"
+    for factor, unit in _UNITS:
+        if 0.02 <= raw * factor <= 0.6:
+            return f"; if the file is in {unit} use --scale {factor:g}"
+    return f"; for a hand-sized object use --scale {10.0 ** round(np.log10(0.1 / raw)):g}"
+
+
+def _weld(label: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Merge equal vertices, drop unused ones and faces that name a vertex twice."""
+    used = np.unique(faces)
+    grid = np.round((vertices[used] - vertices[used].mean(axis=0)) * 1e8).astype(np.int64)  # 10 nm
+    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    keep = np.sort(first)  # in the file's order
+    lookup = np.zeros(len(vertices), np.int64)
+    lookup[used] = np.argsort(np.argsort(first))[inverse.ravel()]
+    faces = lookup[faces]
+    if len(keep) < len(used):
+        notes.append(f"merged {len(used) - len(keep)} duplicate vertices")
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    if not whole.all():
+        notes.append(f"dropped {int((~whole).sum())} faces that had collapsed to a line or point")
+    vertices, faces = vertices[used][keep], faces[whole]
+    a, b, c = (vertices[faces] - vertices.mean(axis=0)).transpose(1, 0, 2) if len(faces) else np.zeros((3, 0, 3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    extent = np.ptp(vertices, axis=0).max()
+    if area < 1e-8 * extent**2:
+        raise ObjectError(f"{label}: surface of {area:.2g} m² (degenerate faces); a solid is accepted")
+    return vertices, faces
+
+
+def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Make the winding consistent and outward, body by body; cavities stay inward."""
+    if len(open_edges(faces)):
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        if not mesh.is_winding_consistent:
+            with _silence():
+                trimesh.repair.fix_winding(mesh)
+            turned = int((mesh.faces != faces).any(axis=1).sum())
+            if turned:
+                notes.append(f"turned {turned} faces to a consistent winding")
+            faces = np.asarray(mesh.faces, np.int64)
+    body = _bodies(faces, len(vertices))
+    count = int(body.max()) + 1
+    corners = vertices[faces] - vertices.mean(axis=0)
+    volume = np.bincount(body, np.linalg.det(corners) / 6.0, count)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, body, corners.min(axis=1))
+    np.maximum.at(high, body, corners.max(axis=1))
+    flip = volume < 0.0
+    if not flip.all():
+        solid = np.flatnonzero(~flip)
+        for k in np.flatnonzero(flip):
+            flip[k] = not ((low[solid] < low[k]) & (high[solid] > high[k])).all(axis=1).any()
+    if flip.any():
+        notes.append(f"turned {int(flip.sum())} of {count} bodies that were inside out")
+        faces = np.where(flip[body][:, None], faces[:, ::-1], faces)
+    return faces
+
+
+def _bodies(faces: np.ndarray, count: int) -> np.ndarray:
+    """Index of the connected body of every face, shape (f,)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    rows, cols = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    graph = coo_array((np.ones(len(rows), np.int8), (rows, cols)), shape=(count, count))
+    label = connected_components(graph, directed=False)[1][faces[:, 0]]
+    return np.unique(label, return_inverse=True)[1]
+
+
+def _close_holes(
+    vertices: np.ndarray, faces: np.ndarray, perimeter: float, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill boundary loops up to ``perimeter`` with a fan around their centre."""
+    loose = open_edges(faces)
+    follow = {int(b): int(a) for a, b in loose}  # against the faces' own direction
+    if not len(loose) or len(follow) < len(loose):  # closed, or a boundary that branches
+        return vertices, faces
+    fans, centres = [], []
+    while follow:
+        loop = [next(iter(follow))]
+        while loop[-1] in follow:
+            loop.append(follow.pop(loop[-1]))
+        if loop[0] != loop[-1]:
+            continue
+        ring = np.array(loop)
+        edge = vertices[ring[1:]] - vertices[ring[:-1]]
+        if np.linalg.norm(edge, axis=1).sum() <= perimeter:
+            hub = len(vertices) + len(centres)
+            centres.append(vertices[ring[:-1]].mean(axis=0))
+            fans.append(np.stack([ring[:-1], ring[1:], np.full(len(edge), hub)], axis=1))
+    if fans:
+        notes.append(f"filled {len(fans)} holes of at most {perimeter * 1000.0:g} mm perimeter")
+        vertices, faces = np.concatenate([vertices, centres]), np.concatenate([faces, *fans])
+    return vertices, faces

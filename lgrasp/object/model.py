@@ -1,0 +1,196 @@
+"""What every later stage knows about an object, made from a mesh once and cached as plain arrays."""
+
+import os
+from dataclasses import dataclass, fields
+
+import numpy as np
+import trimesh
+
+from .clusters import bounding_spheres, cluster_order
+from .load import LoadedMesh, load_mesh
+from .params import ObjectParams
+from .sdf import SdfGrid, build_sdf
+from .surface import face_normals, fold_cosine, probe_fits, sample_creases, sample_surface, thin
+
+__all__ = ["ObjectModel", "preprocess_object"]
+
+_RELAXED_ANGLES = (25.0, 35.0)  # [deg] tried when the sharpness mask leaves too few contact points
+
+
+@dataclass(frozen=True)
+class ObjectModel:
+    """A preprocessed object. Arrays are f32 in the internal frame (user frame minus ``center``) unless stated.
+
+    Attributes:
+        name: File stem.
+        sha256: Hex digest of the source bytes.
+        scale: Factor that was applied to the file's coordinates.
+        center: Centre of the bounding box in the user's frame [m], shape (3,): ``p_user = p_internal + center``.
+        vertices: Repaired mesh in the user's frame, scaled [m], shape (v, 3).
+        faces: Vertex indices, outward winding, shape (f, 3), int32.
+        watertight: Whether the repaired mesh is closed.
+        com: Centre of mass at uniform density (area centroid if not watertight) [m], shape (3,).
+        extents: Sides of the bounding box [m], shape (3,).
+        notes: What was repaired or relaxed, one sentence each.
+        contact_points: Points a finger may touch [m], shape (n, 3).
+        contact_normals: Outward unit normals there, shape (n, 3).
+        obstacle_points: Evenly spread points of the whole surface, in clusters of ``CLUSTER_SIZE`` [m], shape (m, 3).
+        obstacle_normals: Outward unit normals there, shape (m, 3).
+        cluster_center: Bounding ball centres of consecutive runs of obstacle points [m], shape (k, 3).
+        cluster_radius: Their radii [m], shape (k,).
+        sdf: Signed distances [m], negative inside, shape (nx, ny, nz); node (i, j, k) is at sdf_origin + sdf_cell (i, j, k).
+        sdf_origin: Position of node (0, 0, 0) [m], shape (3,).
+        sdf_cell: Node spacing [m].
+    """
+
+    name: str
+    sha256: str
+    scale: float
+    center: np.ndarray
+    vertices: np.ndarray
+    faces: np.ndarray
+    watertight: bool
+    com: np.ndarray
+    extents: np.ndarray
+    notes: list[str]
+    contact_points: np.ndarray
+    contact_normals: np.ndarray
+    obstacle_points: np.ndarray
+    obstacle_normals: np.ndarray
+    cluster_center: np.ndarray
+    cluster_radius: np.ndarray
+    sdf: np.ndarray
+    sdf_origin: np.ndarray
+    sdf_cell: float
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """All fields as arrays (text, flags and numbers as 0-d arrays), free of pickles, for an npz file."""
+        out = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self) if f.name != "notes"}
+        return out | {"notes": np.asarray("\n".join(self.notes))}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> "ObjectModel":
+        """Inverse of :meth:`to_arrays`; also takes an opened npz file."""
+        values = {f.name: arrays[f.name] for f in fields(cls)}
+        plain = {k: v.item() if v.ndim == 0 else np.ascontiguousarray(v) for k, v in values.items()}
+        return cls(**(plain | {"notes": str(plain["notes"]).split("\n") if plain["notes"] else []}))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write :meth:`to_arrays` to an npz file."""
+        with open(path, "wb") as file:
+            np.savez(file, **self.to_arrays())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "ObjectModel":
+        """Read what :meth:`save` wrote."""
+        with np.load(path, allow_pickle=False) as arrays:
+            return cls.from_arrays(arrays)
+
+
+def preprocess_object(
+    path_or_mesh: str | os.PathLike[str] | trimesh.Trimesh,
+    *,
+    scale: float = 1.0,
+    params: ObjectParams | None = None,
+    device: str = "cpu",
+) -> ObjectModel:
+    """Mesh to ObjectModel; the same input gives the same bytes on one type of device.
+
+    Args:
+        path_or_mesh: Mesh file or trimesh.
+        scale: Factor from the file's unit to metres.
+        params: Sampling, mask and grid parameters.
+        device: Warp device that answers the geometric queries.
+
+    Raises:
+        ObjectError: The mesh cannot be used; the message names the file, the value and what is accepted.
+    """
+    params = params or ObjectParams()
+    mesh = load_mesh(path_or_mesh, scale=scale, params=params)
+    notes = list(mesh.notes)
+    center = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
+    vertices, faces = mesh.vertices - center, mesh.faces
+    sdf = build_sdf(
+        vertices,
+        faces,
+        closed=mesh.closed,
+        max_cells=params.sdf_cells,
+        min_cell=params.sdf_min_cell,
+        pad=params.sdf_pad,
+        device=device,
+    )
+    if not (sdf.values < 0.0).any():
+        notes.append(f"no SDF cell lies inside: walls are thinner than {sdf.cell * 1000.0:.2g} mm or enclose nothing")
+    contact_points, contact_normals = _contacts(vertices, faces, sdf, params, notes, device)
+    obstacle_points, obstacle_normals = _obstacles(vertices, faces, params)
+    cluster_center, cluster_radius = bounding_spheres(obstacle_points)
+    return ObjectModel(
+        name=mesh.name,
+        sha256=mesh.sha256,
+        scale=float(scale),
+        center=center.astype(np.float32),
+        vertices=mesh.vertices.astype(np.float32),
+        faces=faces,
+        watertight=mesh.closed,
+        com=_mass_centre(vertices, mesh).astype(np.float32),
+        extents=np.ptp(vertices, axis=0).astype(np.float32),
+        notes=notes,
+        contact_points=contact_points,
+        contact_normals=contact_normals,
+        obstacle_points=obstacle_points,
+        obstacle_normals=obstacle_normals,
+        cluster_center=cluster_center,
+        cluster_radius=cluster_radius,
+        sdf=sdf.values,
+        sdf_origin=sdf.origin,
+        sdf_cell=sdf.cell,
+    )
+
+
+def _mass_centre(vertices: np.ndarray, mesh: LoadedMesh) -> np.ndarray:
+    """Volume centroid of a closed mesh, else area centroid [m], shape (3,)."""
+    corners = vertices[mesh.faces]
+    weight = np.linalg.det(corners) / 6.0  # signed tetrahedra with the origin
+    if mesh.closed and weight.sum() > 1e-12 * np.ptp(vertices, axis=0).max() ** 3:
+        return weight @ corners.sum(axis=1) / 4.0 / weight.sum()
+    area = face_normals(vertices, mesh.faces)[1]
+    return area @ corners.mean(axis=1) / area.sum()
+
+
+def _contacts(
+    vertices: np.ndarray, faces: np.ndarray, sdf: SdfGrid, params: ObjectParams, notes: list[str], device: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Contact points and normals, f32, that are neither concave nor beside a fold."""
+    normals, area = face_normals(vertices, faces)
+    points, face = sample_surface(vertices, faces, params.contact_count, seed=params.seed)
+    keep = thin(points, params.contact_count, float(area.sum()))
+    points, face = points[keep], face[keep]
+    least = max(1, int(params.min_contact_fraction * params.contact_count))
+    probe = probe_fits(sdf, points, normals[face], params.probe_radius, params.probe_tolerance)
+    cosine = fold_cosine(vertices, faces, points, face, params.sharp_radius, device=device)
+    chosen = probe & (cosine >= np.cos(np.radians(params.sharp_angle)))
+    for angle in (a for a in _RELAXED_ANGLES if a > params.sharp_angle):
+        if chosen.sum() < least:
+            chosen = probe & (cosine >= np.cos(np.radians(angle)))
+            notes.append(f"few smooth contact points: turns of {angle:g} deg within the fold reach were admitted")
+    if chosen.sum() < least and probe.any():
+        chosen = probe
+        notes.append("few smooth contact points: the fold test was left out")
+    if not chosen.any():
+        chosen = np.ones_like(probe)
+        notes.append("no contact point lets a finger-sized ball rest: the concavity test was left out")
+    return points[chosen].astype(np.float32), normals[face[chosen]].astype(np.float32)
+
+
+def _obstacles(vertices: np.ndarray, faces: np.ndarray, params: ObjectParams) -> tuple[np.ndarray, np.ndarray]:
+    """Obstacle points and normals, f32, creases first among the candidates, in cluster order."""
+    normals, area = face_normals(vertices, faces)
+    points, face = sample_surface(vertices, faces, params.obstacle_count, seed=params.seed + 1)
+    total = float(area.sum())
+    spacing = 0.9 * float(np.sqrt(total / params.obstacle_count))
+    edge_points, edge_normals = sample_creases(vertices, faces, params.crease_angle, spacing)
+    points = np.concatenate([edge_points, points])
+    normals = np.concatenate([edge_normals, normals[face]])
+    keep = thin(points, params.obstacle_count, total)
+    keep = keep[cluster_order(points[keep])]
+    return points[keep].astype(np.float32), normals[keep].astype(np.float32)

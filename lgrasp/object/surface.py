@@ -1,0 +1,179 @@
+"""Points on an object's surface: contact candidates with their masks, and obstacle points."""
+
+import numpy as np
+import warp as wp
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from . import kernels
+from .sdf import SdfGrid, sample_sdf
+
+__all__ = ["face_neighbours", "face_normals", "fold_cosine", "probe_fits", "sample_creases", "sample_surface", "thin"]
+
+_OVERSAMPLE = 5  # candidates for one point kept
+_WALK_FACES = 256  # faces visited around a point in the fold test
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals, shape (f, 3), zero for a degenerate face, and areas [m²], shape (f,)."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    cross = np.cross(b - a, c - a)
+    double = np.linalg.norm(cross, axis=1)
+    return cross / np.where(double > 0.0, double, 1.0)[:, None], 0.5 * double
+
+
+def face_neighbours(faces: np.ndarray) -> np.ndarray:
+    """Face across the edge from corner e to e + 1, shape (f, 3), int32; -1 across an open edge.
+
+    Edges shared by more than two faces are paired in the order of the faces.
+    """
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    key = edges.min(axis=1) * (int(faces.max()) + 1) + edges.max(axis=1)
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    new = np.r_[True, key[1:] != key[:-1]]
+    rank = np.arange(len(key)) - np.flatnonzero(new)[np.cumsum(new) - 1]
+    first = np.flatnonzero((rank[:-1] % 2 == 0) & (key[1:] == key[:-1]))
+    out = np.full(len(key), -1, np.int32)
+    out[order[first]] = order[first + 1] // 3
+    out[order[first + 1]] = order[first] // 3
+    return out.reshape(-1, 3)
+
+
+def sample_surface(
+    vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stratified area-weighted points in random order.
+
+    Returns:
+        Points [m], shape (n, 3), f64, and their faces, shape (n,), int32; n = ``count`` times an oversampling factor, to
+        be reduced by :func:`thin`.
+    """
+    rng = np.random.default_rng(seed)
+    total = count * _OVERSAMPLE
+    filled = np.cumsum(face_normals(vertices, faces)[1])
+    at = (np.arange(total) + rng.random(total)) / total * filled[-1]
+    face = np.minimum(np.searchsorted(filled, at, side="right"), len(faces) - 1)
+    u, v = rng.random((2, total))
+    u = np.sqrt(u)
+    weights = np.stack([1.0 - u, u * (1.0 - v), u * v], axis=1)  # (n, 3)
+    points = np.einsum("nk,nkd->nd", weights, vertices[faces[face]])
+    order = rng.permutation(total)
+    return points[order], face[order].astype(np.int32)
+
+
+def sample_creases(
+    vertices: np.ndarray, faces: np.ndarray, angle: float, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points along edges that turn by more than ``angle`` [deg], their corners first.
+
+    Returns:
+        Points [m], shape (n, 3), and the mean normals of the two faces, shape (n, 3).
+    """
+    normals, _ = face_normals(vertices, faces)
+    neighbour = face_neighbours(faces)
+    f, e = np.nonzero(neighbour > np.arange(len(faces))[:, None])
+    g = neighbour[f, e]
+    turned = np.einsum("nd,nd->n", normals[f], normals[g]) < np.cos(np.radians(angle))
+    f, e, g = f[turned], e[turned], g[turned]
+    start, end = vertices[faces[f, e]], vertices[faces[f, (e + 1) % 3]]
+    mean = normals[f] + normals[g]
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+    pieces = np.maximum(np.ceil(np.linalg.norm(end - start, axis=1) / spacing).astype(int), 1)
+    row = np.repeat(np.arange(len(f)), pieces)
+    t = (np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[row]
+    points = np.concatenate([start, end, start[row] + t[:, None] * (end - start)[row]])
+    return points, np.concatenate([mean, mean, mean[row]])
+
+
+def thin(points: np.ndarray, count: int, area: float) -> np.ndarray:
+    """Exactly ``count`` evenly spread points: maximal Poisson-disk sets of falling radius, earlier points preferred.
+
+    Args:
+        points: Candidates in order of preference [m], shape (n, 3), n >= ``count``.
+        count: Points to keep.
+        area: Surface area [m²], sets the first radius.
+
+    Returns:
+        Indices of the points kept, shape (count,), coarse to fine.
+    """
+    kept = np.zeros(0, np.int64)
+    left = np.arange(len(points))
+    radius = 0.9 * float(np.sqrt(area / count))
+    while len(kept) < count:
+        if len(kept):
+            left = left[cKDTree(points[kept]).query(points[left], distance_upper_bound=radius)[0] >= radius]
+        chosen = left[_independent(cKDTree(points[left]).query_pairs(radius, output_type="ndarray"), len(left))]
+        kept = np.concatenate([kept, chosen[: count - len(kept)]])
+        left = np.setdiff1d(np.arange(len(points)), kept, assume_unique=True)
+        radius *= 0.8 if radius > 1e-7 else 0.0
+    return kept
+
+
+def _independent(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Greedy maximal independent set in index order: flags, shape (count,), no two of a pair both set."""
+    low, high = pairs.min(axis=1), pairs.max(axis=1)
+    state = np.zeros(count, np.int8)  # 1 in, -1 out
+    while len(low):
+        blocked = np.zeros(count, bool)
+        blocked[high] = True  # waits for an undecided point of smaller index
+        state[(state == 0) & ~blocked] = 1
+        state[high[state[low] == 1]] = -1
+        open_pair = (state[low] == 0) & (state[high] == 0)
+        low, high = low[open_pair], high[open_pair]
+    return state >= 0
+
+
+def fold_cosine(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    points: np.ndarray,
+    point_face: np.ndarray,
+    radius: float,
+    *,
+    device: str = "cpu",
+) -> np.ndarray:
+    """Smallest cosine between a point's face normal and those reached over the surface within ``radius`` [m].
+
+    Args:
+        points: Points on the surface [m], shape (n, 3).
+        point_face: Their faces, shape (n,).
+
+    Returns:
+        Cosines, shape (n,), f32; -1 beside an open edge. Small values mean a fold, an edge or scan noise.
+    """
+    normals, _ = face_normals(vertices, faces)
+    with wp.ScopedDevice(device):
+        out = wp.empty(len(points), dtype=float)
+        inputs = [
+            wp.array(vertices[faces], dtype=wp.vec3),
+            wp.array(face_neighbours(faces), dtype=wp.int32),
+            wp.array(points, dtype=wp.vec3),
+            wp.array(normals[point_face], dtype=wp.vec3),
+            wp.array(point_face, dtype=wp.int32),
+            radius,
+            wp.empty((len(points), min(_WALK_FACES, len(faces))), dtype=wp.int32),
+        ]
+        wp.launch(kernels.fold_spread, len(points), inputs, [out])
+        return out.numpy()
+
+
+def probe_fits(sdf: SdfGrid, points: np.ndarray, normals: np.ndarray, radius: float, tolerance: float) -> np.ndarray:
+    """Whether a ball of ``radius`` [m] can rest on each point from outside and get there.
+
+    The ball touching the point may sink into the object by ``tolerance`` [m] at most; it has no shaft, so whatever stands
+    farther away along the normal (the other wall of a mug) does not count. Its centre must be connected to the outside
+    of the grid, so the walls of closed cavities fail.
+
+    Returns:
+        Flags, shape (n,).
+    """
+    centre = points + radius * normals
+    fits = sample_sdf(sdf, centre) >= radius - tolerance
+    coarse = sdf.values[::2, ::2, ::2] >= radius - tolerance - 2.0 * sdf.cell
+    label, _ = ndimage.label(coarse)
+    border = np.ones(label.shape, bool)
+    border[1:-1, 1:-1, 1:-1] = False
+    outside = np.isin(label, np.unique(label[border & coarse]))
+    at = np.rint((centre - sdf.origin) / (2.0 * sdf.cell)).astype(int)
+    return fits & outside[tuple(np.clip(at, 0, np.array(label.shape) - 1).T)]
