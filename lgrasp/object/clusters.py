@@ -38,7 +38,7 @@ def bounding_spheres(points: np.ndarray, *, iterations: int = 64) -> tuple[np.nd
         iterations: Steps toward the farthest point; the radius is within 1/iterations of the smallest.
 
     Returns:
-        Centres [m], shape (n / CLUSTER_SIZE, 3), and radii [m], shape (n / CLUSTER_SIZE,), f32. The radii are rounded up.
+        Centres [m], shape (n / CLUSTER_SIZE, 3), and radii [m], shape (n / CLUSTER_SIZE,), f32, rounded up.
     """
     group = np.asarray(points, np.float64).reshape(-1, CLUSTER_SIZE, 3)  # (k, c, 3)
     center = group.mean(axis=1)

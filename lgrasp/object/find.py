@@ -4,8 +4,8 @@ import difflib
 import os
 from pathlib import Path
 
-from ..errors import ObjectError
-from ..paths import data_dirs
+from lgrasp.errors import ObjectError
+from lgrasp.paths import data_dirs
 from .load import MESH_SUFFIXES
 
 __all__ = ["find_object", "list_objects"]

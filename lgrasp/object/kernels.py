@@ -96,7 +96,7 @@ def lattice_crossings(
     dims: wp.vec3i,
     step_out: wp.array3d(dtype=wp.int32),
 ):
-    """Steps of the winding number along each z column of cells: +1 where the column enters the object, -1 where it leaves."""
+    """Steps of the winding number along every z column of cells: +1 where it enters the object, -1 where it leaves."""
     f = wp.tid()
     ia = faces[f, 0]
     ib = faces[f, 1]
@@ -198,16 +198,16 @@ def fold_spread(
 ):
     """Smallest dot product of a point's normal with the faces reached over the surface within ``radius``.
 
-    Walks breadth-first over edge neighbours (``queue`` holds the visited faces of a point, its width bounds the walk), so
-    the far side of a thin wall does not count. An open edge within the radius gives -1.
+    Walks breadth-first over edge neighbours (``queue`` holds the visited faces of a point, its width bounds the walk),
+    so the far side of a thin wall does not count. An open edge within the radius gives -1.
     """
     t = wp.tid()
     p = points[t]
     n = normals[t]
     queue[t, 0] = point_face[t]
-    head = int(0)
-    tail = int(1)
-    worst = float(1.0)
+    head = wp.int32(0)
+    tail = wp.int32(1)
+    worst = wp.float32(1.0)
     while head < tail:
         f = queue[t, head]
         head += 1
@@ -219,7 +219,7 @@ def fold_spread(
                 if wp.length(p - closest_on_triangle(u, v, v, p)) <= radius:
                     worst = -1.0
             else:
-                seen = int(0)
+                seen = wp.int32(0)
                 for s in range(tail):
                     if queue[t, s] == g:
                         seen = 1

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from ..errors import ObjectError
+from lgrasp.errors import ObjectError
 from .params import ObjectParams
 
 __all__ = ["MESH_SUFFIXES", "LoadedMesh", "load_mesh", "open_edges"]

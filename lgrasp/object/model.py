@@ -38,7 +38,8 @@ class ObjectModel:
         obstacle_normals: Outward unit normals there, shape (m, 3).
         cluster_center: Bounding ball centres of consecutive runs of obstacle points [m], shape (k, 3).
         cluster_radius: Their radii [m], shape (k,).
-        sdf: Signed distances [m], negative inside, shape (nx, ny, nz); node (i, j, k) is at sdf_origin + sdf_cell (i, j, k).
+        sdf: Signed distances [m], negative inside, shape (nx, ny, nz); node (i, j, k) is at
+            ``sdf_origin + sdf_cell * (i, j, k)``.
         sdf_origin: Position of node (0, 0, 0) [m], shape (3,).
         sdf_cell: Node spacing [m].
     """

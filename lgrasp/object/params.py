@@ -31,7 +31,7 @@ class ObjectParams(BaseModel):
     obstacle_count: int = Field(
         8192, ge=32, le=1 << 20, multiple_of=32, description="Obstacle points, in clusters of 32 (CLUSTER_SIZE)."
     )
-    crease_angle: float = Field(30.0, gt=0.0, le=180.0, description="Edges that turn more get obstacle points of their own.")
+    crease_angle: float = Field(30.0, gt=0.0, le=180.0, description="Edges that turn more get their own obstacle points.")
 
     sdf_cells: int = Field(128**3, ge=16**3, le=512**3, description="Largest number of SDF cells.")
     sdf_min_cell: Length = Field(0.0005, description="SDF cells are not made smaller than this.")

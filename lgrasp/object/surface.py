@@ -46,8 +46,8 @@ def sample_surface(
     """Stratified area-weighted points in random order.
 
     Returns:
-        Points [m], shape (n, 3), f64, and their faces, shape (n,), int32; n = ``count`` times an oversampling factor, to
-        be reduced by :func:`thin`.
+        Points [m], shape (n, 3), f64, and their faces, shape (n,), int32; n = ``count`` times an oversampling factor,
+        to be reduced by :func:`thin`.
     """
     rng = np.random.default_rng(seed)
     total = count * _OVERSAMPLE
@@ -161,8 +161,8 @@ def fold_cosine(
 def probe_fits(sdf: SdfGrid, points: np.ndarray, normals: np.ndarray, radius: float, tolerance: float) -> np.ndarray:
     """Whether a ball of ``radius`` [m] can rest on each point from outside and get there.
 
-    The ball touching the point may sink into the object by ``tolerance`` [m] at most; it has no shaft, so whatever stands
-    farther away along the normal (the other wall of a mug) does not count. Its centre must be connected to the outside
+    The ball touching the point may sink into the object by ``tolerance`` [m] at most; it has no shaft, so whatever
+    stands farther away along the normal (the other wall of a mug) does not count. Its centre must be connected to the outside
     of the grid, so the walls of closed cavities fail.
 
     Returns:
