@@ -1,0 +1,1 @@
+"""Hand room: URDF and hand.yaml -> HandModel."""

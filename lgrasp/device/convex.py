@@ -1,0 +1,250 @@
+"""Convex pieces (hull of vertices, inflated by a radius): true distance by GJK, depth of a point, bounding spheres."""
+
+import warp as wp
+
+__all__ = ["Pieces", "pieces_clear", "point_depth"]
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+
+@wp.struct
+class Pieces:
+    """Convex pieces in body frames: piece i = hull(vertices) + ball(radius).
+
+    Bodies are counted from 0 = static base; body 1 + j belongs to global joint j. ``body_first`` is CSR over bodies.
+    """
+
+    body_first: wp.array(dtype=wp.int32)  # (bodies + 1,)
+    body_sphere: wp.array(dtype=wp.vec4)  # bounding sphere (x, y, z, r) of a whole body; r < 0: empty
+    vertex_first: wp.array(dtype=wp.int32)  # (pieces + 1,)
+    vertices: wp.array(dtype=wp.vec3)
+    plane_first: wp.array(dtype=wp.int32)  # (pieces + 1,)
+    planes: wp.array(dtype=wp.vec4)  # outward normal and offset: n . x <= d
+    sphere: wp.array(dtype=wp.vec4)  # bounding sphere of each piece
+    radius: wp.array(dtype=wp.float32)
+    body: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def point_depth(c: Pieces, i: wp.int32, p: wp.vec3):
+    """Signed distance of body-frame point p to piece i [m]: negative depth inside (exact for one plane), lower bound outside."""
+    s = c.sphere[i]
+    d = wp.length(p - wp.vec3(s[0], s[1], s[2])) - s[3]
+    if d > 0.0:
+        return d
+    first = c.plane_first[i]
+    end = c.plane_first[i + 1]
+    r = c.radius[i]
+    if first == end:
+        # a ball or a capsule: one or two vertices
+        a = c.vertices[c.vertex_first[i]]
+        b = c.vertices[c.vertex_first[i + 1] - 1]
+        ab = b - a
+        t = float(0.0)
+        n2 = wp.dot(ab, ab)
+        if n2 > 0.0:
+            t = wp.clamp(wp.dot(p - a, ab) / n2, 0.0, 1.0)
+        return wp.length(p - a - ab * t) - r
+    m = float(-1.0e9)
+    for k in range(first, end):
+        f = c.planes[k]
+        m = wp.max(m, f[0] * p[0] + f[1] * p[1] + f[2] * p[2] - f[3])
+    return m - r
+
+
+@wp.func
+def _support(c: Pieces, i: wp.int32, d: wp.vec3):
+    first = c.vertex_first[i]
+    best = c.vertices[first]
+    m = wp.dot(best, d)
+    for k in range(first + 1, c.vertex_first[i + 1]):
+        v = c.vertices[k]
+        x = wp.dot(v, d)
+        if x > m:
+            m = x
+            best = v
+    return best
+
+
+@wp.func
+def _closest_on_segment(a: wp.vec3, b: wp.vec3):
+    """Closest point to the origin on a segment, as (x, y, z, mask of kept points)."""
+    ab = b - a
+    t = -wp.dot(a, ab)
+    if t <= 0.0:
+        return wp.vec4(a[0], a[1], a[2], 1.0)
+    n2 = wp.dot(ab, ab)
+    if t >= n2:
+        return wp.vec4(b[0], b[1], b[2], 2.0)
+    p = a + ab * (t / n2)
+    return wp.vec4(p[0], p[1], p[2], 3.0)
+
+
+@wp.func
+def _closest_on_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Closest point to the origin on a triangle by its Voronoi regions, with the mask of kept points (a 1, b 2, c 4)."""
+    ab = b - a
+    ac = c - a
+    d1 = -wp.dot(ab, a)
+    d2 = -wp.dot(ac, a)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.vec4(a[0], a[1], a[2], 1.0)
+    d3 = -wp.dot(ab, b)
+    d4 = -wp.dot(ac, b)
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.vec4(b[0], b[1], b[2], 2.0)
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        p = a + ab * (d1 / (d1 - d3))
+        return wp.vec4(p[0], p[1], p[2], 3.0)
+    d5 = -wp.dot(ab, c)
+    d6 = -wp.dot(ac, c)
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.vec4(c[0], c[1], c[2], 4.0)
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        p = a + ac * (d2 / (d2 - d6))
+        return wp.vec4(p[0], p[1], p[2], 5.0)
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and (d4 - d3) >= 0.0 and (d5 - d6) >= 0.0:
+        p = b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
+        return wp.vec4(p[0], p[1], p[2], 6.0)
+    s = 1.0 / (va + vb + vc)
+    p = a + ab * (vb * s) + ac * (vc * s)
+    return wp.vec4(p[0], p[1], p[2], 7.0)
+
+
+@wp.func
+def pieces_clear(c: Pieces, i: wp.int32, j: wp.int32, T: wp.transform, margin: wp.float32):
+    """Are pieces i and j farther apart than margin [m]? T takes j's body frame to i's. GJK on true convex sets.
+
+    Undecided after 24 steps counts as not clear, so the answer errs to the safe side.
+    """
+    si = c.sphere[i]
+    sj = c.sphere[j]
+    centre = wp.vec3(si[0], si[1], si[2]) - wp.transform_point(T, wp.vec3(sj[0], sj[1], sj[2]))
+    gap = wp.length(centre)
+    reach = c.radius[i] + c.radius[j] + margin
+    if gap - si[3] - sj[3] > margin:
+        return True
+    R = wp.transform_get_rotation(T)
+    v = centre
+    if gap < 1.0e-9:
+        v = wp.vec3(1.0, 0.0, 0.0)
+    a = wp.vec3(0.0)
+    b = wp.vec3(0.0)
+    d = wp.vec3(0.0)
+    e = wp.vec3(0.0)
+    n = int(0)
+    verdict = int(0)
+    for _step in range(24):
+        w = _support(c, i, -v) - wp.transform_point(T, _support(c, j, wp.quat_rotate_inv(R, v)))
+        length = wp.length(v)
+        low = wp.dot(v, w) / length
+        if low > reach:
+            verdict = 1
+            break
+        if n > 0 and length - low < 1.0e-6 + 1.0e-4 * length:
+            # converged, and not above reach
+            break
+        # add w, then keep the smallest face of the simplex that holds the closest point
+        if n == 0:
+            a = w
+            n = 1
+            v = w
+        elif n == 1:
+            b = w
+            r = _closest_on_segment(a, b)
+            m = int(r[3])
+            v = wp.vec3(r[0], r[1], r[2])
+            if m == 2:
+                a = b
+            elif m == 3:
+                n = 2
+        elif n == 2:
+            d = w
+            r = _closest_on_triangle(a, b, d)
+            m = int(r[3])
+            v = wp.vec3(r[0], r[1], r[2])
+            n = 0
+            p = a
+            q = b
+            s = d
+            if (m & 1) != 0:
+                a = p
+                n = 1
+            if (m & 2) != 0:
+                if n == 0:
+                    a = q
+                else:
+                    b = q
+                n += 1
+            if (m & 4) != 0:
+                if n == 0:
+                    a = s
+                elif n == 1:
+                    b = s
+                else:
+                    d = s
+                n += 1
+        else:
+            e = w
+            # the closest of the three faces that hold the new point; inside all of them: overlap
+            best = float(1.0e30)
+            x0 = a
+            x1 = b
+            x2 = d
+            m = int(0)
+            inside = int(1)
+            for f in range(4):
+                p = a
+                q = b
+                s = d
+                o = e
+                if f == 0:
+                    s = e
+                    o = d
+                elif f == 1:
+                    q = e
+                    o = b
+                elif f == 2:
+                    p = e
+                    o = a
+                normal = wp.cross(q - p, s - p)
+                side_o = wp.dot(normal, o - p)
+                side_0 = -wp.dot(normal, p)
+                if side_o * side_0 <= 0.0:
+                    inside = 0
+                    r = _closest_on_triangle(p, q, s)
+                    t = wp.vec3(r[0], r[1], r[2])
+                    n2 = wp.dot(t, t)
+                    if n2 < best:
+                        best = n2
+                        v = t
+                        m = int(r[3])
+                        x0 = p
+                        x1 = q
+                        x2 = s
+            if inside == 1:
+                break
+            n = 0
+            if (m & 1) != 0:
+                a = x0
+                n = 1
+            if (m & 2) != 0:
+                if n == 0:
+                    a = x1
+                else:
+                    b = x1
+                n += 1
+            if (m & 4) != 0:
+                if n == 0:
+                    a = x2
+                elif n == 1:
+                    b = x2
+                else:
+                    d = x2
+                n += 1
+        if wp.length(v) < 1.0e-5:
+            break
+    return verdict == 1

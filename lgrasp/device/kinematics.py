@@ -1,0 +1,80 @@
+"""Forward kinematics of one dependency group in registers, and Jacobian columns of a point on it."""
+
+import warp as wp
+
+__all__ = ["MAX_DOFS", "MAX_JOINTS", "Kinematics", "clamp_dofs", "group_forward", "point_column", "vec_dof"]
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+MAX_JOINTS = 16
+"""Most movable joints (mimic joints included) in one dependency group."""
+MAX_DOFS = 8
+"""Most actuated joints in one dependency group."""
+
+vec_dof = wp.types.vector(MAX_DOFS, wp.float32)
+
+
+@wp.struct
+class Kinematics:
+    """Joints in group order, parents before children; joint j moves body j.
+
+    ``joint_parent`` is an index inside the group, -1 for the static base. A joint's coordinate is
+    ``mult * q[dof] + offset`` with ``dof`` an index inside the group, so mimic joints need no special case.
+    """
+
+    groups: wp.int32
+    joint_first: wp.array(dtype=wp.int32)  # (groups + 1,)
+    dof_first: wp.array(dtype=wp.int32)  # (groups + 1,)
+    joint_parent: wp.array(dtype=wp.int32)
+    joint_dof: wp.array(dtype=wp.int32)
+    joint_mult: wp.array(dtype=wp.float32)
+    joint_offset: wp.array(dtype=wp.float32)
+    joint_axis: wp.array(dtype=wp.vec3)
+    joint_prismatic: wp.array(dtype=wp.int32)
+    joint_origin: wp.array(dtype=wp.transform)
+    dof_lower: wp.array(dtype=wp.float32)
+    dof_upper: wp.array(dtype=wp.float32)
+    dof_open: wp.array(dtype=wp.float32)
+    dof_index: wp.array(dtype=wp.int32)  # column of q that a group's dof is
+
+
+@wp.func
+def group_forward(h: Kinematics, g: wp.int32, q: vec_dof, X: wp.array(dtype=wp.transform)):
+    """Write T_base_body of the group's bodies to X (local array, MAX_JOINTS)."""
+    first = h.joint_first[g]
+    for j in range(h.joint_first[g + 1] - first):
+        k = first + j
+        x = h.joint_mult[k] * q[h.joint_dof[k]] + h.joint_offset[k]
+        o = h.joint_origin[k]
+        p = wp.transform_get_translation(o)
+        r = wp.transform_get_rotation(o)
+        if h.joint_prismatic[k] == 1:
+            p = p + wp.quat_rotate(r, h.joint_axis[k] * x)
+        else:
+            r = r * wp.quat_from_axis_angle(h.joint_axis[k], x)
+        T = wp.transform(p, r)
+        parent = h.joint_parent[k]
+        if parent >= 0:
+            T = X[parent] * T
+        X[j] = T
+    return first
+
+
+@wp.func
+def point_column(h: Kinematics, k: wp.int32, T: wp.transform, p: wp.vec3):
+    """Velocity of point p (base frame) per unit rate of the dof that drives joint k, whose body frame is T. [m/rad or m/m]"""
+    a = wp.transform_vector(T, h.joint_axis[k])
+    v = a
+    if h.joint_prismatic[k] == 0:
+        v = wp.cross(a, p - wp.transform_get_translation(T))
+    return v * h.joint_mult[k]
+
+
+@wp.func
+def clamp_dofs(h: Kinematics, g: wp.int32, q: vec_dof):
+    """q of the group, clamped into the joint limits."""
+    first = h.dof_first[g]
+    r = q
+    for d in range(h.dof_first[g + 1] - first):
+        r[d] = wp.clamp(q[d], h.dof_lower[first + d], h.dof_upper[first + d])
+    return r

@@ -1,0 +1,71 @@
+"""Starts Warp quietly, keeps its kernels in our cache and resolves device names."""
+
+import os
+from dataclasses import dataclass
+
+import warp as wp
+
+from lgrasp.errors import DeviceError
+from lgrasp.paths import cache_dir
+
+__all__ = ["KERNEL_OPTIONS", "Device", "resolve_device", "start"]
+
+KERNEL_OPTIONS = {"enable_backward": False, "max_unroll": 1}
+"""Module options of every non-differentiable kernel module (they decide compile time: minutes or seconds)."""
+
+_started = False
+
+
+@dataclass(frozen=True)
+class Device:
+    """A resolved compute device."""
+
+    alias: str
+    """Warp's name of it: ``cpu`` or ``cuda:N``."""
+    name: str
+    """The product's name, for reports."""
+
+    @property
+    def is_cuda(self) -> bool:
+        return self.alias.startswith("cuda")
+
+
+def start() -> None:
+    """Initialise Warp once, without output; compiled kernels go to ``<cache>/kernels``.
+
+    A ``WARP_CACHE_PATH`` set by the user wins.
+    """
+    global _started
+    if _started:
+        return
+    wp.config.log_level = wp.LOG_ERROR
+    if "WARP_CACHE_PATH" not in os.environ:
+        wp.config.kernel_cache_dir = str(cache_dir() / "kernels")
+    wp.init()
+    _started = True
+
+
+def resolve_device(name: str = "auto") -> Device:
+    """Turn ``auto``, ``cpu``, ``cuda`` or ``cuda:N`` into a device that exists.
+
+    Raises:
+        DeviceError: the name is unknown or the GPU is absent; the message lists what exists.
+    """
+    start()
+    present = ["cpu", *(f"cuda:{i}" for i in range(wp.get_cuda_device_count()))]
+    if name == "auto":
+        alias = present[1] if len(present) > 1 else "cpu"
+    else:
+        alias = "cuda:0" if name == "cuda" else name
+    if alias not in present:
+        raise DeviceError(f"device '{name}' does not exist here; choose auto, {', '.join(present)}")
+    return Device(alias=alias, name=wp.get_device(alias).name if alias != "cpu" else _cpu_name())
+
+
+def _cpu_name() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            model = next(line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))
+    except (OSError, StopIteration):
+        model = "CPU"
+    return f"{model} ({os.cpu_count()} cores)"

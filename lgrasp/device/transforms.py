@@ -1,0 +1,104 @@
+"""Warp functions on directions and rotations."""
+
+import warp as wp
+
+__all__ = [
+    "NORMAL_BINS",
+    "decode_normal",
+    "encode_normal",
+    "normal_bin",
+    "random_rotation",
+    "rotation_between",
+    "tangent",
+]
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+_RES = 8
+NORMAL_BINS = _RES * _RES
+"""Octahedral bins of the unit sphere, about 14 degrees in half-angle."""
+
+_R = wp.constant(_RES)
+
+
+@wp.func
+def _sign(x: wp.float32):
+    return wp.where(x >= 0.0, 1.0, -1.0)
+
+
+@wp.func
+def octahedral(n: wp.vec3):
+    """Unit vector -> point of the square [-1, 1]^2."""
+    s = 1.0 / (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2]))
+    u = n[0] * s
+    v = n[1] * s
+    if n[2] < 0.0:
+        a = (1.0 - wp.abs(v)) * _sign(u)
+        b = (1.0 - wp.abs(u)) * _sign(v)
+        u = a
+        v = b
+    return wp.vec2(u, v)
+
+
+@wp.func
+def normal_bin(n: wp.vec3):
+    """Index of the octahedral bin that holds unit vector n."""
+    e = octahedral(n)
+    i = wp.clamp(int((e[0] + 1.0) * 0.5 * float(_R)), 0, _R - 1)
+    j = wp.clamp(int((e[1] + 1.0) * 0.5 * float(_R)), 0, _R - 1)
+    return i * _R + j
+
+
+@wp.func
+def encode_normal(n: wp.vec3):
+    """Unit vector -> 16 bits (octahedral, 8 + 8), error below 0.6 degrees."""
+    e = octahedral(n)
+    i = wp.clamp(int((e[0] + 1.0) * 127.5 + 0.5), 0, 255)
+    j = wp.clamp(int((e[1] + 1.0) * 127.5 + 0.5), 0, 255)
+    return i * 256 + j
+
+
+@wp.func
+def decode_normal(code: wp.int32):
+    """Inverse of :func:`encode_normal`."""
+    u = float(code // 256) / 127.5 - 1.0
+    v = float(code % 256) / 127.5 - 1.0
+    z = 1.0 - wp.abs(u) - wp.abs(v)
+    if z < 0.0:
+        a = (1.0 - wp.abs(v)) * _sign(u)
+        b = (1.0 - wp.abs(u)) * _sign(v)
+        u = a
+        v = b
+    return wp.normalize(wp.vec3(u, v, z))
+
+
+@wp.func
+def tangent(n: wp.vec3):
+    """A unit vector orthogonal to unit vector n."""
+    a = wp.vec3(1.0, 0.0, 0.0)
+    if wp.abs(n[0]) > 0.7:
+        a = wp.vec3(0.0, 1.0, 0.0)
+    return wp.normalize(wp.cross(n, a))
+
+
+@wp.func
+def random_rotation(state: wp.uint32):
+    """Uniform unit quaternion (Shoemake)."""
+    u = wp.randf(state)
+    a = wp.randf(state, 0.0, 6.2831853)
+    b = wp.randf(state, 0.0, 6.2831853)
+    r = wp.sqrt(1.0 - u)
+    s = wp.sqrt(u)
+    return wp.quat(r * wp.sin(a), r * wp.cos(a), s * wp.sin(b), s * wp.cos(b))
+
+
+@wp.func
+def rotation_between(a: wp.vec3, b: wp.vec3):
+    """Shortest rotation that takes unit vector a to unit vector b."""
+    d = wp.dot(a, b)
+    axis = wp.cross(a, b)
+    q = wp.quat(axis[0], axis[1], axis[2], 1.0 + d)
+    if d < -0.9999:
+        t = tangent(a)
+        q = wp.quat(t[0], t[1], t[2], 0.0)
+    return wp.normalize(q)

@@ -1,0 +1,148 @@
+"""Contact surfaces: where on its links a hand may touch, as points, normals and patches, and as link distance grids."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+import warp as wp
+
+from lgrasp.device.runtime import KERNEL_OPTIONS, start
+from lgrasp.errors import HandError
+from lgrasp.hand.spec import Cone, HandSpec
+
+__all__ = ["ContactPoints", "LinkGrid", "cover_patches", "finger_points", "link_grid", "palm_points"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_GRID_CELL = 8.0e-4
+_GRID_PAD = 6.0e-3
+_POINTS_PER_LINK = 600
+PATCH_RADIUS = 0.010
+PATCH_CONE = np.radians(36.0)
+
+
+@dataclass(frozen=True)
+class ContactPoints:
+    """Surface points that may touch, in body frames."""
+
+    points: np.ndarray  # (N, 3) [m]
+    normals: np.ndarray  # (N, 3) outward
+    body: np.ndarray  # (N,) i32
+    link: np.ndarray  # (N,) i32
+    patch: np.ndarray  # (N,) i32
+
+
+@dataclass(frozen=True)
+class LinkGrid:
+    """Signed distance grid of one contact link in its body frame."""
+
+    values: np.ndarray  # (nx, ny, nz) f32 [m]
+    origin: np.ndarray  # (3,) [m]
+    cell: float
+
+
+@wp.kernel
+def _mesh_distance(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), distance_out: wp.array(dtype=wp.float32)):
+    i = wp.tid()
+    q = wp.mesh_query_point_sign_normal(mesh, points[i], 1.0)
+    p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
+    distance_out[i] = q.sign * wp.length(points[i] - p)
+
+
+def _signed_distance(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    start()
+    handle = wp.Mesh(
+        wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device="cpu"),
+        wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device="cpu"),
+    )
+    out = wp.empty(len(points), dtype=wp.float32, device="cpu")
+    queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device="cpu")
+    wp.launch(_mesh_distance, dim=len(points), inputs=[handle.id, queries], outputs=[out], device="cpu")
+    return out.numpy()
+
+
+def link_grid(meshes: list[trimesh.Trimesh]) -> LinkGrid:
+    """Distance grid of the union of a link's solids (already in the body frame)."""
+    low = np.min([m.bounds[0] for m in meshes], 0) - _GRID_PAD
+    high = np.max([m.bounds[1] for m in meshes], 0) + _GRID_PAD
+    cell = max(_GRID_CELL, float((high - low).max()) / 80)
+    shape = np.ceil((high - low) / cell).astype(int) + 1
+    axes = [low[a] + cell * np.arange(shape[a]) for a in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    values = np.min([_signed_distance(m, points) for m in meshes], 0)
+    return LinkGrid(values.reshape(shape).astype(np.float32), low.astype(np.float32), cell)
+
+
+def _in_cone(normals: np.ndarray, cone: Cone) -> np.ndarray:
+    axis = np.asarray(cone.axis, float)
+    return normals @ (axis / np.linalg.norm(axis)) > np.cos(np.radians(cone.angle))
+
+
+def _sample(mesh: trimesh.Trimesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    count = 8 * _POINTS_PER_LINK
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))
+    return points, mesh.face_normals[faces]
+
+
+def finger_points(
+    meshes: list[trimesh.Trimesh], T_body_link: np.ndarray, forbidden: tuple[Cone, ...], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, 3) of a finger link's allowed surface, body frame.
+
+    A point is dropped when its normal (link frame) is in a forbidden cone, or when other parts of the link block it.
+    """
+    points, normals = map(np.vstack, zip(*(_sample(m, rng) for m in meshes), strict=True))
+    R = T_body_link[:3, :3]
+    keep = np.ones(len(points), bool)
+    for cone in forbidden:
+        keep &= ~_in_cone(normals @ R, cone)
+    # outside every solid of the link, and free above
+    for probe, least in ((1e-4, 0.0), (8e-3, 5e-3)):
+        distance = np.min([_signed_distance(m, points + probe * normals) for m in meshes], 0)
+        keep &= distance > least
+    return _thin(points[keep], normals[keep], _POINTS_PER_LINK, rng)
+
+
+def palm_points(
+    meshes: list[trimesh.Trimesh], T_body_link: np.ndarray, allowed: tuple[Cone, ...], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, 3) of a static link's allowed surface, base frame."""
+    points, normals = map(np.vstack, zip(*(_sample(m, rng) for m in meshes), strict=True))
+    R = T_body_link[:3, :3]
+    keep = np.zeros(len(points), bool)
+    for cone in allowed:
+        keep |= _in_cone(normals @ R, cone)
+    distance = np.min([_signed_distance(m, points + 1e-4 * normals) for m in meshes], 0)
+    keep &= distance > 0
+    return _thin(points[keep], normals[keep], _POINTS_PER_LINK, rng)
+
+
+def _thin(points: np.ndarray, normals: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    chosen = rng.permutation(len(points))[:count]
+    return points[chosen], normals[chosen]
+
+
+def cover_patches(points: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Stochastic cover: patch index (n,) of each point; a patch reaches 10 mm and 36 degrees from its first point."""
+    patch = np.full(len(points), -1, np.int32)
+    for seed in rng.permutation(len(points)):
+        if patch[seed] < 0:
+            near = np.linalg.norm(points - points[seed], axis=1) < PATCH_RADIUS
+            near &= normals @ normals[seed] > np.cos(PATCH_CONE)
+            near[seed] = True
+            patch[near & (patch < 0)] = patch.max() + 1
+    return patch
+
+
+def check_contact_links(spec: HandSpec, link_names: tuple[str, ...], geometry: dict[str, object]) -> None:
+    """Every link that a contact rule names exists and has collision geometry.
+
+    Raises:
+        HandError: naming the link and the links there are.
+    """
+    named = [link for rule in spec.contact for link in rule.links] + list(spec.palm.links)
+    for link in named:
+        if link not in link_names:
+            raise HandError(f"hand '{spec.name}': contact link '{link}' does not exist; links: {', '.join(link_names)}")
+        if not geometry.get(link):
+            raise HandError(f"hand '{spec.name}': contact link '{link}' has no collision geometry")

@@ -1,0 +1,160 @@
+"""Collision geometry -> convex pieces, inner spheres, surface samples and a triangle mesh per link."""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull, QhullError
+
+from lgrasp.errors import HandError
+from lgrasp.hand.urdf import Geometry, Urdf
+
+__all__ = ["Piece", "convex_piece", "geometry_mesh", "inner_spheres", "surface_samples", "transform_points"]
+
+_HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by half of it leaves +-0.2 mm
+_CYLINDER_SIDES = 32
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A convex solid: hull(vertices) inflated by radius; planes (n, d): n . x <= d, empty for balls and capsules."""
+
+    vertices: np.ndarray  # (V, 3) [m]
+    planes: np.ndarray  # (P, 4)
+    radius: float  # [m]
+
+    @property
+    def sphere(self) -> np.ndarray:
+        """Bounding sphere (x, y, z, r) [m]."""
+        c = 0.5 * (self.vertices.min(0) + self.vertices.max(0))
+        return np.append(c, np.linalg.norm(self.vertices - c, axis=1).max() + self.radius)
+
+    def depth(self, p: np.ndarray) -> np.ndarray:
+        """Signed distance of points (n, 3) [m], negative inside; a lower bound outside."""
+        if len(self.planes):
+            return (p @ self.planes[:, :3].T - self.planes[:, 3]).max(1) - self.radius
+        a, b = self.vertices[0], self.vertices[-1]
+        ab = b - a
+        t = np.clip((p - a) @ ab / max(float(ab @ ab), 1e-30), 0, 1)
+        return np.linalg.norm(p - a - t[:, None] * ab, axis=1) - self.radius
+
+
+def transform_points(T: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Points (n, 3) mapped by T (4, 4)."""
+    return p @ T[:3, :3].T + T[:3, 3]
+
+
+def _hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    hull = ConvexHull(points)
+    planes = np.unique(np.round(hull.equations, 9), axis=0)
+    return points[hull.vertices], np.column_stack([planes[:, :3], -planes[:, 3]])
+
+
+def _directions(n: int) -> np.ndarray:
+    """n well-spread unit vectors (Fibonacci), (n, 3)."""
+    i = np.arange(n) + 0.5
+    phi, theta = np.arccos(1 - 2 * i / n), np.pi * (1 + 5**0.5) * i
+    return np.column_stack([np.cos(theta) * np.sin(phi), np.sin(theta) * np.sin(phi), np.cos(phi)])
+
+
+def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
+    """Triangle mesh of one collision element in its own frame [m].
+
+    Raises:
+        HandError: a mesh file that cannot be read or has no volume.
+    """
+    if geometry.kind == "box":
+        return trimesh.creation.box(geometry.size)
+    if geometry.kind == "sphere":
+        return trimesh.creation.icosphere(subdivisions=4, radius=geometry.size[0])
+    if geometry.kind == "cylinder":
+        return trimesh.creation.cylinder(radius=geometry.size[0], height=geometry.size[1], sections=96)
+    file = urdf.mesh_files[geometry.mesh]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mesh = trimesh.load_mesh(file, process=True)
+    except Exception as error:  # any parser error means the same to the user
+        raise HandError(f"URDF {urdf.path}: mesh {file} cannot be read: {' '.join(str(error).split())[:200]}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+        raise HandError(f"URDF {urdf.path}: mesh {file} has no usable triangles")
+    mesh.apply_scale(geometry.size)
+    if mesh.extents.max() > 2.0:
+        raise HandError(
+            f"URDF {urdf.path}: mesh {file} is {mesh.extents.max():.3g} m wide; the file is probably in millimetres, "
+            'add scale="0.001 0.001 0.001" to its <mesh>'
+        )
+    return mesh
+
+
+def convex_piece(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> Piece:
+    """Convex piece of one collision element in its own frame; ``mesh`` is its :func:`geometry_mesh`.
+
+    Raises:
+        HandError: a flat or degenerate mesh.
+    """
+    if geometry.kind == "sphere":
+        return Piece(np.zeros((1, 3)), np.zeros((0, 4)), geometry.size[0])
+    if geometry.kind == "cylinder":
+        # circumscribed, so that the piece is never inside the real surface
+        angle = 2 * np.pi * (np.arange(_CYLINDER_SIDES) + 0.5) / _CYLINDER_SIDES
+        r = geometry.size[0] / np.cos(np.pi / _CYLINDER_SIDES)
+        ring = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
+        h = geometry.size[1] / 2
+        points = np.vstack([np.column_stack([ring, np.full(len(ring), z)]) for z in (-h, h)])
+        return Piece(*_hull(points), 0.0)
+    try:
+        vertices, planes = _hull(np.asarray(mesh.vertices, float))
+        count = 24
+        while len(vertices) > 48 and count <= 384:
+            d = _directions(count)
+            kept = np.unique(np.argmax(vertices @ d.T, axis=0))
+            thin, thin_planes = _hull(vertices[kept])
+            error = float((vertices @ thin_planes[:, :3].T - thin_planes[:, 3]).max())
+            if error <= _HULL_ERROR:
+                return Piece(thin, thin_planes, max(error, 0.0) / 2)
+            count *= 2
+    except QhullError:
+        raise HandError(f"URDF {urdf.path}: collision mesh {geometry.mesh} is flat; collision bodies need volume") from None
+    return Piece(vertices, planes, 0.0)
+
+
+def inner_spheres(piece: Piece, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Spheres (n <= count, 4) (centre, radius) inside a piece that cover its volume greedily, largest gain first [m]."""
+    if not len(piece.planes):
+        a, b = piece.vertices[0], piece.vertices[-1]
+        steps = max(1, int(np.ceil(np.linalg.norm(b - a) / (0.5 * piece.radius))) + 1)
+        t = np.linspace(0, 1, steps)[:, None] if np.any(a != b) else np.zeros((1, 1))
+        return np.column_stack([a + t * (b - a), np.full(len(t), piece.radius)])[:count]
+    low, high = piece.vertices.min(0), piece.vertices.max(0)
+    inside = rng.uniform(low, high, (6000, 3))
+    depth = -piece.depth(inside)
+    inside, depth = inside[depth > 0.0005][:1500], depth[depth > 0.0005][:1500]
+    if len(inside) == 0:
+        c = piece.vertices.mean(0)
+        return np.append(c, max(-float(piece.depth(c[None])[0]), 1e-4))[None]
+    centres = np.argsort(-depth)[:500]
+    # a point counts as covered within 1.3 radii, so the spheres spread
+    near = np.linalg.norm(inside[centres][:, None] - inside[None], axis=2) < 1.3 * depth[centres][:, None]
+    out, left = [], np.ones(len(inside), bool)
+    while len(out) < count and left.any():
+        gain = (near & left).sum(1)
+        best = int(np.argmax(gain))
+        if gain[best] == 0:
+            break
+        out.append(np.append(inside[centres[best]], depth[centres[best]]))
+        left &= ~near[best]
+    return np.array(out)
+
+
+def surface_samples(mesh: trimesh.Trimesh, spacing: float, rng: np.random.Generator) -> np.ndarray:
+    """Points (n, 3) on a mesh no farther apart than about ``spacing`` [m], sharp vertices included."""
+    area = float(mesh.area)
+    n = int(np.clip(4 * area / spacing**2, 64, 20000))
+    points, _ = trimesh.sample.sample_surface(mesh, n, seed=int(rng.integers(2**31)))
+    cell = np.floor(points / spacing).astype(np.int64)
+    _, first = np.unique(cell, axis=0, return_index=True)
+    hull = mesh.convex_hull
+    sharp = hull.vertices if len(hull.vertices) <= 32 else hull.vertices[:: max(1, len(hull.vertices) // 32)]
+    return np.vstack([points[np.sort(first)], sharp])

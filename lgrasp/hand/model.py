@@ -1,0 +1,310 @@
+"""HandModel: everything the stages need to know of a hand, as plain arrays that can be cached."""
+
+import hashlib
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from lgrasp.device.kinematics import MAX_DOFS, MAX_JOINTS
+from lgrasp.errors import HandError
+from lgrasp.hand.contacts import LinkGrid, check_contact_links, cover_patches, finger_points, link_grid, palm_points
+from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres, surface_samples, transform_points
+from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.tree import Tree, build_tree
+from lgrasp.hand.urdf import Urdf, read_urdf
+
+__all__ = ["HAND_VERSION", "HandModel", "build_hand", "hand_digest"]
+
+HAND_VERSION = 1
+"""Raised whenever the arrays of a HandModel change meaning."""
+
+_SPHERES_PER_PIECE = 28
+_SAMPLE_SPACING = 3.0e-3
+
+
+@dataclass(frozen=True)
+class HandModel:
+    """A hand in body frames; body 0 = static base, body 1 + j = joint j of ``tree``. Lengths in metres.
+
+    CSR arrays are named ``*_first``. The static base counts as group 0 in ``pair_first``, finger g as g + 1.
+    """
+
+    name: str
+    sha256: str
+    urdf_text: str
+    mesh_files: dict[str, str]  # URDF mesh path -> file, for the copy inside shards
+    notes: tuple[str, ...]
+    tree: Tree
+    canonical_box: np.ndarray  # (2, 3)
+    # solids
+    piece_first: np.ndarray  # (B + 1,) pieces of each body
+    body_sphere: np.ndarray  # (B, 4) bounding sphere, radius -1 when the body is empty
+    vertex_first: np.ndarray  # (P + 1,)
+    vertices: np.ndarray  # (V, 3)
+    plane_first: np.ndarray  # (P + 1,)
+    planes: np.ndarray  # (F, 4)
+    piece_sphere: np.ndarray  # (P, 4)
+    piece_radius: np.ndarray  # (P,)
+    piece_body: np.ndarray  # (P,)
+    piece_link: np.ndarray  # (P,)
+    sphere_first: np.ndarray  # (B + 1,) inner spheres of each body
+    spheres: np.ndarray  # (S, 4)
+    sample_first: np.ndarray  # (B + 1,) surface samples of each body
+    samples: np.ndarray  # (N, 3)
+    # self-collision: piece pairs that must stay apart, by (group a, group b), a <= b
+    pair_first: np.ndarray  # ((G + 1)^2 + 1,)
+    pairs: np.ndarray  # (Q, 2)
+    # contact surfaces; palm points are those of group G (last)
+    contact_first: np.ndarray  # (G + 2,)
+    contact_points: np.ndarray  # (C, 3)
+    contact_normals: np.ndarray  # (C, 3)
+    contact_body: np.ndarray  # (C,)
+    contact_link: np.ndarray  # (C,)
+    contact_patch: np.ndarray  # (C,)
+    contact_grid: np.ndarray  # (C,) index of the link's grid
+    grid_first: np.ndarray  # (L + 1,)
+    grid_shape: np.ndarray  # (L, 3)
+    grid_origin: np.ndarray  # (L, 3)
+    grid_cell: np.ndarray  # (L,)
+    grid_values: np.ndarray  # flat
+    grid_link: np.ndarray  # (L,)
+    rule_first: np.ndarray  # (L + 1,) forbidden cones of each contact link
+    rules: np.ndarray  # (R, 4) axis in the body frame, cosine
+    mesh_vertex_first: np.ndarray  # (L + 1,) triangle mesh of each contact link, body frame
+    mesh_vertices: np.ndarray  # (W, 3)
+    mesh_face_first: np.ndarray  # (L + 1,)
+    mesh_faces: np.ndarray  # (T, 3)
+
+    @property
+    def groups(self) -> int:
+        return self.tree.groups
+
+    @property
+    def dofs(self) -> int:
+        return len(self.tree.joint_names)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Flat arrays for the cache; inverse of :meth:`from_arrays`."""
+        out = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
+        tree = {f.name: getattr(self.tree, f.name) for f in fields(self.tree)}
+        out |= {f"tree.{k}": v for k, v in tree.items() if isinstance(v, np.ndarray)}
+        text = {
+            "name": self.name,
+            "sha256": self.sha256,
+            "urdf_text": self.urdf_text,
+            "mesh_files": self.mesh_files,
+            "notes": self.notes,
+            "tree": {k: v for k, v in tree.items() if not isinstance(v, np.ndarray)},
+        }
+        out["text"] = np.frombuffer(json.dumps(text).encode(), np.uint8)
+        return out
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> "HandModel":
+        text = json.loads(bytes(arrays["text"]))
+        tree_text = {k: tuple(v) if isinstance(v, list) else v for k, v in text.pop("tree").items()}
+        tree = {k.removeprefix("tree."): v for k, v in arrays.items() if k.startswith("tree.")}
+        own = {k: v for k, v in arrays.items() if not k.startswith("tree.") and k != "text"}
+        text["notes"] = tuple(text["notes"])
+        return cls(tree=Tree(**tree, **tree_text), **own, **text)
+
+
+def hand_digest(urdf_path: Path, spec: HandSpec) -> str:
+    """SHA-256 over the URDF, the collision meshes it names and the rules: the content key of a hand."""
+    urdf = read_urdf(urdf_path)
+    return _digest(urdf, spec)
+
+
+def _digest(urdf: Urdf, spec: HandSpec) -> str:
+    h = hashlib.sha256(urdf.text.encode())
+    for name in sorted(urdf.mesh_files):
+        h.update(name.encode())
+        h.update(urdf.mesh_files[name].read_bytes())
+    h.update(spec.model_dump_json().encode())
+    return h.hexdigest()
+
+
+def _csr(counts: list[int]) -> np.ndarray:
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+
+
+def _stack(parts: list[np.ndarray], width: int, dtype=np.float32) -> np.ndarray:
+    return np.vstack(parts).astype(dtype) if parts else np.zeros((0, width), dtype)
+
+
+def build_hand(urdf_path: Path, spec: HandSpec) -> HandModel:
+    """Build a HandModel from a URDF and its rules.
+
+    Raises:
+        HandError: see :func:`read_urdf`, :func:`build_tree`; also a hand without collision geometry, or with a group of
+            more joints than the kernels hold.
+    """
+    urdf = read_urdf(urdf_path)
+    tree = build_tree(urdf, spec)
+    _check_size(spec, tree)
+    check_contact_links(spec, tree.link_names, dict(urdf.links))
+    rng = np.random.default_rng(0)
+    solids = _Solids(urdf, tree, rng)
+    contacts = _contacts(spec, tree, solids, rng)
+    bodies = len(tree.joint_dof) + 1
+    order = np.argsort([p[0] for p in solids.pieces], kind="stable")
+    pieces = [solids.pieces[i] for i in order]
+    per_body = [[p for p in pieces if p[0] == b] for b in range(bodies)]
+    arrays = {
+        "piece_first": _csr([len(p) for p in per_body]),
+        "body_sphere": np.array([_body_sphere([p[2] for p in group]) for group in per_body], np.float32),
+        "vertex_first": _csr([len(p[2].vertices) for p in pieces]),
+        "vertices": _stack([p[2].vertices for p in pieces], 3),
+        "plane_first": _csr([len(p[2].planes) for p in pieces]),
+        "planes": _stack([p[2].planes for p in pieces], 4),
+        "piece_sphere": _stack([p[2].sphere[None] for p in pieces], 4),
+        "piece_radius": np.array([p[2].radius for p in pieces], np.float32),
+        "piece_body": np.array([p[0] for p in pieces], np.int32),
+        "piece_link": np.array([p[1] for p in pieces], np.int32),
+        "sphere_first": _csr([sum(len(s) for b, s in solids.spheres if b == body) for body in range(bodies)]),
+        "spheres": _stack([s for body in range(bodies) for b, s in solids.spheres if b == body], 4),
+        "sample_first": _csr([sum(len(s) for b, s in solids.samples if b == body) for body in range(bodies)]),
+        "samples": _stack([s for body in range(bodies) for b, s in solids.samples if b == body], 3),
+    }
+    model = HandModel(
+        name=spec.name,
+        sha256=_digest(urdf, spec),
+        urdf_text=urdf.text,
+        mesh_files={name: str(file) for name, file in urdf.mesh_files.items()},
+        notes=tuple(solids.notes),
+        tree=tree,
+        canonical_box=np.array([spec.canonical_box.min, spec.canonical_box.max], np.float32),
+        pair_first=np.zeros((tree.groups + 1) ** 2 + 1, np.int32),
+        pairs=np.zeros((0, 2), np.int32),
+        **arrays,
+        **contacts,
+    )
+    from lgrasp.hand.pairs import with_pairs  # needs the kernels, which need a model
+
+    return with_pairs(model, {(j.parent, j.child) for j in urdf.joints})
+
+
+def _check_size(spec: HandSpec, tree: Tree) -> None:
+    joints, dofs = int(np.diff(tree.joint_first).max()), int(np.diff(tree.dof_first).max())
+    if joints > MAX_JOINTS or dofs > MAX_DOFS:
+        raise HandError(
+            f"hand '{spec.name}': one dependency group has {joints} joints and {dofs} drives, at most {MAX_JOINTS} and "
+            f"{MAX_DOFS} are supported; lock the joint that moves several fingers (hand.yaml: locked)"
+        )
+
+
+def _body_sphere(pieces: list[Piece]) -> np.ndarray:
+    if not pieces:
+        return np.array([0, 0, 0, -1.0])
+    spheres = np.array([p.sphere for p in pieces])
+    low = (spheres[:, :3] - spheres[:, 3:]).min(0)
+    high = (spheres[:, :3] + spheres[:, 3:]).max(0)
+    c = (low + high) / 2
+    far = [np.linalg.norm(p.vertices - c, axis=1).max() + p.radius for p in pieces]
+    return np.append(c, max(far))
+
+
+class _Solids:
+    """Per link: meshes in the body frame; flat lists of pieces, spheres and samples tagged with their body."""
+
+    def __init__(self, urdf: Urdf, tree: Tree, rng: np.random.Generator) -> None:
+        self.meshes: dict[str, list[trimesh.Trimesh]] = {}
+        self.pieces: list[tuple[int, int, Piece]] = []
+        self.spheres: list[tuple[int, np.ndarray]] = []
+        self.samples: list[tuple[int, np.ndarray]] = []
+        self.notes: list[str] = []
+        for index, link in enumerate(tree.link_names):
+            body, T_body_link = int(tree.link_body[index]), tree.T_body_link[index]
+            for geometry in urdf.links[link]:
+                T = T_body_link @ geometry.T_link_geometry
+                mesh = geometry_mesh(urdf, geometry)
+                piece = convex_piece(urdf, geometry, mesh)
+                if geometry.kind == "mesh" and mesh.is_volume and mesh.volume < 0.9 * mesh.convex_hull.volume:
+                    share = 100 * mesh.volume / mesh.convex_hull.volume
+                    self.notes.append(f"link '{link}': mesh {geometry.mesh} fills {share:.0f} % of its convex hull; the hull is used")
+                mesh.apply_transform(T)
+                self.meshes.setdefault(link, []).append(mesh)
+                planes = piece.planes.copy()
+                planes[:, :3] = piece.planes[:, :3] @ T[:3, :3].T
+                planes[:, 3] += planes[:, :3] @ T[:3, 3]
+                piece = Piece(transform_points(T, piece.vertices), planes, piece.radius)
+                self.pieces.append((body, index, piece))
+                self.spheres.append((body, inner_spheres(piece, _SPHERES_PER_PIECE, rng)))
+                self.samples.append((body, surface_samples(mesh, _SAMPLE_SPACING, rng)))
+        if not self.pieces:
+            raise HandError(f"URDF {urdf.path} has no collision geometry; a hand's solid is its collision geometry")
+
+
+def _contacts(spec: HandSpec, tree: Tree, solids: _Solids, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Contact arrays of a HandModel: finger points by group, then palm points."""
+    groups = tree.groups
+    body_group = tree.body_group
+    per_group: list[list[tuple[int, int, np.ndarray, np.ndarray]]] = [[] for _ in range(groups + 1)]
+    grids, grid_link, rules, meshes = [], [], [], []
+    made: dict[bytes, LinkGrid] = {}
+
+    def grid(link: str) -> LinkGrid:
+        # fingertips of one shape share one grid's work
+        key = b"".join(np.round(m.vertices, 9).tobytes() for m in solids.meshes[link])
+        if key not in made:
+            made[key] = link_grid(solids.meshes[link])
+        return made[key]
+
+    for rule in spec.contact:
+        for link in rule.links:
+            index = tree.link_names.index(link)
+            group = int(body_group[tree.link_body[index]])
+            if group < 0:
+                raise HandError(f"hand '{spec.name}': contact link '{link}' does not move; list it under palm")
+            T = tree.T_body_link[index]
+            points, normals = finger_points(solids.meshes[link], T, rule.forbidden, rng)
+            if len(points) == 0:
+                raise HandError(f"hand '{spec.name}': the forbidden cones leave no surface on contact link '{link}'")
+            per_group[group].append((index, len(grids), points, normals))
+            grids.append(grid(link))
+            grid_link.append(index)
+            meshes.append(trimesh.util.concatenate(solids.meshes[link]))
+            axes = [(T[:3, :3] @ (np.array(c.axis) / np.linalg.norm(c.axis)), np.cos(np.radians(c.angle))) for c in rule.forbidden]
+            rules.append(np.array([[*a, c] for a, c in axes]).reshape(-1, 4))
+    for link in spec.palm.links:
+        index = tree.link_names.index(link)
+        if body_group[tree.link_body[index]] >= 0:
+            raise HandError(f"hand '{spec.name}': palm link '{link}' moves; list it under contact")
+        points, normals = palm_points(solids.meshes[link], tree.T_body_link[index], spec.palm.allowed, rng)
+        per_group[groups].append((index, len(grids), points, normals))
+        grids.append(grid(link))
+        grid_link.append(index)
+        meshes.append(trimesh.util.concatenate(solids.meshes[link]))
+        rules.append(np.zeros((0, 4)))
+    flat = [entry for group in per_group for entry in group]
+    patches, count = [], 0
+    for _, _, points, normals in flat:
+        patch = cover_patches(points, normals, rng) if len(points) else np.zeros(0, np.int32)
+        patches.append(patch + count)
+        count += int(patch.max()) + 1 if len(patch) else 0
+    repeat = [len(points) for _, _, points, _ in flat]
+    links = np.repeat([i for i, *_ in flat], repeat).astype(np.int32)
+    return {
+        "contact_first": _csr([sum(len(e[2]) for e in group) for group in per_group]),
+        "contact_points": _stack([e[2] for e in flat], 3),
+        "contact_normals": _stack([e[3] for e in flat], 3),
+        "contact_body": tree.link_body[links].astype(np.int32),
+        "contact_link": links,
+        "contact_patch": np.concatenate(patches).astype(np.int32) if patches else np.zeros(0, np.int32),
+        "contact_grid": np.repeat([g for _, g, *_ in flat], repeat).astype(np.int32),
+        "grid_first": _csr([g.values.size for g in grids]),
+        "grid_shape": np.array([g.values.shape for g in grids], np.int32),
+        "grid_origin": np.array([g.origin for g in grids], np.float32),
+        "grid_cell": np.array([g.cell for g in grids], np.float32),
+        "grid_values": np.concatenate([g.values.ravel() for g in grids]),
+        "grid_link": np.array(grid_link, np.int32),
+        "rule_first": _csr([len(r) for r in rules]),
+        "rules": _stack(rules, 4),
+        "mesh_vertex_first": _csr([len(m.vertices) for m in meshes]),
+        "mesh_vertices": _stack([m.vertices for m in meshes], 3),
+        "mesh_face_first": _csr([len(m.faces) for m in meshes]),
+        "mesh_faces": _stack([m.faces for m in meshes], 3, np.int32),
+    }

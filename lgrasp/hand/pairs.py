@@ -1,0 +1,86 @@
+"""Which pieces of a hand must stay apart: all of non-adjacent links, save pairs that touch in every posture."""
+
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from lgrasp.device.convex import Pieces, pieces_clear
+from lgrasp.device.runtime import KERNEL_OPTIONS, start
+from lgrasp.hand.arrays import body_poses, upload_hand
+from lgrasp.hand.model import HandModel
+
+__all__ = ["pieces_touch", "with_pairs"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_POSTURES = 256
+
+
+@wp.kernel
+def _pieces_touch(
+    pieces: Pieces,
+    pose: wp.array2d(dtype=wp.transform),
+    pairs: wp.array(dtype=wp.vec2i),
+    margin: wp.float32,
+    touch_out: wp.array2d(dtype=wp.int32),
+):
+    row, k = wp.tid()
+    i = pairs[k][0]
+    j = pairs[k][1]
+    T = wp.transform_inverse(pose[row, pieces.body[i]]) * pose[row, pieces.body[j]]
+    if not pieces_clear(pieces, i, j, T, margin):
+        touch_out[row, k] = 1
+
+
+def pieces_touch(model: HandModel, q: np.ndarray, pairs: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    """(N, Q) bool: are piece pairs (Q, 2) within ``margin`` [m] of each other at postures q (N, K)?"""
+    start()
+    hand = upload_hand(model, "cpu")
+    pose = wp.array(body_poses(hand, q), dtype=wp.transform, device="cpu")
+    out = wp.zeros((len(q), len(pairs)), dtype=wp.int32, device="cpu")
+    inputs = [hand.struct.pieces, pose, wp.array(np.asarray(pairs, np.int32), dtype=wp.vec2i, device="cpu"), float(margin)]
+    wp.launch(_pieces_touch, dim=(len(q), len(pairs)), inputs=inputs, outputs=[out], device="cpu")
+    return out.numpy().astype(bool)
+
+
+def _rigid(model: HandModel, adjacent: set[tuple[str, str]]) -> set[tuple[int, int]]:
+    """Link index pairs that never need a test: joined by a joint, or riding on one body."""
+    index = {name: i for i, name in enumerate(model.tree.link_names)}
+    out = {(index[a], index[b]) for a, b in adjacent}
+    return out | {(b, a) for a, b in out}
+
+
+def with_pairs(model: HandModel, adjacent: set[tuple[str, str]]) -> HandModel:
+    """The model with its self-collision pairs, grouped by (group a, group b).
+
+    Args:
+        adjacent: (parent link, child link) of every joint of the URDF.
+    """
+    skip = _rigid(model, adjacent)
+    group = model.tree.body_group + 1
+    candidates = []
+    for i in range(len(model.piece_body)):
+        for j in range(i + 1, len(model.piece_body)):
+            bi, bj = model.piece_body[i], model.piece_body[j]
+            if bi != bj and (int(model.piece_link[i]), int(model.piece_link[j])) not in skip:
+                candidates.append((i, j) if group[bi] <= group[bj] else (j, i))
+    if not candidates:
+        return model
+    pairs = np.array(candidates, np.int32)
+    rng = np.random.default_rng(1)
+    q = rng.uniform(model.tree.joint_lower, model.tree.joint_upper, (_POSTURES, model.dofs))
+    touch = pieces_touch(model, q, pairs)
+    # links, not pieces, are what touches: a link pair is left out when some pieces of it touch in every posture
+    links = np.sort(model.piece_link[pairs], axis=1)
+    keep = np.ones(len(pairs), bool)
+    for pair in np.unique(links, axis=0):
+        members = (links == pair).all(1)
+        if touch[:, members].any(1).all():
+            keep[members] = False
+    pairs = pairs[keep]
+    groups = model.groups + 1
+    key = group[model.piece_body[pairs[:, 0]]] * groups + group[model.piece_body[pairs[:, 1]]]
+    order = np.argsort(key, kind="stable")
+    first = np.searchsorted(key[order], np.arange(groups**2 + 1)).astype(np.int32)
+    return replace(model, pair_first=first, pairs=np.ascontiguousarray(pairs[order]))
