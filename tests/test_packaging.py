@@ -68,9 +68,10 @@ def defined(name: str) -> dict[str, ast.stmt]:
     return found
 
 
-def is_device_code(node: ast.stmt) -> bool:
-    """Whether a definition is a Warp function, kernel or struct (helpers of one kernel file need no export)."""
-    return any(ast.unparse(d).startswith("wp.") for d in getattr(node, "decorator_list", []))
+def is_registered(node: ast.stmt) -> bool:
+    """Whether a decorator hands a definition to Warp or to the command line; it needs no export then."""
+    decorators = [ast.unparse(d).split("(")[0] for d in getattr(node, "decorator_list", [])]
+    return any(d.startswith("wp.") or d.endswith((".command", ".callback")) for d in decorators)
 
 
 def imports(name: str) -> list[tuple[str, str, int]]:
@@ -112,7 +113,7 @@ def test_module_exports_what_it_defines(name):
         for x, node in own.items()
         if not x.startswith("_")
         and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
-        and not is_device_code(node)
+        and not is_registered(node)
     ]
     hidden = [x for x in public if x not in names]
     assert not hidden, f"{name}: public by name but not in __all__ (list it or start it with _): {hidden}"
