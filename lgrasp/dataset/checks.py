@@ -53,7 +53,7 @@ def row_problems(rows: GraspRows, hand: HandRecord, object_ids: Sequence[str], *
     problems: list[str] = []
 
     def require(good: np.ndarray, text: str) -> None:
-        bad = np.flatnonzero(~good.reshape(len(good), -1).all(axis=1))
+        bad = np.flatnonzero(~good.all(axis=tuple(range(1, good.ndim))))
         if len(bad):
             problems.append(f"grasps/{text} (row {first_row + bad[0]}, {len(bad)} rows)")
 

@@ -113,7 +113,10 @@ class ShardReader:
         """Rows ``start`` to ``stop`` of everything under ``/grasps``."""
         values = {name: self.column(name, start, stop) for name in self.columns}
         fields: dict[str, Any] = {name: values.pop(name) for name in GRASP_FIELDS}
-        for group, texts, attribute in (("metrics", "metric_units", "unit"), ("physics", "physics_protocols", "protocol")):
+        for group, texts, attribute in (
+            ("metrics", "metric_units", "unit"),
+            ("physics", "physics_protocols", "protocol"),
+        ):
             members = {n.partition("/")[2]: v for n, v in values.items() if n.startswith(f"{group}/")}
             fields[group] = members
             fields[texts] = {n: self._dataset(f"{group}/{n}").attrs[attribute] for n in members}

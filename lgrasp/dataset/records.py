@@ -136,5 +136,3 @@ def object_set_sha256(objects: Sequence[ObjectRecord]) -> str:
     """Hash of an object set: the object's own hash if single, else SHA-256 of the sorted hashes joined by newlines."""
     hashes = sorted(o.sha256 for o in objects)
     return hashes[0] if len(hashes) == 1 else hashlib.sha256("\n".join(hashes).encode()).hexdigest()
-
-

@@ -21,7 +21,7 @@ def format_problem(file: h5py.File) -> str | None:
     version = str(file.attrs.get("format_version"))
     major = FORMAT_VERSION.partition(".")[0]
     if not re.fullmatch(rf"{major}\.\d+", version):
-        return f"format version {version} cannot be read by this lgrasp, which reads {major}.x; upgrade lgrasp"
+        return f"format_version is {version!r}, this lgrasp reads {major}.x; use a newer lgrasp"
     if not np.array_equal(file.attrs.get("complete"), 1):
         return f"incomplete (attribute complete is {file.attrs.get('complete')!r}, expected 1)"
     return None
@@ -66,12 +66,12 @@ def _dataset_problems(file: h5py.File, path: str, spec: DatasetSpec, dims: dict[
         return [f"{path}: shape is {dataset.shape}, must be [{', '.join(map(str, spec.shape))}]"]
     problems = []
     for axis, (size, symbol) in enumerate(zip(actual, expected, strict=True)):
-        if isinstance(symbol, str):
-            want = dims.setdefault(symbol, size) if symbol.isupper() else size
+        if isinstance(symbol, int):
+            want, name = symbol, str(symbol)
         else:
-            want = symbol
+            want = dims.setdefault(symbol, size) if symbol.isupper() else size
+            name = f"{symbol} = {want}"
         if size != want:
-            name = f"{symbol} = {want}" if isinstance(symbol, str) else str(want)
             problems.append(f"{path}: axis {axis} has length {size}, must be {name}")
     return problems
 

@@ -46,9 +46,7 @@ def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
             raise ShardError(f"cannot write {path}: {problems[0]}")
 
 
-def write_context(
-    file: h5py.File, header: ShardHeader, hand: HandRecord, objects: Any, statistics: Any
-) -> None:
+def write_context(file: h5py.File, header: ShardHeader, hand: HandRecord, objects: Any, statistics: Any) -> None:
     """Write all that is not a row: header attributes, hand, objects, statistics, and the empty row groups.
 
     Raises:

@@ -1,6 +1,7 @@
 """Made-up shards that conform."""
 
 import numpy as np
+import pytest
 
 from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 
@@ -73,7 +74,12 @@ def sample_shard(n=5, *, objects=1, shard_index=0, seed=0, created="2026-01-02T0
     names = ["cup", "mug é", "sphere"][:objects]
     return Shard(
         header=ShardHeader(
-            pipeline="swift", seed=7, shard_index=shard_index, config={"mu": 0.5}, created=created, lgrasp_version="0.1.0"
+            pipeline="swift",
+            seed=7,
+            shard_index=shard_index,
+            config={"mu": 0.5},
+            created=created,
+            lgrasp_version="0.1.0",
         ),
         hand=sample_hand(shape.get("joints", 4), shape.get("links", 3)),
         objects=[sample_object(name, str(i)) for i, name in enumerate(names)],
@@ -89,3 +95,13 @@ def assert_same_rows(a: GraspRows, b: GraspRows) -> None:
         assert b.columns()[name].dtype == values.dtype, name
     assert a.metric_units == b.metric_units
     assert a.physics_protocols == b.physics_protocols
+
+
+@pytest.fixture(scope="session")
+def make_shard():
+    return sample_shard
+
+
+@pytest.fixture(scope="session")
+def same_rows():
+    return assert_same_rows

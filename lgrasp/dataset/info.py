@@ -1,0 +1,59 @@
+"""What shards hold, in one dictionary each."""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.dataset.files import find_shards
+from lgrasp.dataset.reader import ShardReader
+
+__all__ = ["describe"]
+
+
+def describe(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[dict[str, Any]]:
+    """Summaries of shards, JSON-serialisable, one per file.
+
+    Args:
+        paths: Shard files or folders of them.
+
+    Returns:
+        For each shard: ``file``, ``bytes``, ``rows``, ``hand``, ``objects`` (ids), ``pipeline``, ``seed``,
+        ``shard_index``, ``created``, ``lgrasp_version``, ``joints`` (names), ``columns`` (shape of each row dataset),
+        ``metrics`` (unit, min, mean, max of the finite values; None if there are none) and ``statistics``.
+
+    Raises:
+        ShardError: No shard is found, or one cannot be read.
+    """
+    return [_describe(path) for path in find_shards(paths)]
+
+
+def _describe(path: Path) -> dict[str, Any]:
+    with ShardReader(path) as reader:
+        header = reader.header
+        units = reader.rows(0, 0).metric_units
+        return {
+            "file": str(path),
+            "bytes": path.stat().st_size,
+            "rows": len(reader),
+            "hand": str(reader.attributes["hand"]),
+            "objects": reader.object_ids,
+            "pipeline": header.pipeline,
+            "seed": header.seed,
+            "shard_index": header.shard_index,
+            "created": header.created,
+            "lgrasp_version": header.lgrasp_version,
+            "joints": list(reader.hand().joint_names),
+            "columns": {name: list(shape) for name, (shape, _) in reader.columns.items()},
+            "metrics": {n: {"unit": unit, **_range(reader.column(f"metrics/{n}"))} for n, unit in units.items()},
+            "statistics": reader.statistics,
+        }
+
+
+def _range(values: np.ndarray) -> dict[str, float | None]:
+    values = values[np.isfinite(values)].astype(np.float64)
+    if not len(values):
+        return {"min": None, "mean": None, "max": None}
+    return {"min": float(values.min()), "mean": float(values.mean()), "max": float(values.max())}

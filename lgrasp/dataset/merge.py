@@ -1,0 +1,180 @@
+"""Puts the rows of many shards of one hand and one object set into one file."""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from lgrasp.dataset.checks import row_problems
+from lgrasp.dataset.files import find_shards, new_shard_file
+from lgrasp.dataset.manifest import MANIFEST_NAME, check_manifest
+from lgrasp.dataset.padding import pad_column, widest
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.records import HandRecord, ShardHeader
+from lgrasp.dataset.schema import GRASP_FIELDS
+from lgrasp.dataset.writer import create_rows, finish, write_context
+from lgrasp.errors import ShardError
+
+__all__ = ["merge_shards", "sum_statistics"]
+
+_Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
+
+def merge_shards(paths: _Paths, out: str | os.PathLike[str], *, manifest: str | os.PathLike[str] | None = None) -> int:
+    """Copy the rows of shards, ordered by shard index, into one shard file; streams, so memory stays bounded.
+
+    The shards must agree in hand, objects, pipeline, config and seed, and in the names of metrics and verdicts. Rows
+    with fewer objects or contacts than the widest shard are padded. Statistics are summed.
+
+    Args:
+        paths: Shard files, or a folder of them.
+        out: The file to write; if it lies in the folder, it is not merged into itself.
+        manifest: List to check the shards against; by default ``manifest.json`` of the folder, if there is one.
+
+    Returns:
+        The number of rows written.
+
+    Raises:
+        ShardError: A shard is missing, damaged, changed, given twice, or does not belong to the others.
+        OutputError: ``out`` cannot be written.
+    """
+    found = find_shards(paths)
+    folder = Path(paths) if isinstance(paths, str | os.PathLike) else None
+    if folder and folder.is_dir():
+        found = [path for path in found if not _same_file(path, out)]
+        if manifest is None and (folder / MANIFEST_NAME).exists():
+            manifest = folder / MANIFEST_NAME
+    if not found or any(_same_file(path, out) for path in found):
+        raise ShardError(f"{out}: must not be one of the shards to merge")
+    if manifest is not None:
+        check_manifest(manifest, found)
+    sources = sorted((_survey(path) for path in found), key=lambda s: (s.header.shard_index, s.path.name))
+    for source in sources[1:]:
+        _require_same(sources[0], source)
+    _require_once(sources)
+    with new_shard_file(out) as file:
+        hand = _write_head(file, sources)
+        _copy_rows(file, sources, hand)
+        finish(file)
+    return sum(source.rows for source in sources)
+
+
+def sum_statistics(parts: Sequence[Mapping[str, int | float | str]]) -> dict[str, int | float | str]:
+    """Statistics of several shards together: numbers are added, different strings are listed."""
+    total: dict[str, Any] = {}
+    for name in sorted({name for part in parts for name in part}):
+        values: list[Any] = [part[name] for part in parts if name in part]
+        texts = any(isinstance(value, str) for value in values)
+        total[name] = ", ".join(sorted({str(v) for v in values})) if texts else sum(values)
+    return total
+
+
+@dataclass(frozen=True)
+class _Source:
+    path: Path
+    rows: int
+    header: ShardHeader
+    statistics: dict[str, int | float | str]
+    identity: dict[str, Any]
+    """What must agree, by a name for the message."""
+    tails: dict[str, tuple[int, ...]]
+    units: dict[str, str]
+    protocols: dict[str, str]
+    dtypes: dict[str, np.dtype]
+
+    def parts(self) -> list[dict[str, Any]]:
+        if self.header.merged_from:
+            return [dict(part) for part in self.header.merged_from]
+        return [{"file": self.path.name, "shard_index": self.header.shard_index, "rows": self.rows}]
+
+
+def _same_file(path: Path, out: str | os.PathLike[str]) -> bool:
+    return Path(out).exists() and path.samefile(out)
+
+
+def _survey(path: Path) -> _Source:
+    with ShardReader(path) as reader:
+        header, hand, empty = reader.header, reader.hand(), reader.rows(0, 0)
+        extra = {n: (shape[1:], dtype.str) for n, (shape, dtype) in reader.columns.items() if n not in GRASP_FIELDS}
+        identity = {
+            "hand": (hand.name, hand.sha256[:12], *hand.joint_names),
+            "objects": [(o.id, o.sha256[:12], o.scale) for o in reader.objects()],
+            "pipeline": header.pipeline,
+            "config": dict(header.config),
+            "seed": header.seed,
+            "metrics and physics": extra,
+            "metric units": dict(empty.metric_units),
+            "physics protocols": dict(empty.physics_protocols),
+        }
+        return _Source(
+            path=path,
+            rows=len(reader),
+            header=header,
+            statistics=reader.statistics,
+            identity=identity,
+            tails={name: shape[1:] for name, (shape, _) in reader.columns.items()},
+            units=dict(empty.metric_units),
+            protocols=dict(empty.physics_protocols),
+            dtypes={name: dtype for name, (_, dtype) in reader.columns.items()},
+        )
+
+
+def _require_same(first: _Source, other: _Source) -> None:
+    for what, value in other.identity.items():
+        if value != first.identity[what]:
+            mine, theirs = str(value)[:100], str(first.identity[what])[:100]
+            rule = "merge only shards of one hand, one object set and one run"
+            raise ShardError(f"{other.path}: {what} {mine} differs from {theirs} of {first.path}; {rule}")
+
+
+def _require_once(sources: Sequence[_Source]) -> None:
+    holder: dict[int, Path] = {}
+    for source in sources:
+        for part in source.parts():
+            index = part["shard_index"]
+            if index in holder:
+                raise ShardError(f"{source.path}: shard {index} is already in {holder[index]}; leave one out")
+            holder[index] = source.path
+
+
+def _write_head(file: h5py.File, sources: Sequence[_Source]) -> HandRecord:
+    header = ShardHeader(
+        pipeline=sources[0].header.pipeline,
+        seed=sources[0].header.seed,
+        shard_index=-1,
+        config=sources[0].header.config,
+        created=max(source.header.created for source in sources),
+        lgrasp_version=", ".join(sorted({source.header.lgrasp_version for source in sources})),
+        merged_from=[part for source in sources for part in source.parts()],
+    )
+    with ShardReader(sources[0].path) as reader:
+        hand = reader.hand()
+        statistics = sum_statistics([source.statistics for source in sources])
+        write_context(file, header, hand, reader.objects(), statistics)
+    return hand
+
+
+def _copy_rows(file: h5py.File, sources: Sequence[_Source], hand: HandRecord) -> None:
+    total, first = sum(source.rows for source in sources), sources[0]
+    datasets: dict[str, h5py.Dataset] = {}
+    for name, dtype in first.dtypes.items():
+        unit = first.units.get(name.removeprefix("metrics/"), "")
+        protocol = first.protocols.get(name.removeprefix("physics/"), "")
+        shape = (total, *widest(source.tails[name] for source in sources))
+        datasets[name] = create_rows(file, name, shape, dtype, unit=unit, protocol=protocol)
+    done = 0
+    for source in sources:
+        with ShardReader(source.path) as reader:
+            for start, rows in reader.blocks():
+                problems = row_problems(rows, hand, reader.object_ids, first_row=start)
+                if problems:
+                    raise ShardError(f"{source.path}: {problems[0]}")
+                for name, values in rows.columns().items():
+                    dataset = datasets[name]
+                    if dataset.size:
+                        dataset[done : done + len(rows)] = pad_column(name, values, dataset.shape[1:])
+                done += len(rows)

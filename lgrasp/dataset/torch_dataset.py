@@ -1,0 +1,164 @@
+"""Grasps of many shards as a map-style PyTorch Dataset."""
+
+import os
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from lgrasp.dataset.files import find_shards
+from lgrasp.dataset.padding import pad_column, widest
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.records import HandRecord, ObjectRecord
+from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS
+from lgrasp.errors import ShardError
+
+__all__ = ["GraspDataset"]
+
+
+class _Source(NamedTuple):
+    path: Path
+    rows: int
+    hand_sha256: str
+    objects: list[tuple[str, str, float]]
+    """Id, hash and scale."""
+    columns: dict[str, tuple[tuple[int, ...], np.dtype]]
+
+
+class GraspDataset(torch.utils.data.Dataset):
+    """All rows of shards of one hand, each a dictionary of tensors that the default collate function can stack.
+
+    Keys are the flat names of the row datasets: ``q``, ``object_pose``, ..., ``metrics/NAME``, ``physics/NAME``, with
+    the shapes of :class:`GraspRows` less the first axis, padded to the widest shard. ``object_index`` counts in
+    :attr:`objects`, the objects of all shards; ``candidate`` is int64.
+
+    Blocks of 4096 rows are decoded at a time and the last used ones kept, so sequential reading is fast at any size and
+    random reading as long as the data fits ``cache_bytes``. No file stays open: safe with worker processes, forked or
+    spawned, and with any number of shards.
+
+    Args:
+        paths: Shard files or folders of them.
+        columns: Names to return; by default all that every shard has.
+        cache_bytes: Memory for decoded blocks, per worker process.
+
+    Raises:
+        ShardError: A shard cannot be read, hands differ, or a shard lacks a column.
+    """
+
+    def __init__(
+        self,
+        paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+        *,
+        columns: Sequence[str] | None = None,
+        cache_bytes: int = 1 << 29,
+    ) -> None:
+        self._sources = [_survey(path) for path in find_shards(paths)]
+        first = self._sources[0]
+        for source in self._sources:
+            if source.hand_sha256 != first.hand_sha256:
+                raise ShardError(f"{source.path}: another hand than {first.path}; make one GraspDataset per hand")
+        self._ends = list(accumulate(source.rows for source in self._sources))
+        self.objects: list[tuple[str, str, float]] = sorted({o for source in self._sources for o in source.objects})
+        """Id, SHA-256 of the source mesh and scale of every object."""
+        self.columns: list[str] = self._choose(columns)
+        self._tails = {n: widest(source.columns[n][0][1:] for source in self._sources) for n in self.columns}
+        self._cache_bytes = cache_bytes
+        self._cache: OrderedDict[tuple[int, int], dict[str, torch.Tensor]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
+        return self.__getitems__([index])[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, torch.Tensor]]:
+        """Many rows at once, as a DataLoader asks for them; each block is touched once."""
+        by_block: dict[tuple[int, int], tuple[list[int], list[int]]] = {}
+        for position, index in enumerate(indices):
+            shard, row = self._locate(int(index))
+            positions, rows = by_block.setdefault((shard, row // CHUNK_ROWS), ([], []))
+            positions.append(position)
+            rows.append(row % CHUNK_ROWS)
+        items: list[dict[str, torch.Tensor]] = [{} for _ in indices]
+        for (shard, number), (positions, rows) in by_block.items():
+            for name, values in self._block(shard, number).items():
+                for position, value in zip(positions, values[rows].unbind(0), strict=True):
+                    items[position][name] = value
+        return items
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_cache": OrderedDict()}
+
+    def hand(self) -> HandRecord:
+        """The hand of all rows."""
+        with ShardReader(self._sources[0].path) as reader:
+            return reader.hand()
+
+    def object(self, index: int) -> ObjectRecord:
+        """The object that ``object_index`` names by ``index``."""
+        key = self.objects[index]
+        source = next(source for source in self._sources if key in source.objects)
+        with ShardReader(source.path) as reader:
+            return reader.object(key[0])
+
+    def _choose(self, columns: Sequence[str] | None) -> list[str]:
+        def kind(source: _Source, name: str) -> Any:
+            shape, dtype = source.columns[name]
+            return dtype if name in GRASP_FIELDS else (dtype, shape[1:])
+
+        first = self._sources[0]
+        common = [
+            name
+            for name in first.columns
+            if all(name in s.columns and kind(s, name) == kind(first, name) for s in self._sources)
+        ]
+        for name in columns or ():
+            if name not in common:
+                raise ShardError(f"no column {name!r} that all {len(self._sources)} shards have: {', '.join(common)}")
+        return common if columns is None else list(columns)
+
+    def _locate(self, index: int) -> tuple[int, int]:
+        size = len(self)
+        if not -size <= index < size:
+            raise IndexError(f"row {index} of {size}")
+        index %= size
+        shard = bisect_right(self._ends, index)
+        return shard, index - self._ends[shard] + self._sources[shard].rows
+
+    def _block(self, shard: int, number: int) -> dict[str, torch.Tensor]:
+        key = (shard, number)
+        if key not in self._cache:
+            self._cache[key] = self._read_block(shard, number)
+            while len(self._cache) > 1 and sum(map(_bytes, self._cache.values())) > self._cache_bytes:
+                self._cache.popitem(last=False)
+        self._cache.move_to_end(key)
+        return self._cache[key]
+
+    def _read_block(self, shard: int, number: int) -> dict[str, torch.Tensor]:
+        source = self._sources[shard]
+        block: dict[str, torch.Tensor] = {}
+        with ShardReader(source.path) as reader:
+            for name in self.columns:
+                values = reader.column(name, number * CHUNK_ROWS, (number + 1) * CHUNK_ROWS)
+                if name == "object_index":
+                    known = np.array([*(self.objects.index(o) for o in source.objects), -1], dtype=values.dtype)
+                    values = known[values]  # -1, absent, takes the last
+                elif name == "candidate":
+                    values = values.astype(np.int64)
+                block[name] = torch.from_numpy(pad_column(name, values, self._tails[name]))
+        return block
+
+
+def _bytes(block: dict[str, torch.Tensor]) -> int:
+    return sum(values.nbytes for values in block.values())
+
+
+def _survey(path: Path) -> _Source:
+    with ShardReader(path) as reader:
+        objects = [(o.id, o.sha256, o.scale) for o in reader.objects()]
+        return _Source(path, len(reader), str(reader.attributes["hand_sha256"]), objects, reader.columns)

@@ -1,0 +1,53 @@
+"""Checks a shard file against every MUST of the format."""
+
+import os
+
+import numpy as np
+
+from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
+from lgrasp.dataset.reader import ShardReader, open_hdf5, reading
+from lgrasp.dataset.records import object_set_sha256
+from lgrasp.dataset.structure import format_problem, structure_problems, text_sha256
+from lgrasp.errors import ShardError
+
+__all__ = ["validate_shard"]
+
+
+def validate_shard(path: str | os.PathLike[str]) -> list[str]:
+    """All problems of a shard, one line each; an empty list means that it conforms.
+
+    Reads every byte of every dataset of the format, in bounded memory, so checksums are verified. A file that cannot
+    be read at all gives one problem, not an error.
+    """
+    try:
+        with open_hdf5(path) as file, reading(path):
+            fatal = format_problem(file)
+            problems = [fatal] if fatal else structure_problems(file)
+            if not problems and file.attrs.get("text_sha256", text_sha256(file)) != text_sha256(file):
+                problems = ["/: attributes or texts were changed after writing (text_sha256 differs)"]
+        if problems:
+            return problems
+        with ShardReader(path) as reader, reading(path):
+            return _content_problems(reader)
+    except ShardError as error:
+        return [str(error).removeprefix(f"{path}: ")]
+
+
+def _content_problems(reader: ShardReader) -> list[str]:
+    hand, objects = reader.hand(), reader.objects()
+    problems = hand_problems(hand)
+    for record in objects:
+        problems += object_problems(record)
+    if reader.attributes["object_sha256"] != object_set_sha256(objects):
+        problems.append("/: attribute object_sha256 does not belong to the objects")
+    for name, value in reader.statistics.items():
+        if np.ndim(value) or not isinstance(value, int | float | str):
+            problems.append(f"statistics: attribute {name} is neither a number nor a string")
+    seen: set[str] = set()
+    for first_row, rows in reader.blocks():
+        for problem in row_problems(rows, hand, reader.object_ids, first_row=first_row):
+            kind = problem.rpartition(" (row ")[0]
+            if kind not in seen:  # the first block that shows it is enough
+                seen.add(kind)
+                problems.append(problem)
+    return problems

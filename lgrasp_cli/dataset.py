@@ -1,0 +1,109 @@
+"""``lgrasp dataset``: look at, check and merge grasp files."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+__all__ = ["app"]
+
+app = typer.Typer(help="Look at, check and merge grasp files (shards).", no_args_is_help=True)
+
+_Paths = Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.", show_default=False)]
+
+
+@app.command()
+def info(
+    paths: _Paths,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Show rows, hand, objects, pipeline, size and metrics of each shard.
+
+    Example: lgrasp dataset info out/mug
+    """
+    from lgrasp.dataset import describe
+
+    shards = describe(paths)
+    if as_json:
+        typer.echo(json.dumps(shards, indent=2))
+        return
+    from rich.console import Console
+
+    console = Console()
+    console.print(_shard_table(shards))
+    console.print(_metric_table(shards))
+
+
+@app.command()
+def validate(
+    paths: _Paths,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")] = False,
+) -> None:
+    """Check every byte and value of each shard against the format; exit code 2 if one has a problem.
+
+    Example: lgrasp dataset validate out/mug
+    """
+    from lgrasp.dataset import find_shards, validate_shard
+
+    problems = {str(path): validate_shard(path) for path in find_shards(paths)}
+    if as_json:
+        typer.echo(json.dumps(problems, indent=2))
+    for path, lines in problems.items():
+        for line in lines:
+            typer.echo(f"{path}: {line}", err=True)
+    bad = sum(map(bool, problems.values()))
+    if bad:
+        raise typer.Exit(2)
+    if not as_json:
+        typer.echo(f"{len(problems)} shard{'s' if len(problems) > 1 else ''} valid")
+
+
+@app.command()
+def merge(
+    paths: _Paths,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write.", show_default=False)],
+    manifest: Annotated[
+        Path | None, typer.Option(help="List of shards to check against [default: manifest.json of a single folder].")
+    ] = None,
+) -> None:
+    """Put the rows of shards of one hand, object and run into one file.
+
+    Example: lgrasp dataset merge out/mug -o mug.h5
+    """
+    from lgrasp.dataset import merge_shards
+
+    rows = merge_shards(paths[0] if len(paths) == 1 else paths, out, manifest=manifest)
+    typer.echo(f"{out}: {rows} rows")
+
+
+def _shard_table(shards: list[dict[str, Any]]) -> "Table":
+    from rich.table import Table
+
+    table = Table("shard", "hand", "objects", "pipeline", "seed", "index")
+    for name in ("rows", "joints", "MB"):
+        table.add_column(name, justify="right")
+    for s in shards:
+        texts = (Path(s["file"]).name, s["hand"], ", ".join(s["objects"]), s["pipeline"], s["seed"], s["shard_index"])
+        table.add_row(*map(str, texts), f"{s['rows']:,}", str(len(s["joints"])), f"{s['bytes'] / 1e6:.1f}")
+    if len(shards) > 1:
+        total, size = sum(s["rows"] for s in shards), sum(s["bytes"] for s in shards)
+        table.add_section()
+        table.add_row(f"{len(shards)} shards", "", "", "", "", "", f"{total:,}", "", f"{size / 1e6:.1f}")
+    return table
+
+
+def _metric_table(shards: list[dict[str, Any]]) -> "Table":
+    from rich.table import Table
+
+    table = Table("shard", "metric", "unit")
+    for name in ("min", "mean", "max"):
+        table.add_column(name, justify="right")
+    for s in shards:
+        for metric, values in s["metrics"].items():
+            numbers = ("-" if values[k] is None else f"{values[k]:.4g}" for k in ("min", "mean", "max"))
+            table.add_row(Path(s["file"]).name, metric, values["unit"], *numbers)
+    return table

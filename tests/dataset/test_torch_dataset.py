@@ -1,0 +1,74 @@
+import multiprocessing
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from lgrasp.dataset import GraspDataset, read_shard, write_shard
+from lgrasp.errors import ShardError
+
+
+@pytest.fixture
+def folder(tmp_path, make_shard):
+    write_shard(tmp_path / "a.h5", make_shard(5, objects=2, contacts=2))
+    write_shard(tmp_path / "b.h5", make_shard(0, objects=1, shard_index=1))
+    shard = make_shard(4100, objects=3, columns=3, contacts=4, shard_index=2)
+    write_shard(tmp_path / "c.h5", replace(shard, objects=[replace(o, scale=0.1) for o in shard.objects]))
+    return tmp_path
+
+
+def test_rows_of_all_shards(folder):
+    data = GraspDataset(folder)
+    assert len(data) == 4105
+    assert data.objects == sorted(data.objects)
+    assert len(data.objects) == 5
+    a, c = read_shard(folder / "a.h5").grasps, read_shard(folder / "c.h5").grasps
+    np.testing.assert_array_equal(data[2]["q"], a.q[2])
+    np.testing.assert_array_equal(data[5 + 4098]["q"], c.q[4098])
+    np.testing.assert_array_equal(data[-1]["physics/success"], c.physics["success"][-1])
+    assert data[0]["contact_points"].shape == (3, 4, 3)
+    assert (data[0]["contact_links"][2:] == -1).all()
+    assert data[0]["candidate"].dtype == torch.int64
+    assert data[5]["object_pose"].dtype == torch.float32
+    for index, rows, scale in ((1, a, 0.05), (5, c, 0.1)):
+        row = index if index < 5 else index - 5
+        number = int(data[index]["object_index"][0])
+        assert data.objects[number][2] == scale
+        assert data.object(number).id == ["cup", "mug é", "sphere"][rows.object_index[row, 0]]
+    assert data.hand().name == "toy"
+    with pytest.raises(IndexError):
+        data[4105]
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_default_collate_with_two_workers(folder, method):
+    data = GraspDataset(folder, columns=["q", "candidate", "contact_points", "metrics/gap"])
+    data[0]  # the parent has read before the workers start
+    context = multiprocessing.get_context(method)
+    loader = DataLoader(data, batch_size=1000, shuffle=True, num_workers=2, multiprocessing_context=context)
+    batches = list(loader)
+    assert batches[0]["contact_points"].shape == (1000, 3, 4, 3)
+    got = torch.cat([batch["candidate"] for batch in batches]).sort().values
+    expected = torch.cat([torch.arange(5), 2000 + torch.arange(4100)])
+    assert torch.equal(got, expected)
+
+
+def test_small_cache_and_pickle(folder):
+    data = GraspDataset(folder, cache_bytes=1)
+    again = pickle.loads(pickle.dumps(data))
+    for index in (0, 4104, 3, 4100):
+        assert torch.equal(data[index]["q"], again[index]["q"])
+    data[0]["q"].fill_(9)
+    assert not (data[0]["q"] == 9).any()
+
+
+def test_errors(folder, make_shard):
+    with pytest.raises(ShardError, match="no column 'nope'"):
+        GraspDataset(folder, columns=["nope"])
+    shard = make_shard(1)
+    write_shard(folder / "d.h5", replace(shard, hand=replace(shard.hand, sha256="d" * 64)))
+    with pytest.raises(ShardError, match=r"d\.h5: another hand"):
+        GraspDataset(folder)
