@@ -2,12 +2,14 @@
 
 import warp as wp
 
-__all__ = ["MAX_DOFS", "MAX_JOINTS", "Kinematics", "clamp_dofs", "group_forward", "point_column", "vec_dof"]
+__all__ = ["MAX_BODIES", "MAX_DOFS", "MAX_JOINTS", "Kinematics", "clamp_dofs", "group_forward", "point_column", "vec_dof"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 MAX_JOINTS = 16
 """Most movable joints (mimic joints included) in one dependency group."""
+MAX_BODIES = 40
+"""Most movable joints in a hand."""
 MAX_DOFS = 8
 """Most actuated joints in one dependency group."""
 
@@ -39,8 +41,8 @@ class Kinematics:
 
 
 @wp.func
-def group_forward(h: Kinematics, g: wp.int32, q: vec_dof, X: wp.array(dtype=wp.transform)):
-    """Write T_base_body of the group's bodies to X (local array, MAX_JOINTS)."""
+def group_forward(h: Kinematics, g: wp.int32, q: vec_dof, X: wp.array(dtype=wp.transform), at: wp.int32):
+    """Write T_base_body of the group's bodies to the local array X from place ``at`` on; returns the first joint."""
     first = h.joint_first[g]
     for j in range(h.joint_first[g + 1] - first):
         k = first + j
@@ -55,8 +57,8 @@ def group_forward(h: Kinematics, g: wp.int32, q: vec_dof, X: wp.array(dtype=wp.t
         T = wp.transform(p, r)
         parent = h.joint_parent[k]
         if parent >= 0:
-            T = X[parent] * T
-        X[j] = T
+            T = X[at + parent] * T
+        X[at + j] = T
     return first
 
 

@@ -46,7 +46,8 @@ class Hand:
     contacts: Contacts
     sphere_first: wp.array(dtype=wp.int32)
     spheres: wp.array(dtype=wp.vec4)
-    sample_first: wp.array(dtype=wp.int32)
+    cluster_first: wp.array(dtype=wp.int32)
+    cluster_sphere: wp.array(dtype=wp.vec4)
     samples: wp.array(dtype=wp.vec3)
     pair_first: wp.array(dtype=wp.int32)
     pairs: wp.array(dtype=wp.vec2i)
@@ -130,7 +131,8 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
     hand.contacts = contacts
     hand.sphere_first = put(model.sphere_first, wp.int32)
     hand.spheres = put(model.spheres, wp.vec4)
-    hand.sample_first = put(model.sample_first, wp.int32)
+    hand.cluster_first = put(model.cluster_first, wp.int32)
+    hand.cluster_sphere = put(model.cluster_sphere, wp.vec4)
     hand.samples = put(model.samples, wp.vec3)
     hand.pair_first = put(model.pair_first, wp.int32)
     hand.pairs = put(model.pairs, wp.vec2i)
@@ -170,7 +172,7 @@ def _body_poses(h: Kinematics, q: wp.array2d(dtype=wp.float32), pose_out: wp.arr
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     pose_out[row, 0] = wp.transform_identity()
     for g in range(h.groups):
-        first = group_forward(h, g, group_dofs(h, g, q, row), X)
+        first = group_forward(h, g, group_dofs(h, g, q, row), X, 0)
         for j in range(h.joint_first[g + 1] - first):
             pose_out[row, 1 + first + j] = X[j]
 

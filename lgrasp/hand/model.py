@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from lgrasp.device.kinematics import MAX_DOFS, MAX_JOINTS
+from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
+from lgrasp.device.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import LinkGrid, check_contact_links, cover_patches, finger_points, link_grid, palm_points
 from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres, surface_samples, transform_points
@@ -52,8 +53,9 @@ class HandModel:
     piece_link: np.ndarray  # (P,)
     sphere_first: np.ndarray  # (B + 1,) inner spheres of each body
     spheres: np.ndarray  # (S, 4)
-    sample_first: np.ndarray  # (B + 1,) surface samples of each body
-    samples: np.ndarray  # (N, 3)
+    cluster_first: np.ndarray  # (B + 1,) clusters of surface samples of each body
+    cluster_sphere: np.ndarray  # (C, 4) ball around the CLUSTER_SIZE samples of a cluster
+    samples: np.ndarray  # (C * CLUSTER_SIZE, 3)
     # self-collision: piece pairs that must stay apart, by (group a, group b), a <= b
     pair_first: np.ndarray  # ((G + 1)^2 + 1,)
     pairs: np.ndarray  # (Q, 2)
@@ -166,8 +168,7 @@ def build_hand(urdf_path: Path, spec: HandSpec) -> HandModel:
         "piece_link": np.array([p[1] for p in pieces], np.int32),
         "sphere_first": _csr([sum(len(s) for b, s in solids.spheres if b == body) for body in range(bodies)]),
         "spheres": _stack([s for body in range(bodies) for b, s in solids.spheres if b == body], 4),
-        "sample_first": _csr([sum(len(s) for b, s in solids.samples if b == body) for body in range(bodies)]),
-        "samples": _stack([s for body in range(bodies) for b, s in solids.samples if b == body], 3),
+        **_clusters([_stack([s for b, s in solids.samples if b == body], 3) for body in range(bodies)]),
     }
     model = HandModel(
         name=spec.name,
@@ -188,12 +189,29 @@ def build_hand(urdf_path: Path, spec: HandSpec) -> HandModel:
 
 
 def _check_size(spec: HandSpec, tree: Tree) -> None:
+    if len(tree.joint_dof) > MAX_BODIES:
+        raise HandError(f"hand '{spec.name}' has {len(tree.joint_dof)} movable joints, at most {MAX_BODIES} are supported")
     joints, dofs = int(np.diff(tree.joint_first).max()), int(np.diff(tree.dof_first).max())
     if joints > MAX_JOINTS or dofs > MAX_DOFS:
         raise HandError(
             f"hand '{spec.name}': one dependency group has {joints} joints and {dofs} drives, at most {MAX_JOINTS} and "
             f"{MAX_DOFS} are supported; lock the joint that moves several fingers (hand.yaml: locked)"
         )
+
+
+def _clusters(samples: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """Surface samples of each body in compact runs of CLUSTER_SIZE (the last run padded by repeats), with bounding balls."""
+    runs = []
+    for points in samples:
+        points = np.resize(points, (-(-len(points) // CLUSTER_SIZE) * CLUSTER_SIZE, 3))
+        runs.append(points[cluster_order(points)] if len(points) else points)
+    flat = _stack(runs, 3)
+    centre, radius = bounding_spheres(flat)
+    return {
+        "cluster_first": _csr([len(r) // CLUSTER_SIZE for r in runs]),
+        "cluster_sphere": np.column_stack([centre, radius]).astype(np.float32),
+        "samples": flat,
+    }
 
 
 def _body_sphere(pieces: list[Piece]) -> np.ndarray:

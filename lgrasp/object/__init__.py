@@ -1,6 +1,7 @@
 """Objects: mesh file to surface points, obstacle clusters and signed distance grid."""
 
-from .clusters import CLUSTER_SIZE
+from lgrasp.clusters import CLUSTER_SIZE
+
 from .find import find_object, list_objects
 from .load import MESH_SUFFIXES
 from .model import ObjectModel, preprocess_object

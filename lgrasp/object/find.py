@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lgrasp.errors import ObjectError
 from lgrasp.paths import data_dirs
+
 from .load import MESH_SUFFIXES
 
 __all__ = ["find_object", "list_objects"]

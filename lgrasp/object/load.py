@@ -9,11 +9,14 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
+from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import ObjectError
+
 from .params import ObjectParams
 
 __all__ = ["MESH_SUFFIXES", "LoadedMesh", "load_mesh", "open_edges"]
@@ -77,7 +80,9 @@ def load_mesh(
     used[faces.ravel()] = True
     bad = int((~np.isfinite(vertices[used]).all(axis=1)).sum())
     if bad:
-        raise ObjectError(f"{label}: {bad} of {int(used.sum())} vertices are NaN or infinite; finite coordinates are accepted")
+        raise ObjectError(
+            f"{label}: {bad} of {int(used.sum())} vertices are NaN or infinite; finite coordinates are accepted"
+        )
     notes = [f"joined {parts} geometries into one object"] if parts > 1 else []
     vertices = vertices * scale
     _check_size(label, vertices[used], scale, params)
@@ -132,9 +137,9 @@ def _silence() -> Iterator[None]:
 def _parse(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray, int]:
     """Vertices, faces and the number of geometries of a mesh file's bytes."""
     kind = path.suffix.lower()[1:]
-    options = {"skip_materials": True} if kind == "obj" else {}
+    options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
     if kind == "gltf":
-        options["resolver"] = trimesh.resolvers.FilePathResolver(str(path))
+        options["resolver"] = FilePathResolver(str(path))
     try:
         with _silence():
             scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, **options)
@@ -148,7 +153,9 @@ def _parse(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray, int]:
     faces = np.concatenate([np.asarray(m.faces, np.int64) + start for m, start in zip(meshes, starts, strict=False)])
     vertices = np.concatenate([np.asarray(m.vertices, np.float64) for m in meshes])
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise ObjectError(f"{path}: a face names vertex {faces.max()} of {len(vertices)}; existing vertices are accepted")
+        raise ObjectError(
+            f"{path}: a face names vertex {faces.max()} of {len(vertices)}; existing vertices are accepted"
+        )
     return vertices, faces, len(meshes)
 
 

@@ -2,11 +2,13 @@
 
 import os
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import trimesh
 
-from .clusters import bounding_spheres, cluster_order
+from lgrasp.clusters import bounding_spheres, cluster_order
+
 from .load import LoadedMesh, load_mesh
 from .params import ObjectParams
 from .sdf import SdfGrid, build_sdf
@@ -73,13 +75,15 @@ class ObjectModel:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> "ObjectModel":
         """Inverse of :meth:`to_arrays`; also takes an opened npz file."""
         values = {f.name: arrays[f.name] for f in fields(cls)}
-        plain = {k: v.item() if v.ndim == 0 else np.ascontiguousarray(v) for k, v in values.items()}
-        return cls(**(plain | {"notes": str(plain["notes"]).split("\n") if plain["notes"] else []}))
+        plain: dict[str, Any] = {k: v.item() if v.ndim == 0 else np.ascontiguousarray(v) for k, v in values.items()}
+        plain["notes"] = plain["notes"].split("\n") if plain["notes"] else []
+        return cls(**plain)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write :meth:`to_arrays` to an npz file."""
         with open(path, "wb") as file:
-            np.savez(file, **self.to_arrays())
+            arrays: dict[str, Any] = self.to_arrays()
+            np.savez(file, **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "ObjectModel":

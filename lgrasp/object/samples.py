@@ -1,8 +1,9 @@
-"""The sample objects that ship with the package, built from primitives; ``write_samples`` writes the ``objects/`` folder.
+"""Sample objects that ship with the package, built from primitives; ``write_samples`` fills the ``objects/`` folder.
 
 Making them needs manifold3d (part of ``trimesh[easy]``); using the shipped files does not.
 """
 
+import itertools
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -22,7 +23,7 @@ _MERGE = 0.02  # [mm] detail that the boolean operations leave behind below this
 def mug() -> trimesh.Trimesh:
     """Cup of 80 mm diameter and 95 mm height with 4 mm walls and an open handle."""
     body = _revolve([(0, 0), (37, 0), (40, 3), (40, 94), (39, 95), (37, 95), (36, 94), (36, 9), (32, 5), (0, 5)])
-    ring = _tube(_ellipse(24.0, 29.0, 40), radius=5.5)
+    ring = _tube(_ellipse(25.0, 29.0, 36), radius=6.5)
     ring.apply_transform(_frame((1, 0, 0), (0, -1, 0), (40, 0, 49)))
     hollow = _revolve([(0, 5), (38, 5), (38, 96), (0, 96)])
     return _union(body, _minus(ring, hollow))
@@ -71,7 +72,7 @@ def spoon() -> trimesh.Trimesh:
     line = np.stack([30.5 + 117 * s, 0 * s, -1.6 + 16 * s - 10 * s**2], axis=1)
     half = 2.5 + 4.0 * s
     knots = [_hull(_ball((x, -w, z), 2), _ball((x, w, z), 2)) for (x, _, z), w in zip(line, half, strict=True)]
-    return _union(shell, *(_hull(a, b) for a, b in zip(knots[:-1], knots[1:], strict=True)))
+    return _union(shell, *(_hull(a, b) for a, b in itertools.pairwise(knots)))
 
 
 def capsule() -> trimesh.Trimesh:
@@ -161,7 +162,9 @@ def _slab(sides: tuple[float, float, float], center: tuple[float, float, float])
     return trimesh.creation.box(extents=sides, transform=trimesh.transformations.translation_matrix(center))
 
 
-def _rounded_box(sides: tuple[float, float, float], radius: float, center: tuple[float, float, float]) -> trimesh.Trimesh:
+def _rounded_box(
+    sides: tuple[float, float, float], radius: float, center: tuple[float, float, float]
+) -> trimesh.Trimesh:
     reach = 0.5 * np.array(sides) - radius
     corners = np.array(center) + reach * np.array(list(np.ndindex(2, 2, 2))) * 2.0 - reach
     return _hull(*(_ball(tuple(c), radius) for c in np.unique(corners, axis=0)))
@@ -173,7 +176,7 @@ def _disc(center: tuple[float, float, float], radius: float, length: float) -> t
     return trimesh.creation.cylinder(radius=radius, height=length, sections=48, transform=turn)
 
 
-def _tube(line: list[tuple[float, float]], *, radius: float, sections: int = 20) -> trimesh.Trimesh:
+def _tube(line: list[tuple[float, float]], *, radius: float, sections: int = 48) -> trimesh.Trimesh:
     """Closed tube along a convex loop in the xy plane."""
     loop = np.array(line)
     ahead = np.roll(loop, -1, axis=0) - np.roll(loop, 1, axis=0)

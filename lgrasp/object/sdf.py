@@ -124,8 +124,9 @@ def _split(corners: np.ndarray, longest: float) -> np.ndarray:
 
 def _nearest_band_cell(far: np.ndarray) -> np.ndarray:
     """Flat index of the band cell nearest to every cell, shape (n,)."""
-    index = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
-    return np.ravel_multi_index(tuple(index), far.shape).ravel()
+    index = np.empty((3, *far.shape), np.int32)
+    ndimage.distance_transform_edt(far, return_distances=False, return_indices=True, indices=index)
+    return (index[0] * far.shape[1] + index[1]).ravel() * far.shape[2] + index[2].ravel()
 
 
 def _closed_inside(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, cell: float, dims: tuple) -> np.ndarray:

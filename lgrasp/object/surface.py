@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from . import kernels
 from .sdf import SdfGrid, sample_sdf
@@ -40,9 +40,7 @@ def face_neighbours(faces: np.ndarray) -> np.ndarray:
     return out.reshape(-1, 3)
 
 
-def sample_surface(
-    vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
+def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Stratified area-weighted points in random order.
 
     Returns:
@@ -102,8 +100,8 @@ def thin(points: np.ndarray, count: int, area: float) -> np.ndarray:
     radius = 0.9 * float(np.sqrt(area / count))
     while len(kept) < count:
         if len(kept):
-            left = left[cKDTree(points[kept]).query(points[left], distance_upper_bound=radius)[0] >= radius]
-        chosen = left[_independent(cKDTree(points[left]).query_pairs(radius, output_type="ndarray"), len(left))]
+            left = left[KDTree(points[kept]).query(points[left], distance_upper_bound=radius)[0] >= radius]
+        chosen = left[_independent(KDTree(points[left]).query_pairs(radius, output_type="ndarray"), len(left))]
         kept = np.concatenate([kept, chosen[: count - len(kept)]])
         left = np.setdiff1d(np.arange(len(points)), kept, assume_unique=True)
         radius *= 0.8 if radius > 1e-7 else 0.0
@@ -162,8 +160,8 @@ def probe_fits(sdf: SdfGrid, points: np.ndarray, normals: np.ndarray, radius: fl
     """Whether a ball of ``radius`` [m] can rest on each point from outside and get there.
 
     The ball touching the point may sink into the object by ``tolerance`` [m] at most; it has no shaft, so whatever
-    stands farther away along the normal (the other wall of a mug) does not count. Its centre must be connected to the outside
-    of the grid, so the walls of closed cavities fail.
+    stands farther away along the normal (the other wall of a mug) does not count. Its centre must be connected to the
+    outside of the grid, so the walls of closed cavities fail.
 
     Returns:
         Flags, shape (n,).
@@ -171,7 +169,8 @@ def probe_fits(sdf: SdfGrid, points: np.ndarray, normals: np.ndarray, radius: fl
     centre = points + radius * normals
     fits = sample_sdf(sdf, centre) >= radius - tolerance
     coarse = sdf.values[::2, ::2, ::2] >= radius - tolerance - 2.0 * sdf.cell
-    label, _ = ndimage.label(coarse)
+    label = np.zeros(coarse.shape, np.int32)
+    ndimage.label(coarse, output=label)
     border = np.ones(label.shape, bool)
     border[1:-1, 1:-1, 1:-1] = False
     outside = np.isin(label, np.unique(label[border & coarse]))

@@ -1,0 +1,75 @@
+"""Kernels that sample the contact field."""
+
+import warp as wp
+
+from lgrasp.device.kinematics import MAX_JOINTS, group_forward, vec_dof
+from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.device.transforms import encode_normal, normal_bin
+from lgrasp.hand.arrays import Hand
+from lgrasp.hand.clearance import group_pairs_clear
+
+__all__ = ["contact_vectors", "sample_postures"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+
+@wp.kernel
+def sample_postures(
+    hand: Hand,
+    group: wp.int32,
+    seed: wp.int32,
+    margin: wp.float32,
+    posture_out: wp.array2d(dtype=wp.uint8),
+    clear_out: wp.array(dtype=wp.int32),
+):
+    """Uniform postures of one group (8 bits a joint), and whether the group is clear of the static base and of itself."""
+    i = wp.tid()
+    state = wp.rand_init(seed, i)
+    first = hand.kin.dof_first[group]
+    n = hand.kin.dof_first[group + 1] - first
+    q = vec_dof()
+    for d in range(n):
+        code = wp.min(int(wp.randf(state) * 256.0), 255)
+        posture_out[i, d] = wp.uint8(code)
+        low = hand.kin.dof_lower[first + d]
+        q[d] = low + (hand.kin.dof_upper[first + d] - low) * float(code) / 255.0
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    group_forward(hand.kin, group, q, X, 0)
+    clear = int(1)
+    if not group_pairs_clear(hand, 0, group + 1, X, 0, X, 0, margin):
+        clear = 0
+    if clear == 1 and not group_pairs_clear(hand, group + 1, group + 1, X, 0, X, 0, margin):
+        clear = 0
+    clear_out[i] = clear
+
+
+@wp.kernel
+def contact_vectors(
+    hand: Hand,
+    group: wp.int32,
+    seed: wp.int32,
+    posture: wp.array2d(dtype=wp.uint8),
+    chosen: wp.array(dtype=wp.int32),
+    point_out: wp.array(dtype=wp.int32),
+    position_out: wp.array(dtype=wp.vec3),
+    bin_out: wp.array(dtype=wp.int32),
+    normal_out: wp.array(dtype=wp.int32),
+):
+    """Contact vector of a random contact point at each chosen posture (CF, Def. 4.1)."""
+    i = wp.tid()
+    state = wp.rand_init(seed, i)
+    first = hand.kin.dof_first[group]
+    q = vec_dof()
+    for d in range(hand.kin.dof_first[group + 1] - first):
+        low = hand.kin.dof_lower[first + d]
+        q[d] = low + (hand.kin.dof_upper[first + d] - low) * float(int(posture[chosen[i], d])) / 255.0
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    j0 = group_forward(hand.kin, group, q, X, 0)
+    c0 = hand.contacts.first[group]
+    c = c0 + wp.min(int(wp.randf(state) * float(hand.contacts.first[group + 1] - c0)), hand.contacts.first[group + 1] - c0 - 1)
+    T = X[hand.contacts.body[c] - 1 - j0]
+    n = wp.transform_vector(T, hand.contacts.normals[c])
+    point_out[i] = c
+    position_out[i] = wp.transform_point(T, hand.contacts.points[c])
+    bin_out[i] = normal_bin(n)
+    normal_out[i] = encode_normal(n)

@@ -1,0 +1,156 @@
+"""ContactField: every contact vector a hand was seen to make, with the posture that makes it, indexed by voxel."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+import warp as wp
+
+from lgrasp.device.transforms import NORMAL_BINS
+from lgrasp.errors import HandError
+from lgrasp.field.kernels import contact_vectors, sample_postures
+from lgrasp.field.params import FieldParams
+from lgrasp.hand.arrays import HandArrays
+
+__all__ = ["FIELD_VERSION", "ContactField", "build_field"]
+
+FIELD_VERSION = 1
+"""Raised whenever the arrays of a ContactField change meaning."""
+
+_CLEARANCE = 5.0e-4  # [m] postures of the field keep this distance to the palm
+_PER_POSTURE = 4  # contact vectors drawn from one posture
+
+
+@dataclass(frozen=True)
+class ContactField:
+    """Contact vectors of G groups, sorted by (group, voxel, normal bin).
+
+    The vectors of voxel v (counted over all groups) and normal bin b are rows ``start[v * 64 + b]`` to the next entry.
+    """
+
+    hand_sha256: str
+    cell: float  # voxel edge [m]
+    origin: np.ndarray  # (G, 3) f32 lowest corner of each group's grid [m]
+    shape: np.ndarray  # (G, 3) i32
+    cell_first: np.ndarray  # (G + 1,) i32
+    start: np.ndarray  # (cells * 64 + 1,) i32
+    mask: np.ndarray  # (cells,) u64: bit b is set when normal bin b holds a vector
+    point: np.ndarray  # (N,) i32 contact point of the hand
+    offset: np.ndarray  # (N,) i32 place inside the voxel, 3 x 8 bits
+    normal: np.ndarray  # (N,) u16 octahedral hand normal
+    posture: np.ndarray  # (N, D) u8 joint seed, share of each joint's range
+    clear_share: np.ndarray  # (G,) share of uniform postures clear of the palm
+
+    @property
+    def vectors(self) -> int:
+        return len(self.point)
+
+    @property
+    def megabytes(self) -> float:
+        return sum(a.nbytes for a in self.to_arrays().values()) / 1e6
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        return {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> "ContactField":
+        values = {f.name: arrays[f.name] for f in fields(cls)}
+        return cls(**values | {"hand_sha256": str(values["hand_sha256"]), "cell": float(values["cell"])})
+
+
+def build_field(hand: HandArrays, params: FieldParams, progress: Callable[[str, float], None] | None = None) -> ContactField:
+    """Sample and index the contact field of a hand (Def. 4.2).
+
+    Args:
+        progress: called with (what, share done).
+
+    Raises:
+        HandError: a group that no posture frees from the palm.
+    """
+    parts = []
+    for group in range(hand.model.groups):
+        if progress:
+            progress(f"group {group + 1} of {hand.model.groups}", group / hand.model.groups)
+        parts.append(_sample_group(hand, group, params))
+    cell = _bounded_cell([p["position"] for p in parts], params)
+    origins, shapes, keys, base = [], [], [], 0
+    for p in parts:
+        origin = p["position"].min(0) - 1e-4 if len(p["position"]) else np.zeros(3, np.float32)
+        top = p["position"].max(0) if len(p["position"]) else np.zeros(3, np.float32)
+        shape = np.floor((top - origin) / cell).astype(np.int64) + 1
+        place = (p["position"] - origin) / cell
+        index = np.minimum(place.astype(np.int64), shape - 1)
+        voxel = base + (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+        inside = np.clip((place - index) * 256, 0, 255).astype(np.int64)
+        p["offset"] = inside[:, 0] << 16 | inside[:, 1] << 8 | inside[:, 2]
+        keys.append(voxel * NORMAL_BINS + p["bin"])
+        origins.append(origin)
+        shapes.append(shape)
+        base += int(shape.prod())
+    key = np.concatenate(keys)
+    order = np.argsort(key, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(key, minlength=base * NORMAL_BINS))])
+    filled = (np.diff(start) > 0).reshape(base, NORMAL_BINS)
+    mask = np.packbits(filled, axis=1, bitorder="little").view(np.uint64).ravel()
+    if progress:
+        progress("index", 1.0)
+
+    def gather(name: str, dtype) -> np.ndarray:
+        return np.concatenate([p[name] for p in parts])[order].astype(dtype)
+
+    return ContactField(
+        hand_sha256=hand.model.sha256,
+        cell=cell,
+        origin=np.array(origins, np.float32),
+        shape=np.array(shapes, np.int32),
+        cell_first=np.concatenate([[0], np.cumsum([s.prod() for s in shapes])]).astype(np.int32),
+        start=start.astype(np.int32),
+        mask=mask,
+        point=gather("point", np.int32),
+        offset=gather("offset", np.int32),
+        normal=gather("normal", np.uint16),
+        posture=gather("posture", np.uint8),
+        clear_share=np.array([p["clear"] for p in parts], np.float32),
+    )
+
+
+def _bounded_cell(positions: list[np.ndarray], params: FieldParams) -> float:
+    """The voxel edge [m], grown until table and vectors fit the memory bound."""
+    vectors = sum(len(p) for p in positions) * 24
+    cell = params.cell
+    while True:
+        cells = sum(float(np.prod(np.floor(np.ptp(p, axis=0) / cell) + 2)) for p in positions if len(p))
+        if cells * (4 * NORMAL_BINS + 8) + vectors <= params.max_mb * 1e6 or cell > 0.1:
+            return cell
+        cell *= 1.25
+
+
+def _sample_group(hand: HandArrays, group: int, params: FieldParams) -> dict[str, np.ndarray]:
+    """Contact vectors of one group; a group without contact surface gives none."""
+    model, device = hand.model, hand.device
+    width = int(np.diff(model.tree.dof_first).max())
+    surface = int(model.contact_first[group + 1] - model.contact_first[group])
+    count = params.records if surface else 0
+    postures = max(1000, int(1.5 * params.records / _PER_POSTURE))
+    posture = wp.zeros((postures, width), dtype=wp.uint8, device=device)
+    clear = wp.empty(postures, dtype=wp.int32, device=device)
+    seed = params.seed * 1009 + group
+    wp.launch(sample_postures, postures, [hand.struct, group, seed, _CLEARANCE], [posture, clear], device=device)
+    good = np.flatnonzero(clear.numpy())
+    if len(good) == 0:
+        links = [n for n, b in zip(model.tree.link_names, model.tree.link_body, strict=True) if model.tree.body_group[b] == group]
+        raise HandError(f"hand '{model.name}': no posture of finger ({', '.join(links)}) is clear of the palm and of itself")
+    chosen = np.resize(np.repeat(good, _PER_POSTURE), count).astype(np.int32)
+    out = [wp.empty(count, dtype=t, device=device) for t in (wp.int32, wp.vec3, wp.int32, wp.int32)]
+    indices = wp.array(chosen, dtype=wp.int32, device=device)
+    if count:
+        wp.launch(contact_vectors, count, [hand.struct, group, seed + 500_009, posture, indices], out, device=device)
+    point, position, bins, normal = (a.numpy() for a in out)
+    return {
+        "point": point,
+        "position": position.reshape(-1, 3),
+        "bin": bins,
+        "normal": normal,
+        "posture": posture.numpy()[chosen],
+        "clear": np.float32(len(good) / postures),
+    }

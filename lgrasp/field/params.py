@@ -1,0 +1,21 @@
+"""Parameters of the contact field; all of them enter its cache key."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["FieldParams"]
+
+
+class FieldParams(BaseModel):
+    """How the contact field of a hand is sampled and indexed; lengths in metres."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    index: Literal["voxel", "bvh"] = Field("voxel", description="voxel: table with joint seeds; bvh: one tree per patch.")
+    records: int = Field(400_000, ge=1000, le=20_000_000, description="Contact vectors sampled per dependency group.")
+    cell: float = Field(0.008, ge=0.002, le=0.05, description="Edge of a voxel.")
+    box: float = Field(0.01, ge=0.002, le=0.05, description="Edge of a leaf box of the bvh index.")
+    leaf_normals: int = Field(256, ge=1, le=4096, description="Most contact vectors in a leaf of the bvh index.")
+    max_mb: int = Field(512, ge=16, le=65536, description="Memory bound of the field [MB]; voxels grow to respect it.")
+    seed: int = Field(0, ge=0, description="Seed of the sampling.")

@@ -1,0 +1,53 @@
+"""Are parts of a hand apart? Bounding balls first, true convex distance after."""
+
+import warp as wp
+
+from lgrasp.device.convex import pieces_clear
+from lgrasp.hand.arrays import Hand
+
+__all__ = ["group_pairs_clear"]
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+
+@wp.func
+def group_pairs_clear(
+    hand: Hand,
+    a: wp.int32,
+    b: wp.int32,
+    Xa: wp.array(dtype=wp.transform),
+    at_a: wp.int32,
+    Xb: wp.array(dtype=wp.transform),
+    at_b: wp.int32,
+    margin: wp.float32,
+):
+    """Are all listed piece pairs of groups a and b (a <= b; 0 = static base, g + 1 = group g) farther apart than margin?
+
+    Xa, Xb: local arrays with the two groups' body poses from places at_a, at_b on (Xa is not read for the base).
+    """
+    key = a * (hand.kin.groups + 1) + b
+    ja = int(0)
+    if a > 0:
+        ja = hand.kin.joint_first[a - 1] + 1 - at_a
+    jb = int(0)
+    if b > 0:
+        jb = hand.kin.joint_first[b - 1] + 1 - at_b
+    for k in range(hand.pair_first[key], hand.pair_first[key + 1]):
+        i = hand.pairs[k][0]
+        j = hand.pairs[k][1]
+        Ti = wp.transform_identity()
+        if a > 0:
+            Ti = Xa[hand.pieces.body[i] - ja]
+        Tj = wp.transform_identity()
+        if b > 0:
+            Tj = Xb[hand.pieces.body[j] - jb]
+        si = hand.pieces.sphere[i]
+        sj = hand.pieces.sphere[j]
+        ci = wp.transform_point(Ti, wp.vec3(si[0], si[1], si[2]))
+        cj = wp.transform_point(Tj, wp.vec3(sj[0], sj[1], sj[2]))
+        reach = si[3] + sj[3] + margin
+        d = ci - cj
+        if wp.dot(d, d) < reach * reach:
+            if not pieces_clear(hand.pieces, i, j, wp.transform_inverse(Ti) * Tj, margin):
+                return False
+    return True
