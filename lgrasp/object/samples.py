@@ -20,7 +20,7 @@ _DECIMALS = 6  # of a metre
 _MERGE = 0.02  # [mm] detail that the boolean operations leave behind below this is simplified away
 
 
-def mug() -> trimesh.Trimesh:
+def _mug() -> trimesh.Trimesh:
     """Cup of 80 mm diameter and 95 mm height with 4 mm walls and an open handle."""
     body = _revolve([(0, 0), (37, 0), (40, 3), (40, 94), (39, 95), (37, 95), (36, 94), (36, 9), (32, 5), (0, 5)])
     ring = _tube(_ellipse(25.0, 29.0, 36), radius=6.5)
@@ -29,7 +29,7 @@ def mug() -> trimesh.Trimesh:
     return _union(body, _minus(ring, hollow))
 
 
-def bowl() -> trimesh.Trimesh:
+def _bowl() -> trimesh.Trimesh:
     """Round bowl of 140 mm diameter and 58 mm height with 4 mm walls."""
     t = np.radians(np.linspace(0, 84, 13))
     outer = np.stack([22 + 48 * np.sin(t), 56 - 54 * np.cos(t)], axis=1)
@@ -37,14 +37,14 @@ def bowl() -> trimesh.Trimesh:
     return _revolve([(0, 0), (21, 0), *outer, (68.6, 58), *inner, (0, 6)])
 
 
-def bottle() -> trimesh.Trimesh:
+def _bottle() -> trimesh.Trimesh:
     """Filled and capped bottle of 64 mm diameter and 200 mm height."""
     s = np.linspace(0, 1, 14)
     shoulder = np.stack([32 - 19 * (3 * s**2 - 2 * s**3), 125 + 45 * s], axis=1)
     return _revolve([(0, 0), (29, 0), (32, 3), *shoulder, (13, 178), (15, 179), (15, 197), (12, 200), (0, 200)])
 
 
-def hammer() -> trimesh.Trimesh:
+def _hammer() -> trimesh.Trimesh:
     """Hammer of 250 mm length: oval handle, round face and wedge peen."""
     handle = _hull(_ball((0, 0, 13), 11), _ball((0, 3, 13), 11), _ball((0, 0, 180), 8), _ball((0, 3, 180), 8))
     neck = _hull(_ball((0, 1.5, 175), 8), _ball((0, 1.5, 230), 7))
@@ -54,7 +54,7 @@ def hammer() -> trimesh.Trimesh:
     return _union(handle, neck, head, face, peen)
 
 
-def screwdriver() -> trimesh.Trimesh:
+def _screwdriver() -> trimesh.Trimesh:
     """Screwdriver of 210 mm length with a fluted handle and a flat tip."""
     handle = _revolve([(0, 0), (11, 0), (14, 3), (16, 20), (15.5, 60), (12, 78), (11, 84), (13, 92), (11, 98), (0, 98)])
     flutes = [_move(_hull(_ball((0, 0, 18), 5), _ball((0, 0, 66), 5)), _around(60 * k, 19.5)) for k in range(6)]
@@ -63,7 +63,7 @@ def screwdriver() -> trimesh.Trimesh:
     return _union(_minus(handle, *flutes), shaft, tip)
 
 
-def spoon() -> trimesh.Trimesh:
+def _spoon() -> trimesh.Trimesh:
     """Spoon of 180 mm length with a 3 mm bowl wall and a flat curved handle."""
     outer = _move(_ball((0, 0, 0), 1, detail=3), np.diag([32.0, 21.0, 14.0, 1.0]))
     inner = _move(_ball((0, 0, 0), 1, detail=3), np.diag([29.0, 18.0, 11.0, 1.0]))
@@ -75,7 +75,7 @@ def spoon() -> trimesh.Trimesh:
     return _union(shell, *(_hull(a, b) for a, b in itertools.pairwise(knots)))
 
 
-def capsule() -> trimesh.Trimesh:
+def _capsule() -> trimesh.Trimesh:
     """Capsule of 50 mm diameter and 120 mm length."""
     t = np.radians(np.linspace(0, 90, 13))
     low = np.stack([25 * np.sin(t), 25 - 25 * np.cos(t)], axis=1)
@@ -83,30 +83,41 @@ def capsule() -> trimesh.Trimesh:
     return _revolve([*low, *high])
 
 
-def box() -> trimesh.Trimesh:
+def _box() -> trimesh.Trimesh:
     """Sharp box of 50 x 70 x 100 mm."""
     return _slab((50, 70, 100), (0, 0, 50))
 
 
-def sphere() -> trimesh.Trimesh:
+def _sphere() -> trimesh.Trimesh:
     """Ball of 70 mm diameter."""
     return _ball((0, 0, 35), 35, detail=3)
 
 
-def plate() -> trimesh.Trimesh:
+def _plate() -> trimesh.Trimesh:
     """Thin plate of 120 x 80 x 5 mm with rounded edges."""
     return _rounded_box((120, 80, 5), 2.5, (0, 0, 2.5))
 
 
-def tiny() -> trimesh.Trimesh:
+def _tiny() -> trimesh.Trimesh:
     """Coarse capsule of 50 mm diameter and 90 mm length, for smoke runs."""
     profile = [(0, 0), (13, 3), (22, 12), (25, 25), (25, 65), (22, 78), (13, 87), (0, 90)]
     return _revolve(profile, sections=14)
 
 
 SAMPLES: dict[str, Callable[[], trimesh.Trimesh]] = {
-    f.__name__: f for f in (mug, bowl, bottle, hammer, screwdriver, spoon, capsule, box, sphere, plate, tiny)
+    "mug": _mug,
+    "bowl": _bowl,
+    "bottle": _bottle,
+    "hammer": _hammer,
+    "screwdriver": _screwdriver,
+    "spoon": _spoon,
+    "capsule": _capsule,
+    "box": _box,
+    "sphere": _sphere,
+    "plate": _plate,
+    "tiny": _tiny,
 }
+"""Builders of the samples [mm] by name; their docstrings are the descriptions."""
 
 
 def build_sample(name: str) -> trimesh.Trimesh:

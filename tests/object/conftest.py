@@ -1,0 +1,26 @@
+"""Shared object fixtures: parameters that keep the tests fast, and real meshes where they lie beside the checkout."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lgrasp.object import ObjectParams
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "objects"
+
+
+@pytest.fixture(scope="session")
+def fast() -> ObjectParams:
+    return ObjectParams(contact_count=512, obstacle_count=1024, sdf_cells=64**3)
+
+
+@pytest.fixture
+def real_mesh() -> Callable[[str], Path]:
+    def find(name: str) -> Path:
+        path = REAL / f"{name}.obj"
+        if not path.is_file():
+            pytest.skip(f"real mesh {name} is not at ../shared/assets/objects")
+        return path
+
+    return find

@@ -1,0 +1,213 @@
+"""Mesh files: what is repaired and what is refused, and how."""
+
+import os
+
+import numpy as np
+import pytest
+import trimesh
+
+from lgrasp.errors import ObjectError
+from lgrasp.object import ObjectParams, find_object, list_objects
+from lgrasp.object.load import load_mesh, open_edges
+
+BOX = trimesh.creation.box(extents=(0.05, 0.07, 0.1))
+
+
+def write(path, mesh):
+    path.write_bytes(_bytes(mesh, path))
+    return path
+
+
+def _bytes(mesh, path):
+    data = mesh.export(file_type=path.suffix[1:])
+    return data.encode() if isinstance(data, str) else data
+
+
+def refused(source, **kwargs) -> str:
+    with pytest.raises(ObjectError) as caught:
+        load_mesh(source, **kwargs)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 400
+    return message
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".off", ".glb"])
+def test_formats_give_the_same_solid(tmp_path, suffix):
+    mesh = load_mesh(write(tmp_path / f"thing{suffix}", BOX))
+    assert mesh.name == "thing"
+    assert mesh.closed
+    assert (len(mesh.vertices), len(mesh.faces)) == (8, 12)
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx([0.05, 0.07, 0.1], abs=1e-7)
+    assert ("merged 28 duplicate vertices" in mesh.notes) == (suffix == ".stl")
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf"])
+@pytest.mark.parametrize("kind", ["garbage", "text", "header"])
+def test_garbage(tmp_path, suffix, kind):
+    data = {
+        "garbage": np.random.default_rng(0).bytes(5000),
+        "text": b"this is not a mesh\n" * 30,
+        "header": _bytes(BOX, tmp_path / "box.ply")[:60],
+    }[kind]
+    path = tmp_path / f"bad{suffix}"
+    path.write_bytes(data)
+    message = refused(path)
+    assert str(path) in message
+    assert "accepted" in message
+
+
+def test_missing_empty_folder_and_suffix(tmp_path):
+    assert "does not exist" in refused(tmp_path / "none.obj")
+    (tmp_path / "empty.obj").touch()
+    assert "0 bytes" in refused(tmp_path / "empty.obj")
+    (tmp_path / "folder.obj").mkdir()
+    assert "is a folder" in refused(tmp_path / "folder.obj")
+    (tmp_path / "mesh.blend").write_bytes(b"x")
+    message = refused(tmp_path / "mesh.blend")
+    assert ".blend" in message
+    assert ".obj, .stl" in message
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="needs a user that file modes bind")
+def test_unreadable(tmp_path):
+    path = write(tmp_path / "box.obj", BOX)
+    path.chmod(0)
+    assert "cannot be read" in refused(path)
+
+
+def test_no_faces(tmp_path):
+    path = tmp_path / "points.obj"
+    path.write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n")
+    assert "0 faces" in refused(path)
+
+
+def test_face_names_a_missing_vertex(tmp_path):
+    path = tmp_path / "short.obj"
+    path.write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 9\n")
+    assert str(path) in refused(path)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_not_finite(tmp_path, value):
+    text = _bytes(BOX, tmp_path / "box.obj").decode().replace("v ", f"v {value} ", 1)
+    path = tmp_path / "bad.obj"
+    path.write_text(text)
+    message = refused(path)
+    assert str(path) in message
+    vertices = BOX.vertices.copy()
+    vertices[3, 1] = float(value)
+    assert "1 of 8 vertices" in refused(trimesh.Trimesh(vertices, BOX.faces, process=False))
+
+
+def test_flat_and_degenerate():
+    square = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0.1], [0, 0.1, 0.1]], float)
+    faces = [[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]]
+    assert "flat" in refused(trimesh.Trimesh(square, faces, process=False))
+    line = np.array([[0, 0, 0], [0.1, 0.1, 0.1], [0.05, 0.05, 0.05]], float)
+    assert "solid is accepted" in refused(trimesh.Trimesh(line, [[0, 1, 2]], process=False))
+    needle = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], float)
+    assert "degenerate" in refused(trimesh.Trimesh(needle, [[0, 1, 1], [2, 3, 3]], process=False))
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit", "remedy"),
+    [(1000.0, "millimetres", "--scale 0.001"), (100.0, "", "--scale 0.0"), (1e-3, "", "0")],
+)
+def test_units(factor, unit, remedy):
+    mesh = BOX.copy()
+    mesh.apply_scale(factor)
+    message = refused(mesh)
+    assert f"{0.1 * factor:.4g} m" in message
+    assert unit in message
+    assert remedy in message
+    assert "0.005 to 1 m is accepted" in message
+    scaled = load_mesh(mesh, scale=1.0 / factor)
+    assert np.ptp(scaled.vertices, axis=0) == pytest.approx(BOX.extents)
+
+
+def test_scale_of_a_mesh_in_metres_and_bad_scales():
+    assert "--scale 1" in refused(BOX, scale=0.001)
+    for scale in (0.0, -1.0, float("nan"), float("inf")):
+        assert str(scale) in refused(BOX, scale=scale)
+
+
+def test_inside_out_is_flipped_and_cavities_are_not():
+    mesh = BOX.copy()
+    mesh.invert()
+    loaded = load_mesh(mesh)
+    assert trimesh.Trimesh(loaded.vertices, loaded.faces, process=False).volume > 0.0
+    assert any("inside out" in n for n in loaded.notes)
+    inner = trimesh.creation.box(extents=(0.02, 0.02, 0.02))
+    inner.invert()
+    hollow = load_mesh(trimesh.util.concatenate([BOX, inner]))
+    assert hollow.notes == ()
+    assert trimesh.Trimesh(hollow.vertices, hollow.faces, process=False).volume == pytest.approx(BOX.volume - 8e-6)
+    inner.apply_translation([0.2, 0, 0])
+    beside = load_mesh(trimesh.util.concatenate([BOX, inner]))
+    assert trimesh.Trimesh(beside.vertices, beside.faces, process=False).volume == pytest.approx(BOX.volume + 8e-6)
+
+
+def test_mixed_winding_is_made_consistent():
+    faces = BOX.faces.copy()
+    faces[[2, 7]] = faces[[2, 7], ::-1]
+    loaded = load_mesh(trimesh.Trimesh(BOX.vertices, faces, process=False))
+    assert loaded.closed
+    assert trimesh.Trimesh(loaded.vertices, loaded.faces, process=False).volume == pytest.approx(BOX.volume)
+    assert any("consistent winding" in n for n in loaded.notes)
+
+
+def test_small_holes_are_filled_and_large_ones_noted():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
+    pierced = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
+    filled = load_mesh(pierced)
+    assert filled.closed
+    assert any(n.startswith("filled 1 holes") for n in filled.notes)
+    assert trimesh.Trimesh(filled.vertices, filled.faces, process=False).is_watertight
+    cut = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0.01], process=False)
+    opened = load_mesh(cut)
+    assert not opened.closed
+    assert any("not watertight" in n for n in opened.notes)
+
+
+def test_scene_is_joined(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(BOX)
+    scene.add_geometry(BOX, transform=trimesh.transformations.translation_matrix([0.2, 0, 0]))
+    path = tmp_path / "two.glb"
+    path.write_bytes(scene.export(file_type="glb"))
+    loaded = load_mesh(path)
+    assert len(loaded.faces) == 24
+    assert np.ptp(loaded.vertices, axis=0)[0] == pytest.approx(0.25)
+    assert "joined 2 geometries into one object" in loaded.notes
+
+
+def test_open_edges_of_one_triangle():
+    assert sorted(map(tuple, open_edges(np.array([[0, 1, 2]])))) == [(0, 1), (1, 2), (2, 0)]
+    assert len(open_edges(BOX.faces)) == 0
+
+
+def test_unknown_parameter_is_refused():
+    with pytest.raises(ValueError, match="contact_cout"):
+        ObjectParams(contact_cout=3)  # pyright: ignore[reportCallIssue]
+
+
+def test_find(tmp_path, monkeypatch):
+    assert find_object("mug") == list_objects()["mug"]
+    path = write(tmp_path / "mine.obj", BOX)
+    assert find_object(path) == path
+    with pytest.raises(ObjectError, match=r"'hamer' .*did you mean hammer"):
+        find_object("hamer")
+    with pytest.raises(ObjectError, match=r"named objects are .*box.*mug"):
+        find_object("zzzzzz")
+    (tmp_path / "objects").mkdir()
+    own = write(tmp_path / "objects" / "mug.stl", BOX)
+    monkeypatch.setenv("LGRASP_PATH", str(tmp_path))
+    assert find_object("mug") == own
+
+
+def test_nothing_is_printed(tmp_path, capfd):
+    (tmp_path / "bad.obj").write_bytes(b"\xff\xfe" * 500)
+    refused(tmp_path / "bad.obj")
+    load_mesh(write(tmp_path / "box.obj", BOX))
+    assert capfd.readouterr() == ("", "")
