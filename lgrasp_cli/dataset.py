@@ -67,7 +67,7 @@ def merge(
     paths: _Paths,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write.", show_default=False)],
     manifest: Annotated[
-        Path | None, typer.Option(help="List of shards to check against [default: manifest.json of a single folder].")
+        Path | None, typer.Option(help="List of shards to check against; by default manifest.json of a single folder.")
     ] = None,
 ) -> None:
     """Put the rows of shards of one hand, object and run into one file.

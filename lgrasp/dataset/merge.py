@@ -11,6 +11,7 @@ import numpy as np
 
 from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.files import find_shards, new_shard_file
+from lgrasp.dataset.heap import check_heaps
 from lgrasp.dataset.manifest import MANIFEST_NAME, check_manifest
 from lgrasp.dataset.padding import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
@@ -97,6 +98,7 @@ def _same_file(path: Path, out: str | os.PathLike[str]) -> bool:
 
 
 def _survey(path: Path) -> _Source:
+    check_heaps(path)
     with ShardReader(path) as reader:
         header, hand, empty = reader.header, reader.hand(), reader.rows(0, 0)
         extra = {n: (shape[1:], dtype.str) for n, (shape, dtype) in reader.columns.items() if n not in GRASP_FIELDS}

@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from lgrasp.dataset.heap import check_heaps
 from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS
 from lgrasp.dataset.structure import expand, format_problem, structure_problems
@@ -197,6 +198,7 @@ def read_shard(path: str | os.PathLike[str]) -> Shard:
     Raises:
         ShardError: The file is damaged, foreign or of another format version; the message says which.
     """
+    check_heaps(path)
     with ShardReader(path) as reader:
         return Shard(
             header=reader.header,

@@ -5,6 +5,7 @@ import os
 import numpy as np
 
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
+from lgrasp.dataset.heap import check_heaps
 from lgrasp.dataset.reader import ShardReader, open_hdf5, reading
 from lgrasp.dataset.records import object_set_sha256
 from lgrasp.dataset.structure import format_problem, structure_problems, text_sha256
@@ -20,6 +21,7 @@ def validate_shard(path: str | os.PathLike[str]) -> list[str]:
     be read at all gives one problem, not an error.
     """
     try:
+        check_heaps(path)
         with open_hdf5(path) as file, reading(path):
             fatal = format_problem(file)
             problems = [fatal] if fatal else structure_problems(file)

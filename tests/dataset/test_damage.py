@@ -67,6 +67,19 @@ def test_bit_flips_anywhere_are_noticed_or_harmless(tmp_path, whole, same_rows):
             assert (shard.hand.urdf, shard.hand.meshes) == (expected.hand.urdf, expected.hand.meshes)
 
 
+def test_damaged_string_heap_does_not_hang(tmp_path, whole):
+    """HDF5 2.0 loops for ever when the size of a heap entry is wrong."""
+    path = tmp_path / "s.h5"
+    heap = whole.index(b"GCOL")
+    for offset in (8, 9, 13, 16, 24, 25, 30):  # size of the heap; index and size of its first entry
+        data = bytearray(whole)
+        data[heap + offset] ^= 1
+        path.write_bytes(data)
+        assert validate_shard(path)
+        with pytest.raises(ShardError, match="damaged"):
+            read_shard(path)
+
+
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x89HDF\r\n\x1a\n" + bytes(500)])
 def test_garbage(tmp_path, content):
     path = tmp_path / "x.h5"
