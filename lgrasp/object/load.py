@@ -199,13 +199,28 @@ def _weld(label: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str])
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     if not whole.all():
         notes.append(f"dropped {int((~whole).sum())} faces that had collapsed to a line or point")
-    vertices, faces = vertices[used][keep], faces[whole]
+    vertices, faces = vertices[used][keep], _drop_twins(faces[whole], notes)
     a, b, c = (vertices[faces] - vertices.mean(axis=0)).transpose(1, 0, 2) if len(faces) else np.zeros((3, 0, 3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     extent = np.ptp(vertices, axis=0).max()
     if area < 1e-8 * extent**2:
         raise ObjectError(f"{label}: surface of {area:.2g} m² (degenerate faces); a solid is accepted")
     return vertices, faces
+
+
+def _drop_twins(faces: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Drop repeated faces, and every second side of a mesh that is two-sided throughout."""
+    start = np.argmin(faces, axis=1)[:, None] if len(faces) else np.zeros((0, 1), np.int64)
+    turned = np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)  # smallest index first, same winding
+    first = np.sort(np.unique(turned, axis=0, return_index=True)[1])
+    if len(first) < len(faces):
+        notes.append(f"dropped {len(faces) - len(first)} repeated faces")
+    faces = faces[first]
+    sides = np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])
+    if len(faces) and 2 * len(sides) == len(faces):
+        notes.append(f"dropped {len(sides)} back faces of a two-sided mesh")
+        faces = faces[sides]
+    return faces
 
 
 def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
@@ -226,7 +241,7 @@ def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.nda
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, body, corners.min(axis=1))
     np.maximum.at(high, body, corners.max(axis=1))
-    flip = volume < 0.0
+    flip = volume < -1e-9 * np.ptp(vertices, axis=0).max() ** 3
     if not flip.all():
         solid = np.flatnonzero(~flip)
         for k in np.flatnonzero(flip):

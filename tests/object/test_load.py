@@ -170,6 +170,22 @@ def test_small_holes_are_filled_and_large_ones_noted():
     assert any("not watertight" in n for n in opened.notes)
 
 
+def test_repeated_and_two_sided_faces_count_once():
+    back = BOX.copy()
+    back.invert()
+    for other, said in ((BOX, "dropped 12 repeated faces"), (back, "dropped 12 back faces of a two-sided mesh")):
+        loaded = load_mesh(trimesh.util.concatenate([BOX, other]))
+        assert loaded.closed
+        assert said in loaded.notes
+        assert trimesh.Trimesh(loaded.vertices, loaded.faces, process=False).volume == pytest.approx(BOX.volume)
+
+
+def test_glued_bodies_keep_their_common_wall():
+    stacked = load_mesh(trimesh.util.concatenate([BOX, BOX.copy().apply_translation([0, 0, 0.1])]))
+    assert stacked.closed
+    assert len(stacked.faces) == 24
+
+
 def test_scene_is_joined(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(BOX)
