@@ -96,6 +96,6 @@ def sdf_gradient(s: Sdf, p: wp.vec3):
     if o > 0.0:
         # beyond the grid: the surface seen from the clamped point
         e = ox + g * v
-        d = wp.length(e)
-        return wp.vec4(e[0] / d, e[1] / d, e[2] / d, d)
+        h = wp.length(e)
+        return wp.vec4(e[0] / h, e[1] / h, e[2] / h, h)
     return wp.vec4(g[0], g[1], g[2], v)

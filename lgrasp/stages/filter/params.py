@@ -1,0 +1,23 @@
+"""Parameters of the filter stage."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["FilterParams"]
+
+
+class FilterParams(BaseModel):
+    """Exact checks of every emitted grasp; bounds are tighter than those of strict validity. Lengths in metres."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    penetration: float = Field(0.0012, ge=0, le=0.01, description="Largest hand-object penetration.")
+    self_margin: float = Field(0.0003, ge=0, le=0.01, description="Least distance of non-adjacent links.")
+    gap: float = Field(0.0013, gt=0, le=0.01, description="Largest distance of link and object at a contact.")
+    angle: float = Field(17.0, gt=0, le=60, description="Largest angle of the normals at a contact [deg].")
+    friction: float = Field(0.5, gt=0, le=2, description="Friction coefficient of gswo and epsilon.")
+    balance: float = Field(0.035, gt=0, le=1, description="Largest gswo residual (norm).")
+    torque_scale: float = Field(10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")
+    draws: int = Field(12, ge=1, le=1000, description="Postures tried for each unused finger.")
+    slack: float = Field(0.0005, ge=0, le=0.01, description="Penetration of inner spheres forgiven to unused fingers.")
+    open_distance: float = Field(0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the contact normals.")
+    press_distance: float = Field(0.006, ge=0, le=0.1, description="How far q_squeeze reaches into the object.")

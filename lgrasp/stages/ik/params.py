@@ -1,0 +1,21 @@
+"""Parameters of the ik stage."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["IkParams"]
+
+
+class IkParams(BaseModel):
+    """Two-point damped least squares on the contact; lengths in metres."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    iterations: int = Field(8, ge=1, le=200, description="Damped least-squares steps.")
+    lever: float = Field(0.01, gt=0, le=0.1, description="Distance of the second point along the normal.")
+    normal_weight: float = Field(0.15, gt=0, le=10, description="Weight of the second point.")
+    damping: float = Field(2e-6, gt=0, le=1, description="Damping of the least squares.")
+    step: float = Field(0.3, gt=0, le=3, description="Largest joint change in one step [rad or m].")
+    gap: float = Field(0.001, gt=0, le=0.01, description="Largest distance of finger and object at the contact.")
+    angle: float = Field(15.0, gt=0, le=60, description="Largest angle of the normals at the contact [deg].")
+    slack: float = Field(0.001, ge=0, le=0.01, description="Penetration of inner spheres that is forgiven.")
+    clearance: bool = Field(True, description="Also require the whole finger to be clear of the object.")

@@ -1,0 +1,79 @@
+"""search: candidates -> sets of contacts that balance."""
+
+import numpy as np
+import warp as wp
+
+from lgrasp.errors import ConfigError
+from lgrasp.grasp.context import Context
+from lgrasp.grasp.tables import CandidateTable, ContactSets
+from lgrasp.stages.search.kernels import MAX_GROUPS, MAX_KEEP, search_sets
+from lgrasp.stages.search.params import SearchParams
+
+__all__ = ["VERSION", "run"]
+
+VERSION = 1
+
+
+def run(
+    inputs: CandidateTable, params: SearchParams, context: Context, *, realised: bool = True, salt: int = 0
+) -> tuple[ContactSets, dict[str, int]]:
+    """Block-wise zeroth-order search at every pose (Alg. 2).
+
+    Args:
+        realised: combine realised contacts only, and keep fingers apart; else candidates as drawn.
+        salt: number of the pass over these candidates.
+
+    Returns:
+        Sets in (pose, slot) order, and counts ``poses``, ``yielding`` (poses with a set), ``sets``.
+    """
+    d = context.device
+    n, groups, keep = inputs.surface.shape
+    if groups > MAX_GROUPS or keep > MAX_KEEP:
+        raise ConfigError(f"search: {groups} fingers with {keep} candidates; at most {MAX_GROUPS} and {MAX_KEEP} are supported")
+    found = wp.zeros(n, dtype=wp.int32, device=d)
+    sets = wp.full((n, params.per_pose, groups), -1, dtype=wp.int32, device=d)
+    score = wp.zeros((n, params.per_pose), dtype=wp.float32, device=d)
+    poses = inputs.poses
+    wp.launch(
+        search_sets,
+        dim=n,
+        inputs=[
+            context.hand.struct,
+            context.object.struct,
+            context.seed("search", salt),
+            wp.array(params.contacts, dtype=wp.int32, device=d),
+            params.friction,
+            params.threshold,
+            params.balance,
+            params.least_force,
+            params.torque_scale,
+            params.restarts,
+            params.moves,
+            params.per_pose,
+            params.margin,
+            params.separation,
+            int(realised),
+            int(params.score == "gswo"),
+            poses.index,
+            poses.pose,
+            poses.palm_point,
+            poses.palm_surface,
+            inputs.count,
+            inputs.surface,
+            inputs.state,
+            inputs.q,
+        ],
+        outputs=[found, sets, score],
+        device=d,
+    )
+    number = found.numpy()
+    pose = np.repeat(np.arange(n, dtype=np.int32), number)
+    slot = (np.arange(len(pose)) - np.repeat(np.cumsum(number) - number, number)).astype(np.int32)
+    table = ContactSets(
+        candidates=inputs,
+        pose=wp.array(pose, dtype=wp.int32, device=d),
+        slot=wp.array(slot + salt * params.per_pose, dtype=wp.int32, device=d),
+        chosen=wp.array(sets.numpy()[pose, slot], dtype=wp.int32, device=d),
+        score=wp.array(score.numpy()[pose, slot], dtype=wp.float32, device=d),
+    )
+    return table, {"poses": n, "yielding": int((number > 0).sum()), "sets": len(pose)}
