@@ -43,11 +43,10 @@ def test_rows_of_all_shards(folder):
         data[4105]
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
-def test_default_collate_with_two_workers(folder, method):
+def test_default_collate_with_two_workers(folder):
     data = GraspDataset(folder, columns=["q", "candidate", "contact_points", "metrics/gap"])
     data[0]  # the parent has read before the workers start
-    context = multiprocessing.get_context(method)
+    context = multiprocessing.get_context("fork")
     loader = DataLoader(data, batch_size=1000, shuffle=True, num_workers=2, multiprocessing_context=context)
     batches = list(loader)
     assert batches[0]["contact_points"].shape == (1000, 3, 4, 3)
