@@ -27,7 +27,7 @@ class Pieces:
 
 @wp.func
 def point_depth(c: Pieces, i: wp.int32, p: wp.vec3):
-    """Signed distance of body-frame point p to piece i [m]: negative depth inside (exact for one plane), lower bound outside."""
+    """Signed distance of body-frame point p to piece i [m]: negative inside, a lower bound outside."""
     s = c.sphere[i]
     d = wp.length(p - wp.vec3(s[0], s[1], s[2])) - s[3]
     if d > 0.0:
@@ -82,7 +82,7 @@ def _closest_on_segment(a: wp.vec3, b: wp.vec3):
 
 @wp.func
 def _closest_on_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Closest point to the origin on a triangle by its Voronoi regions, with the mask of kept points (a 1, b 2, c 4)."""
+    """Closest point to the origin on a triangle by Voronoi regions, and the mask of kept points (a 1, b 2, c 4)."""
     ab = b - a
     ac = c - a
     d1 = -wp.dot(ab, a)

@@ -2,7 +2,16 @@
 
 import warp as wp
 
-__all__ = ["MAX_BODIES", "MAX_DOFS", "MAX_JOINTS", "Kinematics", "clamp_dofs", "group_forward", "point_column", "vec_dof"]
+__all__ = [
+    "MAX_BODIES",
+    "MAX_DOFS",
+    "MAX_JOINTS",
+    "Kinematics",
+    "clamp_dofs",
+    "group_forward",
+    "point_column",
+    "vec_dof",
+]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -64,7 +73,7 @@ def group_forward(h: Kinematics, g: wp.int32, q: vec_dof, X: wp.array(dtype=wp.t
 
 @wp.func
 def point_column(h: Kinematics, k: wp.int32, T: wp.transform, p: wp.vec3):
-    """Velocity of point p (base frame) per unit rate of the dof that drives joint k, whose body frame is T. [m/rad or m/m]"""
+    """Velocity of point p (base frame) per unit rate of the dof behind joint k, whose body frame is T [m/rad or m/m]."""
     a = wp.transform_vector(T, h.joint_axis[k])
     v = a
     if h.joint_prismatic[k] == 0:

@@ -51,7 +51,7 @@ def _best_direction(a: wp.vec3, n: wp.vec3, mu: wp.float32, edges: wp.int32):
 
 @wp.func
 def _affine_weights(G: mat8, m: wp.int32):
-    """Weights (sum 1) of the least-norm point of the affine hull of m points with Gram matrix G (regularised Cholesky)."""
+    """Weights (sum 1) of the least-norm point of the affine hull of m points, Gram matrix G; regularised Cholesky."""
     L = mat8()
     trace = float(0.0)
     for i in range(m):

@@ -13,7 +13,14 @@ _STEPS = wp.constant(40)
 
 
 @wp.func
-def _reach(u: vec6, arms: wp.array(dtype=wp.vec3), cones: wp.array(dtype=wp.vec3), k: wp.int32, scale: wp.float32, best: wp.array(dtype=wp.int32)):
+def _reach(
+    u: vec6,
+    arms: wp.array(dtype=wp.vec3),
+    cones: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    scale: wp.float32,
+    best: wp.array(dtype=wp.int32),
+):
     """Largest u . w over the cone edges' wrenches; the contact edge that attains it goes to best[0]."""
     f = wp.vec3(u[0], u[1], u[2])
     t = wp.vec3(u[3], u[4], u[5]) * scale
@@ -30,7 +37,12 @@ def _reach(u: vec6, arms: wp.array(dtype=wp.vec3), cones: wp.array(dtype=wp.vec3
 
 @wp.func
 def epsilon_bound(
-    arms: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), k: wp.int32, mu: wp.float32, radius: wp.float32, state: wp.uint32
+    arms: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    mu: wp.float32,
+    radius: wp.float32,
+    state: wp.uint32,
 ):
     """Ferrari-Canny epsilon (L1 hull of 8-edge cones with unit normal force, torque / radius), from above; >= 0.
 

@@ -22,7 +22,7 @@ def sample_postures(
     posture_out: wp.array2d(dtype=wp.uint8),
     clear_out: wp.array(dtype=wp.int32),
 ):
-    """Uniform postures of one group (8 bits a joint), and whether the group is clear of the static base and of itself."""
+    """Uniform postures of one group, 8 bits a joint, and whether it is clear of the static base and of itself."""
     i = wp.tid()
     state = wp.rand_init(seed, i)
     first = hand.kin.dof_first[group]
@@ -66,7 +66,9 @@ def contact_vectors(
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     j0 = group_forward(hand.kin, group, q, X, 0)
     c0 = hand.contacts.first[group]
-    c = c0 + wp.min(int(wp.randf(state) * float(hand.contacts.first[group + 1] - c0)), hand.contacts.first[group + 1] - c0 - 1)
+    c = c0 + wp.min(
+        int(wp.randf(state) * float(hand.contacts.first[group + 1] - c0)), hand.contacts.first[group + 1] - c0 - 1
+    )
     T = X[hand.contacts.body[c] - 1 - j0]
     n = wp.transform_vector(T, hand.contacts.normals[c])
     point_out[i] = c

@@ -58,7 +58,9 @@ class ContactField:
         return cls(**values | {"hand_sha256": str(values["hand_sha256"]), "cell": float(values["cell"])})
 
 
-def build_field(hand: HandArrays, params: FieldParams, progress: Callable[[str, float], None] | None = None) -> ContactField:
+def build_field(
+    hand: HandArrays, params: FieldParams, progress: Callable[[str, float], None] | None = None
+) -> ContactField:
     """Sample and index the contact field of a hand (Def. 4.2).
 
     Args:
@@ -138,8 +140,14 @@ def _sample_group(hand: HandArrays, group: int, params: FieldParams) -> dict[str
     wp.launch(sample_postures, postures, [hand.struct, group, seed, _CLEARANCE], [posture, clear], device=device)
     good = np.flatnonzero(clear.numpy())
     if len(good) == 0:
-        links = [n for n, b in zip(model.tree.link_names, model.tree.link_body, strict=True) if model.tree.body_group[b] == group]
-        raise HandError(f"hand '{model.name}': no posture of finger ({', '.join(links)}) is clear of the palm and of itself")
+        links = [
+            n
+            for n, b in zip(model.tree.link_names, model.tree.link_body, strict=True)
+            if model.tree.body_group[b] == group
+        ]
+        raise HandError(
+            f"hand '{model.name}': no posture of finger ({', '.join(links)}) is clear of the palm and of itself"
+        )
     chosen = np.resize(np.repeat(good, _PER_POSTURE), count).astype(np.int32)
     out = [wp.empty(count, dtype=t, device=device) for t in (wp.int32, wp.vec3, wp.int32, wp.int32)]
     indices = wp.array(chosen, dtype=wp.int32, device=device)

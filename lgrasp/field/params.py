@@ -12,7 +12,9 @@ class FieldParams(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    index: Literal["voxel", "bvh"] = Field("voxel", description="voxel: table with joint seeds; bvh: one tree per patch.")
+    index: Literal["voxel", "bvh"] = Field(
+        "voxel", description="voxel: table with joint seeds; bvh: one tree per patch."
+    )
     records: int = Field(400_000, ge=1000, le=20_000_000, description="Contact vectors sampled per dependency group.")
     cell: float = Field(0.008, ge=0.002, le=0.05, description="Edge of a voxel.")
     box: float = Field(0.01, ge=0.002, le=0.05, description="Edge of a leaf box of the bvh index.")

@@ -1,11 +1,28 @@
 """The tables that flow between stages: structures of arrays on one device."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import warp as wp
 
-__all__ = ["CandidateTable", "ContactSets", "GraspTable", "PoseTable"]
+from lgrasp.device.kinematics import MAX_DOFS, vec_dof
+
+__all__ = [
+    "CandidateTable",
+    "ContactSets",
+    "GraspTable",
+    "PoseTable",
+    "candidate_arrays",
+    "candidate_table",
+    "grasp_arrays",
+    "join_grasps",
+    "pose_arrays",
+    "pose_table",
+    "select_poses",
+    "set_arrays",
+    "set_table",
+    "take_grasps",
+]
 
 
 @dataclass(frozen=True)
@@ -62,3 +79,85 @@ class GraspTable:
     contact_links: np.ndarray  # (N, C) i32 index in link_names, -1 padding
     contact_forces: np.ndarray  # (N, C, 3) object frame
     metrics: dict[str, np.ndarray]  # (N,) each
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def pose_arrays(table: PoseTable) -> dict[str, np.ndarray]:
+    """A PoseTable as NumPy arrays; ``pose`` is (P, 7) x y z, qx qy qz qw."""
+    return {
+        "index": table.index.numpy(),
+        "pose": table.pose.numpy().reshape(-1, 7),
+        "palm_point": table.palm_point.numpy(),
+        "palm_surface": table.palm_surface.numpy(),
+    }
+
+
+def pose_table(arrays: dict[str, np.ndarray], device: str) -> PoseTable:
+    """Inverse of :func:`pose_arrays`."""
+    return PoseTable(
+        index=wp.array(arrays["index"], dtype=wp.int32, device=device),
+        pose=wp.array(arrays["pose"], dtype=wp.transform, device=device),
+        palm_point=wp.array(arrays["palm_point"], dtype=wp.int32, device=device),
+        palm_surface=wp.array(arrays["palm_surface"], dtype=wp.int32, device=device),
+    )
+
+
+def candidate_arrays(table: CandidateTable) -> dict[str, np.ndarray]:
+    """A CandidateTable as NumPy arrays; ``q`` is (P, G, M, MAX_DOFS)."""
+    own = {name: getattr(table, name).numpy() for name in ("count", "surface", "record", "state", "q")}
+    return own | {f"poses.{name}": values for name, values in pose_arrays(table.poses).items()}
+
+
+def candidate_table(arrays: dict[str, np.ndarray], device: str) -> CandidateTable:
+    """Inverse of :func:`candidate_arrays`."""
+    poses = {name.removeprefix("poses."): a for name, a in arrays.items() if name.startswith("poses.")}
+    integers = {
+        name: wp.array(arrays[name], dtype=wp.int32, device=device) for name in ("count", "surface", "record", "state")
+    }
+    q = wp.array(np.reshape(arrays["q"], (*arrays["surface"].shape, MAX_DOFS)), dtype=vec_dof, device=device)
+    return CandidateTable(pose_table(poses, device), q=q, **integers)
+
+
+def set_arrays(table: ContactSets) -> dict[str, np.ndarray]:
+    """ContactSets as NumPy arrays."""
+    own = {name: getattr(table, name).numpy() for name in ("pose", "slot", "chosen", "score")}
+    return own | {f"candidates.{name}": values for name, values in candidate_arrays(table.candidates).items()}
+
+
+def set_table(arrays: dict[str, np.ndarray], device: str) -> ContactSets:
+    """Inverse of :func:`set_arrays`."""
+    inner = {name.removeprefix("candidates."): a for name, a in arrays.items() if name.startswith("candidates.")}
+    own = {name: wp.array(arrays[name], dtype=wp.int32, device=device) for name in ("pose", "slot", "chosen")}
+    score = wp.array(arrays["score"], dtype=wp.float32, device=device)
+    return ContactSets(candidates=candidate_table(inner, device), score=score, **own)
+
+
+def select_poses(table: CandidateTable, rows: np.ndarray, device: str) -> CandidateTable:
+    """The candidates of some poses, in the order given."""
+    return candidate_table({name: values[rows] for name, values in candidate_arrays(table).items()}, device)
+
+
+def grasp_arrays(table: GraspTable) -> dict[str, np.ndarray]:
+    """A GraspTable as flat NumPy arrays (metrics as ``metrics.NAME``)."""
+    own = {f.name: getattr(table, f.name) for f in fields(table) if f.name != "metrics"}
+    return own | {f"metrics.{name}": values for name, values in table.metrics.items()}
+
+
+def _grasps(arrays: dict[str, np.ndarray]) -> GraspTable:
+    metrics = {name.removeprefix("metrics."): a for name, a in arrays.items() if name.startswith("metrics.")}
+    return GraspTable(metrics=metrics, **{name: a for name, a in arrays.items() if not name.startswith("metrics.")})
+
+
+def take_grasps(table: GraspTable, rows: np.ndarray | slice) -> GraspTable:
+    """Some rows of a GraspTable."""
+    return _grasps({name: values[rows] for name, values in grasp_arrays(table).items()})
+
+
+def join_grasps(tables: list[GraspTable]) -> GraspTable:
+    """Several GraspTables one after another."""
+    if len(tables) == 1:
+        return tables[0]
+    parts = [grasp_arrays(t) for t in tables]
+    return _grasps({name: np.concatenate([p[name] for p in parts]) for name in parts[0]})

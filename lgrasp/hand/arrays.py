@@ -214,7 +214,7 @@ def body_poses(hand: HandArrays, q: np.ndarray) -> np.ndarray:
 
 
 def point_jacobians(hand: HandArrays, q: np.ndarray, body: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """d(base-frame position)/dq, (N, 3, K) [m/rad], of one body-frame point (N, 3) on body (N,) at postures q (N, K)."""
+    """d(base position)/dq, (N, 3, K) [m/rad or m/m], of a body-frame point (N, 3) on body (N,) at postures q (N, K)."""
     poses = wp.array(body_poses(hand, q), dtype=wp.transform, device=hand.device)
     out = wp.zeros((len(q), 3, hand.model.dofs), dtype=wp.float32, device=hand.device)
     inputs = [

@@ -21,7 +21,7 @@ def group_pairs_clear(
     at_b: wp.int32,
     margin: wp.float32,
 ):
-    """Are all listed piece pairs of groups a and b (a <= b; 0 = static base, g + 1 = group g) farther apart than margin?
+    """Are the listed piece pairs of groups a and b (a <= b; 0 = static base, g + 1 = group g) all beyond the margin?
 
     Xa, Xb: local arrays with the two groups' body poses from places at_a, at_b on (Xa is not read for the base).
     """
@@ -47,7 +47,8 @@ def group_pairs_clear(
         cj = wp.transform_point(Tj, wp.vec3(sj[0], sj[1], sj[2]))
         reach = si[3] + sj[3] + margin
         d = ci - cj
-        if wp.dot(d, d) < reach * reach:
-            if not pieces_clear(hand.pieces, i, j, wp.transform_inverse(Ti) * Tj, margin):
-                return False
+        if wp.dot(d, d) >= reach * reach:
+            continue
+        if not pieces_clear(hand.pieces, i, j, wp.transform_inverse(Ti) * Tj, margin):
+            return False
     return True

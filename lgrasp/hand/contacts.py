@@ -10,15 +10,15 @@ from lgrasp.device.runtime import KERNEL_OPTIONS, start
 from lgrasp.errors import HandError
 from lgrasp.hand.spec import Cone, HandSpec
 
-__all__ = ["ContactPoints", "LinkGrid", "cover_patches", "finger_points", "link_grid", "palm_points"]
+__all__ = ["ContactPoints", "LinkGrid", "check_contact_links", "cover_patches", "finger_points", "link_grid", "palm_points"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _GRID_CELL = 8.0e-4
 _GRID_PAD = 6.0e-3
 _POINTS_PER_LINK = 600
-PATCH_RADIUS = 0.010
-PATCH_CONE = np.radians(36.0)
+_PATCH_RADIUS = 0.010
+_PATCH_CONE = np.radians(36.0)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,9 @@ def palm_points(
     return _thin(points[keep], normals[keep], _POINTS_PER_LINK, rng)
 
 
-def _thin(points: np.ndarray, normals: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _thin(
+    points: np.ndarray, normals: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     chosen = rng.permutation(len(points))[:count]
     return points[chosen], normals[chosen]
 
@@ -127,8 +129,8 @@ def cover_patches(points: np.ndarray, normals: np.ndarray, rng: np.random.Genera
     patch = np.full(len(points), -1, np.int32)
     for seed in rng.permutation(len(points)):
         if patch[seed] < 0:
-            near = np.linalg.norm(points - points[seed], axis=1) < PATCH_RADIUS
-            near &= normals @ normals[seed] > np.cos(PATCH_CONE)
+            near = np.linalg.norm(points - points[seed], axis=1) < _PATCH_RADIUS
+            near &= normals @ normals[seed] > np.cos(_PATCH_CONE)
             near[seed] = True
             patch[near & (patch < 0)] = patch.max() + 1
     return patch

@@ -116,7 +116,9 @@ def convex_piece(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> Piece
                 return Piece(thin, thin_planes, max(error, 0.0) / 2)
             count *= 2
     except QhullError:
-        raise HandError(f"URDF {urdf.path}: collision mesh {geometry.mesh} is flat; collision bodies need volume") from None
+        raise HandError(
+            f"URDF {urdf.path}: collision mesh {geometry.mesh} is flat; collision bodies need volume"
+        ) from None
     return Piece(vertices, planes, 0.0)
 
 

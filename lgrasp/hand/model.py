@@ -190,7 +190,9 @@ def build_hand(urdf_path: Path, spec: HandSpec) -> HandModel:
 
 def _check_size(spec: HandSpec, tree: Tree) -> None:
     if len(tree.joint_dof) > MAX_BODIES:
-        raise HandError(f"hand '{spec.name}' has {len(tree.joint_dof)} movable joints, at most {MAX_BODIES} are supported")
+        raise HandError(
+            f"hand '{spec.name}' has {len(tree.joint_dof)} movable joints, at most {MAX_BODIES} are supported"
+        )
     joints, dofs = int(np.diff(tree.joint_first).max()), int(np.diff(tree.dof_first).max())
     if joints > MAX_JOINTS or dofs > MAX_DOFS:
         raise HandError(
@@ -242,7 +244,9 @@ class _Solids:
                 piece = convex_piece(urdf, geometry, mesh)
                 if geometry.kind == "mesh" and mesh.is_volume and mesh.volume < 0.9 * mesh.convex_hull.volume:
                     share = 100 * mesh.volume / mesh.convex_hull.volume
-                    self.notes.append(f"link '{link}': mesh {geometry.mesh} fills {share:.0f} % of its convex hull; the hull is used")
+                    self.notes.append(
+                        f"link '{link}': mesh {geometry.mesh} fills {share:.0f} % of its convex hull; the hull is used"
+                    )
                 mesh.apply_transform(T)
                 self.meshes.setdefault(link, []).append(mesh)
                 planes = piece.planes.copy()
@@ -285,7 +289,10 @@ def _contacts(spec: HandSpec, tree: Tree, solids: _Solids, rng: np.random.Genera
             grids.append(grid(link))
             grid_link.append(index)
             meshes.append(trimesh.util.concatenate(solids.meshes[link]))
-            axes = [(T[:3, :3] @ (np.array(c.axis) / np.linalg.norm(c.axis)), np.cos(np.radians(c.angle))) for c in rule.forbidden]
+            axes = [
+                (T[:3, :3] @ (np.array(c.axis) / np.linalg.norm(c.axis)), np.cos(np.radians(c.angle)))
+                for c in rule.forbidden
+            ]
             rules.append(np.array([[*a, c] for a, c in axes]).reshape(-1, 4))
     for link in spec.palm.links:
         index = tree.link_names.index(link)

@@ -39,7 +39,12 @@ def pieces_touch(model: HandModel, q: np.ndarray, pairs: np.ndarray, margin: flo
     hand = upload_hand(model, "cpu")
     pose = wp.array(body_poses(hand, q), dtype=wp.transform, device="cpu")
     out = wp.zeros((len(q), len(pairs)), dtype=wp.int32, device="cpu")
-    inputs = [hand.struct.pieces, pose, wp.array(np.asarray(pairs, np.int32), dtype=wp.vec2i, device="cpu"), float(margin)]
+    inputs = [
+        hand.struct.pieces,
+        pose,
+        wp.array(np.asarray(pairs, np.int32), dtype=wp.vec2i, device="cpu"),
+        float(margin),
+    ]
     wp.launch(_pieces_touch, dim=(len(q), len(pairs)), inputs=inputs, outputs=[out], device="cpu")
     return out.numpy().astype(bool)
 

@@ -67,7 +67,9 @@ def spec_problem(error: ValidationError) -> str:
     """First problem of a pydantic error as one phrase: key, value, what is wrong."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"]) or "file"
-    return f"key '{key}': {first['msg']}" + (f" (got {first['input']!r})" if not isinstance(first["input"], dict) else "")
+    return f"key '{key}': {first['msg']}" + (
+        f" (got {first['input']!r})" if not isinstance(first["input"], dict) else ""
+    )
 
 
 def load_spec(path: Path) -> HandSpec:

@@ -108,7 +108,9 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         raise HandError(f"hand '{spec.name}': every joint of {urdf.path} is locked; leave some to move")
     # the base frame: the base link must be static
     if rides[base][0] is not None:
-        raise HandError(f"hand '{spec.name}': base_link '{base}' is moved by joint '{rides[base][0]}'; name a static link")
+        raise HandError(
+            f"hand '{spec.name}': base_link '{base}' is moved by joint '{rides[base][0]}'; name a static link"
+        )
     T_base_root = np.linalg.inv(rides[base][1])
     for link, (carrier, T) in rides.items():
         if carrier is None:

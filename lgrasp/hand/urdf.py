@@ -129,7 +129,9 @@ def _geometry(path: Path, link: str, collision, meshes: dict[str, Path]) -> Geom
         kind, size = "mesh", tuple(float(x) for x in scale)
         meshes[name] = _mesh_file(path, link, name)
     else:
-        raise HandError(f"URDF {path}: link '{link}' has an unknown collision geometry; use box, sphere, cylinder or mesh")
+        raise HandError(
+            f"URDF {path}: link '{link}' has an unknown collision geometry; use box, sphere, cylinder or mesh"
+        )
     if kind != "mesh" and not all(x > 0 and math.isfinite(x) for x in size):
         raise HandError(f"URDF {path}: link '{link}' has a {kind} of size {size}; sizes must be positive")
     if not np.isfinite(origin).all():

@@ -1,0 +1,58 @@
+"""The candidate bank: contacts of a batch of poses, kept on disk so that later runs need not make them again."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.stages import STAGES
+from lgrasp.engine.workspace import InputKeys
+from lgrasp.grasp.tables import CandidateTable, candidate_arrays, candidate_table
+
+__all__ = ["BANK_CANDIDATES", "Bank"]
+
+BANK_CANDIDATES = 1024
+"""Candidates of one bank entry; the batch size of a run that keeps banks."""
+
+
+@dataclass(frozen=True)
+class Bank:
+    """Bank entries of one shard's stream."""
+
+    cache: Cache
+    pipeline: Pipeline
+    keys: InputKeys
+    shard: int
+    device: str
+
+    def key(self, first: int, count: int) -> str:
+        """Content key of the candidates ``first .. first + count - 1``: the stages before search and their inputs."""
+        described = self.pipeline.describe()["stages"][: self.pipeline.order.index("search")]
+        return content_key(
+            "bank",
+            max(STAGES[n].version for n in self.pipeline.order),
+            stages=described,
+            seed=self.pipeline.seed,
+            inputs=[self.keys.hand, self.keys.object, self.keys.field],
+            shard=self.shard,
+            candidates=[first, count],
+        )
+
+    def has(self, first: int, count: int) -> bool:
+        return self.cache.has("bank", self.key(first, count))
+
+    def load(self, first: int, count: int) -> CandidateTable | None:
+        """The banked candidates on the device, or None."""
+        arrays = self.cache.load("bank", self.key(first, count))
+        return None if arrays is None else candidate_table(arrays, self.device)
+
+    def counts(self, first: int, count: int) -> dict[str, dict[str, int]]:
+        """Survivors per stage as they were when the entry was made."""
+        arrays = self.cache.load("bank", self.key(first, count))
+        return {} if arrays is None else json.loads(str(arrays["counts"]))
+
+    def store(self, first: int, count: int, table: CandidateTable, counts: dict[str, dict[str, int]]) -> None:
+        arrays = candidate_arrays(table) | {"counts": np.asarray(json.dumps(counts))}
+        self.cache.store("bank", self.key(first, count), arrays)

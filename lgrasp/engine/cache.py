@@ -1,0 +1,127 @@
+"""The content-keyed cache: arrays under SHA-256 keys, written whole or not at all; a damaged entry is a miss."""
+
+import hashlib
+import io
+import json
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.errors import CacheError
+from lgrasp.paths import cache_dir
+
+__all__ = ["Cache", "CacheEntry", "content_key"]
+
+_FORMAT = 1
+
+
+def content_key(kind: str, version: int, **parts: Any) -> str:
+    """Key of an artifact: SHA-256 of its kind, code version and everything it depends on (JSON-serialisable)."""
+    text = json.dumps({"format": _FORMAT, "kind": kind, "version": version, **parts}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class CacheEntry:
+    """One file of the cache."""
+
+    kind: str
+    key: str
+    path: Path
+    size: int
+    modified: float
+
+
+class Cache:
+    """Artifacts as ``<root>/<kind>/<key>.npz`` (uncompressed arrays with checksums).
+
+    Args:
+        root: the folder; the platform's user cache folder when None.
+        warn: called with one line when an entry is damaged or the folder cannot be written.
+    """
+
+    def __init__(self, root: str | os.PathLike[str] | None = None, warn: Callable[[str], None] | None = None) -> None:
+        self.root = cache_dir(root)
+        self._warn = warn or (lambda line: None)
+        if self.root.exists() and not self.root.is_dir():
+            raise CacheError(f"cache folder {self.root} is a file; name a folder with --cache-dir or LGRASP_CACHE_DIR")
+
+    def path(self, kind: str, key: str) -> Path:
+        """File of an artifact, whether it exists or not."""
+        return self.root / kind / f"{key}.npz"
+
+    def has(self, kind: str, key: str) -> bool:
+        """Is there an entry? (It may still turn out damaged on loading.)"""
+        return self.path(kind, key).is_file()
+
+    def load(self, kind: str, key: str) -> dict[str, np.ndarray] | None:
+        """Arrays of an artifact, or None when it is absent or damaged (which is said)."""
+        path = self.path(kind, key)
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            self._warn(f"cache entry {path} cannot be read ({error.strerror}); it is made anew")
+            return None
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
+        except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+            self._warn(f"cache entry {path} is damaged; it is made anew")
+            return None
+
+    def store(self, kind: str, key: str, arrays: dict[str, np.ndarray]) -> None:
+        """Write an artifact: unique temporary name, fsync, rename. A cache that cannot be written is said, not fatal."""
+        path = self.path(kind, key)
+        name = ""
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{key[:16]}.", suffix=".tmp", delete=False) as file:
+                name = file.name
+                np.savez(file, allow_pickle=False, **arrays)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(name, path)
+        except OSError as error:
+            if name:
+                Path(name).unlink(missing_ok=True)
+            self._warn(f"cache folder {self.root} cannot be written ({error.strerror}); going on without it")
+
+    def get(self, kind: str, key: str, make: Callable[[], dict[str, np.ndarray]]) -> tuple[dict[str, np.ndarray], bool]:
+        """The artifact and whether it was a hit; a miss is made and stored."""
+        arrays = self.load(kind, key)
+        if arrays is not None:
+            return arrays, True
+        arrays = make()
+        self.store(kind, key, arrays)
+        return arrays, False
+
+    def entries(self) -> list[CacheEntry]:
+        """Every artifact, largest first."""
+        found = []
+        for path in self.root.glob("*/*.npz"):
+            try:
+                info = path.stat()
+            except FileNotFoundError:
+                continue
+            found.append(CacheEntry(path.parent.name, path.stem, path, info.st_size, info.st_mtime))
+        return sorted(found, key=lambda e: -e.size)
+
+    def prune(self, kinds: set[str] | None = None, older_than: float | None = None) -> tuple[int, int]:
+        """Remove artifacts (of some kinds, last written before a time [s since 1970]); returns (files, bytes)."""
+        files = size = 0
+        for entry in self.entries():
+            if (kinds is None or entry.kind in kinds) and (older_than is None or entry.modified < older_than):
+                entry.path.unlink(missing_ok=True)
+                files, size = files + 1, size + entry.size
+        for left in self.root.glob("*/.*.tmp"):
+            left.unlink(missing_ok=True)
+        return files, size

@@ -1,0 +1,282 @@
+"""The main job: hand + object -> grasp shards in a folder."""
+
+import os
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, ShardReader, write_shard
+from lgrasp.device.runtime import resolve_device
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.shard import Execution, ShardResult, make_shard
+from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
+from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
+from lgrasp.grasp.tables import GraspTable
+
+__all__ = ["Job", "Listener", "Outcome", "generate", "job_shards", "shard_path"]
+
+METRIC_UNITS = {"penetration": "m", "self_penetration": "m", "gap": "m", "normal_error": "rad"}
+
+
+@dataclass(frozen=True)
+class Job:
+    """On what and where."""
+
+    hand: str
+    object: str
+    rows: int
+    pipeline: Pipeline
+    out: Path
+    scale: float = 1.0
+    device: str = "auto"
+    workers: int = 0  # 0: all cores (1 on a GPU)
+    batch: int = 0
+    shard_rows: int = 10_000
+    shard_index: int = 0
+    num_shards: int = 1
+    reuse: bool = False
+    resume: bool = True
+    cache: Cache = field(default_factory=Cache)
+
+
+class Listener:
+    """What a job tells while it runs; every method may be overridden."""
+
+    def loading(self, what: str, share: float) -> None:
+        """An input is being loaded or made."""
+
+    def started(self, inputs: Inputs, shards: list[int], present: list[int]) -> None:
+        """Inputs are ready; ``present`` of ``shards`` are on disk already."""
+
+    def advanced(self, shard: int, rows: int, result: ShardResult) -> None:
+        """A batch of a shard is done; ``rows`` of it are found so far."""
+
+    def wrote(self, shard: int, path: Path, result: ShardResult) -> None:
+        """A shard is on disk."""
+
+    def cancelled(self) -> bool:
+        """Should the job stop after the running batch?"""
+        return False
+
+
+@dataclass
+class Outcome:
+    """What a job did."""
+
+    inputs: Inputs
+    paths: list[Path]
+    rows: int  # rows on disk of this job's shards
+    made: int  # rows made by this call
+    present: int  # rows found on disk
+    results: list[ShardResult]
+    wall: float  # whole call [s]
+    starved: bool
+    cancelled: bool = False
+
+
+def job_shards(job: Job) -> list[tuple[int, int]]:
+    """(shard, rows) of every shard that this job (array task) makes.
+
+    Raises:
+        ConfigError: n, shard rows or array numbers out of range.
+    """
+    if job.rows <= 0:
+        raise ConfigError(f"-n {job.rows}: the number of grasps must be at least 1")
+    if job.shard_rows <= 0:
+        raise ConfigError(f"--shard-rows {job.shard_rows}: must be at least 1")
+    if job.num_shards <= 0 or not 0 <= job.shard_index < job.num_shards:
+        raise ConfigError(f"--shard-index {job.shard_index} --num-shards {job.num_shards}: need 0 <= index < number")
+    total = -(-job.rows // job.shard_rows)
+    return [
+        (s, min(job.shard_rows, job.rows - s * job.shard_rows)) for s in range(job.shard_index, total, job.num_shards)
+    ]
+
+
+def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
+    """File of a shard."""
+    safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{hand}-{name}")
+    return out / f"{safe}-{shard:05d}.h5"
+
+
+def generate(job: Job, listener: Listener | None = None) -> Outcome:
+    """Make the missing shards of a job.
+
+    Raises:
+        LgraspError: bad input, unwritable output, or files of another run in the output folder.
+    """
+    listener = listener or Listener()
+    start = time.perf_counter()
+    shards = job_shards(job)
+    device = resolve_device(job.device)
+    pipeline = job.pipeline
+    keys = input_keys(job.hand, job.object, job.scale, pipeline.object, pipeline.field)
+    assert keys.mesh is not None
+    _check_folder(job.out)
+    key = run_key(pipeline.describe(), keys, job.shard_rows)
+    files = {s: shard_path(job.out, keys.source.name, keys.mesh.stem, s) for s, _ in shards}
+    present = {s: n for s, rows in shards if (n := _present(files[s], key, rows, job.resume)) is not None}
+    inputs = load_inputs(job.cache, keys, job.scale, pipeline.object, pipeline.field, device, listener.loading)
+    workers = job.workers or (1 if device.is_cuda else os.cpu_count() or 1)
+    execution = Execution(workers, job.batch, listener.cancelled)
+    listener.started(inputs, [s for s, _ in shards], list(present))
+    outcome = Outcome(inputs, [], sum(present.values()), 0, sum(present.values()), [], 0.0, False)
+    for shard, rows in shards:
+        if shard in present:
+            outcome.paths.append(files[shard])
+            outcome.starved |= present[shard] < rows
+            continue
+        result = make_shard(
+            pipeline,
+            inputs,
+            shard,
+            rows,
+            execution,
+            bank_cache=job.cache if job.reuse else None,
+            progress=lambda found, running, shard=shard: listener.advanced(shard, found, running),
+        )
+        if listener.cancelled() and len(result.grasps) < rows:
+            outcome.cancelled = True
+            break
+        write_shard(files[shard], _shard(job, inputs, key, shard, result))
+        listener.wrote(shard, files[shard], result)
+        outcome.paths.append(files[shard])
+        outcome.results.append(result)
+        outcome.rows += len(result.grasps)
+        outcome.made += len(result.grasps)
+        if result.exhausted:
+            outcome.starved = True
+            break
+    outcome.wall = time.perf_counter() - start
+    return outcome
+
+
+def _check_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".lgrasp-write-test"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise OutputError(f"output folder {out} cannot be written: {error.strerror}; choose another with --out") from None
+
+
+def _present(path: Path, key: str, rows: int, resume: bool) -> int | None:
+    """Rows of a shard that is on disk and need not be made; None when it must be made.
+
+    Raises:
+        OutputError: the file belongs to another run and resume is on.
+    """
+    if not path.exists() or not resume:
+        return None
+    try:
+        with ShardReader(path) as reader:
+            config = reader.header.config
+            found = len(reader)
+            exhausted = bool(reader.statistics.get("exhausted", 0))
+    except ShardError:
+        return None  # damaged: made anew
+    if config.get("run_key") != key:
+        raise OutputError(
+            f"{path} belongs to another run (other hand, object, pipeline, seed or --shard-rows); "
+            "choose another --out, or --no-resume to replace it"
+        )
+    return found if found == rows or exhausted else None
+
+
+def _shard(job: Job, inputs: Inputs, key: str, shard: int, result: ShardResult) -> Shard:
+    """The shard as records; poses and contacts go from the internal to the user's frame of the object."""
+    hand, obj = inputs.hand.model, inputs.object.model
+    tree = hand.tree
+    meshes = {}
+    for name, file in hand.mesh_files.items():
+        try:
+            meshes[name] = Path(file).read_bytes()
+        except OSError as error:
+            raise LgraspError(f"hand mesh {file} cannot be read any more: {error.strerror}") from None
+    return Shard(
+        header=ShardHeader(
+            pipeline=job.pipeline.name,
+            seed=job.pipeline.seed,
+            shard_index=shard,
+            config={
+                "run_key": key,
+                "pipeline": job.pipeline.describe(),
+                "object": job.object,
+                "scale": job.scale,
+                "shard_rows": job.shard_rows,
+                "reuse": job.reuse,
+                "locked": dict(inputs.keys.source.spec.locked),
+            },
+        ),
+        hand=HandRecord(
+            name=hand.name,
+            base_link=tree.base_link,
+            urdf=hand.urdf_text,
+            joint_names=tree.joint_names,
+            joint_lower=tree.joint_lower,
+            joint_upper=tree.joint_upper,
+            link_names=tree.link_names,
+            sha256=hand.sha256,
+            meshes=meshes,
+        ),
+        objects=[
+            ObjectRecord(
+                id=obj.name,
+                name=obj.name,
+                scale=obj.scale,
+                sha256=obj.sha256,
+                watertight=obj.watertight,
+                vertices=obj.vertices,
+                faces=obj.faces,
+            )
+        ],
+        grasps=_rows(result.grasps, obj.center, shard),
+        statistics=_statistics(inputs, result),
+    )
+
+
+def _statistics(inputs: Inputs, result: ShardResult) -> dict[str, Any]:
+    flat: dict[str, Any] = {
+        "device": inputs.device.name,
+        "candidates": result.candidates,
+        "duplicates_dropped": result.duplicates,
+        "exhausted": int(result.exhausted),
+        "seconds_wall": result.wall,
+    }
+    for stage, counts in result.counts.items():
+        flat |= {f"{stage}_{name.replace(' ', '_')}": value for name, value in counts.items()}
+    return flat | {f"seconds_{stage}": seconds for stage, seconds in result.seconds.items()}
+
+
+def _rows(table: GraspTable, center: np.ndarray, shard: int) -> GraspRows:
+    position, quaternion = table.pose[:, :3].astype(float), table.pose[:, [6, 3, 4, 5]].astype(float)
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    # R(q) c for the shift from the internal to the user's frame
+    w, v = quaternion[:, :1], quaternion[:, 1:]
+    c = np.broadcast_to(center.astype(float), v.shape)
+    turned = c + 2 * np.cross(v, np.cross(v, c) + w * c)
+    quaternion[quaternion[:, 0] < 0] *= -1
+    pose = np.hstack([position - turned, quaternion]).astype(np.float32)
+    filled = table.contact_links >= 0
+    width = max(1, int(filled.sum(1).max(initial=1)))
+    points = (table.contact_points + center)[:, :width]
+    return GraspRows(
+        q=table.q,
+        q_pregrasp=table.q_pregrasp,
+        q_squeeze=table.q_squeeze,
+        object_pose=pose[:, None],
+        object_index=np.zeros((len(table), 1), np.int32),
+        contact_points=points[:, None],
+        contact_normals=table.contact_normals[:, None, :width],
+        contact_links=table.contact_links[:, None, :width].astype(np.int16),
+        contact_forces=table.contact_forces[:, None, :width],
+        candidate=(np.uint64(shard) << np.uint64(40)) + table.index.astype(np.uint64),
+        metrics=dict(table.metrics) | {"contacts": filled.sum(1).astype(np.float32)},
+        metric_units=METRIC_UNITS,
+    )

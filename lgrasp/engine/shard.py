@@ -1,0 +1,121 @@
+"""One shard: a pure function of (pipeline, hand, object, shard rows, shard index)."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lgrasp.engine.bank import BANK_CANDIDATES, Bank
+from lgrasp.engine.batch import BatchResult, run_batch
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.workspace import Inputs
+from lgrasp.grasp.context import Context
+from lgrasp.grasp.duplicates import new_rows
+from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
+
+__all__ = ["Execution", "ShardResult", "make_shard"]
+
+_LEAST_EFFORT = 65_536
+_CPU_BATCH = 512
+_GPU_BATCH = 16_384
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How a job runs; none of this changes its rows."""
+
+    workers: int = 1
+    batch: int = 0  # candidates per batch; 0: by device
+    cancelled: Callable[[], bool] = lambda: False
+
+
+@dataclass
+class ShardResult:
+    """Rows of a shard and how they came about."""
+
+    grasps: GraspTable
+    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)  # thread-seconds per stage
+    wall: float = 0.0  # placement through filter [s]
+    candidates: int = 0
+    duplicates: int = 0
+    exhausted: bool = False  # the effort bound was reached before the rows were
+
+
+def _add(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]) -> None:
+    for stage, counts in more.items():
+        into = total.setdefault(stage, {})
+        for name, value in counts.items():
+            into[name] = into.get(name, 0) + value
+
+
+def _batches(pipeline: Pipeline, context: Context, execution: Execution, bank: Bank | None, limit: int) -> Iterator[tuple[int, BatchResult]]:
+    """Results of consecutive batches, in order; ``workers`` of them are worked on at a time."""
+    size = BANK_CANDIDATES if bank else execution.batch or (_GPU_BATCH if context.device != "cpu" else _CPU_BATCH)
+    starts = iter(range(0, limit, size))
+    with ThreadPoolExecutor(execution.workers) as pool:
+        waiting: deque[tuple[int, Future[BatchResult]]] = deque()
+        try:
+            while True:
+                while len(waiting) <= execution.workers and (first := next(starts, None)) is not None:
+                    count = min(size, limit - first)
+                    waiting.append((count, pool.submit(run_batch, pipeline, context, first, count, bank)))
+                if not waiting:
+                    return
+                count, future = waiting.popleft()
+                yield count, future.result()
+        finally:
+            for _, future in waiting:
+                future.cancel()
+
+
+def make_shard(
+    pipeline: Pipeline,
+    inputs: Inputs,
+    shard: int,
+    rows: int,
+    execution: Execution,
+    *,
+    bank_cache: Cache | None = None,
+    progress: Callable[[int, ShardResult], None] | None = None,
+) -> ShardResult:
+    """The first ``rows`` grasps of a shard's candidate stream, near-duplicates left out.
+
+    Args:
+        bank_cache: keep and use candidate banks there.
+        progress: called with (rows so far, running result) after each batch.
+    """
+    context = Context(inputs.hand, inputs.object, inputs.field, inputs.device.alias, pipeline.seed, shard)
+    bank = Bank(bank_cache, pipeline, inputs.keys, shard, inputs.device.alias) if bank_cache else None
+    limit = max(_LEAST_EFFORT, rows * pipeline.effort)
+    result: ShardResult | None = None
+    parts: list[GraspTable] = []
+    pose, q = np.zeros((0, 7), np.float32), np.zeros((0, inputs.hand.model.dofs), np.float32)
+    start = time.perf_counter()
+    for count, batch in _batches(pipeline, context, execution, bank, limit):
+        if result is None:
+            result = ShardResult(batch.grasps)
+        result.candidates += count
+        _add(result.counts, batch.counts)
+        for stage, seconds in batch.seconds.items():
+            result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
+        both_pose, both_q = np.vstack([pose, batch.grasps.pose]), np.vstack([q, batch.grasps.q])
+        fresh = new_rows(both_pose, both_q, len(pose))
+        result.duplicates += int((~fresh).sum())
+        room = rows - len(pose)
+        new = take_grasps(batch.grasps, np.flatnonzero(fresh)[:room])
+        parts.append(new)
+        pose, q = np.vstack([pose, new.pose]), np.vstack([q, new.q])
+        if progress:
+            progress(len(pose), result)
+        if len(pose) >= rows or execution.cancelled():
+            break
+    assert result is not None
+    result.grasps = join_grasps(parts)
+    result.wall = time.perf_counter() - start
+    result.exhausted = len(pose) < rows and not execution.cancelled()
+    return result

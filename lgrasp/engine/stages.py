@@ -1,0 +1,50 @@
+"""The stages there are: name -> parameters, version and function."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel
+
+from lgrasp.errors import ConfigError
+from lgrasp.stages.domain import stage as domain
+from lgrasp.stages.domain.params import DomainParams
+from lgrasp.stages.filter import stage as filter_
+from lgrasp.stages.filter.params import FilterParams
+from lgrasp.stages.ik import stage as ik
+from lgrasp.stages.ik.params import IkParams
+from lgrasp.stages.place import stage as place
+from lgrasp.stages.place.params import PlaceParams
+from lgrasp.stages.search import stage as search
+from lgrasp.stages.search.params import SearchParams
+
+__all__ = ["ORDERS", "STAGES", "Stage", "check_order"]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage: ``run(inputs, params, context) -> (table, counts)``."""
+
+    name: str
+    params: type[BaseModel]
+    version: int
+    run: Callable[..., tuple[Any, dict[str, int]]]
+
+
+STAGES: dict[str, Stage] = {
+    "place": Stage("place", PlaceParams, place.VERSION, place.run),
+    "domain": Stage("domain", DomainParams, domain.VERSION, domain.run),
+    "ik": Stage("ik", IkParams, ik.VERSION, ik.run),
+    "search": Stage("search", SearchParams, search.VERSION, search.run),
+    "filter": Stage("filter", FilterParams, filter_.VERSION, filter_.run),
+}
+
+ORDERS = (("place", "domain", "ik", "search", "filter"), ("place", "domain", "search", "ik", "filter"))
+"""Accepted orders: contacts realised before they are combined, or (the published order) after."""
+
+
+def check_order(names: tuple[str, ...], where: str) -> None:
+    """Raises ConfigError unless ``names`` is one of ORDERS."""
+    if names not in ORDERS:
+        choices = " or ".join(", ".join(order) for order in ORDERS)
+        raise ConfigError(f"{where}: stages {', '.join(names)}; accepted: {choices}")

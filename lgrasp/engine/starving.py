@@ -1,0 +1,32 @@
+"""Why too few grasps came out, in words."""
+
+__all__ = ["starving_stage"]
+
+_STEPS = (
+    ("place", "tried", "kept", "object poses are blocked by the palm, or no two fingers could oppose each other there"),
+    ("domain", "poses", "rich", "too few fingers can reach the object's surface at these poses"),
+    ("ik", "tried", "kept", "fingers cannot put their contact surface on the object without hitting it"),
+    ("search", "poses", "yielding", "the contacts within reach do not balance, or the fingers that would hit each other"),
+    ("filter", "", "kept", "finished grasps collide"),
+)
+
+
+def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
+    """The stage with the smallest share of survivors and a sentence on it.
+
+    Args:
+        counts: survivors per stage as the stages report them.
+    """
+    worst, least, words = "place", 2.0, "nothing was tried"
+    for stage, before, after, reason in _STEPS:
+        found = counts.get(stage)
+        if not found:
+            continue
+        whole = found.get(before, 0) if before else sum(found.values())
+        share = found.get(after, 0) / whole if whole else 0.0
+        if share < least:
+            worst, least = stage, share
+            words = f"{found.get(after, 0):,} of {whole:,} survive: {reason}"
+        if share == 0.0:
+            break
+    return worst, words

@@ -1,0 +1,140 @@
+"""Hand, object and field of a job: found, cached, loaded onto a device."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lgrasp.device.runtime import Device
+from lgrasp.engine.cache import Cache, content_key
+from lgrasp.errors import ObjectError
+from lgrasp.field.arrays import FieldArrays, upload_field
+from lgrasp.field.model import FIELD_VERSION, ContactField, build_field
+from lgrasp.field.params import FieldParams
+from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.hand.find import HandSource, find_hand
+from lgrasp.hand.model import HAND_VERSION, HandModel, build_hand, hand_digest
+from lgrasp.object.arrays import ObjectArrays, upload_object
+from lgrasp.object.find import find_object
+from lgrasp.object.model import ObjectModel, preprocess_object
+from lgrasp.object.params import ObjectParams
+
+__all__ = ["OBJECT_VERSION", "Inputs", "InputKeys", "input_keys", "load_field", "load_hand", "load_inputs", "load_object"]
+
+OBJECT_VERSION = 1
+"""Raised whenever preprocessing gives other arrays."""
+
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class InputKeys:
+    """Content keys of what a job starts from."""
+
+    source: HandSource
+    mesh: Path | None
+    hand: str
+    object: str
+    field: str
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a job starts from, on its device."""
+
+    hand: HandArrays
+    object: ObjectArrays
+    field: FieldArrays
+    keys: InputKeys
+    device: Device
+    seconds: dict[str, float] = field(default_factory=dict)
+    hits: dict[str, bool] = field(default_factory=dict)
+
+
+def input_keys(hand: str, mesh: str | None, scale: float, objects: ObjectParams, fields: FieldParams) -> InputKeys:
+    """Find hand and object and compute the content keys of their artifacts.
+
+    Raises:
+        HandError, ObjectError: see :func:`find_hand`, :func:`find_object`.
+    """
+    source = find_hand(hand)
+    digest = hand_digest(source.urdf, source.spec)
+    hand_key = content_key("hand", HAND_VERSION, content=digest)
+    field_key = content_key("field", FIELD_VERSION, hand=hand_key, params=fields.model_dump(mode="json"))
+    path, object_key = None, ""
+    if mesh is not None:
+        path = find_object(mesh)
+        try:
+            content = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise ObjectError(f"object {path} cannot be read: {error.strerror}") from None
+        object_key = content_key(
+            "object", OBJECT_VERSION, content=content, name=path.name, scale=scale, params=objects.model_dump(mode="json")
+        )
+    return InputKeys(source, path, hand_key, object_key, field_key)
+
+
+def load_hand(cache: Cache, keys: InputKeys) -> tuple[HandModel, bool]:
+    """The HandModel from the cache, or built and cached; and whether it was a hit."""
+    arrays, hit = cache.get("hand", keys.hand, lambda: build_hand(keys.source.urdf, keys.source.spec).to_arrays())
+    return HandModel.from_arrays(arrays), hit
+
+
+def load_object(cache: Cache, keys: InputKeys, scale: float, params: ObjectParams, device: Device) -> tuple[ObjectModel, bool]:
+    """The ObjectModel from the cache, or preprocessed and cached; and whether it was a hit."""
+    assert keys.mesh is not None
+    mesh = keys.mesh
+
+    def make():
+        return preprocess_object(mesh, scale=scale, params=params, device="cpu").to_arrays()
+
+    arrays, hit = cache.get("object", keys.object, make)
+    return ObjectModel.from_arrays(arrays), hit
+
+
+def load_field(
+    cache: Cache, keys: InputKeys, hand: HandArrays, params: FieldParams, report: Report | None = None
+) -> tuple[ContactField, bool]:
+    """The ContactField from the cache, or built and cached; and whether it was a hit."""
+    arrays, hit = cache.get("field", keys.field, lambda: build_field(hand, params, report).to_arrays())
+    return ContactField.from_arrays(arrays), hit
+
+
+def load_inputs(
+    cache: Cache,
+    keys: InputKeys,
+    scale: float,
+    objects: ObjectParams,
+    fields: FieldParams,
+    device: Device,
+    report: Report | None = None,
+) -> Inputs:
+    """Load or make hand, object and field, and put them on the device."""
+    report = report or (lambda what, share: None)
+    seconds, hits = {}, {}
+
+    def timed(name: str, load):
+        start = time.perf_counter()
+        report(name, 0.0)
+        model, hits[name] = load()
+        seconds[name] = time.perf_counter() - start
+        return model
+
+    hand_model = timed("hand", lambda: load_hand(cache, keys))
+    object_model = timed("object", lambda: load_object(cache, keys, scale, objects, device))
+    hand = upload_hand(hand_model, device.alias)
+    field_model = timed("field", lambda: load_field(cache, keys, hand, fields, report))
+    start = time.perf_counter()
+    obj = upload_object(object_model, device.alias)
+    field_arrays = upload_field(field_model, device.alias)
+    seconds["upload"] = time.perf_counter() - start
+    return Inputs(hand, obj, field_arrays, keys, device, seconds, hits)
+
+
+def run_key(pipeline: dict, keys: InputKeys, shard_rows: int) -> str:
+    """Content key of a run: everything that decides its rows."""
+    return hashlib.sha256(
+        json.dumps([pipeline, keys.hand, keys.object, keys.field, shard_rows], sort_keys=True).encode()
+    ).hexdigest()
