@@ -73,7 +73,7 @@ def group_forward(h: Kinematics, g: wp.int32, q: vec_dof, X: wp.array(dtype=wp.t
 
 @wp.func
 def point_column(h: Kinematics, k: wp.int32, T: wp.transform, p: wp.vec3):
-    """Velocity of point p (base frame) per unit rate of the dof behind joint k, whose body frame is T [m/rad or m/m]."""
+    """Velocity of point p (base frame) per unit rate of the dof behind joint k (body frame T) [m/rad or m/m]."""
     a = wp.transform_vector(T, h.joint_axis[k])
     v = a
     if h.joint_prismatic[k] == 0:

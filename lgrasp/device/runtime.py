@@ -1,6 +1,10 @@
 """Starts Warp quietly, keeps its kernels in our cache and resolves device names."""
 
+import contextlib
+import ctypes
 import os
+import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import warp as wp
@@ -41,8 +45,37 @@ def start() -> None:
     wp.config.log_level = wp.LOG_ERROR
     if "WARP_CACHE_PATH" not in os.environ:
         wp.config.kernel_cache_dir = str(cache_dir() / "kernels")
-    wp.init()
+    with _without_driver_warning():
+        wp.init()
     _started = True
+
+
+@contextlib.contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Without a GPU driver, drop the line that Warp's native code writes on stderr about it; other output is kept."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+    except OSError:
+        pass
+    else:
+        yield
+        return
+    try:
+        stderr = os.dup(2)
+    except OSError:  # closed: nobody sees the warning
+        yield
+        return
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            caught.seek(0)
+            kept = [line for line in caught if b"CUDA driver" not in line]
+            with contextlib.suppress(OSError):
+                os.write(2, b"".join(kept))
 
 
 def resolve_device(name: str = "auto") -> Device:
@@ -53,10 +86,7 @@ def resolve_device(name: str = "auto") -> Device:
     """
     start()
     present = ["cpu", *(f"cuda:{i}" for i in range(wp.get_cuda_device_count()))]
-    if name == "auto":
-        alias = present[1] if len(present) > 1 else "cpu"
-    else:
-        alias = "cuda:0" if name == "cuda" else name
+    alias = {"auto": present[min(1, len(present) - 1)], "cuda": "cuda:0"}.get(name, name)
     if alias not in present:
         raise DeviceError(f"device '{name}' does not exist here; choose auto, {', '.join(present)}")
     return Device(alias=alias, name=wp.get_device(alias).name if alias != "cpu" else _cpu_name())

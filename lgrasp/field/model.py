@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -54,7 +55,7 @@ class ContactField:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> "ContactField":
-        values = {f.name: arrays[f.name] for f in fields(cls)}
+        values: dict[str, Any] = {f.name: arrays[f.name] for f in fields(cls)}
         return cls(**values | {"hand_sha256": str(values["hand_sha256"]), "cell": float(values["cell"])})
 
 
@@ -160,5 +161,5 @@ def _sample_group(hand: HandArrays, group: int, params: FieldParams) -> dict[str
         "bin": bins,
         "normal": normal,
         "posture": posture.numpy()[chosen],
-        "clear": np.float32(len(good) / postures),
+        "clear": np.asarray(len(good) / postures, np.float32),
     }

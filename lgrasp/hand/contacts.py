@@ -10,7 +10,7 @@ from lgrasp.device.runtime import KERNEL_OPTIONS, start
 from lgrasp.errors import HandError
 from lgrasp.hand.spec import Cone, HandSpec
 
-__all__ = ["ContactPoints", "LinkGrid", "check_contact_links", "cover_patches", "finger_points", "link_grid", "palm_points"]
+__all__ = ["LinkGrid", "check_contact_links", "cover_patches", "finger_points", "link_grid", "palm_points"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -19,17 +19,6 @@ _GRID_PAD = 6.0e-3
 _POINTS_PER_LINK = 600
 _PATCH_RADIUS = 0.010
 _PATCH_CONE = np.radians(36.0)
-
-
-@dataclass(frozen=True)
-class ContactPoints:
-    """Surface points that may touch, in body frames."""
-
-    points: np.ndarray  # (N, 3) [m]
-    normals: np.ndarray  # (N, 3) outward
-    body: np.ndarray  # (N,) i32
-    link: np.ndarray  # (N,) i32
-    patch: np.ndarray  # (N,) i32
 
 
 @dataclass(frozen=True)
@@ -80,7 +69,7 @@ def _in_cone(normals: np.ndarray, cone: Cone) -> np.ndarray:
 
 def _sample(mesh: trimesh.Trimesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     count = 8 * _POINTS_PER_LINK
-    points, faces = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))[:2]
     return points, mesh.face_normals[faces]
 
 

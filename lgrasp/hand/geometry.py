@@ -123,7 +123,7 @@ def convex_piece(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> Piece
 
 
 def inner_spheres(piece: Piece, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Spheres (n <= count, 4) (centre, radius) inside a piece that cover its volume greedily, largest gain first [m]."""
+    """Spheres (n <= count, 4) (centre, radius) [m] inside a piece, covering its volume greedily, largest gain first."""
     if not len(piece.planes):
         a, b = piece.vertices[0], piece.vertices[-1]
         steps = max(1, int(np.ceil(np.linalg.norm(b - a) / (0.5 * piece.radius))) + 1)
@@ -154,7 +154,7 @@ def surface_samples(mesh: trimesh.Trimesh, spacing: float, rng: np.random.Genera
     """Points (n, 3) on a mesh no farther apart than about ``spacing`` [m], sharp vertices included."""
     area = float(mesh.area)
     n = int(np.clip(4 * area / spacing**2, 64, 20000))
-    points, _ = trimesh.sample.sample_surface(mesh, n, seed=int(rng.integers(2**31)))
+    points = trimesh.sample.sample_surface(mesh, n, seed=int(rng.integers(2**31)))[0]
     cell = np.floor(points / spacing).astype(np.int64)
     _, first = np.unique(cell, axis=0, return_index=True)
     hull = mesh.convex_hull

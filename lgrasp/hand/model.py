@@ -4,6 +4,7 @@ import hashlib
 import json
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -106,12 +107,12 @@ class HandModel:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> "HandModel":
-        text = json.loads(bytes(arrays["text"]))
-        tree_text = {k: tuple(v) if isinstance(v, list) else v for k, v in text.pop("tree").items()}
-        tree = {k.removeprefix("tree."): v for k, v in arrays.items() if k.startswith("tree.")}
+        text: dict[str, Any] = json.loads(bytes(arrays["text"]))
+        tree: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in text.pop("tree").items()}
+        tree |= {k.removeprefix("tree."): v for k, v in arrays.items() if k.startswith("tree.")}
         own = {k: v for k, v in arrays.items() if not k.startswith("tree.") and k != "text"}
         text["notes"] = tuple(text["notes"])
-        return cls(tree=Tree(**tree, **tree_text), **own, **text)
+        return cls(tree=Tree(**tree), **own, **text)
 
 
 def hand_digest(urdf_path: Path, spec: HandSpec) -> str:
@@ -133,7 +134,7 @@ def _csr(counts: list[int]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
 
 
-def _stack(parts: list[np.ndarray], width: int, dtype=np.float32) -> np.ndarray:
+def _stack(parts: list[np.ndarray], width: int, dtype: type = np.float32) -> np.ndarray:
     return np.vstack(parts).astype(dtype) if parts else np.zeros((0, width), dtype)
 
 
@@ -202,7 +203,7 @@ def _check_size(spec: HandSpec, tree: Tree) -> None:
 
 
 def _clusters(samples: list[np.ndarray]) -> dict[str, np.ndarray]:
-    """Surface samples of each body in compact runs of CLUSTER_SIZE (the last run padded by repeats), with bounding balls."""
+    """Surface samples of each body in compact runs of CLUSTER_SIZE (last one padded by repeats), with their balls."""
     runs = []
     for points in samples:
         points = np.resize(points, (-(-len(points) // CLUSTER_SIZE) * CLUSTER_SIZE, 3))

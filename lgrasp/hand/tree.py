@@ -203,6 +203,7 @@ def _limits(
     for j in actuated:
         if lower[j.name] >= upper[j.name]:
             raise HandError(
-                f"hand '{spec.name}': joint '{j.name}' has no room left: the limits of its mimic joints exclude each other"
+                f"hand '{spec.name}': joint '{j.name}' has no room left; the limits of the joints that mimic it "
+                "exclude each other"
             )
     return np.array([lower[j.name] for j in actuated]), np.array([upper[j.name] for j in actuated])
