@@ -6,7 +6,7 @@ from lgrasp.clusters import CLUSTER_SIZE
 from lgrasp.device.convex import point_depth
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.device.sdf import sdf_value
-from lgrasp.hand.arrays import Hand
+from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.object.arrays import Object
 
 __all__ = ["body_clear", "body_depth"]
@@ -63,10 +63,17 @@ def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: 
         if wp.dot(d, d) < reach * reach:
             p = wp.transform_point(T_body, c)
             for piece in range(first, end):
-                if point_depth(hand.pieces, piece, p) < s[3]:
+                grid = hand.piece_grid[piece]
+                if grid >= 0:
+                    # one lookup in the link's distance grid is cheaper than a hull's planes, and true to the link's shape
+                    sdf = hand_grid(hand.contacts, grid)
+                    if sdf_value(sdf, p) < s[3]:
+                        for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+                            depth = wp.max(depth, -sdf_value(sdf, wp.transform_point(T_body, obj.obstacles[i])))
+                elif point_depth(hand.pieces, piece, p) < s[3]:
                     for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
                         q = wp.transform_point(T_body, obj.obstacles[i])
                         depth = wp.max(depth, -point_depth(hand.pieces, piece, q))
-                    if depth > limit:
-                        return depth
+                if depth > limit:
+                    return depth
     return depth
