@@ -7,7 +7,7 @@ import warp as wp
 
 from lgrasp.device.transforms import tangent
 
-__all__ = ["MAX_CONTACTS", "balance", "vec6", "wrench"]
+__all__ = ["MAX_CONTACTS", "balance", "frictionless", "vec6", "wrench"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -21,6 +21,9 @@ vec8 = wp.types.vector(_CORRAL, wp.float32)
 mat8 = wp.types.matrix((_CORRAL, _CORRAL), wp.float32)
 mat86 = wp.types.matrix((_CORRAL, 6), wp.float32)
 mat83 = wp.types.matrix((_CORRAL, 3), wp.float32)
+mat63 = wp.types.matrix((MAX_CONTACTS, 3), wp.float32)
+mat_gram = wp.types.matrix((MAX_CONTACTS, MAX_CONTACTS), wp.float32)
+vec_share = wp.types.vector(MAX_CONTACTS, wp.float32)
 
 
 @wp.func
@@ -219,3 +222,78 @@ def balance(
         i = int(owner[j])
         forces[i] = forces[i] + wp.vec3(F[j, 0], F[j, 1], F[j, 2]) * (w[j] / total)
     return wp.sqrt(norm2)
+
+
+@wp.func
+def frictionless(points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), k: wp.int32, torque_scale: wp.float32):
+    """FSWO (eq. 1) by active sets on the k x k Gram matrix, for the inner loop of the search.
+
+    The full-support solution is exact when all its shares are positive. Otherwise the smallest share is dropped and the
+    rest solved again, which gives a feasible point, so an upper bound: good enough to steer, and never accepted since a
+    contact without force is not.
+
+    Returns:
+        (least norm, smallest share of the normal force; 0 when a contact was dropped).
+    """
+    centroid = wp.vec3(0.0)
+    for i in range(k):
+        centroid = centroid + points[i]
+    centroid = centroid / float(k)
+    G = mat_gram()
+    W = mat63()
+    trace = float(0.0)
+    for i in range(k):
+        t = wp.cross(points[i] - centroid, normals[i]) * torque_scale
+        W[i] = t
+        for j in range(i + 1):
+            g = wp.dot(normals[i], normals[j]) + wp.dot(t, W[j])
+            G[i, j] = g
+            G[j, i] = g
+        trace += G[i, i]
+    eps = 1.0e-6 * trace / float(k)
+    active = vec_share()
+    for i in range(k):
+        active[i] = 1.0
+    least = float(0.0)
+    value = float(0.0)
+    for _drop in range(k):
+        # Cholesky of the active block; inactive rows are identity
+        L = mat_gram()
+        z = vec_share()
+        for i in range(k):
+            if active[i] > 0.0:
+                for j in range(i + 1):
+                    if active[j] > 0.0:
+                        s = G[i, j]
+                        for c in range(j):
+                            s -= L[i, c] * L[j, c]
+                        if i == j:
+                            L[i, i] = wp.sqrt(wp.max(s + eps, eps * 0.01))
+                        else:
+                            L[i, j] = s / L[j, j]
+                s = float(1.0)
+                for c in range(i):
+                    s -= L[i, c] * z[c]
+                z[i] = s / L[i, i]
+        total = float(0.0)
+        low = float(1.0e30)
+        drop = int(0)
+        for b in range(k):
+            i = k - 1 - b
+            if active[i] > 0.0:
+                s = z[i]
+                for c in range(i + 1, k):
+                    if active[c] > 0.0:
+                        s -= L[c, i] * z[c]
+                z[i] = s / L[i, i]
+                total += z[i]
+                if z[i] < low:
+                    low = z[i]
+                    drop = i
+        value = 1.0 / wp.max(total, 1.0e-12)
+        if low >= 0.0:
+            if _drop == 0:
+                least = low * value
+            break
+        active[drop] = 0.0
+    return wp.vec2(wp.sqrt(wp.max(value - eps, 0.0)), least)

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _RES = 8
 NORMAL_BINS = _RES * _RES
-"""Octahedral bins of the unit sphere, about 14 degrees in half-angle."""
+"""Octahedral bins of the unit sphere; a bin reaches 10 to 28 degrees from its middle."""
 
 _R = wp.constant(_RES)
 
@@ -50,15 +50,6 @@ def normal_bin(n: wp.vec3):
 
 
 @wp.func
-def encode_normal(n: wp.vec3):
-    """Unit vector -> 16 bits (octahedral, 8 + 8), error below 0.6 degrees."""
-    e = octahedral(n)
-    i = wp.clamp(int((e[0] + 1.0) * 127.5 + 0.5), 0, 255)
-    j = wp.clamp(int((e[1] + 1.0) * 127.5 + 0.5), 0, 255)
-    return i * 256 + j
-
-
-@wp.func
 def decode_normal(code: wp.int32):
     """Inverse of :func:`encode_normal`."""
     u = float(code // 256) / 127.5 - 1.0
@@ -73,10 +64,32 @@ def decode_normal(code: wp.int32):
 
 
 @wp.func
+def encode_normal(n: wp.vec3):
+    """Unit vector -> 16 bits (octahedral, 8 + 8), the nearest of the four codes around it; error below 0.65 degrees."""
+    e = octahedral(n)
+    i = wp.clamp(int((e[0] + 1.0) * 127.5), 0, 254)
+    j = wp.clamp(int((e[1] + 1.0) * 127.5), 0, 254)
+    best = i * 256 + j
+    top = wp.dot(decode_normal(best), n)
+    for s in range(1, 4):
+        code = (i + s // 2) * 256 + j + s % 2
+        c = wp.dot(decode_normal(code), n)
+        if c > top:
+            top = c
+            best = code
+    return best
+
+
+@wp.func
 def tangent(n: wp.vec3):
-    """A unit vector orthogonal to unit vector n."""
-    a = wp.vec3(1.0, 0.0, 0.0)
-    if wp.abs(n[0]) > 0.7:
+    """n x (the axis of n's smallest component), normalised: the first edge direction of friction cones."""
+    x = wp.abs(n[0])
+    y = wp.abs(n[1])
+    z = wp.abs(n[2])
+    a = wp.vec3(0.0, 0.0, 1.0)
+    if x <= y and x <= z:
+        a = wp.vec3(1.0, 0.0, 0.0)
+    elif y <= z:
         a = wp.vec3(0.0, 1.0, 0.0)
     return wp.normalize(wp.cross(n, a))
 
@@ -98,7 +111,7 @@ def rotation_between(a: wp.vec3, b: wp.vec3):
     d = wp.dot(a, b)
     axis = wp.cross(a, b)
     q = wp.quat(axis[0], axis[1], axis[2], 1.0 + d)
-    if d < -0.9999:
+    if d < -0.999999:
         t = tangent(a)
         q = wp.quat(t[0], t[1], t[2], 0.0)
     return wp.normalize(q)

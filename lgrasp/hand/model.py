@@ -20,11 +20,11 @@ from lgrasp.hand.urdf import Urdf, read_urdf
 
 __all__ = ["HAND_VERSION", "HandModel", "build_hand", "hand_digest"]
 
-HAND_VERSION = 1
+HAND_VERSION = 2
 """Raised whenever the arrays of a HandModel change meaning."""
 
-_SPHERES_PER_PIECE = 28
-_SAMPLE_SPACING = 3.0e-3
+_SPHERES_PER_PIECE = 12
+_SAMPLE_SPACING = 4.0e-3
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ class IkParams(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    iterations: int = Field(8, ge=1, le=200, description="Damped least-squares steps.")
+    iterations: int = Field(3, ge=1, le=200, description="Damped least-squares steps.")
     lever: float = Field(0.01, gt=0, le=0.1, description="Distance of the second point along the normal.")
     normal_weight: float = Field(0.15, gt=0, le=10, description="Weight of the second point.")
     damping: float = Field(2e-6, gt=0, le=1, description="Damping of the least squares.")

@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.device.kinematics import MAX_JOINTS, group_forward, vec_dof
-from lgrasp.device.qp import MAX_CONTACTS, balance
+from lgrasp.device.qp import MAX_CONTACTS, balance, frictionless
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.clearance import group_pairs_clear
@@ -20,41 +20,41 @@ MAX_KEEP = 64
 
 _KEEP = wp.constant(MAX_KEEP)
 _SLOTS = wp.constant(MAX_GROUPS * MAX_KEEP)
+_INSCRIBED = wp.constant(0.92388)
+"""cos(22.5 deg): the round cone inside an 8-edge cone however the edges are turned."""
 vec_set = wp.types.vector(MAX_GROUPS, wp.int32)
 
 
 @wp.func
-def _load(
-    obj: Object,
-    T: wp.transform,
-    hand: Hand,
-    palm: wp.int32,
-    palm_surface: wp.int32,
-    chosen: vec_set,
-    row: wp.int32,
-    surface: wp.array3d(dtype=wp.int32),
-    arms: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-):
-    """Arms about the centroid and inward object normals (base frame) of a set; returns the number of contacts."""
-    k = int(0)
+def _arms(points: wp.array(dtype=wp.vec3), k: wp.int32, arms: wp.array(dtype=wp.vec3)):
+    """Arms of contact points about their centroid."""
     centroid = wp.vec3(0.0)
-    for g in range(hand.kin.groups):
-        if chosen[g] >= 0:
-            s = surface[row, g, chosen[g]]
-            arms[k] = wp.transform_point(T, obj.contact_points[s])
-            normals[k] = -wp.transform_vector(T, obj.contact_normals[s])
-            centroid = centroid + arms[k]
-            k += 1
-    if palm >= 0:
-        arms[k] = wp.transform_point(T, obj.contact_points[palm_surface])
-        normals[k] = -wp.transform_vector(T, obj.contact_normals[palm_surface])
-        centroid = centroid + arms[k]
-        k += 1
-    centroid = centroid / float(k)
     for i in range(k):
-        arms[i] = arms[i] - centroid
+        centroid = centroid + points[i]
+    for i in range(k):
+        arms[i] = points[i] - centroid / float(k)
     return k
+
+
+@wp.func
+def _score(
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    arms: wp.array(dtype=wp.vec3),
+    forces: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    mu: wp.float32,
+    torque_scale: wp.float32,
+):
+    """(residual norm, smallest share of the normal force): FSWO when mu = 0, else GSWO."""
+    if mu <= 0.0:
+        return frictionless(points, normals, k, torque_scale)
+    _arms(points, k, arms)
+    r = balance(arms, normals, k, mu, 0, torque_scale, 0.0, forces)
+    low = float(1.0)
+    for i in range(k):
+        low = wp.min(low, wp.dot(forces[i], normals[i]))
+    return wp.vec2(r, low)
 
 
 @wp.func
@@ -105,8 +105,6 @@ def search_sets(
     need: wp.int32,
     with_friction: wp.int32,
     index: wp.array(dtype=wp.int32),
-    pose: wp.array(dtype=wp.transform),
-    palm_point: wp.array(dtype=wp.int32),
     palm_surface: wp.array(dtype=wp.int32),
     count: wp.array2d(dtype=wp.int32),
     surface: wp.array3d(dtype=wp.int32),
@@ -135,69 +133,71 @@ def search_sets(
         size[g] = n
         if n > 0:
             usable += 1
-    T = pose[row]
-    palm = palm_point[row]
-    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    # contacts of a set in the object's frame, where wrench residuals are the same: chosen groups first, then the palm
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    owner = vec_set()
     Xa = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     Xb = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     goal = wp.sqrt(threshold)
+    palm = palm_surface[row]
     found = int(0)
     mu = float(0.0)
     if with_friction == 1:
-        mu = friction * 0.92388
+        mu = friction * _INSCRIBED
     for _r in range(restarts):
         k = contacts[wp.min(int(wp.randf(state) * float(contacts.shape[0])), contacts.shape[0] - 1)]
         if k > usable:
             k = usable
-        if k < 2 and palm < 0 or k < 1:
+        if k < 1 or (k < 2 and palm < 0):
             break
         # k random usable groups, a random candidate each
         chosen = vec_set()
         left = usable
-        want = k
+        n = int(0)
         for g in range(G):
             chosen[g] = -1
             if size[g] > 0:
-                if wp.randf(state) * float(left) < float(want):
-                    chosen[g] = alive[g * _KEEP + wp.min(int(wp.randf(state) * float(size[g])), size[g] - 1)]
-                    want -= 1
+                if wp.randf(state) * float(left) < float(k - n):
+                    m = alive[g * _KEEP + wp.min(int(wp.randf(state) * float(size[g])), size[g] - 1)]
+                    chosen[g] = m
+                    owner[n] = g
+                    points[n] = obj.contact_points[surface[row, g, m]]
+                    normals[n] = -obj.contact_normals[surface[row, g, m]]
+                    n += 1
                 left -= 1
-        n = _load(obj, T, hand, palm, palm_surface[row], chosen, row, surface, arms, normals)
-        score = balance(arms, normals, n, mu, 0, torque_scale, 0.0, forces)
+        k = n
+        if palm >= 0:
+            points[n] = obj.contact_points[palm]
+            normals[n] = -obj.contact_normals[palm]
+            n += 1
+        score = _score(points, normals, arms, forces, n, mu, torque_scale)
         for _m in range(moves):
-            low = float(1.0)
-            for i in range(n):
-                low = wp.min(low, wp.dot(forces[i], normals[i]))
-            if score < goal and low >= least_force:
+            if score[0] < goal and score[1] >= least_force:
                 break
-            # replace the contact of one chosen group
-            pick = int(wp.randf(state) * float(k))
-            g = int(0)
-            for h in range(G):
-                if chosen[h] >= 0:
-                    if pick == 0:
-                        g = h
-                    pick -= 1
-            trial = chosen
-            trial[g] = alive[g * _KEEP + wp.min(int(wp.randf(state) * float(size[g])), size[g] - 1)]
-            _load(obj, T, hand, palm, palm_surface[row], trial, row, surface, arms, normals)
-            s = balance(arms, normals, n, mu, 0, torque_scale, 0.0, forces)
-            if s < score or (score < goal and s < goal):
-                chosen = trial
-                score = s
-        _load(obj, T, hand, palm, palm_surface[row], chosen, row, surface, arms, normals)
-        score = balance(arms, normals, n, mu, 0, torque_scale, 0.0, forces)
-        low = float(1.0)
-        for i in range(n):
-            low = wp.min(low, wp.dot(forces[i], normals[i]))
-        if score >= goal or low < least_force:
+            # replace the contact of one chosen group; keep what lowers the residual
+            i = wp.min(int(wp.randf(state) * float(k)), k - 1)
+            g = owner[i]
+            m = alive[g * _KEEP + wp.min(int(wp.randf(state) * float(size[g])), size[g] - 1)]
+            old_point = points[i]
+            old_normal = normals[i]
+            points[i] = obj.contact_points[surface[row, g, m]]
+            normals[i] = -obj.contact_normals[surface[row, g, m]]
+            trial = _score(points, normals, arms, forces, n, mu, torque_scale)
+            if trial[0] < score[0] or (score[0] < goal and trial[0] < goal):
+                score = trial
+                chosen[g] = m
+            else:
+                points[i] = old_point
+                normals[i] = old_normal
+        if score[0] >= goal or score[1] < least_force:
             continue
         if _same_set(hand, chosen, row, 0, found, sets_out, q, separation):
             continue
-        # with friction, on the round cone inscribed in every 8-edge cone
-        if balance(arms, normals, n, friction * 0.92388, 0, torque_scale, 0.5 * balanced, forces) > balanced:
+        _arms(points, n, arms)
+        if balance(arms, normals, n, friction * _INSCRIBED, 0, torque_scale, 0.5 * balanced, forces) > balanced:
             continue
         clear = int(1)
         if need == 1:
@@ -213,7 +213,7 @@ def search_sets(
             continue
         for g in range(G):
             sets_out[row, found, g] = chosen[g]
-        score_out[row, found] = score
+        score_out[row, found] = score[0]
         found += 1
         if found == per_pose:
             break

@@ -55,8 +55,6 @@ def run(
             int(realised),
             int(params.score == "gswo"),
             poses.index,
-            poses.pose,
-            poses.palm_point,
             poses.palm_surface,
             inputs.count,
             inputs.surface,
