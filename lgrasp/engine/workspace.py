@@ -4,7 +4,8 @@ import hashlib
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as with_default
 from pathlib import Path
 
 from lgrasp.device.runtime import Device
@@ -21,7 +22,18 @@ from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel, preprocess_object
 from lgrasp.object.params import ObjectParams
 
-__all__ = ["OBJECT_VERSION", "Inputs", "InputKeys", "input_keys", "load_field", "load_hand", "load_inputs", "load_object"]
+__all__ = [
+    "OBJECT_VERSION",
+    "InputKeys",
+    "Inputs",
+    "input_keys",
+    "load_field",
+    "load_hand",
+    "load_inputs",
+    "load_object",
+    "object_key",
+    "run_key",
+]
 
 OBJECT_VERSION = 1
 """Raised whenever preprocessing gives other arrays."""
@@ -49,8 +61,8 @@ class Inputs:
     field: FieldArrays
     keys: InputKeys
     device: Device
-    seconds: dict[str, float] = field(default_factory=dict)
-    hits: dict[str, bool] = field(default_factory=dict)
+    seconds: dict[str, float] = with_default(default_factory=dict)
+    hits: dict[str, bool] = with_default(default_factory=dict)
 
 
 def input_keys(hand: str, mesh: str | None, scale: float, objects: ObjectParams, fields: FieldParams) -> InputKeys:
@@ -63,17 +75,23 @@ def input_keys(hand: str, mesh: str | None, scale: float, objects: ObjectParams,
     digest = hand_digest(source.urdf, source.spec)
     hand_key = content_key("hand", HAND_VERSION, content=digest)
     field_key = content_key("field", FIELD_VERSION, hand=hand_key, params=fields.model_dump(mode="json"))
-    path, object_key = None, ""
-    if mesh is not None:
-        path = find_object(mesh)
-        try:
-            content = hashlib.sha256(path.read_bytes()).hexdigest()
-        except OSError as error:
-            raise ObjectError(f"object {path} cannot be read: {error.strerror}") from None
-        object_key = content_key(
-            "object", OBJECT_VERSION, content=content, name=path.name, scale=scale, params=objects.model_dump(mode="json")
-        )
-    return InputKeys(source, path, hand_key, object_key, field_key)
+    path, key = (None, "") if mesh is None else object_key(mesh, scale, objects)
+    return InputKeys(source, path, hand_key, key, field_key)
+
+
+def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str]:
+    """File and content key of an object.
+
+    Raises:
+        ObjectError: see :func:`find_object`; also a file that cannot be read.
+    """
+    path = find_object(mesh)
+    try:
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ObjectError(f"object {path} cannot be read: {error.strerror}") from None
+    described = params.model_dump(mode="json")
+    return path, content_key("object", OBJECT_VERSION, content=content, name=path.name, scale=scale, params=described)
 
 
 def load_hand(cache: Cache, keys: InputKeys) -> tuple[HandModel, bool]:
@@ -82,15 +100,13 @@ def load_hand(cache: Cache, keys: InputKeys) -> tuple[HandModel, bool]:
     return HandModel.from_arrays(arrays), hit
 
 
-def load_object(cache: Cache, keys: InputKeys, scale: float, params: ObjectParams, device: Device) -> tuple[ObjectModel, bool]:
+def load_object(cache: Cache, mesh: Path, key: str, scale: float, params: ObjectParams) -> tuple[ObjectModel, bool]:
     """The ObjectModel from the cache, or preprocessed and cached; and whether it was a hit."""
-    assert keys.mesh is not None
-    mesh = keys.mesh
 
     def make():
         return preprocess_object(mesh, scale=scale, params=params, device="cpu").to_arrays()
 
-    arrays, hit = cache.get("object", keys.object, make)
+    arrays, hit = cache.get("object", key, make)
     return ObjectModel.from_arrays(arrays), hit
 
 
@@ -122,13 +138,15 @@ def load_inputs(
         seconds[name] = time.perf_counter() - start
         return model
 
+    assert keys.mesh is not None
+    mesh = keys.mesh
     hand_model = timed("hand", lambda: load_hand(cache, keys))
-    object_model = timed("object", lambda: load_object(cache, keys, scale, objects, device))
+    object_model = timed("object", lambda: load_object(cache, mesh, keys.object, scale, objects))
     hand = upload_hand(hand_model, device.alias)
     field_model = timed("field", lambda: load_field(cache, keys, hand, fields, report))
     start = time.perf_counter()
     obj = upload_object(object_model, device.alias)
-    field_arrays = upload_field(field_model, device.alias)
+    field_arrays = upload_field(field_model, hand_model, device.alias)
     seconds["upload"] = time.perf_counter() - start
     return Inputs(hand, obj, field_arrays, keys, device, seconds, hits)
 

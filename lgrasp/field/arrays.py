@@ -9,8 +9,9 @@ from lgrasp.device.kinematics import Kinematics, vec_dof
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.device.transforms import decode_normal, normal_bin
 from lgrasp.field.model import ContactField
+from lgrasp.hand.model import HandModel
 
-__all__ = ["Field", "FieldArrays", "field_has", "field_pick", "field_seed", "upload_field"]
+__all__ = ["Boxes", "Field", "FieldArrays", "boxes_pick", "field_has", "field_pick", "field_seed", "query_field", "upload_field"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -34,17 +35,30 @@ class Field:
     posture: wp.array2d(dtype=wp.uint8)
 
 
+@wp.struct
+class Boxes:
+    """Published index of a ContactField: one bounding-volume hierarchy per patch over its occupied boxes."""
+
+    group_first: wp.array(dtype=wp.int32)  # (G + 1,) patches of each group
+    tree: wp.array(dtype=wp.uint64)  # one wp.Bvh per patch
+    patch_first: wp.array(dtype=wp.int32)
+    leaf_first: wp.array(dtype=wp.int32)
+    leaf_record: wp.array(dtype=wp.int32)
+
+
 @dataclass(frozen=True)
 class FieldArrays:
-    """A contact field and its copy on one device."""
+    """A contact field and its copy on one device; keeps the trees alive."""
 
     model: ContactField
     device: str
     struct: "Field"
+    boxes: "Boxes | None" = None
+    trees: tuple[wp.Bvh, ...] = ()
 
 
-def upload_field(model: ContactField, device: str) -> FieldArrays:
-    """Copy a field to a device."""
+def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArrays:
+    """Copy the field of a hand to a device; trees are built when the field has boxes."""
 
     def put(a: np.ndarray, dtype) -> wp.array:
         return wp.array(np.ascontiguousarray(a), dtype=dtype, device=device)
@@ -61,7 +75,22 @@ def upload_field(model: ContactField, device: str) -> FieldArrays:
     field.offset = put(model.offset, wp.int32)
     field.normal = put(model.normal, wp.uint16)
     field.posture = put(model.posture, wp.uint8)
-    return FieldArrays(model, device, field)
+    if len(model.box) == 0:
+        return FieldArrays(model, device, field)
+    trees, ids = [], []
+    for a, b in zip(model.patch_first[:-1], model.patch_first[1:], strict=True):
+        if a == b:
+            ids.append(0)
+            continue
+        trees.append(wp.Bvh(put(model.box[a:b], wp.vec3), put(model.box[a:b] + np.float32(model.box_edge), wp.vec3)))
+        ids.append(trees[-1].id)
+    boxes = Boxes()
+    boxes.group_first = put(hand.patch_first[:-1], wp.int32)
+    boxes.tree = put(np.array(ids, np.uint64), wp.uint64)
+    boxes.patch_first = put(model.patch_first, wp.int32)
+    boxes.leaf_first = put(model.leaf_first, wp.int32)
+    boxes.leaf_record = put(model.leaf_record, wp.int32)
+    return FieldArrays(model, device, field, boxes, tuple(trees))
 
 
 @wp.func
@@ -119,6 +148,32 @@ def field_pick(f: Field, group: wp.int32, row: wp.int32, p: wp.vec3, n: wp.vec3,
 
 
 @wp.func
+def boxes_pick(b: Boxes, f: Field, group: wp.int32, p: wp.vec3, n: wp.vec3, cosine: wp.float32, state: wp.uint32):
+    """A contact vector of a random patch whose box at p holds a normal within ``cosine`` of n: the best aligned one, or -1."""
+    pick = int(-1)
+    hits = int(0)
+    for patch in range(b.group_first[group], b.group_first[group + 1]):
+        first = b.patch_first[patch]
+        if b.patch_first[patch + 1] > first:
+            query = wp.bvh_query_aabb(b.tree[patch], p, p)
+            leaf = int(0)
+            best = cosine
+            found = int(-1)
+            while wp.bvh_query_next(query, leaf):
+                for i in range(b.leaf_first[first + leaf], b.leaf_first[first + leaf + 1]):
+                    r = b.leaf_record[i]
+                    c = wp.dot(n, decode_normal(int(f.normal[r])))
+                    if c >= best:
+                        best = c
+                        found = r
+            if found >= 0:
+                hits += 1
+                if int(wp.randf(state) * float(hits)) == 0:
+                    pick = found
+    return pick
+
+
+@wp.func
 def field_seed(f: Field, h: Kinematics, group: wp.int32, record: wp.int32):
     """Joint seed of a contact vector [rad or m]."""
     first = h.dof_first[group]
@@ -127,3 +182,68 @@ def field_seed(f: Field, h: Kinematics, group: wp.int32, record: wp.int32):
         low = h.dof_lower[first + d]
         q[d] = low + (h.dof_upper[first + d] - low) * float(int(f.posture[record, d])) / 255.0
     return q
+
+
+@wp.kernel
+def _query_voxels(
+    f: Field,
+    seed: wp.int32,
+    cosine: wp.float32,
+    group: wp.array(dtype=wp.int32),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    record_out: wp.array(dtype=wp.int32),
+):
+    i = wp.tid()
+    record_out[i] = -1
+    row = field_has(f, group[i], point[i], normal[i])
+    if row >= 0:
+        pick = field_pick(f, group[i], row, point[i], normal[i], wp.rand_init(seed, i))
+        if float(pick[1]) * 0.0001 >= cosine:
+            record_out[i] = pick[0]
+
+
+@wp.kernel
+def _query_boxes(
+    b: Boxes,
+    f: Field,
+    seed: wp.int32,
+    cosine: wp.float32,
+    group: wp.array(dtype=wp.int32),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    record_out: wp.array(dtype=wp.int32),
+):
+    i = wp.tid()
+    record_out[i] = boxes_pick(b, f, group[i], point[i], normal[i], cosine, wp.rand_init(seed, i))
+
+
+def query_field(
+    field: FieldArrays, group: np.ndarray, point: np.ndarray, normal: np.ndarray, *, angle: float, index: str = "voxel", seed: int = 0
+) -> np.ndarray:
+    """Which contact vector of its group meets each query? One interface for both indices.
+
+    Args:
+        group: (N,). point: base frame [m], (N, 3). normal: unit hand normal wanted, (N, 3).
+        angle: largest angle between wanted and found normal [rad].
+        index: ``voxel``, or ``bvh`` for a field that was built with it.
+
+    Returns:
+        Row of the field, -1 where none, (N,) i32.
+    """
+    d = field.device
+    out = wp.empty(len(point), dtype=wp.int32, device=d)
+    queries = [
+        seed,
+        float(np.cos(angle)),
+        wp.array(np.asarray(group, np.int32), dtype=wp.int32, device=d),
+        wp.array(np.asarray(point, np.float32), dtype=wp.vec3, device=d),
+        wp.array(np.asarray(normal, np.float32), dtype=wp.vec3, device=d),
+    ]
+    if index == "bvh":
+        if field.boxes is None:
+            raise ValueError("the field has no boxes; build it with index 'bvh'")
+        wp.launch(_query_boxes, len(point), [field.boxes, field.struct, *queries], [out], device=d)
+    else:
+        wp.launch(_query_voxels, len(point), [field.struct, *queries], [out], device=d)
+    return out.numpy()

@@ -9,13 +9,14 @@ import warp as wp
 
 from lgrasp.device.transforms import NORMAL_BINS
 from lgrasp.errors import HandError
+from lgrasp.field.boxes import box_index
 from lgrasp.field.kernels import contact_vectors, sample_postures
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays
 
 __all__ = ["FIELD_VERSION", "ContactField", "build_field"]
 
-FIELD_VERSION = 1
+FIELD_VERSION = 2
 """Raised whenever the arrays of a ContactField change meaning."""
 
 _CLEARANCE = 5.0e-4  # [m] postures of the field keep this distance to the palm
@@ -41,6 +42,12 @@ class ContactField:
     normal: np.ndarray  # (N,) u16 octahedral hand normal
     posture: np.ndarray  # (N, D) u8 joint seed, share of each joint's range
     clear_share: np.ndarray  # (G,) share of uniform postures clear of the palm
+    # the published index, empty unless asked for: per patch the occupied boxes, per box the vectors in it
+    box_edge: float  # [m]
+    patch_first: np.ndarray  # (patches + 1,) i32 boxes of each patch
+    box: np.ndarray  # (boxes, 3) f32 lowest corner [m]
+    leaf_first: np.ndarray  # (boxes + 1,) i32
+    leaf_record: np.ndarray  # (leaves,) i32 rows of the vectors
 
     @property
     def vectors(self) -> int:
@@ -56,7 +63,8 @@ class ContactField:
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> "ContactField":
         values: dict[str, Any] = {f.name: arrays[f.name] for f in fields(cls)}
-        return cls(**values | {"hand_sha256": str(values["hand_sha256"]), "cell": float(values["cell"])})
+        scalars = {"cell": float(values["cell"]), "box_edge": float(values["box_edge"])}
+        return cls(**values | {"hand_sha256": str(values["hand_sha256"]), **scalars})
 
 
 def build_field(
@@ -101,6 +109,8 @@ def build_field(
     def gather(name: str, dtype) -> np.ndarray:
         return np.concatenate([p[name] for p in parts])[order].astype(dtype)
 
+    position, point = gather("position", np.float32), gather("point", np.int32)
+    boxes = box_index(position, hand.model.contact_patch[point], hand.model.patches, params)
     return ContactField(
         hand_sha256=hand.model.sha256,
         cell=cell,
@@ -109,11 +119,12 @@ def build_field(
         cell_first=np.concatenate([[0], np.cumsum([s.prod() for s in shapes])]).astype(np.int32),
         start=start.astype(np.int32),
         mask=mask,
-        point=gather("point", np.int32),
+        point=point,
         offset=gather("offset", np.int32),
         normal=gather("normal", np.uint16),
         posture=gather("posture", np.uint8),
         clear_share=np.array([p["clear"] for p in parts], np.float32),
+        **boxes,
     )
 
 

@@ -86,6 +86,17 @@ class HandModel:
         return self.tree.groups
 
     @property
+    def patches(self) -> int:
+        """Contact patches of fingers and palm; those of group g are consecutive."""
+        return int(self.contact_patch.max()) + 1
+
+    @property
+    def patch_first(self) -> np.ndarray:
+        """(G + 2,) i32: first patch of each group, palm last."""
+        firsts = [self.contact_patch[a:b] for a, b in zip(self.contact_first[:-1], self.contact_first[1:], strict=True)]
+        return np.concatenate([[0], np.cumsum([len(np.unique(p)) for p in firsts])]).astype(np.int32)
+
+    @property
     def dofs(self) -> int:
         return len(self.tree.joint_names)
 

@@ -7,7 +7,7 @@ import warp as wp
 from lgrasp.device.kinematics import vec_dof
 from lgrasp.grasp.context import Context
 from lgrasp.grasp.tables import CandidateTable, PoseTable
-from lgrasp.stages.domain.kernels import draw_domains
+from lgrasp.stages.domain.kernels import draw_domains, draw_domains_bvh
 from lgrasp.stages.domain.params import DomainParams
 
 __all__ = ["VERSION", "run"]
@@ -25,12 +25,14 @@ def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[Cand
     count = wp.zeros((n, groups), dtype=wp.int32, device=d)
     surface, record = (wp.empty((n, groups, params.keep), dtype=wp.int32, device=d) for _ in range(2))
     q = wp.empty((n, groups, params.keep), dtype=vec_dof, device=d)
+    boxes = context.field.boxes
     wp.launch(
-        draw_domains,
+        draw_domains if boxes is None else draw_domains_bvh,
         dim=(n, groups),
         inputs=[
             context.hand.struct,
             context.field.struct,
+            *([] if boxes is None else [boxes]),
             context.object.struct,
             context.seed("domain"),
             params.attempts,

@@ -17,5 +17,5 @@ class IkParams(BaseModel):
     step: float = Field(0.3, gt=0, le=3, description="Largest joint change in one step [rad or m].")
     gap: float = Field(0.001, gt=0, le=0.01, description="Largest distance of finger and object at the contact.")
     angle: float = Field(15.0, gt=0, le=60, description="Largest angle of the normals at the contact [deg].")
-    slack: float = Field(0.001, ge=0, le=0.01, description="Penetration of inner spheres that is forgiven.")
+    slack: float = Field(0.0005, ge=0, le=0.01, description="Penetration of inner spheres that is forgiven.")
     clearance: bool = Field(True, description="Also require the whole finger to be clear of the object.")
