@@ -3,6 +3,7 @@
 import warp as wp
 
 from lgrasp.device.qp import vec6
+from lgrasp.device.transforms import tangent
 
 __all__ = ["epsilon_bound"]
 
@@ -52,10 +53,7 @@ def epsilon_bound(
     cones = wp.zeros(shape=(48,), dtype=wp.vec3)
     for i in range(k):
         n = normals[i]
-        a = wp.vec3(1.0, 0.0, 0.0)
-        if wp.abs(n[0]) > 0.7:
-            a = wp.vec3(0.0, 1.0, 0.0)
-        t = wp.normalize(wp.cross(n, a))
+        t = tangent(n)
         b = wp.cross(n, t)
         for e in range(8):
             angle = 0.78539816 * float(e)
