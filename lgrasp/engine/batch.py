@@ -39,7 +39,9 @@ class _Meter:
         return table
 
 
-def run_stages(pipeline: Pipeline, context: Context, first: int, count: int, last: str, meter: _Meter | None = None) -> Any:
+def run_stages(
+    pipeline: Pipeline, context: Context, first: int, count: int, last: str, meter: _Meter | None = None
+) -> Any:
     """The table of stage ``last`` for candidates ``first .. first + count - 1``, all stages before it included."""
     meter = meter or _Meter()
     table: Any = (first, count)
@@ -59,22 +61,23 @@ def _realised(pipeline: Pipeline) -> bool:
 def run_batch(pipeline: Pipeline, context: Context, first: int, count: int, bank: Bank | None = None) -> BatchResult:
     """Grasps of candidates ``first .. first + count - 1`` of a shard's stream.
 
-    A pure function of its arguments: cutting the stream into other batches gives the same rows in the same order, as
-    long as there is one pass. Later passes search the same candidates again, best-yielding poses first.
+    A pure function of its arguments, and of the batch alone: cutting the stream into other batches gives the same rows
+    in the same order, as long as there is one pass. Later passes search the batch's candidates again, best-yielding
+    poses first, so with several passes the order of the rows depends on the cut.
 
     Args:
         bank: where the candidates before search are kept between runs; None keeps nothing.
     """
     meter = _Meter()
     before_search = pipeline.order[pipeline.order.index("search") - 1]
-    candidates = bank.load(first, count) if bank else None
-    if candidates is None:
-        candidates = run_stages(pipeline, context, first, count, before_search, meter)
+    banked = bank.load(first, count) if bank else None
+    if banked:
+        table, meter.counts = banked
+    else:
+        table = run_stages(pipeline, context, first, count, before_search, meter)
         if bank:
-            bank.store(first, count, candidates, meter.counts)
-    elif bank:
-        meter.counts = bank.counts(first, count)
-    parts, table = [], candidates
+            bank.store(first, count, table, meter.counts)
+    parts = []
     for salt in range(pipeline.params("search").passes):
         sets = meter.run("search", table, pipeline, context, realised=_realised(pipeline), salt=salt)
         grasps = _finish(sets, pipeline, context, meter)

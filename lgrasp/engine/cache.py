@@ -45,10 +45,19 @@ class Cache:
     Args:
         root: the folder; the platform's user cache folder when None.
         warn: called with one line when an entry is damaged or the folder cannot be written.
+        fresh: find nothing but what this object stored itself, so that everything is made anew.
     """
 
-    def __init__(self, root: str | os.PathLike[str] | None = None, warn: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self,
+        root: str | os.PathLike[str] | None = None,
+        warn: Callable[[str], None] | None = None,
+        *,
+        fresh: bool = False,
+    ) -> None:
         self.root = cache_dir(root)
+        self._fresh = fresh
+        self._stored: set[Path] = set()
         self._warn = warn or (lambda line: None)
         if self.root.exists() and not self.root.is_dir():
             raise CacheError(f"cache folder {self.root} is a file; name a folder with --cache-dir or LGRASP_CACHE_DIR")
@@ -59,11 +68,14 @@ class Cache:
 
     def has(self, kind: str, key: str) -> bool:
         """Is there an entry? (It may still turn out damaged on loading.)"""
-        return self.path(kind, key).is_file()
+        path = self.path(kind, key)
+        return path.is_file() and (not self._fresh or path in self._stored)
 
     def load(self, kind: str, key: str) -> dict[str, np.ndarray] | None:
         """Arrays of an artifact, or None when it is absent or damaged (which is said)."""
         path = self.path(kind, key)
+        if not self.has(kind, key):
+            return None
         try:
             data = path.read_bytes()
         except FileNotFoundError:
@@ -79,17 +91,20 @@ class Cache:
             return None
 
     def store(self, kind: str, key: str, arrays: dict[str, np.ndarray]) -> None:
-        """Write an artifact: unique temporary name, fsync, rename. A cache that cannot be written is said, not fatal."""
+        """Write an artifact: unique temporary name, fsync, rename. A folder that cannot be written is no error."""
         path = self.path(kind, key)
         name = ""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{key[:16]}.", suffix=".tmp", delete=False) as file:
+            with tempfile.NamedTemporaryFile(
+                dir=path.parent, prefix=f".{key[:16]}.", suffix=".tmp", delete=False
+            ) as file:
                 name = file.name
                 np.savez(file, allow_pickle=False, **arrays)
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(name, path)
+            self._stored.add(path)
         except OSError as error:
             if name:
                 Path(name).unlink(missing_ok=True)

@@ -2,8 +2,8 @@
 
 import os
 import re
+import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,14 @@ import numpy as np
 from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, ShardReader, write_shard
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import Execution, ShardResult, make_shard
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
 from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
-from lgrasp.grasp.tables import GraspTable
+from lgrasp.grasp.tables import GraspTable, take_grasps
 
-__all__ = ["Job", "Listener", "Outcome", "generate", "job_shards", "shard_path"]
+__all__ = ["Job", "Listener", "Outcome", "check_folder", "generate", "job_shards", "present_rows", "shard_path"]
 
 METRIC_UNITS = {"penetration": "m", "self_penetration": "m", "gap": "m", "normal_error": "rad"}
 
@@ -74,10 +75,11 @@ class Outcome:
     rows: int  # rows on disk of this job's shards
     made: int  # rows made by this call
     present: int  # rows found on disk
-    results: list[ShardResult]
+    results: list[ShardResult]  # without their grasps, which are in the shards
     wall: float  # whole call [s]
     starved: bool
     cancelled: bool = False
+    written: list[Path] = field(default_factory=list)  # shards made by this call
 
 
 def job_shards(job: Job) -> list[tuple[int, int]]:
@@ -117,11 +119,15 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     pipeline = job.pipeline
     keys = input_keys(job.hand, job.object, job.scale, pipeline.object, pipeline.field)
     assert keys.mesh is not None
-    _check_folder(job.out)
+    check_folder(job.out)
     key = run_key(pipeline.describe(), keys, job.shard_rows)
     files = {s: shard_path(job.out, keys.source.name, keys.mesh.stem, s) for s, _ in shards}
-    present = {s: n for s, rows in shards if (n := _present(files[s], key, rows, job.resume)) is not None}
+    present = {s: n for s, rows in shards if (n := present_rows(files[s], key, rows, job.resume)) is not None}
     inputs = load_inputs(job.cache, keys, job.scale, pipeline.object, pipeline.field, device, listener.loading)
+    if len(present) < len(shards):
+        begin = time.perf_counter()
+        load_kernels(device.alias, kernel_modules("lgrasp.stages."), listener.loading)
+        inputs.seconds["kernels"] = time.perf_counter() - begin
     workers = job.workers or (1 if device.is_cuda else os.cpu_count() or 1)
     execution = Execution(workers, job.batch, listener.cancelled)
     listener.started(inputs, [s for s, _ in shards], list(present))
@@ -146,9 +152,11 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
         write_shard(files[shard], _shard(job, inputs, key, shard, result))
         listener.wrote(shard, files[shard], result)
         outcome.paths.append(files[shard])
-        outcome.results.append(result)
+        outcome.written.append(files[shard])
         outcome.rows += len(result.grasps)
         outcome.made += len(result.grasps)
+        result.grasps = take_grasps(result.grasps, slice(0, 0))  # memory must not grow with the shards
+        outcome.results.append(result)
         if result.exhausted:
             outcome.starved = True
             break
@@ -156,17 +164,23 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     return outcome
 
 
-def _check_folder(out: Path) -> None:
+def check_folder(out: Path) -> None:
+    """Could files be written into a folder? It is not made: that is the first shard's business.
+
+    Raises:
+        OutputError: a file is in the way, or the nearest existing folder is read-only.
+    """
+    nearest = next(p for p in (out, *out.absolute().parents) if p.exists() or p.is_symlink())
+    if not nearest.is_dir():
+        raise OutputError(f"output folder {out} cannot be made: {nearest} is a file; choose another with --out")
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".lgrasp-write-test"
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=nearest).close()
     except OSError as error:
-        raise OutputError(f"output folder {out} cannot be written: {error.strerror}; choose another with --out") from None
+        why = error.strerror
+        raise OutputError(f"output folder {out} cannot be written: {why}; choose another with --out") from None
 
 
-def _present(path: Path, key: str, rows: int, resume: bool) -> int | None:
+def present_rows(path: Path, key: str, rows: int, resume: bool) -> int | None:
     """Rows of a shard that is on disk and need not be made; None when it must be made.
 
     Raises:

@@ -53,10 +53,9 @@ class Pipeline(BaseModel):
 
     def with_params(self, stage: str, **changes: Any) -> "Pipeline":
         """A copy with some parameters of one stage replaced and checked."""
-        stages = tuple(
-            (n, parse_model(STAGES[n].params, p.model_dump() | changes, f"pipeline {self.name}, stage {n}") if n == stage else p)
-            for n, p in self.stages
-        )
+        where = f"pipeline {self.name}, stage {stage}"
+        changed = parse_model(STAGES[stage].params, self.params(stage).model_dump() | changes, where)
+        stages = tuple((n, changed if n == stage else p) for n, p in self.stages)
         return self.model_copy(update={"stages": stages})
 
     def describe(self) -> dict[str, Any]:
@@ -91,7 +90,8 @@ def load_pipeline(name: str) -> Pipeline:
     if not path.is_file():
         near = difflib.get_close_matches(name, files, n=1)
         hint = f"did you mean '{near[0]}'? " if near else ""
-        raise ConfigError(f"unknown pipeline '{name}'; {hint}known: {', '.join(files)}, or give the path of a YAML file")
+        known = ", ".join(files)
+        raise ConfigError(f"unknown pipeline '{name}'; {hint}known: {known}, or give the path of a YAML file")
     declared = parse_model(_Declared, read_yaml(path), f"pipeline {path}")
     stages = []
     for entry in declared.stages:

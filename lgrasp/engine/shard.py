@@ -17,7 +17,7 @@ from lgrasp.grasp.context import Context
 from lgrasp.grasp.duplicates import new_rows
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 
-__all__ = ["Execution", "ShardResult", "make_shard"]
+__all__ = ["Execution", "ShardResult", "add_counts", "make_shard"]
 
 _LEAST_EFFORT = 65_536
 _CPU_BATCH = 512
@@ -46,7 +46,8 @@ class ShardResult:
     exhausted: bool = False  # the effort bound was reached before the rows were
 
 
-def _add(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]) -> None:
+def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]) -> None:
+    """Add survivors per stage to a running total."""
     for stage, counts in more.items():
         into = total.setdefault(stage, {})
         for name, value in counts.items():
@@ -100,7 +101,7 @@ def make_shard(
         if result is None:
             result = ShardResult(batch.grasps)
         result.candidates += count
-        _add(result.counts, batch.counts)
+        add_counts(result.counts, batch.counts)
         for stage, seconds in batch.seconds.items():
             result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
         both_pose, both_q = np.vstack([pose, batch.grasps.pose]), np.vstack([q, batch.grasps.q])

@@ -6,7 +6,7 @@ _STEPS = (
     ("place", "tried", "kept", "object poses are blocked by the palm, or no two fingers could oppose each other there"),
     ("domain", "poses", "rich", "too few fingers can reach the object's surface at these poses"),
     ("ik", "tried", "kept", "fingers cannot put their contact surface on the object without hitting it"),
-    ("search", "poses", "yielding", "the contacts within reach do not balance, or the fingers that would hit each other"),
+    ("search", "poses", "yielding", "the contacts within reach do not balance, or the fingers would hit each other"),
     ("filter", "", "kept", "finished grasps collide"),
 )
 

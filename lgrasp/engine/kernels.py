@@ -1,0 +1,46 @@
+"""Compiles (or loads from the kernel cache) what a job is going to launch, before the clock of its stages starts."""
+
+import importlib
+import os
+import pkgutil
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+
+import warp as wp
+
+import lgrasp
+
+__all__ = ["import_all", "kernel_modules", "load_kernels"]
+
+
+def import_all() -> None:
+    """Import every module of lgrasp, so that :func:`kernel_modules` sees them."""
+    for found in pkgutil.walk_packages(lgrasp.__path__, "lgrasp."):
+        if not found.name.startswith("lgrasp._data"):
+            importlib.import_module(found.name)
+
+
+def kernel_modules(prefix: str = "lgrasp.") -> list[str]:
+    """Names of the imported modules below ``prefix`` that hold kernels, sorted."""
+    return sorted(
+        name
+        for name, module in list(sys.modules.items())
+        if name.startswith(prefix)
+        and any(isinstance(x, wp.Kernel) and x.func.__module__ == name for x in vars(module).values())
+    )
+
+
+def load_kernels(device: str, modules: list[str], progress: Callable[[str, float], None] | None = None) -> None:
+    """Compile and load modules for one device, several at a time.
+
+    Args:
+        device: ``cpu`` or ``cuda:N``.
+        progress: called with (module that is ready, share done).
+    """
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
+        waiting = {pool.submit(wp.load_module, name, device): name for name in modules}
+        for done, future in enumerate(as_completed(waiting), 1):
+            future.result()
+            if progress:
+                progress(f"kernels {waiting[future]}", done / len(waiting))

@@ -1,0 +1,95 @@
+"""Options that several commands share, with one wording each."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from lgrasp.engine.cache import Cache
+    from lgrasp.engine.pipeline import Pipeline
+
+__all__ = [
+    "CacheDir",
+    "Device",
+    "Hand",
+    "JsonPath",
+    "Mesh",
+    "PipelineName",
+    "Quiet",
+    "Scale",
+    "Seed",
+    "choose_pipeline",
+    "open_cache",
+    "parse_contacts",
+    "warn",
+]
+
+Hand = Annotated[str, typer.Option("--hand", help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
+Mesh = Annotated[str, typer.Option("--object", "-o", help="Mesh file, or the name of an object.", show_default=False)]
+PipelineName = Annotated[str, typer.Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.")]
+Seed = Annotated[int | None, typer.Option(help="Base seed; default: the pipeline's.", show_default=False)]
+Scale = Annotated[float, typer.Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda:N.")]
+CacheDir = Annotated[
+    Path | None,
+    typer.Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.", show_default=False),
+]
+JsonPath = Annotated[
+    str | None,
+    typer.Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no report; warnings and errors only.")]
+
+
+def warn(line: str) -> None:
+    """Print one warning line on standard error."""
+    typer.echo(f"warning: {line}", err=True)
+
+
+def open_cache(folder: Path | None, *, fresh: bool = False) -> "Cache":
+    """The cache of this command; compiled kernels go to the same folder.
+
+    Args:
+        fresh: make every entry anew.
+    """
+    import os
+
+    if folder is not None:
+        os.environ["LGRASP_CACHE_DIR"] = str(folder.expanduser().absolute())
+    from lgrasp.engine.cache import Cache
+
+    return Cache(folder, warn=warn, fresh=fresh)
+
+
+def parse_contacts(text: str) -> tuple[int, ...]:
+    """``3,3,4`` -> (3, 3, 4).
+
+    Raises:
+        ConfigError: not integers from 2 to 5.
+    """
+    from lgrasp.errors import ConfigError
+
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and 2 <= int(part) <= 5 for part in parts):
+        raise ConfigError(f"--contacts '{text}': give numbers of fingers from 2 to 5, separated by commas, such as 3,4")
+    return tuple(int(part) for part in parts)
+
+
+def choose_pipeline(name: str, seed: int | None = None, contacts: str | None = None) -> "Pipeline":
+    """A pipeline with the seed and the numbers of contacts of the command line.
+
+    Raises:
+        ConfigError: unknown pipeline, or a value out of range.
+    """
+    from lgrasp.engine.pipeline import load_pipeline
+    from lgrasp.errors import ConfigError
+
+    pipeline = load_pipeline(name)
+    if seed is not None:
+        if not 0 <= seed < 2**63:
+            raise ConfigError(f"--seed {seed}: need 0 <= seed < 2^63")
+        pipeline = pipeline.model_copy(update={"seed": seed})
+    if contacts is not None:
+        pipeline = pipeline.with_params("search", contacts=parse_contacts(contacts))
+    return pipeline

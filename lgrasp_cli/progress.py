@@ -1,0 +1,116 @@
+"""While a job runs: progress on standard error, Ctrl-C to stop after the running batch."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from lgrasp.engine.generate import Listener
+from lgrasp.engine.report import survivors
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from lgrasp.engine.shard import ShardResult
+    from lgrasp.engine.workspace import Inputs
+
+__all__ = ["JobProgress", "interruptible", "say"]
+
+_PLAIN_INTERVAL = 10.0  # [s] between lines when standard error is no terminal
+
+
+def say(line: str) -> None:
+    """Print a line of progress on standard error."""
+    typer.echo(line, err=True)
+
+
+class JobProgress(Listener):
+    """Progress of a job: a bar on a terminal, else a plain line every ten seconds, or nothing.
+
+    Args:
+        asked: rows of this job.
+        quiet: show nothing.
+    """
+
+    def __init__(self, asked: int, *, quiet: bool = False) -> None:
+        self.stop = False
+        self.running = False
+        self._asked = asked
+        self._done = 0  # rows of finished shards
+        self._quiet = quiet
+        self._start = self._said = time.monotonic()
+        self._bar: Progress | None = None
+        self._task: Any = None
+
+    def __enter__(self) -> "JobProgress":
+        if not self._quiet and sys.stderr.isatty():
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+            self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True))
+            self._task = self._bar.add_task("loading", total=None, note="")
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def _show(self, what: str, done: int | None, note: str) -> None:
+        if self._bar:
+            total = self._asked if done is not None else None
+            self._bar.update(self._task, description=what, completed=done or 0, total=total, note=note)
+        elif not self._quiet and time.monotonic() - self._said >= _PLAIN_INTERVAL:
+            self._said = time.monotonic()
+            say(f"{what} {note}" if done is None else f"{what} {done:,}/{self._asked:,} {note}")
+
+    def loading(self, what: str, share: float) -> None:
+        self._show("loading", None, f"{what} {share:.0%}" if share else what)
+
+    def started(self, inputs: "Inputs", shards: list[int], present: list[int]) -> None:
+        self.running = True
+        self._start = time.monotonic()
+
+    def present(self, rows: int) -> None:
+        self._done += rows
+
+    def advanced(self, shard: int, rows: int, result: "ShardResult") -> None:
+        per_second = rows / max(time.monotonic() - self._start, 1e-9)
+        flow = "  ".join(f"{stage} {count:,}" for stage, count in survivors(result.counts).items())
+        self._show(f"shard {shard}", self._done + rows, f"{per_second:,.0f}/s  {flow}")
+
+    def wrote(self, shard: int, path: "Path", result: "ShardResult") -> None:
+        self._done += len(result.grasps)
+        self._start = time.monotonic()
+
+    def cancelled(self) -> bool:
+        return self.stop
+
+
+@contextmanager
+def interruptible(progress: JobProgress) -> Iterator[None]:
+    """The first Ctrl-C (or SIGTERM) ends the job after the running batch, the second at once; whole shards stay."""
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        if progress.running and not progress.stop:
+            progress.stop = True
+            say("stopping after the running batch; Ctrl-C again stops at once")
+            return
+        last = threading.Timer(1.0, os._exit, (130,))  # native code may keep the interpreter from ending
+        last.daemon = True
+        last.start()
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,67 @@
+"""Tables on standard output: aligned columns, the same on a terminal and in a file."""
+
+import json
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import typer
+
+__all__ = ["job_report", "print_json", "print_pairs", "print_table"]
+
+
+def print_json(data: Any) -> None:
+    """JSON on standard output."""
+    typer.echo(json.dumps(data, indent=2))
+
+
+def print_pairs(pairs: Iterable[tuple[str, str]]) -> None:
+    """Two columns: what, value."""
+    _print_rows([list(pair) for pair in pairs], ())
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[str] = ()) -> None:
+    """A table with a header line.
+
+    Args:
+        right: columns of numbers.
+    """
+    _print_rows([list(columns), *(list(row) for row in rows)], [i for i, name in enumerate(columns) if name in right])
+
+
+def _print_rows(rows: list[list[str]], right: Sequence[int]) -> None:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = [c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        typer.echo("  ".join(cells).rstrip())
+
+
+def job_report(data: dict[str, Any]) -> list[tuple[str, str]]:
+    """The report of a job as pairs of texts."""
+    seconds, made = data["seconds"], data["made"]
+    stages = list(data["counts"])
+    extra = f" ({data['present']:,} were there)" if data["present"] else ""
+    pairs = [
+        ("grasps", f"{data['grasps']:,} of {data['asked']:,} asked{extra}"),
+        ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
+        ("hand, object", f"{data['hand']}, {data['object']}; pipeline {data['pipeline']}, seed {data['seed']}"),
+        ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it placement through filter"),
+    ]
+    if made:
+        pairs += [
+            ("strict-valid", f"{data['strict_valid_per_s']:,.0f} /s"),
+            ("seed count", f"{data['seed_count_per_s']:,.0f} /s ({data['seed_count']:,})"),
+        ]
+    pairs += [
+        ("survivors", "  ".join(f"{name} {data['survivors'][name]:,}" for name in stages)),
+        ("thread-seconds", "  ".join(f"{name} {seconds[name]:.2f}" for name in stages)),
+        ("loading", "  ".join(f"{n} {seconds[n]:.2f} s" for n in ("hand", "object", "field", "kernels"))),
+        ("near-duplicates", f"{data['near_duplicates']:,}"),
+        ("distinct poses", f"{data['distinct_poses']:,}"),
+        (
+            "peak memory",
+            f"{data['peak_rss_mb']:,.0f} MB"
+            + (f", device {data['peak_device_mb']:,.0f} MB" if data["peak_device_mb"] else ""),
+        ),
+        ("device", data["device"]),
+    ]
+    return pairs
