@@ -9,8 +9,8 @@ __all__ = ["hull_distance", "segment_distance"]
 def hull_distance(a: np.ndarray, b: np.ndarray) -> float:
     """Distance [m] of the convex hulls of points a (n, 3) and b (m, 3); 0 when they overlap.
 
-    The least-norm point of hull(a - b), as non-negative least squares: with homogeneous weights, min |P w|^2 + (1 - sum w)^2
-    has its minimum along the least-norm point.
+    The least-norm point of hull(a - b) by non-negative least squares: with homogeneous weights,
+    min |P w|^2 + (1 - sum w)^2 has its minimum along that point.
     """
     P = (a[:, None] - b[None]).reshape(-1, 3).T  # (3, n m)
     scale = np.abs(P).max()
