@@ -12,7 +12,12 @@ import h5py
 
 from lgrasp.errors import OutputError, ShardError
 
-__all__ = ["find_shards", "new_file", "new_shard_file", "sha256_file"]
+try:
+    import fcntl
+except ImportError:  # Windows: leftovers cannot be told from files being written
+    fcntl = None
+
+__all__ = ["find_shards", "hold_file", "new_file", "new_shard_file", "remove_leftovers", "sha256_file"]
 
 _LIBVER = ("v110", "v110")  # readable since HDF5 1.10; its metadata blocks carry checksums, the older layout's do not
 
@@ -69,7 +74,8 @@ def new_file(path: str | os.PathLike[str]) -> Iterator:
     """A binary file that appears under its name only when the block ends without an error.
 
     The bytes go to a unique ``*.tmp`` in the same folder, which is fsynced and renamed; then the folder is fsynced.
-    Missing parent folders are made. On any error the temporary file is removed.
+    Missing parent folders are made. On any error the temporary file is removed; what a killed process leaves is taken
+    away by :func:`remove_leftovers`.
 
     Raises:
         OutputError: The folder cannot be written or is full.
@@ -79,6 +85,7 @@ def new_file(path: str | os.PathLike[str]) -> Iterator:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "x+b", buffering=0) as file:
+            hold_file(file.fileno())
             yield file
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -106,6 +113,21 @@ def new_shard_file(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
             yield file
         if sink.error is not None:
             raise sink.error
+
+
+def hold_file(descriptor: int) -> None:
+    """Mark an open temporary file as being written, until it is closed or its process ends in any way."""
+    if fcntl:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def remove_leftovers(folder: Path, pattern: str) -> None:
+    """Remove the temporary files that match a glob pattern and that no living process holds."""
+    for path in folder.glob(pattern) if fcntl else ():
+        with suppress(OSError), open(path, "rb") as file:  # gone already, held, or not ours to remove
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink()
 
 
 def _sync_folder(folder: Path) -> None:

@@ -7,14 +7,15 @@ import numpy as np
 
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.stages import STAGES
 from lgrasp.engine.workspace import InputKeys
 from lgrasp.grasp.tables import CandidateTable, candidate_arrays, candidate_table
 
-__all__ = ["BANK_CANDIDATES", "Bank"]
+__all__ = ["BANK_CANDIDATES", "BANK_VERSION", "Bank"]
 
 BANK_CANDIDATES = 1024
 """Candidates of one bank entry; the batch size of a run that keeps banks."""
+BANK_VERSION = 1
+"""Raised whenever the arrays of an entry change meaning; the versions of the stages are in the key too."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Bank:
         described = self.pipeline.describe()["stages"][: self.pipeline.order.index("search")]
         return content_key(
             "bank",
-            max(STAGES[n].version for n in self.pipeline.order),
+            BANK_VERSION,
             stages=described,
             seed=self.pipeline.seed,
             inputs=[self.keys.hand, self.keys.object, self.keys.field],
@@ -43,15 +44,12 @@ class Bank:
     def has(self, first: int, count: int) -> bool:
         return self.cache.has("bank", self.key(first, count))
 
-    def load(self, first: int, count: int) -> CandidateTable | None:
-        """The banked candidates on the device, or None."""
+    def load(self, first: int, count: int) -> tuple[CandidateTable, dict[str, dict[str, int]]] | None:
+        """The banked candidates on the device and the survivors per stage when they were made, or None."""
         arrays = self.cache.load("bank", self.key(first, count))
-        return None if arrays is None else candidate_table(arrays, self.device)
-
-    def counts(self, first: int, count: int) -> dict[str, dict[str, int]]:
-        """Survivors per stage as they were when the entry was made."""
-        arrays = self.cache.load("bank", self.key(first, count))
-        return {} if arrays is None else json.loads(str(arrays["counts"]))
+        if arrays is None:
+            return None
+        return candidate_table(arrays, self.device), json.loads(str(arrays["counts"]))
 
     def store(self, first: int, count: int, table: CandidateTable, counts: dict[str, dict[str, int]]) -> None:
         arrays = candidate_arrays(table) | {"counts": np.asarray(json.dumps(counts))}

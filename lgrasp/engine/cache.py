@@ -5,8 +5,6 @@ import io
 import json
 import os
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lgrasp.dataset.files import hold_file, remove_leftovers
 from lgrasp.errors import CacheError
 from lgrasp.paths import cache_dir
 
@@ -58,8 +57,9 @@ class Cache:
         self.root = cache_dir(root)
         self._fresh = fresh
         self._stored: set[Path] = set()
-        self._warn = warn or (lambda line: None)
-        if self.root.exists() and not self.root.is_dir():
+        self.warn = warn or (lambda line: None)
+        self._writable = True
+        if os.path.exists(self.root) and not os.path.isdir(self.root):
             raise CacheError(f"cache folder {self.root} is a file; name a folder with --cache-dir or LGRASP_CACHE_DIR")
 
     def path(self, kind: str, key: str) -> Path:
@@ -69,7 +69,7 @@ class Cache:
     def has(self, kind: str, key: str) -> bool:
         """Is there an entry? (It may still turn out damaged on loading.)"""
         path = self.path(kind, key)
-        return path.is_file() and (not self._fresh or path in self._stored)
+        return os.path.isfile(path) and (not self._fresh or path in self._stored)
 
     def load(self, kind: str, key: str) -> dict[str, np.ndarray] | None:
         """Arrays of an artifact, or None when it is absent or damaged (which is said)."""
@@ -81,17 +81,22 @@ class Cache:
         except FileNotFoundError:
             return None
         except OSError as error:
-            self._warn(f"cache entry {path} cannot be read ({error.strerror}); it is made anew")
+            self.warn(f"cache entry {path} cannot be read ({error.strerror}); it is made anew")
             return None
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
-        except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError):
-            self._warn(f"cache entry {path} is damaged; it is made anew")
+        except Exception:  # damaged bytes make the readers of zip and npy raise almost anything
+            self.warn(f"cache entry {path} is damaged; it is made anew")
             return None
 
     def store(self, kind: str, key: str, arrays: dict[str, np.ndarray]) -> None:
-        """Write an artifact: unique temporary name, fsync, rename. A folder that cannot be written is no error."""
+        """Write an artifact: unique temporary name, fsync, rename.
+
+        A folder that cannot be written is said once and is no error; nothing more is stored then.
+        """
+        if not self._writable:
+            return
         path = self.path(kind, key)
         name = ""
         try:
@@ -100,15 +105,19 @@ class Cache:
                 dir=path.parent, prefix=f".{key[:16]}.", suffix=".tmp", delete=False
             ) as file:
                 name = file.name
+                hold_file(file.fileno())
                 np.savez(file, allow_pickle=False, **arrays)
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(name, path)
+            name = ""
             self._stored.add(path)
         except OSError as error:
+            self._writable = False
+            self.warn(f"cache folder {self.root} cannot be written ({error.strerror}); going on without it")
+        finally:
             if name:
                 Path(name).unlink(missing_ok=True)
-            self._warn(f"cache folder {self.root} cannot be written ({error.strerror}); going on without it")
 
     def get(self, kind: str, key: str, make: Callable[[], dict[str, np.ndarray]]) -> tuple[dict[str, np.ndarray], bool]:
         """The artifact and whether it was a hit; a miss is made and stored."""
@@ -137,6 +146,5 @@ class Cache:
             if (kinds is None or entry.kind in kinds) and (older_than is None or entry.modified < older_than):
                 entry.path.unlink(missing_ok=True)
                 files, size = files + 1, size + entry.size
-        for left in self.root.glob("*/.*.tmp"):
-            left.unlink(missing_ok=True)
+        remove_leftovers(self.root, "*/.*.tmp")
         return files, size

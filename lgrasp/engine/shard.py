@@ -4,9 +4,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field
-
-import numpy as np
 
 from lgrasp.engine.bank import BANK_CANDIDATES, Bank
 from lgrasp.engine.batch import BatchResult, run_batch
@@ -14,14 +13,15 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.workspace import Inputs
 from lgrasp.grasp.context import Context
-from lgrasp.grasp.duplicates import new_rows
+from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 
-__all__ = ["Execution", "ShardResult", "add_counts", "make_shard"]
+__all__ = ["Execution", "ShardResult", "add_counts", "make_shard", "shard_effort"]
 
 _LEAST_EFFORT = 65_536
 _CPU_BATCH = 512
 _GPU_BATCH = 16_384
+_STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,16 @@ def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]
             into[name] = into.get(name, 0) + value
 
 
-def _batches(pipeline: Pipeline, context: Context, execution: Execution, bank: Bank | None, limit: int) -> Iterator[tuple[int, BatchResult]]:
-    """Results of consecutive batches, in order; ``workers`` of them are worked on at a time."""
-    size = BANK_CANDIDATES if bank else execution.batch or (_GPU_BATCH if context.device != "cpu" else _CPU_BATCH)
+def _batches(
+    pipeline: Pipeline, context: Context, execution: Execution, bank: Bank | None, limit: int
+) -> Iterator[tuple[int, BatchResult]]:
+    """Results of consecutive batches, in order; ``workers`` of them are worked on at a time.
+
+    Closing the generator (or an error in a batch) drops the batches not begun and waits for those that were.
+    """
+    # later passes go over the poses of one batch, so its size decides the order of the rows
+    fixed = bank is not None or pipeline.params("search").passes > 1
+    size = BANK_CANDIDATES if fixed else execution.batch or (_GPU_BATCH if context.device != "cpu" else _CPU_BATCH)
     starts = iter(range(0, limit, size))
     with ThreadPoolExecutor(execution.workers) as pool:
         waiting: deque[tuple[int, Future[BatchResult]]] = deque()
@@ -72,6 +79,12 @@ def _batches(pipeline: Pipeline, context: Context, execution: Execution, bank: B
         finally:
             for _, future in waiting:
                 future.cancel()
+
+
+def shard_effort(pipeline: Pipeline, rows: int) -> int:
+    """Candidates that a shard of ``rows`` rows may try: whole bank entries."""
+    entries = -(-max(_LEAST_EFFORT, rows * pipeline.effort) // BANK_CANDIDATES)
+    return min(entries * BANK_CANDIDATES, _STREAM)
 
 
 def make_shard(
@@ -92,31 +105,29 @@ def make_shard(
     """
     context = Context(inputs.hand, inputs.object, inputs.field, inputs.device.alias, pipeline.seed, shard)
     bank = Bank(bank_cache, pipeline, inputs.keys, shard, inputs.device.alias) if bank_cache else None
-    limit = max(_LEAST_EFFORT, rows * pipeline.effort)
+    limit = shard_effort(pipeline, rows)
     result: ShardResult | None = None
     parts: list[GraspTable] = []
-    pose, q = np.zeros((0, 7), np.float32), np.zeros((0, inputs.hand.model.dofs), np.float32)
+    kept = KeptRows()
+    stopped = False
     start = time.perf_counter()
-    for count, batch in _batches(pipeline, context, execution, bank, limit):
-        if result is None:
-            result = ShardResult(batch.grasps)
-        result.candidates += count
-        add_counts(result.counts, batch.counts)
-        for stage, seconds in batch.seconds.items():
-            result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
-        both_pose, both_q = np.vstack([pose, batch.grasps.pose]), np.vstack([q, batch.grasps.q])
-        fresh = new_rows(both_pose, both_q, len(pose))
-        result.duplicates += int((~fresh).sum())
-        room = rows - len(pose)
-        new = take_grasps(batch.grasps, np.flatnonzero(fresh)[:room])
-        parts.append(new)
-        pose, q = np.vstack([pose, new.pose]), np.vstack([q, new.q])
-        if progress:
-            progress(len(pose), result)
-        if len(pose) >= rows or execution.cancelled():
-            break
+    with closing(_batches(pipeline, context, execution, bank, limit)) as batches:
+        for count, batch in batches:
+            if result is None:
+                result = ShardResult(batch.grasps)
+            result.candidates += count
+            add_counts(result.counts, batch.counts)
+            for stage, seconds in batch.seconds.items():
+                result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
+            new, duplicates = kept.add(batch.grasps.pose, batch.grasps.q, rows - kept.count)
+            result.duplicates += duplicates
+            parts.append(take_grasps(batch.grasps, new))
+            if progress:
+                progress(kept.count, result)
+            if kept.count >= rows or (stopped := execution.cancelled()):
+                break
     assert result is not None
     result.grasps = join_grasps(parts)
     result.wall = time.perf_counter() - start
-    result.exhausted = len(pose) < rows and not execution.cancelled()
+    result.exhausted = kept.count < rows and not stopped
     return result
