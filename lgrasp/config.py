@@ -2,7 +2,7 @@
 
 import difflib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -38,11 +38,29 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
+        errors = error.errors()
+        # a mistyped key is missing under its right name as well; the typing error says more
+        first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
         key = ".".join(str(part) for part in first["loc"]) or "(whole)"
         if first["type"] == "extra_forbidden":
-            name = str(first["loc"][-1])
-            near = difflib.get_close_matches(name, model.model_fields, n=1)
+            name, valid = str(first["loc"][-1]), _keys_at(model, first["loc"][:-1])
+            near = difflib.get_close_matches(name, valid, n=1)
             hint = f"did you mean '{near[0]}'? " if near else ""
-            raise ConfigError(f"{where}: unknown key '{key}'; {hint}valid keys: {', '.join(model.model_fields)}") from None
+            raise ConfigError(f"{where}: unknown key '{key}'; {hint}valid keys: {', '.join(valid)}") from None
+        if first["type"] == "missing":
+            raise ConfigError(f"{where}: key '{key}' is missing") from None
         raise ConfigError(f"{where}: key '{key}' = {first['input']!r}: {first['msg']}") from None
+
+
+def _keys_at(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
+    """Valid keys of the model that a path of keys and list positions leads to."""
+    for part in path:
+        if isinstance(part, str) and part in model.model_fields:
+            kinds = [model.model_fields[part].annotation]
+            while kinds:
+                kind = kinds.pop()
+                if isinstance(kind, type) and issubclass(kind, BaseModel):
+                    model = kind
+                    break
+                kinds += get_args(kind)
+    return list(model.model_fields)

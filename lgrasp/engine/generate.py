@@ -1,26 +1,26 @@
 """The main job: hand + object -> grasp shards in a folder."""
 
 import os
-import re
-import tempfile
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, ShardReader, write_shard
+from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, write_shard
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.folder import check_folder, clean_folder, present_shards, shard_path
 from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.shard import Execution, ShardResult, make_shard
+from lgrasp.engine.shard import Execution, ShardResult, make_shard, shard_effort
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
-from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
+from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.grasp.tables import GraspTable, take_grasps
 
-__all__ = ["Job", "Listener", "Outcome", "check_folder", "generate", "job_shards", "present_rows", "shard_path"]
+__all__ = ["Job", "Listener", "Outcome", "find_present", "generate", "job_shards"]
 
 METRIC_UNITS = {"penetration": "m", "self_penetration": "m", "gap": "m", "normal_error": "rad"}
 
@@ -86,12 +86,14 @@ def job_shards(job: Job) -> list[tuple[int, int]]:
     """(shard, rows) of every shard that this job (array task) makes.
 
     Raises:
-        ConfigError: n, shard rows or array numbers out of range.
+        ConfigError: n, shard rows, workers, batch or array numbers out of range.
     """
     if job.rows <= 0:
         raise ConfigError(f"-n {job.rows}: the number of grasps must be at least 1")
     if job.shard_rows <= 0:
         raise ConfigError(f"--shard-rows {job.shard_rows}: must be at least 1")
+    if job.workers < 0 or job.batch < 0:
+        raise ConfigError(f"--workers {job.workers} --batch {job.batch}: must be at least 0 (0: by device)")
     if job.num_shards <= 0 or not 0 <= job.shard_index < job.num_shards:
         raise ConfigError(f"--shard-index {job.shard_index} --num-shards {job.num_shards}: need 0 <= index < number")
     total = -(-job.rows // job.shard_rows)
@@ -100,10 +102,15 @@ def job_shards(job: Job) -> list[tuple[int, int]]:
     ]
 
 
-def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
-    """File of a shard."""
-    safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{hand}-{name}")
-    return out / f"{safe}-{shard:05d}.h5"
+def find_present(job: Job, files: dict[int, Path], key: str) -> dict[int, int]:
+    """Shards of a job that need not be made, with their numbers of rows.
+
+    Raises:
+        OutputError: see :func:`present_shards`.
+    """
+    if not job.resume:
+        return {}
+    return present_shards(files, dict(job_shards(job)), key, partial(shard_effort, job.pipeline), job.cache.warn)
 
 
 def generate(job: Job, listener: Listener | None = None) -> Outcome:
@@ -122,7 +129,9 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     check_folder(job.out)
     key = run_key(pipeline.describe(), keys, job.shard_rows)
     files = {s: shard_path(job.out, keys.source.name, keys.mesh.stem, s) for s, _ in shards}
-    present = {s: n for s, rows in shards if (n := present_rows(files[s], key, rows, job.resume)) is not None}
+    for path in list(files.values())[:1]:
+        clean_folder(path)
+    present = find_present(job, files, key)
     inputs = load_inputs(job.cache, keys, job.scale, pipeline.object, pipeline.field, device, listener.loading)
     if len(present) < len(shards):
         begin = time.perf_counter()
@@ -134,73 +143,37 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     outcome = Outcome(inputs, [], sum(present.values()), 0, sum(present.values()), [], 0.0, False)
     for shard, rows in shards:
         if shard in present:
-            outcome.paths.append(files[shard])
-            outcome.starved |= present[shard] < rows
-            continue
-        result = make_shard(
-            pipeline,
-            inputs,
-            shard,
-            rows,
-            execution,
-            bank_cache=job.cache if job.reuse else None,
-            progress=lambda found, running, shard=shard: listener.advanced(shard, found, running),
-        )
-        if listener.cancelled() and len(result.grasps) < rows:
-            outcome.cancelled = True
-            break
-        write_shard(files[shard], _shard(job, inputs, key, shard, result))
-        listener.wrote(shard, files[shard], result)
+            found = present[shard]
+        else:
+            if listener.cancelled():
+                outcome.cancelled = True
+                break
+            result = make_shard(
+                pipeline,
+                inputs,
+                shard,
+                rows,
+                execution,
+                bank_cache=job.cache if job.reuse else None,
+                progress=lambda found, running, shard=shard: listener.advanced(shard, found, running),
+            )
+            if result.cancelled:
+                outcome.cancelled = True
+                break
+            write_shard(files[shard], _shard(job, inputs, key, shard, result))
+            listener.wrote(shard, files[shard], result)
+            found = len(result.grasps)
+            outcome.written.append(files[shard])
+            outcome.rows += found
+            outcome.made += found
+            result.grasps = take_grasps(result.grasps, slice(0, 0))  # memory must not grow with the shards
+            outcome.results.append(result)
         outcome.paths.append(files[shard])
-        outcome.written.append(files[shard])
-        outcome.rows += len(result.grasps)
-        outcome.made += len(result.grasps)
-        result.grasps = take_grasps(result.grasps, slice(0, 0))  # memory must not grow with the shards
-        outcome.results.append(result)
-        if result.exhausted:
-            outcome.starved = True
+        outcome.starved |= found < rows
+        if found == 0:  # nor will the next shards give any
             break
     outcome.wall = time.perf_counter() - start
     return outcome
-
-
-def check_folder(out: Path) -> None:
-    """Could files be written into a folder? It is not made: that is the first shard's business.
-
-    Raises:
-        OutputError: a file is in the way, or the nearest existing folder is read-only.
-    """
-    nearest = next(p for p in (out, *out.absolute().parents) if p.exists() or p.is_symlink())
-    if not nearest.is_dir():
-        raise OutputError(f"output folder {out} cannot be made: {nearest} is a file; choose another with --out")
-    try:
-        tempfile.TemporaryFile(dir=nearest).close()
-    except OSError as error:
-        why = error.strerror
-        raise OutputError(f"output folder {out} cannot be written: {why}; choose another with --out") from None
-
-
-def present_rows(path: Path, key: str, rows: int, resume: bool) -> int | None:
-    """Rows of a shard that is on disk and need not be made; None when it must be made.
-
-    Raises:
-        OutputError: the file belongs to another run and resume is on.
-    """
-    if not path.exists() or not resume:
-        return None
-    try:
-        with ShardReader(path) as reader:
-            config = reader.header.config
-            found = len(reader)
-            exhausted = bool(reader.statistics.get("exhausted", 0))
-    except ShardError:
-        return None  # damaged: made anew
-    if config.get("run_key") != key:
-        raise OutputError(
-            f"{path} belongs to another run (other hand, object, pipeline, seed or --shard-rows); "
-            "choose another --out, or --no-resume to replace it"
-        )
-    return found if found == rows or exhausted else None
 
 
 def _shard(job: Job, inputs: Inputs, key: str, shard: int, result: ShardResult) -> Shard:

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.bank import BANK_CANDIDATES, Bank
-from lgrasp.engine.generate import Job, check_folder, job_shards, present_rows, shard_path
+from lgrasp.engine.folder import check_folder, shard_path
+from lgrasp.engine.generate import Job, find_present, job_shards
 from lgrasp.engine.workspace import input_keys, run_key
 
 __all__ = ["PlanLine", "plan"]
@@ -43,10 +44,12 @@ def plan(job: Job) -> list[PlanLine]:
         _cached(job, "object", keys.mesh.stem, keys.object, "preprocess"),
         _cached(job, "field", keys.source.name, keys.field, f"build ({pipeline.field.index})"),
     ]
+    files = {s: shard_path(job.out, keys.source.name, keys.mesh.stem, s) for s, _ in shards}
+    present = find_present(job, files, key)
     for shard, rows in shards:
-        path = shard_path(job.out, keys.source.name, keys.mesh.stem, shard)
-        found = present_rows(path, key, rows, job.resume)
-        if found is not None:
+        path = files[shard]
+        if shard in present:
+            found = present[shard]
             lines.append(PlanLine("shard", str(shard), "present", f"nothing, {found:,} rows are there", str(path)))
             continue
         if job.reuse:

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -44,6 +44,7 @@ class ShardResult:
     candidates: int = 0
     duplicates: int = 0
     exhausted: bool = False  # the effort bound was reached before the rows were
+    cancelled: bool = False
 
 
 def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]) -> None:
@@ -56,7 +57,7 @@ def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]
 
 def _batches(
     pipeline: Pipeline, context: Context, execution: Execution, bank: Bank | None, limit: int
-) -> Iterator[tuple[int, BatchResult]]:
+) -> Generator[tuple[int, BatchResult]]:
     """Results of consecutive batches, in order; ``workers`` of them are worked on at a time.
 
     Closing the generator (or an error in a batch) drops the batches not begun and waits for those that were.
@@ -129,5 +130,6 @@ def make_shard(
     assert result is not None
     result.grasps = join_grasps(parts)
     result.wall = time.perf_counter() - start
+    result.cancelled = stopped
     result.exhausted = kept.count < rows and not stopped
     return result

@@ -1,0 +1,117 @@
+"""The output folder of a job: where its shards lie, which of them are there already, and whether they may stay."""
+
+import os
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from lgrasp.dataset import ShardReader, validate_shard
+from lgrasp.dataset.files import remove_leftovers
+from lgrasp.dataset.heap import check_heaps
+from lgrasp.errors import OutputError, ShardError
+
+__all__ = ["check_folder", "clean_folder", "present_shards", "shard_path"]
+
+_LONGEST = 120  # characters of a name; file systems allow 255 bytes
+
+
+class _Found(NamedTuple):
+    """What a whole shard says of itself."""
+
+    key: str | None
+    rows: int
+    tried: int  # candidates, when they were all that the shard may try; else 0
+
+
+def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
+    """File of a shard."""
+    safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{hand}-{name}")[:_LONGEST]
+    return out / f"{safe}-{shard:05d}.h5"
+
+
+def check_folder(out: Path) -> None:
+    """Could files be written into a folder? It is not made: that is the first shard's business.
+
+    Raises:
+        OutputError: a file is in the way, or the nearest existing folder is read-only.
+    """
+    nearest = next(p for p in (out, *out.absolute().parents) if os.path.lexists(p))
+    if not nearest.is_dir():
+        raise OutputError(f"output folder {out} cannot be made: {nearest} is a file; choose another with --out")
+    try:
+        tempfile.TemporaryFile(dir=nearest).close()
+    except OSError as error:
+        why = error.strerror
+        raise OutputError(f"output folder {out} cannot be written: {why}; choose another with --out") from None
+
+
+def clean_folder(path: Path) -> None:
+    """Remove what killed processes left while writing shards like ``path``; files being written stay."""
+    remove_leftovers(path.parent, f"{_stem(path)}-*.tmp")
+
+
+def present_shards(
+    files: dict[int, Path], rows: dict[int, int], key: str, effort: Callable[[int], int], warn: Callable[[str], None]
+) -> dict[int, int]:
+    """Shards that are on disk and may stay, with their numbers of rows.
+
+    A shard stays when it holds what is asked (or more: nothing is thrown away when fewer are asked later), or when all
+    candidates that it may try were tried.
+
+    Args:
+        files: file of each shard of the job.
+        rows: rows asked of each shard.
+        key: content key of the run.
+        effort: candidates that a shard of some number of rows may try.
+        warn: called with one line when a file is damaged.
+
+    Raises:
+        OutputError: a file, or the folder's first of that name, belongs to another run.
+    """
+    if files:
+        # one of the others is enough: whoever wrote into the folder looked as well
+        first = next(iter(files.values()))
+        others = sorted(set(first.parent.glob(f"{_stem(first)}-[0-9][0-9][0-9][0-9][0-9].h5")) - set(files.values()))
+        for path in others[:1]:
+            _check_run(path, _read(path), key)
+    present = {}
+    for shard, path in files.items():
+        if not os.path.lexists(path):
+            continue
+        problems = validate_shard(path)
+        found = None if problems else _read(path)
+        if found is None:
+            warn(f"shard {path} is damaged ({(problems or ['header'])[0]}); it is made anew")
+            continue
+        _check_run(path, found, key)
+        if found.rows >= rows[shard] or found.tried >= effort(rows[shard]):
+            present[shard] = found.rows
+    return present
+
+
+def _stem(path: Path) -> str:
+    """Name of a shard's file without its number."""
+    return path.stem.rpartition("-")[0]
+
+
+def _check_run(path: Path, found: _Found | None, key: str) -> None:
+    if found is not None and found.key != key:
+        raise OutputError(
+            f"{path} belongs to another run (other hand, object, pipeline, seed or --shard-rows); "
+            "choose another --out, or --no-resume to replace it"
+        )
+
+
+def _read(path: Path) -> _Found | None:
+    """None when the file is no whole shard."""
+    try:
+        check_heaps(path)
+        with ShardReader(path) as reader:
+            config, statistics = reader.header.config, reader.statistics
+            key = config.get("run_key") if isinstance(config, dict) else None
+            tried = int(statistics.get("candidates", 0)) if statistics.get("exhausted") else 0
+            return _Found(key, len(reader), tried)
+    except (ShardError, ValueError):
+        return None
