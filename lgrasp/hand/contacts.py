@@ -137,3 +137,5 @@ def check_contact_links(spec: HandSpec, link_names: tuple[str, ...], geometry: d
             raise HandError(f"hand '{spec.name}': contact link '{link}' does not exist; links: {', '.join(link_names)}")
         if not geometry.get(link):
             raise HandError(f"hand '{spec.name}': contact link '{link}' has no collision geometry")
+        if named.count(link) > 1:
+            raise HandError(f"hand '{spec.name}': link '{link}' is in two contact rules; name it once")

@@ -71,8 +71,11 @@ def _from_urdf(path: Path, known: dict[str, Path]) -> HandSource:
     urdf = read_urdf(path)
     movable = {j.name for j in urdf.joints if j.movable}
     for folder in known.values():
-        source = _from_folder(folder)
-        own = read_urdf(source.urdf)
+        try:
+            source = _from_folder(folder)
+            own = read_urdf(source.urdf)
+        except HandError:  # a broken hand elsewhere on the search path is not this hand
+            continue
         if {j.name for j in own.joints if j.movable} == movable and set(own.links) <= set(urdf.links):
             note = f"rules of the known hand '{source.name}' (same joint and link names)"
             return HandSource(source.name, path, source.spec, note)

@@ -1,19 +1,23 @@
 """hand.yaml: the few things about a hand that its URDF does not say."""
 
+import difflib
+import reprlib
 from pathlib import Path
+from typing import Annotated
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from lgrasp.errors import HandError
 
 __all__ = ["Box", "Cone", "ContactRule", "HandSpec", "PalmRule", "load_spec", "spec_problem"]
 
 Vec3 = tuple[float, float, float]
+Name = Annotated[str, Field(min_length=1)]
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Cone(_Strict):
@@ -22,18 +26,25 @@ class Cone(_Strict):
     axis: Vec3
     angle: float = Field(gt=0, le=180)
 
+    @field_validator("axis")
+    @classmethod
+    def _has_direction(cls, axis: Vec3) -> Vec3:
+        if sum(x * x for x in axis) < 1e-12:
+            raise ValueError("must not be zero")
+        return axis
+
 
 class ContactRule(_Strict):
     """Finger links that may touch the object; surface whose normal lies in a forbidden cone is left out."""
 
-    links: tuple[str, ...]
+    links: tuple[Name, ...] = Field(min_length=1)
     forbidden: tuple[Cone, ...] = ()
 
 
 class PalmRule(_Strict):
     """Static links that may touch the object; only surface whose normal lies in an allowed cone is used."""
 
-    links: tuple[str, ...] = ()
+    links: tuple[Name, ...] = ()
     allowed: tuple[Cone, ...] = ()
 
 
@@ -43,17 +54,23 @@ class Box(_Strict):
     min: Vec3
     max: Vec3
 
+    @model_validator(mode="after")
+    def _is_ordered(self) -> "Box":
+        if not all(a < b for a, b in zip(self.min, self.max, strict=True)):
+            raise ValueError(f"min {list(self.min)} must be below max {list(self.max)} on every axis")
+        return self
+
 
 class HandSpec(_Strict):
     """Contents of hand.yaml."""
 
-    name: str
+    name: Name
     description: str = ""
     urdf: str = "hand.urdf"
     base_link: str | None = None
     locked: dict[str, float] = Field(default_factory=dict)
     static_links: tuple[str, ...] = ()
-    contact: tuple[ContactRule, ...]
+    contact: tuple[ContactRule, ...] = Field(min_length=1)
     palm: PalmRule = PalmRule()
     canonical_box: Box
     open_posture: dict[str, float] = Field(default_factory=dict)
@@ -64,12 +81,17 @@ class HandSpec(_Strict):
 
 
 def spec_problem(error: ValidationError) -> str:
-    """First problem of a pydantic error as one phrase: key, value, what is wrong."""
+    """First problem of a pydantic error as one phrase: key, value, what is wrong, the nearest valid key."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"]) or "file"
-    return f"key '{key}': {first['msg']}" + (
-        f" (got {first['input']!r})" if not isinstance(first["input"], dict) else ""
-    )
+    if first["type"] == "extra_forbidden":
+        known = [name for kind in (HandSpec, ContactRule, PalmRule, Cone, Box) for name in kind.model_fields]
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+        return f"unknown key '{key}'" + (f"; did you mean '{near[0]}'?" if near else f"; keys: {', '.join(known)}")
+    what = " ".join(first["msg"].removeprefix("Value error, ").split())
+    # only plain values are shown, shortened: nested YAML aliases would print without end
+    plain = isinstance(first["input"], str | int | float | None)
+    return f"key '{key}': {what}" + (f" (got {reprlib.repr(first['input'])})" if plain else "")
 
 
 def load_spec(path: Path) -> HandSpec:
@@ -80,8 +102,9 @@ def load_spec(path: Path) -> HandSpec:
     """
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise HandError(f"hand file {path} cannot be read: {' '.join(str(error).split())}") from None
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise HandError(f"hand file {path} cannot be read as YAML: {reason}") from None
     if not isinstance(data, dict):
         raise HandError(f"hand file {path} must be a YAML mapping with the keys of hand.yaml")
     try:

@@ -85,6 +85,12 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
                 f"hand '{spec.name}': locked joint '{name}' = {value} is outside its limits "
                 f"[{by_name[name].lower}, {by_name[name].upper}]"
             )
+    for name in spec.open_posture:
+        if name not in by_name or not by_name[name].movable:
+            raise HandError(f"hand '{spec.name}': open_posture names '{name}', not a movable joint of {urdf.path}")
+    for link in (*spec.static_links, *(x for links in spec.fingers.values() for x in links)):
+        if link not in urdf.links:
+            raise HandError(f"hand '{spec.name}': '{link}' (static_links or fingers) is not a link of {urdf.path}")
     base = spec.base_link or urdf.root
     if base not in urdf.links:
         raise HandError(f"hand '{spec.name}': base_link '{base}' is not a link of {urdf.path}")

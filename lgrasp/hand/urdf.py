@@ -2,6 +2,7 @@
 
 import io
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,6 +68,9 @@ def read_urdf(path: Path) -> Urdf:
     except OSError as error:
         raise HandError(f"URDF {path} cannot be read: {error.strerror}") from None
     robot = _parse(path, raw)
+    for part in (*robot.links, *robot.joints):
+        if not part.name or not part.name.isprintable():
+            raise HandError(f"URDF {path} has a link or joint named {part.name!r}; every one needs a printable name")
     links: dict[str, tuple[Geometry, ...]] = {}
     meshes: dict[str, Path] = {}
     for link in robot.links:
@@ -86,7 +90,7 @@ def _parse(path: Path, raw: bytes) -> yourdfpy.urdf.Robot:
     try:
         tree = etree.fromstring(raw, parser)
     except (etree.XMLSyntaxError, ValueError) as error:
-        raise HandError(f"URDF {path} is not XML: {str(error).splitlines()[0]}") from None
+        raise HandError(f"URDF {path} is not XML: {_one_line(error)}") from None
     if tree.getroottree().docinfo.doctype:
         raise HandError(f"URDF {path} declares a DOCTYPE; entity declarations are not accepted, remove them")
     if tree.tag != "robot":
@@ -125,8 +129,12 @@ def _geometry(path: Path, link: str, collision, meshes: dict[str, Path]) -> Geom
         kind, size, name = "cylinder", (float(g.cylinder.radius), float(g.cylinder.length)), ""
     elif g.mesh is not None:
         name = g.mesh.filename
-        scale = np.broadcast_to(1.0 if g.mesh.scale is None else np.asarray(g.mesh.scale, float), 3)
-        kind, size = "mesh", tuple(float(x) for x in scale)
+        scale = np.asarray(1.0 if g.mesh.scale is None else g.mesh.scale, float)
+        if scale.size not in (1, 3) or not np.isfinite(scale).all() or not scale.all():
+            raise HandError(
+                f"URDF {path}: mesh '{name}' has scale {scale.tolist()}; three numbers other than 0 are needed"
+            )
+        kind, size = "mesh", tuple(float(x) for x in np.broadcast_to(scale, 3))
         meshes[name] = _mesh_file(path, link, name)
     else:
         raise HandError(
@@ -142,18 +150,19 @@ def _geometry(path: Path, link: str, collision, meshes: dict[str, Path]) -> Geom
 def _mesh_file(path: Path, link: str, name: str) -> Path:
     folder = path.resolve().parent
     if name.startswith("package://"):
-        # a package is a folder beside or above the URDF; its name may be that folder's
+        # a package is a folder beside or above the URDF (never the root); its name may be that folder's
         rest = name.removeprefix("package://")
         inner = rest.split("/", 1)[-1]
-        trials = [base / part for base in (folder, *list(folder.parents)[:3]) for part in (rest, inner)]
-        allowed = list(folder.parents)[:3][-1] if len(folder.parents) >= 3 else folder
+        bases = [folder, *[p for p in folder.parents if p != p.parent][:3]]
+        trials = [base / part for base in bases for part in (rest, inner)]
+        allowed = bases[-1]
     else:
         trials = [folder / name.removeprefix("file://")]
         # meshes often sit beside the folder of the URDF (../meshes): one level up is the hand's own package
         allowed = folder.parent
     for trial in trials:
         file = trial.resolve()
-        if file.is_relative_to(allowed) and file.is_file():
+        if file.is_relative_to(allowed) and os.path.isfile(file):  # False, not an error, for impossible names
             return file
     if not trials[0].resolve().is_relative_to(allowed):
         raise HandError(f"URDF {path}: link '{link}' names mesh '{name}', outside the hand's folder {allowed}")
@@ -171,8 +180,10 @@ def _joint(path: Path, j, links: dict[str, tuple[Geometry, ...]]) -> Joint:
     lower = upper = 0.0
     if movable:
         length = float(np.linalg.norm(axis))
-        if not np.isfinite(length) or length < 1e-9:
-            raise HandError(f"URDF {path}: joint '{j.name}' has axis {axis.tolist()}; it must not be zero")
+        if axis.shape != (3,) or not np.isfinite(length) or length < 1e-9:
+            raise HandError(
+                f"URDF {path}: joint '{j.name}' has axis {axis.tolist()}; three numbers, not all 0, are needed"
+            )
         axis = axis / length
         if j.type == "continuous":
             lower, upper = -math.pi, math.pi

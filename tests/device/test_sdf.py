@@ -14,12 +14,10 @@ SHAPE, CELL, ORIGIN, RADIUS = (21, 26, 31), 0.004, np.array([-0.04, -0.05, -0.06
 
 
 @wp.kernel
-def _look_up(
-    s: Sdf, p: wp.array(dtype=wp.vec3), value_out: wp.array(dtype=float), gradient_out: wp.array(dtype=wp.vec4)
-):
+def _look_up(s: Sdf, p: wp.array(dtype=wp.vec3), value_out: wp.array(dtype=float), slope_out: wp.array(dtype=wp.vec4)):
     i = wp.tid()
     value_out[i] = sdf_value(s, p[i])
-    gradient_out[i] = sdf_gradient(s, p[i])
+    slope_out[i] = sdf_gradient(s, p[i])
 
 
 def look_up(device, values: np.ndarray, p: np.ndarray, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
