@@ -10,7 +10,7 @@ class FilterParams(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    penetration: float = Field(0.001, ge=0, le=0.01, description="Largest hand-object penetration.")
+    penetration: float = Field(0.0008, ge=0, le=0.01, description="Largest hand-object penetration.")
     self_margin: float = Field(0.0003, ge=0, le=0.01, description="Least distance of non-adjacent links.")
     gap: float = Field(0.0013, gt=0, le=0.01, description="Largest distance of link and object at a contact.")
     angle: float = Field(17.0, gt=0, le=60, description="Largest angle of the normals at a contact [deg].")
