@@ -124,7 +124,9 @@ def hold_file(descriptor: int) -> None:
 
 def remove_leftovers(folder: Path, pattern: str) -> None:
     """Remove the temporary files that match a glob pattern and that no living process holds."""
-    for path in folder.glob(pattern) if fcntl else ():
+    if not fcntl:
+        return
+    for path in folder.glob(pattern):
         with suppress(OSError), open(path, "rb") as file:  # gone already, held, or not ours to remove
             fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
