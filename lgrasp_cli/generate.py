@@ -7,6 +7,7 @@ import typer
 
 from lgrasp_cli.options import (
     CacheDir,
+    Contacts,
     Device,
     Hand,
     JsonPath,
@@ -40,9 +41,7 @@ def generate(
         typer.Option("--out", help="Folder of the shards; default: grasps/HAND-OBJECT", show_default=False),
     ] = None,
     seed: Seed = None,
-    contacts: Annotated[
-        str | None, typer.Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.", show_default=False)
-    ] = None,
+    contacts: Contacts = None,
     scale: Scale = 1.0,
     device: Device = "auto",
     workers: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
@@ -109,8 +108,7 @@ def run_job(job: "Job", *, quiet: bool) -> tuple[dict[str, Any], "Outcome"]:
     from lgrasp.engine.report import report
     from lgrasp_cli.progress import JobProgress, interruptible
 
-    asked = sum(rows for _, rows in job_shards(job))
-    with JobProgress(asked, quiet=quiet) as progress, interruptible(progress):
+    with JobProgress(dict(job_shards(job)), quiet=quiet) as progress, interruptible(progress):
         outcome = run(job, progress)
     return report(job, outcome), outcome
 
@@ -149,7 +147,6 @@ def _show(data: dict[str, Any], json_path: str | None, quiet: bool) -> None:
 
 def _show_plan(job: "Job", json_path: str | None) -> None:
     from lgrasp.engine.plan import plan
-
     from lgrasp_cli.tables import print_json, print_table
 
     lines = plan(job)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from lgrasp_cli import dataset, generate, prepare
+from lgrasp_cli import bench, cache, dataset, generate, hands, objects, pipelines, prepare, run, stages
 
 __all__ = ["app", "main"]
 
@@ -16,9 +16,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (prepare, generate):
+for module in (prepare, generate, run, stages, bench):
     module.register(app)
-app.add_typer(dataset.app, name="dataset")
+for group in (hands, objects, pipelines, cache, dataset):
+    app.add_typer(group.app, name=group.__name__.rpartition(".")[2])
 
 
 def _version(wanted: bool) -> None:

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CacheDir",
+    "Contacts",
     "Device",
     "Hand",
     "JsonPath",
@@ -34,6 +35,9 @@ Device = Annotated[str, typer.Option(help="auto, cpu or cuda:N.")]
 CacheDir = Annotated[
     Path | None,
     typer.Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.", show_default=False),
+]
+Contacts = Annotated[
+    str | None, typer.Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.", show_default=False)
 ]
 JsonPath = Annotated[
     str | None,

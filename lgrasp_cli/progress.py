@@ -37,14 +37,15 @@ class JobProgress(Listener):
     """Progress of a job: a bar on a terminal, else a plain line every ten seconds, or nothing.
 
     Args:
-        asked: rows of this job.
+        shards: rows of every shard of this job.
         quiet: show nothing.
     """
 
-    def __init__(self, asked: int, *, quiet: bool = False) -> None:
+    def __init__(self, shards: dict[int, int], *, quiet: bool = False) -> None:
         self.stop = False
         self.running = False
-        self._asked = asked
+        self._shards = shards
+        self._asked = sum(shards.values())
         self._done = 0  # rows of finished shards
         self._quiet = quiet
         self._start = self._said = time.monotonic()
@@ -76,10 +77,8 @@ class JobProgress(Listener):
 
     def started(self, inputs: "Inputs", shards: list[int], present: list[int]) -> None:
         self.running = True
+        self._done = sum(self._shards[s] for s in present)
         self._start = time.monotonic()
-
-    def present(self, rows: int) -> None:
-        self._done += rows
 
     def advanced(self, shard: int, rows: int, result: "ShardResult") -> None:
         per_second = rows / max(time.monotonic() - self._start, 1e-9)

@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -148,3 +149,13 @@ class Cache:
                 files, size = files + 1, size + entry.size
         remove_leftovers(self.root, "*/.*.tmp")
         return files, size
+
+    def kernel_bytes(self) -> int:
+        """Size of the compiled kernels, which Warp keeps in a folder of this one."""
+        return sum(path.stat().st_size for path in (self.root / "kernels").rglob("*") if path.is_file())
+
+    def prune_kernels(self) -> int:
+        """Remove the compiled kernels; returns their size [bytes]."""
+        size = self.kernel_bytes()
+        shutil.rmtree(self.root / "kernels", ignore_errors=True)
+        return size

@@ -1,12 +1,124 @@
 """On what and where: array tasks, default folders and configs/*.yaml."""
 
+import difflib
 import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from lgrasp.errors import ConfigError
+from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["array_task", "default_out"]
+from lgrasp.config import parse_model, read_yaml
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.generate import Job
+from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.errors import ConfigError
+from lgrasp.hand.find import find_hand
+from lgrasp.object.find import find_object
+from lgrasp.object.load import MESH_SUFFIXES
+from lgrasp.paths import data_dirs
+
+__all__ = ["JobConfig", "array_task", "config_files", "default_out", "load_config", "plan_jobs"]
+
+
+class JobConfig(BaseModel):
+    """Many hands and objects in one run: configs/NAME.yaml. Paths are relative to the current folder."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    description: str = ""
+    hands: tuple[str, ...] = Field(("allegro",), min_length=1, description="Names or paths.")
+    objects: tuple[str, ...] = Field(min_length=1, description="Names or paths.")
+    object_dir: Path | None = Field(None, description="Folder where the names of objects are looked up first.")
+    pipelines: tuple[str, ...] = Field(("swift",), min_length=1, description="Names or paths.")
+    rows: int = Field(1000, ge=1, description="Grasps per hand, object and pipeline.")
+    seed: int | None = Field(None, ge=0, lt=2**63, description="Replaces the pipelines' own.")
+    scale: float = Field(1.0, gt=0, description="Factor from the meshes' unit to metres.")
+    out: Path = Field(
+        Path("grasps"), description="Folder of the folders HAND-OBJECT (PIPELINE/HAND-OBJECT if several)."
+    )
+    device: str = "auto"
+    workers: int = Field(0, ge=0)
+    batch: int = Field(0, ge=0)
+    shard_rows: int = Field(10_000, ge=1)
+    reuse: bool = False
+
+
+def config_files() -> dict[str, Path]:
+    """Name -> file of every job config on the search path."""
+    found: dict[str, Path] = {}
+    for folder in data_dirs("configs"):
+        for path in sorted(folder.glob("*.yaml")):
+            found.setdefault(path.stem, path)
+    return found
+
+
+def load_config(name: str) -> JobConfig:
+    """A job config by path or by name.
+
+    Raises:
+        ConfigError: no such config, or a wrong key or value in it.
+    """
+    files = config_files()
+    path = Path(name).expanduser()
+    if not path.is_file():
+        known = files.get(name)
+        if known is None:
+            near = difflib.get_close_matches(path.stem, files, n=1)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            names = ", ".join(files) or "none"
+            raise ConfigError(f"unknown config '{name}'; {hint}known: {names}, or give the path of a YAML file")
+        path = known
+    return parse_model(JobConfig, read_yaml(path), f"config {path}")
+
+
+def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1), resume: bool = True) -> list[Job]:
+    """One job for each pipeline, hand and object, in this order.
+
+    Args:
+        array: (task, number of tasks) of a job array.
+
+    Raises:
+        ConfigError: a pipeline that cannot be used, an object folder that does not exist.
+    """
+    if config.object_dir is not None and not config.object_dir.expanduser().is_dir():
+        raise ConfigError(f"object_dir {config.object_dir} is not a folder")
+    jobs = []
+    for name in config.pipelines:
+        pipeline = load_pipeline(name)
+        if config.seed is not None:
+            pipeline = pipeline.model_copy(update={"seed": config.seed})
+        out = config.out / pipeline.name if len(config.pipelines) > 1 else config.out
+        for hand in config.hands:
+            for mesh in config.objects:
+                jobs.append(
+                    Job(
+                        hand=hand,
+                        object=_in_folder(config.object_dir, mesh),
+                        rows=config.rows,
+                        pipeline=pipeline,
+                        out=out / f"{Path(hand).stem}-{Path(mesh).stem}",
+                        scale=config.scale,
+                        device=config.device,
+                        workers=config.workers,
+                        batch=config.batch,
+                        shard_rows=config.shard_rows,
+                        shard_index=array[0],
+                        num_shards=array[1],
+                        reuse=config.reuse,
+                        resume=resume,
+                        cache=cache,
+                    )
+                )
+    return jobs
+
+
+def _in_folder(folder: Path | None, mesh: str) -> str:
+    """Path of an object in a folder, by file name with or without its suffix; else the name as it is."""
+    if folder is None:
+        return mesh
+    here = folder.expanduser()
+    found = next((p for p in (here / mesh, *(here / f"{mesh}{s}" for s in MESH_SUFFIXES)) if p.is_file()), None)
+    return mesh if found is None else str(found)
 
 
 def array_task(
@@ -31,8 +143,9 @@ def array_task(
 
 
 def default_out(hand: str, mesh: str) -> Path:
-    """``grasps/HAND-OBJECT`` for a hand and an object given by name or path."""
-    from lgrasp.hand.find import find_hand
-    from lgrasp.object.find import find_object
+    """``grasps/HAND-OBJECT`` for a hand and an object given by name or path.
 
+    Raises:
+        HandError, ObjectError: there is no such hand or object.
+    """
     return Path("grasps") / f"{find_hand(hand).name}-{find_object(mesh).stem}"

@@ -1,0 +1,131 @@
+"""Descriptions of hands, objects and pipelines, JSON-serialisable."""
+
+from typing import Any
+
+import numpy as np
+
+from lgrasp.config import read_yaml
+from lgrasp.engine.pipeline import load_pipeline, pipeline_files
+from lgrasp.errors import ConfigError
+from lgrasp.hand.find import find_hand, known_hands
+from lgrasp.hand.spec import load_spec
+from lgrasp.hand.tree import build_tree
+from lgrasp.hand.urdf import read_urdf
+from lgrasp.object.find import find_object
+from lgrasp.object.find import list_objects as named_objects
+from lgrasp.object.load import load_mesh
+from lgrasp.paths import data_dirs
+
+__all__ = ["describe_hand", "describe_object", "describe_pipeline", "list_hands", "list_objects", "list_pipelines"]
+
+
+def list_hands() -> list[dict[str, str]]:
+    """Name, description, licence and folder of every known hand.
+
+    Raises:
+        HandError: a hand.yaml is wrong.
+    """
+    specs = {name: (load_spec(folder / "hand.yaml"), folder) for name, folder in known_hands().items()}
+    return [
+        {"name": name, "description": spec.description, "licence": spec.licence, "folder": str(folder)}
+        for name, (spec, folder) in specs.items()
+    ]
+
+
+def describe_hand(name: str) -> dict[str, Any]:
+    """A hand's source, rules, and joints by finger (finger 0 is the first dependency group).
+
+    Raises:
+        HandError: no such hand, or one that cannot be used.
+    """
+    source = find_hand(name)
+    spec = source.spec
+    tree = build_tree(read_urdf(source.urdf), spec)
+    finger = np.searchsorted(tree.dof_first, np.arange(len(tree.joint_names)), side="right") - 1
+    return {
+        "name": source.name,
+        "description": spec.description,
+        "urdf": str(source.urdf),
+        "note": source.note,
+        "base_link": tree.base_link,
+        "locked": dict(spec.locked),
+        "contact_links": [link for rule in spec.contact for link in rule.links],
+        "palm_links": list(spec.palm.links),
+        "canonical_box": spec.canonical_box.model_dump(),
+        "licence": spec.licence,
+        "source": spec.source,
+        "notes": [spec.notes] if isinstance(spec.notes, str) and spec.notes else list(spec.notes),
+        "joints": [
+            {"name": joint, "finger": int(f), "lower": float(low), "upper": float(high)}
+            for joint, f, low, high in zip(tree.joint_names, finger, tree.joint_lower, tree.joint_upper, strict=True)
+        ],
+    }
+
+
+def list_objects() -> list[dict[str, Any]]:
+    """Name, file, faces, licence and description of every named object; what objects.yaml does not say is empty."""
+    notes: dict[str, Any] = {}
+    for folder in data_dirs("objects"):
+        if (folder / "objects.yaml").is_file():
+            notes = read_yaml(folder / "objects.yaml") | notes
+    empty = {"faces": None, "licence": "", "description": ""}
+    found = []
+    for name, path in named_objects().items():
+        note = notes.get(name, {})
+        found.append({"name": name, "file": str(path), **{k: note.get(k, v) for k, v in empty.items()}})
+    return found
+
+
+def describe_object(mesh: str, scale: float = 1.0) -> dict[str, Any]:
+    """A mesh as it would be used: size, repairs.
+
+    Raises:
+        ObjectError: the mesh cannot be used.
+    """
+    path = find_object(mesh)
+    loaded = load_mesh(path, scale=scale)
+    return {
+        "name": loaded.name,
+        "file": str(path),
+        "faces": len(loaded.faces),
+        "extents": [float(side) for side in np.ptp(loaded.vertices, axis=0)],
+        "watertight": loaded.closed,
+        "sha256": loaded.sha256,
+        "notes": list(loaded.notes),
+    }
+
+
+def list_pipelines() -> list[dict[str, Any]]:
+    """Name, description, order of stages and file of every pipeline; for one that cannot be read, why."""
+    found = []
+    for name, path in pipeline_files().items():
+        try:
+            pipeline = load_pipeline(name)
+            entry = {"description": pipeline.description, "stages": list(pipeline.order)}
+        except ConfigError as error:
+            entry = {"description": f"cannot be used: {error}", "stages": []}
+        found.append({"name": name, **entry, "file": str(path)})
+    return found
+
+
+def describe_pipeline(name: str) -> dict[str, Any]:
+    """Every resolved parameter of a pipeline as (part, parameter, value, meaning).
+
+    Raises:
+        ConfigError: no such pipeline, or a wrong one.
+    """
+    pipeline = load_pipeline(name)
+    parts = [("object", pipeline.object), ("field", pipeline.field), *pipeline.stages]
+    rows: list[tuple[str, str, Any, str]] = [
+        ("", "seed", pipeline.seed, "Base seed of all stages."),
+        ("", "effort", pipeline.effort, "Candidates tried per row asked before giving up."),
+    ]
+    for part, params in parts:
+        for key, value in params.model_dump(mode="json").items():
+            rows.append((part, key, value, type(params).model_fields[key].description or ""))
+    return {
+        "name": pipeline.name,
+        "description": pipeline.description,
+        "stages": list(pipeline.order),
+        "parameters": rows,
+    }

@@ -1,0 +1,87 @@
+"""``lgrasp cache``: what is kept between runs."""
+
+from datetime import datetime
+from typing import Annotated
+
+import typer
+
+from lgrasp_cli.options import CacheDir, open_cache
+
+__all__ = ["app"]
+
+app = typer.Typer(help="What is kept between runs.", no_args_is_help=True)
+
+
+@app.command()
+def path(cache_dir: CacheDir = None) -> None:
+    """Print the folder of the cache.
+
+    Example: lgrasp cache path
+    """
+    from lgrasp.paths import cache_dir as folder
+
+    typer.echo(str(folder(cache_dir)))
+
+
+@app.command("list")
+def list_entries(
+    files: Annotated[bool, typer.Option("--files", help="One line for every file.")] = False,
+    cache_dir: CacheDir = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
+) -> None:
+    """List what is in the cache, by kind.
+
+    Example: lgrasp cache list --files
+    """
+    from lgrasp_cli.tables import print_json, print_table
+
+    cache = open_cache(cache_dir)
+    entries = cache.entries()
+    kernels = cache.kernel_bytes()
+    if as_json:
+        print_json([{**vars(e), "path": str(e.path)} for e in entries])
+        return
+    if files:
+        rows = [(e.kind, f"{e.size / 1e6:.2f}", f"{datetime.fromtimestamp(e.modified):%F %R}", e.key) for e in entries]
+        print_table(("kind", "MB", "written", "key"), rows, right=("MB",))
+        return
+    kinds = sorted({e.kind for e in entries})
+    sizes = {kind: [e.size for e in entries if e.kind == kind] for kind in kinds}
+    rows = [(kind, str(len(found)), f"{sum(found) / 1e6:.1f}") for kind, found in sizes.items()]
+    rows.append(("kernels", "", f"{kernels / 1e6:.1f}"))
+    print_table(("kind", "files", "MB"), rows, right=("files", "MB"))
+    typer.echo(str(cache.root))
+
+
+@app.command()
+def prune(
+    kind: Annotated[
+        list[str] | None, typer.Option(help="Only this kind, such as bank; may be repeated.", show_default=False)
+    ] = None,
+    older_than: Annotated[
+        float | None, typer.Option(metavar="DAYS", help="Only what was written longer ago.", show_default=False)
+    ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Everything, compiled kernels too.")] = False,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Remove entries from the cache; what is needed is made anew.
+
+    Example: lgrasp cache prune --kind bank --older-than 7
+    """
+    import time
+
+    from lgrasp.errors import ConfigError
+
+    if not (kind or older_than is not None or everything):
+        raise ConfigError("cache prune: say what, with --kind, --older-than or --all")
+    cache = open_cache(cache_dir)
+    if kind:
+        known = sorted({e.kind for e in cache.entries()} | {"kernels"})
+        for name in kind:
+            if name not in known:
+                raise ConfigError(f"cache prune: no entries of kind '{name}'; there are: {', '.join(known)}")
+    before = None if older_than is None else time.time() - older_than * 86400
+    files, size = cache.prune(set(kind) if kind else None, before)
+    if everything or "kernels" in (kind or ()):
+        size += cache.prune_kernels()
+    typer.echo(f"{files} files and {size / 1e6:.1f} MB removed from {cache.root}")

@@ -1,0 +1,80 @@
+"""``lgrasp place``, ``domain``, ``search``, ``ik``, ``filter``: a pipeline up to one stage, from and to the cache."""
+
+from typing import Annotated
+
+import typer
+
+from lgrasp_cli.options import (
+    CacheDir,
+    Contacts,
+    Device,
+    Hand,
+    Mesh,
+    PipelineName,
+    Scale,
+    Seed,
+    choose_pipeline,
+    open_cache,
+)
+
+__all__ = ["register"]
+
+_WHAT = {
+    "place": "Place the object before the hand: poses that the palm does not block.",
+    "domain": "Draw the contacts that each finger can make at each pose.",
+    "ik": "Put fingers on their contacts and keep what is clear of the object.",
+    "search": "Combine contacts into sets that balance.",
+    "filter": "Finish grasps and check everything exactly.",
+}
+
+
+def register(app: typer.Typer) -> None:
+    """Mount the commands of this file."""
+    for stage, what in _WHAT.items():
+        text = f"{what}\n\nRuns the pipeline up to this stage on one batch of candidates and keeps every table in the "
+        text += f"cache; stages whose table is there are not run.\n\nExample: lgrasp {stage} --object mug.obj"
+        app.command(stage, help=text)(_verb(stage))
+
+
+def _verb(stage: str):
+    def run(
+        mesh: Mesh,
+        hand: Hand = "allegro",
+        pipeline: PipelineName = "swift",
+        candidates: Annotated[int, typer.Option(help="Candidates in the batch.")] = 1024,
+        first: Annotated[int, typer.Option(help="First candidate of the batch.")] = 0,
+        shard_index: Annotated[int, typer.Option(help="Shard whose candidate stream is used.")] = 0,
+        seed: Seed = None,
+        contacts: Contacts = None,
+        scale: Scale = 1.0,
+        device: Device = "auto",
+        force: Annotated[bool, typer.Option("--force", help="Run every stage anew.")] = False,
+        cache_dir: CacheDir = None,
+        as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
+    ) -> None:
+        cache = open_cache(cache_dir, fresh=force)
+        from pathlib import Path
+
+        from lgrasp.engine.generate import Job
+        from lgrasp.engine.onestage import run_stage
+        from lgrasp_cli.tables import print_json, print_table
+
+        chosen = choose_pipeline(pipeline, seed, contacts)
+        job = Job(hand, mesh, candidates, chosen, Path(), scale=scale, device=device, cache=cache)
+        runs = run_stage(job, stage, first, candidates, shard_index)
+        if as_json:
+            print_json([{**vars(run), "path": str(run.path)} for run in runs])
+            return
+        rows = [
+            (
+                run.stage,
+                "hit" if run.hit else "miss",
+                f"{run.seconds:.3f}",
+                "  ".join(f"{name} {number:,}" for name, number in run.counts.items()),
+            )
+            for run in runs
+        ]
+        print_table(("stage", "cache", "seconds", "survivors"), rows, right=("seconds",))
+        typer.echo(str(runs[-1].path))
+
+    return run
