@@ -1,0 +1,280 @@
+"""HandModel: groups, limits, solids, pairs and contact surfaces of real and shipped hands."""
+
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+from reference.convex import hull_distance
+from reference.hands import HANDS, hand_model, hand_source, minimal_spec
+
+from lgrasp.errors import HandError
+from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres
+from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.pairs import pieces_touch
+from lgrasp.hand.tree import build_tree
+from lgrasp.hand.urdf import Geometry, Joint, read_urdf
+
+GROUPS = {
+    "shipped": [4, 4, 4, 4],
+    "allegro": [4, 4, 4, 4],
+    "leap": [4, 4, 4, 4],
+    "shadow": [4, 4, 4, 5, 5],
+    "dclaw": [3, 3, 3],
+    "barrett": [3, 1],  # two fingers share the spread joint
+    "schunk_svh": [1, 2, 2, 1, 1],  # thumb, index, middle, and ring and little with one drive each
+}
+
+
+def names(model: HandModel) -> list[list[str]]:
+    """Actuated joints of each group."""
+    t = model.tree
+    return [[t.joint_names[i] for i in t.dof_index[a:b]] for a, b in itertools.pairwise(t.dof_first)]
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_dependency_groups(name):
+    model = hand_model(name)
+    found = names(model)
+    assert sorted(map(len, found)) == sorted(GROUPS[name])
+    assert sorted(itertools.chain.from_iterable(found)) == sorted(model.tree.joint_names)
+    # no joint's parent is in another group, and parents come first
+    t = model.tree
+    for g in range(t.groups):
+        parents = t.joint_parent[t.joint_first[g] : t.joint_first[g + 1]]
+        assert (parents < np.arange(len(parents))).all()
+
+
+def test_joints_are_named_in_file_order():
+    model = hand_model("shadow")
+    path, _ = hand_source("shadow")
+    text = path.read_text()
+    place = [text.index(f'<joint name="{n}"') for n in model.tree.joint_names]
+    assert place == sorted(place)
+    assert not {"WRJ1", "WRJ2"} & set(model.tree.joint_names)
+
+
+def test_barrett_fingers_share_the_spread():
+    assert names(hand_model("barrett"))[0] == ["finger_1_prox_joint", "finger_1_med_joint", "finger_2_med_joint"]
+
+
+def test_merged_fingers_beyond_the_kernels_are_refused_with_advice():
+    path, _ = hand_source("schunk_svh")
+    with pytest.raises(HandError, match="lock the joint that moves several fingers"):
+        build_hand(path, minimal_spec("schunk_svh", ["right_hand_c"]))
+
+
+@pytest.mark.parametrize("name", ["barrett", "schunk_svh"])
+def test_limits_keep_every_mimic_joint_inside_its_own(name):
+    path, spec = hand_source(name)
+    t = hand_model(name).tree
+    by_name = {j.name: j for j in read_urdf(path).joints}
+
+    def coordinate(j: Joint, q: dict[str, float]) -> float:
+        if j.name in spec.locked:
+            return spec.locked[j.name]
+        return q[j.name] if j.mimic is None else j.mimic[1] * coordinate(by_name[j.mimic[0]], q) + j.mimic[2]
+
+    rng = np.random.default_rng(0)
+    rows = [t.joint_lower, t.joint_upper, *rng.uniform(t.joint_lower, t.joint_upper, (50, len(t.joint_names)))]
+    for row in rows:
+        q = dict(zip(t.joint_names, map(float, row), strict=True))
+        for j in by_name.values():
+            if j.movable:
+                assert j.lower - 1e-5 <= coordinate(j, q) <= j.upper + 1e-5, j.name
+    # not narrower than needed: at each end some joint is at its limit
+    for k, n in enumerate(t.joint_names):
+        for end in (t.joint_lower[k], t.joint_upper[k]):
+            q = dict.fromkeys(t.joint_names, 0.0) | {n: float(end)}
+            slack = [
+                min(abs(coordinate(j, q) - j.lower), abs(coordinate(j, q) - j.upper)) / max(1e-9, abs(mult))
+                for j, mult in driven(by_name, n)
+            ]
+            assert min(slack) < 1e-5
+
+
+def driven(by_name: dict[str, Joint], source: str) -> list[tuple[Joint, float]]:
+    """Joints that a drive moves, itself included, with their multipliers."""
+    out = []
+    for j in by_name.values():
+        mult, at = 1.0, j
+        while at.mimic is not None:
+            mult, at = mult * at.mimic[1], by_name[at.mimic[0]]
+        if at.name == source and j.movable:
+            out.append((j, mult))
+    return out
+
+
+def test_mimic_joints_that_exclude_each_other(tmp_path):
+    box = '<collision><geometry><box size="0.01 0.01 0.05"/></geometry></collision>'
+    links = "".join(f'<link name="{n}">{box}</link>' for n in "abc")
+    text = f"""<robot name="r">{links}
+      <joint name="j" type="revolute"><parent link="a"/><child link="b"/><limit lower="0" upper="1"/></joint>
+      <joint name="k" type="revolute"><parent link="a"/><child link="c"/><limit lower="-5" upper="-4"/>
+        <mimic joint="j"/></joint></robot>"""
+    path = tmp_path / "r.urdf"
+    path.write_text(text)
+    with pytest.raises(HandError, match="'j' has no room left"):
+        build_tree(read_urdf(path), minimal_spec("r", ["b"]))
+
+
+def surface_distance(mesh: trimesh.Trimesh, p: np.ndarray) -> np.ndarray:
+    """Distances [m] of points to a surface, computed in millimetres: trimesh errs by 0.2 mm on triangles of 1e-3 units."""
+    return trimesh.proximity.closest_point(mesh.copy().apply_scale(1e3), 1e3 * p.astype(float))[1] / 1e3
+
+
+def pieces(model: HandModel) -> list[Piece]:
+    v, p = model.vertex_first, model.plane_first
+    return [
+        Piece(model.vertices[v[i] : v[i + 1]].astype(float), model.planes[p[i] : p[i + 1]].astype(float), float(r))
+        for i, r in enumerate(model.piece_radius)
+    ]
+
+
+@pytest.mark.parametrize("name", ["shipped", "allegro", "leap", "shadow"])
+def test_inner_spheres_are_inside_their_body(name):
+    model = hand_model(name)
+    solids = pieces(model)
+    for body in range(len(model.piece_first) - 1):
+        own = solids[model.piece_first[body] : model.piece_first[body + 1]]
+        s = model.spheres[model.sphere_first[body] : model.sphere_first[body + 1]].astype(float)
+        if own:
+            assert len(s) > 0
+            deepest = np.min([p.depth(s[:, :3]) for p in own], 0)
+            assert (deepest + s[:, 3] < 2e-6).all()
+            # and they reach deep: the thickest is nearly the body's own
+            assert s[:, 3].max() > 0.001
+
+
+def test_inner_spheres_of_one_piece_fill_it():
+    corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * [0.01, 0.02, 0.03]
+    planes = np.array([[*s * np.eye(3)[a], h] for a, h in enumerate((0.01, 0.02, 0.03)) for s in (-1, 1)])
+    for piece in (
+        Piece(corner, planes, 0.0),
+        Piece(np.zeros((1, 3)), np.zeros((0, 4)), 0.01),
+        Piece(np.array([[0, 0, 0], [0, 0, 0.05]]), np.zeros((0, 4)), 0.008),
+    ):
+        s = inner_spheres(piece, 28, np.random.default_rng(0))
+        assert (piece.depth(s[:, :3]) + s[:, 3] < 1e-9).all()
+        inside = np.random.default_rng(1).uniform(-0.06, 0.06, (200_000, 3))
+        inside = inside[piece.depth(inside) < -0.003]
+        gap = (np.linalg.norm(inside[:, None] - s[:, :3], axis=2) - s[:, 3]).min(1)
+        assert gap.max() < 0.012
+
+
+def test_cylinder_pieces_hold_the_cylinder():
+    path, _ = hand_source("shipped")
+    urdf = read_urdf(path)
+    for radius, length in ((0.012, 0.05), (0.1, 0.01)):
+        geometry = Geometry("cylinder", (radius, length), np.eye(4))
+        piece = convex_piece(urdf, geometry, geometry_mesh(urdf, geometry))
+        angle = np.linspace(0, 2 * np.pi, 999)
+        rim = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(999, length / 2)])
+        depth = piece.depth(np.vstack([rim, rim * [1, 1, -1]]))
+        assert depth.max() < 1e-9
+        # and little more than it
+        assert np.linalg.norm(piece.vertices[:, :2], axis=1).max() < radius * 1.005
+
+
+@pytest.mark.parametrize("name", ["allegro", "leap", "shadow"])
+def test_hull_pieces_are_within_a_fifth_of_a_millimetre(name):
+    path, _ = hand_source(name)
+    urdf = read_urdf(path)
+    done = 0
+    for solids in urdf.links.values():
+        for geometry in solids:
+            if geometry.kind != "mesh" or done >= 6:
+                continue
+            mesh = geometry_mesh(urdf, geometry)
+            piece = convex_piece(urdf, geometry, mesh)
+            hull = mesh.convex_hull
+            # every hull vertex is within 0.2 mm of the piece: its plane excess picks those worth an exact distance
+            excess = piece.depth(np.asarray(hull.vertices, float))
+            worst = hull.vertices[np.argsort(-excess)[:5]]
+            out = [hull_distance(v[None], piece.vertices) - piece.radius for v in worst]
+            assert max(out) < 2.1e-4, geometry.mesh
+            # the piece's own corners are on the true hull, so it exceeds it by no more than its radius
+            assert piece.radius <= 2.0e-4
+            assert surface_distance(hull, piece.vertices).max() < 1e-6
+            done += 1
+    assert done >= 4
+
+
+@pytest.mark.parametrize("name", ["shipped", "allegro", "leap"])
+def test_pairs_leave_out_neighbours_and_what_always_touches(name):
+    model = hand_model(name)
+    path, _ = hand_source(name)
+    urdf = read_urdf(path)
+    links = model.tree.link_names
+    kept = {frozenset((links[model.piece_link[i]], links[model.piece_link[j]])) for i, j in model.pairs}
+    adjacent = {frozenset((j.parent, j.child)) for j in urdf.joints}
+    assert not kept & adjacent
+    body = dict(zip(links, model.tree.link_body, strict=True))
+    solid = [n for n in links if (model.piece_link == links.index(n)).any()]
+    candidates = {frozenset((a, b)) for a in solid for b in solid if a < b and body[a] != body[b]} - adjacent
+    left_out = candidates - kept
+    rng = np.random.default_rng(7)
+    q = rng.uniform(model.tree.joint_lower, model.tree.joint_upper, (200, model.dofs))
+    for pair in left_out:
+        a, b = (np.flatnonzero(model.piece_link == links.index(n)) for n in pair)
+        both = np.array([(i, j) for i in a for j in b], np.int32)
+        assert pieces_touch(model, q, both).any(1).mean() > 0.98, sorted(pair)
+    # what is kept comes apart in some posture
+    touch = pieces_touch(model, q, model.pairs)
+    for pair in kept:
+        member = [frozenset((links[model.piece_link[i]], links[model.piece_link[j]])) == pair for i, j in model.pairs]
+        assert not touch[:, np.array(member)].any(1).all(), sorted(pair)
+
+
+def test_pairs_are_sorted_into_their_groups():
+    model = hand_model("shadow")
+    group = model.tree.body_group + 1
+    G = model.groups + 1
+    assert len(model.pair_first) == G * G + 1
+    assert model.pair_first[-1] == len(model.pairs)
+    for key in range(G * G):
+        for i, j in model.pairs[model.pair_first[key] : model.pair_first[key + 1]]:
+            assert (group[model.piece_body[i]], group[model.piece_body[j]]) == (key // G, key % G)
+            assert key // G <= key % G
+
+
+def test_contact_points_obey_the_rules():
+    model = hand_model("shipped")
+    path, spec = hand_source("shipped")
+    tree = model.tree
+    assert (np.diff(model.contact_first) > 50).all()
+    np.testing.assert_allclose(np.linalg.norm(model.contact_normals, axis=1), 1, atol=1e-5)
+    forbidden = {link: rule.forbidden for rule in spec.contact for link in rule.links}
+    for index in np.unique(model.contact_link):
+        link, own = tree.link_names[index], model.contact_link == index
+        n = model.contact_normals[own] @ tree.T_body_link[index][:3, :3]
+        for cone in forbidden.get(link, ()):
+            assert (n @ np.array(cone.axis) <= np.cos(np.radians(cone.angle)) + 1e-6).all()
+        if link in spec.palm.links:
+            allowed = [n @ np.array(c.axis) >= np.cos(np.radians(c.angle)) - 1e-6 for c in spec.palm.allowed]
+            assert np.any(allowed, 0).all()
+        # on the surface of the link's solid
+        solid = trimesh.util.concatenate(
+            [
+                geometry_mesh(read_urdf(path), g).apply_transform(tree.T_body_link[index] @ g.T_link_geometry)
+                for g in read_urdf(path).links[link]
+            ]
+        )
+        assert surface_distance(solid, model.contact_points[own][:60]).max() < 1e-6
+    # one patch: near in place and direction
+    for patch in np.unique(model.contact_patch)[::7]:
+        own = model.contact_patch == patch
+        assert np.ptp(model.contact_points[own], axis=0).max() < 0.0201
+        assert len(np.unique(model.contact_link[own])) == 1
+
+
+def test_arrays_round_trip_and_two_builds_are_equal():
+    model = hand_model("shipped")
+    back = HandModel.from_arrays(model.to_arrays())
+    again = build_hand(*hand_source("shipped"))
+    for other in (back, again):
+        for key, value in model.to_arrays().items():
+            np.testing.assert_array_equal(value, other.to_arrays()[key], err_msg=key)
+    assert back.tree.link_names == model.tree.link_names
+    assert isinstance(back.tree.joint_names, tuple)
+    assert back.notes == model.notes
