@@ -41,7 +41,7 @@ def prepare_field(
     where = resolve_device(device)
     keys = input_keys(hand, None, 1.0, ObjectParams(), params)
     start = time.perf_counter()
-    model, _ = load_hand(cache, keys)
+    model, _ = load_hand(cache, keys, where)
     field, hit = load_field(cache, keys, upload_hand(model, where.alias), params, report)
     return {
         "hand": model.name,

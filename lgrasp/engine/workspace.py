@@ -94,9 +94,11 @@ def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str
     return path, content_key("object", OBJECT_VERSION, content=content, name=path.name, scale=scale, params=described)
 
 
-def load_hand(cache: Cache, keys: InputKeys) -> tuple[HandModel, bool]:
+def load_hand(cache: Cache, keys: InputKeys, device: Device) -> tuple[HandModel, bool]:
     """The HandModel from the cache, or built and cached; and whether it was a hit."""
-    arrays, hit = cache.get("hand", keys.hand, lambda: build_hand(keys.source.urdf, keys.source.spec).to_arrays())
+    arrays, hit = cache.get(
+        "hand", keys.hand, lambda: build_hand(keys.source.urdf, keys.source.spec, device.alias).to_arrays()
+    )
     return HandModel.from_arrays(arrays), hit
 
 
@@ -104,7 +106,7 @@ def load_object(cache: Cache, mesh: Path, key: str, scale: float, params: Object
     """The ObjectModel from the cache, or preprocessed and cached; and whether it was a hit."""
 
     def make():
-        return preprocess_object(mesh, scale=scale, params=params, device="cpu").to_arrays()
+        return preprocess_object(mesh, scale=scale, params=params, device=device.alias).to_arrays()
 
     arrays, hit = cache.get("object", key, make)
     return ObjectModel.from_arrays(arrays), hit
@@ -140,7 +142,7 @@ def load_inputs(
 
     assert keys.mesh is not None
     mesh = keys.mesh
-    hand_model = timed("hand", lambda: load_hand(cache, keys))
+    hand_model = timed("hand", lambda: load_hand(cache, keys, device))
     object_model = timed("object", lambda: load_object(cache, mesh, keys.object, scale, objects))
     hand = upload_hand(hand_model, device.alias)
     field_model = timed("field", lambda: load_field(cache, keys, hand, fields, report))

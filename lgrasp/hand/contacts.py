@@ -38,19 +38,19 @@ def _mesh_distance(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), distance_ou
     distance_out[i] = q.sign * wp.length(points[i] - p)
 
 
-def _signed_distance(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+def _signed_distance(mesh: trimesh.Trimesh, points: np.ndarray, device: str) -> np.ndarray:
     start()
     handle = wp.Mesh(
-        wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device="cpu"),
-        wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device="cpu"),
+        wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device=device),
+        wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device=device),
     )
-    out = wp.empty(len(points), dtype=wp.float32, device="cpu")
-    queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device="cpu")
-    wp.launch(_mesh_distance, dim=len(points), inputs=[handle.id, queries], outputs=[out], device="cpu")
+    out = wp.empty(len(points), dtype=wp.float32, device=device)
+    queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
+    wp.launch(_mesh_distance, dim=len(points), inputs=[handle.id, queries], outputs=[out], device=device)
     return out.numpy()
 
 
-def link_grid(meshes: list[trimesh.Trimesh]) -> LinkGrid:
+def link_grid(meshes: list[trimesh.Trimesh], device: str = "cpu") -> LinkGrid:
     """Distance grid of the union of a link's solids (already in the body frame)."""
     low = np.min([m.bounds[0] for m in meshes], 0) - _GRID_PAD
     high = np.max([m.bounds[1] for m in meshes], 0) + _GRID_PAD
@@ -58,7 +58,7 @@ def link_grid(meshes: list[trimesh.Trimesh]) -> LinkGrid:
     shape = np.ceil((high - low) / cell).astype(int) + 1
     axes = [low[a] + cell * np.arange(shape[a]) for a in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    values = np.min([_signed_distance(m, points) for m in meshes], 0)
+    values = np.min([_signed_distance(m, points, device) for m in meshes], 0)
     return LinkGrid(values.reshape(shape).astype(np.float32), low.astype(np.float32), cell)
 
 
@@ -74,7 +74,11 @@ def _sample(mesh: trimesh.Trimesh, rng: np.random.Generator) -> tuple[np.ndarray
 
 
 def finger_points(
-    meshes: list[trimesh.Trimesh], T_body_link: np.ndarray, forbidden: tuple[Cone, ...], rng: np.random.Generator
+    meshes: list[trimesh.Trimesh],
+    T_body_link: np.ndarray,
+    forbidden: tuple[Cone, ...],
+    rng: np.random.Generator,
+    device: str = "cpu",
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals (n, 3) of a finger link's allowed surface, body frame.
 
@@ -87,13 +91,17 @@ def finger_points(
         keep &= ~_in_cone(normals @ R, cone)
     # outside every solid of the link, and free above
     for probe, least in ((1e-4, 0.0), (8e-3, 5e-3)):
-        distance = np.min([_signed_distance(m, points + probe * normals) for m in meshes], 0)
+        distance = np.min([_signed_distance(m, points + probe * normals, device) for m in meshes], 0)
         keep &= distance > least
     return _thin(points[keep], normals[keep], _POINTS_PER_LINK, rng)
 
 
 def palm_points(
-    meshes: list[trimesh.Trimesh], T_body_link: np.ndarray, allowed: tuple[Cone, ...], rng: np.random.Generator
+    meshes: list[trimesh.Trimesh],
+    T_body_link: np.ndarray,
+    allowed: tuple[Cone, ...],
+    rng: np.random.Generator,
+    device: str = "cpu",
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals (n, 3) of a static link's allowed surface, base frame."""
     points, normals = map(np.vstack, zip(*(_sample(m, rng) for m in meshes), strict=True))
@@ -101,7 +109,7 @@ def palm_points(
     keep = np.zeros(len(points), bool)
     for cone in allowed:
         keep |= _in_cone(normals @ R, cone)
-    distance = np.min([_signed_distance(m, points + 1e-4 * normals) for m in meshes], 0)
+    distance = np.min([_signed_distance(m, points + 1e-4 * normals, device) for m in meshes], 0)
     keep &= distance > 0
     return _thin(points[keep], normals[keep], _POINTS_PER_LINK, rng)
 

@@ -149,8 +149,8 @@ def _stack(parts: list[np.ndarray], width: int, dtype: type = np.float32) -> np.
     return np.vstack(parts).astype(dtype) if parts else np.zeros((0, width), dtype)
 
 
-def build_hand(urdf_path: Path, spec: HandSpec) -> HandModel:
-    """Build a HandModel from a URDF and its rules.
+def build_hand(urdf_path: Path, spec: HandSpec, device: str = "cpu") -> HandModel:
+    """Build a HandModel from a URDF and its rules; ``device`` answers the geometric queries.
 
     Raises:
         HandError: see :func:`read_urdf`, :func:`build_tree`; also a hand without collision geometry, or with a group of
@@ -162,7 +162,7 @@ def build_hand(urdf_path: Path, spec: HandSpec) -> HandModel:
     check_contact_links(spec, tree.link_names, dict(urdf.links))
     rng = np.random.default_rng(0)
     solids = _Solids(urdf, tree, rng)
-    contacts = _contacts(spec, tree, solids, rng)
+    contacts = _contacts(spec, tree, solids, rng, device)
     bodies = len(tree.joint_dof) + 1
     order = np.argsort([p[0] for p in solids.pieces], kind="stable")
     pieces = [solids.pieces[i] for i in order]
@@ -197,7 +197,7 @@ def build_hand(urdf_path: Path, spec: HandSpec) -> HandModel:
     )
     from lgrasp.hand.pairs import with_pairs  # needs the kernels, which need a model
 
-    return with_pairs(model, {(j.parent, j.child) for j in urdf.joints})
+    return with_pairs(model, {(j.parent, j.child) for j in urdf.joints}, device)
 
 
 def _check_size(spec: HandSpec, tree: Tree) -> None:
@@ -272,7 +272,9 @@ class _Solids:
             raise HandError(f"URDF {urdf.path} has no collision geometry; a hand's solid is its collision geometry")
 
 
-def _contacts(spec: HandSpec, tree: Tree, solids: _Solids, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _contacts(
+    spec: HandSpec, tree: Tree, solids: _Solids, rng: np.random.Generator, device: str
+) -> dict[str, np.ndarray]:
     """Contact arrays of a HandModel: finger points by group, then palm points."""
     groups = tree.groups
     body_group = tree.body_group
@@ -284,7 +286,7 @@ def _contacts(spec: HandSpec, tree: Tree, solids: _Solids, rng: np.random.Genera
         # fingertips of one shape share one grid's work
         key = b"".join(np.round(m.vertices, 9).tobytes() for m in solids.meshes[link])
         if key not in made:
-            made[key] = link_grid(solids.meshes[link])
+            made[key] = link_grid(solids.meshes[link], device)
         return made[key]
 
     for rule in spec.contact:
@@ -294,7 +296,7 @@ def _contacts(spec: HandSpec, tree: Tree, solids: _Solids, rng: np.random.Genera
             if group < 0:
                 raise HandError(f"hand '{spec.name}': contact link '{link}' does not move; list it under palm")
             T = tree.T_body_link[index]
-            points, normals = finger_points(solids.meshes[link], T, rule.forbidden, rng)
+            points, normals = finger_points(solids.meshes[link], T, rule.forbidden, rng, device)
             if len(points) == 0:
                 raise HandError(f"hand '{spec.name}': the forbidden cones leave no surface on contact link '{link}'")
             per_group[group].append((index, len(grids), points, normals))
@@ -310,7 +312,7 @@ def _contacts(spec: HandSpec, tree: Tree, solids: _Solids, rng: np.random.Genera
         index = tree.link_names.index(link)
         if body_group[tree.link_body[index]] >= 0:
             raise HandError(f"hand '{spec.name}': palm link '{link}' moves; list it under contact")
-        points, normals = palm_points(solids.meshes[link], tree.T_body_link[index], spec.palm.allowed, rng)
+        points, normals = palm_points(solids.meshes[link], tree.T_body_link[index], spec.palm.allowed, rng, device)
         per_group[groups].append((index, len(grids), points, normals))
         grids.append(grid(link))
         grid_link.append(index)

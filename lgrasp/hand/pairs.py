@@ -33,19 +33,21 @@ def _pieces_touch(
         touch_out[row, k] = 1
 
 
-def pieces_touch(model: HandModel, q: np.ndarray, pairs: np.ndarray, margin: float = 0.0) -> np.ndarray:
+def pieces_touch(
+    model: HandModel, q: np.ndarray, pairs: np.ndarray, margin: float = 0.0, device: str = "cpu"
+) -> np.ndarray:
     """(N, Q) bool: are piece pairs (Q, 2) within ``margin`` [m] of each other at postures q (N, K)?"""
     start()
-    hand = upload_hand(model, "cpu")
-    pose = wp.array(body_poses(hand, q), dtype=wp.transform, device="cpu")
-    out = wp.zeros((len(q), len(pairs)), dtype=wp.int32, device="cpu")
+    hand = upload_hand(model, device)
+    pose = wp.array(body_poses(hand, q), dtype=wp.transform, device=device)
+    out = wp.zeros((len(q), len(pairs)), dtype=wp.int32, device=device)
     inputs = [
         hand.struct.pieces,
         pose,
-        wp.array(np.asarray(pairs, np.int32), dtype=wp.vec2i, device="cpu"),
+        wp.array(np.asarray(pairs, np.int32), dtype=wp.vec2i, device=device),
         float(margin),
     ]
-    wp.launch(_pieces_touch, dim=(len(q), len(pairs)), inputs=inputs, outputs=[out], device="cpu")
+    wp.launch(_pieces_touch, dim=(len(q), len(pairs)), inputs=inputs, outputs=[out], device=device)
     return out.numpy().astype(bool)
 
 
@@ -56,7 +58,7 @@ def _rigid(model: HandModel, adjacent: set[tuple[str, str]]) -> set[tuple[int, i
     return out | {(b, a) for a, b in out}
 
 
-def with_pairs(model: HandModel, adjacent: set[tuple[str, str]]) -> HandModel:
+def with_pairs(model: HandModel, adjacent: set[tuple[str, str]], device: str = "cpu") -> HandModel:
     """The model with its self-collision pairs, grouped by (group a, group b).
 
     Args:
@@ -75,7 +77,7 @@ def with_pairs(model: HandModel, adjacent: set[tuple[str, str]]) -> HandModel:
     pairs = np.array(candidates, np.int32)
     rng = np.random.default_rng(1)
     q = rng.uniform(model.tree.joint_lower, model.tree.joint_upper, (_POSTURES, model.dofs))
-    touch = pieces_touch(model, q, pairs)
+    touch = pieces_touch(model, q, pairs, device=device)
     # links, not pieces, are what touches: a link pair is left out when some pieces of it touch in every posture
     links = np.sort(model.piece_link[pairs], axis=1)
     keep = np.ones(len(pairs), bool)
