@@ -1,0 +1,103 @@
+"""Same pipeline, seed and inputs: same rows, whatever the batch size, the workers and the cut of the stream."""
+
+import numpy as np
+import pytest
+
+from lgrasp.engine import shard as shard_module
+from lgrasp.engine.batch import run_batch
+from lgrasp.engine.shard import Execution, make_shard
+from lgrasp.grasp.context import Context
+from lgrasp.grasp.tables import grasp_arrays, join_grasps
+
+
+def assert_same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
+    assert a.keys() == b.keys()
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+@pytest.fixture(scope="module", params=["swift", "lightning"])
+def pipeline(request):
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture(scope="module")
+def source(pipeline, load):
+    return load(pipeline=pipeline)
+
+
+@pytest.fixture(scope="module")
+def rows(pipeline):
+    return 60 if pipeline.name == "swift" else 12
+
+
+@pytest.fixture(scope="module")
+def reference(pipeline, source, rows):
+    return grasp_arrays(make_shard(pipeline, source, 0, rows, Execution(1, 512)).grasps)
+
+
+@pytest.mark.parametrize(("workers", "batch"), [(1, 64), (2, 100), (2, 512), (3, 1000)])
+def test_batch_size_and_workers(pipeline, source, reference, rows, workers, batch):
+    assert_same(reference, grasp_arrays(make_shard(pipeline, source, 0, rows, Execution(workers, batch)).grasps))
+
+
+def test_cut_of_the_stream(pipeline, source):
+    own = Context(source.hand, source.object, source.field, "cpu", 0, 0)
+    whole = run_batch(pipeline, own, 0, 400)
+    parts = [run_batch(pipeline, own, first, count) for first, count in ((0, 1), (1, 149), (150, 250))]
+    assert_same(grasp_arrays(whole.grasps), grasp_arrays(join_grasps([p.grasps for p in parts])))
+    for stage, counts in whole.counts.items():
+        for name, value in counts.items():
+            assert value == sum(p.counts[stage][name] for p in parts), (stage, name)
+
+
+def test_fewer_rows_are_a_prefix(pipeline, source, reference):
+    few = grasp_arrays(make_shard(pipeline, source, 0, 7, Execution(1, 300)).grasps)
+    assert_same(few, {name: values[:7] for name, values in reference.items()})
+
+
+@pytest.mark.parametrize("batch", [64, 700])
+def test_several_passes(swift, inputs, batch):
+    """Later passes take the best poses of a batch first, so the engine fixes the batch."""
+    pipeline = swift.with_params("search", passes=2)
+    first = make_shard(pipeline, inputs, 0, 80, Execution(1, 512)).grasps
+    assert_same(grasp_arrays(first), grasp_arrays(make_shard(pipeline, inputs, 0, 80, Execution(2, batch)).grasps))
+
+
+def test_seeds_and_shards_differ(swift, inputs):
+    base = make_shard(swift, inputs, 0, 60, Execution()).grasps
+    seed = make_shard(swift.model_copy(update={"seed": 1}), inputs, 0, 60, Execution()).grasps
+    shard = make_shard(swift, inputs, 1, 60, Execution()).grasps
+    for other in (seed, shard):
+        assert not (base.pose[:, None] == other.pose[None]).all(2).any()
+
+
+def test_shards_do_not_depend_on_their_number(run, grasps, tmp_path):
+    run(rows=60, shard_rows=20, out=tmp_path / "three")
+    run(rows=40, shard_rows=20, out=tmp_path / "two")
+    run(rows=60, shard_rows=20, shard_index=1, num_shards=3, out=tmp_path / "task")
+    three = sorted((tmp_path / "three").glob("*.h5"))
+    two = sorted((tmp_path / "two").glob("*.h5"))
+    (task,) = (tmp_path / "task").glob("*.h5")
+    assert [p.name for p in three] == [f"allegro-mug-{s:05d}.h5" for s in range(3)]
+    assert task.name == three[1].name
+    for a, b in ((three[0], two[0]), (three[1], two[1]), (three[1], task)):
+        assert_same(grasps(a), grasps(b))
+
+
+def test_effort_covers_whole_bank_entries(swift):
+    pipeline = swift.model_copy(update={"effort": 333})
+    efforts = [shard_module.shard_effort(pipeline, rows) for rows in (1, 1000, 1001, 10**9)]
+    assert all(e % 1024 == 0 for e in efforts)
+    assert efforts == sorted(efforts)
+    assert efforts[0] == 65_536
+    assert efforts[-1] < 2**31
+
+
+def test_candidates_are_numbered_by_shard(run, grasps, tmp_path):
+    run(rows=40, shard_rows=20)
+    found = grasps(tmp_path / "out")["candidate"]
+    assert set(found >> np.uint64(40)) == {0, 1}
+    for s in (0, 1):
+        own = found[found >> np.uint64(40) == s]
+        assert (np.diff(own.astype(np.int64)) >= 0).all()

@@ -1,0 +1,389 @@
+"""A run that was cut in any way ends with the bytes of an uninterrupted one."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import weakref
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from lgrasp.dataset.files import hold_file
+from lgrasp.engine import shard as shard_module
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.generate import Job, Listener, generate
+from lgrasp.errors import ConfigError, OutputError
+
+CHILD = """
+import os, signal, sys
+from pathlib import Path
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.generate import Job, Listener, generate
+from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.field.params import FieldParams
+
+class Say(Listener):
+    def started(self, inputs, shards, present):
+        print("started", flush=True)
+
+out, cache, rows, shard_rows, index, number = sys.argv[1:7]
+if sys.argv[7:] == ["die"]:  # with all bytes written, before the file has its name
+    os.replace = lambda a, b, replace=os.replace: (
+        os.kill(os.getpid(), signal.SIGKILL) if str(b).endswith("00001.h5") else replace(a, b)
+    )
+pipeline = load_pipeline("swift").model_copy(update={"field": FieldParams(records=20_000)})
+generate(
+    Job("allegro", "mug", int(rows), pipeline, Path(out), device="cpu", workers=1, shard_rows=int(shard_rows),
+        shard_index=int(index), num_shards=int(number), cache=Cache(cache)),
+    Say(),
+)
+"""
+
+
+def start(out, cache, rows, shard_rows=20, index=0, number=1, *more) -> subprocess.Popen:
+    arguments = [str(a) for a in (out, cache, rows, shard_rows, index, number, *more)]
+    return subprocess.Popen([sys.executable, "-c", CHILD, *arguments], stdout=subprocess.PIPE, text=True)
+
+
+def finish(child: subprocess.Popen) -> int:
+    child.communicate(timeout=120)
+    return child.returncode
+
+
+def leftovers(folder):
+    return [p.name for p in folder.iterdir() if p.suffix != ".h5"]
+
+
+@pytest.fixture
+def warnings_of(cache_root):
+    lines: list[str] = []
+    return lines, Cache(cache_root, lines.append)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(swift, cache_root, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    generate(Job("allegro", "mug", 80, swift, folder, shard_rows=20, device="cpu", cache=Cache(cache_root)))
+    return folder
+
+
+@pytest.fixture
+def whole(uninterrupted, tmp_path):
+    """Folder of an uninterrupted run of 80 rows in shards of 20."""
+    return Path(shutil.copytree(uninterrupted, tmp_path / "whole"))
+
+
+def test_deleted_shards_are_made_again(run, whole, raw_grasps, tmp_path):
+    out = run(rows=80).paths[0].parent
+    kept = sorted(out.glob("*.h5"))
+    before = kept[1].stat().st_mtime_ns
+    for shard in (0, 2):
+        kept[shard].unlink()
+    outcome = run(rows=80)
+    assert (outcome.rows, outcome.made, outcome.present) == (80, 40, 40)
+    assert [p.name for p in outcome.written] == [kept[0].name, kept[2].name]
+    assert kept[1].stat().st_mtime_ns == before
+    assert raw_grasps(out) == raw_grasps(whole)
+
+
+def test_nothing_to_do(run, raw_grasps):
+    first = run(rows=40)
+    again = run(rows=40)
+    assert (again.made, again.present, again.rows) == (0, 40, 40)
+    assert again.paths == first.paths
+    assert not again.written
+
+
+def test_more_rows_later(run, whole, raw_grasps, tmp_path):
+    """A last shard that was shorter is made anew, whole ones stay."""
+    run(rows=50)
+    outcome = run(rows=80)
+    assert (outcome.present, outcome.made) == (40, 40)
+    assert raw_grasps(tmp_path / "out") == raw_grasps(whole)
+
+
+def test_fewer_rows_later(run, raw_grasps, tmp_path):
+    """Rows on disk are not thrown away when fewer are asked."""
+    run(rows=50)
+    before = raw_grasps(tmp_path / "out")
+    outcome = run(rows=45)
+    assert (outcome.made, outcome.rows, outcome.starved) == (0, 50, False)
+    assert raw_grasps(tmp_path / "out") == before
+
+
+def test_no_resume_replaces(run, raw_grasps, tmp_path):
+    run(rows=40)
+    before = raw_grasps(tmp_path / "out")
+    outcome = run(rows=40, resume=False)
+    assert outcome.made == 40
+    assert raw_grasps(tmp_path / "out") == before
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "garbage", "header", "rows", "text"])
+def test_damaged_shard(job, warnings_of, whole, raw_grasps, damage):
+    lines, cache = warnings_of
+    expected = raw_grasps(whole)
+    path = sorted(whole.glob("*.h5"))[1]
+    data = bytearray(path.read_bytes())
+    if damage == "truncated":
+        data = data[: len(data) // 2]
+    elif damage == "empty":
+        data = bytearray()
+    elif damage == "garbage":
+        data = bytearray(np.random.default_rng(0).bytes(len(data)))
+    elif damage == "header":
+        data[100:200] = bytes(100)
+    elif damage == "rows":
+        with h5py.File(path) as file:
+            offset = file["grasps/q"].id.get_chunk_info(0).byte_offset
+        data[offset + 5] ^= 0x40
+    else:
+        at = data.index(b"<robot")
+        data[at + 1] ^= 1
+    path.write_bytes(data)
+    outcome = generate(job(rows=80, out=whole, cache=cache))
+    assert outcome.made == 20
+    assert raw_grasps(whole) == expected
+    assert len(lines) == 1
+    assert str(path) in lines[0]
+    assert "\n" not in lines[0]
+
+
+def test_shard_of_another_run(run, swift, tmp_path):
+    run(rows=40)
+    other = swift.model_copy(update={"seed": 5})
+    with pytest.raises(OutputError, match="another run"):
+        run(rows=40, pipeline=other)
+    with pytest.raises(OutputError, match="another run"):
+        run(rows=40, shard_rows=10)
+    sorted((tmp_path / "out").glob("*.h5"))[0].unlink()
+    with pytest.raises(OutputError, match="another run"):  # its own shard 0 is free, the folder is not
+        run(rows=20, pipeline=other)
+    assert run(rows=40, pipeline=other, resume=False).made == 40
+
+
+def test_other_objects_may_share_a_folder(run, tmp_path):
+    run(rows=20)
+    run(rows=20, object="sphere")
+    assert len(list((tmp_path / "out").glob("*.h5"))) == 2
+
+
+class TestStarving:
+    """Bounded effort: what is found is kept, and history does not matter."""
+
+    @pytest.fixture(autouse=True)
+    def _short_effort(self, monkeypatch):
+        monkeypatch.setattr(shard_module, "_LEAST_EFFORT", 1024)
+
+    @pytest.fixture
+    def poor(self, swift):
+        return swift.model_copy(update={"effort": 1})
+
+    @pytest.fixture
+    def hopeless(self, swift):
+        return swift.with_params("search", threshold=1e-9).model_copy(update={"effort": 1})
+
+    def test_starved_shards_are_present(self, run, poor, raw_grasps, tmp_path):
+        first = run(rows=2000, shard_rows=1000, pipeline=poor)
+        assert first.starved
+        assert len(first.paths) == 2
+        assert 0 < first.made < 2000
+        assert all(r.exhausted and r.candidates == 1024 for r in first.results)
+        before = raw_grasps(tmp_path / "out")
+        again = run(rows=2000, shard_rows=1000, pipeline=poor)
+        assert (again.made, again.rows, again.starved) == (0, first.made, True)
+        first.paths[1].unlink()
+        again = run(rows=2000, shard_rows=1000, pipeline=poor)
+        assert 0 < again.made < 1000
+        assert raw_grasps(tmp_path / "out") == before
+
+    def test_more_effort_when_more_is_asked(self, run, poor, tmp_path):
+        """A last shard that gave up early goes on when n, and with it the effort, grows."""
+        first = run(rows=1000, shard_rows=4000, pipeline=poor)
+        more = run(rows=4000, shard_rows=4000, pipeline=poor)
+        assert first.starved
+        assert more.starved
+        assert more.results[0].candidates == 4096
+        assert more.rows > first.rows
+
+    def test_array_tasks_find_the_same(self, run, poor, raw_grasps, tmp_path):
+        run(rows=3000, shard_rows=1000, pipeline=poor, out=tmp_path / "single")
+        for task in range(3):
+            run(
+                rows=3000,
+                shard_rows=1000,
+                pipeline=poor,
+                out=tmp_path / "array",
+                shard_index=task,
+                num_shards=3,
+            )
+        assert len(raw_grasps(tmp_path / "single")) == 3
+        assert raw_grasps(tmp_path / "single") == raw_grasps(tmp_path / "array")
+
+    def test_an_empty_shard_ends_the_run(self, run, hopeless, tmp_path):
+        first = run(rows=3000, shard_rows=1000, pipeline=hopeless)
+        assert (first.rows, first.starved, len(first.paths)) == (0, True, 1)
+        again = run(rows=3000, shard_rows=1000, pipeline=hopeless)
+        assert (again.rows, again.starved, len(again.paths), again.made) == (0, True, 1, 0)
+        assert len(list((tmp_path / "out").iterdir())) == 1
+
+
+def test_cancelled_run_keeps_whole_shards(job, whole, raw_grasps, tmp_path):
+    class Stop(Listener):
+        batches = 0
+
+        def advanced(self, shard, rows, result):
+            self.batches += shard == 1
+
+        def cancelled(self):
+            return self.batches > 0
+
+    outcome = generate(job(rows=80, batch=16), Stop())
+    assert outcome.cancelled
+    assert not outcome.starved
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["allegro-mug-00000.h5"]
+    generate(job(rows=80))
+    assert raw_grasps(tmp_path / "out") == raw_grasps(whole)
+
+
+def test_cancelled_before_the_first_batch(job, tmp_path):
+    class Stop(Listener):
+        def cancelled(self):
+            return True
+
+    outcome = generate(job(), Stop())
+    assert outcome.cancelled
+    assert not (tmp_path / "out").exists()
+
+
+def test_killed_at_random_moments(whole, raw_grasps, job, cache_root, tmp_path):
+    random = np.random.default_rng(11)
+    out = tmp_path / "killed"
+    for _ in range(3):
+        child = start(out, cache_root, 80)
+        assert child.stdout.readline() == "started\n"
+        time.sleep(random.uniform(0.0, 0.6))
+        child.kill()
+        finish(child)
+    generate(job(rows=80, out=out))
+    assert raw_grasps(out) == raw_grasps(whole)
+    assert not leftovers(out)
+
+
+def test_killed_while_writing(whole, raw_grasps, job, cache_root, tmp_path):
+    out = tmp_path / "killed"
+    assert finish(start(out, cache_root, 80, 20, 0, 1, "die")) == -signal.SIGKILL
+    (left,) = leftovers(out)
+    assert left.endswith(".h5.tmp")
+    assert len(list(out.glob("*.h5"))) == 1
+    held = out / "allegro-mug-00003.0123456789ab.h5.tmp"  # another process is writing this one
+    foreign = out / "notes.tmp"
+    foreign.touch()
+    with open(held, "wb") as file:
+        hold_file(file.fileno())
+        generate(job(rows=80, out=out))
+        assert sorted(leftovers(out)) == sorted([held.name, foreign.name])
+    generate(job(rows=80, out=out))
+    assert leftovers(out) == [foreign.name]
+    assert raw_grasps(out) == raw_grasps(whole)
+
+
+def test_four_processes_share_an_empty_cache(whole, raw_grasps, tmp_path):
+    out, cache = tmp_path / "array", tmp_path / "cache"
+    children = [start(out, cache, 80, 20, task, 4) for task in range(4)]
+    assert [finish(child) for child in children] == [0, 0, 0, 0]
+    assert raw_grasps(out) == raw_grasps(whole)
+    assert not leftovers(out)
+    assert sorted(p.parent.name for p in cache.rglob("*") if p.is_file()) == ["field", "hand", "object"]
+
+
+def test_full_disk(job, raw_grasps, tmp_path):
+    """A limit on the size of files stands for the full disk."""
+    resource = pytest.importorskip("resource")
+    out = tmp_path / "out"
+    generate(job(rows=20))
+    before = raw_grasps(out)
+    size = next(out.iterdir()).stat().st_size
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for limit in (0, size // 3, size - 100):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+        try:
+            with pytest.raises(OutputError) as caught:
+                generate(job(rows=40))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert "\n" not in str(caught.value)
+        assert raw_grasps(out) == before
+        assert not leftovers(out)
+    assert generate(job(rows=40)).made == 20
+
+
+def test_output_folder_that_cannot_be_made(job, tmp_path):
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(OutputError, match="is a file"):
+            generate(job(out=out))
+    with pytest.raises(OutputError, match="cannot be written"):
+        generate(job(out=Path("/proc/lgrasp")))
+
+
+def test_bad_input_leaves_no_folder(job, tmp_path):
+    bad = tmp_path / "bad.obj"
+    bad.write_text("v 0 0 0\n")
+    with pytest.raises(Exception, match=r"bad\.obj"):
+        generate(job(object=str(bad)))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rows": 0},
+        {"rows": -5},
+        {"shard_rows": 0},
+        {"num_shards": 0},
+        {"shard_index": 1},
+        {"shard_index": -1, "num_shards": 2},
+        {"workers": -1},
+        {"batch": -1},
+    ],
+)
+def test_numbers_out_of_range(job, changes):
+    with pytest.raises(ConfigError) as caught:
+        generate(job(**changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_task_without_a_shard(run, tmp_path):
+    outcome = run(rows=20, shard_index=3, num_shards=4)
+    assert (outcome.paths, outcome.rows, outcome.starved) == ([], 0, False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_long_names(run, tmp_path):
+    from lgrasp.object.find import find_object
+
+    mesh = tmp_path / f"{'x' * 240}.obj"
+    mesh.write_bytes(find_object("sphere").read_bytes())
+    assert run(rows=20, object=str(mesh)).paths[0].is_file()
+
+
+def test_memory_does_not_grow_with_the_shards(job):
+    class Watch(Listener):
+        def __init__(self):
+            self.tables = []
+            self.alive = []
+
+        def wrote(self, shard, path, result):
+            self.tables.append(weakref.ref(result.grasps))
+            self.alive.append(sum(table() is not None for table in self.tables))
+
+    watch = Watch()
+    outcome = generate(job(rows=100), watch)
+    assert outcome.rows == 100
+    assert watch.alive == [1] * 5
+    assert sum(len(r.grasps) for r in outcome.results) == 0
