@@ -225,7 +225,9 @@ def balance(
 
 
 @wp.func
-def frictionless(points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), k: wp.int32, torque_scale: wp.float32):
+def frictionless(
+    points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), k: wp.int32, torque_scale: wp.float32
+):
     """FSWO (eq. 1) by active sets on the k x k Gram matrix, for the inner loop of the search.
 
     The full-support solution is exact when all its shares are positive. Otherwise the smallest share is dropped and the

@@ -9,31 +9,34 @@ __all__ = ["epsilon_bound"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
-_STARTS = wp.constant(13)
-_STEPS = wp.constant(40)
+_EDGES = wp.constant(8)
+_STARTS = wp.constant(12)
+_SHOTS = wp.constant(20)
+_WALKS = wp.constant(12)
+_CORE = 1.0e-4
+_CORE_C = wp.constant(_CORE)
+
+mat66 = wp.types.matrix((6, 6), wp.float32)
 
 
 @wp.func
-def _reach(
-    u: vec6,
-    arms: wp.array(dtype=wp.vec3),
-    cones: wp.array(dtype=wp.vec3),
-    k: wp.int32,
-    scale: wp.float32,
-    best: wp.array(dtype=wp.int32),
-):
-    """Largest u . w over the cone edges' wrenches; the contact edge that attains it goes to best[0]."""
-    f = wp.vec3(u[0], u[1], u[2])
-    t = wp.vec3(u[3], u[4], u[5]) * scale
-    top = float(-1.0e30)
-    for i in range(k):
-        a = f + wp.cross(t, arms[i])
-        for e in range(8):
-            x = wp.dot(a, cones[i * 8 + e])
-            if x > top:
-                top = x
-                best[0] = i * 8 + e
-    return top
+def _pivot(B: mat66, r: wp.int32, d: vec6):
+    """Inverse of a basis after the vector with coordinates d in it has taken place r."""
+    out = mat66()
+    for c in range(6):
+        out[r, c] = B[r, c] / d[r]
+    for i in range(6):
+        if i != r:
+            for c in range(6):
+                out[i, c] = B[i, c] - d[i] * out[r, c]
+    return out
+
+
+@wp.func
+def _edge_wrench(arms: wp.array(dtype=wp.vec3), cones: wp.array(dtype=wp.vec3), e: wp.int32, scale: wp.float32):
+    f = cones[e]
+    t = wp.cross(arms[e // _EDGES], f) * scale
+    return vec6(f[0], f[1], f[2], t[0], t[1], t[2])
 
 
 @wp.func
@@ -47,43 +50,115 @@ def epsilon_bound(
 ):
     """Ferrari-Canny epsilon (L1 hull of 8-edge cones with unit normal force, torque / radius), from above; >= 0.
 
-    epsilon = min over unit wrenches u of max_i u . w_i. The inner maximum is convex in u, so subgradient descent on the
-    sphere from several starts finds its least value; every iterate is an upper bound of epsilon.
+    epsilon is the distance of the hull's nearest facet. From each start a ray is shot at the hull (simplex method; a
+    tiny cross-polytope of size 1e-4 is the first basis), then a walk crosses from facet to nearer facet (dual simplex
+    pivots) until the foot of the perpendicular lies in the facet. Every facet passed is an upper bound. Values below
+    2.5e-4, the resolution, are returned as 0.
     """
     cones = wp.zeros(shape=(48,), dtype=wp.vec3)
     for i in range(k):
         n = normals[i]
         t = tangent(n)
         b = wp.cross(n, t)
-        for e in range(8):
+        for e in range(_EDGES):
             angle = 0.78539816 * float(e)
-            cones[i * 8 + e] = n + (t * wp.cos(angle) + b * wp.sin(angle)) * mu
-    best = wp.zeros(shape=(1,), dtype=wp.int32)
+            cones[i * _EDGES + e] = n + (t * wp.cos(angle) + b * wp.sin(angle)) * mu
     scale = 1.0 / radius
     least = float(1.0e30)
-    for s in range(_STARTS):
-        u = vec6()
-        if s < 12:
-            u[s // 2] = 1.0 - 2.0 * float(s % 2)
-        else:
-            for c in range(6):
-                u[c] = wp.randn(state)
-            u = wp.normalize(u)
-        step = float(0.3)
-        for _t in range(_STEPS):
-            top = _reach(u, arms, cones, k, scale, best)
-            if top < least:
-                least = top
-            if top <= 0.0:
+    for _s in range(_STARTS):
+        v = vec6()  # the ray
+        for c in range(6):
+            v[c] = wp.randn(state)
+        v = wp.normalize(v)
+        # B: inverse of the basis (its vectors as columns); x: coordinates of v, all >= 0; y: plane through the basis
+        B = mat66()
+        x = vec6()
+        y = vec6()
+        for c in range(6):
+            B[c, c] = wp.where(v[c] >= 0.0, 1.0, -1.0) / _CORE_C
+            x[c] = wp.abs(v[c]) / _CORE_C
+            y[c] = B[c, c]
+        ok = int(0)
+        for _t in range(_SHOTS):
+            # the wrench farthest beyond the plane y . w = 1 enters
+            yf = wp.vec3(y[0], y[1], y[2])
+            yt = wp.vec3(y[3], y[4], y[5]) * scale
+            top = float(-1.0e30)
+            at = int(0)
+            for i in range(k):
+                a = yf + wp.cross(yt, arms[i])
+                for e in range(_EDGES):
+                    z = wp.dot(a, cones[i * _EDGES + e])
+                    if z > top:
+                        top = z
+                        at = i * _EDGES + e
+            least = wp.min(least, top / wp.length(y))
+            if least < 2.5e-4:
                 return 0.0
-            e = best[0]
-            f = cones[e]
-            m = wp.cross(arms[e // 8], f) * scale
-            w = vec6(f[0], f[1], f[2], m[0], m[1], m[2])
-            d = w - u * wp.dot(w, u)
-            length = wp.length(d)
-            if length < 1.0e-9:
+            if top < 1.0 + 1.0e-4:
+                ok = 1
                 break
-            u = wp.normalize(u - d * (step / length))
-            step = step * 0.88
-    return wp.max(least, 0.0)
+            d = B * _edge_wrench(arms, cones, at, scale)
+            r = int(-1)
+            low = float(1.0e30)
+            for c in range(6):
+                if d[c] > 1.0e-5 and x[c] < low * d[c]:
+                    low = x[c] / d[c]
+                    r = c
+            if r < 0:
+                break
+            B = _pivot(B, r, d)
+            for c in range(6):
+                x[c] = wp.max(x[c] - low * d[c], 0.0)
+            x[r] = low
+            y = vec6()
+            for i in range(6):
+                y = y + B[i]
+        if ok == 0:
+            continue
+        for _t in range(_WALKS):
+            # the perpendicular's coordinates: all >= 0 where its foot is in the facet
+            x = B * y
+            r = int(0)
+            for c in range(1, 6):
+                if x[c] < x[r]:
+                    r = c
+            if x[r] > -1.0e-4 * wp.length(x):
+                break
+            # turn the plane about the ridge opposite vertex r until it meets the next wrench
+            row = B[r]
+            yf = wp.vec3(y[0], y[1], y[2])
+            yt = wp.vec3(y[3], y[4], y[5]) * scale
+            rf = wp.vec3(row[0], row[1], row[2])
+            rt = wp.vec3(row[3], row[4], row[5]) * scale
+            theta = float(1.0e30)
+            at = int(-1)
+            for i in range(k):
+                a = yf + wp.cross(yt, arms[i])
+                b = rf + wp.cross(rt, arms[i])
+                for e in range(_EDGES):
+                    f = cones[i * _EDGES + e]
+                    slope = -wp.dot(b, f)
+                    if slope > 1.0e-4:
+                        room = wp.max(1.0 - wp.dot(a, f), 0.0)
+                        if room < theta * slope:
+                            theta = room / slope
+                            at = i * _EDGES + e
+            if at < 0:
+                break
+            B = _pivot(B, r, B * _edge_wrench(arms, cones, at, scale))
+            y = vec6()
+            for i in range(6):
+                y = y + B[i]
+            # rounding may leave wrenches beyond the plane: the bound is their support, not the plane
+            yf = wp.vec3(y[0], y[1], y[2])
+            yt = wp.vec3(y[3], y[4], y[5]) * scale
+            top = float(-1.0e30)
+            for i in range(k):
+                a = yf + wp.cross(yt, arms[i])
+                for e in range(_EDGES):
+                    top = wp.max(top, wp.dot(a, cones[i * _EDGES + e]))
+            least = wp.min(least, top / wp.length(y))
+    if least < 2.5e-4:
+        return 0.0
+    return least
