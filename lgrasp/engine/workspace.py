@@ -102,11 +102,13 @@ def load_hand(cache: Cache, keys: InputKeys, device: Device) -> tuple[HandModel,
     return HandModel.from_arrays(arrays), hit
 
 
-def load_object(cache: Cache, mesh: Path, key: str, scale: float, params: ObjectParams) -> tuple[ObjectModel, bool]:
+def load_object(
+    cache: Cache, mesh: Path, key: str, scale: float, params: ObjectParams, device: str = "cpu"
+) -> tuple[ObjectModel, bool]:
     """The ObjectModel from the cache, or preprocessed and cached; and whether it was a hit."""
 
     def make():
-        return preprocess_object(mesh, scale=scale, params=params, device=device.alias).to_arrays()
+        return preprocess_object(mesh, scale=scale, params=params, device=device).to_arrays()
 
     arrays, hit = cache.get("object", key, make)
     return ObjectModel.from_arrays(arrays), hit
@@ -143,7 +145,7 @@ def load_inputs(
     assert keys.mesh is not None
     mesh = keys.mesh
     hand_model = timed("hand", lambda: load_hand(cache, keys, device))
-    object_model = timed("object", lambda: load_object(cache, mesh, keys.object, scale, objects))
+    object_model = timed("object", lambda: load_object(cache, mesh, keys.object, scale, objects, device.alias))
     hand = upload_hand(hand_model, device.alias)
     field_model = timed("field", lambda: load_field(cache, keys, hand, fields, report))
     start = time.perf_counter()
