@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import Device, Hand, JsonPath, open_cache, warn
+from lgrasp_cli.options import Device, Hand, JsonPath, check_report, open_cache, warn
 
 __all__ = ["bench", "register"]
 
@@ -57,6 +57,7 @@ def bench(
         "workers": workers,
     }
     jobs = plan_jobs(parse_model(JobConfig, given, "bench"), cache)
+    check_report(json_path)
     results = measure(jobs, repeat, lambda line: typer.echo(line, err=True))
     if json_path == "-":
         print_json(results)

@@ -16,6 +16,7 @@ from lgrasp_cli.options import (
     Quiet,
     Scale,
     Seed,
+    check_report,
     choose_pipeline,
     open_cache,
 )
@@ -96,6 +97,7 @@ def generate(
     if dry_run:
         _show_plan(job, json_path)
         return
+    check_report(json_path)
     data, outcome = run_job(job, quiet=quiet)
     _show(data, json_path, quiet)
     conclude(data, outcome)

@@ -47,10 +47,10 @@ def _options(
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 bad input or output, 3 too few grasps, 130 interrupted."""
     if os.environ.get("LGRASP_DEBUG"):
-        code = app(standalone_mode=False)
+        code = app(prog_name="lgrasp", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     try:
-        code = app(standalone_mode=False)
+        code = app(prog_name="lgrasp", standalone_mode=False)
         sys.stdout.flush()
     except BaseException as error:
         _leave(*_explain(error))

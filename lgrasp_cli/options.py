@@ -20,6 +20,7 @@ __all__ = [
     "Quiet",
     "Scale",
     "Seed",
+    "check_report",
     "choose_pipeline",
     "open_cache",
     "parse_contacts",
@@ -44,6 +45,18 @@ JsonPath = Annotated[
     typer.Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no report; warnings and errors only.")]
+
+
+def check_report(path: str | None) -> None:
+    """Fail before the job if its report could not be written.
+
+    Raises:
+        OutputError: a folder, or one that cannot be written.
+    """
+    if path and path != "-":
+        from lgrasp.engine.report import check_json
+
+        check_json(path)
 
 
 def warn(line: str) -> None:

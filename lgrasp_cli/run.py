@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import CacheDir, JsonPath, Quiet, open_cache
+from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache
 
 __all__ = ["register", "run"]
 
@@ -55,6 +55,7 @@ def run(
     if dry_run:
         _show_plans(jobs)
         return
+    check_report(json_path)
     results = []
     for number, job in enumerate(jobs, 1):
         if not quiet:

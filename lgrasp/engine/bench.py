@@ -27,9 +27,9 @@ def bench(jobs: list[Job], repeat: int, progress: Callable[[str], None] | None =
         progress: called with one line before each run.
 
     Returns:
-        One dictionary for each job: ``pipeline``, ``hand``, ``object``, ``grasps``, ``device``, each rate as
-        ``median``, ``min``, ``max``; of the middle run ``seconds`` and ``survivors``; ``build_seconds`` of object and field,
-        ``load_seconds``, ``near_duplicates``, ``distinct_poses``, ``starved``, ``peak_rss_mb``.
+        One dictionary for each job: ``pipeline``, ``hand``, ``object``, ``grasps``, ``device``; each rate as ``median``,
+        ``min``, ``max``; ``seconds`` and ``survivors`` of the middle run; ``build_seconds`` and ``load_seconds`` of
+        object and field; ``near_duplicates``, ``distinct_poses``, ``starved``, ``peak_rss_mb``.
 
     Raises:
         LgraspError: bad input.

@@ -13,13 +13,14 @@ import warp as wp
 
 from lgrasp.dataset.files import new_file
 from lgrasp.dataset.reader import ShardReader
+from lgrasp.engine.folder import check_folder
 from lgrasp.engine.generate import Job, Outcome
 from lgrasp.engine.shard import add_counts
 from lgrasp.engine.stages import STAGES
 from lgrasp.errors import OutputError
 from lgrasp.grasp.duplicates import near_pairs
 
-__all__ = ["SEED_FSWO", "Tally", "peak_device_mb", "peak_rss_mb", "report", "survivors", "write_json"]
+__all__ = ["SEED_FSWO", "Tally", "check_json", "peak_device_mb", "peak_rss_mb", "report", "survivors", "write_json"]
 
 SEED_FSWO = 0.15
 """Squared frictionless residual below which the published system counts a grasp."""
@@ -145,13 +146,25 @@ def peak_device_mb(device: str) -> float:
     return wp.get_mempool_used_mem_high(device) / 1e6
 
 
+def check_json(path: str | os.PathLike[str]) -> None:
+    """Could a report be written there? To be asked before a long job.
+
+    Raises:
+        OutputError: it is a folder, or its folder cannot be written.
+    """
+    if Path(path).is_dir():
+        raise OutputError(f"report {path} cannot be written: it is a folder; name a file")
+    try:
+        check_folder(Path(path).parent)
+    except OutputError as error:
+        raise OutputError(f"report {path}: {str(error).replace('choose another with --out', 'name another')}") from None
+
+
 def write_json(path: str | os.PathLike[str], data: Any) -> None:
     """Write JSON so that the file is whole or absent.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    if Path(path).is_dir():
-        raise OutputError(f"cannot write {path}: it is a folder; name a file")
     with new_file(path) as file:
         file.write((json.dumps(data, indent=2) + "\n").encode())

@@ -1,0 +1,84 @@
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from lgrasp.device.runtime import start
+from lgrasp_cli.main import main
+
+QUICK = str(Path(__file__).parent / "quick.yaml")
+SCRIPT = "from lgrasp_cli.main import main; main()"
+
+
+@dataclass(frozen=True)
+class Result:
+    code: int
+    out: str
+    err: str
+
+    def error(self, code: int = 2) -> str:
+        """The one line that a failure prints."""
+        assert self.code == code, self
+        (line,) = self.err.splitlines()
+        assert line.startswith("error: ")
+        assert "Traceback" not in self.out + self.err
+        return line
+
+
+@pytest.fixture(scope="session")
+def quick():
+    """The file of a pipeline that is small enough for tests."""
+    return QUICK
+
+
+@pytest.fixture(scope="session")
+def shared_cache(tmp_path_factory):
+    """A cache that all tests of the command line share."""
+    return tmp_path_factory.mktemp("cli-cache")
+
+
+@pytest.fixture
+def cli(monkeypatch, capfd, shared_cache, tmp_path):
+    """cli(*arguments): run the command in this process, in an empty folder."""
+    monkeypatch.setenv("LGRASP_CACHE_DIR", str(shared_cache))
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in os.environ if name.startswith("SLURM_")]:
+        monkeypatch.delenv(name)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["lgrasp", *map(str, arguments)])
+        with pytest.raises(SystemExit) as leaving:
+            main()
+        captured = capfd.readouterr()
+        return Result(int(leaving.value.code or 0), captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture
+def generate(cli, tmp_path):
+    """generate(*more): 20 grasps of the tiny object with the quick pipeline into ./out."""
+
+    def call(*more, mesh="tiny", rows=20, out=tmp_path / "out"):
+        base = ["generate", "--object", mesh, "-n", rows, "--pipeline", QUICK, "--out", out]
+        return cli(*base, "--device", "cpu", *more)
+
+    return call
+
+
+@pytest.fixture
+def process(shared_cache, tmp_path):
+    """process(*arguments): start the command as a process of its own."""
+    start()
+    env = os.environ | {"LGRASP_CACHE_DIR": str(shared_cache), "WARP_CACHE_PATH": wp.config.kernel_cache_dir}
+
+    def begin(*arguments):
+        command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        return subprocess.Popen(command, cwd=tmp_path, env=env, text=True, **pipes)
+
+    return begin

@@ -1,0 +1,160 @@
+"""The other commands: inputs, stages one by one, lists, configs, cache, bench."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+STAGES = ["place", "domain", "ik", "search", "filter"]
+
+
+def test_build_field(cli, quick):
+    first = json.loads(cli("build-field", "allegro", "-p", quick, "--force", "--json").out)
+    assert not first["cached"]
+    assert first["vectors"] == 80_000
+    assert len(first["clear_share"]) == first["groups"] == 4
+    again = json.loads(cli("build-field", "allegro", "-p", quick, "--json").out)
+    assert again["cached"]
+    assert "clear of the palm" in cli("build-field", "allegro", "-p", quick).out
+    assert "'kd'" in cli("build-field", "allegro", "--index", "kd").error()
+
+
+def test_preprocess(cli, quick):
+    first = json.loads(cli("preprocess", "tiny", "-p", quick, "--force", "--json").out)
+    assert first["watertight"]
+    assert first["faces"] == 168
+    assert not first["cached"]
+    assert json.loads(cli("preprocess", "tiny", "-p", quick, "--json").out)["cached"]
+    assert "watertight" in cli("preprocess", "tiny", "-p", quick).out
+
+
+@pytest.mark.parametrize("order", ["quick", "published"])
+def test_stages_use_the_cache(cli, tmp_path, shared_cache, order, quick):
+    pipeline, stages = quick, STAGES
+    if order == "published":
+        text = Path(quick).read_text()
+        pipeline = tmp_path / "published.yaml"
+        pipeline.write_text(text.replace("  - ik: {}\n  - search: {}\n", "  - search: {}\n  - ik: {}\n"))
+        stages = ["place", "domain", "search", "ik", "filter"]
+    base = ("--object", "tiny", "-p", pipeline, "--candidates", 128, "--device", "cpu")
+    for n, stage in enumerate(stages):
+        result = cli(stage, *base)
+        assert result.code == 0, result.err
+        lines = result.out.splitlines()
+        assert [line.split()[0] for line in lines[1:-1]] == stages[: n + 1]
+        states = [line.split()[1] for line in lines[1:-1]]
+        assert states[:n] == ["hit"] * n
+        assert (shared_cache / stage).is_dir()
+        assert lines[-1].startswith(str(shared_cache / stage))
+    again = json.loads(cli("filter", *base, "--json").out)
+    assert [run["hit"] for run in again] == [True] * 5
+    assert again[-1]["counts"]["kept"] > 0
+    other = json.loads(cli("place", *base, "--first", 128 * len(order), "--json").out)
+    assert not other[0]["hit"]
+    assert "--candidates 0" in cli("place", "--object", "tiny", "--candidates", 0).error()
+
+
+def test_a_damaged_table_is_made_anew(cli, quick):
+    base = ("domain", "--object", "tiny", "-p", quick, "--candidates", 64, "--device", "cpu", "--json")
+    first = json.loads(cli(*base).out)
+    with open(first[-1]["path"], "r+b") as file:
+        file.truncate(1000)
+    result = cli(*base)
+    assert [run["hit"] for run in json.loads(result.out)] == [True, False]
+    assert "damaged" in result.err
+
+
+def test_hands(cli):
+    assert "allegro" in cli("hands", "list").out
+    data = json.loads(cli("hands", "show", "allegro", "--json").out)
+    assert len(data["joints"]) == 16
+    assert {joint["finger"] for joint in data["joints"]} == {0, 1, 2, 3}
+    assert "joint_12.0" in cli("hands", "show", "allegro").out
+    assert "did you mean 'allegro'" in cli("hands", "show", "alegro").error()
+
+
+def test_objects(cli):
+    assert {"mug", "tiny"} <= {entry["name"] for entry in json.loads(cli("objects", "list", "--json").out)}
+    assert "mug" in cli("objects", "list").out
+    assert "watertight  yes" in cli("objects", "show", "tiny").out
+    assert "did you mean" in cli("objects", "show", "tinny").error()
+
+
+def test_pipelines(cli):
+    names = [entry["name"] for entry in json.loads(cli("pipelines", "list", "--json").out)]
+    assert "swift" in names
+    rows = json.loads(cli("pipelines", "show", "swift", "--json").out)["parameters"]
+    assert all(meaning for *_, meaning in rows)
+    assert "iterations" in cli("pipelines", "show", "swift").out
+
+
+def test_cache(cli, tmp_path, shared_cache, quick):
+    assert cli("cache", "path").out.strip() == str(shared_cache)
+    own = ("--cache-dir", tmp_path / "cache")
+    cli("preprocess", "tiny", "-p", quick, *own)
+    listed = cli("cache", "list", *own).out
+    assert [line.split()[:2] for line in listed.splitlines()[1:2]] == [["object", "1"]]
+    assert len(json.loads(cli("cache", "list", "--json", *own).out)) == 1
+    assert "object" in cli("cache", "list", "--files", *own).out
+    assert "say what" in cli("cache", "prune", *own).error()
+    assert "'objekt'" in cli("cache", "prune", "--kind", "objekt", *own).error()
+    assert cli("cache", "prune", "--older-than", 1, *own).out.startswith("0 files")
+    assert cli("cache", "prune", "--all", *own).out.startswith("1 files")
+
+
+def test_run(cli, tmp_path, quick):
+    config = tmp_path / "c.yaml"
+    config.write_text(f"objects: [tiny, nothing, sphere]\npipelines: [{quick}]\nrows: 10\nout: made\ndevice: cpu\n")
+    plan = cli("run", config, "--dry-run")
+    assert "nothing" in plan.error()
+    assert not (tmp_path / "made").exists()
+    result = cli("run", config, "--json", tmp_path / "r.json", "-n", 5)
+    assert result.code == 2
+    data = json.loads((tmp_path / "r.json").read_text())
+    assert [job["status"] for job in data["jobs"]] == ["done", "failed", "done"]
+    assert data["exit_code"] == 2
+    assert [line.split()[-1] for line in result.out.splitlines()[1:]] == ["done", "failed", "done"]
+    made = sorted(p.relative_to(tmp_path / "made").parts[0] for p in (tmp_path / "made").rglob("*.h5"))
+    assert made == ["allegro-sphere", "allegro-tiny"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("objects: [tiny]\nrow: 5", "did you mean 'rows'"),
+        ("objects: []", "objects"),
+        ("objects: [tiny]\nrows: 0", "rows"),
+        ("objects: [tiny]\npipelines: [swfit]", "did you mean 'swift'"),
+        ("objects: [tiny]\nobject_dir: nowhere", "nowhere"),
+    ],
+)
+def test_wrong_configs(cli, tmp_path, text, words):
+    (tmp_path / "c.yaml").write_text(text)
+    assert words in cli("run", tmp_path / "c.yaml").error()
+
+
+def test_shipped_configs(cli):
+    from lgrasp.engine.jobs import config_files, load_config
+
+    assert {"smoke", "table1"} <= set(config_files())
+    assert all(load_config(name) for name in config_files())
+    assert "did you mean 'smoke'" in cli("run", "smok").error()
+
+
+def test_bench(cli, tmp_path, quick):
+    base = ("bench", "--objects", "tiny", "--pipelines", quick, "-n", 10, "--repeat", 2, "--device", "cpu")
+    result = cli(*base, "--json", tmp_path / "b.json")
+    assert result.code == 0, result.err
+    (entry,) = json.loads((tmp_path / "b.json").read_text())
+    rate = entry["strict_valid_per_s"]
+    assert 0 < rate["min"] <= rate["median"] <= rate["max"]
+    assert entry["grasps"] == 10
+    assert entry["build_seconds"]["field"] > 0
+    assert "strict/s" in result.out
+    assert [p.name for p in tmp_path.iterdir()] == ["b.json"]
+
+
+def test_warm_up(cli):
+    lines = cli("warm-up", "--device", "cpu").out.splitlines()
+    assert any("lgrasp.stages.search.kernels" in line for line in lines)
+    assert "ready on cpu" in lines[-1]

@@ -1,0 +1,156 @@
+"""Bad input: exit code 2, one line, nothing half-written."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from lgrasp.object import find_object
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (["--hand", "alegro"], "did you mean 'allegro'"),
+        (["--hand", "no/such.urdf"], "does not exist"),
+        (["--object", "tinny"], "did you mean tiny"),
+        (["--object", "no/such.obj"], "neither a mesh file nor"),
+        (["--pipeline", "swfit"], "did you mean 'swift'"),
+        (["--device", "cuda:77"], "device 'cuda:77' does not exist"),
+        (["--device", "tpu"], "choose auto, cpu"),
+        (["-n", "0"], "at least 1"),
+        (["-n", "-5"], "at least 1"),
+        (["-n", "many"], "valid integer"),
+        (["--shard-rows", "0"], "--shard-rows 0"),
+        (["--workers", "-1"], "--workers"),
+        (["--num-shards", "0"], "--num-shards 0"),
+        (["--shard-index", "3"], "--shard-index 3"),
+        (["--seed", "-1"], "--seed -1"),
+        (["--contacts", "3,7"], "from 2 to 5"),
+        (["--contacts", "three"], "from 2 to 5"),
+        (["--scale", "0"], "scale 0"),
+        (["--scale", "nan"], "scale nan"),
+        (["--scale", "1000"], "90 m"),
+        (["--scale", "1e-5"], "accepted"),
+        (["--out", "/proc/nothing"], "cannot be"),
+        (["--json", "/proc/nothing/x.json"], "cannot be"),
+        (["--objct", "x"], "--objct"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_options(cli, tmp_path, changes, words, quick):
+    base = {"--object": "tiny", "-n": "20", "--pipeline": quick, "--out": "out", "--device": "cpu"}
+    base |= dict([changes])
+    assert words in cli("generate", *(x for pair in base.items() for x in pair)).error()
+    assert not list(tmp_path.iterdir())
+
+
+def test_unknown_command(cli):
+    assert "Did you mean 'generate'" in cli("generat").error()
+    assert "--object" in cli("generate").error()
+
+
+def test_out_is_a_file(generate, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    assert "is a file" in generate(out=tmp_path / "file").error()
+    assert "is a file" in generate(out=tmp_path / "file" / "below").error()
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_report_is_a_folder(generate, tmp_path):
+    (tmp_path / "folder").mkdir()
+    assert "it is a folder" in generate("--json", tmp_path / "folder").error()
+    assert not (tmp_path / "out").exists()
+
+
+def test_cache_is_a_file(generate, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    assert "is a file" in generate("--cache-dir", tmp_path / "file").error()
+
+
+def write_meshes(folder):
+    """Name -> words of the error."""
+    mesh = trimesh.load(find_object("tiny"))
+    text = find_object("tiny").read_text()
+    vertices = [line for line in text.splitlines() if line.startswith("v ")]
+    (folder / "nan.obj").write_text(text.replace(vertices[3], "v nan 0 0"))
+    (folder / "empty.obj").write_text("")
+    (folder / "points.obj").write_text("\n".join(vertices))
+    (folder / "garbage.stl").write_bytes(np.random.default_rng(0).bytes(4000))
+    (folder / "garbage.glb").write_bytes(np.random.default_rng(0).bytes(4000))
+    (folder / "text.xyz").write_text("0 0 0")
+    big = mesh.copy().apply_scale(1000)
+    big.export(folder / "millimetres.obj")
+    mesh.copy().apply_scale(1200).export(folder / "hundred.obj")
+    flat = mesh.copy().apply_transform(np.diag([1, 1, 0, 1]))
+    flat.export(folder / "flat.obj")
+    return {
+        "nan.obj": "NaN or infinite",
+        "empty.obj": "0 bytes",
+        "points.obj": "0 faces",
+        "garbage.stl": "garbage.stl",
+        "garbage.glb": "not a readable",
+        "text.xyz": "suffix",
+        "millimetres.obj": "--scale 0.001",
+        "hundred.obj": "--scale",
+        "flat.obj": "flat",
+    }
+
+
+def test_meshes(cli, generate, tmp_path):
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for name, words in write_meshes(folder).items():
+        assert words in generate(mesh=folder / name).error()
+        assert words in cli("preprocess", folder / name).error()
+    assert not (tmp_path / "out").exists()
+
+
+URDFS = {
+    "not.urdf": ("this is no XML", "XML"),
+    "empty.urdf": ("", "empty.urdf"),
+    "still.urdf": ("<robot name='x'><link name='a'/></robot>", "still.urdf"),
+    "bomb.urdf": ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot name='&a;'><link name='a'/></robot>", "bomb.urdf"),
+}
+
+
+@pytest.mark.parametrize("name", URDFS)
+def test_urdfs(cli, generate, tmp_path, name):
+    text, words = URDFS[name]
+    (tmp_path / name).write_text(text)
+    assert words in generate("--hand", tmp_path / name).error()
+    assert words in cli("build-field", tmp_path / name).error()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name: x\nstages: [{place: {}}]", "accepted"),
+        ("name: x\nstages: [{plaice: {}}]", "did you mean 'place'"),
+        ("name: x\nsteps: []", "unknown key 'steps'"),
+        ("name: x\nstages: [{place: {canonicl: 1}}]", "did you mean 'canonical'"),
+        ("name: x\nfield: {index: tree}\nstages: []", "field"),
+        ("[1, 2]", "mapping"),
+        ("a: [", "cannot be read"),
+    ],
+)
+def test_pipelines(cli, tmp_path, text, words):
+    (tmp_path / "p.yaml").write_text(text)
+    for command in (("pipelines", "show"), ("generate", "--object", "tiny", "--out", "out", "--pipeline")):
+        assert words in cli(*command, tmp_path / "p.yaml").error()
+    assert not (tmp_path / "out").exists()
+
+
+def test_unexpected_failures_are_one_line(generate, monkeypatch):
+    for error, words in (
+        (MemoryError(), "out of memory"),
+        (OSError(28, "No space left on device", "x.h5"), "x.h5: No space left"),
+    ):
+
+        def fail(*_, error=error, **__):
+            raise error
+
+        monkeypatch.setattr("lgrasp.engine.generate.load_inputs", fail)
+        assert words in generate().error()
+    monkeypatch.setattr("lgrasp.engine.generate.load_inputs", lambda *_, **__: 1 / 0)
+    assert "unexpected ZeroDivisionError" in generate().error(1)

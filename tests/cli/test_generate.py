@@ -1,0 +1,180 @@
+"""The main job from the command line: report, resume, plan, arrays, starvation, interruption."""
+
+import json
+import os
+import signal
+import time
+
+import pytest
+
+from lgrasp.dataset import read_shard, validate_shard
+from lgrasp.engine.jobs import array_task
+from lgrasp.errors import ConfigError
+
+KEYS = {
+    "grasps",
+    "strict_valid_per_s",
+    "seed_count_per_s",
+    "seconds",
+    "survivors",
+    "near_duplicates",
+    "distinct_poses",
+    "peak_rss_mb",
+    "device",
+    "peak_device_mb",
+}
+STAGES = {"place", "domain", "ik", "search", "filter"}
+
+
+def test_report(generate, tmp_path):
+    result = generate("--shard-rows", 8, "--json", tmp_path / "report.json")
+    assert (result.code, result.err) == (0, "")
+    assert result.out.startswith("grasps ")
+    assert "20 of 20 asked" in result.out
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert set(data) >= KEYS
+    assert set(data["survivors"]) == STAGES
+    assert set(data["seconds"]) >= STAGES | {"hand", "object", "field", "total"}
+    assert data["grasps"] == data["made"] == 20
+    assert 0 < data["distinct_poses"] <= 20
+    assert data["near_duplicates"] == 0
+    assert 0 < data["seed_count"] <= 20
+    assert data["strict_valid_per_s"] == pytest.approx(20 / data["seconds"]["wall"])
+    assert data["peak_rss_mb"] > 50
+    assert data["peak_device_mb"] == 0
+    paths = sorted((tmp_path / "out").iterdir())
+    assert [p.name for p in paths] == data["shards"]
+    assert [len(read_shard(p).grasps) for p in paths] == [8, 8, 4]
+    assert not [line for p in paths for line in validate_shard(p)]
+
+
+def test_report_on_standard_output(generate):
+    result = generate("--json", "-")
+    assert json.loads(result.out)["grasps"] == 20
+
+
+def test_quiet(generate):
+    result = generate("--quiet")
+    assert (result.code, result.out, result.err) == (0, "", "")
+
+
+def test_resume_counts_what_is_there(generate, tmp_path):
+    generate("--shard-rows", 8)
+    (tmp_path / "out" / "allegro-tiny-00001.h5").unlink()
+    data = json.loads(generate("--shard-rows", 8, "--json", "-").out)
+    assert (data["grasps"], data["made"], data["present"]) == (20, 8, 12)
+    data = json.loads(generate("--shard-rows", 8, "--json", "-").out)
+    assert (data["made"], data["strict_valid_per_s"]) == (0, 0)
+    assert data["survivors"]["filter"] >= 20
+
+
+def test_force_makes_everything_anew(generate):
+    generate()
+    data = json.loads(generate("--json", "-", "--force").out)
+    assert data["made"] == 20
+    assert data["hits"] == {"hand": False, "object": False, "field": False}
+
+
+def test_another_run_in_the_folder(generate, tmp_path):
+    generate()
+    before = (tmp_path / "out" / "allegro-tiny-00000.h5").read_bytes()
+    assert "belongs to another run" in generate("--seed", 1).error()
+    assert (tmp_path / "out" / "allegro-tiny-00000.h5").read_bytes() == before
+    assert generate("--seed", 1, "--no-resume").code == 0
+
+
+def test_contacts(generate, tmp_path):
+    assert generate("--contacts", "2").code == 0
+    shard = read_shard(tmp_path / "out" / "allegro-tiny-00000.h5")
+    names = list(shard.hand.link_names)
+    fingers = [{i for i in row if i >= 0 and names[i] != "base_link"} for row in shard.grasps.contact_links[:, 0]]
+    assert {len(found) for found in fingers} == {2}
+
+
+def snapshot(*folders):
+    return {p: (p.stat().st_mtime_ns, p.stat().st_size) for folder in folders for p in sorted(folder.rglob("*"))}
+
+
+@pytest.mark.parametrize("built", [False, True])
+def test_dry_run_has_no_side_effects(cli, generate, tmp_path, shared_cache, built):
+    if built:
+        generate("--shard-rows", 8, rows=8)
+    cache = shared_cache if built else tmp_path / "none"
+    more = () if built else ("--cache-dir", cache)
+    before = snapshot(tmp_path, cache) if built else {}
+    result = generate("--shard-rows", 8, "--dry-run", "--reuse", *more)
+    assert result.code == 0
+    lines = [line.split() for line in result.out.splitlines()]
+    states = {(words[0], words[1]): words[2] for words in lines}
+    known = "hit" if built else "miss"
+    assert [states["hand", "allegro"], states["object", "tiny"], states["field", "allegro"]] == [known] * 3
+    assert states["shard", "0"] == ("present" if built else "missing")
+    assert states["shard", "2"] == "missing"
+    assert snapshot(tmp_path, cache) == before if built else not list(tmp_path.iterdir())
+
+
+def test_array_tasks_share_the_shards(generate, tmp_path, monkeypatch):
+    monkeypatch.setenv("SLURM_ARRAY_TASK_MIN", "5")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_COUNT", "2")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "6")
+    data = json.loads(generate("--shard-rows", 8, "--json", "-").out)
+    assert data["shards"] == ["allegro-tiny-00001.h5"]
+    data = json.loads(generate("--shard-rows", 8, "--json", "-", "--shard-index", 0, "--num-shards", 2).out)
+    assert data["shards"] == ["allegro-tiny-00000.h5", "allegro-tiny-00002.h5"]
+    assert "--shard-index" in generate("--shard-index", 2, "--num-shards", 2).error()
+
+
+def test_array_task_numbers():
+    slurm = {f"SLURM_ARRAY_TASK_{name}": value for name, value in {"ID": "9", "COUNT": "4", "MIN": "3"}.items()}
+    assert array_task(None, None, {}) == (0, 1)
+    assert array_task(None, None, slurm | {"SLURM_ARRAY_TASK_STEP": "2"}) == (3, 4)
+    assert array_task(1, 5, slurm) == (1, 5)
+    with pytest.raises(ConfigError):
+        array_task(None, None, slurm | {"SLURM_ARRAY_TASK_ID": "x"})
+
+
+def test_starved_run_keeps_what_it_found(generate, tmp_path, monkeypatch):
+    monkeypatch.setattr("lgrasp.engine.shard._LEAST_EFFORT", 256)
+    result = generate("--json", tmp_path / "report.json", "--scale", 9, mesh="sphere")
+    assert "starves" in result.error(3)
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert data["starved"]
+    assert data["grasps"] < 20
+    assert not [line for p in (tmp_path / "out").iterdir() for line in validate_shard(p)]
+    again = generate("--scale", 9, mesh="sphere")  # nothing to make, still too few
+    assert again.error(3) == result.error(3)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interruption_leaves_whole_shards(process, generate, tmp_path, number, quick):
+    generate(rows=1)  # inputs are cached
+    out = tmp_path / "many"
+    base = ("--object", "tiny", "--pipeline", quick, "--device", "cpu", "--shard-rows", 50, "--out", out)
+    running = process("generate", *base, "-n", 1_000_000)
+    until = time.monotonic() + 30
+    while not list(out.glob("*.h5")) and time.monotonic() < until:
+        time.sleep(0.02)
+    running.send_signal(number)
+    output, errors = running.communicate(timeout=30)
+    assert running.returncode == 130, errors
+    assert "Traceback" not in output + errors
+    assert "interrupted" in errors
+    shards = sorted(out.iterdir())
+    assert shards
+    assert {p.suffix for p in shards} == {".h5"}
+    assert {len(read_shard(p).grasps) for p in shards} == {50}
+
+
+def test_closed_pipe_is_quiet(process):
+    running = process("pipelines", "show", "swift")
+    assert running.stdout is not None
+    running.stdout.close()
+    running.stdout = None
+    _, errors = running.communicate(timeout=30)
+    assert errors == ""
+    assert running.returncode in (0, 1, 141)
+
+
+def test_debug_shows_the_traceback(process, monkeypatch):
+    monkeypatch.setitem(os.environ, "LGRASP_DEBUG", "1")
+    assert "Traceback" not in process("hands", "show", "nobody").communicate(timeout=30)[1]

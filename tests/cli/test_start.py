@@ -1,0 +1,60 @@
+"""Help, version and start-up cost."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+import typer
+
+import lgrasp
+from lgrasp_cli.main import app
+
+GROUPS = ("hands", "objects", "pipelines", "cache", "dataset")
+
+
+def names():
+    group = typer.main.get_command(app)
+    found = []
+    for name, command in group.commands.items():
+        found += [(name, sub) for sub in command.commands] if name in GROUPS else [(name,)]
+    return found
+
+
+def test_the_commands_of_the_issue_are_there():
+    wanted = {"build-field", "preprocess", "generate", "run", "bench", "warm-up"}
+    wanted |= {"place", "domain", "search", "ik", "filter"}
+    have = names()
+    assert {(name,) for name in wanted} <= set(have)
+    assert {(group, "list") for group in ("hands", "objects", "pipelines", "cache")} <= set(have)
+    assert {(group, "show") for group in ("hands", "objects", "pipelines")} <= set(have)
+
+
+@pytest.mark.parametrize("command", names(), ids=" ".join)
+def test_help_has_an_example(cli, command):
+    result = cli(*command, "--help")
+    assert result.code == 0
+    assert f"Example: lgrasp {' '.join(command)}" in result.out
+
+
+def test_version(cli):
+    assert cli("--version").out == f"lgrasp {lgrasp.__version__}\n"
+
+
+def test_no_command_prints_help(cli):
+    result = cli()
+    assert result.code == 2
+    assert "Usage: lgrasp" in result.out + result.err
+    assert "error" not in result.err
+
+
+def test_help_is_quick_and_light():
+    code = "import sys; sys.argv = ['lgrasp', '--help']\nfrom lgrasp_cli.main import main\n"
+    code += "try:\n    main()\nfinally:\n    print([m for m in ('numpy', 'warp', 'torch', 'h5py') if m in sys.modules])"
+    seconds = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        seconds.append(time.perf_counter() - begin)
+    assert result.stdout.splitlines()[-1] == "[]"
+    assert min(seconds) < 0.5
