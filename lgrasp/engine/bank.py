@@ -49,7 +49,11 @@ class Bank:
         arrays = self.cache.load("bank", self.key(first, count))
         if arrays is None:
             return None
-        return candidate_table(arrays, self.device), json.loads(str(arrays["counts"]))
+        try:
+            return candidate_table(arrays, self.device), json.loads(str(arrays["counts"]))
+        except (KeyError, ValueError, RuntimeError):
+            self.cache.warn(f"bank {self.cache.path('bank', self.key(first, count))} is damaged; it is made anew")
+            return None
 
     def store(self, first: int, count: int, table: CandidateTable, counts: dict[str, dict[str, int]]) -> None:
         arrays = candidate_arrays(table) | {"counts": np.asarray(json.dumps(counts))}

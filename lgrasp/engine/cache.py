@@ -19,7 +19,8 @@ from lgrasp.paths import cache_dir
 
 __all__ = ["Cache", "CacheEntry", "content_key"]
 
-_FORMAT = 1
+_FORMAT = 2
+_NAMES = "/names"  # member that lists the others
 
 
 def content_key(kind: str, version: int, **parts: Any) -> str:
@@ -86,7 +87,10 @@ class Cache:
             return None
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
+                arrays = {name: archive[name] for name in archive.files}
+            if json.loads(str(arrays.pop(_NAMES))) != sorted(arrays):  # checksums cover members, not their list
+                raise ValueError("members are missing")
+            return arrays
         except Exception:  # damaged bytes make the readers of zip and npy raise almost anything
             self.warn(f"cache entry {path} is damaged; it is made anew")
             return None
@@ -107,7 +111,7 @@ class Cache:
             ) as file:
                 name = file.name
                 hold_file(file.fileno())
-                np.savez(file, allow_pickle=False, **arrays)
+                np.savez(file, allow_pickle=False, **arrays | {_NAMES: np.asarray(json.dumps(sorted(arrays)))})
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(name, path)

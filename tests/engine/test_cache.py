@@ -1,0 +1,221 @@
+"""The content-keyed cache: whole entries or none, whatever happens to the folder."""
+
+import os
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.generate import generate
+from lgrasp.errors import CacheError
+
+ARRAYS = {"a": np.arange(40, dtype=np.float32).reshape(8, 5), "text": np.asarray("word"), "none": np.zeros((0, 3))}
+
+
+def same(a: dict[str, np.ndarray] | None, b: dict[str, np.ndarray]) -> bool:
+    return a is not None and a.keys() == b.keys() and all(np.array_equal(a[n], b[n]) for n in b)
+
+
+@pytest.fixture
+def lines() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def cache(tmp_path, lines) -> Cache:
+    return Cache(tmp_path / "cache", lines.append)
+
+
+def test_round_trip(cache, lines):
+    assert cache.load("kind", "key") is None
+    cache.store("kind", "key", ARRAYS)
+    assert same(cache.load("kind", "key"), ARRAYS)
+    assert cache.has("kind", "key")
+    assert not cache.has("kind", "other")
+    assert not lines
+
+
+def test_get_makes_once(cache):
+    calls = []
+
+    def make():
+        calls.append(1)
+        return ARRAYS
+
+    assert cache.get("kind", "key", make)[1] is False
+    found, hit = cache.get("kind", "key", make)
+    assert hit
+    assert same(found, ARRAYS)
+    assert len(calls) == 1
+
+
+def test_fresh_cache_finds_only_its_own(tmp_path, cache):
+    cache.store("kind", "key", ARRAYS)
+    fresh = Cache(tmp_path / "cache", pytest.fail, fresh=True)
+    assert fresh.load("kind", "key") is None
+    fresh.store("kind", "key", {"b": np.ones(2)})
+    assert fresh.has("kind", "key")
+    assert same(cache.load("kind", "key"), {"b": np.ones(2)})
+
+
+def test_every_byte_flipped(cache, lines):
+    """Any flipped byte gives the arrays as they were, or a miss with one line; never an error or other numbers."""
+    cache.store("kind", "key", ARRAYS)
+    path = cache.path("kind", "key")
+    data = path.read_bytes()
+    misses = 0
+    for at in range(len(data)):
+        broken = bytearray(data)
+        broken[at] ^= 0xFF
+        path.write_bytes(broken)
+        lines.clear()
+        found = cache.load("kind", "key")
+        misses += found is None
+        assert (found is None and len(lines) == 1 and "\n" not in lines[0]) or same(found, ARRAYS), at
+    assert misses > len(data) // 2
+
+
+def test_every_truncation(cache, lines):
+    cache.store("kind", "key", ARRAYS)
+    path = cache.path("kind", "key")
+    data = path.read_bytes()
+    for size in range(len(data)):
+        path.write_bytes(data[:size])
+        assert cache.load("kind", "key") is None, size
+    assert len(lines) == len(data)
+
+
+def test_pickles_are_not_loaded(cache, lines):
+    path = cache.path("kind", "key")
+    path.parent.mkdir(parents=True)
+    np.savez(path, a=np.array([{}], dtype=object), allow_pickle=True)
+    assert cache.load("kind", "key") is None
+    assert len(lines) == 1
+
+
+def test_folder_in_place_of_an_entry(cache, lines):
+    cache.path("kind", "key").mkdir(parents=True)
+    found, hit = cache.get("kind", "key", lambda: ARRAYS)
+    assert same(found, ARRAYS)
+    assert not hit
+    assert len(lines) == 1
+
+
+def test_root_is_a_file(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(CacheError, match="is a file"):
+        Cache(tmp_path / "file")
+
+
+@pytest.mark.parametrize("where", ["below a file", "/proc/lgrasp"])
+def test_folder_that_cannot_be_written(tmp_path, lines, where):
+    (tmp_path / "file").touch()
+    cache = Cache(tmp_path / "file" / "cache" if where == "below a file" else where, lines.append)
+    for key in ("a", "b"):
+        assert same(cache.get("kind", key, lambda: ARRAYS)[0], ARRAYS)
+        assert cache.load("kind", key) is None
+    assert len(lines) == 1
+    assert "going on without it" in lines[0]
+
+
+def test_full_disk(cache, lines):
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+    try:
+        cache.store("kind", "key", {"a": np.zeros(100_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert len(lines) == 1
+    assert list(cache.path("kind", "key").parent.iterdir()) == []
+
+
+def test_writers_and_readers_at_once(cache, lines):
+    """Threads store and load one entry: every load is whole."""
+    arrays = [{"a": np.full(5000, n)} for n in range(4)]
+    bad = []
+
+    def work(mine):
+        for _ in range(15):
+            cache.store("kind", "key", mine)
+            found = cache.load("kind", "key")
+            if found is None or not any(same(found, a) for a in arrays):
+                bad.append(found)
+
+    threads = [threading.Thread(target=work, args=(a,)) for a in arrays]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    assert not bad
+    assert not lines
+    assert os.listdir(cache.root / "kind") == ["key.npz"]
+
+
+def test_prune(cache):
+    for kind in ("hand", "bank"):
+        cache.store(kind, "key", ARRAYS)
+    left = cache.root / "bank" / ".key.0123.tmp"
+    left.touch()
+    assert sorted(e.kind for e in cache.entries()) == ["bank", "hand"]
+    files, size = cache.prune({"bank"})
+    assert (files, size > 0) == (1, True)
+    assert not left.exists()
+    assert cache.prune(older_than=0.0) == (0, 0)
+    assert cache.prune()[0] == 1
+    assert not cache.entries()
+
+
+def test_keys_tell_everything_apart():
+    keys = [
+        content_key("a", 1, x=1),
+        content_key("b", 1, x=1),
+        content_key("a", 2, x=1),
+        content_key("a", 1, x=2),
+        content_key("a", 1, y=1),
+        content_key("a", 1, x="1"),
+        content_key("a", 1, x=[1]),
+    ]
+    assert len(set(keys)) == len(keys)
+    assert content_key("a", 1, x=1, y=2) == content_key("a", 1, y=2, x=1)
+    assert all(len(k) == 64 for k in keys)
+
+
+@pytest.mark.parametrize(("kind", "damage"), [("hand", "cut"), ("object", "flip"), ("field", "cut"), ("bank", "flip")])
+def test_damaged_artifact_is_made_again(job, inputs, cache_root, raw_grasps, lines, tmp_path, kind, damage):
+    cache = Cache(tmp_path / "cache", lines.append)
+    for name in ("hand", "object", "field"):
+        shutil.copytree(cache_root / name, cache.root / name)
+    generate(job(rows=20, reuse=True, cache=cache, out=tmp_path / "first"))
+    if kind == "bank":
+        path = next((cache.root / kind).iterdir())
+    else:
+        path = cache.path(kind, getattr(inputs.keys, kind))
+    whole = path.read_bytes()
+    broken = bytearray(whole)
+    broken[len(whole) // 2] ^= 1
+    path.write_bytes(broken if damage == "flip" else whole[: len(whole) // 3])
+    generate(job(rows=20, reuse=True, cache=cache, out=tmp_path / "second"))
+    assert raw_grasps(tmp_path / "first") == raw_grasps(tmp_path / "second")
+    assert len(lines) == 1
+    assert str(path) in lines[0]
+    if kind != "bank":  # slots of a bank that hold no candidate are not set
+        assert path.read_bytes() == whole
+
+
+def test_job_without_a_writable_cache(job, raw_grasps, lines, tmp_path):
+    (tmp_path / "file").touch()
+    generate(job(rows=20, out=tmp_path / "first"))
+    cache = Cache(tmp_path / "file" / "cache", lines.append)
+    generate(job(rows=20, cache=cache, reuse=True, out=tmp_path / "second"))
+    assert raw_grasps(tmp_path / "first") == raw_grasps(tmp_path / "second")
+    assert len(lines) == 1
+
+
+def test_default_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("LGRASP_CACHE_DIR", str(tmp_path))
+    assert Cache().root == Path(tmp_path)
+    assert Cache(tmp_path / "own").root == tmp_path / "own"
