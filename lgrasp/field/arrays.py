@@ -11,7 +11,17 @@ from lgrasp.device.transforms import decode_normal, normal_bin
 from lgrasp.field.model import ContactField
 from lgrasp.hand.model import HandModel
 
-__all__ = ["Boxes", "Field", "FieldArrays", "boxes_pick", "field_has", "field_pick", "field_seed", "query_field", "upload_field"]
+__all__ = [
+    "Boxes",
+    "Field",
+    "FieldArrays",
+    "boxes_pick",
+    "field_has",
+    "field_pick",
+    "field_seed",
+    "query_field",
+    "upload_field",
+]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -219,7 +229,14 @@ def _query_boxes(
 
 
 def query_field(
-    field: FieldArrays, group: np.ndarray, point: np.ndarray, normal: np.ndarray, *, angle: float, index: str = "voxel", seed: int = 0
+    field: FieldArrays,
+    group: np.ndarray,
+    point: np.ndarray,
+    normal: np.ndarray,
+    *,
+    angle: float,
+    index: str = "voxel",
+    seed: int = 0,
 ) -> np.ndarray:
     """Which contact vector of its group meets each query? One interface for both indices.
 

@@ -37,7 +37,9 @@ def box_index(position: np.ndarray, patch: np.ndarray, patches: int, params: Fie
     leaf_first = np.concatenate([[0], np.cumsum(kept)])
     inside = np.arange(leaf_first[-1]) - np.repeat(leaf_first[:-1], kept)
     spread = inside * np.repeat(number, kept) // np.repeat(kept, kept)
-    corner = np.column_stack([boxes // (size[1] * size[2]) % size[0], boxes // size[2] % size[1], boxes % size[2]]) + low
+    corner = (
+        np.column_stack([boxes // (size[1] * size[2]) % size[0], boxes // size[2] % size[1], boxes % size[2]]) + low
+    )
     owner = boxes // (size[0] * size[1] * size[2])
     return {
         "box_edge": params.box,

@@ -20,6 +20,7 @@ FIELD_VERSION = 2
 """Raised whenever the arrays of a ContactField change meaning."""
 
 _CLEARANCE = 5.0e-4  # [m] postures of the field keep this distance to the palm
+_VECTOR_BYTES = 24  # at most, of one contact vector in all arrays
 _PER_POSTURE = 4  # contact vectors drawn from one posture
 
 
@@ -130,11 +131,12 @@ def build_field(
 
 def _bounded_cell(positions: list[np.ndarray], params: FieldParams) -> float:
     """The voxel edge [m], grown until table and vectors fit the memory bound."""
-    vectors = sum(len(p) for p in positions) * 24
+    vectors = sum(len(p) for p in positions) * _VECTOR_BYTES
     cell = params.cell
     while True:
         cells = sum(float(np.prod(np.floor(np.ptp(p, axis=0) / cell) + 2)) for p in positions if len(p))
-        if cells * (4 * NORMAL_BINS + 8) + vectors <= params.max_mb * 1e6 or cell > 0.1:
+        fits = cells * (4 * NORMAL_BINS + 8) + vectors <= params.max_mb * 1e6
+        if fits and cells * NORMAL_BINS < 2**31:  # rows of the table are 32-bit
             return cell
         cell *= 1.25
 
@@ -144,7 +146,9 @@ def _sample_group(hand: HandArrays, group: int, params: FieldParams) -> dict[str
     model, device = hand.model, hand.device
     width = int(np.diff(model.tree.dof_first).max())
     surface = int(model.contact_first[group + 1] - model.contact_first[group])
-    count = params.records if surface else 0
+    # vectors may fill half of the memory bound, the table the rest
+    room = int(0.5e6 * params.max_mb / _VECTOR_BYTES / model.groups)
+    count = min(params.records, room) if surface else 0
     postures = max(1000, int(1.5 * params.records / _PER_POSTURE))
     posture = wp.zeros((postures, width), dtype=wp.uint8, device=device)
     clear = wp.empty(postures, dtype=wp.int32, device=device)

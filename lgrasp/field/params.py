@@ -19,5 +19,7 @@ class FieldParams(BaseModel):
     cell: float = Field(0.008, ge=0.002, le=0.05, description="Edge of a voxel.")
     box: float = Field(0.01, ge=0.002, le=0.05, description="Edge of a leaf box of the bvh index.")
     leaf_normals: int = Field(256, ge=1, le=4096, description="Most contact vectors in a leaf of the bvh index.")
-    max_mb: int = Field(512, ge=16, le=65536, description="Memory bound of the field [MB]; voxels grow to respect it.")
+    max_mb: int = Field(
+        512, ge=16, le=65536, description="Memory bound of the field [MB]; vectors and voxels give way."
+    )
     seed: int = Field(0, ge=0, description="Seed of the sampling.")

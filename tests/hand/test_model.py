@@ -119,7 +119,7 @@ def test_mimic_joints_that_exclude_each_other(tmp_path):
 
 
 def surface_distance(mesh: trimesh.Trimesh, p: np.ndarray) -> np.ndarray:
-    """Distances [m] of points to a surface, computed in millimetres: trimesh errs by 0.2 mm on triangles of 1e-3 units."""
+    """Distances [m] of points to a surface, in millimetres: trimesh errs by 0.2 mm on triangles of 1e-3 units."""
     return trimesh.proximity.closest_point(mesh.copy().apply_scale(1e3), 1e3 * p.astype(float))[1] / 1e3
 
 
