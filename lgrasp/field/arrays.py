@@ -159,7 +159,7 @@ def field_pick(f: Field, group: wp.int32, row: wp.int32, p: wp.vec3, n: wp.vec3,
 
 @wp.func
 def boxes_pick(b: Boxes, f: Field, group: wp.int32, p: wp.vec3, n: wp.vec3, cosine: wp.float32, state: wp.uint32):
-    """A contact vector of a random patch whose box at p holds a normal within ``cosine`` of n: the best aligned one, or -1."""
+    """The best aligned contact vector of a random patch whose box at p holds a normal within ``cosine`` of n, or -1."""
     pick = int(-1)
     hits = int(0)
     for patch in range(b.group_first[group], b.group_first[group + 1]):
