@@ -109,7 +109,7 @@ def make_shard(
     limit = shard_effort(pipeline, rows)
     result: ShardResult | None = None
     parts: list[GraspTable] = []
-    kept = KeptRows()
+    kept = KeptRows(inputs.hand.model.dofs, inputs.device.alias)
     stopped = False
     start = time.perf_counter()
     with closing(_batches(pipeline, context, execution, bank, limit)) as batches:

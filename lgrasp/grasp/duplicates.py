@@ -1,7 +1,10 @@
 """Near-duplicates: object translation within 5 mm, rotation within 5 degrees and every joint within 0.1 rad."""
 
 import numpy as np
+import warp as wp
 from scipy.spatial import cKDTree
+
+from lgrasp.grasp.near_kernels import near_earlier
 
 __all__ = ["NEAR_ANGLE", "NEAR_DISTANCE", "NEAR_JOINT", "KeptRows", "near_pairs", "new_rows"]
 
@@ -40,12 +43,15 @@ def new_rows(pose: np.ndarray, q: np.ndarray) -> np.ndarray:
 class KeptRows:
     """Rows kept so far of a stream, without near-duplicates: the same ones however the stream is cut.
 
-    The time per row grows with the logarithm of their number: rows lie in blocks, each at least twice as long as the
-    next one.
+    A hash grid over object positions (on the job's device) tells which rows have any row close before them; those few are
+    then decided one by one.
     """
 
-    def __init__(self) -> None:
-        self._blocks: list[tuple[np.ndarray, np.ndarray, cKDTree]] = []
+    def __init__(self, joints: int, device: str = "cpu") -> None:
+        self._device = device
+        self._pose = np.zeros((0, 7), np.float32)
+        self._q = np.zeros((0, joints), np.float32)
+        self._grid = wp.HashGrid(128, 128, 128, device=device)
         self.count = 0
 
     def add(self, pose: np.ndarray, q: np.ndarray, room: int) -> tuple[np.ndarray, int]:
@@ -55,30 +61,43 @@ class KeptRows:
             Indices of the rows kept now, and the number of near-duplicates before the last of them (all of them
             unless the room ran out).
         """
-        fresh = np.flatnonzero(~self._touched(pose, q))
-        fresh = fresh[new_rows(pose[fresh], q[fresh])]
-        kept = fresh[:room]
+        if len(pose) == 0:
+            return np.zeros(0, int), 0
+        if self.count + len(pose) > len(self._pose):
+            grown = np.zeros((2 * (self.count + len(pose)), 7 + self._q.shape[1]), np.float32)
+            grown[: self.count, :7], grown[: self.count, 7:] = self._pose[: self.count], self._q[: self.count]
+            self._pose, self._q = np.ascontiguousarray(grown[:, :7]), np.ascontiguousarray(grown[:, 7:])
+        end = self.count + len(pose)
+        self._pose[self.count : end], self._q[self.count : end] = pose, q
+        keep = np.ones(end, bool)
+        for row in self.count + np.flatnonzero(self._suspects(end)):
+            before = np.flatnonzero(keep[:row])
+            same = _near(self._pose[before], self._q[before], self._pose[[row]], self._q[[row]])
+            keep[row] = not same.any()
+        kept = np.flatnonzero(keep[self.count :])[:room]
         looked_at = kept[-1] + 1 if len(kept) and len(kept) == room else len(pose)
-        if len(kept):
-            self.count += len(kept)
-            self._append(pose[kept], q[kept])
+        after = self.count + len(kept)
+        self._pose[self.count : after], self._q[self.count : after] = pose[kept], q[kept]
+        self.count = after
         return kept, int(looked_at - len(kept))
 
-    def _append(self, pose: np.ndarray, q: np.ndarray) -> None:
-        while self._blocks and len(self._blocks[-1][0]) < 2 * len(pose):
-            before_pose, before_q, _ = self._blocks.pop()
-            pose, q = np.vstack([before_pose, pose]), np.vstack([before_q, q])
-        self._blocks.append((pose, q, cKDTree(pose[:, :3])))
-
-    def _touched(self, pose: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Mask (N,) of the rows that are near-duplicates of a kept row."""
-        touched = np.zeros(len(pose), bool)
-        for block_pose, block_q, tree in self._blocks:
-            found = tree.query_ball_point(pose[:, :3], _REACH)
-            i = np.repeat(np.arange(len(pose)), [len(rows) for rows in found])
-            j = np.fromiter((row for rows in found for row in rows), int, len(i))
-            touched[i[_near(pose[i], q[i], block_pose[j], block_q[j])]] = True
-        return touched
+    def _suspects(self, end: int) -> np.ndarray:
+        """Mask of the rows ``count .. end - 1`` that have a row close before them (with a little slack for rounding)."""
+        d = self._device
+        position = wp.array(np.ascontiguousarray(self._pose[:end, :3]), dtype=wp.vec3, device=d)
+        rotation = wp.array(np.ascontiguousarray(self._pose[:end, 3:]), dtype=wp.vec4, device=d)
+        q = wp.array(self._q[:end], dtype=wp.float32, device=d)
+        near = wp.empty(end - self.count, dtype=wp.int32, device=d)
+        self._grid.build(position, _REACH)
+        limits = [_REACH, float(np.cos(NEAR_ANGLE / 2)) - 1e-6, NEAR_JOINT * 1.00001]
+        wp.launch(
+            near_earlier,
+            dim=len(near),
+            inputs=[self._grid.id, position, rotation, q, self.count, *limits],
+            outputs=[near],
+            device=d,
+        )
+        return near.numpy() > 0
 
 
 def _near(pose_a: np.ndarray, q_a: np.ndarray, pose_b: np.ndarray, q_b: np.ndarray) -> np.ndarray:

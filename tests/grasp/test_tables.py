@@ -1,0 +1,62 @@
+"""Tables survive the way to NumPy and back; rows are taken and joined column by column."""
+
+import numpy as np
+import pytest
+
+from lgrasp.engine.batch import run_stages
+from lgrasp.grasp.tables import (
+    candidate_arrays,
+    candidate_table,
+    grasp_arrays,
+    join_grasps,
+    pose_arrays,
+    pose_table,
+    select_poses,
+    set_arrays,
+    set_table,
+    take_grasps,
+)
+
+
+@pytest.fixture(scope="module")
+def tables(swift, context):
+    return {stage: run_stages(swift, context, 0, 256, stage) for stage in ("place", "ik", "search", "filter")}
+
+
+def assert_same(a, b):
+    assert a.keys() == b.keys()
+    for name in a:
+        assert a[name].dtype == b[name].dtype
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("stage", "pack", "unpack"),
+    [
+        ("place", pose_arrays, pose_table),
+        ("ik", candidate_arrays, candidate_table),
+        ("search", set_arrays, set_table),
+    ],
+)
+def test_round_trip(tables, stage, pack, unpack):
+    arrays = {name: values.copy() for name, values in pack(tables[stage]).items()}
+    assert_same(arrays, pack(unpack(arrays, "cpu")))
+
+
+def test_select_poses(tables):
+    table = tables["ik"]
+    order = np.array([5, 0, 3])
+    chosen = candidate_arrays(select_poses(table, order, "cpu"))
+    for name, values in candidate_arrays(table).items():
+        np.testing.assert_array_equal(chosen[name], values[order], err_msg=name)
+    assert len(select_poses(table, np.zeros(0, int), "cpu").poses) == 0
+
+
+def test_take_and_join(tables):
+    grasps = tables["filter"]
+    n = len(grasps)
+    assert n > 4
+    parts = [take_grasps(grasps, slice(0, 3)), take_grasps(grasps, slice(3, 3)), take_grasps(grasps, np.arange(3, n))]
+    assert [len(p) for p in parts] == [3, 0, n - 3]
+    assert_same(grasp_arrays(join_grasps(parts)), grasp_arrays(grasps))
+    assert all(len(values) == n for values in grasp_arrays(grasps).values())
