@@ -7,7 +7,7 @@ import warp as wp
 
 from lgrasp.device.convex import Pieces
 from lgrasp.device.kinematics import MAX_JOINTS, Kinematics, group_forward, point_column, vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.device.runtime import KERNEL_OPTIONS, start
 from lgrasp.device.sdf import Sdf
 from lgrasp.hand.model import HandModel
 
@@ -75,6 +75,7 @@ def _quaternions(T: np.ndarray) -> np.ndarray:
 
 def upload_hand(model: HandModel, device: str) -> HandArrays:
     """Copy a hand to a device."""
+    start()
 
     def put(a: np.ndarray, dtype) -> wp.array:
         return wp.array(np.ascontiguousarray(a), dtype=dtype, device=device)
