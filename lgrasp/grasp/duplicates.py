@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
+from lgrasp.device.runtime import start
 from lgrasp.grasp.near_kernels import near_earlier
 
 __all__ = ["NEAR_ANGLE", "NEAR_DISTANCE", "NEAR_JOINT", "KeptRows", "near_pairs", "new_rows"]
@@ -48,6 +49,7 @@ class KeptRows:
     """
 
     def __init__(self, joints: int, device: str = "cpu") -> None:
+        start()
         self._device = device
         self._pose = np.zeros((0, 7), np.float32)
         self._q = np.zeros((0, joints), np.float32)
