@@ -90,8 +90,8 @@ def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str
         content = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise ObjectError(f"object {path} cannot be read: {error.strerror}") from None
-    described = params.model_dump(mode="json")
-    return path, content_key("object", OBJECT_VERSION, content=content, name=path.name, scale=scale, params=described)
+    described = {"name": path.name, "scale": float(scale), "params": params.model_dump(mode="json")}
+    return path, content_key("object", OBJECT_VERSION, content=content, **described)
 
 
 def load_hand(cache: Cache, keys: InputKeys, device: Device) -> tuple[HandModel, bool]:

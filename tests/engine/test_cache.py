@@ -190,10 +190,7 @@ def test_damaged_artifact_is_made_again(job, inputs, cache_root, raw_grasps, lin
     for name in ("hand", "object", "field"):
         shutil.copytree(cache_root / name, cache.root / name)
     generate(job(rows=20, reuse=True, cache=cache, out=tmp_path / "first"))
-    if kind == "bank":
-        path = next((cache.root / kind).iterdir())
-    else:
-        path = cache.path(kind, getattr(inputs.keys, kind))
+    path = next((cache.root / kind).iterdir()) if kind == "bank" else cache.path(kind, getattr(inputs.keys, kind))
     whole = path.read_bytes()
     broken = bytearray(whole)
     broken[len(whole) // 2] ^= 1

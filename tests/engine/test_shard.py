@@ -1,0 +1,108 @@
+"""Batches of a shard: worked on ahead, none left running, none lost."""
+
+import threading
+import time
+
+import pytest
+
+from lgrasp.engine import shard as shard_module
+from lgrasp.engine.batch import run_batch
+from lgrasp.engine.shard import Execution, make_shard
+
+
+@pytest.fixture
+def watched(monkeypatch):
+    """Numbers of the first candidates of the batches begun, and how many run now."""
+
+    class Watch:
+        begun: list[int] = []  # noqa: RUF012
+        running = 0
+        lock = threading.Lock()
+        fail_at = -1
+        pause = 0.0
+
+    watch = Watch()
+    watch.begun = []
+
+    def run(pipeline, context, first, count, bank):
+        with watch.lock:
+            watch.begun.append(first)
+            watch.running += 1
+        try:
+            time.sleep(watch.pause)
+            if first == watch.fail_at:
+                raise RuntimeError("out of memory")
+            return run_batch(pipeline, context, first, count, bank)
+        finally:
+            with watch.lock:
+                watch.running -= 1
+
+    monkeypatch.setattr(shard_module, "run_batch", run)
+    return watch
+
+
+def threads() -> int:
+    return sum(t.name.startswith("ThreadPoolExecutor") for t in threading.enumerate())
+
+
+def test_enough_rows(swift, inputs, watched):
+    watched.pause = 0.02
+    make_shard(swift, inputs, 0, 5, Execution(2, 64))
+    assert watched.running == 0
+    assert threads() == 0
+    done = len(watched.begun)
+    time.sleep(0.05)
+    assert len(watched.begun) == done
+
+
+def test_error_in_a_batch(swift, inputs, watched):
+    watched.fail_at = 128
+    watched.pause = 0.02
+    with pytest.raises(RuntimeError, match="out of memory") as caught:
+        make_shard(swift, inputs, 0, 10_000, Execution(2, 64))
+    assert watched.running == 0
+    assert threads() == 0
+    assert max(watched.begun) <= 128 + 3 * 64
+    assert caught.value
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_error_while_reporting(swift, inputs, watched, error):
+    def report(rows, result):
+        raise error
+
+    with pytest.raises(error) as caught:
+        make_shard(swift, inputs, 0, 10_000, Execution(2, 64), progress=report)
+    assert watched.running == 0  # although the traceback keeps the frames alive
+    assert threads() == 0
+    assert caught.tb
+
+
+def test_cancelled(swift, inputs, watched):
+    result = make_shard(swift, inputs, 0, 10_000, Execution(2, 64, lambda: len(watched.begun) > 2))
+    assert result.cancelled
+    assert not result.exhausted
+    assert watched.running == 0
+    assert threads() == 0
+
+
+def test_progress(swift, inputs):
+    seen = []
+    result = make_shard(
+        swift, inputs, 0, 30, Execution(2, 100), progress=lambda rows, running: seen.append((rows, running.candidates))
+    )
+    assert [candidates for _, candidates in seen] == [100 * (i + 1) for i in range(len(seen))]
+    assert [rows for rows, _ in seen] == sorted(rows for rows, _ in seen)
+    assert seen[-1] == (30, result.candidates)
+    assert result.counts["place"]["tried"] == result.candidates
+    assert set(result.seconds) == set(swift.order)
+    assert result.wall > 0
+
+
+def test_last_batch_is_shorter(swift, inputs, monkeypatch):
+    monkeypatch.setattr(shard_module, "shard_effort", lambda pipeline, rows: 150)
+    result = make_shard(swift, inputs, 0, 10_000, Execution(1, 64))
+    assert result.exhausted
+    assert result.candidates == 150
+    assert result.counts["place"]["tried"] == 150
+    assert int(result.grasps.index.max()) < 150
