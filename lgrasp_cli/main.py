@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from lgrasp_cli import bench, cache, dataset, generate, hands, objects, pipelines, prepare, run, stages
+from lgrasp_cli.interrupt import Interrupted, on_interrupt, stop_now
 
 __all__ = ["app", "main"]
 
@@ -50,8 +51,9 @@ def main() -> None:
         code = app(prog_name="lgrasp", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     try:
-        code = app(prog_name="lgrasp", standalone_mode=False)
-        sys.stdout.flush()
+        with on_interrupt(stop_now):
+            code = app(prog_name="lgrasp", standalone_mode=False)
+            sys.stdout.flush()
     except BaseException as error:
         _leave(*_explain(error))
     sys.exit(code if isinstance(code, int) else 0)
@@ -67,7 +69,7 @@ def _explain(error: BaseException) -> tuple[str, int]:
         return "", 2
     if isinstance(error, typer.TyperException):
         return f"error: {error.format_message()}", error.exit_code
-    if isinstance(error, KeyboardInterrupt | typer.Abort):
+    if isinstance(error, Interrupted | KeyboardInterrupt | typer.Abort):
         return "interrupted", 130
     if isinstance(error, SystemExit):
         return "", error.code if isinstance(error.code, int) else 1

@@ -1,13 +1,8 @@
 """While a job runs: progress on standard error, Ctrl-C to stop after the running batch."""
 
-import os
-import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import FrameType
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -16,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lgrasp.engine.generate import Listener
 from lgrasp.engine.report import survivors
+from lgrasp_cli.interrupt import on_interrupt, stop_now
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -93,23 +89,13 @@ class JobProgress(Listener):
         return self.stop
 
 
-@contextmanager
-def interruptible(progress: JobProgress) -> Iterator[None]:
+def interruptible(progress: JobProgress) -> AbstractContextManager[None]:
     """The first Ctrl-C (or SIGTERM) ends the job after the running batch, the second at once; whole shards stay."""
 
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        if progress.running and not progress.stop:
-            progress.stop = True
-            say("stopping after the running batch; Ctrl-C again stops at once")
-            return
-        last = threading.Timer(1.0, os._exit, (130,))  # native code may keep the interpreter from ending
-        last.daemon = True
-        last.start()
-        raise KeyboardInterrupt
+    def stop() -> None:
+        if progress.stop or not progress.running:
+            stop_now()
+        progress.stop = True
+        say("stopping after the running batch; Ctrl-C again stops at once")
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return on_interrupt(stop)

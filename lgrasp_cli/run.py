@@ -73,6 +73,7 @@ def _run_one(job: Any, quiet: bool) -> dict[str, Any]:
     """The report of a job with its status, one line of why, and exit code."""
     from lgrasp.errors import LgraspError
     from lgrasp_cli.generate import conclude, run_job
+    from lgrasp_cli.interrupt import Interrupted
 
     base = {"hand": job.hand, "object": job.object, "pipeline": job.pipeline.name}
     data: dict[str, Any] = {}
@@ -86,7 +87,7 @@ def _run_one(job: Any, quiet: bool) -> dict[str, Any]:
     except (MemoryError, OSError) as error:
         typer.echo(f"error: {error or 'out of memory'}", err=True)
         return base | data | {"status": "failed", "error": str(error), "exit_code": 2}
-    except (KeyboardInterrupt, typer.Exit):
+    except (Interrupted, typer.Exit):
         return base | data | {"status": "interrupted", "error": "", "exit_code": 130}
     return base | data | {"status": "done", "error": "", "exit_code": 0}
 

@@ -27,8 +27,8 @@ def bench(jobs: list[Job], repeat: int, progress: Callable[[str], None] | None =
         progress: called with one line before each run.
 
     Returns:
-        One dictionary for each job: ``pipeline``, ``hand``, ``object``, ``grasps``, ``device``; each rate as ``median``,
-        ``min``, ``max``; ``seconds`` and ``survivors`` of the middle run; ``build_seconds`` and ``load_seconds`` of
+        For each job ``pipeline``, ``hand``, ``object``, ``grasps``, ``device``; each rate as ``median``, ``min``,
+        ``max``; ``seconds`` and ``survivors`` of the middle run; ``build_seconds`` and ``load_seconds`` of
         object and field; ``near_duplicates``, ``distinct_poses``, ``starved``, ``peak_rss_mb``.
 
     Raises:

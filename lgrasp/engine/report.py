@@ -154,6 +154,8 @@ def check_json(path: str | os.PathLike[str]) -> None:
     """
     if Path(path).is_dir():
         raise OutputError(f"report {path} cannot be written: it is a folder; name a file")
+    if _is_special(Path(path)):
+        return
     try:
         check_folder(Path(path).parent)
     except OutputError as error:
@@ -161,10 +163,22 @@ def check_json(path: str | os.PathLike[str]) -> None:
 
 
 def write_json(path: str | os.PathLike[str], data: Any) -> None:
-    """Write JSON so that the file is whole or absent.
+    """Write JSON so that the file is whole or absent; a pipe or device such as /dev/stdout is written to.
 
     Raises:
         OutputError: the file cannot be written.
     """
+    text = json.dumps(data, indent=2) + "\n"
+    if _is_special(Path(path)):
+        try:
+            Path(path).write_text(text)
+        except OSError as error:
+            raise OutputError(f"report {path} cannot be written: {error.strerror}") from None
+        return
     with new_file(path) as file:
-        file.write((json.dumps(data, indent=2) + "\n").encode())
+        file.write(text.encode())
+
+
+def _is_special(path: Path) -> bool:
+    """Something that exists and is no regular file: it must not be replaced by one."""
+    return path.exists() and not path.is_file()

@@ -165,6 +165,22 @@ def test_interruption_leaves_whole_shards(process, generate, tmp_path, number, q
     assert {len(read_shard(p).grasps) for p in shards} == {50}
 
 
+@pytest.mark.parametrize("delay", [0.5, 1.0])
+def test_interruption_while_loading(process, tmp_path, delay):
+    running = process("generate", "--object", "mug", "-n", 1_000_000, "--out", tmp_path / "out")
+    time.sleep(delay)
+    running.send_signal(signal.SIGINT)
+    _, errors = running.communicate(timeout=30)
+    assert running.returncode == 130
+    assert "Traceback" not in errors
+    assert errors.splitlines()[-1].startswith("interrupted")
+
+
+def test_report_into_a_device(generate):
+    assert "No space" in generate("--json", "/dev/full").error()
+    assert os.stat("/dev/full").st_rdev
+
+
 def test_closed_pipe_is_quiet(process):
     running = process("pipelines", "show", "swift")
     assert running.stdout is not None

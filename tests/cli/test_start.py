@@ -1,8 +1,8 @@
 """Help, version and start-up cost."""
 
+import resource
 import subprocess
 import sys
-import time
 
 import pytest
 import typer
@@ -53,8 +53,9 @@ def test_help_is_quick_and_light():
     code += "try:\n    main()\nfinally:\n    print([m for m in ('numpy', 'warp', 'torch', 'h5py') if m in sys.modules])"
     seconds = []
     for _ in range(3):
-        begin = time.perf_counter()
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        seconds.append(time.perf_counter() - begin)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)  # whoever else computes
     assert result.stdout.splitlines()[-1] == "[]"
     assert min(seconds) < 0.5

@@ -1,0 +1,53 @@
+"""What Ctrl-C and SIGTERM do."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+__all__ = ["Interrupted", "on_interrupt", "stop_now"]
+
+_GRACE = 1.0  # [s] that native code may take before the process is ended
+
+
+class Interrupted(BaseException):
+    """The user stopped the command."""
+
+
+def stop_now() -> None:
+    """Unwind to the end of the command, and end the process where that takes longer than a second.
+
+    Raises:
+        Interrupted: always.
+    """
+    last = threading.Timer(_GRACE, _end)
+    last.daemon = True
+    last.start()
+    raise Interrupted
+
+
+def _end() -> None:
+    sys.stderr.write("interrupted\n")
+    sys.stderr.flush()
+    os._exit(130)
+
+
+@contextmanager
+def on_interrupt(action: Callable[[], None]) -> Iterator[None]:
+    """Call ``action`` on SIGINT and SIGTERM inside the block."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        action()
+
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
