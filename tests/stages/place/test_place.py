@@ -1,0 +1,95 @@
+"""place: poses that the palm does not block."""
+
+from copy import copy
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lgrasp.errors import ConfigError
+from lgrasp.grasp.context import Context
+from lgrasp.grasp.tables import pose_arrays
+from lgrasp.stages.place.params import PlaceParams
+from lgrasp.stages.place.stage import run
+
+
+def place(context, first=0, count=300, **params):
+    return run((first, count), PlaceParams(**params), context)
+
+
+def test_counts_and_order(context):
+    table, counts = place(context, 50, 300)
+    arrays = pose_arrays(table)
+    assert counts["tried"] == 300
+    assert counts["kept"] == len(table) > 10
+    assert counts["kept"] + counts["blocked"] <= 300
+    assert (np.diff(arrays["index"]) > 0).all()
+    assert arrays["index"].min() >= 50
+    assert arrays["index"].max() < 350
+    np.testing.assert_allclose(np.linalg.norm(arrays["pose"][:, 3:], axis=1), 1.0, atol=1e-5)
+
+
+def test_palm_is_free(context, tables, solids, mesh, pose_matrices, inputs):
+    """Dense points of the palm in the object and of the object in the palm's solids."""
+    from reference.judge import Object, hand_object_penetration
+
+    tree = inputs.hand.model.tree
+    static = copy(solids)
+    static.solids = [s for s in solids.solids if tree.link_body[s.link] == 0]
+    assert static.solids
+    T = np.linalg.inv(pose_matrices(pose_arrays(tables.place)["pose"][:50]))[:, None]
+    names = inputs.hand.model.tree.joint_names
+    zero = solids.forward(solids.resolve_joints({n: np.zeros(1) for n in names}, 1), 1)
+    depth = np.max(hand_object_penetration(static, Object(mesh), T @ zero), axis=0)
+    assert depth.max() < PlaceParams().clearance + 5e-4
+
+
+def test_kept_candidates_are_what_the_kernel_kept(context):
+    """Each candidate alone gives what it gave among the others."""
+    whole = pose_arrays(place(context, 0, 60)[0])
+    single = [pose_arrays(place(context, i, 1)[0]) for i in range(60)]
+    for name, values in whole.items():
+        np.testing.assert_array_equal(values, np.concatenate([s[name] for s in single]), err_msg=name)
+
+
+def test_palm_contact(context, inputs):
+    table, _ = place(context, 0, 1500, canonical=0, exhaustive=0, palm=1)
+    arrays, hand, obj = pose_arrays(table), inputs.hand.model, inputs.object.model
+    assert len(table) > 10
+    palm, surface = arrays["palm_point"], arrays["palm_surface"]
+    assert (palm >= hand.contact_first[hand.groups]).all()
+    R = Rotation.from_quat(arrays["pose"][:, 3:])
+    points = R.apply(obj.contact_points[surface]) + arrays["pose"][:, :3]
+    np.testing.assert_allclose(points, hand.contact_points[palm], atol=1e-5)
+    np.testing.assert_allclose(R.apply(obj.contact_normals[surface]), -hand.contact_normals[palm], atol=1e-4)
+
+
+@pytest.mark.parametrize("source", ["canonical", "exhaustive"])
+def test_other_sources_claim_no_palm(context, source):
+    weights = {"canonical": 0.0, "exhaustive": 0.0, "palm": 0.0, source: 1.0}
+    arrays = pose_arrays(place(context, **weights)[0])
+    assert len(arrays["index"]) > 5
+    assert (arrays["palm_point"] == -1).all()
+    assert (arrays["palm_surface"] == -1).all()
+
+
+def test_weights_need_not_sum_to_one(context):
+    a = pose_arrays(place(context, canonical=0.6, exhaustive=0.3, palm=0.1)[0])
+    b = pose_arrays(place(context, canonical=6, exhaustive=3, palm=1)[0])
+    np.testing.assert_array_equal(a["index"], b["index"])
+
+
+def test_all_weights_zero(context):
+    with pytest.raises(ConfigError, match="canonical"):
+        place(context, canonical=0, exhaustive=0, palm=0)
+
+
+def test_shards_differ(context):
+    other = Context(context.hand, context.object, context.field, "cpu", 0, 1)
+    a, b = (pose_arrays(place(c)[0])["pose"] for c in (context, other))
+    assert not (a[:, None] == b[None]).all(2).any()
+
+
+def test_no_candidates(context):
+    table, counts = place(context, 0, 0)
+    assert (len(table), counts["tried"], counts["kept"]) == (0, 0, 0)

@@ -1,0 +1,147 @@
+"""search: sets that balance, recomputed exactly."""
+
+import numpy as np
+import pytest
+from reference.wrench import cone_forces, residual, wrenches
+from scipy.optimize import nnls
+
+from lgrasp.errors import ConfigError
+from lgrasp.grasp.tables import set_arrays
+from lgrasp.stages.search.params import SearchParams
+from lgrasp.stages.search.stage import run
+
+
+def contacts(arrays, obj, i, T):
+    """Arms about the centroid [m] and inward normals (k, 3) of set i in the base frame."""
+    p = arrays["pose"][i]
+    chosen = arrays["chosen"][i]
+    surface = [arrays["candidates.surface"][p, g, c] for g, c in enumerate(chosen) if c >= 0]
+    if arrays["candidates.poses.palm_point"][p] >= 0:
+        surface.append(arrays["candidates.poses.palm_surface"][p])
+    points = obj.contact_points[surface] @ T[p, :3, :3].T
+    return (points - points.mean(0)).astype(float), -(obj.contact_normals[surface] @ T[p, :3, :3].T).astype(float)
+
+
+@pytest.fixture(scope="module")
+def found(tables, context, swift):
+    params = swift.params("search")
+    table, counts = run(tables.ik, params, context)
+    return set_arrays(table), counts, params
+
+
+def test_counts(found, tables):
+    arrays, counts, params = found
+    assert counts["poses"] == len(tables.place)
+    assert counts["sets"] == len(arrays["pose"]) > 50
+    assert counts["yielding"] == len(np.unique(arrays["pose"]))
+    assert (np.diff(arrays["pose"]) >= 0).all()
+    for pose in np.unique(arrays["pose"]):
+        slots = arrays["slot"][arrays["pose"] == pose]
+        assert slots.tolist() == list(range(len(slots)))
+        assert len(slots) <= params.per_pose
+
+
+def test_chosen_candidates_are_realised(found):
+    arrays, _, params = found
+    for i, p in enumerate(arrays["pose"]):
+        used = [(g, c) for g, c in enumerate(arrays["chosen"][i]) if c >= 0]
+        assert len(used) in params.contacts or len(used) < min(params.contacts)
+        assert len(used) + (arrays["candidates.poses.palm_point"][p] >= 0) >= 2
+        for g, c in used:
+            assert c < arrays["candidates.count"][p, g]
+            assert arrays["candidates.state"][p, g, c] == 1
+
+
+def test_residuals(found, inputs, pose_matrices):
+    arrays, _, params = found
+    T = pose_matrices(arrays["candidates.poses.pose"])
+    for i in range(len(arrays["pose"])):
+        arms, normals = contacts(arrays, inputs.object.model, i, T)
+        exact = residual(arms, normals, 0.0, 0, params.torque_scale)
+        assert exact == pytest.approx(arrays["score"][i], abs=2e-3)
+        assert arrays["score"][i] ** 2 <= params.threshold
+        assert residual(arms, normals, params.friction, 8, params.torque_scale) < params.balance + 2e-3
+
+
+def test_every_contact_carries_its_share(found, inputs, pose_matrices):
+    arrays, _, params = found
+    T = pose_matrices(arrays["candidates.poses.pose"])
+    for i in range(len(arrays["pose"])):
+        arms, normals = contacts(arrays, inputs.object.model, i, T)
+        W = wrenches(arms, cone_forces(normals, 0.0, 0), params.torque_scale).T
+        w, _ = nnls(np.vstack([W, np.ones(W.shape[1])]), np.append(np.zeros(6), 1.0))
+        if np.linalg.matrix_rank(np.vstack([W, np.ones(W.shape[1])]), tol=1e-2) == W.shape[1]:  # else not unique
+            assert (w / w.sum()).min() > params.least_force - 5e-3
+
+
+def test_sets_of_a_pose_are_apart(found, inputs):
+    arrays, _, params = found
+    q, chosen = arrays["candidates.q"], arrays["chosen"]
+    for pose in np.unique(arrays["pose"]):
+        rows = np.flatnonzero(arrays["pose"] == pose)
+        for a in range(len(rows)):
+            for b in range(a):
+                ca, cb = chosen[rows[a]], chosen[rows[b]]
+                if ((ca >= 0) == (cb >= 0)).all():
+                    groups = np.flatnonzero(ca >= 0)
+                    far = max(np.abs(q[pose, g, ca[g]] - q[pose, g, cb[g]]).max() for g in groups)
+                    assert far > params.separation - 1e-6
+
+
+def test_fingers_do_not_meet(found, inputs, solids, link_poses, finger_posture):
+    from reference.judge import SolidPoses
+
+    arrays, _, _ = found
+    tree = inputs.hand.model.tree
+    rows = np.arange(0, len(arrays["pose"]), 2)
+    q = np.zeros((len(rows), len(tree.joint_names)))
+    for g in range(tree.groups):
+        used = np.flatnonzero(arrays["chosen"][rows, g] >= 0)
+        at = rows[used]
+        values = arrays["candidates.q"][arrays["pose"][at], g, arrays["chosen"][at, g]]
+        q[used] += finger_posture(np.full(len(used), g), values)
+    poses = SolidPoses(solids.solids, link_poses(q))
+    group = [tree.body_group[tree.link_body[s.link]] for s in solids.solids]
+    checked = 0
+    for a, b in solids.pairs:
+        ga, gb = group[a], group[b]
+        if ga < 0 or gb < 0 or ga == gb:
+            continue
+        far = poses.far(a, b)
+        for i in np.flatnonzero(~far & (arrays["chosen"][rows, ga] >= 0) & (arrays["chosen"][rows, gb] >= 0)):
+            assert poses.depth(int(i), a, b, 0.0) <= 1e-5
+            checked += 1
+    assert checked > 20
+
+
+def test_later_passes_draw_others(tables, context, swift):
+    params = swift.params("search")
+    first, second = (set_arrays(run(tables.ik, params, context, salt=s)[0]) for s in (0, 1))
+    assert second["slot"].min() >= params.per_pose
+    rows = [{(int(p), tuple(c)) for p, c in zip(a["pose"], a["chosen"], strict=True)} for a in (first, second)]
+    assert len(rows[1] - rows[0]) > 10
+
+
+def test_gswo_score(tables, context, swift, inputs, pose_matrices):
+    """With friction in the score more sets count as balanced; each still meets the bound."""
+    params = swift.params("search").model_copy(update={"score": "gswo"})
+    arrays = set_arrays(run(tables.ik, params, context)[0])
+    assert len(arrays["pose"]) > 50
+    T = pose_matrices(arrays["candidates.poses.pose"])
+    for i in range(0, len(arrays["pose"]), 3):
+        arms, normals = contacts(arrays, inputs.object.model, i, T)
+        assert residual(arms, normals, params.friction, 8, params.torque_scale) < params.balance + 2e-3
+
+
+def test_k_is_as_asked(tables, context):
+    arrays = set_arrays(run(tables.ik, SearchParams(contacts=(2,)), context)[0])
+    assert ((arrays["chosen"] >= 0).sum(1) <= 2).all()
+    assert len(arrays["pose"]) > 5
+
+
+def test_too_many_candidates(tables, context, swift):
+    from types import SimpleNamespace
+
+    table = SimpleNamespace(surface=SimpleNamespace(shape=(3, 99, 16)))
+    with pytest.raises(ConfigError, match="99 fingers"):
+        run(table, swift.params("search"), context)

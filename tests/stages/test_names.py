@@ -1,0 +1,52 @@
+"""One name per stage, everywhere."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from lgrasp.engine.pipeline import pipeline_files
+from lgrasp.engine.stages import ORDERS, STAGES
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "pipeline.md"
+
+
+def folders(path: Path) -> set[str]:
+    return {p.name for p in path.iterdir() if p.is_dir() and not p.name.startswith(("_", "."))}
+
+
+def test_folders():
+    assert folders(ROOT / "lgrasp" / "stages") == set(STAGES)
+    assert folders(ROOT / "tests" / "stages") == set(STAGES)
+    assert all(set(order) == set(STAGES) for order in ORDERS)
+    for name, stage in STAGES.items():
+        assert stage.name == name
+        assert stage.run.__module__ == f"lgrasp.stages.{name}.stage"
+        assert stage.params.__module__ == f"lgrasp.stages.{name}.params"
+
+
+@pytest.mark.parametrize("name", sorted(pipeline_files()))
+def test_pipelines(name):
+    declared = yaml.safe_load(pipeline_files()[name].read_text())
+    assert {stage for entry in declared["stages"] for stage in entry} == set(STAGES)
+
+
+def test_commands():
+    typer = pytest.importorskip("typer")
+    app = pytest.importorskip("lgrasp_cli.main").app
+    assert set(STAGES) <= set(typer.main.get_command(app).commands)
+
+
+@pytest.mark.skipif(not PAGE.is_file(), reason="docs/pipeline.md is not written yet")
+def test_headings():
+    headings = {h.strip(" `") for h in re.findall(r"^#+ (.*)$", PAGE.read_text(), re.MULTILINE)}
+    assert set(STAGES) <= headings
+
+
+def test_parameters_are_described():
+    for stage in STAGES.values():
+        for name, field in stage.params.model_fields.items():
+            assert field.description, f"{stage.name}: {name}"
+        assert stage.version >= 1
