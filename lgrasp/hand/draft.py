@@ -1,0 +1,218 @@
+"""URDF -> hand.yaml without a human: fingers, palmar surface, canonical box, open posture, and why."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.errors import HandError
+from lgrasp.hand.anatomy import Anatomy, finger_names, held_value, study_anatomy
+from lgrasp.hand.palmar import sample_bodies
+from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.survey import Survey, survey_hand
+from lgrasp.hand.urdf import Urdf, read_urdf
+
+__all__ = ["draft_spec"]
+
+_LEAST_EXTENT, _MOST_EXTENT = 0.02, 3.0  # [m] of a hand, an arm included
+_OPEN_DRAWS = 800
+
+
+def draft_spec(urdf_path: Path, name: str | None = None) -> tuple[HandSpec, list[str]]:
+    """Rules for a hand from its URDF alone, and what was decided, in words.
+
+    Raises:
+        HandError: the URDF cannot be used (see :func:`read_urdf`, :func:`study_anatomy`), the hand is of impossible
+            size, or no two of its parts ever face each other.
+    """
+    urdf = read_urdf(urdf_path)
+    name = name or urdf.name
+    anatomy = study_anatomy(urdf, name)
+    survey = _best_survey(urdf, anatomy, name)
+    _check_size(urdf, survey)
+    _check_hold(urdf, survey)
+    said: list[str] = []
+    data: dict[str, Any] = {"name": name, "urdf": urdf_path.name, "base_link": survey.model.tree.base_link}
+    if anatomy.base_link:
+        said.append(f"base frame: '{anatomy.base_link}', which carries the fingers (base_link)")
+    else:
+        said.append(f"base frame: the root link '{urdf.root}' (base_link)")
+    data["locked"] = survey.locked
+    said += _say_locked(survey)
+    names = finger_names(anatomy)
+    data["static_links"] = [n for n, b in zip(survey.model.tree.link_names, survey.model.tree.link_body, strict=True) if b == 0]
+    data["contact"] = _contact_rules(survey)
+    data["palm"] = _palm_rule(survey)
+    said += _say_contacts(survey, names)
+    assert survey.hold is not None
+    low, high = np.round(survey.hold.low, 3), np.round(survey.hold.high, 3)
+    data["canonical_box"] = {"min": low.tolist(), "max": high.tolist()}
+    said.append(_say_box(survey, names, low, high))
+    opened, clear = _open_posture(survey)
+    data["open_posture"] = opened
+    said.append(
+        "open posture: "
+        + ("free of self-collision, " if clear else "NO sampled posture is free of self-collision, this is the best one; ")
+        + "fingers away from the canonical box (open_posture)"
+    )
+    data["fingers"] = {
+        finger: [n for b in np.flatnonzero(anatomy.tree.body_group == g) for n in anatomy.links(int(b))]
+        for g, finger in enumerate(names)
+    }
+    said += [f"note: {note}" for note in survey.model.notes]
+    return HandSpec.model_validate(data), said
+
+
+def _best_survey(urdf: Urdf, anatomy: Anatomy, name: str) -> Survey:
+    """The survey of the lock values at which fingers oppose best: all shared joints at 0, or all in mid-range."""
+    by_name = {j.name: j for j in urdf.joints}
+    spread = [n for n in anatomy.locked if n not in anatomy.carrying]
+    base = {n: held_value(by_name[n]) for n in anatomy.locked}
+    trials = [base, *({**base, **{n: held_value(by_name[n], s) for n in spread}} for s in (0.5, 0.0, 1.0) if spread)]
+    surveys = []
+    for i, locked in enumerate(trials):
+        if locked not in trials[:i]:
+            surveys.append(survey_hand(urdf, anatomy, name, locked))
+    return max(surveys, key=lambda s: s.hold.score if s.hold else 0.0)
+
+
+def _check_size(urdf: Urdf, survey: Survey) -> None:
+    t = survey.postures.t.reshape(-1, 3)
+    reach = survey.model.body_sphere[survey.model.body_sphere[:, 3] > 0, 3].max()
+    extent = float(max(np.ptp(t, axis=0).max(), reach))
+    if extent < _LEAST_EXTENT:
+        raise HandError(
+            f"URDF {urdf.path}: the hand is {1000 * extent:.2g} mm large; lengths are in metres, is a scale applied twice?"
+        )
+    if extent > _MOST_EXTENT:
+        raise HandError(
+            f"URDF {urdf.path}: the hand is {extent:.3g} m large; joint origins are probably in millimetres, "
+            "multiply them by 0.001"
+        )
+
+
+def _check_hold(urdf: Urdf, survey: Survey) -> None:
+    """Refuse what can hold nothing.
+
+    Raises:
+        HandError: with the reason and the remedy.
+    """
+    if survey.hold is not None:
+        return
+    anatomy = survey.anatomy
+    moved = int(anatomy.tree.groups)
+    tips = ", ".join(anatomy.links(b)[0] for b in anatomy.tips)
+    if moved == 1 and len(anatomy.tips) == 1:
+        raise HandError(
+            f"URDF {urdf.path} has one finger ({tips}) and no static surface opposite to it; a grasp needs two contacts that "
+            "face each other: add the missing fingers, or a fixed link that the finger closes against"
+        )
+    if moved == 1:
+        raise HandError(
+            f"URDF {urdf.path}: one drive moves all fingers ({tips}) together; lgrasp places one contact per drive, so they "
+            f"cannot oppose each other: 'lgrasp hands add {urdf.path}' makes one of two coupled jaws the base"
+        )
+    shares = ", ".join(f"{100 * s:.0f} %" for s in survey.postures.clear.mean(0))
+    raise HandError(
+        f"URDF {urdf.path}: no two of its {moved} fingers ({tips}) ever face each other across an object of 4 to 6 cm "
+        f"(postures clear of the palm, per finger: {shares}); check joint axes, limits (radians) and mesh scales"
+    )
+
+
+def _say_locked(survey: Survey) -> list[str]:
+    said = []
+    for joint, value in survey.locked.items():
+        why = "it carries the whole hand" if joint in survey.anatomy.carrying else "it moves several fingers"
+        said.append(f"joint '{joint}' is locked at {value:g}: {why} (locked)")
+    return said
+
+
+def _rounded(axis: np.ndarray) -> list[float]:
+    """An axis with two decimals, or a coordinate axis when it is within 8 degrees of one."""
+    main = int(np.argmax(np.abs(axis)))
+    if abs(axis[main]) > 0.99:
+        snapped = np.zeros(3)
+        snapped[main] = np.sign(axis[main])
+        return snapped.tolist()
+    return (np.round(axis, 2) + 0.0).tolist()
+
+
+def _contact_rules(survey: Survey) -> list[dict[str, Any]]:
+    """One rule per set of links with the same forbidden cone."""
+    rules: dict[tuple[float, ...], list[str]] = {}
+    for side in (s for sides in survey.sides.values() for s in sides):
+        key = tuple(_rounded(-side.axis))
+        if side.skin.link not in (link for links in rules.values() for link in links):
+            rules.setdefault(key, []).append(side.skin.link)
+    return [{"links": links, "forbidden": [{"axis": list(axis), "angle": 105.0}]} for axis, links in rules.items()]
+
+
+def _palm_rule(survey: Survey) -> dict[str, Any]:
+    if not survey.palm:
+        return {}
+    links = [side.skin.link for side in survey.palm]
+    return {"links": links, "allowed": [{"axis": _rounded(survey.palm[0].axis), "angle": 45.0}]}
+
+
+def _say_contacts(survey: Survey, names: list[str]) -> list[str]:
+    said = []
+    group = survey.anatomy.tree.body_group
+    for g, finger in enumerate(names):
+        tips = [t for t in survey.anatomy.tips if group[t] == g]
+        sides = {s.skin.link: s for t in tips for s in survey.sides.get(t, [])}
+        joints = len(set().union(*(d for t, d in zip(survey.anatomy.tips, survey.anatomy.drives, strict=True) if t in tips)))
+        if sides:
+            area = 1e4 * sum(s.area for s in sides.values())
+            said.append(f"finger '{finger}': {joints} drives, may touch with {', '.join(sides)} ({area:.1f} cm2 palmar; contact)")
+        else:
+            said.append(f"finger '{finger}': {joints} drives, shows the other fingers no surface, so it touches nothing (contact)")
+        if len(tips) > 1:
+            said.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
+    if survey.palm:
+        area = 1e4 * sum(s.area for s in survey.palm)
+        said.append(f"palm: {', '.join(s.skin.link for s in survey.palm)} ({area:.0f} cm2 face the fingertips; palm)")
+    else:
+        said.append("palm: none; no static link shows the fingertips 3 cm2 or more (palm)")
+    return said
+
+
+def _say_box(survey: Survey, names: list[str], low: np.ndarray, high: np.ndarray) -> str:
+    hold = survey.hold
+    assert hold is not None
+
+    def label(key: str) -> str:
+        return "palm" if key == "palm" else names[int(key)]
+
+    pairs = [f"{label(a)}-{label(b)}" for (a, b), v in sorted(hold.opposing.items(), key=lambda x: -x[1]) if v > 0.3]
+    place = " x ".join(f"[{a:.3f}, {b:.3f}]" for a, b in zip(low, high, strict=True))
+    who = f"{', '.join(pairs[:6])} face each other there" if pairs else "fingers barely face each other there"
+    return f"canonical box: {place} m, where a 4-6 cm ball is held best: {who} (canonical_box)"
+
+
+def _open_posture(survey: Survey) -> tuple[dict[str, float], bool]:
+    """Joint values free of self-collision that keep the fingers out of the canonical box, as near to 0 as that allows."""
+    model, tree = survey.model, survey.model.tree
+    assert survey.hold is not None
+    rng = np.random.default_rng(3)
+    lower, upper = tree.joint_lower.astype(float), tree.joint_upper.astype(float)
+    rest = np.clip(0.0, lower, upper)
+    span = upper - lower
+    draws = rng.uniform(lower, upper, (_OPEN_DRAWS, len(lower)))
+    # from the rest posture outwards, and the corners of the range
+    share = rng.uniform(0, 1, (_OPEN_DRAWS, 1)) ** 2
+    q = np.vstack([rest, rest + share * (draws - rest), np.where(rng.random(draws.shape) < 0.5, lower, upper)])
+    # a margin to the limits where there is room
+    q = np.clip(q, np.minimum(rest, lower + 0.01 * span), np.maximum(rest, upper - 0.01 * span))
+    postures = sample_bodies(model, q)
+    away = np.full(len(q), np.inf)
+    for side in (s for sides in survey.sides.values() for s in sides):
+        b = side.skin.body
+        p = np.einsum("nij,kj->nki", postures.R[:, b], side.skin.points[::8]) + postures.t[:, None, b]
+        outside = np.maximum(np.maximum(survey.hold.low - p, p - survey.hold.high), 0.0)
+        away = np.minimum(away, np.linalg.norm(outside, axis=2).min(1))
+    cost = np.abs((q - rest) / span).mean(1)
+    value = np.minimum(away, 0.03) / 0.03 - 0.5 * cost - 10.0 * postures.touching
+    best = int(np.argmax(value))
+    values = np.clip(np.round(q[best], 3), lower, upper)
+    opened = {n: float(v) for n, v in zip(tree.joint_names, values, strict=True)}
+    return opened, not bool(postures.touching[best])

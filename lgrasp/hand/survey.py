@@ -1,0 +1,176 @@
+"""What a hand can do with given joints locked: palmar surface, contact cones, and the best place to hold something."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lgrasp.hand.anatomy import Anatomy, probe_spec
+from lgrasp.hand.geometry import Piece
+from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.palmar import Postures, Skin, link_skins, sample_bodies, see_skins
+from lgrasp.hand.reach import Hold, Touch, best_hold, finger_touches, still_touches
+from lgrasp.hand.urdf import Urdf
+
+__all__ = ["Side", "Survey", "static_depth", "survey_hand"]
+
+_POSTURES = 1200
+_SPREAD = 75.0  # [deg] contact normals of a finger lie this close to its palmar direction
+_PALM_SPREAD = 45.0
+_LEAST_AREA = 2.0e-5  # [m^2] contact surface of a link
+_LEAST_PALM = 3.0e-4
+
+
+@dataclass(frozen=True)
+class Side:
+    """Surface of one link that may touch: its skin, the palmar direction (link frame), which samples are in its cone."""
+
+    skin: Skin
+    axis: np.ndarray  # (3,), link frame
+    chosen: np.ndarray  # (n,) bool
+    area: float  # [m^2]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """See :func:`survey_hand`."""
+
+    model: HandModel
+    anatomy: Anatomy
+    locked: dict[str, float]
+    postures: Postures
+    sides: dict[int, list[Side]]  # tip body -> contact links, the most distal first
+    palm: list[Side]
+    hold: Hold | None
+
+
+def survey_hand(urdf: Urdf, anatomy: Anatomy, name: str, locked: dict[str, float]) -> Survey:
+    """Sample postures, see which surface is palmar, choose contact links, and look for the best place to hold."""
+    tip_link = next(n for n in anatomy.links(anatomy.tips[0]) if urdf.links[n])
+    model = build_hand(urdf.path, probe_spec(name, tip_link, locked, anatomy.base_link))
+    rng = np.random.default_rng(0)
+    tree = model.tree
+    postures = sample_bodies(model, rng.uniform(tree.joint_lower, tree.joint_upper, (_POSTURES, model.dofs)))
+    skins = link_skins(urdf, model)
+    tips = {b: _tip_point([s for s in skins if s.body == b]) for b in anatomy.tips}
+    skins = see_skins(skins, postures, tips)
+    sides = {}
+    for tip in anatomy.tips:
+        sides[tip] = _finger_sides(anatomy, model, skins, tip)
+    palm = _palm_sides([s for s in skins if s.body == 0])
+    sides = {tip: found for tip, found in sides.items() if found}
+    touches = [
+        finger_touches(str(tip), postures, int(tree.body_group[tip]), tip, *_allowed(found, tip))
+        for tip, found in sides.items()
+    ]
+    if palm:
+        points, normals = _allowed(palm, 0)
+        touches.append(still_touches("palm", points, normals, 8 * _POSTURES))
+    depth = static_depth(model)
+    hold = best_hold(_one_per_group(touches, anatomy), lambda p: depth(p) < 0.016)
+    return Survey(model, anatomy, locked, postures, sides, palm, hold)
+
+
+def _one_per_group(touches: list[Touch], anatomy: Anatomy) -> list[Touch]:
+    """Tips that one group moves together count as one holder: a finger makes one contact."""
+    merged: dict[str, Touch] = {}
+    for t in touches:
+        key = "palm" if t.name == "palm" else str(int(anatomy.tree.body_group[int(t.name)]))
+        if key in merged:
+            points, normals = np.vstack([merged[key].points, t.points]), np.vstack([merged[key].normals, t.normals])
+            merged[key] = Touch(key, points, normals)
+        else:
+            merged[key] = Touch(key, t.points, t.normals)
+    return list(merged.values())
+
+
+def _tip_point(skins: list[Skin]) -> np.ndarray:
+    """Middle of the part of a body's surface that is farthest from its joint."""
+    points = np.vstack([s.points for s in skins])
+    far = np.linalg.norm(points, axis=1)
+    return points[far >= np.quantile(far, 0.8)].mean(0)
+
+
+def _allowed(sides: list[Side], body: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals of the sides on one body, in equal density."""
+    own = [s for s in sides if s.skin.body == body]
+    return np.vstack([s.skin.points[s.chosen] for s in own]), np.vstack([s.skin.normals[s.chosen] for s in own])
+
+
+def _finger_sides(anatomy: Anatomy, model: HandModel, skins: list[Skin], tip: int) -> list[Side]:
+    """Contact links of one finger: those on its last body, and on the one before when that shows a large palmar surface."""
+    distal = [s for s in skins if s.body == tip]
+    axis = _palmar_axis(model, distal, tip, at_tip=True)
+    if axis is None:
+        return []
+    sides = [side for s in distal if (side := _side(s, axis, _SPREAD)).area >= _LEAST_AREA]
+    before = anatomy.parent(tip)
+    if sides and before > 0 and before not in anatomy.tips:
+        inner = [s for s in skins if s.body == before]
+        siblings = [t for t in anatomy.tips if t != tip and before in anatomy.path(t)]
+        axis = _palmar_axis(model, inner, before, at_tip=False) if inner and not siblings else None
+        if axis is not None:
+            more = [side for s in inner if (side := _side(s, axis, _SPREAD - 15)).area >= _LEAST_AREA]
+            shown = sum(s.skin.seen[s.chosen].mean() * s.area for s in more)
+            if shown > 0.7 * sum(s.skin.seen[s.chosen].mean() * s.area for s in sides) and shown > 1e-4:
+                sides += more
+    return sides
+
+
+def _palmar_axis(model: HandModel, skins: list[Skin], body: int, *, at_tip: bool) -> np.ndarray | None:
+    """Palmar direction in the body frame: mean of the normals seen, across the flexion axis, tilted towards the tip."""
+    m = sum(((s.seen[:, None] * s.normals).mean(0) * s.area for s in skins), np.zeros(3))
+    if np.linalg.norm(m) < 1e-9:
+        return None
+    m /= np.linalg.norm(m)
+    if model.tree.joint_prismatic[body - 1]:
+        return m
+    along = _tip_point(skins)
+    along /= max(float(np.linalg.norm(along)), 1e-9)
+    hinge = model.tree.joint_axis[body - 1].astype(float)
+    if abs(hinge @ along) < 0.6:
+        flat = m - (m @ hinge) * hinge
+        if np.linalg.norm(flat) > 0.35:
+            m = flat / np.linalg.norm(flat)
+    across = m - (m @ along) * along
+    if np.linalg.norm(across) > 0.3:
+        m = across / np.linalg.norm(across) + (0.5 * along if at_tip else 0.0)
+    return m / np.linalg.norm(m)
+
+
+def _side(skin: Skin, axis: np.ndarray, spread: float) -> Side:
+    """The part of a skin within ``spread`` degrees of an axis (body frame)."""
+    chosen = skin.normals @ axis > np.cos(np.radians(spread))
+    chosen &= skin.seen > 0.1 * max(float(skin.seen.max()), 1e-9)
+    return Side(skin, skin.T_body_link[:3, :3].T @ axis, chosen, skin.area * float(chosen.mean()))
+
+
+def _palm_sides(skins: list[Skin]) -> list[Side]:
+    """Static links whose surface the fingertips see, those that agree with the best one's direction in their own frame."""
+    sides: list[Side] = []
+    for s in sorted(skins, key=lambda s: -s.seen_area):
+        m = (s.seen[:, None] * s.normals).mean(0)
+        if np.linalg.norm(m) < 1e-9:
+            continue
+        side = _side(s, m / np.linalg.norm(m), _PALM_SPREAD)
+        if side.area < _LEAST_PALM or float(s.seen[side.chosen].mean()) < 0.15:
+            continue
+        if not sides or side.axis @ sides[0].axis > 0.94:
+            sides.append(side)
+    return sides[:4]
+
+
+def static_depth(model: HandModel):
+    """Function of points (n, 3) [m] -> lower bound of their distance to the static links (n,) [m]."""
+    pieces = [
+        Piece(
+            model.vertices[model.vertex_first[p] : model.vertex_first[p + 1]],
+            model.planes[model.plane_first[p] : model.plane_first[p + 1]],
+            float(model.piece_radius[p]),
+        )
+        for p in range(model.piece_first[0], model.piece_first[1])
+    ]
+
+    def depth(points: np.ndarray) -> np.ndarray:
+        return np.min([np.full(len(points), np.inf), *(p.depth(points) for p in pieces)], 0)
+
+    return depth
