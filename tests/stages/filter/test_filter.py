@@ -6,9 +6,8 @@ from reference.wrench import residual
 from scipy.spatial.transform import Rotation
 
 from lgrasp.grasp.tables import set_arrays, set_table
-from lgrasp.stages.filter.kernels import REASONS
 from lgrasp.stages.filter.params import FilterParams
-from lgrasp.stages.filter.stage import run
+from lgrasp.stages.filter.stage import REASONS, run
 
 
 @pytest.fixture(scope="module")
