@@ -37,7 +37,8 @@ def quick():
 
 @pytest.fixture(scope="session")
 def shared_cache(tmp_path_factory):
-    """A cache that all tests of the command line share."""
+    """A cache that all tests of the command line share; compiled kernels stay in the user's."""
+    start()
     return tmp_path_factory.mktemp("cli-cache")
 
 
@@ -73,8 +74,8 @@ def generate(cli, tmp_path):
 @pytest.fixture
 def process(shared_cache, tmp_path):
     """process(*arguments): start the command as a process of its own."""
-    start()
-    env = os.environ | {"LGRASP_CACHE_DIR": str(shared_cache), "WARP_CACHE_PATH": wp.config.kernel_cache_dir}
+    kernels = Path(wp.config.kernel_cache_dir).parent  # Warp adds its version
+    env = os.environ | {"LGRASP_CACHE_DIR": str(shared_cache), "WARP_CACHE_PATH": str(kernels)}
 
     def begin(*arguments):
         command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
