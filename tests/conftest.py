@@ -13,7 +13,7 @@ from lgrasp.engine.generate import Job, Outcome, generate
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs
 from lgrasp.field.params import FieldParams
-from lgrasp.grasp.context import Context
+from lgrasp.stages.context import Context
 
 OBJECT = "mug"
 RECORDS = 20_000

@@ -11,7 +11,7 @@ __all__ = ["MAX_CONTACTS", "balance", "frictionless", "vec6", "wrench"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
-MAX_CONTACTS = 6
+MAX_CONTACTS = 7
 """Fingers plus palm in one grasp."""
 _CORRAL = 8
 _CORRAL_C = wp.constant(_CORRAL)

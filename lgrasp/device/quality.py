@@ -2,12 +2,14 @@
 
 import warp as wp
 
-from lgrasp.device.qp import vec6
+from lgrasp.device.qp import MAX_CONTACTS, vec6
 from lgrasp.device.transforms import tangent
 
 __all__ = ["epsilon_bound"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+_CONES = wp.constant(8 * MAX_CONTACTS)
 
 _EDGES = wp.constant(8)
 _STARTS = wp.constant(12)
@@ -55,7 +57,7 @@ def epsilon_bound(
     pivots) until the foot of the perpendicular lies in the facet. Every facet passed is an upper bound. Values below
     2.5e-4, the resolution, are returned as 0.
     """
-    cones = wp.zeros(shape=(48,), dtype=wp.vec3)
+    cones = wp.zeros(shape=(_CONES,), dtype=wp.vec3)
     for i in range(k):
         n = normals[i]
         t = tangent(n)

@@ -9,8 +9,8 @@ import numpy as np
 from lgrasp.engine.bank import Bank
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.stages import STAGES
-from lgrasp.grasp.context import Context
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, select_poses
+from lgrasp.stages.context import Context
 
 __all__ = ["BatchResult", "run_batch", "run_stages"]
 

@@ -17,7 +17,6 @@ from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.stages import STAGES
 from lgrasp.engine.workspace import InputKeys, input_keys, load_inputs
 from lgrasp.errors import ConfigError
-from lgrasp.grasp.context import Context
 from lgrasp.grasp.tables import (
     CandidateTable,
     ContactSets,
@@ -31,6 +30,7 @@ from lgrasp.grasp.tables import (
     set_arrays,
     set_table,
 )
+from lgrasp.stages.context import Context
 
 __all__ = ["StageRun", "run_stage"]
 

@@ -12,9 +12,9 @@ from lgrasp.engine.batch import BatchResult, run_batch
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.workspace import Inputs
-from lgrasp.grasp.context import Context
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
+from lgrasp.stages.context import Context
 
 __all__ = ["Execution", "ShardResult", "add_counts", "make_shard", "shard_effort"]
 

@@ -65,7 +65,7 @@ def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: 
             for piece in range(first, end):
                 grid = hand.piece_grid[piece]
                 if grid >= 0:
-                    # one lookup in the link's distance grid is cheaper than a hull's planes, and true to the link's shape
+                    # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
                     sdf = hand_grid(hand.contacts, grid)
                     if sdf_value(sdf, p) < s[3]:
                         for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):

@@ -44,8 +44,8 @@ def new_rows(pose: np.ndarray, q: np.ndarray) -> np.ndarray:
 class KeptRows:
     """Rows kept so far of a stream, without near-duplicates: the same ones however the stream is cut.
 
-    A hash grid over object positions (on the job's device) tells which rows have any row close before them; those few are
-    then decided one by one.
+    A hash grid over object positions (on the job's device) tells which rows have any row close before them; those few
+    are then decided one by one.
     """
 
     def __init__(self, joints: int, device: str = "cpu") -> None:
@@ -84,7 +84,7 @@ class KeptRows:
         return kept, int(looked_at - len(kept))
 
     def _suspects(self, end: int) -> np.ndarray:
-        """Mask of the rows ``count .. end - 1`` that have a row close before them (with a little slack for rounding)."""
+        """Mask of the rows ``count .. end - 1`` that have a row close before them (with some slack for rounding)."""
         d = self._device
         position = wp.array(np.ascontiguousarray(self._pose[:end, :3]), dtype=wp.vec3, device=d)
         rotation = wp.array(np.ascontiguousarray(self._pose[:end, 3:]), dtype=wp.vec4, device=d)

@@ -21,7 +21,7 @@ def near_earlier(
     joint: wp.float32,
     near_out: wp.array(dtype=wp.int32),
 ):
-    """near_out[i] = 1 when a row before row first + i is within reach [m], the half-angle cosine and joint [rad or m]."""
+    """1 when a row before row first + i is within reach [m], half-angle cosine and joint [rad or m] of it, else 0."""
     i = wp.tid()
     row = first + i
     p = position[row]

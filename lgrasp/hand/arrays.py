@@ -49,6 +49,7 @@ class Hand:
     cluster_first: wp.array(dtype=wp.int32)
     cluster_sphere: wp.array(dtype=wp.vec4)
     samples: wp.array(dtype=wp.vec3)
+    body_group: wp.array(dtype=wp.int32)  # group of each body, -1 for the base
     piece_grid: wp.array(dtype=wp.int32)  # distance grid of the piece's link, -1 when it is no contact link
     pair_first: wp.array(dtype=wp.int32)
     pairs: wp.array(dtype=wp.vec2i)
@@ -136,6 +137,7 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
     hand.cluster_first = put(model.cluster_first, wp.int32)
     hand.cluster_sphere = put(model.cluster_sphere, wp.vec4)
     hand.samples = put(model.samples, wp.vec3)
+    hand.body_group = put(t.body_group, wp.int32)
     grid_of = {int(link): i for i, link in enumerate(model.grid_link)}
     hand.piece_grid = put(np.array([grid_of.get(int(link), -1) for link in model.piece_link], np.int32), wp.int32)
     hand.pair_first = put(model.pair_first, wp.int32)

@@ -6,7 +6,7 @@ import pytest
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.batch import run_batch
 from lgrasp.engine.shard import Execution, make_shard
-from lgrasp.grasp.context import Context
+from lgrasp.stages.context import Context
 from lgrasp.grasp.tables import grasp_arrays, join_grasps
 
 

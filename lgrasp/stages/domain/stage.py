@@ -5,8 +5,8 @@ import math
 import warp as wp
 
 from lgrasp.device.kinematics import vec_dof
-from lgrasp.grasp.context import Context
 from lgrasp.grasp.tables import CandidateTable, PoseTable
+from lgrasp.stages.context import Context
 from lgrasp.stages.domain.kernels import draw_domains, draw_domains_bvh
 from lgrasp.stages.domain.params import DomainParams
 

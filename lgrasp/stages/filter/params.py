@@ -19,5 +19,7 @@ class FilterParams(BaseModel):
     torque_scale: float = Field(10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")
     draws: int = Field(12, ge=1, le=1000, description="Postures tried for each unused finger.")
     slack: float = Field(0.0005, ge=0, le=0.01, description="Penetration of inner spheres forgiven to unused fingers.")
-    open_distance: float = Field(0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the contact normals.")
+    open_distance: float = Field(
+        0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the contact normals."
+    )
     press_distance: float = Field(0.006, ge=0, le=0.1, description="How far q_squeeze reaches into the object.")

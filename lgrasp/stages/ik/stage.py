@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from lgrasp.grasp.context import Context
 from lgrasp.grasp.tables import CandidateTable, ContactSets
+from lgrasp.stages.context import Context
 from lgrasp.stages.ik.kernels import realise_contacts
 from lgrasp.stages.ik.params import IkParams
 
@@ -25,7 +25,7 @@ def run(
     realised, and only sets whose every contact was realised come back.
 
     Returns:
-        The table of the kind that came in, and counts ``tried``, ``reached`` (gap and normals met), ``kept`` (also clear).
+        The table of the kind that came in, and counts ``tried``, ``reached`` (gap and normals met), ``kept`` (clear).
     """
     sets = inputs if isinstance(inputs, ContactSets) else None
     table = inputs.candidates if isinstance(inputs, ContactSets) else inputs
@@ -72,7 +72,9 @@ def run(
     }
     if sets is None:
         return table, counts
-    good = np.where(chosen >= 0, np.take_along_axis(state[pose], np.maximum(chosen, 0)[:, :, None], 2)[:, :, 0] == 1, True)
+    good = np.where(
+        chosen >= 0, np.take_along_axis(state[pose], np.maximum(chosen, 0)[:, :, None], 2)[:, :, 0] == 1, True
+    )
     keep = np.flatnonzero(good.all(1))
     kept = replace(
         sets,

@@ -27,7 +27,9 @@ def _aligned(p: wp.vec3, n: wp.vec3, point: wp.vec3, normal: wp.vec3, state: wp.
 
 
 @wp.func
-def rate_pose(hand: Hand, field: Field, obj: Object, T: wp.transform, palm: wp.int32, samples: wp.int32, state: wp.uint32):
+def rate_pose(
+    hand: Hand, field: Field, obj: Object, T: wp.transform, palm: wp.int32, samples: wp.int32, state: wp.uint32
+):
     """How many pairs of reachable contacts of different groups oppose each other.
 
     A pair counts when each contact's inward normal is within 40 degrees of the line to the other.
@@ -88,7 +90,7 @@ def place_objects(
     palm_surface_out: wp.array(dtype=wp.int32),
     rating_out: wp.array(dtype=wp.int32),
 ):
-    """The best of several clear poses per candidate; rating -1: none was clear of the static links, 0: none can hold."""
+    """The best of several clear poses per candidate; rating -1: none was clear of static links, 0: none can hold."""
     row = wp.tid()
     state = wp.rand_init(seed, first + row)
     G = hand.kin.groups

@@ -10,9 +10,15 @@ class PlaceParams(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    canonical: float = Field(0.6, ge=0, description="Weight of surface point to point of the canonical box, any rotation.")
-    exhaustive: float = Field(0.3, ge=0, description="Weight of surface point on a contact vector of the field, any roll.")
+    canonical: float = Field(
+        0.6, ge=0, description="Weight of surface point to point of the canonical box, any rotation."
+    )
+    exhaustive: float = Field(
+        0.3, ge=0, description="Weight of surface point on a contact vector of the field, any roll."
+    )
     palm: float = Field(0.1, ge=0, description="Weight of surface point pressed on the palm, any roll.")
-    proposals: int = Field(8, ge=1, le=256, description="Poses tried per candidate; the one with the richest contacts stays.")
+    proposals: int = Field(
+        8, ge=1, le=256, description="Poses tried per candidate; the one with the richest contacts stays."
+    )
     samples: int = Field(24, ge=0, le=256, description="Surface points per finger that rate a pose; 0: no rating.")
     clearance: float = Field(0.0005, ge=0, le=0.01, description="Penetration of static links that is forgiven [m].")

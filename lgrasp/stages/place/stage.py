@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from lgrasp.errors import ConfigError
-from lgrasp.grasp.context import Context
 from lgrasp.grasp.tables import PoseTable
+from lgrasp.stages.context import Context
 from lgrasp.stages.place.kernels import place_objects
 from lgrasp.stages.place.params import PlaceParams
 

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from lgrasp.engine.batch import run_stages
-from lgrasp.grasp.context import Context
 from lgrasp.grasp.tables import candidate_arrays, set_arrays
+from lgrasp.stages.context import Context
 from lgrasp.stages.ik.stage import run
 
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import ConfigError
-from lgrasp.grasp.context import Context
 from lgrasp.grasp.tables import pose_arrays
+from lgrasp.stages.context import Context
 from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.stage import run
 

@@ -1,0 +1,45 @@
+"""Kernel that measures the penetration of hand and object."""
+
+import warp as wp
+
+from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.grasp.clearance import body_depth
+from lgrasp.hand.arrays import Hand
+from lgrasp.object.arrays import Object
+
+__all__ = ["deepen"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+
+@wp.kernel
+def deepen(
+    hand: Hand,
+    obj: Object,
+    max_depth: wp.float32,
+    used: wp.int32,
+    pose: wp.array(dtype=wp.transform),
+    set_pose: wp.array(dtype=wp.int32),
+    chosen: wp.array2d(dtype=wp.int32),
+    body: wp.array2d(dtype=wp.transform),
+    outcome: wp.array(dtype=wp.int32),
+    depth_out: wp.array(dtype=wp.float32),
+):
+    """One thread per (set, body): the largest penetration [m] of the base and the touching fingers (used = 1) or of the
+    others (used = 0) goes to ``depth_out``; above ``max_depth`` its value is of no account."""
+    i, b = wp.tid()
+    if outcome[i] != 0 or depth_out[i] > max_depth:
+        return
+    g = hand.body_group[b]
+    B = wp.transform_identity()
+    if g < 0:
+        if used == 0:
+            return
+    else:
+        if (chosen[i, g] >= 0) != (used == 1):
+            return
+        B = body[i, b - 1]
+    T = wp.transform_inverse(pose[set_pose[i]]) * B
+    d = body_depth(hand, obj, b, T, max_depth)
+    if d > 0.0:
+        wp.atomic_max(depth_out, i, d)

@@ -1,0 +1,9 @@
+"""Outcomes of a contact set and the numbers kept of a grasp."""
+
+__all__ = ["METRICS", "REASONS"]
+
+REASONS = ("kept", "unused finger", "self-collision", "object collision", "contact", "balance")
+"""Outcome codes of a set."""
+
+METRICS = ("fswo", "gswo", "epsilon", "penetration", "self_penetration", "gap", "normal_error")
+"""Columns of the metrics table."""

@@ -1,0 +1,199 @@
+"""Kernels that finish grasps: balance, control poses, quality, and packing of the rows that are kept."""
+
+import warp as wp
+
+from lgrasp.device.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.device.qp import MAX_CONTACTS, balance
+from lgrasp.device.quality import epsilon_bound
+from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.hand.arrays import Hand
+from lgrasp.object.arrays import Object
+
+__all__ = ["balance_grasps", "control_poses", "grasp_epsilon", "pack_rows"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+
+@wp.func
+def _contacts(
+    obj: Object,
+    surfaces: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+):
+    """Points and inward normals of a set's contacts in the object's frame; returns their number."""
+    k = int(0)
+    for c in range(surfaces.shape[0]):
+        if surfaces[c] >= 0:
+            points[k] = obj.contact_points[surfaces[c]]
+            normals[k] = -obj.contact_normals[surfaces[c]]
+            k += 1
+    return k
+
+
+@wp.kernel
+def balance_grasps(
+    obj: Object,
+    friction: wp.float32,
+    balanced: wp.float32,
+    torque_scale: wp.float32,
+    max_depth: wp.float32,
+    contact_surface: wp.array2d(dtype=wp.int32),
+    depth: wp.array(dtype=wp.float32),
+    outcome_out: wp.array(dtype=wp.int32),
+    force_out: wp.array2d(dtype=wp.vec3),
+    fswo_out: wp.array(dtype=wp.float32),
+    gswo_out: wp.array(dtype=wp.float32),
+):
+    """FSWO (eq. 1), GSWO (eq. 2, 8-edge cones) and its forces, object frame."""
+    i = wp.tid()
+    if outcome_out[i] != 0:
+        return
+    if depth[i] > max_depth:
+        outcome_out[i] = 3
+        return
+    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    k = _contacts(obj, contact_surface[i], arms, normals)
+    centroid = wp.vec3(0.0)
+    for c in range(k):
+        centroid = centroid + arms[c]
+    for c in range(k):
+        arms[c] = arms[c] - centroid / float(k)
+    fswo_out[i] = balance(arms, normals, k, 0.0, 0, torque_scale, 0.0, forces)
+    gswo = balance(arms, normals, k, friction, 8, torque_scale, 1.0e-4, forces)
+    gswo_out[i] = gswo
+    if gswo > balanced:
+        outcome_out[i] = 5
+        return
+    for c in range(k):
+        force_out[i, c] = forces[c]
+
+
+@wp.kernel
+def grasp_epsilon(
+    obj: Object,
+    seed: wp.int32,
+    friction: wp.float32,
+    contact_surface: wp.array2d(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    epsilon_out: wp.array(dtype=wp.float32),
+):
+    """Ferrari-Canny bound of the kept rows, about the object's centre of mass."""
+    i = wp.tid()
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    k = _contacts(obj, contact_surface[row[i]], points, normals)
+    for c in range(k):
+        points[c] = points[c] - obj.com
+    epsilon_out[i] = epsilon_bound(points, normals, k, friction, obj.radius, wp.rand_init(seed))
+
+
+@wp.func
+def _shift_contact(hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, point: wp.vec3, by: wp.vec3):
+    """Joint positions that move a point of the group's body j by ``by`` [m] (three damped steps), limits kept."""
+    j0 = hand.kin.joint_first[g]
+    dofs = hand.kin.dof_first[g + 1] - hand.kin.dof_first[g]
+    q = q0
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    target = wp.vec3(0.0)
+    for it in range(3):
+        group_forward(hand.kin, g, q, X, 0)
+        p = wp.transform_point(X[j], point)
+        if it == 0:
+            target = p + by
+        e = target - p
+        J = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
+        a = j
+        while a >= 0:
+            d = hand.kin.joint_dof[j0 + a]
+            J[d] = J[d] + point_column(hand.kin, j0 + a, X[a], p)
+            a = hand.kin.joint_parent[j0 + a]
+        # damped right inverse: dq = J^T (J J^T + c I)^-1 e
+        A = wp.identity(n=3, dtype=wp.float32) * 1.0e-4
+        for d in range(dofs):
+            A = A + wp.outer(J[d], J[d])
+        y = wp.inverse(A) * e
+        for d in range(dofs):
+            q[d] = q[d] + wp.clamp(wp.dot(J[d], y), -0.4, 0.4)
+        q = clamp_dofs(hand.kin, g, q)
+    return q
+
+
+@wp.kernel
+def control_poses(
+    hand: Hand,
+    obj: Object,
+    open_distance: wp.float32,
+    press_distance: wp.float32,
+    pose: wp.array(dtype=wp.transform),
+    set_pose: wp.array(dtype=wp.int32),
+    contact: wp.array2d(dtype=wp.int32),
+    contact_surface: wp.array2d(dtype=wp.int32),
+    body: wp.array2d(dtype=wp.transform),
+    posture: wp.array2d(dtype=vec_dof),
+    row: wp.array(dtype=wp.int32),
+    q_out: wp.array2d(dtype=wp.float32),
+    pregrasp_out: wp.array2d(dtype=wp.float32),
+    squeeze_out: wp.array2d(dtype=wp.float32),
+):
+    """One thread per (kept row, group): q, and q with the contact moved out of and into the object."""
+    i, g = wp.tid()
+    s = row[i]
+    x = posture[s, g]
+    opened = x
+    pressed = x
+    j0 = hand.kin.joint_first[g]
+    for k in range(contact.shape[1]):
+        c = contact[s, k]
+        if c >= 0:
+            b = hand.contacts.body[c]
+            if b > j0 and b <= hand.kin.joint_first[g + 1]:
+                T = pose[set_pose[s]]
+                p = wp.transform_point(T, obj.contact_points[contact_surface[s, k]])
+                n = wp.transform_vector(T, obj.contact_normals[contact_surface[s, k]])
+                local = wp.transform_point(wp.transform_inverse(body[s, b - 1]), p)
+                opened = _shift_contact(hand, g, x, b - 1 - j0, local, n * open_distance)
+                pressed = _shift_contact(hand, g, x, b - 1 - j0, local, -n * press_distance)
+    first = hand.kin.dof_first[g]
+    for d in range(hand.kin.dof_first[g + 1] - first):
+        column = hand.kin.dof_index[first + d]
+        q_out[i, column] = x[d]
+        pregrasp_out[i, column] = opened[d]
+        squeeze_out[i, column] = pressed[d]
+
+
+@wp.kernel
+def pack_rows(
+    hand: Hand,
+    obj: Object,
+    pose: wp.array(dtype=wp.transform),
+    set_pose: wp.array(dtype=wp.int32),
+    contact: wp.array2d(dtype=wp.int32),
+    contact_surface: wp.array2d(dtype=wp.int32),
+    force: wp.array2d(dtype=wp.vec3),
+    row: wp.array(dtype=wp.int32),
+    pose_out: wp.array(dtype=wp.transform),
+    point_out: wp.array2d(dtype=wp.vec3),
+    normal_out: wp.array2d(dtype=wp.vec3),
+    link_out: wp.array2d(dtype=wp.int32),
+    force_out: wp.array2d(dtype=wp.vec3),
+):
+    """Pose and contacts of the kept rows; NaN and -1 where there is no contact."""
+    i = wp.tid()
+    s = row[i]
+    pose_out[i] = pose[set_pose[s]]
+    for k in range(contact.shape[1]):
+        c = contact[s, k]
+        if c >= 0:
+            point_out[i, k] = obj.contact_points[contact_surface[s, k]]
+            normal_out[i, k] = obj.contact_normals[contact_surface[s, k]]
+            link_out[i, k] = hand.contacts.link[c]
+            force_out[i, k] = force[s, k]
+        else:
+            none = wp.vec3(wp.nan, wp.nan, wp.nan)
+            point_out[i, k] = none
+            normal_out[i, k] = none
+            force_out[i, k] = none
+            link_out[i, k] = -1
