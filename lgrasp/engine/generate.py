@@ -2,7 +2,7 @@
 
 import os
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -163,6 +163,8 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
             write_shard(files[shard], _shard(job, inputs, key, shard, result))
             listener.wrote(shard, files[shard], result)
             found = len(result.grasps)
+            kept = result.counts.get("filter", {}).get("kept", 0)
+            execution = replace(execution, rate=max(kept / result.candidates, 1e-3))
             outcome.written.append(files[shard])
             outcome.rows += found
             outcome.made += found

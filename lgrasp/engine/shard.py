@@ -20,7 +20,7 @@ __all__ = ["Execution", "ShardResult", "add_counts", "make_shard", "shard_effort
 
 _LEAST_EFFORT = 65_536
 _CPU_BATCH = 512
-_GPU_BATCH = 16_384
+_GPU_LEAST, _GPU_MOST = 2_048, 65_536
 _STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
 
@@ -31,6 +31,7 @@ class Execution:
     workers: int = 1
     batch: int = 0  # candidates per batch; 0: by device
     cancelled: Callable[[], bool] = lambda: False
+    rate: float = 1.0  # rows expected per candidate
 
 
 @dataclass
@@ -56,23 +57,26 @@ def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]
 
 
 def _batches(
-    pipeline: Pipeline, context: Context, execution: Execution, bank: Bank | None, limit: int
+    pipeline: Pipeline, context: Context, execution: Execution, bank: Bank | None, limit: int, size: Callable[[], int]
 ) -> Generator[tuple[int, BatchResult]]:
     """Results of consecutive batches, in order; ``workers`` of them are worked on at a time.
 
     Closing the generator (or an error in a batch) drops the batches not begun and waits for those that were.
+
+    Args:
+        size: candidates of the next batch.
     """
-    # later passes go over the poses of one batch, so its size decides the order of the rows
-    fixed = bank is not None or pipeline.params("search").passes > 1
-    size = BANK_CANDIDATES if fixed else execution.batch or (_GPU_BATCH if context.device != "cpu" else _CPU_BATCH)
-    starts = iter(range(0, limit, size))
+    # a GPU is full with one batch: a second one in the queue would only be waste at the end of the shard
+    ahead = execution.workers if context.device == "cpu" else 0
+    first = 0
     with ThreadPoolExecutor(execution.workers) as pool:
         waiting: deque[tuple[int, Future[BatchResult]]] = deque()
         try:
             while True:
-                while len(waiting) <= execution.workers and (first := next(starts, None)) is not None:
-                    count = min(size, limit - first)
+                while len(waiting) <= ahead and first < limit:
+                    count = min(size(), limit - first)
                     waiting.append((count, pool.submit(run_batch, pipeline, context, first, count, bank)))
+                    first += count
                 if not waiting:
                     return
                 count, future = waiting.popleft()
@@ -112,7 +116,17 @@ def make_shard(
     kept = KeptRows(inputs.hand.model.dofs, inputs.device.alias)
     stopped = False
     start = time.perf_counter()
-    with closing(_batches(pipeline, context, execution, bank, limit)) as batches:
+    # later passes go over the poses of one batch, so its size decides the order of the rows
+    fixed = BANK_CANDIDATES if bank is not None or pipeline.params("search").passes > 1 else execution.batch
+
+    def size() -> int:
+        if fixed or context.device == "cpu":
+            return fixed or _CPU_BATCH
+        # as many as should do, going by those so far
+        rate = kept.count / result.candidates if result and kept.count else execution.rate
+        return int(min(max(1.05 * (rows - kept.count) / rate + 256, _GPU_LEAST), _GPU_MOST))
+
+    with closing(_batches(pipeline, context, execution, bank, limit, size)) as batches:
         for count, batch in batches:
             if result is None:
                 result = ShardResult(batch.grasps)
