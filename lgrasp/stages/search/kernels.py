@@ -116,9 +116,11 @@ def try_starts(
             available += 1
     palm = palm_surface[row]
     k = contacts[wp.min(int(wp.randf(state) * float(contacts.shape[0])), contacts.shape[0] - 1)]
-    k = wp.min(k, available)
-    if k < 1 or (k < 2 and palm < 0):
-        return
+    if k > available:
+        # the palm's contact may stand in for one finger
+        if palm < 0 or k - 1 > available or available == 0:
+            return
+        k = available
     # contacts in the object's frame, where wrench residuals are the same: chosen groups first, then the palm
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)

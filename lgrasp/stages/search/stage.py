@@ -11,7 +11,7 @@ from lgrasp.stages.search.params import SearchParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 2
+VERSION = 3
 
 _CPU_LANES = 2
 _GPU_LANES = 12
