@@ -152,7 +152,12 @@ def _show_plan(job: "Job", json_path: str | None) -> None:
     from lgrasp_cli.tables import print_json, print_table
 
     lines = plan(job)
+    data = [line._asdict() for line in lines]
     if json_path == "-":
-        print_json([line._asdict() for line in lines])
+        print_json(data)
         return
+    if json_path:
+        from lgrasp.engine.report import write_json
+
+        write_json(json_path, data)
     print_table(("what", "which", "state", "to do", "file"), lines)
