@@ -49,8 +49,9 @@ def sdf_value(s: Sdf, p: wp.vec3):
     oz = x[2] - cz
     o2 = ox * ox + oy * oy + oz * oz
     if o2 > 0.0:
-        o = wp.sqrt(o2) / s.inv_cell
-        v = wp.max(o, v - o)
+        # the surface is inside the grid, so it is no nearer than this
+        o2 = o2 / (s.inv_cell * s.inv_cell)
+        v = wp.sqrt(o2 + wp.max(v, 0.0) * wp.max(v, 0.0))
     return v
 
 

@@ -16,7 +16,7 @@ class PlaceParams(BaseModel):
     exhaustive: float = Field(
         0.3, ge=0, description="Weight of surface point on a contact vector of the field, any roll."
     )
-    palm: float = Field(0.1, ge=0, description="Weight of surface point pressed on the palm, any roll.")
+    palm: float = Field(0.1, ge=0, le=1e6, description="Weight of surface point pressed on the palm, any roll.")
     proposals: int = Field(
         8, ge=1, le=256, description="Poses tried per candidate; the one with the richest contacts stays."
     )
