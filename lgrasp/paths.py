@@ -5,7 +5,7 @@ from pathlib import Path
 
 import platformdirs
 
-__all__ = ["cache_dir", "data_dirs"]
+__all__ = ["cache_dir", "data_dirs", "package_files", "user_dir"]
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -23,8 +23,23 @@ def data_dirs(kind: str) -> list[Path]:
     if not shipped.is_dir():
         shipped = _PACKAGE.parent / kind
     roots = [Path(p).expanduser() for p in os.environ.get("LGRASP_PATH", "").split(os.pathsep) if p]
-    roots.append(Path(platformdirs.user_data_dir("lgrasp")))
-    return [p for p in (*(root / kind for root in roots), shipped) if p.is_dir()]
+    return [p for p in (*(root / kind for root in roots), user_dir(kind), shipped) if p.is_dir()]
+
+
+def user_dir(kind: str) -> Path:
+    """The user's own folder of one kind (see :func:`data_dirs`), which need not exist."""
+    return Path(platformdirs.user_data_dir("lgrasp")) / kind
+
+
+def package_files(distribution: str) -> list[Path] | None:
+    """Files of an installed distribution, found without importing it; None when it is not installed."""
+    from importlib import metadata
+
+    try:
+        listed = metadata.files(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+    return [Path(str(file.locate())) for file in listed or []]
 
 
 def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:

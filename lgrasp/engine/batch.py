@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lgrasp.engine.bank import Bank
+from lgrasp.engine.fit import fit_params
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.stages import STAGES
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, select_poses
@@ -30,8 +31,9 @@ class _Meter:
         self.seconds: dict[str, float] = {}
 
     def run(self, stage: str, inputs: Any, pipeline: Pipeline, context: Context, **options: Any) -> Any:
+        params = fit_params(stage, pipeline.params(stage), context.hand.model)
         start = time.perf_counter()
-        table, counts = STAGES[stage].run(inputs, pipeline.params(stage), context, **options)
+        table, counts = STAGES[stage].run(inputs, params, context, **options)
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
         total = self.counts.setdefault(stage, {})
         for name, value in counts.items():

@@ -11,6 +11,7 @@ import numpy as np
 
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import content_key
+from lgrasp.engine.fit import fit_params
 from lgrasp.engine.generate import Job
 from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
@@ -89,7 +90,9 @@ def run_stage(
     for stage in stages[done:]:
         start = time.perf_counter()
         options = {"realised": "ik" in stages[: stages.index(stage)]} if stage == "search" else {}
-        table, counts = STAGES[stage].run(table, pipeline.params(stage), context, **options)
+        table, counts = STAGES[stage].run(
+            table, fit_params(stage, pipeline.params(stage), inputs.hand.model), context, **options
+        )
         seconds = time.perf_counter() - start
         cache.store(stage, files[stage], _arrays(table) | {"counts": np.asarray(json.dumps(counts))})
         runs.append(StageRun(stage, False, counts, seconds, cache.path(stage, files[stage])))

@@ -43,6 +43,14 @@ class Anatomy:
             body = self.parent(body)
         return out[::-1]
 
+    def driven_by(self, body: int) -> frozenset[str]:
+        """Actuated joints that move a body."""
+        if body == 0:
+            return frozenset()
+        first = int(self.tree.dof_first[self.tree.body_group[body]])
+        columns = (int(self.tree.dof_index[first + self.tree.joint_dof[b - 1]]) for b in self.path(body))
+        return frozenset(self.tree.joint_names[c] for c in columns)
+
     def links(self, body: int) -> list[str]:
         """Links that ride on a body."""
         return [n for n, b in zip(self.tree.link_names, self.tree.link_body, strict=True) if b == body]
@@ -51,7 +59,13 @@ class Anatomy:
 def probe_spec(name: str, link: str, locked: dict[str, float], base_link: str | None) -> HandSpec:
     """Rules that say no more than what is needed to build a model: one contact link."""
     box = {"min": (0.0, 0.0, 0.0), "max": (0.1, 0.1, 0.1)}
-    data = {"name": name, "contact": [{"links": [link]}], "canonical_box": box, "locked": locked, "base_link": base_link}
+    data = {
+        "name": name,
+        "contact": [{"links": [link]}],
+        "canonical_box": box,
+        "locked": locked,
+        "base_link": base_link,
+    }
     return HandSpec.model_validate(data)
 
 
@@ -62,30 +76,38 @@ def held_value(joint: Joint, share: float | None = None) -> float:
     return round(joint.lower + (0.5 if share is None else share) * (joint.upper - joint.lower), 4)
 
 
-def study_anatomy(urdf: Urdf, name: str) -> Anatomy:
+def study_anatomy(urdf: Urdf, name: str, mover: str | None = None) -> Anatomy:
     """Find fingers; lock arm, wrist and spread joints, one by one, until no joint moves two fingers that could part.
+
+    Args:
+        mover: the moving jaw of a gripper; every joint that does not drive this link is locked.
 
     Raises:
         HandError: no collision geometry on moving links, limits in degrees, or more fingers than are supported.
     """
     by_name = {j.name: j for j in urdf.joints}
-    for j in urdf.joints:
-        if j.movable and not j.prismatic and j.upper - j.lower > 13.0:
-            raise HandError(
-                f"URDF {urdf.path}: joint '{j.name}' turns from {j.lower:g} to {j.upper:g} rad; its limits are probably in "
-                "degrees, multiply them by 0.0174533"
-            )
     if not any(urdf.links.values()):
         raise HandError(
             f"URDF {urdf.path} has no collision geometry; 'lgrasp hands add {urdf.path}' takes the visual geometry for it"
         )
     locked: list[str] = []
-    while True:
+    if mover is not None:
+        whole = _anatomy(urdf, name, {})
+        drive = whole.driven_by(int(whole.tree.link_body[whole.tree.link_names.index(mover)]))
+        locked = [n for n in whole.tree.joint_names if n not in drive]
+    while mover is None:
         anatomy = _anatomy(urdf, name, {n: held_value(by_name[n]) for n in locked})
         joint = _shared_joint(anatomy)
         if joint is None:
             break
         locked.append(joint)
+    anatomy = _anatomy(urdf, name, {n: held_value(by_name[n]) for n in locked})
+    for j in urdf.joints:
+        if j.name in anatomy.tree.joint_names and not j.prismatic and j.upper - j.lower > 13.0:
+            raise HandError(
+                f"URDF {urdf.path}: joint '{j.name}' turns from {j.lower:g} to {j.upper:g} rad; its limits are probably in "
+                "degrees, multiply them by 0.0174533"
+            )
     if len(anatomy.tips) == 0:
         raise HandError(f"URDF {urdf.path}: no moving link has collision geometry; add <collision> to the finger links")
     if anatomy.tree.groups > _MOST_FINGERS:
@@ -109,12 +131,7 @@ def _anatomy(urdf: Urdf, name: str, locked: dict[str, float]) -> Anatomy:
     has = {int(tree.link_body[tree.link_names.index(link)]) for link in solid} - {0}
     inner = {b for body in has for b in rough.path(body)[:-1]}
     tips = tuple(sorted(has - inner))
-    drives = []
-    for tip in tips:
-        group = int(tree.body_group[tip])
-        columns = [int(tree.dof_index[tree.dof_first[group] + tree.joint_dof[b - 1]]) for b in rough.path(tip)]
-        drives.append(frozenset(tree.joint_names[c] for c in columns))
-    return Anatomy(tree, None, (), (), tips, tuple(drives))
+    return Anatomy(tree, None, (), (), tips, tuple(rough.driven_by(tip) for tip in tips))
 
 
 def _shared_joint(anatomy: Anatomy) -> str | None:
@@ -179,8 +196,14 @@ def finger_names(anatomy: Anatomy) -> list[str]:
     names: list[str] = []
     for g in range(anatomy.tree.groups):
         bodies = np.flatnonzero(anatomy.tree.body_group == g)
-        text = " ".join(link.lower() for b in bodies for link in anatomy.links(int(b)))
-        count = {word: sum(text.count(k) for k in keys) for word, keys in words}
+        texts = [link.lower() for b in bodies for link in anatomy.links(int(b))]
+        texts += [n.lower() for tip, d in zip(anatomy.tips, anatomy.drives, strict=True) if tip in bodies for n in d]
+        count = dict.fromkeys((word for word, _ in words), 0)
+        for text in texts:
+            found = [word for word, keys in words if any(k in text for k in keys)]
+            # a middle phalanx is no middle finger
+            for word in [w for w in found if w != "middle"] or found:
+                count[word] += 1
         word = max(count, key=lambda w: count[w])
         names.append(word if count[word] > 0 and word not in names else f"finger_{g + 1}")
     return names

@@ -18,8 +18,13 @@ _LEAST_EXTENT, _MOST_EXTENT = 0.02, 3.0  # [m] of a hand, an arm included
 _OPEN_DRAWS = 800
 
 
-def draft_spec(urdf_path: Path, name: str | None = None) -> tuple[HandSpec, list[str]]:
+def draft_spec(
+    urdf_path: Path, name: str | None = None, *, jaws: tuple[str, str] | None = None
+) -> tuple[HandSpec, list[str]]:
     """Rules for a hand from its URDF alone, and what was decided, in words.
+
+    Args:
+        jaws: (static link, moving link) of a gripper that :func:`lgrasp.hand.jaws.make_base` turned round.
 
     Raises:
         HandError: the URDF cannot be used (see :func:`read_urdf`, :func:`study_anatomy`), the hand is of impossible
@@ -27,8 +32,10 @@ def draft_spec(urdf_path: Path, name: str | None = None) -> tuple[HandSpec, list
     """
     urdf = read_urdf(urdf_path)
     name = name or urdf.name
-    anatomy = study_anatomy(urdf, name)
-    survey = _best_survey(urdf, anatomy, name)
+    anatomy = study_anatomy(urdf, name, jaws[1] if jaws else None)
+    if jaws is None:
+        _check_coupled(urdf, anatomy)
+    survey = _best_survey(urdf, anatomy, name, jaws)
     _check_size(urdf, survey)
     _check_hold(urdf, survey)
     said: list[str] = []
@@ -40,7 +47,9 @@ def draft_spec(urdf_path: Path, name: str | None = None) -> tuple[HandSpec, list
     data["locked"] = survey.locked
     said += _say_locked(survey)
     names = finger_names(anatomy)
-    data["static_links"] = [n for n, b in zip(survey.model.tree.link_names, survey.model.tree.link_body, strict=True) if b == 0]
+    data["static_links"] = [
+        n for n, b in zip(survey.model.tree.link_names, survey.model.tree.link_body, strict=True) if b == 0
+    ]
     data["contact"] = _contact_rules(survey)
     data["palm"] = _palm_rule(survey)
     said += _say_contacts(survey, names)
@@ -52,7 +61,11 @@ def draft_spec(urdf_path: Path, name: str | None = None) -> tuple[HandSpec, list
     data["open_posture"] = opened
     said.append(
         "open posture: "
-        + ("free of self-collision, " if clear else "NO sampled posture is free of self-collision, this is the best one; ")
+        + (
+            "free of self-collision, "
+            if clear
+            else "NO sampled posture is free of self-collision, this is the best one; "
+        )
         + "fingers away from the canonical box (open_posture)"
     )
     data["fingers"] = {
@@ -63,16 +76,27 @@ def draft_spec(urdf_path: Path, name: str | None = None) -> tuple[HandSpec, list
     return HandSpec.model_validate(data), said
 
 
-def _best_survey(urdf: Urdf, anatomy: Anatomy, name: str) -> Survey:
+def _check_coupled(urdf: Urdf, anatomy: Anatomy) -> None:
+    if anatomy.tree.groups == 1 and len(anatomy.tips) > 1:
+        tips = ", ".join(anatomy.links(b)[0] for b in anatomy.tips)
+        raise HandError(
+            f"URDF {urdf.path}: one drive moves all fingers ({tips}) together; lgrasp places one contact per drive, so they "
+            f"cannot oppose each other: 'lgrasp hands add {urdf.path}' makes one of the two jaws the base"
+        )
+
+
+def _best_survey(urdf: Urdf, anatomy: Anatomy, name: str, jaws: tuple[str, str] | None) -> Survey:
     """The survey of the lock values at which fingers oppose best: all shared joints at 0, or all in mid-range."""
     by_name = {j.name: j for j in urdf.joints}
     spread = [n for n in anatomy.locked if n not in anatomy.carrying]
     base = {n: held_value(by_name[n]) for n in anatomy.locked}
+    if jaws is not None:
+        return survey_hand(urdf, anatomy, name, base, jaws)
     trials = [base, *({**base, **{n: held_value(by_name[n], s) for n in spread}} for s in (0.5, 0.0, 1.0) if spread)]
     surveys = []
     for i, locked in enumerate(trials):
         if locked not in trials[:i]:
-            surveys.append(survey_hand(urdf, anatomy, name, locked))
+            surveys.append(survey_hand(urdf, anatomy, name, locked, jaws))
     return max(surveys, key=lambda s: s.hold.score if s.hold else 0.0)
 
 
@@ -107,11 +131,6 @@ def _check_hold(urdf: Urdf, survey: Survey) -> None:
             f"URDF {urdf.path} has one finger ({tips}) and no static surface opposite to it; a grasp needs two contacts that "
             "face each other: add the missing fingers, or a fixed link that the finger closes against"
         )
-    if moved == 1:
-        raise HandError(
-            f"URDF {urdf.path}: one drive moves all fingers ({tips}) together; lgrasp places one contact per drive, so they "
-            f"cannot oppose each other: 'lgrasp hands add {urdf.path}' makes one of two coupled jaws the base"
-        )
     shares = ", ".join(f"{100 * s:.0f} %" for s in survey.postures.clear.mean(0))
     raise HandError(
         f"URDF {urdf.path}: no two of its {moved} fingers ({tips}) ever face each other across an object of 4 to 6 cm "
@@ -123,6 +142,8 @@ def _say_locked(survey: Survey) -> list[str]:
     said = []
     for joint, value in survey.locked.items():
         why = "it carries the whole hand" if joint in survey.anatomy.carrying else "it moves several fingers"
+        if survey.model.groups == 1:
+            why = "it does not move the jaw"
         said.append(f"joint '{joint}' is locked at {value:g}: {why} (locked)")
     return said
 
@@ -160,12 +181,18 @@ def _say_contacts(survey: Survey, names: list[str]) -> list[str]:
     for g, finger in enumerate(names):
         tips = [t for t in survey.anatomy.tips if group[t] == g]
         sides = {s.skin.link: s for t in tips for s in survey.sides.get(t, [])}
-        joints = len(set().union(*(d for t, d in zip(survey.anatomy.tips, survey.anatomy.drives, strict=True) if t in tips)))
+        joints = len(
+            set().union(*(d for t, d in zip(survey.anatomy.tips, survey.anatomy.drives, strict=True) if t in tips))
+        )
         if sides:
             area = 1e4 * sum(s.area for s in sides.values())
-            said.append(f"finger '{finger}': {joints} drives, may touch with {', '.join(sides)} ({area:.1f} cm2 palmar; contact)")
+            said.append(
+                f"finger '{finger}': {joints} drives, may touch with {', '.join(sides)} ({area:.1f} cm2 palmar; contact)"
+            )
         else:
-            said.append(f"finger '{finger}': {joints} drives, shows the other fingers no surface, so it touches nothing (contact)")
+            said.append(
+                f"finger '{finger}': {joints} drives, shows the other fingers no surface, so it touches nothing (contact)"
+            )
         if len(tips) > 1:
             said.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
     if survey.palm:
@@ -185,7 +212,12 @@ def _say_box(survey: Survey, names: list[str], low: np.ndarray, high: np.ndarray
 
     pairs = [f"{label(a)}-{label(b)}" for (a, b), v in sorted(hold.opposing.items(), key=lambda x: -x[1]) if v > 0.3]
     place = " x ".join(f"[{a:.3f}, {b:.3f}]" for a, b in zip(low, high, strict=True))
-    who = f"{', '.join(pairs[:6])} face each other there" if pairs else "fingers barely face each other there"
+    able = [label(k) for k, v in hold.able.items() if v > 0.3]
+    who = (
+        f"{', '.join(pairs[:6])} face each other there"
+        if pairs
+        else f"{', '.join(able)} reach it, none straight opposite"
+    )
     return f"canonical box: {place} m, where a 4-6 cm ball is held best: {who} (canonical_box)"
 
 

@@ -10,10 +10,21 @@ from scipy.spatial import ConvexHull, QhullError
 from lgrasp.errors import HandError
 from lgrasp.hand.urdf import Geometry, Urdf
 
-__all__ = ["Piece", "convex_piece", "geometry_mesh", "inner_spheres", "surface_samples", "transform_points"]
+__all__ = [
+    "MOST_FACES",
+    "Piece",
+    "convex_piece",
+    "geometry_mesh",
+    "inner_spheres",
+    "surface_samples",
+    "thin_mesh",
+    "transform_points",
+]
 
 _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by half of it leaves +-0.2 mm
 _CYLINDER_SIDES = 32
+MOST_FACES = 40_000
+"""Collision meshes with more faces are thinned to about this many."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +90,32 @@ def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
         raise HandError(f"URDF {urdf.path}: mesh {file} cannot be read: {' '.join(str(error).split())[:200]}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
         raise HandError(f"URDF {urdf.path}: mesh {file} has no usable triangles")
+    mesh = thin_mesh(mesh, MOST_FACES)
     mesh.apply_scale(geometry.size)
     if mesh.extents.max() > 2.0:
         raise HandError(
             f"URDF {urdf.path}: mesh {file} is {mesh.extents.max():.3g} m wide; the file is probably in millimetres, "
             'add scale="0.001 0.001 0.001" to its <mesh>'
         )
+    return mesh
+
+
+def thin_mesh(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
+    """The mesh itself, or one of at most ``most`` faces: vertices in one cell of a grid become their mean."""
+    cells = np.sqrt(most) / 2
+    while len(mesh.faces) > most:
+        edge = float(mesh.extents.max()) / cells
+        cell = np.floor((mesh.vertices - mesh.bounds[0]) / edge).astype(np.int64)
+        _, index, number = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+        index = index.ravel()
+        vertices = np.stack([np.bincount(index, mesh.vertices[:, a]) for a in range(3)], 1) / number[:, None]
+        faces = index[mesh.faces]
+        faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+        thin = trimesh.Trimesh(vertices, faces, process=True)
+        thin.update_faces(thin.unique_faces())
+        if len(thin.faces) <= most:
+            return thin
+        cells /= 1.2
     return mesh
 
 

@@ -12,8 +12,8 @@ _CELL = 0.010  # [m]
 _RADII = (0.02, 0.025, 0.03)  # of the balls that are held [m]
 _PALM_WEIGHT = 0.02  # of a finger against the palm, where fingers could face each other
 _FULL = 4.0  # votes at which a finger counts as able to touch from a direction
-_LEAST = 0.012  # half edges of the box [m]
-_MOST = 0.030
+_LEAST = 0.020  # half edges of the box [m]
+_MOST = 0.035
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,9 @@ def _directions(n: int = 32) -> np.ndarray:
 def _smooth(votes: np.ndarray) -> np.ndarray:
     """Sums over neighbouring cells (weights 1/4, 1/2, 1/4 on each axis), votes (nx, ny, nz, b)."""
     for axis in range(3):
-        padded = np.concatenate([np.zeros_like(np.take(votes, [0], axis)), votes, np.zeros_like(np.take(votes, [0], axis))], axis)
+        padded = np.concatenate(
+            [np.zeros_like(np.take(votes, [0], axis)), votes, np.zeros_like(np.take(votes, [0], axis))], axis
+        )
         n = votes.shape[axis]
         votes = sum(w * np.take(padded, np.arange(k, k + n), axis) for k, w in ((0, 0.5), (1, 1.0), (2, 0.5)))
     return votes
@@ -89,7 +91,9 @@ def best_hold(touches: list[Touch], blocked) -> Hold | None:
         side = np.tile(np.argmax(t.normals @ axes.T, 1), len(_RADII))
         votes = np.bincount(cell * len(axes) + side, minlength=int(shape.prod()) * len(axes)).astype(np.float32)
         # neighbouring directions count as well
-        votes = _smooth(votes.reshape(*shape, len(axes))).reshape(-1, len(axes)) @ (axes @ axes.T > 0.85).astype(np.float32)
+        votes = _smooth(votes.reshape(*shape, len(axes))).reshape(-1, len(axes)) @ (axes @ axes.T > 0.85).astype(
+            np.float32
+        )
         able.append(np.minimum(votes * (20_000 / len(c)) / _FULL / 8, 1.0))
     places = low + (np.stack(np.unravel_index(np.arange(shape.prod()), tuple(shape)), -1) + 0.5) * _CELL
     free = ~blocked(places)

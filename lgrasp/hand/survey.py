@@ -1,6 +1,6 @@
 """What a hand can do with given joints locked: palmar surface, contact cones, and the best place to hold something."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ _SPREAD = 75.0  # [deg] contact normals of a finger lie this close to its palmar
 _PALM_SPREAD = 45.0
 _LEAST_AREA = 2.0e-5  # [m^2] contact surface of a link
 _LEAST_PALM = 3.0e-4
+_PALM_REACH = 0.10  # [m] from the palm to what is held
 
 
 @dataclass(frozen=True)
@@ -43,31 +44,53 @@ class Survey:
     hold: Hold | None
 
 
-def survey_hand(urdf: Urdf, anatomy: Anatomy, name: str, locked: dict[str, float]) -> Survey:
-    """Sample postures, see which surface is palmar, choose contact links, and look for the best place to hold."""
+def survey_hand(
+    urdf: Urdf, anatomy: Anatomy, name: str, locked: dict[str, float], jaws: tuple[str, str] | None = None
+) -> Survey:
+    """Sample postures, see which surface is palmar, choose contact links, and look for the best place to hold.
+
+    Args:
+        jaws: (static link, moving link) of a gripper whose one drive closes them; nothing else touches then.
+    """
     tip_link = next(n for n in anatomy.links(anatomy.tips[0]) if urdf.links[n])
     model = build_hand(urdf.path, probe_spec(name, tip_link, locked, anatomy.base_link))
     rng = np.random.default_rng(0)
     tree = model.tree
     postures = sample_bodies(model, rng.uniform(tree.joint_lower, tree.joint_upper, (_POSTURES, model.dofs)))
     skins = link_skins(urdf, model)
-    tips = {b: _tip_point([s for s in skins if s.body == b]) for b in anatomy.tips}
+    used = anatomy.tips if jaws is None else (int(tree.link_body[tree.link_names.index(jaws[1])]),)
+    tips = {b: _tip_point([s for s in skins if s.body == b]) for b in used}
+    if jaws is not None:
+        tips[0] = _tip_point([s for s in skins if s.link == jaws[0]] or [s for s in skins if s.body == 0])
+    elif len(tips) == 1 and any(s.body == 0 for s in skins):
+        tips[0] = _nearest_static(skins, postures, used[0], tips[used[0]])
     skins = see_skins(skins, postures, tips)
-    sides = {}
-    for tip in anatomy.tips:
-        sides[tip] = _finger_sides(anatomy, model, skins, tip)
-    palm = _palm_sides([s for s in skins if s.body == 0])
-    sides = {tip: found for tip, found in sides.items() if found}
+    sides = {tip: found for tip in used if (found := _finger_sides(anatomy, model, skins, tip))}
     touches = [
         finger_touches(str(tip), postures, int(tree.body_group[tip]), tip, *_allowed(found, tip))
         for tip, found in sides.items()
     ]
+    touches = _one_per_group(touches, anatomy)
+    depth = static_depth(model)
+
+    def blocked(p: np.ndarray) -> np.ndarray:
+        return depth(p) < 0.016
+
+    hold = best_hold(touches, blocked)
+    palm = _palm_sides([s for s in skins if s.body == 0], None if hold is None else hold.centre)
     if palm:
         points, normals = _allowed(palm, 0)
-        touches.append(still_touches("palm", points, normals, 8 * _POSTURES))
-    depth = static_depth(model)
-    hold = best_hold(_one_per_group(touches, anatomy), lambda p: depth(p) < 0.016)
+        hold = best_hold([*touches, still_touches("palm", points, normals, 8 * _POSTURES)], blocked)
     return Survey(model, anatomy, locked, postures, sides, palm, hold)
+
+
+def _nearest_static(skins: list[Skin], postures: Postures, body: int, tip: np.ndarray) -> np.ndarray:
+    """The point of the static links that a lone fingertip comes nearest to."""
+    rows = np.flatnonzero(postures.clear.all(1))[:100]
+    way = np.einsum("nij,j->ni", postures.R[rows, body], tip) + postures.t[rows, body]
+    still = np.vstack([s.points for s in skins if s.body == 0])
+    gap = np.linalg.norm(still[:, None] - way[None], axis=2) if len(way) else np.zeros((len(still), 1))
+    return still[np.argmin(gap.min(1))]
 
 
 def _one_per_group(touches: list[Touch], anatomy: Anatomy) -> list[Touch]:
@@ -104,7 +127,7 @@ def _finger_sides(anatomy: Anatomy, model: HandModel, skins: list[Skin], tip: in
         return []
     sides = [side for s in distal if (side := _side(s, axis, _SPREAD)).area >= _LEAST_AREA]
     before = anatomy.parent(tip)
-    if sides and before > 0 and before not in anatomy.tips:
+    if sides and anatomy.tree.groups > 1 and before > 0 and before not in anatomy.tips:
         inner = [s for s in skins if s.body == before]
         siblings = [t for t in anatomy.tips if t != tip and before in anatomy.path(t)]
         axis = _palmar_axis(model, inner, before, at_tip=False) if inner and not siblings else None
@@ -144,10 +167,22 @@ def _side(skin: Skin, axis: np.ndarray, spread: float) -> Side:
     return Side(skin, skin.T_body_link[:3, :3].T @ axis, chosen, skin.area * float(chosen.mean()))
 
 
-def _palm_sides(skins: list[Skin]) -> list[Side]:
-    """Static links whose surface the fingertips see, those that agree with the best one's direction in their own frame."""
+def _palm_sides(skins: list[Skin], centre: np.ndarray | None) -> list[Side]:
+    """Static links whose surface the fingertips see, those that agree with the best one's direction in their own frame.
+
+    Args:
+        centre: where things are held [m]; surface that is far from it or faces away does not count.
+    """
+    near = []
+    for s in skins:
+        seen = s.seen
+        if centre is not None:
+            way = centre - s.points
+            far = np.linalg.norm(way, axis=1)
+            seen = seen * ((far < _PALM_REACH) & ((way * s.normals).sum(1) > 0.3 * far))
+        near.append(replace(s, seen=seen))
     sides: list[Side] = []
-    for s in sorted(skins, key=lambda s: -s.seen_area):
+    for s in sorted(near, key=lambda s: -s.seen_area):
         m = (s.seen[:, None] * s.normals).mean(0)
         if np.linalg.norm(m) < 1e-9:
             continue

@@ -12,7 +12,7 @@ from lxml import etree
 
 from lgrasp.errors import HandError
 
-__all__ = ["Geometry", "Joint", "Urdf", "read_urdf"]
+__all__ = ["Geometry", "Joint", "Urdf", "find_mesh", "read_urdf"]
 
 _MOVABLE = {"revolute", "prismatic", "continuous"}
 
@@ -135,7 +135,7 @@ def _geometry(path: Path, link: str, collision, meshes: dict[str, Path]) -> Geom
                 f"URDF {path}: mesh '{name}' has scale {scale.tolist()}; three numbers other than 0 are needed"
             )
         kind, size = "mesh", tuple(float(x) for x in np.broadcast_to(scale, 3))
-        meshes[name] = _mesh_file(path, link, name)
+        meshes[name] = find_mesh(path, link, name)
     else:
         raise HandError(
             f"URDF {path}: link '{link}' has an unknown collision geometry; use box, sphere, cylinder or mesh"
@@ -147,7 +147,12 @@ def _geometry(path: Path, link: str, collision, meshes: dict[str, Path]) -> Geom
     return Geometry(kind, size, origin, name)
 
 
-def _mesh_file(path: Path, link: str, name: str) -> Path:
+def find_mesh(path: Path, link: str, name: str) -> Path:
+    """File of a mesh that a link of the URDF at ``path`` names; ``package://`` is a folder beside or above the URDF.
+
+    Raises:
+        HandError: no such file, or one outside the hand's folder tree.
+    """
     folder = path.resolve().parent
     if name.startswith("package://"):
         # a package is a folder beside or above the URDF (never the root); its name may be that folder's

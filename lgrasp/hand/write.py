@@ -1,0 +1,72 @@
+"""HandSpec -> hand.yaml that explains itself."""
+
+from pathlib import Path
+
+import yaml
+
+from lgrasp.hand.spec import Cone, HandSpec
+
+__all__ = ["write_spec"]
+
+
+def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
+    """Write a hand.yaml with a comment on every key and what was decided on top."""
+    lines = [
+        "# Drafted by 'lgrasp hands add'. Every key may be changed; 'lgrasp hands check' says what a change does.",
+        "#",
+    ]
+    lines += [f"# - {' '.join(line.split())}" for line in decisions]
+    lines += ["", f"name: {_plain(spec.name)}", f"urdf: {_plain(spec.urdf)}"]
+    lines += ["", "# Poses are given in the frame of this link; it must not move with any finger."]
+    lines += [f"base_link: {_plain(spec.base_link)}"]
+    lines += [
+        "",
+        "# Joints held at a value [rad or m]; they are no degrees of freedom for lgrasp. Free one by deleting its line.",
+    ]
+    lines += _mapping("locked", spec.locked)
+    lines += ["", "# Links that do not move with any finger."]
+    lines += [f"static_links: {_plain(list(spec.static_links))}"]
+    lines += [
+        "",
+        "# Links that may touch an object. Surface whose normal (link frame) lies within `angle` degrees of `axis` may not:",
+    ]
+    lines += [
+        "# the axis points away from the palmar side. Delete a link to keep it off the object; a smaller angle allows more."
+    ]
+    lines += ["contact:"]
+    for rule in spec.contact:
+        lines += [f"  - links: {_plain(list(rule.links))}"]
+        lines += ["    forbidden:", *(f"      - {_cone(c)}" for c in rule.forbidden)] if rule.forbidden else []
+    lines += ["", "# Static links that may touch an object, where their normal lies within `angle` degrees of `axis`."]
+    lines += ["# `palm: {}` keeps objects off the palm."]
+    if spec.palm.links:
+        lines += ["palm:", f"  links: {_plain(list(spec.palm.links))}", "  allowed:"]
+        lines += [f"    - {_cone(c)}" for c in spec.palm.allowed]
+    else:
+        lines += ["palm: {}"]
+    box = spec.canonical_box
+    lines += [
+        "",
+        "# Where an object's surface is put first (base_link frame, metres): between the fingertips, off the palm.",
+    ]
+    lines += [f"canonical_box: {{min: {_plain(list(box.min))}, max: {_plain(list(box.max))}}}"]
+    lines += ["", "# Where unused fingers go: free of self-collision, away from the canonical box."]
+    lines += _mapping("open_posture", spec.open_posture)
+    lines += ["", "# Names of the fingers, for reports."]
+    lines += ["fingers:", *(f"  {_plain(name)}: {_plain(list(links))}" for name, links in spec.fingers.items())]
+    lines += ["", "# Yours to fill in: the licence and the source of the model."]
+    lines += [f"licence: {_plain(spec.licence)}", f"source: {_plain(spec.source)}", ""]
+    path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def _plain(value: object) -> str:
+    text = yaml.safe_dump(value, default_flow_style=True, width=10**6, allow_unicode=True, sort_keys=False)
+    return text.removesuffix("...\n").strip()
+
+
+def _cone(cone: Cone) -> str:
+    return f"{{axis: {_plain(list(cone.axis))}, angle: {cone.angle:g}}}"
+
+
+def _mapping(key: str, values: dict[str, float]) -> list[str]:
+    return [f"{key}:", *(f"  {_plain(n)}: {v:g}" for n, v in values.items())] if values else [f"{key}: {{}}"]
