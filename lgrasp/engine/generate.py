@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, write_shard
+from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder, clean_folder, present_shards, shard_path
@@ -17,6 +17,7 @@ from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import Execution, ShardResult, make_shard, shard_effort
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
+from lgrasp.engine.writing import BackgroundWriter
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.grasp.tables import GraspTable, take_grasps
 
@@ -141,39 +142,46 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     execution = Execution(workers, job.batch, listener.cancelled)
     listener.started(inputs, [s for s, _ in shards], list(present))
     outcome = Outcome(inputs, [], sum(present.values()), 0, sum(present.values()), [], 0.0, False)
-    for shard, rows in shards:
-        if shard in present:
-            found = present[shard]
-        else:
-            if listener.cancelled():
-                outcome.cancelled = True
+    wanted = dict(shards)
+
+    def written(shard: int, result: ShardResult) -> None:
+        found = len(result.grasps)
+        outcome.written.append(files[shard])
+        outcome.made += found
+        outcome.rows += found
+        outcome.starved |= found < wanted[shard]
+        outcome.results.append(result)
+        listener.wrote(shard, files[shard], result)
+        result.grasps = take_grasps(result.grasps, slice(0, 0))  # memory must not grow with the shards
+
+    with BackgroundWriter(written) as writer:
+        for shard, rows in shards:
+            if shard in present:
+                outcome.starved |= present[shard] < rows
+                found = present[shard]
+            else:
+                if listener.cancelled():
+                    outcome.cancelled = True
+                    break
+                result = make_shard(
+                    pipeline,
+                    inputs,
+                    shard,
+                    rows,
+                    execution,
+                    bank_cache=job.cache if job.reuse else None,
+                    progress=lambda found, running, shard=shard: listener.advanced(shard, found, running),
+                )
+                if result.cancelled:
+                    outcome.cancelled = True
+                    break
+                found = len(result.grasps)
+                kept = result.counts.get("filter", {}).get("kept", 0)
+                execution = replace(execution, rate=max(kept / result.candidates, 1e-3))
+                writer.put(shard, files[shard], _shard(job, inputs, key, shard, result), result)
+            if found == 0:  # nor will the next shards give any
                 break
-            result = make_shard(
-                pipeline,
-                inputs,
-                shard,
-                rows,
-                execution,
-                bank_cache=job.cache if job.reuse else None,
-                progress=lambda found, running, shard=shard: listener.advanced(shard, found, running),
-            )
-            if result.cancelled:
-                outcome.cancelled = True
-                break
-            write_shard(files[shard], _shard(job, inputs, key, shard, result))
-            listener.wrote(shard, files[shard], result)
-            found = len(result.grasps)
-            kept = result.counts.get("filter", {}).get("kept", 0)
-            execution = replace(execution, rate=max(kept / result.candidates, 1e-3))
-            outcome.written.append(files[shard])
-            outcome.rows += found
-            outcome.made += found
-            result.grasps = take_grasps(result.grasps, slice(0, 0))  # memory must not grow with the shards
-            outcome.results.append(result)
-        outcome.paths.append(files[shard])
-        outcome.starved |= found < rows
-        if found == 0:  # nor will the next shards give any
-            break
+    outcome.paths = [files[s] for s, _ in shards if s in present or files[s] in outcome.written]
     outcome.wall = time.perf_counter() - start
     return outcome
 
