@@ -185,7 +185,7 @@ class TestStarving:
 
     @pytest.fixture
     def hopeless(self, swift):
-        return swift.with_params("search", threshold=1e-15).model_copy(update={"effort": 1})
+        return swift.with_params("search", least_force=0.5).model_copy(update={"effort": 1})
 
     def test_starved_shards_are_present(self, run, poor, raw_grasps, tmp_path):
         first = run(rows=2000, shard_rows=1000, pipeline=poor)
