@@ -86,6 +86,7 @@ def try_starts(
     least_force: wp.float32,
     torque_scale: wp.float32,
     moves: wp.int32,
+    rounds: wp.int32,
     per_pose: wp.int32,
     margin: wp.float32,
     realised: wp.int32,
@@ -151,24 +152,53 @@ def try_starts(
         mu = friction * _INSCRIBED
     goal = wp.sqrt(threshold)
     score = _score(points, normals, arms, forces, n, mu, torque_scale)
-    for _m in range(moves):
-        if score[0] < goal and score[1] >= least_force:
+    # the most finger contacts a set may come to have
+    most = int(0)
+    for i in range(contacts.shape[0]):
+        most = wp.max(most, contacts[i])
+    most = wp.min(most, available)
+    free = int(0)  # contacts before this one stay: they were searched in an earlier round
+    for r in range(rounds):
+        for _m in range(moves):
+            if score[0] < goal and score[1] >= least_force:
+                break
+            # replace the contact of one chosen group; keep what lowers the residual
+            i = free + wp.min(int(wp.randf(state) * float(k - free)), k - free - 1)
+            g = owner[i]
+            m = usable[row, g, wp.min(int(wp.randf(state) * float(size[row, g])), size[row, g] - 1)]
+            old_point = points[i]
+            old_normal = normals[i]
+            points[i] = obj.contact_points[surface[row, g, m]]
+            normals[i] = -obj.contact_normals[surface[row, g, m]]
+            trial = _score(points, normals, arms, forces, n, mu, torque_scale)
+            if trial[0] < score[0] or (score[0] < goal and trial[0] < goal):
+                score = trial
+                chosen[g] = m
+            else:
+                points[i] = old_point
+                normals[i] = old_normal
+        if (score[0] < goal and score[1] >= least_force) or k >= most or r + 1 == rounds:
             break
-        # replace the contact of one chosen group; keep what lowers the residual
-        i = wp.min(int(wp.randf(state) * float(k)), k - 1)
-        g = owner[i]
-        m = usable[row, g, wp.min(int(wp.randf(state) * float(size[row, g])), size[row, g] - 1)]
-        old_point = points[i]
-        old_normal = normals[i]
-        points[i] = obj.contact_points[surface[row, g, m]]
-        normals[i] = -obj.contact_normals[surface[row, g, m]]
-        trial = _score(points, normals, arms, forces, n, mu, torque_scale)
-        if trial[0] < score[0] or (score[0] < goal and trial[0] < goal):
-            score = trial
-            chosen[g] = m
-        else:
-            points[i] = old_point
-            normals[i] = old_normal
+        # the set lacks stability: add a contact of an unused finger, and search that one
+        skip = wp.min(int(wp.randf(state) * float(available - k)), available - k - 1)
+        added = int(-1)
+        for g in range(G):
+            if added < 0 and size[row, g] > 0 and chosen[g] < 0:
+                if skip == 0:
+                    added = g
+                skip -= 1
+        if palm >= 0:
+            points[n] = points[k]
+            normals[n] = normals[k]
+        m = usable[row, added, wp.min(int(wp.randf(state) * float(size[row, added])), size[row, added] - 1)]
+        chosen[added] = m
+        owner[k] = added
+        points[k] = obj.contact_points[surface[row, added, m]]
+        normals[k] = -obj.contact_normals[surface[row, added, m]]
+        free = k
+        k += 1
+        n += 1
+        score = _score(points, normals, arms, forces, n, mu, torque_scale)
     if score[0] >= goal or score[1] < least_force:
         return
     _arms(points, n, arms)

@@ -13,7 +13,9 @@ class SearchParams(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     contacts: tuple[int, ...] = Field(
-        (3, 3, 3, 3, 4), min_length=1, description="Finger contacts k, drawn evenly; 2 to 5."
+        (3, 3, 3, 3, 4),
+        min_length=1,
+        description="Finger contacts k of the first round, drawn evenly; the largest bounds later rounds.",
     )
     score: Literal["fswo", "gswo"] = Field(
         "fswo", description="Residual that the search lowers: frictionless or with friction."
@@ -23,8 +25,14 @@ class SearchParams(BaseModel):
     balance: float = Field(0.03, gt=0, le=1, description="Largest gswo residual (norm, inscribed round cone) of a set.")
     least_force: float = Field(0.03, ge=0, le=0.5, description="Smallest share of the normal force on a contact.")
     torque_scale: float = Field(10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")
-    restarts: int = Field(24, ge=1, le=4096, description="Random starts per pose.")
-    moves: int = Field(20, ge=0, le=1000, description="Replacements of one contact per start.")
+    restarts: int = Field(20, ge=1, le=4096, description="Random starts per pose.")
+    moves: int = Field(12, ge=0, le=1000, description="Replacements of one contact per start and round.")
+    rounds: int = Field(
+        2,
+        ge=1,
+        le=4,
+        description="Rounds per start; each after the first adds a finger if that is needed and k allows.",
+    )
     per_pose: int = Field(3, ge=1, le=64, description="Most sets per pose.")
     passes: int = Field(1, ge=1, le=64, description="Rounds over the same candidates (multi-pass generation).")
     margin: float = Field(0.0003, ge=0, le=0.01, description="Least distance between fingers [m].")

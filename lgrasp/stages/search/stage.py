@@ -11,7 +11,7 @@ from lgrasp.stages.search.params import SearchParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 3
+VERSION = 4
 
 _CPU_LANES = 2
 _GPU_LANES = 12
@@ -62,6 +62,7 @@ def run(
                 params.least_force,
                 params.torque_scale,
                 params.moves,
+                params.rounds,
                 params.per_pose,
                 params.margin,
                 int(realised),
