@@ -60,13 +60,17 @@ def add_hand(urdf: Path, *, name: str | None = None, out: Path | None = None, fo
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
     except OSError as error:
         raise HandError(f"hand folder {folder} cannot be made: {error.strerror}; choose another with --out") from None
+    originals = {temporary / "hand.urdf": urdf}
     try:
-        spec, said = _fill(urdf, name, temporary)
+        spec, said = _fill(urdf, name, temporary, originals)
         temporary.chmod(0o755)
         _swap(temporary, folder)
     except LgraspError as error:
-        # messages name the user's file, not the copy that is gone
-        raise type(error)(str(error).replace(str(temporary / "hand.urdf"), str(urdf))) from None
+        # messages name the user's files, not copies that are gone
+        text = str(error)
+        for copy, original in originals.items():
+            text = text.replace(str(copy.resolve()), str(original)).replace(str(copy), str(original))
+        raise type(error)(text) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return Adopted(folder, spec, said)
@@ -86,14 +90,14 @@ def _swap(new: Path, folder: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _fill(urdf: Path, name: str, folder: Path) -> tuple[HandSpec, list[str]]:
+def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> tuple[HandSpec, list[str]]:
     """Write URDF, meshes and hand.yaml into a folder and build the hand once."""
     robot = etree.fromstring(urdf.read_bytes(), etree.XMLParser(resolve_entities=False, no_network=True))
     for note in [e for e in robot.iter() if not isinstance(e.tag, str)]:
         if note.getparent() is not None:
             note.getparent().remove(note)
     said = _take_visuals(robot)
-    said += _take_meshes(robot, urdf, folder)
+    said += _take_meshes(robot, urdf, folder, originals)
     target = folder / "hand.urdf"
     _write(robot, target)
     jaws = find_jaws(target)
@@ -134,8 +138,11 @@ def _take_visuals(robot: etree._Element) -> list[str]:
     )
 
 
-def _take_meshes(robot: etree._Element, urdf: Path, folder: Path) -> list[str]:
-    """Copy every mesh to meshes/collision or meshes/visual and name it there; huge collision meshes are thinned."""
+def _take_meshes(robot: etree._Element, urdf: Path, folder: Path, originals: dict[Path, Path]) -> list[str]:
+    """Copy every mesh to meshes/collision or meshes/visual and name it there; huge collision meshes are thinned.
+
+    ``originals`` gets the file that each copy was made from.
+    """
     said: list[str] = []
     for kind in ("collision", "visual"):
         copied: dict[Path, str] = {}
@@ -152,6 +159,7 @@ def _take_meshes(robot: etree._Element, urdf: Path, folder: Path) -> list[str]:
                     break
                 if file not in copied:
                     copied[file] = _copy_mesh(file, folder, kind, set(copied.values()), said)
+                    originals[folder / copied[file]] = file
                 mesh.set("filename", copied[file])
     return said
 

@@ -16,6 +16,7 @@ __all__ = ["draft_spec"]
 
 _LEAST_EXTENT, _MOST_EXTENT = 0.02, 3.0  # [m] of a hand, an arm included
 _OPEN_DRAWS = 800
+_ARM_TRIALS = 5
 
 
 def draft_spec(
@@ -86,18 +87,28 @@ def _check_coupled(urdf: Urdf, anatomy: Anatomy) -> None:
 
 
 def _best_survey(urdf: Urdf, anatomy: Anatomy, name: str, jaws: tuple[str, str] | None) -> Survey:
-    """The survey of the lock values at which fingers oppose best: all shared joints at 0, or all in mid-range."""
+    """The survey of the lock values at which fingers oppose best: all shared joints at 0, or at some share of their range.
+
+    An arm that is in the way of the fingers is held elsewhere.
+    """
     by_name = {j.name: j for j in urdf.joints}
-    spread = [n for n in anatomy.locked if n not in anatomy.carrying]
     base = {n: held_value(by_name[n]) for n in anatomy.locked}
-    if jaws is not None:
-        return survey_hand(urdf, anatomy, name, base, jaws)
-    trials = [base, *({**base, **{n: held_value(by_name[n], s) for n in spread}} for s in (0.5, 0.0, 1.0) if spread)]
-    surveys = []
-    for i, locked in enumerate(trials):
-        if locked not in trials[:i]:
-            surveys.append(survey_hand(urdf, anatomy, name, locked, jaws))
-    return max(surveys, key=lambda s: s.hold.score if s.hold else 0.0)
+    carrying = anatomy.locked if jaws is not None else anatomy.carrying
+    spread = [n for n in anatomy.locked if n not in carrying]
+    best = survey_hand(urdf, anatomy, name, base, jaws)
+    rng = np.random.default_rng(0)
+    for _ in range(_ARM_TRIALS):
+        if not carrying or best.postures.clear.mean() > 0.6:
+            break
+        base = {**base, **{n: held_value(by_name[n], float(rng.uniform(0.2, 0.8))) for n in carrying}}
+        survey = survey_hand(urdf, anatomy, name, base, jaws)
+        best = max((best, survey), key=lambda s: (s.hold is not None, s.postures.clear.mean()))
+    for share in (0.0, 0.5, 1.0):
+        locked = {**best.locked, **{n: held_value(by_name[n], share) for n in spread}}
+        if locked != best.locked:
+            survey = survey_hand(urdf, anatomy, name, locked, jaws)
+            best = max((best, survey), key=lambda s: s.hold.score if s.hold else 0.0)
+    return best
 
 
 def _check_size(urdf: Urdf, survey: Survey) -> None:

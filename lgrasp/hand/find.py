@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lgrasp.errors import HandError
+from lgrasp.hand.packages import PACKAGE_HANDS, drafted_folder, package_urdf
 from lgrasp.hand.spec import HandSpec, load_spec
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.paths import data_dirs
@@ -33,7 +34,8 @@ def known_hands() -> dict[str, Path]:
 
 
 def find_hand(name: str) -> HandSource:
-    """A known name, a folder with hand.yaml, or a URDF file.
+    """A known name, a folder with hand.yaml, a URDF file, or a hand of an installed package (PACKAGE_HANDS, or
+    ``DISTRIBUTION:URDF``).
 
     For a URDF the rules are those of the hand.yaml beside it, else those of the known hand whose joint and link names
     all occur in it.
@@ -45,6 +47,9 @@ def find_hand(name: str) -> HandSource:
     if name in known:
         return _from_folder(known[name])
     path = Path(name).expanduser()
+    urdf = None if path.exists() else package_urdf(name)
+    if urdf is not None:
+        return _from_package(urdf, name.replace(":", "_"), known)
     if path.is_dir():
         if not (path / "hand.yaml").is_file():
             raise HandError(f"hand folder {path} has no hand.yaml; name a URDF file or a folder with hand.yaml")
@@ -53,9 +58,12 @@ def find_hand(name: str) -> HandSource:
         return _from_urdf(path, known)
     if path.suffix or "/" in name:
         raise HandError(f"hand file {path} does not exist; known hands: {', '.join(known)}")
-    near = difflib.get_close_matches(name, known, n=1)
+    near = difflib.get_close_matches(name, [*known, *PACKAGE_HANDS], n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""
-    raise HandError(f"unknown hand '{name}'; {hint}known hands: {', '.join(known)}, or give the path of a URDF")
+    raise HandError(
+        f"unknown hand '{name}'; {hint}known hands: {', '.join(known)}, those of packages: {', '.join(PACKAGE_HANDS)}, "
+        "or give the path of a URDF"
+    )
 
 
 def _from_folder(folder: Path) -> HandSource:
@@ -68,6 +76,17 @@ def _from_urdf(path: Path, known: dict[str, Path]) -> HandSource:
     if beside.is_file():
         spec = load_spec(beside)
         return HandSource(spec.name, path, spec)
+    source = _rules_of_known(path, known)
+    if source is None:
+        raise HandError(
+            f"URDF {path}: no hand.yaml beside it and no known hand has its joint and link names; draft one with "
+            f"'lgrasp hands add {path}' (known hands: {', '.join(known)})"
+        )
+    return source
+
+
+def _rules_of_known(path: Path, known: dict[str, Path]) -> HandSource | None:
+    """The URDF with the rules of the known hand whose joint and link names all occur in it."""
     urdf = read_urdf(path)
     movable = {j.name for j in urdf.joints if j.movable}
     for folder in known.values():
@@ -79,7 +98,13 @@ def _from_urdf(path: Path, known: dict[str, Path]) -> HandSource:
         if {j.name for j in own.joints if j.movable} == movable and set(own.links) <= set(urdf.links):
             note = f"rules of the known hand '{source.name}' (same joint and link names)"
             return HandSource(source.name, path, source.spec, note)
-    raise HandError(
-        f"URDF {path}: no hand.yaml beside it and no known hand has its joint and link names; "
-        f"write a hand.yaml next to it (known hands: {', '.join(known)})"
-    )
+    return None
+
+
+def _from_package(urdf: Path, name: str, known: dict[str, Path]) -> HandSource:
+    source = _rules_of_known(urdf, known)
+    if source is not None and all(read_urdf(urdf).links.get(link) for link in source.spec.palm.links):
+        return HandSource(name, urdf, source.spec.model_copy(update={"name": name}), source.note)
+    folder, _ = drafted_folder(urdf, name)
+    spec = load_spec(folder / "hand.yaml")
+    return HandSource(spec.name, folder / spec.urdf, spec, f"rules drafted from {urdf.name} of an installed package")

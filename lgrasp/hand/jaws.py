@@ -6,7 +6,8 @@ import numpy as np
 from lxml import etree
 
 from lgrasp.hand.anatomy import Anatomy, study_anatomy
-from lgrasp.hand.survey import survey_hand
+from lgrasp.hand.palmar import Postures
+from lgrasp.hand.survey import Side, survey_hand
 from lgrasp.hand.urdf import read_urdf
 
 __all__ = ["find_jaws", "make_base"]
@@ -24,7 +25,9 @@ def find_jaws(urdf_path: Path) -> tuple[str, str] | None:
     locked = {j.name: 0.0 if j.lower <= 0 <= j.upper else (j.lower + j.upper) / 2 for j in urdf.joints}
     survey = survey_hand(urdf, anatomy, urdf.name, {n: locked[n] for n in anatomy.locked})
     best, pair = 0.0, None
-    sides = {tip: found[0] for tip, found in survey.sides.items()}
+    # fingertips, not links that end near the palm
+    reach = {tip: _reach(survey.postures, anatomy, tip, found[0]) for tip, found in survey.sides.items()}
+    sides = {tip: found[0] for tip, found in survey.sides.items() if reach[tip] > 0.7 * max(reach.values())}
     for a, one in sides.items():
         for b, other in sides.items():
             if a >= b:
@@ -41,13 +44,19 @@ def find_jaws(urdf_path: Path) -> tuple[str, str] | None:
     return _mounting_link(anatomy, pair[0]), _mounting_link(anatomy, pair[1])
 
 
-def _places(postures, body: int, side) -> np.ndarray:
+def _places(postures: Postures, body: int, side: Side) -> np.ndarray:
     middle = side.skin.points[side.chosen].mean(0)
     return postures.R[:, body] @ middle + postures.t[:, body]
 
 
-def _facing(postures, body: int, side) -> np.ndarray:
+def _facing(postures: Postures, body: int, side: Side) -> np.ndarray:
     return postures.R[:, body] @ (side.skin.T_body_link[:3, :3] @ side.axis)
+
+
+def _reach(postures: Postures, anatomy: Anatomy, body: int, side: Side) -> float:
+    """Mean distance of a surface from where its finger is mounted [m]."""
+    root = anatomy.path(body)[0]
+    return float(np.linalg.norm(_places(postures, body, side) - postures.t[:, root], axis=1).mean())
 
 
 def _mounting_link(anatomy: Anatomy, body: int) -> str:

