@@ -1,22 +1,27 @@
-"""Stage parameters that a hand cannot meet as asked, lowered to what it has."""
+"""Stage parameters that depend on the hand."""
 
 from typing import Any
 
 import numpy as np
 
 from lgrasp.hand.model import HandModel
+from lgrasp.stages.search.params import SearchParams
 
 __all__ = ["fit_params"]
 
 
 def fit_params(stage: str, params: Any, hand: HandModel) -> Any:
-    """The parameters of a stage for a hand: search asks for no more finger contacts than there are fingers.
+    """The parameters of a stage for a hand: how many finger contacts search asks for.
 
-    A gripper has two jaws; asking for three contacts would give nothing. A pure function of parameters and hand, both of
-    which are in the content keys.
+    A hand's own wish (hand.yaml: contacts) stands in for the default of search, and no more contacts are asked for than
+    there are fingers: asking three of a gripper with two jaws would give nothing. A pure function of parameters and
+    hand, both of which are in the content keys.
     """
     if stage != "search":
         return params
+    asked = params.contacts
+    if hand.contacts and asked == SearchParams().contacts:
+        asked = hand.contacts
     fingers = int((np.diff(hand.contact_first[:-1]) > 0).sum())
-    contacts = tuple(min(k, max(2, fingers)) for k in params.contacts)
+    contacts = tuple(min(k, max(2, fingers)) for k in asked)
     return params if contacts == params.contacts else params.model_copy(update={"contacts": contacts})

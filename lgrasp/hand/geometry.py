@@ -14,6 +14,7 @@ __all__ = [
     "MOST_FACES",
     "Piece",
     "convex_piece",
+    "convex_pieces",
     "geometry_mesh",
     "inner_spheres",
     "surface_samples",
@@ -23,6 +24,7 @@ __all__ = [
 
 _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by half of it leaves +-0.2 mm
 _CYLINDER_SIDES = 32
+_MOST_BODIES = 16
 MOST_FACES = 40_000
 """Collision meshes with more faces are thinned to about this many."""
 
@@ -40,6 +42,18 @@ class Piece:
         """Bounding sphere (x, y, z, r) [m]."""
         c = 0.5 * (self.vertices.min(0) + self.vertices.max(0))
         return np.append(c, np.linalg.norm(self.vertices - c, axis=1).max() + self.radius)
+
+    @property
+    def hull_volume(self) -> float:
+        """Volume of the hull without the radius [m^3]; 0 for balls and capsules."""
+        return float(ConvexHull(self.vertices).volume) if len(self.planes) else 0.0
+
+    def moved(self, T: np.ndarray) -> "Piece":
+        """The piece mapped by a rigid motion T (4, 4)."""
+        planes = self.planes.copy()
+        planes[:, :3] = self.planes[:, :3] @ T[:3, :3].T
+        planes[:, 3] += planes[:, :3] @ T[:3, 3]
+        return Piece(transform_points(T, self.vertices), planes, self.radius)
 
     def depth(self, p: np.ndarray) -> np.ndarray:
         """Signed distance of points (n, 3) [m], negative inside; a lower bound outside."""
@@ -151,6 +165,20 @@ def convex_piece(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> Piece
             f"URDF {urdf.path}: collision mesh {geometry.mesh} is flat; collision bodies need volume"
         ) from None
     return Piece(vertices, planes, 0.0)
+
+
+def convex_pieces(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> list[Piece]:
+    """Convex pieces of one collision element: one per connected body of its mesh, so that gaps between bodies stay.
+
+    Raises:
+        HandError: a flat or degenerate mesh.
+    """
+    if geometry.kind == "mesh" and 1 < mesh.body_count <= _MOST_BODIES:
+        try:
+            return [convex_piece(urdf, geometry, part) for part in mesh.split(only_watertight=False)]
+        except HandError:
+            pass  # a flat part: its hull has no volume, that of the whole may
+    return [convex_piece(urdf, geometry, mesh)]
 
 
 def inner_spheres(piece: Piece, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -13,14 +13,14 @@ from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.device.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import LinkGrid, check_contact_links, cover_patches, finger_points, link_grid, palm_points
-from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres, surface_samples, transform_points
+from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh, inner_spheres, surface_samples, transform_points
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 
 __all__ = ["HAND_VERSION", "HandModel", "build_hand", "hand_digest"]
 
-HAND_VERSION = 2
+HAND_VERSION = 3
 """Raised whenever the arrays of a HandModel change meaning."""
 
 _SPHERES_PER_PIECE = 12
@@ -39,6 +39,7 @@ class HandModel:
     urdf_text: str
     mesh_files: dict[str, str]  # URDF mesh path -> file, for the copy inside shards
     notes: tuple[str, ...]
+    contacts: tuple[int, ...]  # finger contacts k that suit this hand, empty: the pipeline decides
     tree: Tree
     canonical_box: np.ndarray  # (2, 3)
     # solids
@@ -111,6 +112,7 @@ class HandModel:
             "urdf_text": self.urdf_text,
             "mesh_files": self.mesh_files,
             "notes": self.notes,
+            "contacts": self.contacts,
             "tree": {k: v for k, v in tree.items() if not isinstance(v, np.ndarray)},
         }
         out["text"] = np.frombuffer(json.dumps(text).encode(), np.uint8)
@@ -122,7 +124,7 @@ class HandModel:
         tree: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in text.pop("tree").items()}
         tree |= {k.removeprefix("tree."): v for k, v in arrays.items() if k.startswith("tree.")}
         own = {k: v for k, v in arrays.items() if not k.startswith("tree.") and k != "text"}
-        text["notes"] = tuple(text["notes"])
+        text |= {key: tuple(text[key]) for key in ("notes", "contacts")}
         return cls(tree=Tree(**tree), **own, **text)
 
 
@@ -188,6 +190,7 @@ def build_hand(urdf_path: Path, spec: HandSpec, device: str = "cpu") -> HandMode
         urdf_text=urdf.text,
         mesh_files={name: str(file) for name, file in urdf.mesh_files.items()},
         notes=tuple(solids.notes),
+        contacts=spec.contacts,
         tree=tree,
         canonical_box=np.array([spec.canonical_box.min, spec.canonical_box.max], np.float32),
         pair_first=np.zeros((tree.groups + 1) ** 2 + 1, np.int32),
@@ -253,20 +256,19 @@ class _Solids:
             for geometry in urdf.links[link]:
                 T = T_body_link @ geometry.T_link_geometry
                 mesh = geometry_mesh(urdf, geometry)
-                piece = convex_piece(urdf, geometry, mesh)
-                if geometry.kind == "mesh" and mesh.is_volume and mesh.volume < 0.9 * mesh.convex_hull.volume:
-                    share = 100 * mesh.volume / mesh.convex_hull.volume
+                pieces = convex_pieces(urdf, geometry, mesh)
+                filled = sum(p.hull_volume for p in pieces)
+                if geometry.kind == "mesh" and abs(mesh.volume) < 0.9 * filled:
+                    share = 100 * abs(mesh.volume) / filled
                     self.notes.append(
                         f"link '{link}': mesh {geometry.mesh} fills {share:.0f} % of its convex hull; the hull is used"
                     )
                 mesh.apply_transform(T)
                 self.meshes.setdefault(link, []).append(mesh)
-                planes = piece.planes.copy()
-                planes[:, :3] = piece.planes[:, :3] @ T[:3, :3].T
-                planes[:, 3] += planes[:, :3] @ T[:3, 3]
-                piece = Piece(transform_points(T, piece.vertices), planes, piece.radius)
-                self.pieces.append((body, index, piece))
-                self.spheres.append((body, inner_spheres(piece, _SPHERES_PER_PIECE, rng)))
+                for piece in pieces:
+                    moved = piece.moved(T)
+                    self.pieces.append((body, index, moved))
+                    self.spheres.append((body, inner_spheres(moved, _SPHERES_PER_PIECE, rng)))
                 self.samples.append((body, surface_samples(mesh, _SAMPLE_SPACING, rng)))
         if not self.pieces:
             raise HandError(f"URDF {urdf.path} has no collision geometry; a hand's solid is its collision geometry")
