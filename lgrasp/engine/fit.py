@@ -20,7 +20,7 @@ def fit_params(stage: str, params: Any, hand: HandModel) -> Any:
     if stage != "search":
         return params
     asked = params.contacts
-    if hand.contacts and asked == SearchParams().contacts:
+    if hand.contacts and asked == SearchParams.model_fields["contacts"].default:
         asked = hand.contacts
     fingers = int((np.diff(hand.contact_first[:-1]) > 0).sum())
     contacts = tuple(min(k, max(2, fingers)) for k in asked)

@@ -13,7 +13,7 @@ from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.device.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import LinkGrid, check_contact_links, cover_patches, finger_points, link_grid, palm_points
-from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh, inner_spheres, surface_samples, transform_points
+from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh, inner_spheres, surface_samples
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf

@@ -50,4 +50,6 @@ class ObjectParams(BaseModel):
 
     sdf_cells: int = Field(default=128**3, ge=16**3, le=512**3, description="Largest number of SDF cells.")
     sdf_min_cell: Length = Field(default=0.0005, description="SDF cells are not made smaller than this.")
-    sdf_pad: Length = Field(default=0.016, description="SDF margin around the bounding box; more than a fingertip's radius.")
+    sdf_pad: Length = Field(
+        default=0.016, description="SDF margin around the bounding box; more than a fingertip's radius."
+    )

@@ -6,8 +6,8 @@ import pytest
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.batch import run_batch
 from lgrasp.engine.shard import Execution, make_shard
-from lgrasp.stages.context import Context
 from lgrasp.grasp.tables import grasp_arrays, join_grasps
+from lgrasp.stages.context import Context
 
 
 def assert_same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:

@@ -185,7 +185,7 @@ def test_unknown_hands(library, tmp_path):
     refused(lambda: find_hand(str(tmp_path)), tmp_path, "no hand.yaml")
     other = tmp_path / "other.urdf"
     other.write_text((SHIPPED / "hand.urdf").read_text().replace("joint_0.0", "joint_x"))
-    refused(lambda: find_hand(str(other)), other, "write a hand.yaml")
+    refused(lambda: find_hand(str(other)), other, "lgrasp hands add")
 
 
 def test_hand_without_solids(tmp_path):
