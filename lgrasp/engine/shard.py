@@ -19,7 +19,7 @@ from lgrasp.stages.context import Context
 __all__ = ["Execution", "ShardResult", "add_counts", "make_shard", "shard_effort"]
 
 _LEAST_EFFORT = 65_536
-_CPU_BATCH = 512
+_CPU_BATCH = 256
 _GPU_LEAST, _GPU_MOST = 2_048, 65_536
 _STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
