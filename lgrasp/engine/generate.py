@@ -215,9 +215,9 @@ def _shard(job: Job, inputs: Inputs, key: str, shard: int, result: ShardResult) 
             name=hand.name,
             base_link=tree.base_link,
             urdf=hand.urdf_text,
-            joint_names=tree.joint_names,
-            joint_lower=tree.joint_lower,
-            joint_upper=tree.joint_upper,
+            joint_names=(*tree.joint_names, *tree.locked_names),
+            joint_lower=np.concatenate([tree.joint_lower, tree.locked_limits[:, 0]]),
+            joint_upper=np.concatenate([tree.joint_upper, tree.locked_limits[:, 1]]),
             link_names=tree.link_names,
             sha256=hand.sha256,
             meshes=meshes,
@@ -233,7 +233,7 @@ def _shard(job: Job, inputs: Inputs, key: str, shard: int, result: ShardResult) 
                 faces=obj.faces,
             )
         ],
-        grasps=_rows(result.grasps, obj.center, shard),
+        grasps=_rows(result.grasps, obj.center, shard, tree.locked_values),
         statistics=_statistics(inputs, result),
     )
 
@@ -251,7 +251,7 @@ def _statistics(inputs: Inputs, result: ShardResult) -> dict[str, Any]:
     return flat | {f"seconds_{stage}": seconds for stage, seconds in result.seconds.items()}
 
 
-def _rows(table: GraspTable, center: np.ndarray, shard: int) -> GraspRows:
+def _rows(table: GraspTable, center: np.ndarray, shard: int, locked: np.ndarray) -> GraspRows:
     position, quaternion = table.pose[:, :3].astype(float), table.pose[:, [6, 3, 4, 5]].astype(float)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     # R(q) c for the shift from the internal to the user's frame
@@ -263,10 +263,14 @@ def _rows(table: GraspTable, center: np.ndarray, shard: int) -> GraspRows:
     filled = table.contact_links >= 0
     width = max(1, int(filled.sum(1).max(initial=1)))
     points = (table.contact_points + center)[:, :width]
+
+    def with_locked(q: np.ndarray) -> np.ndarray:
+        return np.hstack([q, np.broadcast_to(locked, (len(q), len(locked)))])
+
     return GraspRows(
-        q=table.q,
-        q_pregrasp=table.q_pregrasp,
-        q_squeeze=table.q_squeeze,
+        q=with_locked(table.q),
+        q_pregrasp=with_locked(table.q_pregrasp),
+        q_squeeze=with_locked(table.q_squeeze),
         object_pose=pose[:, None],
         object_index=np.zeros((len(table), 1), np.int32),
         contact_points=points[:, None],

@@ -33,6 +33,9 @@ class Tree:
     joint_prismatic: np.ndarray  # (J,) i32
     T_parent_joint: np.ndarray  # (J, 4, 4)
     dof_index: np.ndarray  # (K,) i32: column of q that group-ordered dof d is
+    locked_names: tuple[str, ...]  # actuated joints held at a value; shards list them after those of q
+    locked_values: np.ndarray  # (H,) [rad or m]
+    locked_limits: np.ndarray  # (H, 2)
     link_names: tuple[str, ...]
     link_body: np.ndarray  # (L,) i32
     T_body_link: np.ndarray  # (L, 4, 4)
@@ -142,6 +145,7 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     opened = np.clip(np.array([spec.open_posture.get(j.name, 0.0) for j in actuated]), lower, upper)
     body = {j.name: 1 + i for i, j in enumerate(order)}
     links = list(urdf.links)
+    locked = [j for j in urdf.joints if j.mimic is None and j.name in spec.locked]
     return Tree(
         base_link=base,
         joint_names=tuple(j.name for j in actuated),
@@ -158,6 +162,9 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         joint_prismatic=np.array([j.prismatic for j in order], np.int32),
         T_parent_joint=np.array([pose_of[j.name] for j in order]),
         dof_index=np.array(dof_index, np.int32),
+        locked_names=tuple(j.name for j in locked),
+        locked_values=np.array([spec.locked[j.name] for j in locked], np.float32),
+        locked_limits=np.array([(j.lower, j.upper) for j in locked], np.float32).reshape(-1, 2),
         link_names=tuple(links),
         link_body=np.array([0 if (c := rides[n][0]) is None else body[c] for n in links], np.int32),
         T_body_link=np.array([rides[n][1] for n in links]),
