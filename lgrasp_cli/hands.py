@@ -1,8 +1,11 @@
 """``lgrasp hands``: the hands there are."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from lgrasp_cli.options import CacheDir, Device, PipelineName, Quiet, choose_pipeline, open_cache
 
 __all__ = ["app"]
 
@@ -61,3 +64,85 @@ def show_hand(
     typer.echo()
     rows = [(str(j["finger"]), j["name"], f"{j['lower']:.3f}", f"{j['upper']:.3f}") for j in hand["joints"]]
     print_table(("finger", "joint", "lower", "upper"), rows, right=("lower", "upper"))
+
+
+@app.command("add")
+def add_hand(
+    urdf: Annotated[Path, typer.Argument(metavar="URDF", help="URDF file of the hand.")],
+    name: Annotated[str | None, typer.Option(help="Name of the hand; default: the file's.", show_default=False)] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the hand; default: hands/NAME in your data folder.", show_default=False),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the hand of that name.")] = False,
+) -> None:
+    """Draft a hand from its URDF: fingers, palmar surface, canonical box, open posture.
+
+    Example: lgrasp hands add my_hand.urdf
+    """
+    from lgrasp.hand.adopt import add_hand as add
+
+    made = add(urdf, name=name, out=out, force=force)
+    for line in made.decisions:
+        typer.echo(f"- {' '.join(line.split())}")
+    typer.echo(f"\nwrote {made.folder}")
+    typer.echo(f"change what was decided in {made.folder / 'hand.yaml'}; the key is in brackets above")
+    typer.echo(f"try it: lgrasp hands check {made.spec.name if out is None else made.folder}")
+
+
+@app.command("check")
+def check_hand(
+    name: Annotated[str, typer.Argument(help="Name of a hand, a URDF file, a folder, or a hand of a package.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the pictures; default: check/NAME.", show_default=False)
+    ] = None,
+    rows: Annotated[int, typer.Option("-n", "--rows", min=1, help="Grasps asked per object.")] = 200,
+    pipeline: PipelineName = "swift",
+    device: Device = "auto",
+    workers: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
+    cache_dir: CacheDir = None,
+    quiet: Quiet = False,
+    as_json: _AsJson = False,
+) -> None:
+    """Try a hand on a ball, a box and a cylinder of 5 cm; say where the yield dies and why; save pictures.
+
+    Example: lgrasp hands check my_hand
+    """
+    from dataclasses import asdict
+
+    from lgrasp.engine.check import check_hand as check
+    from lgrasp.hand.find import find_hand
+    from lgrasp_cli.progress import say
+    from lgrasp_cli.tables import print_json, print_table
+
+    chosen, cache = choose_pipeline(pipeline), open_cache(cache_dir)
+    folder = out or Path("check") / find_hand(name).name
+    found = check(
+        name,
+        chosen,
+        out=folder,
+        rows=rows,
+        device=device,
+        workers=workers,
+        cache=cache,
+        report=None if quiet else lambda line: say(f"trying {line}"),
+    )
+    if as_json:
+        print_json(asdict(found) | {"pictures": [str(p) for p in found.pictures]})
+        return
+    if found.note:
+        typer.echo(found.note)
+    for note in found.notes:
+        typer.echo(f"note: {note}")
+    stages = list(found.objects[0].survivors)
+    rated = [
+        [o.name, *(f"{o.survivors[s]:,}" for s in stages), f"{o.rows:,} of {o.asked:,}", f"{o.seconds:.1f}"]
+        for o in found.objects
+    ]
+    columns = ("object", *stages, "grasps", "seconds")
+    print_table(columns, rated, right=columns[1:])
+    for o in found.objects:
+        for line in o.reasons:
+            typer.echo(f"{o.name}: {line}")
+    for picture in found.pictures:
+        typer.echo(f"wrote {picture}")

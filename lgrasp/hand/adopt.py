@@ -105,8 +105,8 @@ def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> t
         make_base(robot, jaws[0])
         _write(robot, target)
         said.append(
-            f"one drive moves both jaws: '{jaws[0]}' is made the base (the copy of the URDF is turned round; joint values "
-            f"mean the same), so that '{jaws[1]}' closes against it as against a palm"
+            f"one drive moves both jaws: '{jaws[0]}' is made the base (the copy of the URDF is turned round; joint "
+            f"values mean the same), so that '{jaws[1]}' closes against it as against a palm"
         )
     spec, decided = draft_spec(target, name, jaws=jaws)
     spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {urdf.name}"})
@@ -192,7 +192,7 @@ def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], said: list[
 
 
 def _thinned(file: Path) -> tuple[trimesh.Trimesh, int] | None:
-    """A huge mesh, thinned, and its faces before; None for others (and for what cannot be read: said when it is used)."""
+    """A huge mesh, thinned, and its faces before; None for others, and for what cannot be read (said later)."""
     if file.stat().st_size < _LARGE:
         return None
     try:

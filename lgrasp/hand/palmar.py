@@ -59,14 +59,14 @@ def sample_bodies(model: HandModel, q: np.ndarray) -> Postures:
     poses = body_poses(upload_hand(model, "cpu"), q)
     R = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix().reshape(*poses.shape[:2], 3, 3)
     clear = np.ones((len(q), model.groups), bool)
-    touching = np.zeros(len(q), bool)
+    touching: np.ndarray = np.zeros(len(q), bool)
     if len(model.pairs):
         touch = pieces_touch(model, q, model.pairs)
         group = model.tree.body_group[model.piece_body[model.pairs]]  # (Q, 2), the base is -1
         for g in range(model.groups):
             own = (group[:, 1] == g) & ((group[:, 0] == -1) | (group[:, 0] == g))
             clear[:, g] = ~touch[:, own].any(1)
-        touching = touch.any(1)
+        touching = np.asarray(touch.any(1))
     return Postures(q, R, poses[..., :3].astype(float), clear, touching)
 
 
@@ -81,12 +81,18 @@ def link_skins(urdf: Urdf, model: HandModel) -> list[Skin]:
         for geometry in urdf.links[link]:
             mesh = geometry_mesh(urdf, geometry)
             meshes.append(mesh.apply_transform(tree.T_body_link[index] @ geometry.T_link_geometry))
-        mesh = trimesh.util.concatenate(meshes)
+        mesh = _join(meshes)
         points, faces = trimesh.sample.sample_surface(mesh, _POINTS, seed=index)[:2]
         normals = np.asarray(mesh.face_normals)[faces]
         T, body = tree.T_body_link[index], int(tree.link_body[index])
         skins.append(Skin(link, body, float(mesh.area), points, normals, np.zeros(len(points)), T, mesh))
     return skins
+
+
+def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    joined = trimesh.util.concatenate(meshes)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
 
 
 @wp.kernel

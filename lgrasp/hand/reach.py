@@ -1,6 +1,7 @@
 """Where fingers can hold something: contact points and normals of random postures vote for the centre of a ball."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -62,14 +63,31 @@ def _directions(n: int = 32) -> np.ndarray:
 
 
 def _smooth(votes: np.ndarray) -> np.ndarray:
-    """Sums over neighbouring cells (weights 1/4, 1/2, 1/4 on each axis), votes (nx, ny, nz, b)."""
+    """Sums over neighbouring cells (weights 1/2, 1, 1/2 on each axis), votes (nx, ny, nz, b)."""
     for axis in range(3):
-        padded = np.concatenate(
-            [np.zeros_like(np.take(votes, [0], axis)), votes, np.zeros_like(np.take(votes, [0], axis))], axis
-        )
         n = votes.shape[axis]
-        votes = sum(w * np.take(padded, np.arange(k, k + n), axis) for k, w in ((0, 0.5), (1, 1.0), (2, 0.5)))
+        padded = np.pad(votes, [(1, 1) if a == axis else (0, 0) for a in range(4)])
+        left, right = (np.take(padded, np.arange(k, k + n), axis) for k in (0, 2))
+        votes = 0.5 * left + votes + 0.5 * right
     return votes
+
+
+def _balanced_threes(able: list[np.ndarray], axes: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """How well three fingers balance at each place (V,), summed over sets of three; ``able``: (V, b) per finger."""
+    n = len(axes)
+    i, j, k = np.meshgrid(*(np.arange(n),) * 3, indexing="ij")
+    # directions balance when each one's share of the force is positive and the rest is within friction
+    normal = np.cross(axes[i], axes[j])
+    flat = np.abs((normal * axes[k]).sum(-1)) < 0.35
+    spread = (np.abs(axes[i] + axes[j] + axes[k]) ** 2).sum(-1) < 0.5
+    i, j, k = (x[flat & spread] for x in (i, j, k))
+    out = np.zeros(len(free), np.float32)
+    rows = np.flatnonzero(free & (np.sum([a.max(1) > 0.05 for a in able], 0) >= 3))
+    for part in np.array_split(rows, max(1, len(rows) * len(i) // 10_000_000)):
+        for a, b, c in combinations(able, 3):
+            least = np.minimum(np.minimum(a[part][:, i], b[part][:, j]), c[part][:, k])
+            out[part] += least.max(1) + 10.0 * least.mean(1)
+    return out
 
 
 def best_hold(touches: list[Touch], blocked) -> Hold | None:
@@ -99,6 +117,7 @@ def best_hold(touches: list[Touch], blocked) -> Hold | None:
     free = ~blocked(places)
     opposite = axes @ axes.T < -0.82
     partner = [np.stack([a[:, opposite[b]].max(1) for b in range(len(axes))], 1) for a in able]
+    fingers = [i for i, t in enumerate(touches) if t.name != "palm"]
     pairs = {}
     score = np.zeros(len(places), np.float32)
     for i in range(len(touches)):
@@ -109,9 +128,12 @@ def best_hold(touches: list[Touch], blocked) -> Hold | None:
             value = facing.max(1) + 0.1 * facing.sum(1)
             pairs[touches[j].name, touches[i].name] = value
             with_palm = "palm" in (touches[j].name, touches[i].name)
-            score += value * (_PALM_WEIGHT if with_palm and len(touches) > 2 else 1.0)
-    score[~free] = 0.0
+            score += value * (_PALM_WEIGHT if with_palm and len(fingers) > 1 else 1.0)
     faced = np.max(list(pairs.values()), axis=0)
+    if len(fingers) > 2:
+        three = _balanced_threes([able[i] for i in fingers], axes, free)
+        score, faced = 0.3 * score + three, np.maximum(faced, three)
+    score[~free] = 0.0
     score[faced < 0.05] = 0.0
     if score.max() <= 0.0:
         return None

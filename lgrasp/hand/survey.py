@@ -14,7 +14,7 @@ from lgrasp.hand.urdf import Urdf
 __all__ = ["Side", "Survey", "static_depth", "survey_hand"]
 
 _POSTURES = 1200
-_SPREAD = 75.0  # [deg] contact normals of a finger lie this close to its palmar direction
+_LEAST_TIP = 5.0e-5  # [m^2] distal half of a fingertip
 _PALM_SPREAD = 45.0
 _LEAST_AREA = 2.0e-5  # [m^2] contact surface of a link
 _LEAST_PALM = 3.0e-4
@@ -23,10 +23,11 @@ _PALM_REACH = 0.10  # [m] from the palm to what is held
 
 @dataclass(frozen=True)
 class Side:
-    """Surface of one link that may touch: its skin, the palmar direction (link frame), which samples are in its cone."""
+    """Surface of one link that may touch: its skin, palmar direction and forbidden cones (link frame), samples."""
 
     skin: Skin
     axis: np.ndarray  # (3,), link frame
+    forbidden: tuple[tuple[np.ndarray, float], ...]  # axis, degrees
     chosen: np.ndarray  # (n,) bool
     area: float  # [m^2]
 
@@ -120,51 +121,77 @@ def _allowed(sides: list[Side], body: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _finger_sides(anatomy: Anatomy, model: HandModel, skins: list[Skin], tip: int) -> list[Side]:
-    """Contact links of one finger: those on its last body, and on the one before when that shows a large palmar surface."""
+    """Contact links of one finger.
+
+    A finger of three drives or more touches with the distal half of its last body, which it can turn any way, and the
+    rest of the finger stays clear. One of fewer drives needs all its palmar surface, that of the body before included.
+    """
     distal = [s for s in skins if s.body == tip]
-    axis = _palmar_axis(model, distal, tip, at_tip=True)
+    axis = _palmar_axis(model, distal, tip)
     if axis is None:
         return []
-    sides = [side for s in distal if (side := _side(s, axis, _SPREAD)).area >= _LEAST_AREA]
+    along = _along(distal)
+    hinged = not model.tree.joint_prismatic[tip - 1] and np.linalg.norm(axis - (axis @ along) * along) > 0.3
+    if hinged and len(anatomy.driven_by(tip)) >= 3:
+        across = axis - (axis @ along) * along
+        across /= np.linalg.norm(across)
+        sides = [_side(s, [(-along, 91.0), (-across, 60.0)]) for s in distal]
+        sides = [side for side in sides if side.area >= _LEAST_TIP]
+        if sides:
+            return sides
+    tilted = axis - (axis @ along) * along
+    if hinged:
+        axis = tilted / np.linalg.norm(tilted) + 0.5 * along
+        axis /= np.linalg.norm(axis)
+    sides = [_side(s, [(-axis, 105.0)]) for s in distal]
+    sides = [side for side in sides if side.area >= _LEAST_AREA]
     before = anatomy.parent(tip)
     if sides and anatomy.tree.groups > 1 and before > 0 and before not in anatomy.tips:
         inner = [s for s in skins if s.body == before]
         siblings = [t for t in anatomy.tips if t != tip and before in anatomy.path(t)]
-        axis = _palmar_axis(model, inner, before, at_tip=False) if inner and not siblings else None
+        axis = _palmar_axis(model, inner, before) if inner and not siblings else None
         if axis is not None:
-            more = [side for s in inner if (side := _side(s, axis, _SPREAD - 15)).area >= _LEAST_AREA]
+            more = [side for s in inner if (side := _side(s, [(-axis, 120.0)])).area >= _LEAST_AREA]
             shown = sum(s.skin.seen[s.chosen].mean() * s.area for s in more)
             if shown > 0.7 * sum(s.skin.seen[s.chosen].mean() * s.area for s in sides) and shown > 1e-4:
                 sides += more
     return sides
 
 
-def _palmar_axis(model: HandModel, skins: list[Skin], body: int, *, at_tip: bool) -> np.ndarray | None:
-    """Palmar direction in the body frame: mean of the normals seen, across the flexion axis, tilted towards the tip."""
+def _along(skins: list[Skin]) -> np.ndarray:
+    """Unit vector from a body's joint to the far end of its surface."""
+    way = _tip_point(skins)
+    return way / max(float(np.linalg.norm(way)), 1e-9)
+
+
+def _palmar_axis(model: HandModel, skins: list[Skin], body: int) -> np.ndarray | None:
+    """Palmar direction in the body frame: mean of the normals seen, across the flexion axis."""
     m = sum(((s.seen[:, None] * s.normals).mean(0) * s.area for s in skins), np.zeros(3))
     if np.linalg.norm(m) < 1e-9:
         return None
     m /= np.linalg.norm(m)
     if model.tree.joint_prismatic[body - 1]:
         return m
-    along = _tip_point(skins)
-    along /= max(float(np.linalg.norm(along)), 1e-9)
+    along = _along(skins)
     hinge = model.tree.joint_axis[body - 1].astype(float)
     if abs(hinge @ along) < 0.6:
         flat = m - (m @ hinge) * hinge
         if np.linalg.norm(flat) > 0.35:
             m = flat / np.linalg.norm(flat)
-    across = m - (m @ along) * along
-    if np.linalg.norm(across) > 0.3:
-        m = across / np.linalg.norm(across) + (0.5 * along if at_tip else 0.0)
-    return m / np.linalg.norm(m)
+    return m
 
 
-def _side(skin: Skin, axis: np.ndarray, spread: float) -> Side:
-    """The part of a skin within ``spread`` degrees of an axis (body frame)."""
-    chosen = skin.normals @ axis > np.cos(np.radians(spread))
-    chosen &= skin.seen > 0.1 * max(float(skin.seen.max()), 1e-9)
-    return Side(skin, skin.T_body_link[:3, :3].T @ axis, chosen, skin.area * float(chosen.mean()))
+def _side(skin: Skin, forbidden: list[tuple[np.ndarray, float]]) -> Side:
+    """What forbidden cones (axis in the body frame, degrees) leave of a skin, as far as it is seen."""
+    chosen = skin.seen > 0.1 * max(float(skin.seen.max()), 1e-9)
+    if len(forbidden) > 1:  # a fingertip that turns any way: all of it will be seen
+        chosen = np.ones(len(skin.points), bool)
+    for axis, angle in forbidden:
+        chosen &= skin.normals @ axis < np.cos(np.radians(angle))
+    R = skin.T_body_link[:3, :3]
+    cones = tuple((R.T @ axis, angle) for axis, angle in forbidden)
+    mean = -sum((axis for axis, _ in cones), np.zeros(3))
+    return Side(skin, mean / np.linalg.norm(mean), cones, chosen, skin.area * float(chosen.mean()))
 
 
 def _palm_sides(skins: list[Skin], centre: np.ndarray | None) -> list[Side]:
@@ -186,7 +213,7 @@ def _palm_sides(skins: list[Skin], centre: np.ndarray | None) -> list[Side]:
         m = (s.seen[:, None] * s.normals).mean(0)
         if np.linalg.norm(m) < 1e-9:
             continue
-        side = _side(s, m / np.linalg.norm(m), _PALM_SPREAD)
+        side = _side(s, [(-m / np.linalg.norm(m), 180.0 - _PALM_SPREAD)])
         if side.area < _LEAST_PALM or float(s.seen[side.chosen].mean()) < 0.15:
             continue
         if not sides or side.axis @ sides[0].axis > 0.94:

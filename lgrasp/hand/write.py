@@ -21,17 +21,17 @@ def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
     lines += [f"base_link: {_plain(spec.base_link)}"]
     lines += [
         "",
-        "# Joints held at a value [rad or m]; they are no degrees of freedom for lgrasp. Free one by deleting its line.",
+        "# Joints held at a value [rad or m]; lgrasp does not move them. Free one by deleting its line.",
     ]
     lines += _mapping("locked", spec.locked)
     lines += ["", "# Links that do not move with any finger."]
     lines += [f"static_links: {_plain(list(spec.static_links))}"]
     lines += [
         "",
-        "# Links that may touch an object. Surface whose normal (link frame) lies within `angle` degrees of `axis` may not:",
+        "# Links that may touch an object, save surface whose normal (link frame) is within `angle` degrees of `axis`:",
     ]
     lines += [
-        "# the axis points away from the palmar side. Delete a link to keep it off the object; a smaller angle allows more."
+        "# the axis points away from the palmar side. Delete a link to keep it off objects; smaller angles allow more."
     ]
     lines += ["contact:"]
     for rule in spec.contact:
@@ -44,6 +44,8 @@ def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
         lines += [f"    - {_cone(c)}" for c in spec.palm.allowed]
     else:
         lines += ["palm: {}"]
+    lines += ["", "# Numbers of fingers that touch, drawn evenly; [] leaves it to the pipeline (3, 4)."]
+    lines += [f"contacts: {_plain(list(spec.contacts))}"]
     box = spec.canonical_box
     lines += [
         "",

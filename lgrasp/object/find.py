@@ -26,7 +26,7 @@ def list_objects() -> dict[str, Path]:
 
 
 def find_object(name_or_path: str | os.PathLike[str]) -> Path:
-    """Mesh file of an object: an existing path, a name of :func:`list_objects`, or ``ycb:NAME`` of an installed package.
+    """Mesh file of an object: an existing path, a name of :func:`list_objects`, or ``ycb:NAME`` of a package.
 
     Raises:
         ObjectError: There is neither such a file nor such a name, or the package is not installed.

@@ -1,0 +1,238 @@
+"""Pictures of a hand without a display: contact patches, canonical box, workspace clouds, sample grasps."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from lgrasp.dataset.records import Shard
+from lgrasp.engine.diagnose import field_vectors, finger_label
+from lgrasp.engine.workspace import Inputs
+from lgrasp.hand.geometry import thin_mesh
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.palmar import Skin, link_skins, sample_bodies
+from lgrasp.hand.urdf import read_urdf
+
+__all__ = ["draw_grasps", "draw_hand", "draw_workspace"]
+
+_COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#e377c2", "#17becf")
+_PALM = "#e8a400"
+_LINK = "#c4c8cc"
+_OBJECT = "#ff9a3c"
+_FACES = 2500  # of a link
+_LIGHT = np.array([0.35, 0.25, 0.9]) / np.linalg.norm([0.35, 0.25, 0.9])
+
+
+def draw_hand(inputs: Inputs, path: Path) -> Path:
+    """The open hand from two sides: surface that may touch in colours, the palm's in gold, canonical box."""
+    model = inputs.hand.model
+    triangles, colours = _hand_triangles(inputs, model.tree.joint_open, patches=True)
+    figure = _figure(13, 7.2)
+    towards = _palmar_direction(inputs)
+    for i, turn in enumerate((20.0, 115.0)):
+        axes = figure.add_subplot(1, 2, i + 1, projection="3d")
+        _add_triangles(axes, triangles, colours)
+        _add_box(axes, model.canonical_box)
+        _frame(axes, np.vstack([_hand_points(model, model.tree.joint_open), model.canonical_box]), towards, turn)
+    _legend(figure, inputs, box=True)
+    figure.suptitle(f"{model.name}: open posture, surface that may touch, canonical box")
+    return _save(figure, path)
+
+
+def draw_workspace(inputs: Inputs, path: Path) -> Path:
+    """Where each finger's contact surface can go (dots), the canonical box and the hand, from two sides."""
+    model = inputs.hand.model
+    triangles, colours = _hand_triangles(inputs, model.tree.joint_open, patches=False)
+    clouds = [field_vectors(inputs.field.model, g)[0] for g in range(model.groups)]
+    clouds = [c[:: max(1, len(c) // 1500)] for c in clouds]
+    figure = _figure(13, 7.2)
+    towards = _palmar_direction(inputs)
+    for i, turn in enumerate((20.0, 115.0)):
+        axes = figure.add_subplot(1, 2, i + 1, projection="3d")
+        _add_triangles(axes, triangles, colours)
+        for g, cloud in enumerate(clouds):
+            axes.scatter(*cloud.T, s=5.0, color=_COLOURS[g % len(_COLOURS)], alpha=0.5, linewidths=0, zorder=5)
+        _add_box(axes, model.canonical_box)
+        _frame(
+            axes, np.vstack([_hand_points(model, model.tree.joint_open), model.canonical_box, *clouds]), towards, turn
+        )
+    _legend(figure, inputs, box=True)
+    figure.suptitle(f"{model.name}: reach of every finger's contact surface")
+    return _save(figure, path)
+
+
+def draw_grasps(inputs: Inputs, samples: list[tuple[str, Shard, int]], path: Path) -> Path:
+    """Sample grasps with their objects and contact points."""
+    model = inputs.hand.model
+    figure = _figure(15, 6.0)
+    for i, (name, shard, row) in enumerate(samples):
+        axes = figure.add_subplot(1, len(samples), i + 1, projection="3d")
+        triangles, colours = _hand_triangles(inputs, shard.grasps.q[row], patches=True)
+        obj = shard.objects[0]
+        pose = _matrix(shard.grasps.object_pose[row, 0])
+        mesh = thin_mesh(trimesh.Trimesh(np.asarray(obj.vertices), np.asarray(obj.faces), process=False), _FACES)
+        vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        solid = vertices[mesh.faces]
+        _add_triangles(axes, np.vstack([triangles, solid]), np.vstack([colours, _shade(solid, _OBJECT)]))
+        points = shard.grasps.contact_points[row, 0]
+        points = points[np.isfinite(points).all(1)] @ pose[:3, :3].T + pose[:3, 3]
+        axes.scatter(*points.T, s=45, c="black", depthshade=False, zorder=10)
+        _frame(
+            axes,
+            np.vstack([_hand_points(model, shard.grasps.q[row]), vertices]),
+            _away(points, vertices.mean(0), inputs),
+            0.0,
+        )
+        axes.set_title(f"{name}: {len(points)} contacts, epsilon {shard.grasps.metrics['epsilon'][row]:.2f}")
+    figure.suptitle(f"{model.name}: sample grasps (black: contacts)")
+    return _save(figure, path)
+
+
+def _figure(width: float, height: float) -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg", force=False)
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=100, layout=None)
+    FigureCanvasAgg(figure)
+    figure.subplots_adjust(left=0.0, right=0.98, bottom=0.09, top=0.9, wspace=0.04)
+    return figure
+
+
+def _save(figure: Any, path: Path) -> Path:
+    figure.savefig(path)
+    return path
+
+
+def _matrix(pose: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(pose[3:7], scalar_first=True).as_matrix()
+    T[:3, 3] = pose[:3]
+    return T
+
+
+def _hand_triangles(inputs: Inputs, q: np.ndarray, *, patches: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles (n, 3, 3) of a hand in the base frame and their colours (n, 4)."""
+    model = inputs.hand.model
+    postures = sample_bodies(model, np.asarray(q, float)[None])
+    R, t = postures.R[0], postures.t[0]
+    triangles, colours = [], []
+    for skin in link_skins(read_urdf(inputs.keys.source.urdf), model):
+        mesh = thin_mesh(skin.mesh, _FACES)
+        if len(mesh.faces) < _FACES:
+            edge = max(0.008, float(np.sqrt(4 * mesh.area / _FACES)))
+            mesh = trimesh.Trimesh(
+                *trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge)[:2], process=False
+            )
+        placed = (mesh.vertices @ R[skin.body].T + t[skin.body])[mesh.faces]
+        tint = _shade(placed, _LINK)
+        if patches:
+            for group, chosen in _patch_faces(model, skin, mesh):
+                colour = _PALM if group == model.groups else _COLOURS[group % len(_COLOURS)]
+                tint[chosen] = _shade(placed[chosen], colour)
+        triangles.append(placed)
+        colours.append(tint)
+    return np.concatenate(triangles), np.concatenate(colours)
+
+
+def _hand_points(model: HandModel, q: np.ndarray) -> np.ndarray:
+    """Contact points (n, 3) and body origins at a posture: what a picture must show of a hand, without its arm."""
+    postures = sample_bodies(model, np.asarray(q, float)[None])
+    body = model.contact_body
+    placed = np.einsum("nij,nj->ni", postures.R[0][body], model.contact_points) + postures.t[0][body]
+    return np.vstack([placed, postures.t[0][1:]])
+
+
+def _patch_faces(model: HandModel, skin: Skin, mesh: trimesh.Trimesh) -> list[tuple[int, np.ndarray]]:
+    """(group, faces that are contact surface) of a link."""
+    link = model.tree.link_names.index(skin.link)
+    rows = np.flatnonzero(model.contact_link == link)
+    if not len(rows):
+        return []
+    group = int(np.searchsorted(model.contact_first, rows[0], "right")) - 1
+    far, near = cKDTree(model.contact_points[rows]).query(mesh.triangles_center)
+    agree = (mesh.face_normals * model.contact_normals[rows][near]).sum(1) > 0.6
+    return [(group, np.flatnonzero((far < 0.006) & agree))]
+
+
+def _shade(triangles: np.ndarray, colour: str) -> np.ndarray:
+    from matplotlib.colors import to_rgb
+
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    light = 0.55 + 0.45 * np.clip(normals @ _LIGHT, -0.6, 1)
+    return np.column_stack([np.clip(light[:, None] * np.array(to_rgb(colour)), 0, 1), np.ones(len(light))])
+
+
+def _add_triangles(axes: Any, triangles: np.ndarray, colours: np.ndarray) -> None:
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    axes.add_collection3d(Poly3DCollection(triangles, facecolors=colours, edgecolors=colours, linewidths=0.2, zorder=1))
+
+
+def _add_box(axes: Any, box: np.ndarray) -> None:
+    """Edges of a box (2, 3)."""
+    corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    points = box[0] + corner * (box[1] - box[0])
+    for a in range(8):
+        for b in range(a):
+            if np.abs(corner[a] - corner[b]).sum() == 1:
+                axes.plot(*points[[a, b]].T, color="black", linewidth=1.6, zorder=9)
+
+
+def _palmar_direction(inputs: Inputs) -> np.ndarray:
+    """Direction from which the contact surface of the open hand is seen best."""
+    model = inputs.hand.model
+    postures = sample_bodies(model, model.tree.joint_open[None])
+    last = int(model.contact_first[model.groups + 1])
+    body = model.contact_body[:last]
+    weight = np.where(body == 0, 2.0, 1.0)
+    n = np.einsum("nij,nj->ni", postures.R[0][body], model.contact_normals[:last])
+    way = (weight[:, None] * n).sum(0)
+    size = float(np.linalg.norm(way))
+    if size < 0.15 * weight.sum():  # jaws that face each other: look across them
+        return np.linalg.svd(n - n.mean(0), full_matrices=False)[2][-1]
+    return way / size
+
+
+def _away(points: np.ndarray, centre: np.ndarray, inputs: Inputs) -> np.ndarray:
+    """A direction from which object and contacts are seen past the hand."""
+    way = centre - points.mean(0) + 0.02 * _palmar_direction(inputs)
+    size = float(np.linalg.norm(way))
+    return way / size if size > 1e-6 else _palmar_direction(inputs)
+
+
+def _frame(axes: Any, points: np.ndarray, towards: np.ndarray, turn: float) -> None:
+    """Equal scales around points, camera on the side ``towards``, turned about z by ``turn`` degrees."""
+    middle = (points.min(0) + points.max(0)) / 2
+    half = float(np.ptp(points, axis=0).max()) / 2 * 0.95
+    for axis, c in zip("xyz", middle, strict=True):
+        getattr(axes, f"set_{axis}lim")(c - half, c + half)
+        getattr(axes, f"set_{axis}label")(f"{axis} (m)", fontsize=8)
+        axes.tick_params(axis=axis, labelsize=6)
+    axes.set_box_aspect((1, 1, 1), zoom=1.1)
+    axes.computed_zorder = False  # dots and lines are drawn over solids
+    elevation = float(np.clip(np.degrees(np.arcsin(np.clip(towards[2], -1, 1))), -20, 55)) + 12
+    axes.view_init(elev=elevation, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) + turn)
+
+
+def _legend(figure: Any, inputs: Inputs, *, box: bool) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    model = inputs.hand.model
+    names = dict(inputs.keys.source.spec.fingers)
+    marks: list[Any] = [
+        Patch(color=_COLOURS[g % len(_COLOURS)], label=finger_label(model, names, g)) for g in range(model.groups)
+    ]
+    if model.contact_first[-1] > model.contact_first[-2]:
+        marks.append(Patch(color=_PALM, label="palm"))
+    if box:
+        marks.append(Line2D([], [], color="black", label="canonical box"))
+    figure.legend(handles=marks, loc="lower center", ncols=len(marks), fontsize=9, frameon=False)
