@@ -1,0 +1,68 @@
+"""URDFs that tests write: grippers, plain fingers, a hand turned round or mirrored."""
+
+from pathlib import Path
+
+from lxml import etree
+
+from lgrasp.hand.urdf import read_urdf
+
+JAW = '<origin xyz="{x} 0 0.03"/><geometry><box size="0.01 0.02 0.06"/></geometry>'
+SLIDE = '<joint name="{n}" type="prismatic"><parent link="base"/><child link="jaw_{n}"/><origin xyz="0 0 0.035"/>{rest}'
+LIMIT = '<limit lower="0" upper="0.05" effort="1" velocity="1"/>'
+PHALANX = '<link name="{n}"><collision><origin xyz="0 0 0.025"/>{geometry}</collision></link>'
+HINGE = (
+    '<joint name="{n}" type="revolute"><parent link="{p}"/><child link="{c}"/><origin xyz="0 {y} {z}"/>'
+    '<axis xyz="{s} 0 0"/><limit lower="-0.2" upper="{u}"/></joint>'
+)
+BAR = '<geometry><box size="0.015 0.015 0.05"/></geometry>'
+BASE = '<link name="base"><collision><geometry><box size="0.04 0.1 0.03"/></geometry></collision></link>'
+
+
+def gripper(folder: Path, *, mimic: bool = False, kind: str = "collision") -> Path:
+    """Two prismatic jaws."""
+    base = f'<link name="base"><{kind}><geometry><box size="0.12 0.05 0.06"/></geometry></{kind}></link>'
+    jaws = "".join(
+        f'<link name="jaw_{n}"><{kind}>{JAW.format(x=x)}</{kind}></link>' for n, x in (("l", 0.005), ("r", -0.005))
+    )
+    rest = '<axis xyz="{s} 0 0"/>' + LIMIT
+    left = SLIDE.format(n="l", rest=rest.format(s=1)) + "</joint>"
+    right = SLIDE.format(n="r", rest=rest.format(s=-1)) + ('<mimic joint="l"/>' if mimic else "") + "</joint>"
+    path = folder / "jaws.urdf"
+    path.write_text(f'<robot name="jaws">{base}{jaws}{left}{right}</robot>')
+    return path
+
+
+def fingers(folder: Path, count: int, tip: str = BAR, upper: float = 1.5) -> Path:
+    """Two fingers of two hinges, or one that has nothing to close against."""
+    base = BASE if count > 1 else BASE.replace("0.04 0.1 0.03", "0.03 0.03 0.03")
+    parts = []
+    for i, (y, s) in enumerate(((0.04, 1), (-0.04, -1)) if count > 1 else ((0.0, 1),)):
+        parts += [PHALANX.format(n=f"a{i}", geometry=BAR), PHALANX.format(n=f"b{i}", geometry=tip)]
+        parts.append(HINGE.format(n=f"j{i}", p="base", c=f"a{i}", y=y, z=0.02, s=s, u=upper))
+        parts.append(HINGE.format(n=f"k{i}", p=f"a{i}", c=f"b{i}", y=0, z=0.06, s=s, u=upper))
+    path = folder / "fingers.urdf"
+    path.write_text(f'<robot name="fingers">{base}{"".join(parts)}</robot>')
+    return path
+
+
+def turned(source: Path, folder: Path, rpy: str, *, mirror: bool = False) -> Path:
+    """A primitive URDF under a new root, rotated; or its mirror image (x to -x)."""
+    robot = etree.parse(str(source)).getroot()
+    if mirror:
+        for origin in robot.iter("origin"):
+            x, y, z = map(float, origin.get("xyz", "0 0 0").split())
+            r, p, w = map(float, origin.get("rpy", "0 0 0").split())
+            origin.set("xyz", f"{-x} {y} {z}")
+            origin.set("rpy", f"{r} {-p} {-w}")
+        for axis in robot.iter("axis"):
+            x, y, z = map(float, axis.get("xyz").split())
+            axis.set("xyz", f"{x} {-y} {-z}")  # axial vectors turn the other way
+    root = read_urdf(source).root
+    etree.SubElement(robot, "link", name="mount")
+    joint = etree.SubElement(robot, "joint", name="mounting", type="fixed")
+    etree.SubElement(joint, "parent", link="mount")
+    etree.SubElement(joint, "child", link=root)
+    etree.SubElement(joint, "origin", xyz="0.1 -0.2 0.3", rpy=rpy)
+    path = folder / "turned.urdf"
+    path.write_bytes(etree.tostring(robot))
+    return path
