@@ -152,7 +152,7 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
         outcome.starved |= found < wanted[shard]
         outcome.results.append(result)
         listener.wrote(shard, files[shard], result)
-        result.grasps = take_grasps(result.grasps, slice(0, 0))  # memory must not grow with the shards
+        result.grasps = take_grasps(result.grasps, np.zeros(0, int))  # a copy: memory must not grow with the shards
 
     with BackgroundWriter(written) as writer:
         for shard, rows in shards:

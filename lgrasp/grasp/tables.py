@@ -150,8 +150,8 @@ def _grasps(arrays: dict[str, np.ndarray]) -> GraspTable:
     return GraspTable(metrics=metrics, **{name: a for name, a in arrays.items() if not name.startswith("metrics.")})
 
 
-def take_grasps(table: GraspTable, rows: np.ndarray | slice) -> GraspTable:
-    """Some rows of a GraspTable."""
+def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:
+    """Copies of some rows of a GraspTable, by index (n,)."""
     return _grasps({name: values[rows] for name, values in grasp_arrays(table).items()})
 
 
