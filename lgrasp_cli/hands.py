@@ -144,5 +144,7 @@ def check_hand(
     for o in found.objects:
         for line in o.reasons:
             typer.echo(f"{o.name}: {line}")
+    for line in found.hints:
+        typer.echo(f"could be better: {line}")
     for picture in found.pictures:
         typer.echo(f"wrote {picture}")

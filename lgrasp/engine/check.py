@@ -11,7 +11,7 @@ import trimesh
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.records import Shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.diagnose import diagnose
+from lgrasp.engine.diagnose import diagnose, hand_findings
 from lgrasp.engine.generate import Job, generate
 from lgrasp.engine.pictures import draw_grasps, draw_hand, draw_workspace
 from lgrasp.engine.pipeline import Pipeline
@@ -44,6 +44,7 @@ class HandCheck:
     hand: str
     note: str  # where the rules come from
     notes: list[str]  # of the collision model
+    hints: list[str] = field(default_factory=list)  # what the rules leave unused, though enough came out
     objects: list[ObjectCheck] = field(default_factory=list)
     pictures: list[Path] = field(default_factory=list)
 
@@ -114,6 +115,9 @@ def check_hand(
                 shards[name] = read_shard(outcome.paths[0])
     assert result is not None
     assert inputs is not None
+    if not any(o.reasons for o in result.objects):
+        found = hand_findings(inputs.hand.model, inputs.field.model, dict(inputs.keys.source.spec.fingers))
+        result.hints = [line for stage in ("domain", "place", "ik", "search") for line in found[stage]]
     say("pictures")
     try:
         out.mkdir(parents=True, exist_ok=True)

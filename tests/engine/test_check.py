@@ -41,6 +41,7 @@ def test_drafted_gripper_holds_all_three(jaws, tmp_path, swift: Pipeline, cache_
     assert [o.name for o in found.objects] == ["sphere", "box", "cylinder"]
     assert [o.rows for o in found.objects] == [20, 20, 20]
     assert all(o.reasons == [] for o in found.objects)
+    assert found.hints == []
     assert all(list(o.survivors) == list(swift.order) for o in found.objects)
     assert [p.name for p in found.pictures] == ["hand.png", "workspace.png", "grasps.png"]
     for picture in found.pictures:
