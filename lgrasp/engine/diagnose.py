@@ -15,6 +15,8 @@ __all__ = ["diagnose", "field_vectors", "finger_label", "hand_findings"]
 
 _SHOWN = 20_000  # contact vectors of a finger that are looked at
 _NEAR = 0.015  # [m]
+_FACING = 0.95  # cosine
+_CHECKED = 0.05  # [m] size of the objects that a hand is tried on
 _POOR = 0.02  # share of survivors that counts as the place where the yield dies
 
 
@@ -54,12 +56,17 @@ def _decode(code: np.ndarray) -> np.ndarray:
 
 
 def _field_hold(model: HandModel, field: ContactField) -> Hold | None:
+    depth = static_depth(model)
+    return best_hold(_touches(model, field), lambda p: depth(p) < 0.016)
+
+
+def _touches(model: HandModel, field: ContactField) -> list[Touch]:
+    """What every finger and the palm can touch with."""
     touches = [Touch(str(g), *field_vectors(field, g)) for g in range(model.groups)]
     a, b = model.contact_first[model.groups : model.groups + 2]
     if b > a:
         touches.append(still_touches("palm", model.contact_points[a:b], model.contact_normals[a:b], _SHOWN))
-    depth = static_depth(model)
-    return best_hold(touches, lambda p: depth(p) < 0.016)
+    return touches
 
 
 def _box_text(low: np.ndarray, high: np.ndarray) -> str:
@@ -99,12 +106,35 @@ def hand_findings(model: HandModel, field: ContactField, names: dict[str, tuple[
             "side (the axis must point away from the palmar side), or the fingers cannot oppose: check locked"
         )
         found["place"] += found["search"]
+    widest = _widest_gap(model, field)
+    if widest is not None and widest < _CHECKED:
+        found["search"].append(
+            f"where the two contact surfaces face each other they are at most {1000 * widest:.0f} mm apart: objects "
+            "with parallel sides must be narrower, or contact and palm must name surface that faces farther apart"
+        )
     notes = [n for n in model.notes if "hull" in n]
     if notes:
         found["filter"].append(
             f"{len(notes)} concave collision meshes count as their hulls, which blocks room: {notes[0]}"
         )
     return found
+
+
+def _widest_gap(model: HandModel, field: ContactField) -> float | None:
+    """Largest distance [m] at which the surfaces of a hand that has just two face each other; None for other hands."""
+    touches = [t for t in _touches(model, field) if len(t.points)]
+    if len(touches) != 2:
+        return None
+    rng = np.random.default_rng(0)
+    (p, n), (r, m) = (
+        (t.points[rows], t.normals[rows]) for t in touches for rows in [rng.integers(len(t.points), size=2000)]
+    )
+    way = r[None] - p[:, None]
+    far = np.maximum(np.linalg.norm(way, axis=2), 1e-9)
+    facing = np.einsum("ijk,ik->ij", way, n) > _FACING * far
+    facing &= np.einsum("ijk,jk->ij", way, m) < -_FACING * far
+    facing &= n @ m.T < -_FACING
+    return float(far[facing].max()) if facing.any() else 0.0
 
 
 def _near_share(vectors: np.ndarray, points: np.ndarray) -> float:

@@ -87,6 +87,14 @@ def test_surfaces_that_never_face_are_named(jaws, tmp_path, swift, cache_root):
     assert any("never face each other" in line for line in load_findings(hand, swift, cache_root)["search"])
 
 
+def test_jaws_that_open_too_little_are_named(jaws, tmp_path, swift, cache_root):
+    hand = spoil(jaws, tmp_path, palm={})
+    urdf = tmp_path / "hand.urdf"
+    urdf.write_text(urdf.read_text().replace('upper="0.05"', 'upper="0.02"'))
+    (line,) = load_findings(hand, swift, cache_root)["search"]
+    assert "face each other they are at most 4" in line  # 40 mm, along the surfaces a little more
+
+
 def test_box_inside_the_palm_is_named(jaws, tmp_path, swift, cache_root):
     hand = spoil(jaws, tmp_path, canonical_box={"min": [-0.04, -0.02, -0.02], "max": [0.04, 0.02, 0.02]})
     assert any("inside static links" in line for line in load_findings(hand, swift, cache_root)["place"])
