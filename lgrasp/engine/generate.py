@@ -18,8 +18,9 @@ from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import Execution, ShardResult, make_shard, shard_effort
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.writing import BackgroundWriter
-from lgrasp.errors import ConfigError, LgraspError
+from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import GraspTable, take_grasps
+from lgrasp.hand.urdf import read_urdf
 
 __all__ = ["Job", "Listener", "Outcome", "find_present", "generate", "job_shards"]
 
@@ -143,6 +144,7 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     listener.started(inputs, [s for s, _ in shards], list(present))
     outcome = Outcome(inputs, [], sum(present.values()), 0, sum(present.values()), [], 0.0, False)
     wanted = dict(shards)
+    meshes = _mesh_blobs(keys.source.urdf)
 
     def written(shard: int, result: ShardResult) -> None:
         found = len(result.grasps)
@@ -178,7 +180,7 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
                 found = len(result.grasps)
                 kept = result.counts.get("filter", {}).get("kept", 0)
                 execution = replace(execution, rate=max(kept / result.candidates, 1e-3))
-                writer.put(shard, files[shard], _shard(job, inputs, key, shard, result), result)
+                writer.put(shard, files[shard], _shard(job, inputs, meshes, key, shard, result), result)
             if found == 0:  # nor will the next shards give any
                 break
     outcome.paths = [files[s] for s, _ in shards if s in present or files[s] in outcome.written]
@@ -186,16 +188,15 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     return outcome
 
 
-def _shard(job: Job, inputs: Inputs, key: str, shard: int, result: ShardResult) -> Shard:
+def _mesh_blobs(urdf: Path) -> dict[str, bytes]:
+    """Collision meshes of a hand by the path its URDF names, read where the hand is now, not where it was cached."""
+    return {name: file.read_bytes() for name, file in read_urdf(urdf).mesh_files.items()}
+
+
+def _shard(job: Job, inputs: Inputs, meshes: dict[str, bytes], key: str, shard: int, result: ShardResult) -> Shard:
     """The shard as records; poses and contacts go from the internal to the user's frame of the object."""
     hand, obj = inputs.hand.model, inputs.object.model
     tree = hand.tree
-    meshes = {}
-    for name, file in hand.mesh_files.items():
-        try:
-            meshes[name] = Path(file).read_bytes()
-        except OSError as error:
-            raise LgraspError(f"hand mesh {file} cannot be read any more: {error.strerror}") from None
     return Shard(
         header=ShardHeader(
             pipeline=job.pipeline.name,

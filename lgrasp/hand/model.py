@@ -20,7 +20,7 @@ from lgrasp.hand.urdf import Urdf, read_urdf
 
 __all__ = ["HAND_VERSION", "HandModel", "build_hand", "hand_digest"]
 
-HAND_VERSION = 4
+HAND_VERSION = 5
 """Raised whenever the arrays of a HandModel change meaning."""
 
 _SPHERES_PER_PIECE = 12
@@ -37,7 +37,6 @@ class HandModel:
     name: str
     sha256: str
     urdf_text: str
-    mesh_files: dict[str, str]  # URDF mesh path -> file, for the copy inside shards
     notes: tuple[str, ...]
     contacts: tuple[int, ...]  # finger contacts k that suit this hand, empty: the pipeline decides
     tree: Tree
@@ -110,7 +109,6 @@ class HandModel:
             "name": self.name,
             "sha256": self.sha256,
             "urdf_text": self.urdf_text,
-            "mesh_files": self.mesh_files,
             "notes": self.notes,
             "contacts": self.contacts,
             "tree": {k: v for k, v in tree.items() if not isinstance(v, np.ndarray)},
@@ -188,7 +186,6 @@ def build_hand(urdf_path: Path, spec: HandSpec, device: str = "cpu") -> HandMode
         name=spec.name,
         sha256=_digest(urdf, spec),
         urdf_text=urdf.text,
-        mesh_files={name: str(file) for name, file in urdf.mesh_files.items()},
         notes=tuple(solids.notes),
         contacts=spec.contacts,
         tree=tree,

@@ -1,0 +1,28 @@
+"""A cached hand serves wherever its files lie: no path is part of what the cache holds."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from lgrasp.dataset import read_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.generate import Job, generate
+from lgrasp.engine.pipeline import load_pipeline
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "hands" / "allegro"
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real Allegro with mesh fingertips is not here")
+def test_a_cached_hand_may_move(tmp_path):
+    pipeline = load_pipeline("swift")
+    pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 20_000})})
+    cache = Cache(tmp_path / "cache")
+    shutil.copytree(REAL, tmp_path / "before")
+    first = generate(Job(str(tmp_path / "before/allegro.urdf"), "sphere", 5, pipeline, tmp_path / "a", cache=cache))
+    shutil.move(tmp_path / "before", tmp_path / "after")
+    second = generate(Job(str(tmp_path / "after/allegro.urdf"), "sphere", 5, pipeline, tmp_path / "b", cache=cache))
+    assert second.inputs.hits["hand"]
+    meshes = read_shard(first.paths[0]).hand.meshes
+    assert meshes
+    assert read_shard(second.paths[0]).hand.meshes == meshes
