@@ -1,4 +1,4 @@
-"""``lgrasp bench``: how fast, on this machine."""
+"""``lgrasp bench``: how fast, on this machine; ``lgrasp bench table1``: beside the published figures."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,16 +6,17 @@ from typing import Annotated, Any
 import typer
 
 from lgrasp_cli.options import Device, Hand, JsonPath, check_report, open_cache, warn
+from lgrasp_cli.table1 import table1
 
-__all__ = ["bench", "register"]
+__all__ = ["app"]
+
+app = typer.Typer(invoke_without_command=True, subcommand_metavar="[table1 [OPTIONS]]")
+app.command()(table1)
 
 
-def register(app: typer.Typer) -> None:
-    """Mount the commands of this file."""
-    app.command()(bench)
-
-
+@app.callback()
 def bench(
+    context: typer.Context,
     hand: Hand = "allegro",
     objects: Annotated[str, typer.Option(help="Names or mesh files, separated by commas.")] = "mug",
     pipelines: Annotated[str, typer.Option(help="Names or YAML files, separated by commas.")] = "swift,lightning",
@@ -35,6 +36,9 @@ def bench(
 
     Example: lgrasp bench --objects mug,bowl --repeat 5
     """
+    if context.invoked_subcommand:
+        _refuse_options(context)
+        return
     cache = open_cache(None)
     from lgrasp.config import parse_model
     from lgrasp.engine.bench import bench as measure
@@ -67,6 +71,14 @@ def bench(
         from lgrasp.engine.report import write_json
 
         write_json(json_path, results)
+
+
+def _refuse_options(context: typer.Context) -> None:
+    """Options before the name of a subcommand would have no effect."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    if any(source is not None and source.name == "COMMANDLINE" for source in sources.values()):
+        name = context.invoked_subcommand
+        raise typer.BadParameter(f"options of 'bench {name}' come after its name: lgrasp bench {name} --device cpu")
 
 
 def _show(results: list[dict[str, Any]], rows: int, repeat: int) -> None:

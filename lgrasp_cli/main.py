@@ -17,9 +17,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (prepare, generate, run, stages, bench):
+for module in (prepare, generate, run, stages):
     module.register(app)
-for group in (hands, objects, pipelines, cache, dataset):
+for group in (bench, hands, objects, pipelines, cache, dataset):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])
 
 

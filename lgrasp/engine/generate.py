@@ -1,5 +1,6 @@
 """The main job: hand + object -> grasp shards in a folder."""
 
+import math
 import os
 import time
 from dataclasses import dataclass, field, replace
@@ -40,6 +41,7 @@ class Job:
     device: str = "auto"
     workers: int = 0  # 0: all cores (1 on a GPU)
     batch: int = 0
+    rate: float = 1.0  # rows expected per candidate by the first shard; sizes its batches on a GPU, never changes rows
     shard_rows: int = 10_000
     shard_index: int = 0
     num_shards: int = 1
@@ -82,13 +84,14 @@ class Outcome:
     starved: bool
     cancelled: bool = False
     written: list[Path] = field(default_factory=list)  # shards made by this call
+    rate: float = 1.0  # rows per candidate of the last shard made; Job.rate if none was
 
 
 def job_shards(job: Job) -> list[tuple[int, int]]:
     """(shard, rows) of every shard that this job (array task) makes.
 
     Raises:
-        ConfigError: n, shard rows, workers, batch or array numbers out of range.
+        ConfigError: n, shard rows, workers, batch, rate or array numbers out of range.
     """
     if job.rows <= 0:
         raise ConfigError(f"-n {job.rows}: the number of grasps must be at least 1")
@@ -96,6 +99,8 @@ def job_shards(job: Job) -> list[tuple[int, int]]:
         raise ConfigError(f"--shard-rows {job.shard_rows}: must be at least 1")
     if job.workers < 0 or job.batch < 0:
         raise ConfigError(f"--workers {job.workers} --batch {job.batch}: must be at least 0 (0: by device)")
+    if not 0 < job.rate < math.inf:
+        raise ConfigError(f"rate {job.rate}: the rows expected per candidate must be positive and finite")
     if job.num_shards <= 0 or not 0 <= job.shard_index < job.num_shards:
         raise ConfigError(f"--shard-index {job.shard_index} --num-shards {job.num_shards}: need 0 <= index < number")
     total = -(-job.rows // job.shard_rows)
@@ -140,7 +145,7 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
         load_kernels(device.alias, kernel_modules("lgrasp.stages."), listener.loading)
         inputs.seconds["kernels"] = time.perf_counter() - begin
     workers = job.workers or (1 if device.is_cuda else os.cpu_count() or 1)
-    execution = Execution(workers, job.batch, listener.cancelled)
+    execution = Execution(workers, job.batch, listener.cancelled, job.rate)
     listener.started(inputs, [s for s, _ in shards], list(present))
     outcome = Outcome(inputs, [], sum(present.values()), 0, sum(present.values()), [], 0.0, False)
     wanted = dict(shards)
@@ -183,6 +188,7 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
                 writer.put(shard, files[shard], _shard(job, inputs, meshes, key, shard, result), result)
             if found == 0:  # nor will the next shards give any
                 break
+    outcome.rate = execution.rate
     outcome.paths = [files[s] for s, _ in shards if s in present or files[s] in outcome.written]
     outcome.wall = time.perf_counter() - start
     return outcome

@@ -17,7 +17,26 @@ from lgrasp.object.find import find_object
 from lgrasp.object.load import MESH_SUFFIXES
 from lgrasp.paths import data_dirs
 
-__all__ = ["JobConfig", "array_task", "config_files", "default_out", "load_config", "plan_jobs"]
+__all__ = [
+    "JobConfig",
+    "Published",
+    "array_task",
+    "config_files",
+    "default_out",
+    "in_folder",
+    "load_config",
+    "plan_jobs",
+]
+
+
+class Published(BaseModel):
+    """Figures of others that a benchmark shows beside its own."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    source: str = Field(description="Where they are printed.")
+    device: str = Field(description="What they were measured on.")
+    per_s: dict[str, dict[str, float]] = Field(description="Hand -> object -> grasps per second.")
 
 
 class JobConfig(BaseModel):
@@ -27,6 +46,7 @@ class JobConfig(BaseModel):
 
     description: str = ""
     hands: tuple[str, ...] = Field(("allegro",), min_length=1, description="Names or paths.")
+    hand_dir: Path | None = Field(None, description="Folder where NAME/NAME.urdf is looked up first.")
     objects: tuple[str, ...] = Field(min_length=1, description="Names or paths.")
     object_dir: Path | None = Field(None, description="Folder where the names of objects are looked up first.")
     pipelines: tuple[str, ...] = Field(("swift",), min_length=1, description="Names or paths.")
@@ -41,6 +61,7 @@ class JobConfig(BaseModel):
     batch: int = Field(0, ge=0)
     shard_rows: int = Field(10_000, ge=1)
     reuse: bool = False
+    published: Published | None = Field(None, description="Figures of others; for lgrasp bench table1.")
 
 
 def config_files() -> dict[str, Path]:
@@ -78,10 +99,11 @@ def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1
         array: (task, number of tasks) of a job array.
 
     Raises:
-        ConfigError: a pipeline that cannot be used, an object folder that does not exist.
+        ConfigError: a pipeline that cannot be used, a folder of hands or objects that does not exist.
     """
-    if config.object_dir is not None and not config.object_dir.expanduser().is_dir():
-        raise ConfigError(f"object_dir {config.object_dir} is not a folder")
+    for key, folder in (("hand_dir", config.hand_dir), ("object_dir", config.object_dir)):
+        if folder is not None and not folder.expanduser().is_dir():
+            raise ConfigError(f"{key} {folder} is not a folder")
     jobs = []
     for name in config.pipelines:
         pipeline = load_pipeline(name)
@@ -92,8 +114,8 @@ def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1
             for mesh in config.objects:
                 jobs.append(
                     Job(
-                        hand=hand,
-                        object=_in_folder(config.object_dir, mesh),
+                        hand=_urdf_in_folder(config.hand_dir, hand),
+                        object=in_folder(config.object_dir, mesh),
                         rows=config.rows,
                         pipeline=pipeline,
                         out=out / f"{Path(hand).stem}-{Path(mesh).stem}",
@@ -112,7 +134,13 @@ def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1
     return jobs
 
 
-def _in_folder(folder: Path | None, mesh: str) -> str:
+def _urdf_in_folder(folder: Path | None, hand: str) -> str:
+    """``folder/NAME/NAME.urdf`` if there is one; else the name as it is."""
+    path = folder and folder.expanduser() / hand / f"{hand}.urdf"
+    return str(path) if path and path.is_file() else hand
+
+
+def in_folder(folder: Path | None, mesh: str) -> str:
     """Path of an object in a folder, by file name with or without its suffix; else the name as it is."""
     if folder is None:
         return mesh

@@ -31,7 +31,7 @@ class Execution:
     workers: int = 1
     batch: int = 0  # candidates per batch; 0: by device
     cancelled: Callable[[], bool] = lambda: False
-    rate: float = 1.0  # rows expected per candidate
+    rate: float = 1.0  # rows expected per candidate, until there are some: sizes the first batch on a GPU
 
 
 @dataclass
@@ -86,6 +86,13 @@ def _batches(
                 future.cancel()
 
 
+def _batch_size(device: str, missing: int, rate: float) -> int:
+    """Candidates of a batch: on a GPU as many as should give the missing rows."""
+    if device == "cpu":
+        return _CPU_BATCH
+    return int(min(max(1.05 * missing / rate + 256, _GPU_LEAST), _GPU_MOST))
+
+
 def shard_effort(pipeline: Pipeline, rows: int) -> int:
     """Candidates that a shard of ``rows`` rows may try: whole bank entries."""
     entries = -(-max(_LEAST_EFFORT, rows * pipeline.effort) // BANK_CANDIDATES)
@@ -120,11 +127,9 @@ def make_shard(
     fixed = BANK_CANDIDATES if bank is not None or pipeline.params("search").passes > 1 else execution.batch
 
     def size() -> int:
-        if fixed or context.device == "cpu":
-            return fixed or _CPU_BATCH
-        # as many as should do, going by those so far
+        # going by those so far
         rate = kept.count / result.candidates if result and kept.count else execution.rate
-        return int(min(max(1.05 * (rows - kept.count) / rate + 256, _GPU_LEAST), _GPU_MOST))
+        return fixed or _batch_size(context.device, rows - kept.count, rate)
 
     with closing(_batches(pipeline, context, execution, bank, limit, size)) as batches:
         for count, batch in batches:

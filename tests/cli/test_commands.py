@@ -154,6 +154,77 @@ def test_bench(cli, tmp_path, quick):
     assert [p.name for p in tmp_path.iterdir()] == ["b.json"]
 
 
+@pytest.fixture
+def table1(cli, quick, tmp_path_factory):
+    """table1(*more): two small cells."""
+    slow = tmp_path_factory.mktemp("pipelines") / "slow.yaml"
+    slow.write_text(Path(quick).read_text().replace("name: quick", "name: slow"))
+    pair = f"{quick},{slow}"
+    base = ("bench", "table1", "--objects", "tiny,capsule", "--pipelines", pair, "-n", 10, "--baseline-n", 1)
+    return lambda *more: cli(*base, "--hands", "allegro", "--repeat", 1, "--device", "cpu", *more)
+
+
+def test_bench_table1(table1, tmp_path):
+    result = table1("--json", "t.json", "--plot", "t.png")
+    assert result.code == 0, result.err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["t.json", "t.png"]
+    assert (tmp_path / "t.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    table = json.loads((tmp_path / "t.json").read_text())
+    assert table["complete"]
+    assert [cell["object"] for cell in table["cells"]] == ["tiny", "capsule"]
+    for cell in table["cells"]:
+        runs = cell["pipelines"]
+        assert {name: run["grasps"] for name, run in runs.items()} == {"quick": 10, "slow": 1}
+        rates = {name: run["strict_valid_per_s"]["median"] for name, run in runs.items()}
+        assert cell["ratio"]["slow"] == rates["quick"] / rates["slow"]
+        wanted = {"survivors", "seconds", "build_seconds", "near_duplicates", "distinct_poses", "seed_count_per_s"}
+        assert all(wanted <= set(run) for run in runs.values())
+    tiny, capsule = table["cells"]
+    assert tiny["published_per_s"] is None
+    assert capsule["published_ratio"]["quick"] == rates["quick"] / 1296
+    for text in ("trimmed mean", "quick/slow", "Table 1", "A100", "survivors", "near-dup", "field s"):
+        assert text in result.out
+    assert "[2/2] allegro capsule: quick" in result.err
+    again = table1("--json", "t.json", "--resume")
+    assert again.code == 0
+    assert "run 1/1" not in again.err
+    assert again.out == result.out
+
+
+def test_bench_table1_interrupted(table1, monkeypatch, tmp_path):
+    from lgrasp.engine.bench import Bench
+
+    measure = Bench.measure
+
+    def stopped(self, jobs, *more):
+        if jobs[0].object == "capsule":
+            raise KeyboardInterrupt
+        return measure(self, jobs, *more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Bench, "measure", stopped)
+        assert table1("--json", "t.json").code == 130
+    kept = json.loads((tmp_path / "t.json").read_text())
+    assert [cell["object"] for cell in kept["cells"]] == ["tiny"]
+    assert not kept["complete"]
+    assert [p.name for p in tmp_path.iterdir()] == ["t.json"]
+    result = table1("--json", "t.json", "--resume")
+    assert "tiny, " not in result.err
+    whole = json.loads((tmp_path / "t.json").read_text())
+    assert whole["cells"][0] == kept["cells"][0]
+    assert whole["complete"]
+
+
+def test_bench_table1_refuses(cli):
+    assert "come after its name" in cli("bench", "--device", "cpu", "table1").error()
+    assert ".png" in cli("bench", "table1", "--plot", "t.pdf").error()
+    assert "--json PATH" in cli("bench", "table1", "--resume").error()
+    assert "hand_dir" in cli("bench", "table1", "--hand-dir", "absent", "--objects", "mug").error()
+    result = cli("bench", "table1", "--objects", "plier", "--device", "cpu", "-n", 1)
+    assert result.code == 2
+    assert "no cell could be measured" in result.err
+
+
 def test_warm_up(cli):
     lines = cli("warm-up", "--device", "cpu").out.splitlines()
     assert any("lgrasp.stages.search.kernels" in line for line in lines)

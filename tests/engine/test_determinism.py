@@ -5,7 +5,9 @@ import pytest
 
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.batch import run_batch
+from lgrasp.engine.generate import generate
 from lgrasp.engine.shard import Execution, make_shard
+from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import grasp_arrays, join_grasps
 from lgrasp.stages.context import Context
 
@@ -39,6 +41,34 @@ def reference(pipeline, source, rows):
 @pytest.mark.parametrize(("workers", "batch"), [(1, 64), (2, 100), (2, 512), (3, 1000)])
 def test_batch_size_and_workers(pipeline, source, reference, rows, workers, batch):
     assert_same(reference, grasp_arrays(make_shard(pipeline, source, 0, rows, Execution(workers, batch)).grasps))
+
+
+@pytest.mark.parametrize("rate", [1e-2, 1.0, 1e6])
+def test_expected_rows_per_candidate(swift, inputs, monkeypatch, rate):
+    """Batches sized by the yield, as on a GPU."""
+    expected = grasp_arrays(make_shard(swift, inputs, 0, 60, Execution(1, 512)).grasps)
+    size, sizes = shard_module._batch_size, []
+
+    def as_on_a_gpu(device, missing, rate):
+        sizes.append(size("cuda:0", missing, rate))
+        return sizes[-1]
+
+    monkeypatch.setattr(shard_module, "_batch_size", as_on_a_gpu)
+    assert_same(expected, grasp_arrays(make_shard(swift, inputs, 0, 60, Execution(1, rate=rate)).grasps))
+    assert sizes[0] == (int(1.05 * 60 / rate + 256) if rate < 0.1 else 2048)
+
+
+def test_rows_do_not_depend_on_the_rate(run, job, grasps, tmp_path):
+    known = run(rows=40, rate=0.03, out=tmp_path / "known")
+    unknown = run(rows=40, out=tmp_path / "unknown")
+    assert (
+        known.rate
+        == unknown.rate
+        == pytest.approx(known.results[-1].counts["filter"]["kept"] / known.results[-1].candidates)
+    )
+    assert_same(grasps(tmp_path / "known"), grasps(tmp_path / "unknown"))
+    with pytest.raises(ConfigError, match="rate"):
+        generate(job(rate=0.0))
 
 
 def test_cut_of_the_stream(pipeline, source):
