@@ -11,7 +11,7 @@ def cluster_order(points: np.ndarray) -> np.ndarray:
     """Order that makes every run of ``CLUSTER_SIZE`` points compact: recursive median split of the longest axis.
 
     Args:
-        points: Points [m], shape (n, 3), n a multiple of ``CLUSTER_SIZE``.
+        points: Points [m], shape (n, 3); all runs but the last are full.
 
     Returns:
         Permutation, shape (n,), int64; consecutive clusters are near each other as well.

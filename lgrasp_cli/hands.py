@@ -55,6 +55,7 @@ def show_hand(
         ("base link", hand["base_link"]),
         ("contact links", ", ".join(hand["contact_links"])),
         ("palm", ", ".join(hand["palm_links"]) or "none"),
+        *(("shared joint", f"{n}: {', '.join(f'{x:g}' for x in v)}") for n, v in hand["shared"].items()),
         ("canonical box", f"{box} mm"),
         ("licence", hand["licence"] or "not stated"),
         ("source", hand["source"] or "not stated"),
@@ -62,7 +63,11 @@ def show_hand(
     ]
     print_pairs([(what, " ".join(text.split())) for what, text in pairs])
     typer.echo()
-    rows = [(str(j["finger"]), j["name"], f"{j['lower']:.3f}", f"{j['upper']:.3f}") for j in hand["joints"]]
+    finger = {None: "shared"}
+    rows = [
+        (finger.get(j["finger"], str(j["finger"])), j["name"], f"{j['lower']:.3f}", f"{j['upper']:.3f}")
+        for j in hand["joints"]
+    ]
     print_table(("finger", "joint", "lower", "upper"), rows, right=("lower", "upper"))
 
 

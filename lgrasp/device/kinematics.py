@@ -5,6 +5,7 @@ import warp as wp
 __all__ = [
     "MAX_BODIES",
     "MAX_DOFS",
+    "MAX_GROUPS",
     "MAX_JOINTS",
     "Kinematics",
     "clamp_dofs",
@@ -21,6 +22,8 @@ MAX_BODIES = 40
 """Most movable joints in a hand."""
 MAX_DOFS = 8
 """Most actuated joints in one dependency group."""
+MAX_GROUPS = 6
+"""Most dependency groups of a hand."""
 
 vec_dof = wp.types.vector(MAX_DOFS, wp.float32)
 
@@ -45,8 +48,10 @@ class Kinematics:
     joint_origin: wp.array(dtype=wp.transform)
     dof_lower: wp.array(dtype=wp.float32)
     dof_upper: wp.array(dtype=wp.float32)
-    dof_open: wp.array(dtype=wp.float32)
     dof_index: wp.array(dtype=wp.int32)  # column of q that a group's dof is
+    dof_free: wp.array(dtype=wp.int32)  # (groups,) dofs that the group moves itself; shared ones come after
+    settings: wp.int32  # number of combinations of values of the shared joints
+    dof_setting: wp.array2d(dtype=wp.float32)  # (settings, dofs) open posture with the shared joints in place
 
 
 @wp.func

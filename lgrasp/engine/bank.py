@@ -14,7 +14,7 @@ __all__ = ["BANK_CANDIDATES", "BANK_VERSION", "Bank"]
 
 BANK_CANDIDATES = 1024
 """Candidates of one bank entry; the batch size of a run that keeps banks."""
-BANK_VERSION = 1
+BANK_VERSION = 2
 """Raised whenever the arrays of an entry change meaning; the versions of the stages are in the key too."""
 
 

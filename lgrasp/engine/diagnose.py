@@ -30,19 +30,26 @@ def finger_label(model: HandModel, names: dict[str, tuple[str, ...]], group: int
     return links[-1]
 
 
-def field_vectors(field: ContactField, group: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (n, 3) [m] and hand normals (n, 3) of at most 20,000 contact vectors of a group, base frame."""
-    first, last = (int(field.start[field.cell_first[g] * NORMAL_BINS]) for g in (group, group + 1))
+def field_vectors(field: ContactField, group: int, groups: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 3) [m] and hand normals (n, 3) of at most 20,000 contact vectors of a group, base frame.
+
+    Those of all settings of the shared joints together; ``groups`` is the number of groups of the hand.
+    """
+    slots = range(group, len(field.shape), groups)
+    parts = [_slot_vectors(field, slot, _SHOWN // len(slots)) for slot in slots]
+    return np.concatenate([p for p, _ in parts]), np.concatenate([n for _, n in parts])
+
+
+def _slot_vectors(field: ContactField, slot: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    first, last = (int(field.start[field.cell_first[s] * NORMAL_BINS]) for s in (slot, slot + 1))
     rows = (
-        np.unique(np.linspace(first, max(first, last - 1), _SHOWN).astype(np.int64))
-        if last > first
-        else np.zeros(0, int)
+        np.unique(np.linspace(first, max(first, last - 1), most).astype(np.int64)) if last > first else np.zeros(0, int)
     )
-    voxel = (np.searchsorted(field.start, rows, "right") - 1) // NORMAL_BINS - field.cell_first[group]
-    corner = np.stack(np.unravel_index(voxel, tuple(field.shape[group])), -1) if len(rows) else np.zeros((0, 3))
+    voxel = (np.searchsorted(field.start, rows, "right") - 1) // NORMAL_BINS - field.cell_first[slot]
+    corner = np.stack(np.unravel_index(voxel, tuple(field.shape[slot])), -1) if len(rows) else np.zeros((0, 3))
     packed = field.offset[rows].astype(np.int64)
     inside = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], -1) / 256.0
-    return field.origin[group] + field.cell * (corner + inside), _decode(field.normal[rows])
+    return field.origin[slot] + field.cell * (corner + inside), _decode(field.normal[rows])
 
 
 def _decode(code: np.ndarray) -> np.ndarray:
@@ -62,7 +69,7 @@ def _field_hold(model: HandModel, field: ContactField) -> Hold | None:
 
 def _touches(model: HandModel, field: ContactField) -> list[Touch]:
     """What every finger and the palm can touch with."""
-    touches = [Touch(str(g), *field_vectors(field, g)) for g in range(model.groups)]
+    touches = [Touch(str(g), *field_vectors(field, g, model.groups)) for g in range(model.groups)]
     a, b = model.contact_first[model.groups : model.groups + 2]
     if b > a:
         touches.append(still_touches("palm", model.contact_points[a:b], model.contact_normals[a:b], _SHOWN))
@@ -80,7 +87,7 @@ def hand_findings(model: HandModel, field: ContactField, names: dict[str, tuple[
     low, high = model.canonical_box
     points = low + np.random.default_rng(0).random((400, 3)) * (high - low)
     usable = [g for g in range(model.groups) if model.contact_first[g + 1] > model.contact_first[g]]
-    reach = {g: _near_share(field_vectors(field, g)[0], points) for g in usable}
+    reach = {g: _near_share(field_vectors(field, g, model.groups)[0], points) for g in usable}
     hold = _field_hold(model, field)
     far = [label[g] for g in usable if reach[g] < 0.05]
     if far:
@@ -94,10 +101,10 @@ def hand_findings(model: HandModel, field: ContactField, names: dict[str, tuple[
     if blocked > 0.3:
         where = f": move canonical_box to {_box_text(hold.low, hold.high)}" if hold else ": move canonical_box off them"
         found["place"].append(f"{100 * blocked:.0f} % of the canonical box is inside static links{where}")
-    for g in range(model.groups):
-        if field.clear_share[g] < 0.1:
+    for g, clear in enumerate(field.clear_share.reshape(-1, model.groups).max(0)):
+        if clear < 0.1:
             found["ik"].append(
-                f"only {100 * field.clear_share[g]:.1f} % of the postures of '{label[g]}' are clear of static links "
+                f"only {100 * clear:.1f} % of the postures of '{label[g]}' are clear of static links "
                 "and of itself: check its collision geometry (hulls of concave meshes), the joint limits and locked"
             )
     if hold is None:

@@ -33,7 +33,7 @@ def list_hands() -> list[dict[str, str]]:
 
 
 def describe_hand(name: str) -> dict[str, Any]:
-    """A hand's source, rules, and joints by finger (finger 0 is the first dependency group).
+    """A hand's source, rules, and joints by finger (0 is the first dependency group, None for shared joints).
 
     Raises:
         HandError: no such hand, or one that cannot be used.
@@ -41,7 +41,8 @@ def describe_hand(name: str) -> dict[str, Any]:
     source = find_hand(name)
     spec = source.spec
     tree = build_tree(read_urdf(source.urdf), spec)
-    finger = np.searchsorted(tree.dof_first, np.arange(len(tree.joint_names)), side="right") - 1
+    group = np.repeat(np.arange(tree.groups), np.diff(tree.dof_first))
+    finger = {int(k): int(g) for k, g in zip(tree.dof_index, group, strict=True)}
     return {
         "name": source.name,
         "description": spec.description,
@@ -49,6 +50,7 @@ def describe_hand(name: str) -> dict[str, Any]:
         "note": source.note,
         "base_link": tree.base_link,
         "locked": dict(spec.locked),
+        "shared": {name: list(values) for name, values in spec.shared.items()},
         "contact_links": [link for rule in spec.contact for link in rule.links],
         "palm_links": list(spec.palm.links),
         "canonical_box": spec.canonical_box.model_dump(),
@@ -56,8 +58,13 @@ def describe_hand(name: str) -> dict[str, Any]:
         "source": spec.source,
         "notes": [spec.notes] if isinstance(spec.notes, str) and spec.notes else list(spec.notes),
         "joints": [
-            {"name": joint, "finger": int(f), "lower": float(low), "upper": float(high)}
-            for joint, f, low, high in zip(tree.joint_names, finger, tree.joint_lower, tree.joint_upper, strict=True)
+            {
+                "name": joint,
+                "finger": None if joint in tree.shared_names else finger[k],
+                "lower": float(tree.joint_lower[k]),
+                "upper": float(tree.joint_upper[k]),
+            }
+            for k, joint in enumerate(tree.joint_names)
         ],
     }
 

@@ -45,7 +45,7 @@ def draw_workspace(inputs: Inputs, path: Path) -> Path:
     """Where each finger's contact surface can go (dots), the canonical box and the hand, from two sides."""
     model = inputs.hand.model
     triangles, colours = _hand_triangles(inputs, model.tree.joint_open, patches=False)
-    clouds = [field_vectors(inputs.field.model, g)[0] for g in range(model.groups)]
+    clouds = [field_vectors(inputs.field.model, g, model.groups)[0] for g in range(model.groups)]
     clouds = [c[:: max(1, len(c) // 1500)] for c in clouds]
     figure = _figure(13, 7.2)
     towards = _palmar_direction(inputs)

@@ -35,7 +35,7 @@ __all__ = [
     "run_key",
 ]
 
-OBJECT_VERSION = 1
+OBJECT_VERSION = 2
 """Raised whenever preprocessing gives other arrays."""
 
 Report = Callable[[str, float], None]

@@ -17,6 +17,7 @@ __all__ = [
     "FieldArrays",
     "boxes_pick",
     "field_has",
+    "field_pair",
     "field_pick",
     "field_seed",
     "query_field",
@@ -30,7 +31,7 @@ _TRIES = wp.constant(6)
 
 @wp.struct
 class Field:
-    """Voxel index of a ContactField (same names, same meaning)."""
+    """Voxel index of a ContactField (same names, same meaning); a slot is ``setting * groups + group``."""
 
     cell: wp.float32
     inv_cell: wp.float32
@@ -43,13 +44,18 @@ class Field:
     offset: wp.array(dtype=wp.int32)
     normal: wp.array(dtype=wp.uint16)
     posture: wp.array2d(dtype=wp.uint8)
+    pairs: wp.int32
+    pair_point: wp.array2d(dtype=wp.vec3)
+    pair_normal: wp.array2d(dtype=wp.vec3)
+    pair_slot: wp.array(dtype=wp.vec2i)
+    pair_width: wp.array(dtype=wp.float32)
 
 
 @wp.struct
 class Boxes:
     """Published index of a ContactField: one bounding-volume hierarchy per patch over its occupied boxes."""
 
-    group_first: wp.array(dtype=wp.int32)  # (G + 1,) patches of each group
+    slot_first: wp.array(dtype=wp.int32)  # (slots + 1,) patches of each slot
     tree: wp.array(dtype=wp.uint64)  # one wp.Bvh per patch
     patch_first: wp.array(dtype=wp.int32)
     leaf_first: wp.array(dtype=wp.int32)
@@ -85,6 +91,11 @@ def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArra
     field.offset = put(model.offset, wp.int32)
     field.normal = put(model.normal, wp.uint16)
     field.posture = put(model.posture, wp.uint8)
+    field.pairs = len(model.pair_width)
+    field.pair_point = put(model.pair_point, wp.vec3)
+    field.pair_normal = put(model.pair_normal, wp.vec3)
+    field.pair_slot = put(model.pair_slot, wp.vec2i)
+    field.pair_width = put(model.pair_width, wp.float32)
     if len(model.box) == 0:
         return FieldArrays(model, device, field)
     trees, ids = [], []
@@ -95,7 +106,9 @@ def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArra
         trees.append(wp.Bvh(put(model.box[a:b], wp.vec3), put(model.box[a:b] + np.float32(model.box_edge), wp.vec3)))
         ids.append(trees[-1].id)
     boxes = Boxes()
-    boxes.group_first = put(hand.patch_first[:-1], wp.int32)
+    settings = np.arange(len(hand.tree.settings))[:, None] * hand.patches
+    slot_first = np.append(settings + hand.patch_first[:-2], len(settings) * hand.patches)
+    boxes.slot_first = put(slot_first, wp.int32)
     boxes.tree = put(np.array(ids, np.uint64), wp.uint64)
     boxes.patch_first = put(model.patch_first, wp.int32)
     boxes.leaf_first = put(model.leaf_first, wp.int32)
@@ -104,13 +117,13 @@ def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArra
 
 
 @wp.func
-def field_has(f: Field, group: wp.int32, p: wp.vec3, n: wp.vec3):
-    """Table row of (voxel of p, normal bin of n) when it holds contact vectors of the group, else -1.
+def field_has(f: Field, slot: wp.int32, p: wp.vec3, n: wp.vec3):
+    """Table row of (voxel of p, normal bin of n) when it holds contact vectors of the slot, else -1.
 
     p [m] and n (hand normal) are in the base frame.
     """
-    x = (p - f.origin[group]) * f.inv_cell
-    s = f.shape[group]
+    x = (p - f.origin[slot]) * f.inv_cell
+    s = f.shape[slot]
     if x[0] < 0.0 or x[1] < 0.0 or x[2] < 0.0:
         return int(-1)
     i = int(x[0])
@@ -118,7 +131,7 @@ def field_has(f: Field, group: wp.int32, p: wp.vec3, n: wp.vec3):
     k = int(x[2])
     if i >= s[0] or j >= s[1] or k >= s[2]:
         return int(-1)
-    v = f.cell_first[group] + (i * s[1] + j) * s[2] + k
+    v = f.cell_first[slot] + (i * s[1] + j) * s[2] + k
     bits = f.mask[v]
     if bits == wp.uint64(0):
         return int(-1)
@@ -129,13 +142,13 @@ def field_has(f: Field, group: wp.int32, p: wp.vec3, n: wp.vec3):
 
 
 @wp.func
-def field_pick(f: Field, group: wp.int32, row: wp.int32, p: wp.vec3, n: wp.vec3, state: wp.uint32):
+def field_pick(f: Field, slot: wp.int32, row: wp.int32, p: wp.vec3, n: wp.vec3, state: wp.uint32):
     """The best of a few contact vectors of a table row: (index, cosine of its normal to n)."""
     a = f.start[row]
     count = f.start[row + 1] - a
-    v = row // 64 - f.cell_first[group]
-    s = f.shape[group]
-    x = (p - f.origin[group]) * f.inv_cell
+    v = row // 64 - f.cell_first[slot]
+    s = f.shape[slot]
+    x = (p - f.origin[slot]) * f.inv_cell
     corner = wp.vec3(float(v // (s[1] * s[2])), float((v // s[2]) % s[1]), float(v % s[2]))
     local = (x - corner) * 256.0
     best = float(1.0e30)
@@ -158,11 +171,21 @@ def field_pick(f: Field, group: wp.int32, row: wp.int32, p: wp.vec3, n: wp.vec3,
 
 
 @wp.func
-def boxes_pick(b: Boxes, f: Field, group: wp.int32, p: wp.vec3, n: wp.vec3, cosine: wp.float32, state: wp.uint32):
+def field_pair(f: Field, width: wp.float32, slack: wp.float32, state: wp.uint32):
+    """A random pair of opposed contact vectors whose distance is within ``slack`` of ``width`` [m], or -1."""
+    a = wp.lower_bound(f.pair_width, width - slack)
+    b = wp.lower_bound(f.pair_width, width + slack)
+    if b <= a:
+        return int(-1)
+    return a + wp.min(int(wp.randf(state) * float(b - a)), b - a - 1)
+
+
+@wp.func
+def boxes_pick(b: Boxes, f: Field, slot: wp.int32, p: wp.vec3, n: wp.vec3, cosine: wp.float32, state: wp.uint32):
     """The best aligned contact vector of a random patch whose box at p holds a normal within ``cosine`` of n, or -1."""
     pick = int(-1)
     hits = int(0)
-    for patch in range(b.group_first[group], b.group_first[group + 1]):
+    for patch in range(b.slot_first[slot], b.slot_first[slot + 1]):
         first = b.patch_first[patch]
         if b.patch_first[patch + 1] > first:
             query = wp.bvh_query_aabb(b.tree[patch], p, p)
@@ -184,11 +207,17 @@ def boxes_pick(b: Boxes, f: Field, group: wp.int32, p: wp.vec3, n: wp.vec3, cosi
 
 
 @wp.func
-def field_seed(f: Field, h: Kinematics, group: wp.int32, record: wp.int32):
-    """Joint seed of a contact vector [rad or m]."""
+def field_seed(f: Field, h: Kinematics, slot: wp.int32, record: wp.int32):
+    """Joint seed of a contact vector of a slot [rad or m]; shared joints have exactly their value in the setting."""
+    setting = slot // h.groups
+    group = slot - setting * h.groups
     first = h.dof_first[group]
+    free = h.dof_free[group]
     q = vec_dof()
     for d in range(h.dof_first[group + 1] - first):
+        if d >= free:
+            q[d] = h.dof_setting[setting, first + d]
+            continue
         low = h.dof_lower[first + d]
         q[d] = low + (h.dof_upper[first + d] - low) * float(int(f.posture[record, d])) / 255.0
     return q
@@ -199,16 +228,16 @@ def _query_voxels(
     f: Field,
     seed: wp.int32,
     cosine: wp.float32,
-    group: wp.array(dtype=wp.int32),
+    slot: wp.array(dtype=wp.int32),
     point: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
     record_out: wp.array(dtype=wp.int32),
 ):
     i = wp.tid()
     record_out[i] = -1
-    row = field_has(f, group[i], point[i], normal[i])
+    row = field_has(f, slot[i], point[i], normal[i])
     if row >= 0:
-        pick = field_pick(f, group[i], row, point[i], normal[i], wp.rand_init(seed, i))
+        pick = field_pick(f, slot[i], row, point[i], normal[i], wp.rand_init(seed, i))
         if float(pick[1]) * 0.0001 >= cosine:
             record_out[i] = pick[0]
 
@@ -219,18 +248,18 @@ def _query_boxes(
     f: Field,
     seed: wp.int32,
     cosine: wp.float32,
-    group: wp.array(dtype=wp.int32),
+    slot: wp.array(dtype=wp.int32),
     point: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
     record_out: wp.array(dtype=wp.int32),
 ):
     i = wp.tid()
-    record_out[i] = boxes_pick(b, f, group[i], point[i], normal[i], cosine, wp.rand_init(seed, i))
+    record_out[i] = boxes_pick(b, f, slot[i], point[i], normal[i], cosine, wp.rand_init(seed, i))
 
 
 def query_field(
     field: FieldArrays,
-    group: np.ndarray,
+    slot: np.ndarray,
     point: np.ndarray,
     normal: np.ndarray,
     *,
@@ -238,10 +267,11 @@ def query_field(
     index: str = "voxel",
     seed: int = 0,
 ) -> np.ndarray:
-    """Which contact vector of its group meets each query? One interface for both indices.
+    """Which contact vector of its slot meets each query? One interface for both indices.
 
     Args:
-        group: (N,). point: base frame [m], (N, 3). normal: unit hand normal wanted, (N, 3).
+        slot: (N,), ``setting * groups + group``; the group itself for a hand without shared joints.
+        point: base frame [m], (N, 3). normal: unit hand normal wanted, (N, 3).
         angle: largest angle between wanted and found normal [rad].
         index: ``voxel``, or ``bvh`` for a field that was built with it.
 
@@ -253,7 +283,7 @@ def query_field(
     queries = [
         seed,
         float(np.cos(angle)),
-        wp.array(np.asarray(group, np.int32), dtype=wp.int32, device=d),
+        wp.array(np.asarray(slot, np.int32), dtype=wp.int32, device=d),
         wp.array(np.asarray(point, np.float32), dtype=wp.vec3, device=d),
         wp.array(np.asarray(normal, np.float32), dtype=wp.vec3, device=d),
     ]

@@ -13,10 +13,21 @@ __all__ = ["contact_vectors", "sample_postures"]
 wp.set_module_options(KERNEL_OPTIONS)
 
 
+@wp.func
+def _shared_values(hand: Hand, group: wp.int32, setting: wp.int32):
+    """The group's dofs with the shared joints at their values, its own at 0."""
+    first = hand.kin.dof_first[group]
+    q = vec_dof()
+    for d in range(hand.kin.dof_free[group], hand.kin.dof_first[group + 1] - first):
+        q[d] = hand.kin.dof_setting[setting, first + d]
+    return q
+
+
 @wp.kernel
 def sample_postures(
     hand: Hand,
     group: wp.int32,
+    setting: wp.int32,
     seed: wp.int32,
     margin: wp.float32,
     posture_out: wp.array2d(dtype=wp.uint8),
@@ -26,9 +37,9 @@ def sample_postures(
     i = wp.tid()
     state = wp.rand_init(seed, i)
     first = hand.kin.dof_first[group]
-    n = hand.kin.dof_first[group + 1] - first
-    q = vec_dof()
-    for d in range(n):
+    free = hand.kin.dof_free[group]
+    q = _shared_values(hand, group, setting)
+    for d in range(free):
         code = wp.min(int(wp.randf(state) * 256.0), 255)
         posture_out[i, d] = wp.uint8(code)
         low = hand.kin.dof_lower[first + d]
@@ -47,6 +58,7 @@ def sample_postures(
 def contact_vectors(
     hand: Hand,
     group: wp.int32,
+    setting: wp.int32,
     seed: wp.int32,
     posture: wp.array2d(dtype=wp.uint8),
     chosen: wp.array(dtype=wp.int32),
@@ -54,13 +66,14 @@ def contact_vectors(
     position_out: wp.array(dtype=wp.vec3),
     bin_out: wp.array(dtype=wp.int32),
     normal_out: wp.array(dtype=wp.int32),
+    direction_out: wp.array(dtype=wp.vec3),
 ):
     """Contact vector of a random contact point at each chosen posture (CF, Def. 4.1)."""
     i = wp.tid()
     state = wp.rand_init(seed, i)
     first = hand.kin.dof_first[group]
-    q = vec_dof()
-    for d in range(hand.kin.dof_first[group + 1] - first):
+    q = _shared_values(hand, group, setting)
+    for d in range(hand.kin.dof_free[group]):
         low = hand.kin.dof_lower[first + d]
         q[d] = low + (hand.kin.dof_upper[first + d] - low) * float(int(posture[chosen[i], d])) / 255.0
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
@@ -75,3 +88,4 @@ def contact_vectors(
     position_out[i] = wp.transform_point(T, hand.contacts.points[c])
     bin_out[i] = normal_bin(n)
     normal_out[i] = encode_normal(n)
+    direction_out[i] = n

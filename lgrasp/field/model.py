@@ -11,41 +11,51 @@ from lgrasp.device.transforms import NORMAL_BINS
 from lgrasp.errors import HandError
 from lgrasp.field.boxes import box_index
 from lgrasp.field.kernels import contact_vectors, sample_postures
+from lgrasp.field.opposed import opposed_pairs
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.model import HandModel
 
 __all__ = ["FIELD_VERSION", "ContactField", "build_field"]
 
-FIELD_VERSION = 2
+FIELD_VERSION = 3
 """Raised whenever the arrays of a ContactField change meaning."""
 
 _CLEARANCE = 5.0e-4  # [m] postures of the field keep this distance to the palm
 _VECTOR_BYTES = 24  # at most, of one contact vector in all arrays
+_LEAST_RECORDS = 60_000  # of a slot, when the records of a group are divided among settings
 _PER_POSTURE = 4  # contact vectors drawn from one posture
 
 
 @dataclass(frozen=True)
 class ContactField:
-    """Contact vectors of G groups, sorted by (group, voxel, normal bin).
+    """Contact vectors of S slots, sorted by (slot, voxel, normal bin).
 
-    The vectors of voxel v (counted over all groups) and normal bin b are rows ``start[v * 64 + b]`` to the next entry.
+    Slot ``setting * groups + group`` holds those of a group with the shared joints at one of their settings. The
+    vectors of voxel v (counted over all slots) and normal bin b are rows ``start[v * 64 + b]`` to the next entry.
     """
 
     hand_sha256: str
     cell: float  # voxel edge [m]
-    origin: np.ndarray  # (G, 3) f32 lowest corner of each group's grid [m]
-    shape: np.ndarray  # (G, 3) i32
-    cell_first: np.ndarray  # (G + 1,) i32
+    origin: np.ndarray  # (S, 3) f32 lowest corner of each slot's grid [m]
+    shape: np.ndarray  # (S, 3) i32
+    cell_first: np.ndarray  # (S + 1,) i32
     start: np.ndarray  # (cells * 64 + 1,) i32
     mask: np.ndarray  # (cells,) u64: bit b is set when normal bin b holds a vector
     point: np.ndarray  # (N,) i32 contact point of the hand
     offset: np.ndarray  # (N,) i32 place inside the voxel, 3 x 8 bits
     normal: np.ndarray  # (N,) u16 octahedral hand normal
     posture: np.ndarray  # (N, D) u8 joint seed, share of each joint's range
-    clear_share: np.ndarray  # (G,) share of uniform postures clear of the palm
-    # the published index, empty unless asked for: per patch the occupied boxes, per box the vectors in it
+    clear_share: np.ndarray  # (S,) share of uniform postures clear of the palm
+    # contact vectors of two fingers that press towards each other, by distance
+    pair_point: np.ndarray  # (P, 2, 3) f32 [m]
+    pair_normal: np.ndarray  # (P, 2, 3) f32 hand normals
+    pair_slot: np.ndarray  # (P, 2) i32
+    pair_width: np.ndarray  # (P,) f32 rising [m]
+    # the published index, empty unless asked for: per setting and patch the occupied boxes, per box
+    # the vectors in it
     box_edge: float  # [m]
-    patch_first: np.ndarray  # (patches + 1,) i32 boxes of each patch
+    patch_first: np.ndarray  # (settings * patches + 1,) i32 boxes of each patch
     box: np.ndarray  # (boxes, 3) f32 lowest corner [m]
     leaf_first: np.ndarray  # (boxes + 1,) i32
     leaf_record: np.ndarray  # (leaves,) i32 rows of the vectors
@@ -80,10 +90,13 @@ def build_field(
         HandError: a group that no posture frees from the palm.
     """
     parts = []
-    for group in range(hand.model.groups):
+    groups = hand.model.groups
+    slots = len(hand.model.tree.settings) * groups
+    for slot in range(slots):
         if progress:
-            progress(f"group {group + 1} of {hand.model.groups}", group / hand.model.groups)
-        parts.append(_sample_group(hand, group, params))
+            progress(f"group {slot + 1} of {slots}", slot / slots)
+        parts.append(_sample_slot(hand, slot, params))
+    _check_clear(hand.model, np.array([p["clear"] for p in parts]).reshape(-1, groups))
     cell = _bounded_cell([p["position"] for p in parts], params)
     origins, shapes, keys, base = [], [], [], 0
     for p in parts:
@@ -111,7 +124,9 @@ def build_field(
         return np.concatenate([p[name] for p in parts])[order].astype(dtype)
 
     position, point = gather("position", np.float32), gather("point", np.int32)
-    boxes = box_index(position, hand.model.contact_patch[point], hand.model.patches, params)
+    setting = np.repeat(np.arange(slots) // groups, [len(p["point"]) for p in parts])[order]
+    patch = setting * hand.model.patches + hand.model.contact_patch[point]
+    boxes = box_index(position, patch, slots // groups * hand.model.patches, params)
     return ContactField(
         hand_sha256=hand.model.sha256,
         cell=cell,
@@ -125,6 +140,7 @@ def build_field(
         normal=gather("normal", np.uint16),
         posture=gather("posture", np.uint8),
         clear_share=np.array([p["clear"] for p in parts], np.float32),
+        **opposed_pairs(parts, groups, params.seed),
         **boxes,
     )
 
@@ -141,21 +157,9 @@ def _bounded_cell(positions: list[np.ndarray], params: FieldParams) -> float:
         cell *= 1.25
 
 
-def _sample_group(hand: HandArrays, group: int, params: FieldParams) -> dict[str, np.ndarray]:
-    """Contact vectors of one group; a group without contact surface gives none."""
-    model, device = hand.model, hand.device
-    width = int(np.diff(model.tree.dof_first).max())
-    surface = int(model.contact_first[group + 1] - model.contact_first[group])
-    # vectors may fill half of the memory bound, the table the rest
-    room = int(0.5e6 * params.max_mb / _VECTOR_BYTES / model.groups)
-    count = min(params.records, room) if surface else 0
-    postures = max(1000, int(1.5 * params.records / _PER_POSTURE))
-    posture = wp.zeros((postures, width), dtype=wp.uint8, device=device)
-    clear = wp.empty(postures, dtype=wp.int32, device=device)
-    seed = params.seed * 1009 + group
-    wp.launch(sample_postures, postures, [hand.struct, group, seed, _CLEARANCE], [posture, clear], device=device)
-    good = np.flatnonzero(clear.numpy())
-    if len(good) == 0:
+def _check_clear(model: HandModel, clear: np.ndarray) -> None:
+    """Raises HandError when a group is clear of the palm in no setting; ``clear`` (V, G) are shares of postures."""
+    for group in np.flatnonzero((clear == 0.0).all(0)):
         links = [
             n
             for n, b in zip(model.tree.link_names, model.tree.link_body, strict=True)
@@ -164,17 +168,40 @@ def _sample_group(hand: HandArrays, group: int, params: FieldParams) -> dict[str
         raise HandError(
             f"hand '{model.name}': no posture of finger ({', '.join(links)}) is clear of the palm and of itself"
         )
+
+
+def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, np.ndarray]:
+    """Contact vectors of a group in a setting; none without contact surface or when no posture is clear."""
+    model, device = hand.model, hand.device
+    settings = len(model.tree.settings)
+    setting, group = divmod(slot, model.groups)
+    width = int(np.diff(model.tree.dof_first).max())
+    surface = int(model.contact_first[group + 1] - model.contact_first[group])
+    # vectors may fill half of the memory bound, the table the rest
+    room = int(0.5e6 * params.max_mb / _VECTOR_BYTES / (model.groups * settings))
+    records = params.records if settings == 1 else max(params.records // settings, min(params.records, _LEAST_RECORDS))
+    postures = max(1000, int(1.5 * records / _PER_POSTURE))
+    posture = wp.zeros((postures, width), dtype=wp.uint8, device=device)
+    clear = wp.empty(postures, dtype=wp.int32, device=device)
+    seed = params.seed * 1009 + slot
+    inputs = [hand.struct, group, setting, seed, _CLEARANCE]
+    wp.launch(sample_postures, postures, inputs, [posture, clear], device=device)
+    good = np.flatnonzero(clear.numpy())
+    count = min(records, room) if surface and len(good) else 0
     chosen = np.resize(np.repeat(good, _PER_POSTURE), count).astype(np.int32)
-    out = [wp.empty(count, dtype=t, device=device) for t in (wp.int32, wp.vec3, wp.int32, wp.int32)]
+    kinds = (wp.int32, wp.vec3, wp.int32, wp.int32, wp.vec3)
+    out = [wp.empty(count, dtype=t, device=device) for t in kinds]
     indices = wp.array(chosen, dtype=wp.int32, device=device)
     if count:
-        wp.launch(contact_vectors, count, [hand.struct, group, seed + 500_009, posture, indices], out, device=device)
-    point, position, bins, normal = (a.numpy() for a in out)
+        inputs = [hand.struct, group, setting, seed + 500_009, posture, indices]
+        wp.launch(contact_vectors, count, inputs, out, device=device)
+    point, position, bins, normal, direction = (a.numpy() for a in out)
     return {
         "point": point,
         "position": position.reshape(-1, 3),
         "bin": bins,
         "normal": normal,
+        "direction": direction.reshape(-1, 3),
         "posture": posture.numpy()[chosen],
         "clear": np.asarray(len(good) / postures, np.float32),
     }

@@ -33,6 +33,8 @@ class PoseTable:
     pose: wp.array  # (P,) transform T_hand_object of the object's internal frame
     palm_point: wp.array  # (P,) i32 hand contact point that touches, -1 without palm contact
     palm_surface: wp.array  # (P,) i32 object contact point that touches, -1
+    setting: wp.array  # (P,) i32 setting of the hand's shared joints
+    anchor: wp.array  # (P, G) i32 object contact point that each group can surely touch about, -1 unknown
 
     def __len__(self) -> int:
         return self.index.shape[0]
@@ -91,6 +93,8 @@ def pose_arrays(table: PoseTable) -> dict[str, np.ndarray]:
         "pose": table.pose.numpy().reshape(-1, 7),
         "palm_point": table.palm_point.numpy(),
         "palm_surface": table.palm_surface.numpy(),
+        "setting": table.setting.numpy(),
+        "anchor": table.anchor.numpy(),
     }
 
 
@@ -101,6 +105,8 @@ def pose_table(arrays: dict[str, np.ndarray], device: str) -> PoseTable:
         pose=wp.array(arrays["pose"], dtype=wp.transform, device=device),
         palm_point=wp.array(arrays["palm_point"], dtype=wp.int32, device=device),
         palm_surface=wp.array(arrays["palm_surface"], dtype=wp.int32, device=device),
+        setting=wp.array(arrays["setting"], dtype=wp.int32, device=device),
+        anchor=wp.array(arrays["anchor"], dtype=wp.int32, device=device),
     )
 
 

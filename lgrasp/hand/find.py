@@ -6,8 +6,8 @@ from pathlib import Path
 
 from lgrasp.errors import HandError
 from lgrasp.hand.packages import PACKAGE_HANDS, drafted_folder, package_urdf
-from lgrasp.hand.spec import HandSpec, load_spec
-from lgrasp.hand.urdf import read_urdf
+from lgrasp.hand.spec import Coupling, HandSpec, load_spec
+from lgrasp.hand.urdf import Joint, read_urdf
 from lgrasp.paths import data_dirs
 
 __all__ = ["HandSource", "find_hand", "known_hands"]
@@ -97,8 +97,23 @@ def _rules_of_known(path: Path, known: dict[str, Path]) -> HandSource | None:
             continue
         if {j.name for j in own.joints if j.movable} == movable and set(own.links) <= set(urdf.links):
             note = f"rules of the known hand '{source.name}' (same joint and link names)"
-            return HandSource(source.name, path, source.spec, note)
+            missing = _missing_couplings(urdf.joints, own.joints)
+            if missing:
+                note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
+            return HandSource(
+                source.name, path, source.spec.model_copy(update={"mimic": source.spec.mimic | missing}), note
+            )
     return None
+
+
+def _missing_couplings(joints: tuple[Joint, ...], known: tuple[Joint, ...]) -> dict[str, Coupling]:
+    """Mimic relations of the known hand for joints that have none."""
+    free = {j.name for j in joints if j.movable and j.mimic is None}
+    return {
+        j.name: Coupling(joint=j.mimic[0], multiplier=j.mimic[1], offset=j.mimic[2])
+        for j in known
+        if j.mimic is not None and j.name in free
+    }
 
 
 def _from_package(urdf: Path, name: str, known: dict[str, Path]) -> HandSource:

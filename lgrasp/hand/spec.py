@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from lgrasp.errors import HandError
 
-__all__ = ["Box", "Cone", "ContactRule", "HandSpec", "PalmRule", "load_spec", "spec_problem"]
+__all__ = ["Box", "Cone", "ContactRule", "Coupling", "HandSpec", "PalmRule", "load_spec", "spec_problem"]
 
 Vec3 = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
@@ -61,6 +61,14 @@ class Box(_Strict):
         return self
 
 
+class Coupling(_Strict):
+    """A joint's coordinate is ``multiplier`` times that of ``joint`` plus ``offset``, as in <mimic>."""
+
+    joint: Name
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
 class HandSpec(_Strict):
     """Contents of hand.yaml."""
 
@@ -69,6 +77,8 @@ class HandSpec(_Strict):
     urdf: str = "hand.urdf"
     base_link: str | None = None
     locked: dict[str, float] = Field(default_factory=dict)
+    shared: dict[str, tuple[float, ...]] = Field(default_factory=dict)
+    mimic: dict[str, Coupling] = Field(default_factory=dict)
     static_links: tuple[str, ...] = ()
     contact: tuple[ContactRule, ...] = Field(min_length=1)
     palm: PalmRule = PalmRule()
@@ -86,7 +96,7 @@ def spec_problem(error: ValidationError) -> str:
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"]) or "file"
     if first["type"] == "extra_forbidden":
-        known = [name for kind in (HandSpec, ContactRule, PalmRule, Cone, Box) for name in kind.model_fields]
+        known = [name for kind in (HandSpec, ContactRule, PalmRule, Cone, Box, Coupling) for name in kind.model_fields]
         near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
         return f"unknown key '{key}'" + (f"; did you mean '{near[0]}'?" if near else f"; keys: {', '.join(known)}")
     what = " ".join(first["msg"].removeprefix("Value error, ").split())

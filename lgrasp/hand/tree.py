@@ -1,21 +1,27 @@
 """Joint tree -> dependency groups, actuated joints and the flat tables of the Warp forward kinematics."""
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec
-from lgrasp.hand.urdf import Joint, Urdf
+from lgrasp.hand.urdf import Joint, Urdf, check_mimic
 
-__all__ = ["Tree", "build_tree"]
+__all__ = ["MAX_SETTINGS", "Tree", "build_tree"]
+
+MAX_SETTINGS = 32
+"""Most combinations of values of a hand's shared joints."""
 
 
 @dataclass(frozen=True)
 class Tree:
-    """Tables of a hand's kinematics; G groups, J movable joints in group order, D = K actuated joints.
+    """Tables of a hand's kinematics; G groups, J movable joints in group order, K actuated joints, D drives of groups.
 
-    Body 0 is the static base; body 1 + j is moved by joint j. Every link rides on one body.
+    Body 0 is the static base; body 1 + j is moved by joint j. Every link rides on one body. A joint that several groups
+    share (and what mimics it) is in each of them, once with the links that ride on it, else bare; so D >= K and every
+    group stands by itself once the shared joints have a value. Shared joints only take the values of a setting.
     """
 
     base_link: str
@@ -32,7 +38,10 @@ class Tree:
     joint_axis: np.ndarray  # (J, 3)
     joint_prismatic: np.ndarray  # (J,) i32
     T_parent_joint: np.ndarray  # (J, 4, 4)
-    dof_index: np.ndarray  # (K,) i32: column of q that group-ordered dof d is
+    dof_index: np.ndarray  # (D,) i32: column of q that group-ordered dof d is
+    dof_free: np.ndarray  # (G,) i32: dofs that a group moves itself; they come first, shared ones after
+    shared_names: tuple[str, ...]  # joints that several groups share
+    settings: np.ndarray  # (V, K) open posture with the shared joints at their values; V >= 1
     locked_names: tuple[str, ...]  # actuated joints held at a value; shards list them after those of q
     locked_values: np.ndarray  # (H,) [rad or m]
     locked_limits: np.ndarray  # (H, 2)
@@ -75,10 +84,12 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     """Split the hand into static base and dependency groups.
 
     Groups are the connected components of the tree without static links; a mimic joint joins the group of its source.
+    Shared joints connect nothing.
 
     Raises:
-        HandError: spec names a joint or link that does not exist, or a locked value is outside the limits.
+        HandError: spec names a joint or link that does not exist, or a locked or shared value is outside the limits.
     """
+    urdf = _with_mimic(urdf, spec)
     by_name = {j.name: j for j in urdf.joints}
     for name, value in spec.locked.items():
         if name not in by_name or not by_name[name].movable:
@@ -128,22 +139,31 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         if carrier is None:
             pose_of[name] = T_base_root @ pose_of[name]
 
-    groups = _group(moving, parent_of)
-    order = [j for members in groups for j in members]
-    local = {j.name: i for members in groups for i, j in enumerate(members)}
+    drive = {j.name: _drive(j, by_name) for j in moving}
+    shared = _check_shared(spec, moving, urdf)
+    groups = _group(moving, parent_of, drive, shared)
     actuated = [j for j in urdf.joints if j in moving and j.mimic is None]
     column = {j.name: i for i, j in enumerate(actuated)}
-    dof_first, dof_index, dof_local = [0], [], {}
+    dof_first, dof_index, dof_free, joint_dof, joint_parent = [0], [], [], [], []
+    body: dict[str, int] = {}
     for members in groups:
+        sources = dict.fromkeys(drive[j.name][0] for j in members)
+        own = [n for n in sources if n not in shared]
+        place = {n: i for i, n in enumerate([*own, *(n for n in sources if n in shared)])}
+        local = {j.name: i for i, j in enumerate(members)}
         for j in members:
-            if j.mimic is None:
-                dof_local[j.name] = len(dof_index) - dof_first[-1]
-                dof_index.append(column[j.name])
+            up = parent_of[j.name]
+            joint_dof.append(place[drive[j.name][0]])
+            joint_parent.append(-1 if up is None else local[up])
+            # the links of a joint that is in several groups ride with the first
+            body.setdefault(j.name, len(joint_dof))
+        dof_index += [column[n] for n in place]
         dof_first.append(len(dof_index))
-    drive = [_drive(j, by_name) for j in order]
-    lower, upper = _limits(actuated, order, drive, spec)
+        dof_free.append(len(own))
+    order = [j for members in groups for j in members]
+    lower, upper = _limits(actuated, moving, drive, spec)
     opened = np.clip(np.array([spec.open_posture.get(j.name, 0.0) for j in actuated]), lower, upper)
-    body = {j.name: 1 + i for i, j in enumerate(order)}
+    settings = _settings(spec, shared, column, opened, lower, upper)
     links = list(urdf.links)
     locked = [j for j in urdf.joints if j.mimic is None and j.name in spec.locked]
     return Tree(
@@ -151,17 +171,20 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         joint_names=tuple(j.name for j in actuated),
         joint_lower=lower.astype(np.float32),
         joint_upper=upper.astype(np.float32),
-        joint_open=opened.astype(np.float32),
+        joint_open=settings[0],
         joint_first=np.cumsum([0, *(len(m) for m in groups)]).astype(np.int32),
         dof_first=np.array(dof_first, np.int32),
-        joint_parent=np.array([-1 if (p := parent_of[j.name]) is None else local[p] for j in order], np.int32),
-        joint_dof=np.array([dof_local[source] for source, _, _ in drive], np.int32),
-        joint_mult=np.array([m for _, m, _ in drive], np.float32),
-        joint_offset=np.array([b for _, _, b in drive], np.float32),
+        joint_parent=np.array(joint_parent, np.int32),
+        joint_dof=np.array(joint_dof, np.int32),
+        joint_mult=np.array([drive[j.name][1] for j in order], np.float32),
+        joint_offset=np.array([drive[j.name][2] for j in order], np.float32),
         joint_axis=np.array([j.axis for j in order], np.float32),
         joint_prismatic=np.array([j.prismatic for j in order], np.int32),
         T_parent_joint=np.array([pose_of[j.name] for j in order]),
         dof_index=np.array(dof_index, np.int32),
+        dof_free=np.array(dof_free, np.int32),
+        shared_names=shared,
+        settings=settings,
         locked_names=tuple(j.name for j in locked),
         locked_values=np.array([spec.locked[j.name] for j in locked], np.float32),
         locked_limits=np.array([(j.lower, j.upper) for j in locked], np.float32).reshape(-1, 2),
@@ -171,23 +194,104 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     )
 
 
-def _group(moving: list[Joint], parent_of: dict[str, str | None]) -> list[list[Joint]]:
-    """Connected components: joints that share an ancestor joint, or a mimic source."""
-    label = {j.name: j.name for j in moving}
+def _with_mimic(urdf: Urdf, spec: HandSpec) -> Urdf:
+    """The URDF with the couplings that hand.yaml adds."""
+    by_name = {j.name: j for j in urdf.joints}
+    for name, coupling in spec.mimic.items():
+        for end in (name, coupling.joint):
+            if end not in by_name or not by_name[end].movable:
+                raise HandError(f"hand '{spec.name}': mimic names '{end}', not a movable joint of {urdf.path}")
+    joints = tuple(
+        replace(j, mimic=(m.joint, m.multiplier, m.offset)) if (m := spec.mimic.get(j.name)) else j for j in urdf.joints
+    )
+    check_mimic(urdf.path, joints)
+    return replace(urdf, joints=joints)
+
+
+def _check_shared(spec: HandSpec, moving: list[Joint], urdf: Urdf) -> tuple[str, ...]:
+    free = {j.name for j in moving if j.mimic is None}
+    for name, values in spec.shared.items():
+        if name not in free:
+            raise HandError(
+                f"hand '{spec.name}': shared joint '{name}' is not a joint of {urdf.path} that moves by itself"
+            )
+        if not values:
+            raise HandError(f"hand '{spec.name}': shared joint '{name}' has no values; list some or lock it")
+    number = int(np.prod([len(values) for values in spec.shared.values()]))
+    if number > MAX_SETTINGS:
+        raise HandError(
+            f"hand '{spec.name}': the values of its shared joints make {number} settings, at most {MAX_SETTINGS} are "
+            "supported; list fewer"
+        )
+    if len(spec.shared) == len(free):
+        raise HandError(f"hand '{spec.name}': every joint of {urdf.path} is locked or shared; leave some to move")
+    return tuple(spec.shared)
+
+
+def _settings(
+    spec: HandSpec,
+    shared: tuple[str, ...],
+    column: dict[str, int],
+    opened: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+) -> np.ndarray:
+    rows = []
+    for values in itertools.product(*(spec.shared[name] for name in shared)):
+        row = opened.copy()
+        for name, value in zip(shared, values, strict=True):
+            k = column[name]
+            if not lower[k] - 1e-4 <= value <= upper[k] + 1e-4:
+                raise HandError(
+                    f"hand '{spec.name}': shared joint '{name}' = {value} is outside its limits "
+                    f"[{lower[k]:g}, {upper[k]:g}]"
+                )
+            row[k] = min(max(value, lower[k]), upper[k])
+        rows.append(row)
+    return np.array(rows, np.float32)
+
+
+def _group(
+    moving: list[Joint],
+    parent_of: dict[str, str | None],
+    drive: dict[str, tuple[str, float, float]],
+    shared: tuple[str, ...],
+) -> list[list[Joint]]:
+    """Connected components: joints that share an ancestor joint, or a source that is not one of the shared joints.
+
+    Joints driven by a shared one join no groups; each group gets a copy of those below which its joints are mounted.
+    """
+    by_name = {j.name: j for j in moving}
+    framing = {j.name for j in moving if drive[j.name][0] in shared}
+    label = {j.name: j.name for j in moving if j.name not in framing}
 
     def find(name: str) -> str:
         while label[name] != name:
             name = label[name]
         return name
 
-    for j in moving:
-        for other in (parent_of[j.name], j.mimic[0] if j.mimic else None):
-            if other is not None:
-                label[find(j.name)] = find(other)
-    groups: dict[str, list[Joint]] = {}
-    for j in moving:
-        groups.setdefault(find(j.name), []).append(j)
-    return list(groups.values())
+    for name in label:
+        for other in (parent_of[name], drive[name][0]):
+            if other is not None and other not in framing:
+                label[find(name)] = find(other)
+    members: dict[str, set[str]] = {}
+    for name in label:
+        members.setdefault(find(name), set()).add(name)
+    for names in members.values():
+        for name in list(names):
+            up = parent_of[name]
+            while up is not None:
+                names.add(up)
+                up = parent_of[up]
+    # links on framing joints that carry no finger go with the first group
+    first = next(iter(members.values()))
+    for name in framing - set().union(*members.values()):
+        up: str | None = name
+        while up is not None:
+            first.add(up)
+            up = parent_of[up]
+    position = {name: i for i, name in enumerate(by_name)}
+    return [[by_name[n] for n in sorted(names, key=position.__getitem__)] for names in members.values()]
 
 
 def _drive(j: Joint, by_name: dict[str, Joint]) -> tuple[str, float, float]:
@@ -203,12 +307,13 @@ def _drive(j: Joint, by_name: dict[str, Joint]) -> tuple[str, float, float]:
 
 
 def _limits(
-    actuated: list[Joint], order: list[Joint], drive: list[tuple[str, float, float]], spec: HandSpec
+    actuated: list[Joint], moving: list[Joint], drive: dict[str, tuple[str, float, float]], spec: HandSpec
 ) -> tuple[np.ndarray, np.ndarray]:
     """Limits of the actuated joints [rad or m], narrowed so that every mimic joint stays inside its own."""
     lower = {j.name: j.lower for j in actuated}
     upper = {j.name: j.upper for j in actuated}
-    for j, (source, mult, offset) in zip(order, drive, strict=True):
+    for j in moving:
+        source, mult, offset = drive[j.name]
         if j.mimic is None or mult == 0.0:
             continue
         a, b = sorted(((j.lower - offset) / mult, (j.upper - offset) / mult))

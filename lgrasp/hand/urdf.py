@@ -3,6 +3,7 @@
 import io
 import math
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from lxml import etree
 
 from lgrasp.errors import HandError
 
-__all__ = ["Geometry", "Joint", "Urdf", "find_mesh", "read_urdf"]
+__all__ = ["Geometry", "Joint", "Urdf", "check_mimic", "find_mesh", "read_urdf"]
 
 _MOVABLE = {"revolute", "prismatic", "continuous"}
 
@@ -81,7 +82,7 @@ def read_urdf(path: Path) -> Urdf:
     ordered, root = _order(path, links, joints)
     if not any(j.movable for j in ordered):
         raise HandError(f"URDF {path} has no movable joint; a hand needs revolute, continuous or prismatic joints")
-    _check_mimic(path, ordered)
+    check_mimic(path, ordered)
     return Urdf(path, robot.name or path.stem, raw.decode("utf-8", "replace"), root, links, tuple(ordered), meshes)
 
 
@@ -239,7 +240,9 @@ def _order(path: Path, links: dict[str, tuple[Geometry, ...]], joints: list[Join
     return ordered, roots[0]
 
 
-def _check_mimic(path: Path, joints: list[Joint]) -> None:
+def check_mimic(path: Path, joints: Iterable[Joint]) -> None:
+    """Raises HandError when a joint mimics none that moves, or itself through others."""
+    joints = list(joints)
     by_name = {j.name: j for j in joints}
     for j in joints:
         seen, at = {j.name}, j

@@ -21,6 +21,7 @@ class Object:
     sdf: Sdf
     contact_points: wp.array(dtype=wp.vec3)
     contact_normals: wp.array(dtype=wp.vec3)
+    contact_opposite: wp.array(dtype=wp.int32)
     contacts: wp.int32
     obstacles: wp.array(dtype=wp.vec3)  # CLUSTER_SIZE per cluster
     cluster_sphere: wp.array(dtype=wp.vec4)
@@ -54,6 +55,7 @@ def upload_object(model: ObjectModel, device: str) -> ObjectArrays:
     obj.sdf = s
     obj.contact_points = put(model.contact_points, wp.vec3)
     obj.contact_normals = put(model.contact_normals, wp.vec3)
+    obj.contact_opposite = put(model.contact_opposite, wp.int32)
     obj.contacts = len(model.contact_points)
     obj.obstacles = put(model.obstacle_points, wp.vec3)
     obj.cluster_sphere = put(np.column_stack([model.cluster_center, model.cluster_radius]), wp.vec4)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-__all__ = ["far_distance", "fold_spread", "lattice_crossings", "nearest_face_band", "winding_sign"]
+__all__ = ["draw_opposite", "far_distance", "fold_spread", "lattice_crossings", "nearest_face_band", "winding_sign"]
 
 wp.config.log_level = wp.LOG_ERROR
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
@@ -39,6 +39,29 @@ def closest_on_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3):
         return b + ((d4 - d3) / ((d4 - d3) + (d5 - d6))) * (c - b)
     denom = 1.0 / (va + vb + vc)
     return a + (vb * denom) * ab + (vc * denom) * ac
+
+
+@wp.kernel
+def draw_opposite(
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    cosine: float,
+    seed: int,
+    opposite_out: wp.array(dtype=wp.int32),
+):
+    """One of the points that face point i: both outward normals within the cone of the line between the two."""
+    i = wp.tid()
+    state = wp.rand_init(seed, i)
+    chosen = int(-1)
+    found = int(0)
+    for j in range(points.shape[0]):
+        line = points[j] - points[i]
+        limit = cosine * wp.length(line)
+        if j != i and wp.dot(line, normals[j]) > limit and -wp.dot(line, normals[i]) > limit:
+            found += 1
+            if wp.randf(state) * float(found) < 1.0:
+                chosen = j
+    opposite_out[i] = chosen
 
 
 @wp.kernel

@@ -12,7 +12,15 @@ from lgrasp.clusters import bounding_spheres, cluster_order
 from .load import LoadedMesh, load_mesh
 from .params import ObjectParams
 from .sdf import SdfGrid, build_sdf
-from .surface import face_normals, fold_cosine, probe_fits, sample_creases, sample_surface, thin
+from .surface import (
+    face_normals,
+    fold_cosine,
+    opposite_points,
+    probe_fits,
+    sample_creases,
+    sample_surface,
+    thin,
+)
 
 __all__ = ["ObjectModel", "preprocess_object"]
 
@@ -34,8 +42,9 @@ class ObjectModel:
         com: Centre of mass at uniform density (area centroid if not watertight) [m], shape (3,).
         extents: Sides of the bounding box [m], shape (3,).
         notes: What was repaired or relaxed, one sentence each.
-        contact_points: Points a finger may touch [m], shape (n, 3).
+        contact_points: Points a finger may touch, neighbours mostly near each other in order [m], shape (n, 3).
         contact_normals: Outward unit normals there, shape (n, 3).
+        contact_opposite: Contact point facing away on the other side of the object, -1 where none, shape (n,), int32.
         obstacle_points: Evenly spread points of the whole surface, in clusters of ``CLUSTER_SIZE`` [m], shape (m, 3).
         obstacle_normals: Outward unit normals there, shape (m, 3).
         cluster_center: Bounding ball centres of consecutive runs of obstacle points [m], shape (k, 3).
@@ -58,6 +67,7 @@ class ObjectModel:
     notes: list[str]
     contact_points: np.ndarray
     contact_normals: np.ndarray
+    contact_opposite: np.ndarray
     obstacle_points: np.ndarray
     obstacle_normals: np.ndarray
     cluster_center: np.ndarray
@@ -142,6 +152,7 @@ def preprocess_object(
         notes=notes,
         contact_points=contact_points,
         contact_normals=contact_normals,
+        contact_opposite=opposite_points(contact_points, contact_normals, seed=params.seed, device=device),
         obstacle_points=obstacle_points,
         obstacle_normals=obstacle_normals,
         cluster_center=cluster_center,
@@ -184,7 +195,9 @@ def _contacts(
     if not chosen.any():
         chosen = np.ones_like(probe)
         notes.append("no contact point lets a finger-sized ball rest: the concavity test was left out")
-    return points[chosen].astype(np.float32), normals[face[chosen]].astype(np.float32)
+    points, face = points[chosen], face[chosen]
+    order = cluster_order(points)
+    return points[order].astype(np.float32), normals[face[order]].astype(np.float32)
 
 
 def _obstacles(vertices: np.ndarray, faces: np.ndarray, params: ObjectParams) -> tuple[np.ndarray, np.ndarray]:

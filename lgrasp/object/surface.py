@@ -8,8 +8,18 @@ from scipy.spatial import KDTree
 from . import kernels
 from .sdf import SdfGrid, sample_sdf
 
-__all__ = ["face_neighbours", "face_normals", "fold_cosine", "probe_fits", "sample_creases", "sample_surface", "thin"]
+__all__ = [
+    "face_neighbours",
+    "face_normals",
+    "fold_cosine",
+    "opposite_points",
+    "probe_fits",
+    "sample_creases",
+    "sample_surface",
+    "thin",
+]
 
+_OPPOSED = float(np.cos(np.radians(30.0)))  # of the line between two opposite points to their normals, at least
 _OVERSAMPLE = 5  # candidates for one point kept
 _WALK_FACES = 256  # faces visited around a point in the fold test
 
@@ -153,6 +163,25 @@ def fold_cosine(
             wp.empty((len(points), min(_WALK_FACES, len(faces))), dtype=wp.int32),
         ]
         wp.launch(kernels.fold_spread, len(points), inputs, [out])
+        return out.numpy()
+
+
+def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int, device: str = "cpu") -> np.ndarray:
+    """For each point a random one that a finger and an opposed finger could press together with it.
+
+    Both normals are within 30 degrees of the line between the two; cavities in between do not matter.
+
+    Args:
+        points: On the surface [m], shape (n, 3).
+        normals: Outward unit normals, shape (n, 3).
+
+    Returns:
+        Indices, shape (n,), int32; -1 where there is none.
+    """
+    with wp.ScopedDevice(device):
+        out = wp.empty(len(points), dtype=wp.int32)
+        inputs = [wp.array(points, dtype=wp.vec3), wp.array(normals, dtype=wp.vec3), _OPPOSED, seed]
+        wp.launch(kernels.draw_opposite, len(points), inputs, [out])
         return out.numpy()
 
 

@@ -101,7 +101,7 @@ def test_box_inside_the_palm_is_named(jaws, tmp_path, swift, cache_root):
 
 
 def test_field_vectors_are_contacts_of_the_finger(inputs: Inputs):
-    points, normals = field_vectors(inputs.field.model, 0)
+    points, normals = field_vectors(inputs.field.model, 0, inputs.hand.model.groups)
     assert len(points) > 1000
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-6)
     reach = np.linalg.norm(points - inputs.hand.model.tree.T_parent_joint[0][:3, 3], axis=1)

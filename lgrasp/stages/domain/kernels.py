@@ -12,6 +12,8 @@ __all__ = ["draw_domains", "draw_domains_bvh"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
+_NEAR = wp.constant(16.0)  # contact points before and after one that count as near it
+
 
 @wp.kernel
 def draw_domains(
@@ -24,6 +26,8 @@ def draw_domains(
     cosine: wp.float32,
     index: wp.array(dtype=wp.int32),
     pose: wp.array(dtype=wp.transform),
+    setting: wp.array(dtype=wp.int32),
+    anchor: wp.array2d(dtype=wp.int32),
     count_out: wp.array2d(dtype=wp.int32),
     surface_out: wp.array3d(dtype=wp.int32),
     record_out: wp.array3d(dtype=wp.int32),
@@ -31,22 +35,31 @@ def draw_domains(
 ):
     """Contact domain of each (pose, group): surface points that a contact vector of the group meets."""
     row, g = wp.tid()
+    slot = setting[row] * hand.kin.groups + g
     state = wp.rand_init(seed, index[row] * hand.kin.groups + g)
     T = pose[row]
     R = wp.transform_get_rotation(T)
     t = wp.transform_get_translation(T)
     n = int(0)
-    for _a in range(attempts):
-        i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+    for a in range(attempts):
+        near = anchor[row, g]
+        if n > 0:
+            near = surface_out[row, g, a % n]
+        i = int(0)
+        if a < attempts // 2 or near < 0:
+            i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+        else:
+            # few were found all over the surface: look about those
+            i = wp.clamp(near + int(wp.randf(state) * (2.0 * _NEAR + 1.0)) - int(_NEAR), 0, obj.contacts - 1)
         p = wp.quat_rotate(R, obj.contact_points[i]) + t
         normal = -wp.quat_rotate(R, obj.contact_normals[i])
-        row_in_field = field_has(field, g, p, normal)
+        row_in_field = field_has(field, slot, p, normal)
         if row_in_field >= 0:
-            pick = field_pick(field, g, row_in_field, p, normal, state)
+            pick = field_pick(field, slot, row_in_field, p, normal, state)
             if float(pick[1]) * 0.0001 >= cosine:
                 surface_out[row, g, n] = i
                 record_out[row, g, n] = pick[0]
-                q_out[row, g, n] = field_seed(field, hand.kin, g, pick[0])
+                q_out[row, g, n] = field_seed(field, hand.kin, slot, pick[0])
                 n += 1
                 if n == keep:
                     break
@@ -65,6 +78,8 @@ def draw_domains_bvh(
     cosine: wp.float32,
     index: wp.array(dtype=wp.int32),
     pose: wp.array(dtype=wp.transform),
+    setting: wp.array(dtype=wp.int32),
+    anchor: wp.array2d(dtype=wp.int32),
     count_out: wp.array2d(dtype=wp.int32),
     surface_out: wp.array3d(dtype=wp.int32),
     record_out: wp.array3d(dtype=wp.int32),
@@ -72,6 +87,7 @@ def draw_domains_bvh(
 ):
     """The same domains from the published index: every patch of the group is asked, a hit one is picked at random."""
     row, g = wp.tid()
+    slot = setting[row] * hand.kin.groups + g
     state = wp.rand_init(seed, index[row] * hand.kin.groups + g)
     T = pose[row]
     n = int(0)
@@ -79,11 +95,11 @@ def draw_domains_bvh(
         i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
         p = wp.transform_point(T, obj.contact_points[i])
         normal = -wp.transform_vector(T, obj.contact_normals[i])
-        r = boxes_pick(boxes, field, g, p, normal, cosine, state)
+        r = boxes_pick(boxes, field, slot, p, normal, cosine, state)
         if r >= 0:
             surface_out[row, g, n] = i
             record_out[row, g, n] = r
-            q_out[row, g, n] = field_seed(field, hand.kin, g, r)
+            q_out[row, g, n] = field_seed(field, hand.kin, slot, r)
             n += 1
             if n == keep:
                 break

@@ -12,7 +12,7 @@ from lgrasp.stages.domain.params import DomainParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 1
+VERSION = 2
 
 
 def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[CandidateTable, dict[str, int]]:
@@ -40,6 +40,8 @@ def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[Cand
             math.cos(math.radians(params.angle)),
             inputs.index,
             inputs.pose,
+            inputs.setting,
+            inputs.anchor,
         ],
         outputs=[count, surface, record, q],
         device=d,

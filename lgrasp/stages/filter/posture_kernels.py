@@ -122,6 +122,7 @@ def fill_unused(
     margin: wp.float32,
     index: wp.array(dtype=wp.int32),
     pose: wp.array(dtype=wp.transform),
+    setting: wp.array(dtype=wp.int32),
     set_pose: wp.array(dtype=wp.int32),
     set_slot: wp.array(dtype=wp.int32),
     chosen: wp.array2d(dtype=wp.int32),
@@ -147,8 +148,9 @@ def fill_unused(
     X = body_out[i]
     for g in range(G):
         if chosen[i, g] < 0:
-            r0 = field.start[field.cell_first[g] * 64]
-            r1 = field.start[field.cell_first[g + 1] * 64]
+            slot = setting[row] * G + g
+            r0 = field.start[field.cell_first[slot] * 64]
+            r1 = field.start[field.cell_first[slot + 1] * 64]
             first = hand.kin.dof_first[g]
             dofs = hand.kin.dof_first[g + 1] - first
             found = int(0)
@@ -156,9 +158,12 @@ def fill_unused(
                 share = 1.0 - float(t + 1) / float(draws)
                 x = vec_dof()
                 if r1 > r0:
-                    x = field_seed(field, hand.kin, g, r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1))
+                    x = field_seed(
+                        field, hand.kin, slot, r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1)
+                    )
                 for d in range(dofs):
-                    o = hand.kin.dof_open[first + d]
+                    # of shared joints the very value of the setting
+                    o = hand.kin.dof_setting[setting[row], first + d]
                     x[d] = o + share * (x[d] - o)
                 group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
                 clear = int(1)

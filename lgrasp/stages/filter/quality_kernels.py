@@ -94,7 +94,7 @@ def grasp_epsilon(
 def _shift_contact(hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, point: wp.vec3, by: wp.vec3):
     """Joint positions that move a point of the group's body j by ``by`` [m] (three damped steps), limits kept."""
     j0 = hand.kin.joint_first[g]
-    dofs = hand.kin.dof_first[g + 1] - hand.kin.dof_first[g]
+    dofs = hand.kin.dof_free[g]
     q = q0
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     target = wp.vec3(0.0)

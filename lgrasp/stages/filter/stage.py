@@ -83,6 +83,7 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
             params.self_margin,
             poses.index,
             poses.pose,
+            poses.setting,
             inputs.pose,
             inputs.slot,
             inputs.chosen,

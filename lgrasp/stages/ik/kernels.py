@@ -83,7 +83,7 @@ def realise_contacts(
     sdf = hand_grid(hand.contacts, grid)
     j0 = hand.kin.joint_first[g]
     body = hand.contacts.body[c] - 1 - j0
-    dofs = hand.kin.dof_first[g + 1] - hand.kin.dof_first[g]
+    dofs = hand.kin.dof_free[g]
     q = q_out[row, g, m]
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     point = hand.contacts.points[c]

@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_JOINTS, group_forward
+from lgrasp.device.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.device.transforms import random_rotation, rotation_between
-from lgrasp.field.arrays import Field, field_has, field_seed
+from lgrasp.field.arrays import Field, field_has, field_pair, field_seed
 from lgrasp.grasp.clearance import body_clear, body_depth
 from lgrasp.hand.arrays import Hand
 from lgrasp.object.arrays import Object
@@ -16,6 +16,8 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 _HITS = wp.constant(6)  # rated contacts per group
 _MAX_RATED = wp.constant(48)
+_PINCHES = wp.constant(32)  # draws of two opposite points and two opposed contact vectors
+_PINCH_SLACK = wp.constant(0.002)  # [m] difference of their distances
 
 
 @wp.func
@@ -27,12 +29,72 @@ def _aligned(p: wp.vec3, n: wp.vec3, point: wp.vec3, normal: wp.vec3, state: wp.
 
 
 @wp.func
+def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int32), state: wp.uint32):
+    """Pose that puts two opposite object points between two fingers that press towards each other, any roll.
+
+    ``anchor`` gets the two points; all of them stay below 0 when no pose was found.
+
+    Returns:
+        Pose and setting.
+    """
+    G = hand.kin.groups
+    T = wp.transform_identity()
+    for _t in range(_PINCHES):
+        i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+        j = obj.contact_opposite[i]
+        if j < 0:
+            continue
+        line = obj.contact_points[j] - obj.contact_points[i]
+        width = wp.length(line)
+        pair = field_pair(field, width, _PINCH_SLACK, state)
+        if pair < 0:
+            continue
+        a = field.pair_point[pair, 0]
+        b = field.pair_point[pair, 1]
+        axis = wp.normalize(b - a)
+        R = rotation_between(line / width, axis)
+        # the roll that brings the first normals together, unless they are along the line
+        have = -wp.quat_rotate(R, obj.contact_normals[i])
+        want = field.pair_normal[pair, 0]
+        side = wp.cross(have, axis)
+        x = wp.dot(want - axis * wp.dot(want, axis), have - axis * wp.dot(have, axis))
+        y = wp.dot(wp.cross(have, want), axis)
+        angle = wp.atan2(y, x) + 0.3 * wp.randn(state)
+        if wp.length(side) < 0.1 or wp.length(wp.cross(want, axis)) < 0.1:
+            angle = wp.randf(state, 0.0, 6.2831853)
+        R = wp.quat_from_axis_angle(axis, angle) * R
+        middle = 0.5 * (obj.contact_points[i] + obj.contact_points[j])
+        T = wp.transform(0.5 * (a + b) - wp.quat_rotate(R, middle), R)
+        slot = field.pair_slot[pair]
+        p = wp.transform_point(T, obj.contact_points[i])
+        q = wp.transform_point(T, obj.contact_points[j])
+        if (
+            field_has(field, slot[0], p, -wp.quat_rotate(R, obj.contact_normals[i])) >= 0
+            and field_has(field, slot[1], q, -wp.quat_rotate(R, obj.contact_normals[j])) >= 0
+        ):
+            setting = slot[0] // G
+            anchor[slot[0] - setting * G] = i
+            anchor[slot[1] - setting * G] = j
+            return T, setting
+    return T, int(-1)
+
+
+@wp.func
 def rate_pose(
-    hand: Hand, field: Field, obj: Object, T: wp.transform, palm: wp.int32, samples: wp.int32, state: wp.uint32
+    hand: Hand,
+    field: Field,
+    obj: Object,
+    T: wp.transform,
+    setting: wp.int32,
+    palm: wp.int32,
+    samples: wp.int32,
+    anchor: wp.array(dtype=wp.int32),
+    state: wp.uint32,
 ):
     """How many pairs of reachable contacts of different groups oppose each other.
 
-    A pair counts when each contact's inward normal is within 40 degrees of the line to the other.
+    A pair counts when each contact's inward normal is within 40 degrees of the line to the other. ``anchor`` holds an
+    object contact point that each group can touch, or gets one.
     """
     points = wp.zeros(shape=(_MAX_RATED,), dtype=wp.vec3)
     normals = wp.zeros(shape=(_MAX_RATED,), dtype=wp.vec3)
@@ -42,16 +104,20 @@ def rate_pose(
     t = wp.transform_get_translation(T)
     for g in range(hand.kin.groups):
         hits = int(0)
-        for _s in range(samples):
-            i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+        for s in range(samples):
+            i = anchor[g]
+            if s > 0 or i < 0:
+                i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
             p = wp.quat_rotate(R, obj.contact_points[i]) + t
             n = -wp.quat_rotate(R, obj.contact_normals[i])
-            if field_has(field, g, p, n) >= 0:
+            if field_has(field, setting * hand.kin.groups + g, p, n) >= 0:
                 points[m] = p
                 normals[m] = n
                 owner[m] = g
                 m += 1
                 hits += 1
+                if anchor[g] < 0:
+                    anchor[g] = i
                 if hits == _HITS or m == _MAX_RATED - 1:
                     break
     if palm >= 0:
@@ -81,13 +147,16 @@ def place_objects(
     seed: wp.int32,
     first: wp.int32,
     canonical: wp.float32,
-    exhaustive: wp.float32,
+    pinch: wp.float32,
+    palm_share: wp.float32,
     proposals: wp.int32,
     samples: wp.int32,
     clearance: wp.float32,
     pose_out: wp.array(dtype=wp.transform),
     palm_point_out: wp.array(dtype=wp.int32),
     palm_surface_out: wp.array(dtype=wp.int32),
+    setting_out: wp.array(dtype=wp.int32),
+    anchor_out: wp.array2d(dtype=wp.int32),
     rating_out: wp.array(dtype=wp.int32),
 ):
     """The best of several clear poses per candidate; rating -1: none was clear of static links, 0: none can hold."""
@@ -96,6 +165,7 @@ def place_objects(
     G = hand.kin.groups
     palm0 = hand.contacts.first[G]
     palms = hand.contacts.first[G + 1] - palm0
+    anchor = wp.zeros(shape=(MAX_GROUPS,), dtype=wp.int32)
     best = int(-1)
     for _b in range(proposals):
         u = wp.randf(state)
@@ -103,33 +173,44 @@ def place_objects(
         point = obj.contact_points[i]
         normal = obj.contact_normals[i]
         palm = int(-1)
+        for k in range(G):
+            anchor[k] = -1
+        setting = int(0)
+        if hand.kin.settings > 1:
+            setting = wp.min(int(wp.randf(state) * float(hand.kin.settings)), hand.kin.settings - 1)
         T = wp.transform_identity()
         if u < canonical:
             x = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
             p = hand.box_low + wp.cw_mul(x, hand.box_high - hand.box_low)
             R = random_rotation(state)
             T = wp.transform(p - wp.quat_rotate(R, point), R)
-        elif u < canonical + exhaustive or palms == 0:
+        elif u < canonical + pinch:
+            T, setting = _pinch(hand, field, obj, anchor, state)
+            if setting < 0:
+                continue
+        elif u < canonical + pinch + palm_share and palms > 0:
+            palm = palm0 + wp.min(int(wp.randf(state) * float(palms)), palms - 1)
+            T = _aligned(hand.contacts.points[palm], hand.contacts.normals[palm], point, normal, state)
+        else:
             g = wp.min(int(wp.randf(state) * float(G)), G - 1)
-            r0 = field.start[field.cell_first[g] * 64]
-            r1 = field.start[field.cell_first[g + 1] * 64]
+            slot = setting * G + g
+            r0 = field.start[field.cell_first[slot] * 64]
+            r1 = field.start[field.cell_first[slot + 1] * 64]
             if r1 > r0:
                 r = r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1)
                 X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-                j0 = group_forward(hand.kin, g, field_seed(field, hand.kin, g, r), X, 0)
+                j0 = group_forward(hand.kin, g, field_seed(field, hand.kin, slot, r), X, 0)
                 c = field.point[r]
                 B = X[hand.contacts.body[c] - 1 - j0]
                 p = wp.transform_point(B, hand.contacts.points[c])
                 T = _aligned(p, wp.transform_vector(B, hand.contacts.normals[c]), point, normal, state)
-        else:
-            palm = palm0 + wp.min(int(wp.randf(state) * float(palms)), palms - 1)
-            T = _aligned(hand.contacts.points[palm], hand.contacts.normals[palm], point, normal, state)
+                anchor[g] = i
         rating = int(-1)
         T_object = wp.transform_inverse(T)
         if body_clear(hand, obj, 0, T_object, clearance):
             rating = 1
             if samples > 0:
-                rating = rate_pose(hand, field, obj, T, palm, samples, state)
+                rating = rate_pose(hand, field, obj, T, setting, palm, samples, anchor, state)
             if rating > best and rating > 0 and body_depth(hand, obj, 0, T_object, clearance) > clearance:
                 rating = -1
         if rating > best:
@@ -137,4 +218,7 @@ def place_objects(
             pose_out[row] = T
             palm_point_out[row] = palm
             palm_surface_out[row] = wp.where(palm >= 0, i, -1)
+            setting_out[row] = setting
+            for k in range(G):
+                anchor_out[row, k] = anchor[k]
     rating_out[row] = best

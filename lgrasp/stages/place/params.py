@@ -14,7 +14,10 @@ class PlaceParams(BaseModel):
         0.6, ge=0, description="Weight of surface point to point of the canonical box, any rotation."
     )
     exhaustive: float = Field(
-        0.3, ge=0, description="Weight of surface point on a contact vector of the field, any roll."
+        0.2, ge=0, description="Weight of surface point on a contact vector of the field, any roll."
+    )
+    pinch: float = Field(
+        0.6, ge=0, description="Weight of two opposite surface points between two opposed fingers, any roll."
     )
     palm: float = Field(0.1, ge=0, le=1e6, description="Weight of surface point pressed on the palm, any roll.")
     proposals: int = Field(

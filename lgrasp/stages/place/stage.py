@@ -11,7 +11,7 @@ from lgrasp.stages.place.params import PlaceParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 1
+VERSION = 2
 
 
 def run(inputs: tuple[int, int], params: PlaceParams, context: Context) -> tuple[PoseTable, dict[str, int]]:
@@ -24,12 +24,13 @@ def run(inputs: tuple[int, int], params: PlaceParams, context: Context) -> tuple
         ConfigError: all weights are zero.
     """
     first, count = inputs
-    total = params.canonical + params.exhaustive + params.palm
+    total = params.canonical + params.exhaustive + params.pinch + params.palm
     if total <= 0:
-        raise ConfigError("place: weights canonical, exhaustive and palm are all 0; one must be positive")
+        raise ConfigError("place: weights canonical, exhaustive, pinch and palm are all 0; one must be positive")
     d = context.device
     pose = wp.empty(count, dtype=wp.transform, device=d)
-    palm_point, palm_surface, rating = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(3))
+    anchor = wp.empty((count, context.hand.model.groups), dtype=wp.int32, device=d)
+    palm_point, palm_surface, setting, rating = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(4))
     wp.launch(
         place_objects,
         dim=count,
@@ -40,12 +41,13 @@ def run(inputs: tuple[int, int], params: PlaceParams, context: Context) -> tuple
             context.seed("place"),
             first,
             params.canonical / total,
-            params.exhaustive / total,
+            params.pinch / total,
+            params.palm / total,
             params.proposals,
             params.samples,
             params.clearance,
         ],
-        outputs=[pose, palm_point, palm_surface, rating],
+        outputs=[pose, palm_point, palm_surface, setting, anchor, rating],
         device=d,
     )
     rated = rating.numpy()
@@ -55,5 +57,7 @@ def run(inputs: tuple[int, int], params: PlaceParams, context: Context) -> tuple
         pose=wp.array(pose.numpy()[keep], dtype=wp.transform, device=d),
         palm_point=wp.array(palm_point.numpy()[keep], dtype=wp.int32, device=d),
         palm_surface=wp.array(palm_surface.numpy()[keep], dtype=wp.int32, device=d),
+        setting=wp.array(setting.numpy()[keep], dtype=wp.int32, device=d),
+        anchor=wp.array(anchor.numpy()[keep], dtype=wp.int32, device=d),
     )
     return table, {"tried": count, "blocked": int((rated < 0).sum()), "kept": len(keep)}

@@ -2,19 +2,17 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_JOINTS, group_forward, vec_dof
+from lgrasp.device.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward, vec_dof
 from lgrasp.device.qp import MAX_CONTACTS, balance, frictionless
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.clearance import group_pairs_clear
 from lgrasp.object.arrays import Object
 
-__all__ = ["MAX_GROUPS", "MAX_KEEP", "keep_sets", "list_usable", "try_starts"]
+__all__ = ["MAX_KEEP", "keep_sets", "list_usable", "try_starts"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-MAX_GROUPS = 6
-"""Most dependency groups of a hand."""
 MAX_KEEP = 64
 """Most candidates per pose and group."""
 

@@ -3,10 +3,11 @@
 import numpy as np
 import warp as wp
 
+from lgrasp.device.kinematics import MAX_GROUPS
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.stages.context import Context
-from lgrasp.stages.search.kernels import MAX_GROUPS, MAX_KEEP, keep_sets, list_usable, try_starts
+from lgrasp.stages.search.kernels import MAX_KEEP, keep_sets, list_usable, try_starts
 from lgrasp.stages.search.params import SearchParams
 
 __all__ = ["VERSION", "run"]

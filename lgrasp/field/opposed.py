@@ -1,0 +1,60 @@
+"""Pairs of contact vectors of different fingers that press towards each other, by their distance."""
+
+import numpy as np
+
+__all__ = ["opposed_pairs"]
+
+_DRAWN = 4_000_000  # pairs looked at, all settings together
+_KEPT = 65_536
+_CONE = np.cos(np.radians(35.0))  # of each hand normal to the line between the two, at least
+_WIDTHS = (0.002, 0.20)  # [m]
+
+
+def opposed_pairs(parts: list[dict[str, np.ndarray]], groups: int, seed: int) -> dict[str, np.ndarray]:
+    """Pair arrays of a ContactField, in order of their widths.
+
+    Args:
+        parts: ``position`` (n, 3) [m] and unit ``direction`` (n, 3), the hand normal, of every slot.
+        groups: number of groups of the hand; slot = setting * groups + group.
+    """
+    rng = np.random.default_rng(seed)
+    both = [
+        (a, b)
+        for a in range(len(parts))
+        for b in range(a + 1, len(parts))
+        if a // groups == b // groups and len(parts[a]["position"]) and len(parts[b]["position"])
+    ]
+    ends, normals, slots = [], [], []
+    for a, b in both:
+        p, q = parts[a], parts[b]
+        i, j = (rng.integers(len(x["position"]), size=_DRAWN // len(both)) for x in (p, q))
+        line = q["position"][j] - p["position"][i]
+        width = np.linalg.norm(line, axis=1)
+        limit = _CONE * width
+        good = (np.einsum("nd,nd->n", line, p["direction"][i]) > limit) & (width > _WIDTHS[0]) & (width < _WIDTHS[1])
+        good &= np.einsum("nd,nd->n", line, q["direction"][j]) < -limit
+        ends.append(np.stack([p["position"][i[good]], q["position"][j[good]]], 1))
+        normals.append(np.stack([p["direction"][i[good]], q["direction"][j[good]]], 1))
+        slots.append(np.broadcast_to([a, b], (int(good.sum()), 2)))
+    end = np.concatenate([np.zeros((0, 2, 3)), *ends]).astype(np.float32)
+    normal = np.concatenate([np.zeros((0, 2, 3)), *normals]).astype(np.float32)
+    slot = np.concatenate([np.zeros((0, 2)), *slots]).astype(np.int32)
+    width = np.linalg.norm(end[:, 1] - end[:, 0], axis=1)
+    kept = _even(width, rng)
+    return {
+        "pair_point": end[kept],
+        "pair_normal": normal[kept],
+        "pair_slot": slot[kept],
+        "pair_width": width[kept].astype(np.float32),
+    }
+
+
+def _even(width: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Rows in order of width, about as many of every millimetre; small hands' rare distances are all kept."""
+    order = rng.permutation(len(width))
+    order = order[np.argsort(np.floor(width[order] / 0.001), kind="stable")]
+    _, first, number = np.unique(np.floor(width[order] / 0.001), return_index=True, return_counts=True)
+    rank = np.arange(len(order)) - np.repeat(first, number)
+    most = _KEPT // max(len(first), 1)
+    kept = order[rank < most]
+    return kept[np.argsort(width[kept], kind="stable")]
