@@ -91,16 +91,16 @@ def read_table(path: Path, wanted: Table) -> Table:
         return wanted
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        settings, cells = found["settings"], found["cells"]
+        was = found["settings"] | {"hands": found["hands"], "objects": found["objects"]}
+        cells = [cell for cell in found["cells"] if not cell["error"]]
     except (OSError, ValueError, TypeError, KeyError):
         raise ConfigError(f"--resume: {path} is no table of lgrasp bench table1; remove it or name another") from None
-    for name, value in wanted["settings"].items():
-        if settings.get(name) != value:
+    for name, value in (wanted["settings"] | {"hands": wanted["hands"], "objects": wanted["objects"]}).items():
+        if was.get(name) != value:
             raise ConfigError(
-                f"--resume: {path} was measured with {name} {settings.get(name)}, not {value}; name another file"
+                f"--resume: {path} was measured with {name} {was.get(name)}, not {value}; name another file"
             )
-    here = [c for c in cells if c["hand"] in wanted["hands"] and c["object"] in wanted["objects"] and not c["error"]]
-    return with_ratios(wanted | {"cells": here})
+    return with_ratios(wanted | {"cells": cells})
 
 
 def measure_table(

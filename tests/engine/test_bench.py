@@ -145,6 +145,8 @@ def test_resume_keeps_measured_cells(table, tmp_path):
     assert not kept["complete"]
     with pytest.raises(ConfigError, match="measured with rows 100, not 200"):
         read_table(path, new_table(config(rows=200), repeat=3, baseline_rows=10))
+    with pytest.raises(ConfigError, match="measured with objects"):
+        read_table(path, new_table(config(objects=("mug",)), repeat=3, baseline_rows=10))
     path.write_text("[]")
     with pytest.raises(ConfigError, match="no table"):
         read_table(path, wanted)
