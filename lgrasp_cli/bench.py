@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lgrasp_cli.interrupt import before_end
 from lgrasp_cli.options import Device, Hand, JsonPath, check_report, open_cache, warn
 from lgrasp_cli.table1 import table1
 
@@ -41,7 +42,7 @@ def bench(
         return
     cache = open_cache(None)
     from lgrasp.config import parse_model
-    from lgrasp.engine.bench import bench as measure
+    from lgrasp.engine.bench import Bench
     from lgrasp.engine.jobs import JobConfig, plan_jobs
     from lgrasp.engine.pipeline import pipeline_files
     from lgrasp_cli.tables import print_json
@@ -62,7 +63,8 @@ def bench(
     }
     jobs = plan_jobs(parse_model(JobConfig, given, "bench"), cache)
     check_report(json_path)
-    results = measure(jobs, repeat, lambda line: typer.echo(line, err=True))
+    with Bench() as runs, before_end(runs.discard):
+        results = runs.measure(jobs, repeat, lambda line: typer.echo(line, err=True))
     if json_path == "-":
         print_json(results)
         return

@@ -5,12 +5,13 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
-__all__ = ["Interrupted", "on_interrupt", "stop_now"]
+__all__ = ["Interrupted", "before_end", "on_interrupt", "stop_now"]
 
 _GRACE = 1.0  # [s] that native code may take before the process is ended
+_last: list[Callable[[], None]] = []  # what is still done then
 
 
 class Interrupted(BaseException):
@@ -29,7 +30,20 @@ def stop_now() -> None:
     raise Interrupted
 
 
+@contextmanager
+def before_end(action: Callable[[], None]) -> Iterator[None]:
+    """Call ``action`` if the process is ended inside the block before the main thread could unwind it."""
+    _last.append(action)
+    try:
+        yield
+    finally:
+        _last.remove(action)
+
+
 def _end() -> None:
+    for action in list(_last):
+        with suppress(Exception):
+            action()
     sys.stderr.write("interrupted\n")
     sys.stderr.flush()
     os._exit(130)

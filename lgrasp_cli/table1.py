@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lgrasp_cli.interrupt import before_end
 from lgrasp_cli.options import Device, JsonPath, check_report, open_cache, warn
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ def table1(
     """
     cache = open_cache(None)
     from lgrasp.config import parse_model
+    from lgrasp.engine.bench import Bench
     from lgrasp.engine.charts import check_plot, draw_table
     from lgrasp.engine.jobs import JobConfig, load_config
     from lgrasp.engine.report import write_json
@@ -89,11 +91,12 @@ def table1(
     table = new_table(config, repeat=repeat, baseline_rows=baseline_rows or max(1, config.rows // 10))
     if resume and json_path:
         table = read_table(Path(json_path), table)
-    measured = measure_table(table, config, cache, progress=lambda line: typer.echo(line, err=True))
-    for table, cell in measured:
-        if to_file and json_path:
-            write_json(json_path, table)
-        typer.echo(_cell_line(table, cell), err=True)
+    with Bench() as bench, before_end(bench.discard):
+        measured = measure_table(bench, table, config, cache, progress=lambda line: typer.echo(line, err=True))
+        for table, cell in measured:
+            if to_file and json_path:
+                write_json(json_path, table)
+            typer.echo(_cell_line(table, cell), err=True)
     if plot:
         draw_table(table, plot)
     if json_path == "-":

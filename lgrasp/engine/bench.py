@@ -1,5 +1,6 @@
 """Pipelines side by side on several objects, in one run on one device."""
 
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,18 +12,12 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.generate import Job, Outcome, generate
 from lgrasp.engine.report import report
 
-__all__ = ["Bench", "bench"]
+__all__ = ["Bench"]
 
 _MEASURED = ("strict_valid_per_s", "seed_count_per_s")
 _INPUTS = ("object", "field")
 _PROBE_ROWS = 256  # and at most a tenth of the rows
 Progress = Callable[[str], None]
-
-
-def bench(jobs: list[Job], repeat: int, progress: Progress | None = None) -> list[dict[str, Any]]:
-    """Run each job ``repeat`` times, in turns, and report the middle and the spread; see :meth:`Bench.measure`."""
-    with Bench() as runs:
-        return runs.measure(jobs, repeat, progress)
 
 
 class Bench:
@@ -40,6 +35,11 @@ class Bench:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.discard()
+
+    def discard(self) -> None:
+        """Remove the temporary folder, whatever still runs in it."""
+        shutil.rmtree(self._folder.name, ignore_errors=True)
         self._folder.cleanup()
 
     def measure(self, jobs: list[Job], repeat: int, progress: Progress | None = None) -> list[dict[str, Any]]:

@@ -104,6 +104,7 @@ def read_table(path: Path, wanted: Table) -> Table:
 
 
 def measure_table(
+    bench: Bench,
     table: Table,
     config: JobConfig,
     cache: Cache,
@@ -124,17 +125,16 @@ def measure_table(
     # plan_jobs: pipeline, hand, object; here all pipelines of a hand and object go together
     pairs = [(hand, mesh) for hand in table["hands"] for mesh in table["objects"]]
     done = {(cell["hand"], cell["object"]) for cell in table["cells"]}
-    with Bench() as bench:
-        for number, (hand, mesh) in enumerate(pairs):
-            if (hand, mesh) in done:
-                continue
-            cell_jobs = [
-                job if k == 0 else replace(job, rows=settings["baseline_rows"])
-                for k, job in enumerate(jobs[number + k * len(pairs)] for k in range(count))
-            ]
-            cell = _cell(bench, cell_jobs, settings, progress) | {"hand": hand, "object": mesh}
-            table = with_ratios(table | {"cells": [*table["cells"], cell]})
-            yield table, cell
+    for number, (hand, mesh) in enumerate(pairs):
+        if (hand, mesh) in done:
+            continue
+        cell_jobs = [
+            job if k == 0 else replace(job, rows=settings["baseline_rows"])
+            for k, job in enumerate(jobs[number + k * len(pairs)] for k in range(count))
+        ]
+        cell = _cell(bench, cell_jobs, settings, progress) | {"hand": hand, "object": mesh}
+        table = with_ratios(table | {"cells": [*table["cells"], cell]})
+        yield table, cell
 
 
 def _cell(bench: Bench, jobs: list[Job], settings: dict[str, Any], progress: Callable[[str], None] | None) -> Cell:

@@ -1,6 +1,7 @@
 """The other commands: inputs, stages one by one, lists, configs, cache, bench."""
 
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -213,6 +214,20 @@ def test_bench_table1_interrupted(table1, monkeypatch, tmp_path):
     whole = json.loads((tmp_path / "t.json").read_text())
     assert whole["cells"][0] == kept["cells"][0]
     assert whole["complete"]
+
+
+def test_interrupted_bench_leaves_nothing(process, quick, tmp_path, monkeypatch):
+    """Also when it is ended in the middle of a batch."""
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    child = process("bench", "--objects", "tiny", "--pipelines", quick, "-n", 200_000, "--device", "cpu")
+    while "run 1/" not in child.stderr.readline():
+        assert child.poll() is None
+    child.send_signal(signal.SIGINT)
+    _, errors = child.communicate(timeout=60)
+    assert (child.returncode, errors.splitlines()[-1]) == (130, "interrupted")
+    assert list(scratch.iterdir()) == []
 
 
 def test_bench_table1_refuses(cli):

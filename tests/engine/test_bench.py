@@ -7,7 +7,7 @@ from statistics import median
 import pytest
 
 from lgrasp.engine import bench as bench_module
-from lgrasp.engine.bench import Bench, bench
+from lgrasp.engine.bench import Bench
 from lgrasp.engine.charts import check_plot, draw_table
 from lgrasp.engine.generate import generate
 from lgrasp.engine.jobs import JobConfig, Published, in_folder, load_config, plan_jobs
@@ -37,7 +37,8 @@ def runs(monkeypatch):
 
 
 def test_yield_goes_from_run_to_run(job, runs):
-    results = bench([job(object="tiny", rows=40), job(object="tiny", rows=20)], repeat=2)
+    with Bench() as several:
+        results = several.measure([job(object="tiny", rows=40), job(object="tiny", rows=20)], repeat=2)
     trials = [(trial.rows, trial.rate) for trial, _ in runs]
     after = [outcome.rate for _, outcome in runs]
     # two probes, then the jobs in turns; each begins with what the run before of the same job measured
@@ -153,12 +154,13 @@ def test_resume_keeps_measured_cells(table, tmp_path):
 
 
 def test_measured_cells_are_left_alone(table, job):
-    assert list(measure_table(table, config(), job().cache)) == []
+    assert list(measure_table(Bench(), table, config(), job().cache)) == []
 
 
 def test_cells_that_cannot_be_measured(job):
     chosen = config(objects=("absent", "tiny"), pipelines=(QUICK,), rows=10)
-    parts = list(measure_table(new_table(chosen, repeat=1, baseline_rows=1), chosen, job().cache))
+    with Bench() as several:
+        parts = list(measure_table(several, new_table(chosen, repeat=1, baseline_rows=1), chosen, job().cache))
     assert [len(table["cells"]) for table, _ in parts] == [1, 2]
     absent, tiny = parts[-1][0]["cells"]
     assert "absent" in absent["error"]
