@@ -63,9 +63,8 @@ def show_hand(
     ]
     print_pairs([(what, " ".join(text.split())) for what, text in pairs])
     typer.echo()
-    finger = {None: "shared"}
     rows = [
-        (finger.get(j["finger"], str(j["finger"])), j["name"], f"{j['lower']:.3f}", f"{j['upper']:.3f}")
+        ("shared" if j["finger"] is None else str(j["finger"]), j["name"], f"{j['lower']:.3f}", f"{j['upper']:.3f}")
         for j in hand["joints"]
     ]
     print_table(("finger", "joint", "lower", "upper"), rows, right=("lower", "upper"))

@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 
+from lgrasp.device.kinematics import MAX_JOINTS
 from lgrasp.errors import HandError
 from lgrasp.hand.anatomy import Anatomy, finger_names, held_value, study_anatomy
 from lgrasp.hand.palmar import sample_bodies
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.survey import Survey, survey_hand
+from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 
 __all__ = ["draft_spec"]
@@ -18,6 +20,7 @@ _LEAST_EXTENT, _MOST_EXTENT = 0.02, 3.0  # [m] of a hand, an arm included
 _OPEN_DRAWS = 800
 _ARM_TRIALS = 5
 _FEW_DRIVES = 2.0  # a finger, on average
+_SHARED_VALUES = {1: 4, 2: 3, 3: 2}  # values of each shared joint, by their number
 
 
 def draft_spec(
@@ -82,7 +85,41 @@ def draft_spec(
         for g, finger in enumerate(names)
     }
     said += [f"note: {note}" for note in survey.model.notes]
-    return HandSpec.model_validate(data), said
+    spec = HandSpec.model_validate(data)
+    return (spec, said) if jaws is not None else _with_shared(urdf, survey, spec, said)
+
+
+def _with_shared(urdf: Urdf, survey: Survey, spec: HandSpec, said: list[str]) -> tuple[HandSpec, list[str]]:
+    """Locked joints that move several fingers take a few values instead, unless the palm rides on them."""
+    spread = [n for n in spec.locked if n not in survey.anatomy.carrying]
+    count = _SHARED_VALUES.get(len(spread), 0)
+    if count == 0:
+        return spec, said
+    by_name = {j.name: j for j in urdf.joints}
+    shared = {n: _around(spec.locked[n], by_name[n].lower, by_name[n].upper, count) for n in spread}
+    free = spec.model_copy(
+        update={"locked": {n: v for n, v in spec.locked.items() if n not in shared}, "shared": shared}
+    )
+    try:
+        tree = build_tree(urdf, free)
+    except HandError:  # a joint that mimics one of them does not reach as far
+        return spec, said
+    static = {n for n, b in zip(tree.link_names, tree.link_body, strict=True) if b == 0}
+    if not static.issuperset(spec.palm.links) or max(np.diff(tree.joint_first)) > MAX_JOINTS:
+        return spec, said
+    told = [line for line in said if not any(line.startswith(f"joint '{n}' is locked") for n in shared)]
+    told += [
+        f"joint '{n}' moves several fingers: poses take it at {', '.join(f'{v:g}' for v in values)} (shared)"
+        for n, values in shared.items()
+    ]
+    return free.model_copy(update={"static_links": tuple(n for n in spec.static_links if n in static)}), told
+
+
+def _around(best: float, lower: float, upper: float, count: int) -> tuple[float, ...]:
+    """Values spread over a range, the nearest of them moved to the best one."""
+    values = [round(lower + (i + 0.5) / count * (upper - lower), 4) for i in range(count)]
+    values[int(np.argmin(np.abs(np.array(values) - best)))] = best
+    return tuple(values)
 
 
 def _check_coupled(urdf: Urdf, anatomy: Anatomy) -> None:

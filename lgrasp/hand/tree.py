@@ -271,8 +271,11 @@ def _group(
         return name
 
     for name in label:
-        for other in (parent_of[name], drive[name][0]):
-            if other is not None and other not in framing:
+        up = parent_of[name]
+        while up is not None and up in framing:
+            up = parent_of[up]
+        for other in (up, drive[name][0]):
+            if other is not None:
                 label[find(name)] = find(other)
     members: dict[str, set[str]] = {}
     for name in label:

@@ -24,6 +24,21 @@ def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
         "# Joints held at a value [rad or m]; lgrasp does not move them. Free one by deleting its line.",
     ]
     lines += _mapping("locked", spec.locked)
+    lines += ["", "# Joints that move several fingers: every pose of the object takes one of these values [rad or m]."]
+    lines += (
+        ["shared:", *(f"  {_plain(n)}: {_plain(list(v))}" for n, v in spec.shared.items())]
+        if spec.shared
+        else ["shared: {}"]
+    )
+    lines += [
+        "",
+        "# Couplings that the URDF does not state: `joint: {joint: its source, multiplier: 1.0, offset: 0.0}`.",
+    ]
+    lines += (
+        ["mimic:", *(f"  {_plain(n)}: {_plain(c.model_dump())}" for n, c in spec.mimic.items())]
+        if spec.mimic
+        else ["mimic: {}"]
+    )
     lines += ["", "# Links that do not move with any finger."]
     lines += [f"static_links: {_plain(list(spec.static_links))}"]
     lines += [

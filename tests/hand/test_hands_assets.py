@@ -1,6 +1,7 @@
 """The shipped hands: primitive geometry, and the kinematics of the real models."""
 
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +24,8 @@ HANDS = {
     "leap": (16, 16, 4),
     "shadow": (24, 22, 5),
     "dclaw": (9, 9, 3),
-    "barrett": (8, 3, 3),
-    "schunk_svh": (20, 8, 3),
+    "barrett": (8, 4, 3),
+    "schunk_svh": (20, 9, 3),
 }
 REAL = {name: ASSETS / name / f"{name}.urdf" for name in HANDS} | {"barrett": ASSETS / "barrett" / "barrett_mimic.urdf"}
 
@@ -90,9 +91,11 @@ def test_groups_and_sizes(name):
 
 def test_open_posture_is_inside_the_limits(name):
     r, joints = rules(name), ours(name).joint_map
-    driven = {j for j in ours(name).actuated_joint_names if j not in r["locked"]}
+    held = [(joint, value) for joint, value in r.get("locked", {}).items()]
+    held += [(joint, value) for joint, values in r.get("shared", {}).items() for value in values]
+    driven = {j for j in ours(name).actuated_joint_names if j not in dict(held)}
     assert set(r["open_posture"]) == driven
-    for joint, value in {**r["locked"], **r["open_posture"]}.items():
+    for joint, value in [*held, *r["open_posture"].items()]:
         assert joints[joint].limit.lower <= value <= joints[joint].limit.upper, joint
 
 
@@ -167,24 +170,27 @@ def test_open_posture_is_free_of_self_collision(name):
         return coal.Sphere(geometry.sphere.radius)
 
     r, urdf = rules(name), ours(name)
-    urdf.update_cfg({k: v for k, v in {**r["locked"], **r["open_posture"]}.items() if k in urdf.actuated_joint_names})
-    solids = [
-        (link, solid(shape.geometry), urdf.get_transform(link) @ shape.origin)
-        for link in urdf.link_map
-        for shape in urdf.link_map[link].collisions
-    ]
     near = {frozenset((joint.parent, joint.child)) for joint in urdf.joint_map.values()}
     static = set(r["static_links"])
-    for i, (a, solid_a, T_a) in enumerate(solids):
-        for b, solid_b, T_b in solids[i + 1 :]:
-            if a == b or frozenset((a, b)) in near or {a, b} <= static:
-                continue
-            distance = coal.distance(
-                solid_a,
-                coal.Transform3s(T_a[:3, :3], T_a[:3, 3]),
-                solid_b,
-                coal.Transform3s(T_b[:3, :3], T_b[:3, 3]),
-                coal.DistanceRequest(),
-                coal.DistanceResult(),
-            )
-            assert distance > 5e-4, (a, b)
+    settings = product(*([(joint, value) for value in values] for joint, values in r.get("shared", {}).items()))
+    for setting in settings:
+        posture = {**r.get("locked", {}), **r["open_posture"], **dict(setting)}
+        urdf.update_cfg({k: v for k, v in posture.items() if k in urdf.actuated_joint_names})
+        solids = [
+            (link, solid(shape.geometry), urdf.get_transform(link) @ shape.origin)
+            for link in urdf.link_map
+            for shape in urdf.link_map[link].collisions
+        ]
+        for i, (a, solid_a, T_a) in enumerate(solids):
+            for b, solid_b, T_b in solids[i + 1 :]:
+                if a == b or frozenset((a, b)) in near or {a, b} <= static:
+                    continue
+                distance = coal.distance(
+                    solid_a,
+                    coal.Transform3s(T_a[:3, :3], T_a[:3, 3]),
+                    solid_b,
+                    coal.Transform3s(T_b[:3, :3], T_b[:3, 3]),
+                    coal.DistanceRequest(),
+                    coal.DistanceResult(),
+                )
+                assert distance > 5e-4, (a, b)

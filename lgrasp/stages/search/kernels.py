@@ -211,7 +211,13 @@ def try_starts(
             for b in range(a + 1, k):
                 h = owner[b]
                 group_forward(hand.kin, h, q[row, h, chosen[h]], Xb, 0)
-                if not group_pairs_clear(hand, g + 1, h + 1, Xa, 0, Xb, 0, margin):
+                # an added finger may come before in the order of groups
+                clear = bool(True)
+                if g < h:
+                    clear = group_pairs_clear(hand, g + 1, h + 1, Xa, 0, Xb, 0, margin)
+                else:
+                    clear = group_pairs_clear(hand, h + 1, g + 1, Xb, 0, Xa, 0, margin)
+                if not clear:
                     return
     for g in range(G):
         chosen_out[row, lane, g] = chosen[g]

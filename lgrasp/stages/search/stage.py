@@ -12,7 +12,7 @@ from lgrasp.stages.search.params import SearchParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 4
+VERSION = 5
 
 _CPU_LANES = 2
 _GPU_LANES = 12

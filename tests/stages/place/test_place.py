@@ -53,7 +53,7 @@ def test_kept_candidates_are_what_the_kernel_kept(context):
 
 
 def test_palm_contact(context, inputs):
-    table, _ = place(context, 0, 1500, canonical=0, exhaustive=0, palm=1)
+    table, _ = place(context, 0, 1500, canonical=0, exhaustive=0, pinch=0, palm=1)
     arrays, hand, obj = pose_arrays(table), inputs.hand.model, inputs.object.model
     assert len(table) > 10
     palm, surface = arrays["palm_point"], arrays["palm_surface"]
@@ -64,9 +64,9 @@ def test_palm_contact(context, inputs):
     np.testing.assert_allclose(R.apply(obj.contact_normals[surface]), -hand.contact_normals[palm], atol=1e-4)
 
 
-@pytest.mark.parametrize("source", ["canonical", "exhaustive"])
+@pytest.mark.parametrize("source", ["canonical", "exhaustive", "pinch"])
 def test_other_sources_claim_no_palm(context, source):
-    weights = {"canonical": 0.0, "exhaustive": 0.0, "palm": 0.0, source: 1.0}
+    weights = {"canonical": 0.0, "exhaustive": 0.0, "pinch": 0.0, "palm": 0.0, source: 1.0}
     arrays = pose_arrays(place(context, **weights)[0])
     assert len(arrays["index"]) > 5
     assert (arrays["palm_point"] == -1).all()
@@ -74,14 +74,14 @@ def test_other_sources_claim_no_palm(context, source):
 
 
 def test_weights_need_not_sum_to_one(context):
-    a = pose_arrays(place(context, canonical=0.6, exhaustive=0.3, palm=0.1)[0])
-    b = pose_arrays(place(context, canonical=6, exhaustive=3, palm=1)[0])
+    a = pose_arrays(place(context, canonical=0.6, exhaustive=0.3, pinch=0.3, palm=0.1)[0])
+    b = pose_arrays(place(context, canonical=6, exhaustive=3, pinch=3, palm=1)[0])
     np.testing.assert_array_equal(a["index"], b["index"])
 
 
 def test_all_weights_zero(context):
     with pytest.raises(ConfigError, match="canonical"):
-        place(context, canonical=0, exhaustive=0, palm=0)
+        place(context, canonical=0, exhaustive=0, pinch=0, palm=0)
 
 
 def test_shards_differ(context):
