@@ -3,6 +3,7 @@
 __all__ = [
     "CacheError",
     "ConfigError",
+    "DecomposeError",
     "DeviceError",
     "HandError",
     "LgraspError",
@@ -25,6 +26,10 @@ class HandError(LgraspError):
 
 class ObjectError(LgraspError):
     """An object mesh (file, scale or name) cannot be used."""
+
+
+class DecomposeError(LgraspError):
+    """A mesh could not be cut into convex pieces; callers go on with its hull."""
 
 
 class ConfigError(LgraspError):

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("torch", "warp", "trimesh", "yourdfpy", "h5py", "scipy", "numpy", "coacd", "pytorch_kinematics")
 DATA = ("hands", "objects", "pipelines", "configs")
 
-SHARED = {"clusters", "config", "errors", "paths", "seeding"}
+SHARED = {"clusters", "config", "decompose", "errors", "paths", "seeding"}
 """Modules of lgrasp that everything may import; they import one another only."""
 
 MAY_IMPORT = {

@@ -6,8 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from dataclasses import field as with_default
+from functools import partial
 from pathlib import Path
 
+from lgrasp.decompose import decompose
 from lgrasp.device.runtime import Device
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.errors import ObjectError
@@ -96,9 +98,12 @@ def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str
 
 def load_hand(cache: Cache, keys: InputKeys, device: Device) -> tuple[HandModel, bool]:
     """The HandModel from the cache, or built and cached; and whether it was a hit."""
-    arrays, hit = cache.get(
-        "hand", keys.hand, lambda: build_hand(keys.source.urdf, keys.source.spec, device.alias).to_arrays()
-    )
+
+    def make():
+        source, cut = keys.source, partial(decompose, store=cache)
+        return build_hand(source.urdf, source.spec, device.alias, decompose=cut).to_arrays()
+
+    arrays, hit = cache.get("hand", keys.hand, make)
     return HandModel.from_arrays(arrays), hit
 
 

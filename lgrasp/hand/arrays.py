@@ -11,7 +11,18 @@ from lgrasp.device.runtime import KERNEL_OPTIONS, start
 from lgrasp.device.sdf import Sdf
 from lgrasp.hand.model import HandModel
 
-__all__ = ["Contacts", "Hand", "HandArrays", "body_poses", "hand_grid", "point_jacobians", "upload_hand"]
+__all__ = [
+    "Contacts",
+    "Hand",
+    "HandArrays",
+    "Overlaps",
+    "body_poses",
+    "hand_grid",
+    "overlap_grid",
+    "point_jacobians",
+    "pose_matrices",
+    "upload_hand",
+]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -38,6 +49,20 @@ class Contacts:
 
 
 @wp.struct
+class Overlaps:
+    """Link pairs tested on their true surfaces (names of a HandModel without ``overlap_``)."""
+
+    first: wp.array(dtype=wp.int32)
+    sides: wp.array(dtype=wp.vec4i)
+    points: wp.array(dtype=wp.vec3)
+    grid_first: wp.array(dtype=wp.int32)
+    grid_shape: wp.array(dtype=wp.vec3i)
+    grid_origin: wp.array(dtype=wp.vec3)
+    grid_inv_cell: wp.array(dtype=wp.float32)
+    grid_values: wp.array(dtype=wp.float32)
+
+
+@wp.struct
 class Hand:
     """All of a hand that kernels read."""
 
@@ -53,6 +78,7 @@ class Hand:
     piece_grid: wp.array(dtype=wp.int32)  # distance grid of the piece's link, -1 when it is no contact link
     pair_first: wp.array(dtype=wp.int32)
     pairs: wp.array(dtype=wp.vec2i)
+    overlaps: Overlaps
     box_low: wp.vec3
     box_high: wp.vec3
 
@@ -144,6 +170,16 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
     hand.piece_grid = put(np.array([grid_of.get(int(link), -1) for link in model.piece_link], np.int32), wp.int32)
     hand.pair_first = put(model.pair_first, wp.int32)
     hand.pairs = put(model.pairs, wp.vec2i)
+    overlaps = Overlaps()
+    overlaps.first = put(model.overlap_first, wp.int32)
+    overlaps.sides = put(model.overlap_sides, wp.vec4i)
+    overlaps.points = put(model.overlap_points, wp.vec3)
+    overlaps.grid_first = put(model.overlap_grid_first, wp.int32)
+    overlaps.grid_shape = put(model.overlap_grid_shape, wp.vec3i)
+    overlaps.grid_origin = put(model.overlap_grid_origin, wp.vec3)
+    overlaps.grid_inv_cell = put(1.0 / model.overlap_grid_cell, wp.float32)
+    overlaps.grid_values = put(model.overlap_grid_values, wp.float32)
+    hand.overlaps = overlaps
     hand.box_low = wp.vec3(*map(float, model.canonical_box[0]))
     hand.box_high = wp.vec3(*map(float, model.canonical_box[1]))
     return HandArrays(model, device, hand, tuple(meshes))
@@ -152,6 +188,21 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
 @wp.func
 def hand_grid(c: Contacts, i: wp.int32):
     """Distance grid of contact link i."""
+    s = Sdf()
+    s.values = c.grid_values
+    s.first = c.grid_first[i]
+    n = c.grid_shape[i]
+    s.nx = n[0]
+    s.ny = n[1]
+    s.nz = n[2]
+    s.origin = c.grid_origin[i]
+    s.inv_cell = c.grid_inv_cell[i]
+    return s
+
+
+@wp.func
+def overlap_grid(c: Overlaps, i: wp.int32):
+    """Distance grid of side i."""
     s = Sdf()
     s.values = c.grid_values
     s.first = c.grid_first[i]
@@ -219,6 +270,16 @@ def body_poses(hand: HandArrays, q: np.ndarray) -> np.ndarray:
     queries = wp.array(q, dtype=wp.float32, device=hand.device)
     wp.launch(_body_poses, dim=len(q), inputs=[hand.struct.kin, queries], outputs=[out], device=hand.device)
     return out.numpy().reshape(len(q), bodies, 7)
+
+
+def pose_matrices(poses: np.ndarray) -> np.ndarray:
+    """(N, 4, 4) of Warp transforms (N, 7) [x y z, qx qy qz qw]."""
+    from scipy.spatial.transform import Rotation
+
+    T = np.broadcast_to(np.eye(4), (len(poses), 4, 4)).copy()
+    T[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
+    T[:, :3, 3] = poses[:, :3]
+    return T
 
 
 def point_jacobians(hand: HandArrays, q: np.ndarray, body: np.ndarray, point: np.ndarray) -> np.ndarray:

@@ -1,13 +1,17 @@
-"""Are parts of a hand apart? Bounding balls first, true convex distance after."""
+"""Are parts of a hand apart? Bounding balls first, true convex distance after; sockets on their true surfaces."""
 
 import warp as wp
 
 from lgrasp.device.convex import pieces_clear
-from lgrasp.hand.arrays import Hand
+from lgrasp.device.sdf import sdf_value
+from lgrasp.hand.arrays import Hand, overlap_grid
+from lgrasp.hand.overlap import OVERLAP
 
 __all__ = ["group_pairs_clear"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+_OVERLAP = wp.constant(OVERLAP)
 
 
 @wp.func
@@ -21,7 +25,8 @@ def group_pairs_clear(
     at_b: wp.int32,
     margin: wp.float32,
 ):
-    """Are the listed piece pairs of groups a and b (a <= b; 0 = static base, g + 1 = group g) all beyond the margin?
+    """Are the listed piece pairs of groups a and b (a <= b; 0 = static base, g + 1 = group g) all beyond the margin,
+    and does no pair that is tested on its true surfaces overlap by more than OVERLAP?
 
     Xa, Xb: local arrays with the two groups' body poses from places at_a, at_b on (Xa is not read for the base).
     """
@@ -51,4 +56,22 @@ def group_pairs_clear(
             continue
         if not pieces_clear(hand.pieces, i, j, wp.transform_inverse(Ti) * Tj, margin):
             return False
+    for k in range(hand.overlaps.first[key], hand.overlaps.first[key + 1]):
+        side = hand.overlaps.sides[k]
+        Tp = wp.transform_identity()
+        Tg = wp.transform_identity()
+        # which of the two groups a body is in; for a = b either is right
+        if hand.body_group[side[0]] + 1 == b:
+            Tp = Xb[side[0] - jb]
+        elif a > 0:
+            Tp = Xa[side[0] - ja]
+        if hand.body_group[side[1]] + 1 == b:
+            Tg = Xb[side[1] - jb]
+        elif a > 0:
+            Tg = Xa[side[1] - ja]
+        grid = overlap_grid(hand.overlaps, k)
+        T = wp.transform_inverse(Tg) * Tp
+        for i in range(side[2], side[3]):
+            if sdf_value(grid, wp.transform_point(T, hand.overlaps.points[i])) < -_OVERLAP:
+                return False
     return True

@@ -4,15 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-import warp as wp
 
-from lgrasp.device.runtime import KERNEL_OPTIONS, start
 from lgrasp.errors import HandError
+from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.spec import Cone, HandSpec
 
-__all__ = ["LinkGrid", "check_contact_links", "cover_patches", "finger_points", "link_grid", "palm_points"]
-
-wp.set_module_options(KERNEL_OPTIONS)
+__all__ = ["LinkGrid", "box_grid", "check_contact_links", "cover_patches", "finger_points", "link_grid", "palm_points"]
 
 _GRID_CELL = 8.0e-4
 _GRID_PAD = 6.0e-3
@@ -23,42 +20,34 @@ _PATCH_CONE = np.radians(36.0)
 
 @dataclass(frozen=True)
 class LinkGrid:
-    """Signed distance grid of one contact link in its body frame."""
+    """Signed distance grid of one link in its body frame."""
 
     values: np.ndarray  # (nx, ny, nz) f32 [m]
     origin: np.ndarray  # (3,) [m]
     cell: float
 
 
-@wp.kernel
-def _mesh_distance(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), distance_out: wp.array(dtype=wp.float32)):
-    i = wp.tid()
-    q = wp.mesh_query_point_sign_normal(mesh, points[i], 1.0)
-    p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
-    distance_out[i] = q.sign * wp.length(points[i] - p)
-
-
-def _signed_distance(mesh: trimesh.Trimesh, points: np.ndarray, device: str) -> np.ndarray:
-    start()
-    handle = wp.Mesh(
-        wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device=device),
-        wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device=device),
-    )
-    out = wp.empty(len(points), dtype=wp.float32, device=device)
-    queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
-    wp.launch(_mesh_distance, dim=len(points), inputs=[handle.id, queries], outputs=[out], device=device)
-    return out.numpy()
-
-
 def link_grid(meshes: list[trimesh.Trimesh], device: str = "cpu") -> LinkGrid:
     """Distance grid of the union of a link's solids (already in the body frame)."""
     low = np.min([m.bounds[0] for m in meshes], 0) - _GRID_PAD
     high = np.max([m.bounds[1] for m in meshes], 0) + _GRID_PAD
-    cell = max(_GRID_CELL, float((high - low).max()) / 80)
+    return box_grid(meshes, low, high, max(_GRID_CELL, float((high - low).max()) / 80), device)
+
+
+def box_grid(
+    meshes: list[trimesh.Trimesh],
+    low: np.ndarray,
+    high: np.ndarray,
+    cell: float,
+    device: str = "cpu",
+    *,
+    winding: bool = False,
+) -> LinkGrid:
+    """Distance grid of the union of a link's solids in a box with corners ``low`` and ``high`` (3,) [m]."""
     shape = np.ceil((high - low) / cell).astype(int) + 1
     axes = [low[a] + cell * np.arange(shape[a]) for a in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    values = np.min([_signed_distance(m, points, device) for m in meshes], 0)
+    values = np.min([signed_distance(m, points, device, winding=winding) for m in meshes], 0)
     return LinkGrid(values.reshape(shape).astype(np.float32), low.astype(np.float32), cell)
 
 
@@ -91,7 +80,7 @@ def finger_points(
         keep &= ~_in_cone(normals @ R, cone)
     # outside every solid of the link, and free above
     for probe, least in ((1e-4, 0.0), (8e-3, 5e-3)):
-        distance = np.min([_signed_distance(m, points + probe * normals, device) for m in meshes], 0)
+        distance = np.min([signed_distance(m, points + probe * normals, device) for m in meshes], 0)
         keep &= distance > least
     return _thin(points[keep], normals[keep], _POINTS_PER_LINK, rng)
 
@@ -109,7 +98,7 @@ def palm_points(
     keep = np.zeros(len(points), bool)
     for cone in allowed:
         keep |= _in_cone(normals @ R, cone)
-    distance = np.min([_signed_distance(m, points + 1e-4 * normals, device) for m in meshes], 0)
+    distance = np.min([signed_distance(m, points + 1e-4 * normals, device) for m in meshes], 0)
     keep &= distance > 0
     return _thin(points[keep], normals[keep], _POINTS_PER_LINK, rng)
 

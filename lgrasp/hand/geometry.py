@@ -7,7 +7,9 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
-from lgrasp.errors import HandError
+from lgrasp.decompose import Decompose
+from lgrasp.errors import DecomposeError, HandError
+from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.urdf import Geometry, Urdf
 
 __all__ = [
@@ -17,6 +19,7 @@ __all__ = [
     "convex_pieces",
     "geometry_mesh",
     "inner_spheres",
+    "is_dented",
     "surface_samples",
     "thin_mesh",
     "transform_points",
@@ -25,6 +28,10 @@ __all__ = [
 _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by half of it leaves +-0.2 mm
 _CYLINDER_SIDES = 32
 _MOST_BODIES = 16
+_FILLED = 0.9  # a body that fills less of its hull ...
+_DENT = 4.0e-3  # ... and lies deeper below it [m] somewhere is cut into convex pieces
+_MOST_PIECES = 8  # of one collision element; kernels go through all of them
+_UNCOVERED = 7.0e-4  # pieces may leave out no more of the true surface [m]
 MOST_FACES = 40_000
 """Collision meshes with more faces are thinned to about this many."""
 
@@ -150,35 +157,103 @@ def convex_piece(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> Piece
         points = np.vstack([np.column_stack([ring, np.full(len(ring), z)]) for z in (-h, h)])
         return Piece(*_hull(points), 0.0)
     try:
-        vertices, planes = _hull(np.asarray(mesh.vertices, float))
-        count = 24
-        while len(vertices) > 48 and count <= 384:
-            d = _directions(count)
-            kept = np.unique(np.argmax(vertices @ d.T, axis=0))
-            thin, thin_planes = _hull(vertices[kept])
-            error = float((vertices @ thin_planes[:, :3].T - thin_planes[:, 3]).max())
-            if error <= _HULL_ERROR:
-                return Piece(thin, thin_planes, max(error, 0.0) / 2)
-            count *= 2
+        return _hull_piece(np.asarray(mesh.vertices, float))
     except QhullError:
         raise HandError(
             f"URDF {urdf.path}: collision mesh {geometry.mesh} is flat; collision bodies need volume"
         ) from None
+
+
+def _hull_piece(points: np.ndarray) -> Piece:
+    """The hull of points (n, 3), thinned and inflated so that it is true within half of _HULL_ERROR."""
+    vertices, planes = _hull(points)
+    count = 24
+    while len(vertices) > 48 and count <= 384:
+        d = _directions(count)
+        kept = np.unique(np.argmax(vertices @ d.T, axis=0))
+        thin, thin_planes = _hull(vertices[kept])
+        error = float((vertices @ thin_planes[:, :3].T - thin_planes[:, 3]).max())
+        if error <= _HULL_ERROR:
+            return Piece(thin, thin_planes, max(error, 0.0) / 2)
+        count *= 2
     return Piece(vertices, planes, 0.0)
 
 
-def convex_pieces(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> list[Piece]:
-    """Convex pieces of one collision element: one per connected body of its mesh, so that gaps between bodies stay.
+def convex_pieces(
+    urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh, decompose: Decompose | None = None
+) -> tuple[list[Piece], str]:
+    """Convex pieces of one collision element, and in words how they differ from it ("": hardly).
+
+    Every connected body of a mesh is a piece of its own, so that gaps between bodies stay. A dented body is cut by
+    ``decompose`` (None: it is not); where that fails its hull is used.
 
     Raises:
         HandError: a flat or degenerate mesh.
     """
-    if geometry.kind == "mesh" and 1 < mesh.body_count <= _MOST_BODIES:
+    if geometry.kind != "mesh":
+        return [convex_piece(urdf, geometry, mesh)], ""
+    bodies, hulls = [mesh], []
+    if 1 < mesh.body_count <= _MOST_BODIES:
+        bodies = list(mesh.split(only_watertight=False))
+    try:
+        hulls = [convex_piece(urdf, geometry, body) for body in bodies]
+    except HandError:
+        if len(bodies) == 1:
+            raise
+        # a flat part: its hull has no volume, that of the whole may
+        bodies, hulls = [mesh], [convex_piece(urdf, geometry, mesh)]
+    dented = [is_dented(body) for body in bodies]
+    if not any(dented):
+        return hulls, ""
+    share = 100 * abs(mesh.volume) / sum(hull.hull_volume for hull in hulls)
+    said = f"mesh {geometry.mesh} fills {share:.0f} % of its convex hull"
+    if decompose is None:
+        return hulls, said
+    pieces, failures = [], []
+    for body, hull, cut in zip(bodies, hulls, dented, strict=True):
+        parts = [hull]
+        if cut:
+            try:
+                parts = _cut(body, decompose, max(2, _MOST_PIECES // sum(dented)))
+            except DecomposeError as error:
+                failures.append(str(error))
+        pieces += parts
+    said += f"; {len(pieces)} convex pieces" if len(pieces) > len(hulls) else "; the hull is used"
+    return pieces, said + (f" ({failures[0]})" if failures else "")
+
+
+def is_dented(body: trimesh.Trimesh) -> bool:
+    """Does a body differ much from its hull: by a tenth of its volume, and by 4 mm somewhere?
+
+    Raises:
+        QhullError: a flat body.
+    """
+    hull = ConvexHull(np.asarray(body.vertices, float))
+    if abs(body.volume) >= _FILLED * hull.volume:
+        return False
+    shell = trimesh.Trimesh(hull.points, hull.simplices, process=False)
+    points = trimesh.sample.sample_surface(shell, 2000, seed=0)[0]
+    return bool(np.abs(signed_distance(body, points)).max() > _DENT)
+
+
+def _cut(body: trimesh.Trimesh, decompose: Decompose, most: int) -> list[Piece]:
+    """Convex pieces of a dented body.
+
+    Raises:
+        DecomposeError: see :func:`lgrasp.decompose.decompose`; also pieces that leave out some of the surface.
+    """
+    found = decompose(np.asarray(body.vertices), np.asarray(body.faces), threshold=_DENT, max_pieces=most)
+    pieces = []
+    for vertices in found:
         try:
-            return [convex_piece(urdf, geometry, part) for part in mesh.split(only_watertight=False)]
-        except HandError:
-            pass  # a flat part: its hull has no volume, that of the whole may
-    return [convex_piece(urdf, geometry, mesh)]
+            pieces.append(_hull_piece(vertices))
+        except QhullError:  # a sliver; the surface tells whether it is missed
+            continue
+    points = np.vstack([body.vertices, trimesh.sample.sample_surface(body, 4000, seed=0)[0]])
+    left = float(np.min([piece.depth(points) for piece in pieces], 0).max()) if pieces else np.inf
+    if left > _UNCOVERED:
+        raise DecomposeError(f"its convex pieces leave out {1e3 * left:.1f} mm of the surface")
+    return pieces
 
 
 def inner_spheres(piece: Piece, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -10,10 +10,12 @@ import numpy as np
 import trimesh
 
 from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
+from lgrasp.decompose import Decompose
 from lgrasp.device.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import LinkGrid, check_contact_links, cover_patches, finger_points, link_grid, palm_points
 from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh, inner_spheres, surface_samples
+from lgrasp.hand.overlap import overlap_arrays
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
@@ -60,6 +62,15 @@ class HandModel:
     # self-collision: piece pairs that must stay apart, by (group a, group b), a <= b
     pair_first: np.ndarray  # ((G + 1)^2 + 1,)
     pairs: np.ndarray  # (Q, 2)
+    # link pairs that nearly always touch, on their true surfaces: points of one link against a grid of the other
+    overlap_first: np.ndarray  # ((G + 1)^2 + 1,)
+    overlap_sides: np.ndarray  # (S, 4) body of the points, body of the grid, first and last + 1 of the points
+    overlap_points: np.ndarray  # (P, 3)
+    overlap_grid_first: np.ndarray  # (S + 1,)
+    overlap_grid_shape: np.ndarray  # (S, 3)
+    overlap_grid_origin: np.ndarray  # (S, 3)
+    overlap_grid_cell: np.ndarray  # (S,)
+    overlap_grid_values: np.ndarray  # flat
     # contact surfaces; palm points are those of group G (last)
     contact_first: np.ndarray  # (G + 2,)
     contact_points: np.ndarray  # (C, 3)
@@ -149,8 +160,12 @@ def _stack(parts: list[np.ndarray], width: int, dtype: type = np.float32) -> np.
     return np.vstack(parts).astype(dtype) if parts else np.zeros((0, width), dtype)
 
 
-def build_hand(urdf_path: Path, spec: HandSpec, device: str = "cpu") -> HandModel:
+def build_hand(
+    urdf_path: Path, spec: HandSpec, device: str = "cpu", *, decompose: Decompose | None = None
+) -> HandModel:
     """Build a HandModel from a URDF and its rules; ``device`` answers the geometric queries.
+
+    Dented collision bodies are cut into convex pieces by ``decompose``; without it their hulls are taken.
 
     Raises:
         HandError: see :func:`read_urdf`, :func:`build_tree`; also a hand without collision geometry, or with a group of
@@ -161,7 +176,7 @@ def build_hand(urdf_path: Path, spec: HandSpec, device: str = "cpu") -> HandMode
     _check_size(spec, tree)
     check_contact_links(spec, tree.link_names, dict(urdf.links))
     rng = np.random.default_rng(0)
-    solids = _Solids(urdf, tree, rng)
+    solids = _Solids(urdf, tree, rng, decompose)
     contacts = _contacts(spec, tree, solids, rng, device)
     bodies = len(tree.joint_dof) + 1
     order = np.argsort([p[0] for p in solids.pieces], kind="stable")
@@ -192,12 +207,13 @@ def build_hand(urdf_path: Path, spec: HandSpec, device: str = "cpu") -> HandMode
         canonical_box=np.array([spec.canonical_box.min, spec.canonical_box.max], np.float32),
         pair_first=np.zeros((tree.groups + 1) ** 2 + 1, np.int32),
         pairs=np.zeros((0, 2), np.int32),
+        **overlap_arrays([], [], (tree.groups + 1) ** 2),
         **arrays,
         **contacts,
     )
     from lgrasp.hand.pairs import with_pairs  # needs the kernels, which need a model
 
-    return with_pairs(model, {(j.parent, j.child) for j in urdf.joints}, device)
+    return with_pairs(model, {(j.parent, j.child) for j in urdf.joints}, solids.meshes, solids.dented, device)
 
 
 def _check_size(spec: HandSpec, tree: Tree) -> None:
@@ -242,24 +258,22 @@ def _body_sphere(pieces: list[Piece]) -> np.ndarray:
 class _Solids:
     """Per link: meshes in the body frame; flat lists of pieces, spheres and samples tagged with their body."""
 
-    def __init__(self, urdf: Urdf, tree: Tree, rng: np.random.Generator) -> None:
+    def __init__(self, urdf: Urdf, tree: Tree, rng: np.random.Generator, decompose: Decompose | None) -> None:
         self.meshes: dict[str, list[trimesh.Trimesh]] = {}
         self.pieces: list[tuple[int, int, Piece]] = []
         self.spheres: list[tuple[int, np.ndarray]] = []
         self.samples: list[tuple[int, np.ndarray]] = []
         self.notes: list[str] = []
+        self.dented: set[str] = set()
         for index, link in enumerate(tree.link_names):
             body, T_body_link = int(tree.link_body[index]), tree.T_body_link[index]
             for geometry in urdf.links[link]:
                 T = T_body_link @ geometry.T_link_geometry
                 mesh = geometry_mesh(urdf, geometry)
-                pieces = convex_pieces(urdf, geometry, mesh)
-                filled = sum(p.hull_volume for p in pieces)
-                if geometry.kind == "mesh" and abs(mesh.volume) < 0.9 * filled:
-                    share = 100 * abs(mesh.volume) / filled
-                    self.notes.append(
-                        f"link '{link}': mesh {geometry.mesh} fills {share:.0f} % of its convex hull; the hull is used"
-                    )
+                pieces, said = convex_pieces(urdf, geometry, mesh, decompose)
+                if said:
+                    self.notes.append(f"link '{link}': {said}")
+                    self.dented.add(link)
                 mesh.apply_transform(T)
                 self.meshes.setdefault(link, []).append(mesh)
                 for piece in pieces:

@@ -1,20 +1,25 @@
 """Which pieces of a hand must stay apart: all of non-adjacent links, save pairs that touch in every posture."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import trimesh
 import warp as wp
 
 from lgrasp.device.convex import Pieces, pieces_clear
 from lgrasp.device.runtime import KERNEL_OPTIONS, start
-from lgrasp.hand.arrays import body_poses, upload_hand
+from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.overlap import OVERLAP, Side, overlap_arrays, overlap_sides
 
 __all__ = ["pieces_touch", "with_pairs"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _POSTURES = 256
+_NEARLY = 0.95  # of all postures
+_TOUCH = 5.0e-5  # [m] that distance grids may err
 
 
 @wp.kernel
@@ -58,11 +63,22 @@ def _rigid(model: HandModel, adjacent: set[tuple[str, str]]) -> set[tuple[int, i
     return out | {(b, a) for a, b in out}
 
 
-def with_pairs(model: HandModel, adjacent: set[tuple[str, str]], device: str = "cpu") -> HandModel:
+def with_pairs(
+    model: HandModel,
+    adjacent: set[tuple[str, str]],
+    meshes: Mapping[str, Sequence[trimesh.Trimesh]],
+    dented: set[str],
+    device: str = "cpu",
+) -> HandModel:
     """The model with its self-collision pairs, grouped by (group a, group b).
+
+    Link pairs that touch in every posture are left out. Where a link is dented its pieces do not tell: pairs of which
+    the pieces touch in nearly every posture are then decided, and tested ever after, on the true surfaces.
 
     Args:
         adjacent: (parent link, child link) of every joint of the URDF.
+        meshes: solids of each link, body frame.
+        dented: links with bodies that differ much from their hulls.
     """
     skip = _rigid(model, adjacent)
     group = model.tree.body_group + 1
@@ -81,13 +97,43 @@ def with_pairs(model: HandModel, adjacent: set[tuple[str, str]], device: str = "
     # links, not pieces, are what touches: a link pair is left out when some pieces of it touch in every posture
     links = np.sort(model.piece_link[pairs], axis=1)
     keep = np.ones(len(pairs), bool)
+    names, notes, sides, keys = model.tree.link_names, list(model.notes), [], []
+    groups = model.groups + 1
     for pair in np.unique(links, axis=0):
         members = (links == pair).all(1)
-        if touch[:, members].any(1).all():
+        share = touch[:, members].any(1).mean()
+        a, b = (names[k] for k in pair)
+        if share > _NEARLY and (a in dented or b in dented):
+            keep[members] = False
+            found, note = _true_overlap(model, (a, b), meshes, q, device)
+            sides += found
+            body_a, body_b = sorted(int(group[model.tree.link_body[k]]) for k in pair)
+            keys += [body_a * groups + body_b] * len(found)
+            notes += [note] if note else []
+        elif share == 1.0:
             keep[members] = False
     pairs = pairs[keep]
-    groups = model.groups + 1
     key = group[model.piece_body[pairs[:, 0]]] * groups + group[model.piece_body[pairs[:, 1]]]
     order = np.argsort(key, kind="stable")
     first = np.searchsorted(key[order], np.arange(groups**2 + 1)).astype(np.int32)
-    return replace(model, pair_first=first, pairs=np.ascontiguousarray(pairs[order]))
+    overlaps = overlap_arrays(sides, keys, groups**2)
+    return replace(model, pair_first=first, pairs=np.ascontiguousarray(pairs[order]), notes=tuple(notes), **overlaps)
+
+
+def _true_overlap(
+    model: HandModel, pair: tuple[str, str], meshes: Mapping[str, Sequence[trimesh.Trimesh]], q: np.ndarray, device: str
+) -> tuple[list[Side], str]:
+    """Both sides of a link pair's test on the true surfaces, none when it is pointless, and what to tell the user."""
+    index = [model.tree.link_names.index(name) for name in pair]
+    bodies = (int(model.tree.link_body[index[0]]), int(model.tree.link_body[index[1]]))
+    poses = body_poses(upload_hand(model, device), q).astype(float)
+    T = [pose_matrices(poses[:, body]) for body in bodies]
+    sides = overlap_sides(bodies, (meshes[pair[0]], meshes[pair[1]]), (T[0], T[1]), device)
+    if not sides:
+        return [], ""
+    depth = np.max([side.depth for side in sides], 0)
+    said = f"links '{pair[0]}' and '{pair[1]}' overlap"
+    if (depth > _TOUCH).all():
+        return [], f"{said} in every posture; they are not kept apart"
+    share = (depth > OVERLAP).mean()
+    return sides, f"{said} by more than {1e3 * OVERLAP:.1f} mm in {100 * share:.0f} % of all postures" if share else ""

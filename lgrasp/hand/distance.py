@@ -1,0 +1,48 @@
+"""Signed distances of points to a triangle mesh."""
+
+import numpy as np
+import trimesh
+import warp as wp
+
+from lgrasp.device.runtime import KERNEL_OPTIONS, start
+
+__all__ = ["signed_distance"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+
+@wp.kernel
+def _mesh_distance(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), distance_out: wp.array(dtype=wp.float32)):
+    i = wp.tid()
+    q = wp.mesh_query_point_sign_normal(mesh, points[i], 1.0)
+    p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
+    distance_out[i] = q.sign * wp.length(points[i] - p)
+
+
+@wp.kernel
+def _winding_distance(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), distance_out: wp.array(dtype=wp.float32)):
+    i = wp.tid()
+    q = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0)
+    p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
+    distance_out[i] = q.sign * wp.length(points[i] - p)
+
+
+def signed_distance(
+    mesh: trimesh.Trimesh, points: np.ndarray, device: str = "cpu", *, winding: bool = False
+) -> np.ndarray:
+    """Signed distances (n,) [m] of points (n, 3) to a mesh, negative inside.
+
+    Args:
+        winding: decide inside and outside by winding numbers, which bear holes and cost more.
+    """
+    start()
+    handle = wp.Mesh(
+        wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device=device),
+        wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device=device),
+        support_winding_number=winding,
+    )
+    out = wp.empty(len(points), dtype=wp.float32, device=device)
+    queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
+    kernel = _winding_distance if winding else _mesh_distance
+    wp.launch(kernel, dim=len(points), inputs=[handle.id, queries], outputs=[out], device=device)
+    return out.numpy()

@@ -1,0 +1,136 @@
+"""Link pairs whose pieces touch in nearly every posture although their true surfaces may not: samples and grids.
+
+Knuckles sit in sockets of the palm. Hulls of both touch always, and so do the meshes themselves where they are drawn
+with less play than the real parts have. Such a pair may overlap by :data:`OVERLAP`, measured on the true surfaces:
+samples of each link in a distance grid of the other. A pair that touches in every posture is left alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from lgrasp.hand.contacts import LinkGrid, box_grid
+
+__all__ = ["OVERLAP", "Side", "overlap_arrays", "overlap_sides"]
+
+OVERLAP = 7.0e-4
+"""Depth [m] to which such pairs may overlap."""
+
+_SPACING = 8.0e-4
+_MOST_POINTS = 20_000
+_CELL = 6.0e-4
+_MOST_CELLS = 300_000
+_PAD = 3.0e-3
+_SHALLOW = 3.0e-4  # points that never get deeper than this are not kept
+
+
+@dataclass(frozen=True)
+class Side:
+    """Points of one link that enter another link, and that link's distance grid."""
+
+    body: int  # of the points
+    grid_body: int
+    points: np.ndarray  # (n, 3) [m], body frame, those that are deepest most often first
+    grid: LinkGrid
+    depth: np.ndarray  # (N,) [m] deepest point at each posture, 0 when apart
+
+
+def _surface(meshes: Sequence[trimesh.Trimesh]) -> np.ndarray:
+    """Points (n, 3) of a link's surface about _SPACING apart, vertices included."""
+    parts = [np.asarray(m.vertices, float) for m in meshes]
+    for mesh in meshes:
+        count = int(np.clip(4 * mesh.area / _SPACING**2, 64, 8 * _MOST_POINTS))
+        parts.append(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
+    points = np.vstack(parts)
+    _, first = np.unique(np.floor(points / _SPACING).astype(np.int64), axis=0, return_index=True)
+    return points[np.sort(first)][:_MOST_POINTS]
+
+
+def _lookup(grid: LinkGrid, p: np.ndarray) -> np.ndarray:
+    """Signed distances of points (..., 3) by trilinear interpolation; far (1 m) beyond the grid."""
+    from scipy.ndimage import map_coordinates
+
+    x = (p - grid.origin) / grid.cell
+    value = map_coordinates(grid.values, x.reshape(-1, 3).T, order=1, mode="constant", cval=1.0)
+    return value.reshape(x.shape[:-1])
+
+
+def _side(
+    body: int,
+    grid_body: int,
+    meshes: Sequence[trimesh.Trimesh],
+    grid_meshes: Sequence[trimesh.Trimesh],
+    T: np.ndarray,
+    device: str,
+) -> Side | None:
+    """Points of ``meshes`` against a grid of ``grid_meshes``; T (N, 4, 4) takes the points' body to the grid's."""
+    points = _surface(meshes)
+    low, high = np.min([m.bounds[0] for m in grid_meshes], 0), np.max([m.bounds[1] for m in grid_meshes], 0)
+    near = np.zeros(len(points), bool)
+    box_low, box_high = high.copy(), low.copy()
+    for M in T:
+        p = points @ M[:3, :3].T + M[:3, 3]
+        inside = ((p > low) & (p < high)).all(1)
+        if inside.any():
+            near |= inside
+            box_low, box_high = np.minimum(box_low, p[inside].min(0)), np.maximum(box_high, p[inside].max(0))
+    if not near.any():
+        return None
+    points = points[near]
+    box_low, box_high = box_low - _PAD, box_high + _PAD
+    cell = max(_CELL, float(np.prod(box_high - box_low) / _MOST_CELLS) ** (1 / 3))
+    grid = box_grid(list(grid_meshes), box_low, box_high, cell, device, winding=True)
+    depth, often, deepest = np.zeros(len(T)), np.zeros(len(points)), np.zeros(len(points))
+    for i, M in enumerate(T):
+        sunk = np.maximum(0.0, -_lookup(grid, points @ M[:3, :3].T + M[:3, 3]))
+        depth[i] = sunk.max()
+        often += sunk > OVERLAP
+        deepest = np.maximum(deepest, sunk)
+    order = np.argsort(-often, kind="stable")
+    return Side(body, grid_body, points[order[deepest[order] > _SHALLOW]], grid, depth)
+
+
+def overlap_sides(
+    bodies: tuple[int, int],
+    meshes: tuple[Sequence[trimesh.Trimesh], Sequence[trimesh.Trimesh]],
+    T_base: tuple[np.ndarray, np.ndarray],
+    device: str = "cpu",
+) -> list[Side]:
+    """Both sides of a link pair, those without a point that sinks in left out.
+
+    Args:
+        bodies: of the two links.
+        meshes: their solids, body frames.
+        T_base: (N, 4, 4) poses of the two bodies at N postures.
+    """
+    T_ab = np.linalg.inv(T_base[0]) @ T_base[1]  # b in a
+    found = [
+        _side(bodies[1], bodies[0], meshes[1], meshes[0], T_ab, device),
+        _side(bodies[0], bodies[1], meshes[0], meshes[1], np.linalg.inv(T_ab), device),
+    ]
+    return [side for side in found if side is not None and len(side.points)]
+
+
+def overlap_arrays(sides: Sequence[Side], key: Sequence[int], keys: int) -> dict[str, np.ndarray]:
+    """The ``overlap_*`` arrays of a HandModel; ``key`` is the group pair of each side, of ``keys``."""
+    order = np.argsort(np.asarray(key, int), kind="stable")
+    chosen = [sides[i] for i in order]
+    ends = np.cumsum([0, *(len(s.points) for s in chosen)])
+    rows = [(s.body, s.grid_body, ends[i], ends[i + 1]) for i, s in enumerate(chosen)]
+    counts = np.bincount(np.asarray(key, int), minlength=keys) if len(chosen) else np.zeros(keys, int)
+
+    def joined(parts: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+        return np.concatenate([np.zeros((0, *shape), np.float32), *(p.astype(np.float32) for p in parts)])
+
+    return {
+        "overlap_first": np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
+        "overlap_sides": np.array(rows, np.int32).reshape(-1, 4),
+        "overlap_points": joined([s.points for s in chosen], (3,)),
+        "overlap_grid_first": np.cumsum([0, *(s.grid.values.size for s in chosen)]).astype(np.int32),
+        "overlap_grid_shape": np.array([s.grid.values.shape for s in chosen], np.int32).reshape(-1, 3),
+        "overlap_grid_origin": joined([s.grid.origin[None] for s in chosen], (3,)),
+        "overlap_grid_cell": np.array([s.grid.cell for s in chosen], np.float32),
+        "overlap_grid_values": joined([s.grid.values.ravel() for s in chosen], ()),
+    }
