@@ -64,6 +64,8 @@ def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: 
             p = wp.transform_point(T_body, c)
             for piece in range(first, end):
                 grid = hand.piece_grid[piece]
+                if grid >= 0 and piece > first and hand.piece_grid[piece - 1] == grid:
+                    continue  # another piece of a link that is done
                 if grid >= 0:
                     # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
                     sdf = hand_grid(hand.contacts, grid)

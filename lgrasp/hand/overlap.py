@@ -15,8 +15,8 @@ from lgrasp.hand.contacts import LinkGrid, box_grid
 
 __all__ = ["OVERLAP", "Side", "overlap_arrays", "overlap_sides"]
 
-OVERLAP = 7.0e-4
-"""Depth [m] to which such pairs may overlap."""
+OVERLAP = 8.5e-4
+"""Depth [m] to which such pairs may overlap; a grasp is strictly valid to 1 mm."""
 
 _SPACING = 8.0e-4
 _MOST_POINTS = 20_000

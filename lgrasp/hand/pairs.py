@@ -136,4 +136,4 @@ def _true_overlap(
     if (depth > _TOUCH).all():
         return [], f"{said} in every posture; they are not kept apart"
     share = (depth > OVERLAP).mean()
-    return sides, f"{said} by more than {1e3 * OVERLAP:.1f} mm in {100 * share:.0f} % of all postures" if share else ""
+    return sides, f"{said} by more than {1e3 * OVERLAP:.2g} mm in {100 * share:.0f} % of all postures" if share else ""
