@@ -7,7 +7,7 @@ from lgrasp.device.sdf import sdf_value
 from lgrasp.hand.arrays import Hand, overlap_grid
 from lgrasp.hand.overlap import OVERLAP
 
-__all__ = ["group_pairs_clear"]
+__all__ = ["group_pairs_clear", "overlap_depth"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -75,3 +75,22 @@ def group_pairs_clear(
             if sdf_value(grid, wp.transform_point(T, hand.overlaps.points[i])) < -_OVERLAP:
                 return False
     return True
+
+
+@wp.func
+def overlap_depth(hand: Hand, X: wp.array2d(dtype=wp.transform), row: wp.int32):
+    """Deepest overlap [m] of the pairs that are tested on their true surfaces, 0 when apart; X (N, bodies - 1)."""
+    depth = float(0.0)
+    for k in range(hand.overlaps.sides.shape[0]):
+        side = hand.overlaps.sides[k]
+        Tp = wp.transform_identity()
+        Tg = wp.transform_identity()
+        if side[0] > 0:
+            Tp = X[row, side[0] - 1]
+        if side[1] > 0:
+            Tg = X[row, side[1] - 1]
+        grid = overlap_grid(hand.overlaps, k)
+        T = wp.transform_inverse(Tg) * Tp
+        for i in range(side[2], side[3]):
+            depth = wp.max(depth, -sdf_value(grid, wp.transform_point(T, hand.overlaps.points[i])))
+    return depth

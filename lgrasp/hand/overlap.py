@@ -13,7 +13,7 @@ import trimesh
 
 from lgrasp.hand.contacts import LinkGrid, box_grid
 
-__all__ = ["OVERLAP", "Side", "overlap_arrays", "overlap_sides"]
+__all__ = ["OVERLAP", "OverlapSide", "overlap_arrays", "overlap_sides"]
 
 OVERLAP = 8.5e-4
 """Depth [m] to which such pairs may overlap; a grasp is strictly valid to 1 mm."""
@@ -27,7 +27,7 @@ _SHALLOW = 3.0e-4  # points that never get deeper than this are not kept
 
 
 @dataclass(frozen=True)
-class Side:
+class OverlapSide:
     """Points of one link that enter another link, and that link's distance grid."""
 
     body: int  # of the points
@@ -64,7 +64,7 @@ def _side(
     grid_meshes: Sequence[trimesh.Trimesh],
     T: np.ndarray,
     device: str,
-) -> Side | None:
+) -> OverlapSide | None:
     """Points of ``meshes`` against a grid of ``grid_meshes``; T (N, 4, 4) takes the points' body to the grid's."""
     points = _surface(meshes)
     low, high = np.min([m.bounds[0] for m in grid_meshes], 0), np.max([m.bounds[1] for m in grid_meshes], 0)
@@ -89,7 +89,7 @@ def _side(
         often += sunk > OVERLAP
         deepest = np.maximum(deepest, sunk)
     order = np.argsort(-often, kind="stable")
-    return Side(body, grid_body, points[order[deepest[order] > _SHALLOW]], grid, depth)
+    return OverlapSide(body, grid_body, points[order[deepest[order] > _SHALLOW]], grid, depth)
 
 
 def overlap_sides(
@@ -97,7 +97,7 @@ def overlap_sides(
     meshes: tuple[Sequence[trimesh.Trimesh], Sequence[trimesh.Trimesh]],
     T_base: tuple[np.ndarray, np.ndarray],
     device: str = "cpu",
-) -> list[Side]:
+) -> list[OverlapSide]:
     """Both sides of a link pair, those without a point that sinks in left out.
 
     Args:
@@ -113,7 +113,7 @@ def overlap_sides(
     return [side for side in found if side is not None and len(side.points)]
 
 
-def overlap_arrays(sides: Sequence[Side], key: Sequence[int], keys: int) -> dict[str, np.ndarray]:
+def overlap_arrays(sides: Sequence[OverlapSide], key: Sequence[int], keys: int) -> dict[str, np.ndarray]:
     """The ``overlap_*`` arrays of a HandModel; ``key`` is the group pair of each side, of ``keys``."""
     order = np.argsort(np.asarray(key, int), kind="stable")
     chosen = [sides[i] for i in order]

@@ -11,7 +11,7 @@ from lgrasp.device.convex import Pieces, pieces_clear
 from lgrasp.device.runtime import KERNEL_OPTIONS, start
 from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.overlap import OVERLAP, Side, overlap_arrays, overlap_sides
+from lgrasp.hand.overlap import OVERLAP, OverlapSide, overlap_arrays, overlap_sides
 
 __all__ = ["pieces_touch", "with_pairs"]
 
@@ -122,7 +122,7 @@ def with_pairs(
 
 def _true_overlap(
     model: HandModel, pair: tuple[str, str], meshes: Mapping[str, Sequence[trimesh.Trimesh]], q: np.ndarray, device: str
-) -> tuple[list[Side], str]:
+) -> tuple[list[OverlapSide], str]:
     """Both sides of a link pair's test on the true surfaces, none when it is pointless, and what to tell the user."""
     index = [model.tree.link_names.index(name) for name in pair]
     bodies = (int(model.tree.link_body[index[0]]), int(model.tree.link_body[index[1]]))

@@ -7,9 +7,10 @@ from lgrasp.device.qp import MAX_CONTACTS, balance
 from lgrasp.device.quality import epsilon_bound
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
+from lgrasp.hand.clearance import overlap_depth
 from lgrasp.object.arrays import Object
 
-__all__ = ["balance_grasps", "control_poses", "grasp_epsilon", "pack_rows"]
+__all__ = ["balance_grasps", "control_poses", "grasp_epsilon", "pack_rows", "self_overlap"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -88,6 +89,18 @@ def grasp_epsilon(
     for c in range(k):
         points[c] = points[c] - obj.com
     epsilon_out[i] = epsilon_bound(points, normals, k, friction, obj.radius, wp.rand_init(seed))
+
+
+@wp.kernel
+def self_overlap(
+    hand: Hand,
+    body: wp.array2d(dtype=wp.transform),
+    row: wp.array(dtype=wp.int32),
+    depth_out: wp.array(dtype=wp.float32),
+):
+    """Overlap of links in the kept rows: of pairs that nearly always touch; all others are apart."""
+    i = wp.tid()
+    depth_out[i] = overlap_depth(hand, body, row[i])
 
 
 @wp.func

@@ -12,7 +12,13 @@ from lgrasp.stages.filter.object_kernels import deepen
 from lgrasp.stages.filter.outcomes import METRICS, REASONS
 from lgrasp.stages.filter.params import FilterParams
 from lgrasp.stages.filter.posture_kernels import fill_unused, place_used
-from lgrasp.stages.filter.quality_kernels import balance_grasps, control_poses, grasp_epsilon, pack_rows
+from lgrasp.stages.filter.quality_kernels import (
+    balance_grasps,
+    control_poses,
+    grasp_epsilon,
+    pack_rows,
+    self_overlap,
+)
 
 __all__ = ["VERSION", "run"]
 
@@ -133,6 +139,8 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
         outputs=[epsilon],
         device=d,
     )
+    overlap = wp.empty(m, dtype=wp.float32, device=d)
+    wp.launch(self_overlap, dim=m, inputs=[hand, body, row], outputs=[overlap], device=d)
     pose = wp.empty(m, dtype=wp.transform, device=d)
     point, normal, push = (wp.empty((m, groups + 1), dtype=wp.vec3, device=d) for _ in range(3))
     link = wp.empty((m, groups + 1), dtype=wp.int32, device=d)
@@ -148,7 +156,7 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
         "gswo": gswo.numpy()[keep],
         "epsilon": epsilon.numpy(),
         "penetration": depth.numpy()[keep],
-        "self_penetration": np.zeros(m, np.float32),  # pairs are kept apart, so there is none
+        "self_penetration": overlap.numpy(),
         "gap": gap.numpy()[keep],
         "normal_error": np.arccos(np.clip(dot.numpy()[keep], -1, 1)),
     }
