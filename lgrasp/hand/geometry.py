@@ -176,7 +176,20 @@ def _hull_piece(points: np.ndarray) -> Piece:
         if error <= _HULL_ERROR:
             return Piece(thin, thin_planes, max(error, 0.0) / 2)
         count *= 2
-    return Piece(vertices, planes, 0.0)
+    if len(vertices) <= 48:
+        return Piece(vertices, planes, 0.0)
+    # edges and flat sides: directions miss what matters there; add the vertex farthest out of each face instead
+    kept = np.unique(np.argmax(vertices @ _directions(24).T, axis=0))
+    while True:
+        thin, thin_planes = _hull(vertices[kept])
+        excess = vertices @ thin_planes[:, :3].T - thin_planes[:, 3]
+        out = excess.max(0)
+        if out.max() <= _HULL_ERROR:
+            return Piece(thin, thin_planes, max(float(out.max()), 0.0) / 2)
+        more = np.union1d(kept, excess.argmax(0)[out > _HULL_ERROR])
+        if len(more) == len(kept):  # rounding
+            return Piece(vertices, planes, 0.0)
+        kept = more
 
 
 def convex_pieces(
