@@ -81,7 +81,8 @@ def _side(
     points = points[near]
     box_low, box_high = box_low - _PAD, box_high + _PAD
     cell = max(_CELL, float(np.prod(box_high - box_low) / _MOST_CELLS) ** (1 / 3))
-    grid = box_grid(list(grid_meshes), box_low, box_high, cell, device, winding=True)
+    holes = not all(m.is_watertight for m in grid_meshes)
+    grid = box_grid(list(grid_meshes), box_low, box_high, cell, device, winding=holes)
     depth, often, deepest = np.zeros(len(T)), np.zeros(len(points)), np.zeros(len(points))
     for i, M in enumerate(T):
         sunk = np.maximum(0.0, -_lookup(grid, points @ M[:3, :3].T + M[:3, 3]))
