@@ -171,13 +171,13 @@ def field_pick(f: Field, slot: wp.int32, row: wp.int32, p: wp.vec3, n: wp.vec3, 
 
 
 @wp.func
-def field_pair(f: Field, width: wp.float32, slack: wp.float32, state: wp.uint32):
-    """A random pair of opposed contact vectors whose distance is within ``slack`` of ``width`` [m], or -1."""
+def field_pair(f: Field, width: wp.float32, slack: wp.float32, u: wp.float32):
+    """A pair of opposed contact vectors with distance within ``slack`` of ``width`` [m], or -1; u in [0, 1) picks."""
     a = wp.lower_bound(f.pair_width, width - slack)
     b = wp.lower_bound(f.pair_width, width + slack)
     if b <= a:
         return int(-1)
-    return a + wp.min(int(wp.randf(state) * float(b - a)), b - a - 1)
+    return a + wp.min(int(u * float(b - a)), b - a - 1)
 
 
 @wp.func

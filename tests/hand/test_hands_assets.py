@@ -25,7 +25,7 @@ HANDS = {
     "shadow": (24, 22, 5),
     "dclaw": (9, 9, 3),
     "barrett": (8, 4, 3),
-    "schunk_svh": (20, 9, 3),
+    "schunk_svh": (20, 9, 5),
 }
 REAL = {name: ASSETS / name / f"{name}.urdf" for name in HANDS} | {"barrett": ASSETS / "barrett" / "barrett_mimic.urdf"}
 

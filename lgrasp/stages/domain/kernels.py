@@ -55,7 +55,7 @@ def draw_domains(
         normal = -wp.quat_rotate(R, obj.contact_normals[i])
         row_in_field = field_has(field, slot, p, normal)
         if row_in_field >= 0:
-            pick = field_pick(field, slot, row_in_field, p, normal, state)
+            pick = field_pick(field, slot, row_in_field, p, normal, wp.rand_init(wp.randi(state)))
             if float(pick[1]) * 0.0001 >= cosine:
                 surface_out[row, g, n] = i
                 record_out[row, g, n] = pick[0]
@@ -95,7 +95,7 @@ def draw_domains_bvh(
         i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
         p = wp.transform_point(T, obj.contact_points[i])
         normal = -wp.transform_vector(T, obj.contact_normals[i])
-        r = boxes_pick(boxes, field, slot, p, normal, cosine, state)
+        r = boxes_pick(boxes, field, slot, p, normal, cosine, wp.rand_init(wp.randi(state)))
         if r >= 0:
             surface_out[row, g, n] = i
             record_out[row, g, n] = r

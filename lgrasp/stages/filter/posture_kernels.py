@@ -157,14 +157,13 @@ def fill_unused(
             for t in range(draws):
                 share = 1.0 - float(t + 1) / float(draws)
                 x = vec_dof()
-                if r1 > r0:
-                    x = field_seed(
-                        field, hand.kin, slot, r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1)
-                    )
                 for d in range(dofs):
-                    # of shared joints the very value of the setting
-                    o = hand.kin.dof_setting[setting[row], first + d]
-                    x[d] = o + share * (x[d] - o)
+                    x[d] = hand.kin.dof_setting[setting[row], first + d]
+                if r1 > r0:
+                    r = r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1)
+                    drawn = field_seed(field, hand.kin, slot, r)
+                    # the values of shared joints are the same in both
+                    x = x + share * (drawn - x)
                 group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
                 clear = int(1)
                 for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):

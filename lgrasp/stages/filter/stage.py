@@ -22,7 +22,7 @@ from lgrasp.stages.filter.quality_kernels import (
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 2
+VERSION = 3
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, dict[str, int]]:

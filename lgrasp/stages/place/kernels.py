@@ -46,7 +46,7 @@ def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int3
             continue
         line = obj.contact_points[j] - obj.contact_points[i]
         width = wp.length(line)
-        pair = field_pair(field, width, _PINCH_SLACK, state)
+        pair = field_pair(field, width, _PINCH_SLACK, wp.randf(state))
         if pair < 0:
             continue
         a = field.pair_point[pair, 0]
@@ -159,7 +159,10 @@ def place_objects(
     anchor_out: wp.array2d(dtype=wp.int32),
     rating_out: wp.array(dtype=wp.int32),
 ):
-    """The best of several clear poses per candidate; rating -1: none was clear of static links, 0: none can hold."""
+    """The best of several clear poses per candidate; rating -1: none was clear of static links, 0: none can hold.
+
+    Functions get random states of their own: one handed over is a copy, so that its numbers would come again here.
+    """
     row = wp.tid()
     state = wp.rand_init(seed, first + row)
     G = hand.kin.groups
@@ -182,15 +185,17 @@ def place_objects(
         if u < canonical:
             x = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
             p = hand.box_low + wp.cw_mul(x, hand.box_high - hand.box_low)
-            R = random_rotation(state)
+            R = random_rotation(wp.rand_init(wp.randi(state)))
             T = wp.transform(p - wp.quat_rotate(R, point), R)
         elif u < canonical + pinch:
-            T, setting = _pinch(hand, field, obj, anchor, state)
+            T, setting = _pinch(hand, field, obj, anchor, wp.rand_init(wp.randi(state)))
             if setting < 0:
                 continue
         elif u < canonical + pinch + palm_share and palms > 0:
             palm = palm0 + wp.min(int(wp.randf(state) * float(palms)), palms - 1)
-            T = _aligned(hand.contacts.points[palm], hand.contacts.normals[palm], point, normal, state)
+            T = _aligned(
+                hand.contacts.points[palm], hand.contacts.normals[palm], point, normal, wp.rand_init(wp.randi(state))
+            )
         else:
             g = wp.min(int(wp.randf(state) * float(G)), G - 1)
             slot = setting * G + g
@@ -203,14 +208,15 @@ def place_objects(
                 c = field.point[r]
                 B = X[hand.contacts.body[c] - 1 - j0]
                 p = wp.transform_point(B, hand.contacts.points[c])
-                T = _aligned(p, wp.transform_vector(B, hand.contacts.normals[c]), point, normal, state)
+                n = wp.transform_vector(B, hand.contacts.normals[c])
+                T = _aligned(p, n, point, normal, wp.rand_init(wp.randi(state)))
                 anchor[g] = i
         rating = int(-1)
         T_object = wp.transform_inverse(T)
         if body_clear(hand, obj, 0, T_object, clearance):
             rating = 1
             if samples > 0:
-                rating = rate_pose(hand, field, obj, T, setting, palm, samples, anchor, state)
+                rating = rate_pose(hand, field, obj, T, setting, palm, samples, anchor, wp.rand_init(wp.randi(state)))
             if rating > best and rating > 0 and body_depth(hand, obj, 0, T_object, clearance) > clearance:
                 rating = -1
         if rating > best:
