@@ -193,7 +193,7 @@ def _hull_piece(points: np.ndarray) -> Piece:
 
 
 def convex_pieces(
-    urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh, decompose: Decompose | None = None
+    urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh, decompose: Decompose | None = None, device: str = "cpu"
 ) -> tuple[list[Piece], str]:
     """Convex pieces of one collision element, and in words how they differ from it ("": hardly).
 
@@ -215,7 +215,7 @@ def convex_pieces(
             raise
         # a flat part: its hull has no volume, that of the whole may
         bodies, hulls = [mesh], [convex_piece(urdf, geometry, mesh)]
-    dented = [is_dented(body) for body in bodies]
+    dented = [is_dented(body, device) for body in bodies]
     if not any(dented):
         return hulls, ""
     share = 100 * abs(mesh.volume) / sum(hull.hull_volume for hull in hulls)
@@ -235,7 +235,7 @@ def convex_pieces(
     return pieces, said + (f" ({failures[0]})" if failures else "")
 
 
-def is_dented(body: trimesh.Trimesh) -> bool:
+def is_dented(body: trimesh.Trimesh, device: str = "cpu") -> bool:
     """Does a body differ much from its hull: by a tenth of its volume, and by 4 mm somewhere?
 
     Raises:
@@ -246,7 +246,7 @@ def is_dented(body: trimesh.Trimesh) -> bool:
         return False
     shell = trimesh.Trimesh(hull.points, hull.simplices, process=False)
     points = trimesh.sample.sample_surface(shell, 2000, seed=0)[0]
-    return bool(np.abs(signed_distance(body, points)).max() > _DENT)
+    return bool(np.abs(signed_distance(body, points, device)).max() > _DENT)
 
 
 def _cut(body: trimesh.Trimesh, decompose: Decompose, most: int) -> list[Piece]:

@@ -176,7 +176,7 @@ def build_hand(
     _check_size(spec, tree)
     check_contact_links(spec, tree.link_names, dict(urdf.links))
     rng = np.random.default_rng(0)
-    solids = _Solids(urdf, tree, rng, decompose)
+    solids = _Solids(urdf, tree, rng, decompose, device)
     contacts = _contacts(spec, tree, solids, rng, device)
     bodies = len(tree.joint_dof) + 1
     order = np.argsort([p[0] for p in solids.pieces], kind="stable")
@@ -258,7 +258,9 @@ def _body_sphere(pieces: list[Piece]) -> np.ndarray:
 class _Solids:
     """Per link: meshes in the body frame; flat lists of pieces, spheres and samples tagged with their body."""
 
-    def __init__(self, urdf: Urdf, tree: Tree, rng: np.random.Generator, decompose: Decompose | None) -> None:
+    def __init__(
+        self, urdf: Urdf, tree: Tree, rng: np.random.Generator, decompose: Decompose | None, device: str
+    ) -> None:
         self.meshes: dict[str, list[trimesh.Trimesh]] = {}
         self.pieces: list[tuple[int, int, Piece]] = []
         self.spheres: list[tuple[int, np.ndarray]] = []
@@ -270,7 +272,7 @@ class _Solids:
             for geometry in urdf.links[link]:
                 T = T_body_link @ geometry.T_link_geometry
                 mesh = geometry_mesh(urdf, geometry)
-                pieces, said = convex_pieces(urdf, geometry, mesh, decompose)
+                pieces, said = convex_pieces(urdf, geometry, mesh, decompose, device)
                 if said:
                     self.notes.append(f"link '{link}': {said}")
                     self.dented.add(link)
