@@ -20,7 +20,8 @@ from lgrasp.engine.shard import Execution, ShardResult, make_shard, shard_effort
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.writing import BackgroundWriter
 from lgrasp.errors import ConfigError
-from lgrasp.grasp.tables import GraspTable, take_grasps
+from lgrasp.grasp.tables import GraspTable, take_grasps, user_poses
+from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import read_urdf
 
 __all__ = ["Job", "Listener", "Outcome", "find_present", "generate", "job_shards"]
@@ -222,9 +223,9 @@ def _shard(job: Job, inputs: Inputs, meshes: dict[str, bytes], key: str, shard: 
             name=hand.name,
             base_link=tree.base_link,
             urdf=hand.urdf_text,
-            joint_names=(*tree.joint_names, *tree.locked_names),
-            joint_lower=np.concatenate([tree.joint_lower, tree.locked_limits[:, 0]]),
-            joint_upper=np.concatenate([tree.joint_upper, tree.locked_limits[:, 1]]),
+            joint_names=tree.listed_names,
+            joint_lower=tree.listed_limits[:, 0],
+            joint_upper=tree.listed_limits[:, 1],
             link_names=tree.link_names,
             sha256=hand.sha256,
             meshes=meshes,
@@ -240,7 +241,7 @@ def _shard(job: Job, inputs: Inputs, meshes: dict[str, bytes], key: str, shard: 
                 faces=obj.faces,
             )
         ],
-        grasps=_rows(result.grasps, obj.center, shard, tree.locked_values),
+        grasps=_rows(result.grasps, obj.center, shard, tree),
         statistics=_statistics(inputs, result),
     )
 
@@ -258,27 +259,16 @@ def _statistics(inputs: Inputs, result: ShardResult) -> dict[str, Any]:
     return flat | {f"seconds_{stage}": seconds for stage, seconds in result.seconds.items()}
 
 
-def _rows(table: GraspTable, center: np.ndarray, shard: int, locked: np.ndarray) -> GraspRows:
-    position, quaternion = table.pose[:, :3].astype(float), table.pose[:, [6, 3, 4, 5]].astype(float)
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    # R(q) c for the shift from the internal to the user's frame
-    w, v = quaternion[:, :1], quaternion[:, 1:]
-    c = np.broadcast_to(center.astype(float), v.shape)
-    turned = c + 2 * np.cross(v, np.cross(v, c) + w * c)
-    quaternion[quaternion[:, 0] < 0] *= -1
-    pose = np.hstack([position - turned, quaternion]).astype(np.float32)
+def _rows(table: GraspTable, center: np.ndarray, shard: int, tree: Tree) -> GraspRows:
     filled = table.contact_links >= 0
     width = max(1, int(filled.sum(1).max(initial=1)))
     points = (table.contact_points + center)[:, :width]
 
-    def with_locked(q: np.ndarray) -> np.ndarray:
-        return np.hstack([q, np.broadcast_to(locked, (len(q), len(locked)))])
-
     return GraspRows(
-        q=with_locked(table.q),
-        q_pregrasp=with_locked(table.q_pregrasp),
-        q_squeeze=with_locked(table.q_squeeze),
-        object_pose=pose[:, None],
+        q=tree.listed_values(table.q),
+        q_pregrasp=tree.listed_values(table.q_pregrasp),
+        q_squeeze=tree.listed_values(table.q_squeeze),
+        object_pose=user_poses(table.pose, center)[:, None],
         object_index=np.zeros((len(table), 1), np.int32),
         contact_points=points[:, None],
         contact_normals=table.contact_normals[:, None, :width],

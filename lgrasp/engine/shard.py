@@ -13,7 +13,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.workspace import Inputs
 from lgrasp.grasp.duplicates import KeptRows
-from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
+from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps, user_poses
 from lgrasp.stages.context import Context
 
 __all__ = ["Execution", "ShardResult", "add_counts", "make_shard", "shard_effort"]
@@ -139,7 +139,9 @@ def make_shard(
             add_counts(result.counts, batch.counts)
             for stage, seconds in batch.seconds.items():
                 result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
-            new, duplicates = kept.add(batch.grasps.pose, batch.grasps.q, rows - kept.count)
+            # near-duplicates are defined on poses as they are written
+            pose = user_poses(batch.grasps.pose, inputs.object.model.center)
+            new, duplicates = kept.add(pose, batch.grasps.q, rows - kept.count)
             result.duplicates += duplicates
             parts.append(take_grasps(batch.grasps, new))
             if progress:

@@ -1,11 +1,13 @@
 """Near-duplicates: object translation within 5 mm, rotation within 5 degrees and every joint within 0.1 rad."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
 from lgrasp.device.runtime import start
-from lgrasp.grasp.near_kernels import near_earlier
+from lgrasp.grasp.near_kernels import list_near, near_earlier
 
 __all__ = ["NEAR_ANGLE", "NEAR_DISTANCE", "NEAR_JOINT", "KeptRows", "near_pairs", "new_rows"]
 
@@ -45,7 +47,7 @@ class KeptRows:
     """Rows kept so far of a stream, without near-duplicates: the same ones however the stream is cut.
 
     A hash grid over object positions (on the job's device) tells which rows have any row close before them; those few
-    are then decided one by one.
+    are then decided in order.
     """
 
     def __init__(self, joints: int, device: str = "cpu") -> None:
@@ -65,17 +67,16 @@ class KeptRows:
         """
         if len(pose) == 0:
             return np.zeros(0, int), 0
-        if self.count + len(pose) > len(self._pose):
-            grown = np.zeros((2 * (self.count + len(pose)), 7 + self._q.shape[1]), np.float32)
-            grown[: self.count, :7], grown[: self.count, 7:] = self._pose[: self.count], self._q[: self.count]
-            self._pose, self._q = np.ascontiguousarray(grown[:, :7]), np.ascontiguousarray(grown[:, 7:])
         end = self.count + len(pose)
+        if end > len(self._pose):
+            self._pose = np.concatenate([self._pose[: self.count], np.zeros((2 * end - self.count, 7), np.float32)])
+            self._q = np.concatenate(
+                [self._q[: self.count], np.zeros((2 * end - self.count, self._q.shape[1]), np.float32)]
+            )
         self._pose[self.count : end], self._q[self.count : end] = pose, q
         keep = np.ones(end, bool)
-        for row in self.count + np.flatnonzero(self._suspects(end)):
-            before = np.flatnonzero(keep[:row])
-            same = _near(self._pose[before], self._q[before], self._pose[[row]], self._q[[row]])
-            keep[row] = not same.any()
+        for row, before in self._near_before(end):
+            keep[row] = not keep[before].any()
         kept = np.flatnonzero(keep[self.count :])[:room]
         looked_at = kept[-1] + 1 if len(kept) and len(kept) == room else len(pose)
         after = self.count + len(kept)
@@ -83,23 +84,34 @@ class KeptRows:
         self.count = after
         return kept, int(looked_at - len(kept))
 
-    def _suspects(self, end: int) -> np.ndarray:
-        """Mask of the rows ``count .. end - 1`` that have a row close before them (with some slack for rounding)."""
+    def _near_before(self, end: int) -> Iterator[tuple[int, np.ndarray]]:
+        """Each of the rows ``count .. end - 1`` that has near-duplicates before it, in order, and which these are."""
         d = self._device
         position = wp.array(np.ascontiguousarray(self._pose[:end, :3]), dtype=wp.vec3, device=d)
         rotation = wp.array(np.ascontiguousarray(self._pose[:end, 3:]), dtype=wp.vec4, device=d)
         q = wp.array(self._q[:end], dtype=wp.float32, device=d)
         near = wp.empty(end - self.count, dtype=wp.int32, device=d)
         self._grid.build(position, _REACH)
+        # with some slack for rounding: pairs are decided in double precision below
         limits = [_REACH, float(np.cos(NEAR_ANGLE / 2)) - 1e-6, NEAR_JOINT * 1.00001]
-        wp.launch(
-            near_earlier,
-            dim=len(near),
-            inputs=[self._grid.id, position, rotation, q, self.count, *limits],
-            outputs=[near],
-            device=d,
-        )
-        return near.numpy() > 0
+        rows = [self._grid.id, position, rotation, q]
+        wp.launch(near_earlier, len(near), [*rows, self.count, *limits], [near], device=d)
+        suspects = self.count + np.flatnonzero(near.numpy()).astype(np.int32)
+        if len(suspects) == 0:
+            return
+        asked = wp.array(suspects, dtype=wp.int32, device=d)
+        number, none = (wp.empty(n, dtype=wp.int32, device=d) for n in (len(suspects), 0))
+        wp.launch(list_near, len(suspects), [*rows, asked, *limits, none], [number, none], device=d)
+        first = np.concatenate([[0], np.cumsum(number.numpy())]).astype(np.int32)
+        others = wp.empty(int(first[-1]), dtype=wp.int32, device=d)
+        places = wp.array(first[:-1], dtype=wp.int32, device=d)
+        wp.launch(list_near, len(suspects), [*rows, asked, *limits, places], [number, others], device=d)
+        other = others.numpy()
+        row = np.repeat(suspects, np.diff(first))
+        same = _near(self._pose[other], self._q[other], self._pose[row], self._q[row])
+        for i, suspect in enumerate(suspects):
+            part = slice(first[i], first[i + 1])
+            yield int(suspect), other[part][same[part]]
 
 
 def _near(pose_a: np.ndarray, q_a: np.ndarray, pose_b: np.ndarray, q_b: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ __all__ = [
     "set_arrays",
     "set_table",
     "take_grasps",
+    "user_poses",
 ]
 
 
@@ -159,6 +160,22 @@ def _grasps(arrays: dict[str, np.ndarray]) -> GraspTable:
 def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:
     """Copies of some rows of a GraspTable, by index (n,)."""
     return _grasps({name: values[rows] for name, values in grasp_arrays(table).items()})
+
+
+def user_poses(pose: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """T_hand_object of the object's user frame as written to shards: x y z [m], qw qx qy qz with qw >= 0, (N, 7) f32.
+
+    Args:
+        pose: of the object's internal frame, x y z, qx qy qz qw, (N, 7).
+        center: origin of the internal frame in the user's frame [m], (3,).
+    """
+    quaternion = pose[:, [6, 3, 4, 5]].astype(float)
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    w, v = quaternion[:, :1], quaternion[:, 1:]
+    c = np.broadcast_to(center.astype(float), v.shape)
+    turned = c + 2 * np.cross(v, np.cross(v, c) + w * c)
+    quaternion[quaternion[:, 0] < 0] *= -1
+    return np.hstack([pose[:, :3].astype(float) - turned, quaternion]).astype(np.float32)
 
 
 def join_grasps(tables: list[GraspTable]) -> GraspTable:
