@@ -100,9 +100,9 @@ def _rules_of_known(path: Path, known: dict[str, Path]) -> HandSource | None:
             missing = _missing_couplings(urdf.joints, own.joints)
             if missing:
                 note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
-            return HandSource(
-                source.name, path, source.spec.model_copy(update={"mimic": source.spec.mimic | missing}), note
-            )
+            stated = {j.name for j in urdf.joints if j.mimic is not None}
+            added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
+            return HandSource(source.name, path, source.spec.model_copy(update={"mimic": added | missing}), note)
     return None
 
 

@@ -45,9 +45,33 @@ class Tree:
     locked_names: tuple[str, ...]  # actuated joints held at a value; shards list them after those of q
     locked_values: np.ndarray  # (H,) [rad or m]
     locked_limits: np.ndarray  # (H, 2)
+    coupled_names: tuple[
+        str, ...
+    ]  # joints whose coupling only hand.yaml states; shards list them after the locked ones
+    coupled_column: np.ndarray  # (M,) i32: column of q that drives each
+    coupled_mult: np.ndarray  # (M,)
+    coupled_offset: np.ndarray  # (M,) [rad or m]
+    coupled_limits: np.ndarray  # (M, 2)
     link_names: tuple[str, ...]
     link_body: np.ndarray  # (L,) i32
     T_body_link: np.ndarray  # (L, 4, 4)
+
+    @property
+    def listed_names(self) -> tuple[str, ...]:
+        """Joints of a shard: with them and the URDF alone every link has its place."""
+        return (*self.joint_names, *self.locked_names, *self.coupled_names)
+
+    @property
+    def listed_limits(self) -> np.ndarray:
+        """Limits of the listed joints [rad or m], shape [K + H + M, 2]."""
+        own = np.column_stack([self.joint_lower, self.joint_upper])
+        return np.concatenate([own, self.locked_limits, self.coupled_limits])
+
+    def listed_values(self, q: np.ndarray) -> np.ndarray:
+        """Values of the listed joints [rad or m], shape [n, K + H + M], for actuated joints q, shape [n, K]."""
+        locked = np.broadcast_to(self.locked_values, (len(q), len(self.locked_values)))
+        coupled = self.coupled_mult * q[:, self.coupled_column] + self.coupled_offset
+        return np.hstack([q, locked, coupled]).astype(q.dtype)
 
     @property
     def groups(self) -> int:
@@ -89,6 +113,7 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     Raises:
         HandError: spec names a joint or link that does not exist, or a locked or shared value is outside the limits.
     """
+    stated = {j.name for j in urdf.joints if j.mimic is not None}
     urdf = _with_mimic(urdf, spec)
     by_name = {j.name: j for j in urdf.joints}
     for name, value in spec.locked.items():
@@ -98,6 +123,10 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
             raise HandError(
                 f"hand '{spec.name}': locked joint '{name}' = {value} is outside its limits "
                 f"[{by_name[name].lower}, {by_name[name].upper}]"
+            )
+        if (mimic := by_name[name].mimic) is not None:
+            raise HandError(
+                f"hand '{spec.name}': joint '{name}' is locked but follows joint '{mimic[0]}'; lock that one instead"
             )
     for name in spec.open_posture:
         if name not in by_name or not by_name[name].movable:
@@ -165,7 +194,11 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     opened = np.clip(np.array([spec.open_posture.get(j.name, 0.0) for j in actuated]), lower, upper)
     settings = _settings(spec, shared, column, opened, lower, upper)
     links = list(urdf.links)
-    locked = [j for j in urdf.joints if j.mimic is None and j.name in spec.locked]
+    # joints that the URDF by itself would leave at 0: locked ones, and those that only hand.yaml couples
+    unstated = [j for j in urdf.joints if j.mimic is not None and j.name not in stated]
+    held = [(j, _fixed_value(j, spec.locked, by_name)) for j in urdf.joints if j.name in spec.locked or j in unstated]
+    locked = [(j, value) for j, value in held if value is not None]
+    coupled = [(j, drive[j.name]) for j in unstated if j.name in drive]
     return Tree(
         base_link=base,
         joint_names=tuple(j.name for j in actuated),
@@ -185,9 +218,14 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         dof_free=np.array(dof_free, np.int32),
         shared_names=shared,
         settings=settings,
-        locked_names=tuple(j.name for j in locked),
-        locked_values=np.array([spec.locked[j.name] for j in locked], np.float32),
-        locked_limits=np.array([(j.lower, j.upper) for j in locked], np.float32).reshape(-1, 2),
+        locked_names=tuple(j.name for j, _ in locked),
+        locked_values=np.array([value for _, value in locked], np.float32),
+        locked_limits=_own_limits([j for j, _ in locked]),
+        coupled_names=tuple(j.name for j, _ in coupled),
+        coupled_column=np.array([column[source] for _, (source, _, _) in coupled], np.int32),
+        coupled_mult=np.array([mult for _, (_, mult, _) in coupled], np.float32),
+        coupled_offset=np.array([offset for _, (_, _, offset) in coupled], np.float32),
+        coupled_limits=_own_limits([j for j, _ in coupled]),
         link_names=tuple(links),
         link_body=np.array([0 if (c := rides[n][0]) is None else body[c] for n in links], np.int32),
         T_body_link=np.array([rides[n][1] for n in links]),
@@ -201,11 +239,26 @@ def _with_mimic(urdf: Urdf, spec: HandSpec) -> Urdf:
         for end in (name, coupling.joint):
             if end not in by_name or not by_name[end].movable:
                 raise HandError(f"hand '{spec.name}': mimic names '{end}', not a movable joint of {urdf.path}")
+        given = by_name[name].mimic
+        wanted = (coupling.joint, coupling.multiplier, coupling.offset)
+        if given is not None and given != wanted:
+            raise HandError(
+                f"hand '{spec.name}': mimic couples '{name}' to {_coupling_text(wanted)}, but {urdf.path} couples it "
+                f"to {_coupling_text(given)}; leave it out of hand.yaml, or change the URDF"
+            )
     joints = tuple(
         replace(j, mimic=(m.joint, m.multiplier, m.offset)) if (m := spec.mimic.get(j.name)) else j for j in urdf.joints
     )
     check_mimic(urdf.path, joints)
     return replace(urdf, joints=joints)
+
+
+def _coupling_text(mimic: tuple[str, float, float]) -> str:
+    return f"{mimic[1]:g} x '{mimic[0]}'" + (f" {mimic[2]:+g}" if mimic[2] else "")
+
+
+def _own_limits(joints: list[Joint]) -> np.ndarray:
+    return np.array([(j.lower, j.upper) for j in joints], np.float32).reshape(-1, 2)
 
 
 def _check_shared(spec: HandSpec, moving: list[Joint], urdf: Urdf) -> tuple[str, ...]:

@@ -49,3 +49,23 @@ def test_couplings_of_the_known_hand_fill_gaps(tmp_path):
     coupling = source.spec.mimic["finger_2_prox_joint"]
     assert (coupling.joint, coupling.multiplier) == ("finger_1_prox_joint", -1.0)
     assert len(source.spec.mimic) == 4
+
+
+def test_joints_that_only_the_rules_couple_are_in_the_shard(cache, tmp_path):
+    """Whoever poses the URDF of the shard by its joints gets the hand that grasped."""
+    text = "\n".join(line for line in find_hand("barrett").urdf.read_text().splitlines() if "<mimic" not in line)
+    bare = tmp_path / "bare.urdf"
+    bare.write_text(text)
+    pipeline = load_pipeline("swift")
+    pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 40_000})})
+    outcome = generate(Job(str(bare), "sphere", 40, pipeline, tmp_path / "out", cache=cache))
+    assert outcome.rows == 40
+    shard = read_shard(outcome.paths[0])
+    names = list(shard.hand.joint_names)
+    assert len(names) == len(set(names)) == 8
+    assert names[:4] == [n for n in names if n not in find_hand(str(bare)).spec.mimic]
+    q = shard.grasps.q
+    for joint, coupling in find_hand(str(bare)).spec.mimic.items():
+        wanted = coupling.multiplier * q[:, names.index(coupling.joint)] + coupling.offset
+        np.testing.assert_allclose(q[:, names.index(joint)], wanted, atol=1e-6)
+    assert judge(outcome.paths).valid.all()

@@ -9,6 +9,7 @@ from lgrasp.errors import HandError
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import build_hand
+from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
 
@@ -97,23 +98,63 @@ def test_bad_shared_joints(shared, message):
         build_tree(urdf, spec)
 
 
-def test_a_coupling_of_the_rules_counts_like_one_of_the_urdf(tmp_path):
+@pytest.fixture
+def couples(tmp_path):
+    """Rules and joint tree of a hand with joints j, k, m, and l that mimics k, once hand.yaml says more."""
     box = '<collision><geometry><box size="0.01 0.01 0.05"/></geometry></collision>'
-    links = "".join(f'<link name="{n}">{box}</link>' for n in "abc")
+    links = "".join(f'<link name="{n}">{box}</link>' for n in "abcde")
     text = f"""<robot name="r">{links}
       <joint name="j" type="revolute"><parent link="a"/><child link="b"/><limit lower="0" upper="1"/></joint>
-      <joint name="k" type="revolute"><parent link="a"/><child link="c"/><limit lower="-1" upper="0"/></joint>
+      <joint name="k" type="revolute"><parent link="a"/><child link="c"/><limit lower="-1" upper="1"/></joint>
+      <joint name="l" type="revolute"><parent link="a"/><child link="d"/><limit lower="-2" upper="2"/>
+        <mimic joint="k" multiplier="2"/></joint>
+      <joint name="m" type="revolute"><parent link="a"/><child link="e"/><limit lower="-3" upper="3"/></joint>
       </robot>"""
     path = tmp_path / "r.urdf"
     path.write_text(text)
-    spec = minimal_spec("r", ["b"])
-    assert build_tree(read_urdf(path), spec).groups == 2
-    from lgrasp.hand.spec import HandSpec
 
-    coupled = HandSpec.model_validate(spec.model_dump() | {"mimic": {"k": {"joint": "j", "multiplier": -0.5}}})
-    tree = build_tree(read_urdf(path), coupled)
-    assert tree.joint_names == ("j",)
-    assert sorted(tree.joint_mult) == [-0.5, 1.0]
-    bad = HandSpec.model_validate(spec.model_dump() | {"mimic": {"k": {"joint": "k"}}})
-    with pytest.raises(HandError, match="mimics itself"):
-        build_tree(read_urdf(path), bad)
+    def build(**more):
+        return build_tree(read_urdf(path), HandSpec.model_validate(minimal_spec("r", ["b"]).model_dump() | more))
+
+    return build
+
+
+def test_a_coupling_of_the_rules_counts_like_one_of_the_urdf(couples):
+    assert couples().groups == 3
+    tree = couples(mimic={"k": {"joint": "j", "multiplier": -0.5, "offset": 0.1}})
+    assert tree.groups == 2
+    assert tree.joint_names == ("j", "m")
+    assert sorted(tree.joint_mult) == [-1.0, -0.5, 1.0, 1.0]
+
+
+def test_joints_that_only_the_rules_couple_are_listed(couples):
+    """Those that the URDF couples are not: whoever reads the URDF moves them along."""
+    tree = couples(mimic={"k": {"joint": "j", "multiplier": -0.5, "offset": 0.1}})
+    assert tree.listed_names == ("j", "m", "k")
+    np.testing.assert_allclose(tree.listed_limits, [[0, 1], [-3, 3], [-1, 1]])
+    q = np.array([[0.0, 0.7], [0.6, 0.7]])
+    np.testing.assert_allclose(tree.listed_values(q), [[0, 0.7, 0.1], [0.6, 0.7, -0.2]], atol=1e-7)
+    assert couples().listed_names == ("j", "k", "m")
+
+
+def test_couplings_to_a_locked_joint_are_locked(couples):
+    coupling = {"joint": "l", "multiplier": 0.5, "offset": 0.1}
+    tree = couples(locked={"k": 0.4}, mimic={"m": coupling})
+    assert tree.listed_names == ("j", "k", "m")
+    assert tree.locked_names == ("k", "m")
+    np.testing.assert_allclose(tree.listed_limits[1:], [[-1, 1], [-3, 3]])
+    np.testing.assert_allclose(tree.listed_values(np.array([[0.3]])), [[0.3, 0.4, 0.5]], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"mimic": {"k": {"joint": "k"}}}, "mimics itself"),
+        ({"mimic": {"k": {"joint": "x"}}}, "mimic names 'x', not a movable joint"),
+        ({"mimic": {"l": {"joint": "j"}}}, "mimic couples 'l' to 1 x 'j', but .* couples it to 2 x 'k'"),
+        ({"locked": {"l": 0.1}}, "'l' is locked but follows joint 'k'; lock that one"),
+    ],
+)
+def test_bad_couplings(couples, more, message):
+    with pytest.raises(HandError, match=message):
+        couples(**more)
