@@ -25,9 +25,12 @@ def deepen(
     outcome: wp.array(dtype=wp.int32),
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread per (set, body): the largest penetration [m] of the base and the touching fingers (used = 1) or of the
-    others (used = 0) goes to ``depth_out``; above ``max_depth`` its value is of no account."""
-    i, b = wp.tid()
+    """Largest penetration [m] of the base and the touching fingers (used = 1) or of the others (used = 0).
+
+    One thread per (body, set), so that neighbours do like work; ``depth_out`` grows to the largest. Above ``max_depth``
+    its value is of no account.
+    """
+    b, i = wp.tid()
     if outcome[i] != 0 or depth_out[i] > max_depth:
         return
     g = hand.body_group[b]

@@ -186,17 +186,27 @@ def pack_rows(
     contact: wp.array2d(dtype=wp.int32),
     contact_surface: wp.array2d(dtype=wp.int32),
     force: wp.array2d(dtype=wp.vec3),
+    index: wp.array(dtype=wp.int32),
+    set_slot: wp.array(dtype=wp.int32),
+    numbers: wp.array2d(dtype=wp.float32),
     row: wp.array(dtype=wp.int32),
     pose_out: wp.array(dtype=wp.transform),
     point_out: wp.array2d(dtype=wp.vec3),
     normal_out: wp.array2d(dtype=wp.vec3),
     link_out: wp.array2d(dtype=wp.int32),
     force_out: wp.array2d(dtype=wp.vec3),
+    index_out: wp.array(dtype=wp.int32),
+    slot_out: wp.array(dtype=wp.int32),
+    numbers_out: wp.array2d(dtype=wp.float32),
 ):
     """Pose and contacts of the kept rows; NaN and -1 where there is no contact."""
     i = wp.tid()
     s = row[i]
     pose_out[i] = pose[set_pose[s]]
+    index_out[i] = index[set_pose[s]]
+    slot_out[i] = set_slot[s]
+    for k in range(numbers.shape[0]):
+        numbers_out[k, i] = numbers[k, s]
     for k in range(contact.shape[1]):
         c = contact[s, k]
         if c >= 0:

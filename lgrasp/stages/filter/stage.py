@@ -1,10 +1,12 @@
 """filter: contact sets with joint positions -> finished grasps, every claim recomputed."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
+from lgrasp.device.fetch import fetch
 from lgrasp.device.kinematics import vec_dof
 from lgrasp.grasp.tables import ContactSets, GraspTable
 from lgrasp.stages.context import Context
@@ -39,8 +41,8 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     body = wp.empty((n, bodies - 1), dtype=wp.transform, device=d)
     posture = wp.empty((n, groups), dtype=vec_dof, device=d)
     contact, contact_surface = (wp.empty((n, groups + 1), dtype=wp.int32, device=d) for _ in range(2))
-    gap, dot, fswo, gswo = (wp.empty(n, dtype=wp.float32, device=d) for _ in range(4))
-    depth = wp.zeros(n, dtype=wp.float32, device=d)
+    numbers = wp.zeros((5, max(n, 1)), dtype=wp.float32, device=d)
+    gap, dot, fswo, gswo, depth = (numbers[i] for i in range(5))
     force = wp.empty((n, groups + 1), dtype=wp.vec3, device=d)
     wp.launch(
         place_used,
@@ -68,7 +70,7 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     def measure(used: int) -> None:
         wp.launch(
             deepen,
-            dim=(n, bodies),
+            dim=(bodies, n),
             inputs=[hand, obj, params.penetration, used, poses.pose, inputs.pose, inputs.chosen, body, outcome],
             outputs=[depth],
             device=d,
@@ -109,7 +111,30 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     code = outcome.numpy()
     keep = np.flatnonzero(code == 0).astype(np.int32)
     counts = {reason: int((code == i).sum()) for i, reason in enumerate(REASONS)}
-    m, dofs = len(keep), context.hand.model.dofs
+    checked = _Checked(body, posture, contact, contact_surface, force, numbers)
+    return _kept_rows(inputs, checked, keep, params, context), counts
+
+
+@dataclass(frozen=True)
+class _Checked:
+    """What the checks left on the device, n sets."""
+
+    body: wp.array  # (n, bodies - 1)
+    posture: wp.array  # (n, groups)
+    contact: wp.array  # (n, groups + 1)
+    contact_surface: wp.array  # (n, groups + 1)
+    force: wp.array  # (n, groups + 1)
+    numbers: wp.array  # (5, n) gap, dot of normals, fswo, gswo, penetration
+
+
+def _kept_rows(
+    inputs: ContactSets, checked: _Checked, keep: np.ndarray, params: FilterParams, context: Context
+) -> GraspTable:
+    """Rows of the sets ``keep`` (m,): control poses, epsilon and all that is stored."""
+    d, m = context.device, len(keep)
+    hand, obj = context.hand.struct, context.object.struct
+    groups, dofs = context.hand.model.groups, context.hand.model.dofs
+    poses = inputs.candidates.poses
     row = wp.array(keep, dtype=wp.int32, device=d)
     q, pregrasp, squeeze = (wp.empty((m, dofs), dtype=wp.float32, device=d) for _ in range(3))
     wp.launch(
@@ -122,55 +147,69 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
             params.press_distance,
             poses.pose,
             inputs.pose,
-            contact,
-            contact_surface,
-            body,
-            posture,
+            checked.contact,
+            checked.contact_surface,
+            checked.body,
+            checked.posture,
             row,
         ],
         outputs=[q, pregrasp, squeeze],
         device=d,
     )
-    epsilon = wp.empty(m, dtype=wp.float32, device=d)
+    epsilon, overlap = (wp.empty(m, dtype=wp.float32, device=d) for _ in range(2))
     wp.launch(
         grasp_epsilon,
         dim=m,
-        inputs=[obj, context.seed("filter", 1), params.friction, contact_surface, row],
+        inputs=[obj, context.seed("filter", 1), params.friction, checked.contact_surface, row],
         outputs=[epsilon],
         device=d,
     )
-    overlap = wp.empty(m, dtype=wp.float32, device=d)
-    wp.launch(self_overlap, dim=m, inputs=[hand, body, row], outputs=[overlap], device=d)
+    wp.launch(self_overlap, dim=m, inputs=[hand, checked.body, row], outputs=[overlap], device=d)
     pose = wp.empty(m, dtype=wp.transform, device=d)
     point, normal, push = (wp.empty((m, groups + 1), dtype=wp.vec3, device=d) for _ in range(3))
     link = wp.empty((m, groups + 1), dtype=wp.int32, device=d)
+    index, slot = (wp.empty(m, dtype=wp.int32, device=d) for _ in range(2))
+    numbers = wp.empty((5, m), dtype=wp.float32, device=d)
     wp.launch(
         pack_rows,
         dim=m,
-        inputs=[hand, obj, poses.pose, inputs.pose, contact, contact_surface, force, row],
-        outputs=[pose, point, normal, link, push],
+        inputs=[
+            hand,
+            obj,
+            poses.pose,
+            inputs.pose,
+            checked.contact,
+            checked.contact_surface,
+            checked.force,
+            poses.index,
+            inputs.slot,
+            checked.numbers,
+            row,
+        ],
+        outputs=[pose, point, normal, link, push, index, slot, numbers],
         device=d,
     )
+    fetched = fetch([index, slot, q, pregrasp, squeeze, pose, point, normal, link, push, numbers, epsilon, overlap])
+    (gap, dot, fswo, gswo, depth), epsilons, overlaps = fetched[-3:]
     values = {
-        "fswo": fswo.numpy()[keep],
-        "gswo": gswo.numpy()[keep],
-        "epsilon": epsilon.numpy(),
-        "penetration": depth.numpy()[keep],
-        "self_penetration": overlap.numpy(),
-        "gap": gap.numpy()[keep],
-        "normal_error": np.arccos(np.clip(dot.numpy()[keep], -1, 1)),
+        "fswo": fswo,
+        "gswo": gswo,
+        "epsilon": epsilons,
+        "penetration": depth,
+        "self_penetration": overlaps,
+        "gap": gap,
+        "normal_error": np.arccos(np.clip(dot, -1, 1)),
     }
-    grasps = GraspTable(
-        index=poses.index.numpy()[inputs.pose.numpy()[keep]].astype(np.int64),
-        slot=inputs.slot.numpy()[keep],
-        q=q.numpy(),
-        q_pregrasp=pregrasp.numpy(),
-        q_squeeze=squeeze.numpy(),
-        pose=pose.numpy().reshape(-1, 7),
-        contact_points=point.numpy(),
-        contact_normals=normal.numpy(),
-        contact_links=link.numpy(),
-        contact_forces=push.numpy(),
+    return GraspTable(
+        index=fetched[0].astype(np.int64),
+        slot=fetched[1],
+        q=fetched[2],
+        q_pregrasp=fetched[3],
+        q_squeeze=fetched[4],
+        pose=fetched[5].reshape(-1, 7),
+        contact_points=fetched[6],
+        contact_normals=fetched[7],
+        contact_links=fetched[8],
+        contact_forces=fetched[9],
         metrics={name: values[name] for name in METRICS},
     )
-    return grasps, counts

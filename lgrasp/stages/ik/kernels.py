@@ -66,10 +66,12 @@ def realise_contacts(
     wanted: wp.array3d(dtype=wp.int32),
     q_out: wp.array3d(dtype=vec_dof),
     state_out: wp.array3d(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
 ):
     """Joint positions that put a candidate's contact on the object (eq. 7), and whether they do.
 
-    ``q_out`` holds the seed on entry. Candidates with ``wanted`` 0 are left alone.
+    ``q_out`` holds the seed on entry. Candidates with ``wanted`` 0 are left alone. ``counts_out`` grows by those tried,
+    reached and kept.
     """
     row, g, m = wp.tid()
     if m >= count[row, g] or wanted[row, g, m] == 0:
@@ -147,3 +149,8 @@ def realise_contacts(
                 ok = -2
     q_out[row, g, m] = q
     state_out[row, g, m] = ok
+    wp.atomic_add(counts_out, 0, 1)
+    if ok != -1:
+        wp.atomic_add(counts_out, 1, 1)
+    if ok == 1:
+        wp.atomic_add(counts_out, 2, 1)

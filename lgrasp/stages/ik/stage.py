@@ -39,6 +39,7 @@ def run(
         row, group = np.nonzero(chosen >= 0)
         flags[pose[row], group, chosen[row, group]] = 1
         wanted = wp.array(flags, dtype=wp.int32, device=d)
+    number = wp.zeros(3, dtype=wp.int32, device=d)
     wp.launch(
         realise_contacts,
         dim=shape,
@@ -61,17 +62,13 @@ def run(
             table.record,
             wanted,
         ],
-        outputs=[table.q, table.state],
+        outputs=[table.q, table.state, number],
         device=d,
     )
-    state = table.state.numpy()
-    counts = {
-        "tried": int((state != 0).sum()),
-        "reached": int(((state == 1) | (state == -2)).sum()),
-        "kept": int((state == 1).sum()),
-    }
+    counts = dict(zip(("tried", "reached", "kept"), map(int, number.numpy()), strict=True))
     if sets is None:
         return table, counts
+    state = table.state.numpy()
     good = np.where(
         chosen >= 0, np.take_along_axis(state[pose], np.maximum(chosen, 0)[:, :, None], 2)[:, :, 0] == 1, True
     )

@@ -1,4 +1,4 @@
-"""Kernel of the place stage."""
+"""Kernels of the place stage: poses are proposed, the best is chosen, the rest is dropped."""
 
 import warp as wp
 
@@ -10,12 +10,13 @@ from lgrasp.grasp.clearance import body_clear, body_depth
 from lgrasp.hand.arrays import Hand
 from lgrasp.object.arrays import Object
 
-__all__ = ["place_objects"]
+__all__ = ["choose_poses", "propose_poses", "take_poses"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _HITS = wp.constant(6)  # rated contacts per group
 _MAX_RATED = wp.constant(48)
+_STRIDE = wp.constant(7919)  # between the seeds of a candidate's proposals
 _PINCHES = wp.constant(32)  # draws of two opposite points and two opposed contact vectors
 _PINCH_SLACK = wp.constant(0.002)  # [m] difference of their distances
 
@@ -140,7 +141,7 @@ def rate_pose(
 
 
 @wp.kernel
-def place_objects(
+def propose_poses(
     hand: Hand,
     field: Field,
     obj: Object,
@@ -149,82 +150,143 @@ def place_objects(
     canonical: wp.float32,
     pinch: wp.float32,
     palm_share: wp.float32,
-    proposals: wp.int32,
     samples: wp.int32,
     clearance: wp.float32,
+    pose_out: wp.array2d(dtype=wp.transform),
+    palm_point_out: wp.array2d(dtype=wp.int32),
+    surface_out: wp.array2d(dtype=wp.int32),
+    setting_out: wp.array2d(dtype=wp.int32),
+    anchor_out: wp.array3d(dtype=wp.int32),
+    rating_out: wp.array2d(dtype=wp.int32),
+):
+    """One of several poses per candidate, and its rating; -1: not clear of static links, 0: it can hold nothing.
+
+    Functions get random states of their own: one handed over is a copy, so that its numbers would come again here.
+    """
+    row, b = wp.tid()
+    state = wp.rand_init(seed + b * _STRIDE, first + row)
+    G = hand.kin.groups
+    palm0 = hand.contacts.first[G]
+    palms = hand.contacts.first[G + 1] - palm0
+    u = wp.randf(state)
+    i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+    point = obj.contact_points[i]
+    normal = obj.contact_normals[i]
+    palm = int(-1)
+    anchor = wp.zeros(shape=(MAX_GROUPS,), dtype=wp.int32)
+    for k in range(G):
+        anchor[k] = -1
+    setting = int(0)
+    if hand.kin.settings > 1:
+        setting = wp.min(int(wp.randf(state) * float(hand.kin.settings)), hand.kin.settings - 1)
+    T = wp.transform_identity()
+    rating = int(-1)
+    if u < canonical:
+        x = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
+        p = hand.box_low + wp.cw_mul(x, hand.box_high - hand.box_low)
+        R = random_rotation(wp.rand_init(wp.randi(state)))
+        T = wp.transform(p - wp.quat_rotate(R, point), R)
+    elif u < canonical + pinch:
+        T, setting = _pinch(hand, field, obj, anchor, wp.rand_init(wp.randi(state)))
+        if setting < 0:
+            rating = 0
+    elif u < canonical + pinch + palm_share and palms > 0:
+        palm = palm0 + wp.min(int(wp.randf(state) * float(palms)), palms - 1)
+        n = hand.contacts.normals[palm]
+        T = _aligned(hand.contacts.points[palm], n, point, normal, wp.rand_init(wp.randi(state)))
+    else:
+        g = wp.min(int(wp.randf(state) * float(G)), G - 1)
+        slot = setting * G + g
+        r0 = field.start[field.cell_first[slot] * 64]
+        r1 = field.start[field.cell_first[slot + 1] * 64]
+        if r1 > r0:
+            r = r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1)
+            X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+            j0 = group_forward(hand.kin, g, field_seed(field, hand.kin, slot, r), X, 0)
+            c = field.point[r]
+            B = X[hand.contacts.body[c] - 1 - j0]
+            p = wp.transform_point(B, hand.contacts.points[c])
+            n = wp.transform_vector(B, hand.contacts.normals[c])
+            T = _aligned(p, n, point, normal, wp.rand_init(wp.randi(state)))
+            anchor[g] = i
+        else:
+            rating = 0
+    if rating < 0 and body_clear(hand, obj, 0, wp.transform_inverse(T), clearance):
+        rating = 1
+        if samples > 0:
+            rating = rate_pose(hand, field, obj, T, setting, palm, samples, anchor, wp.rand_init(wp.randi(state)))
+    pose_out[row, b] = T
+    palm_point_out[row, b] = palm
+    surface_out[row, b] = i
+    setting_out[row, b] = setting
+    for k in range(G):
+        anchor_out[row, b, k] = anchor[k]
+    rating_out[row, b] = rating
+
+
+@wp.kernel
+def choose_poses(
+    hand: Hand,
+    obj: Object,
+    clearance: wp.float32,
+    pose: wp.array2d(dtype=wp.transform),
+    rating: wp.array2d(dtype=wp.int32),
+    chosen_out: wp.array(dtype=wp.int32),
+    rating_out: wp.array(dtype=wp.int32),
+):
+    """The best rated proposal of each candidate that is clear of static links to the last point."""
+    row = wp.tid()
+    chosen = int(-1)
+    best = int(-1)
+    for b in range(rating.shape[1]):
+        if rating[row, b] == 0:
+            best = 0
+    ceiling = int(1 << 30)
+    after = int(-1)
+    for _try in range(rating.shape[1]):
+        # the next in order of ratings, earlier proposals first
+        pick = int(-1)
+        for b in range(rating.shape[1]):
+            r = rating[row, b]
+            if r > 0 and (r < ceiling or (r == ceiling and b > after)) and (pick < 0 or r > rating[row, pick]):
+                pick = b
+        if pick < 0:
+            break
+        ceiling = rating[row, pick]
+        after = pick
+        if body_depth(hand, obj, 0, wp.transform_inverse(pose[row, pick]), clearance) <= clearance:
+            chosen = pick
+            best = ceiling
+            break
+    chosen_out[row] = chosen
+    rating_out[row] = best
+
+
+@wp.kernel
+def take_poses(
+    kept: wp.array(dtype=wp.int32),
+    chosen: wp.array(dtype=wp.int32),
+    first: wp.int32,
+    pose: wp.array2d(dtype=wp.transform),
+    palm_point: wp.array2d(dtype=wp.int32),
+    surface: wp.array2d(dtype=wp.int32),
+    setting: wp.array2d(dtype=wp.int32),
+    anchor: wp.array3d(dtype=wp.int32),
+    index_out: wp.array(dtype=wp.int32),
     pose_out: wp.array(dtype=wp.transform),
     palm_point_out: wp.array(dtype=wp.int32),
     palm_surface_out: wp.array(dtype=wp.int32),
     setting_out: wp.array(dtype=wp.int32),
     anchor_out: wp.array2d(dtype=wp.int32),
-    rating_out: wp.array(dtype=wp.int32),
 ):
-    """The best of several clear poses per candidate; rating -1: none was clear of static links, 0: none can hold.
-
-    Functions get random states of their own: one handed over is a copy, so that its numbers would come again here.
-    """
-    row = wp.tid()
-    state = wp.rand_init(seed, first + row)
-    G = hand.kin.groups
-    palm0 = hand.contacts.first[G]
-    palms = hand.contacts.first[G + 1] - palm0
-    anchor = wp.zeros(shape=(MAX_GROUPS,), dtype=wp.int32)
-    best = int(-1)
-    for _b in range(proposals):
-        u = wp.randf(state)
-        i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
-        point = obj.contact_points[i]
-        normal = obj.contact_normals[i]
-        palm = int(-1)
-        for k in range(G):
-            anchor[k] = -1
-        setting = int(0)
-        if hand.kin.settings > 1:
-            setting = wp.min(int(wp.randf(state) * float(hand.kin.settings)), hand.kin.settings - 1)
-        T = wp.transform_identity()
-        if u < canonical:
-            x = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
-            p = hand.box_low + wp.cw_mul(x, hand.box_high - hand.box_low)
-            R = random_rotation(wp.rand_init(wp.randi(state)))
-            T = wp.transform(p - wp.quat_rotate(R, point), R)
-        elif u < canonical + pinch:
-            T, setting = _pinch(hand, field, obj, anchor, wp.rand_init(wp.randi(state)))
-            if setting < 0:
-                continue
-        elif u < canonical + pinch + palm_share and palms > 0:
-            palm = palm0 + wp.min(int(wp.randf(state) * float(palms)), palms - 1)
-            T = _aligned(
-                hand.contacts.points[palm], hand.contacts.normals[palm], point, normal, wp.rand_init(wp.randi(state))
-            )
-        else:
-            g = wp.min(int(wp.randf(state) * float(G)), G - 1)
-            slot = setting * G + g
-            r0 = field.start[field.cell_first[slot] * 64]
-            r1 = field.start[field.cell_first[slot + 1] * 64]
-            if r1 > r0:
-                r = r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1)
-                X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-                j0 = group_forward(hand.kin, g, field_seed(field, hand.kin, slot, r), X, 0)
-                c = field.point[r]
-                B = X[hand.contacts.body[c] - 1 - j0]
-                p = wp.transform_point(B, hand.contacts.points[c])
-                n = wp.transform_vector(B, hand.contacts.normals[c])
-                T = _aligned(p, n, point, normal, wp.rand_init(wp.randi(state)))
-                anchor[g] = i
-        rating = int(-1)
-        T_object = wp.transform_inverse(T)
-        if body_clear(hand, obj, 0, T_object, clearance):
-            rating = 1
-            if samples > 0:
-                rating = rate_pose(hand, field, obj, T, setting, palm, samples, anchor, wp.rand_init(wp.randi(state)))
-            if rating > best and rating > 0 and body_depth(hand, obj, 0, T_object, clearance) > clearance:
-                rating = -1
-        if rating > best:
-            best = rating
-            pose_out[row] = T
-            palm_point_out[row] = palm
-            palm_surface_out[row] = wp.where(palm >= 0, i, -1)
-            setting_out[row] = setting
-            for k in range(G):
-                anchor_out[row, k] = anchor[k]
-    rating_out[row] = best
+    """Rows of the PoseTable: the chosen proposals of the candidates that are kept."""
+    i = wp.tid()
+    row = kept[i]
+    b = chosen[row]
+    index_out[i] = first + row
+    pose_out[i] = pose[row, b]
+    palm_point_out[i] = palm_point[row, b]
+    palm_surface_out[i] = wp.where(palm_point[row, b] >= 0, surface[row, b], -1)
+    setting_out[i] = setting[row, b]
+    for k in range(anchor.shape[2]):
+        anchor_out[i, k] = anchor[row, b, k]

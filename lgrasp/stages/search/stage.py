@@ -7,12 +7,12 @@ from lgrasp.device.kinematics import MAX_GROUPS
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.stages.context import Context
-from lgrasp.stages.search.kernels import MAX_KEEP, keep_sets, list_usable, try_starts
+from lgrasp.stages.search.kernels import MAX_KEEP, check_starts, keep_sets, list_usable, take_sets, try_starts
 from lgrasp.stages.search.params import SearchParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 5
+VERSION = 6
 
 _CPU_LANES = 2
 _GPU_LANES = 12
@@ -48,39 +48,53 @@ def run(
     tried = wp.empty((n, lanes, groups), dtype=wp.int32, device=d)
     tried_score = wp.empty((n, lanes), dtype=wp.float32, device=d)
     for first in range(0, params.restarts, lanes):
+        if first + lanes > params.restarts:
+            tried_score = tried_score[:, : params.restarts - first]
         wp.launch(
-            try_starts,
-            dim=(n, min(lanes, params.restarts - first)),
+            try_starts[params.score],
+            dim=tried_score.shape,
             inputs=[
-                context.hand.struct,
+                groups,
                 context.object.struct,
                 context.seed("search", salt),
                 first,
                 contacts,
                 params.friction,
                 params.threshold,
-                params.balance,
                 params.least_force,
                 params.torque_scale,
                 params.moves,
                 params.rounds,
                 params.per_pose,
-                params.margin,
-                int(realised),
-                int(params.score == "gswo"),
                 inputs.poses.index,
                 inputs.poses.palm_surface,
                 inputs.surface,
                 size,
                 usable,
-                inputs.q,
                 found,
             ],
             outputs=[tried, tried_score],
             device=d,
         )
-        if first + lanes > params.restarts:
-            tried_score = tried_score[:, : params.restarts - first]
+        wp.launch(
+            check_starts,
+            dim=tried_score.shape,
+            inputs=[
+                context.hand.struct,
+                context.object.struct,
+                params.friction,
+                params.balance,
+                params.torque_scale,
+                params.margin,
+                int(realised),
+                inputs.poses.palm_surface,
+                inputs.surface,
+                inputs.q,
+                tried,
+            ],
+            outputs=[tried_score],
+            device=d,
+        )
         wp.launch(
             keep_sets,
             dim=n,
@@ -89,13 +103,20 @@ def run(
             device=d,
         )
     number = found.numpy()
-    pose = np.repeat(np.arange(n, dtype=np.int32), number)
-    slot = (np.arange(len(pose)) - np.repeat(np.cumsum(number) - number, number)).astype(np.int32)
+    ends = np.cumsum(number, dtype=np.int32)
+    total = int(ends[-1]) if n else 0
     table = ContactSets(
         candidates=inputs,
-        pose=wp.array(pose, dtype=wp.int32, device=d),
-        slot=wp.array(slot + salt * params.per_pose, dtype=wp.int32, device=d),
-        chosen=wp.array(sets.numpy()[pose, slot], dtype=wp.int32, device=d),
-        score=wp.array(score.numpy()[pose, slot], dtype=wp.float32, device=d),
+        pose=wp.empty(total, dtype=wp.int32, device=d),
+        slot=wp.empty(total, dtype=wp.int32, device=d),
+        chosen=wp.empty((total, groups), dtype=wp.int32, device=d),
+        score=wp.empty(total, dtype=wp.float32, device=d),
     )
-    return table, {"poses": n, "yielding": int((number > 0).sum()), "sets": len(pose)}
+    wp.launch(
+        take_sets,
+        dim=n,
+        inputs=[wp.array(ends - number, dtype=wp.int32, device=d), salt * params.per_pose, found, sets, score],
+        outputs=[table.pose, table.slot, table.chosen, table.score],
+        device=d,
+    )
+    return table, {"poses": n, "yielding": int((number > 0).sum()), "sets": total}

@@ -1,0 +1,35 @@
+"""Several device arrays to the host with one wait, through page-locked memory that is kept."""
+
+import threading
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+__all__ = ["fetch"]
+
+_LINE = 256  # bytes that places in the staging memory are rounded up to
+_staging = threading.local()
+
+
+def fetch(arrays: Sequence[wp.array]) -> list[np.ndarray]:
+    """Copies of contiguous arrays of one device as NumPy arrays of their own.
+
+    Args:
+        arrays: shape (N, …) each; vector and transform types add a dimension, as ``numpy()`` does.
+    """
+    if not arrays or not arrays[0].device.is_cuda:
+        return [a.numpy().copy() for a in arrays]
+    places = np.cumsum([0, *(-(-a.size * wp.types.type_size_in_bytes(a.dtype) // _LINE) * _LINE for a in arrays)])
+    memory = getattr(_staging, "memory", None)
+    if memory is None or memory.shape[0] < places[-1]:
+        memory = wp.empty(max(2 * int(places[-1]), 1 << 20), dtype=wp.uint8, device="cpu", pinned=True)
+        _staging.memory = memory
+    out = []
+    for a, place in zip(arrays, places, strict=False):
+        host = wp.array(ptr=memory.ptr + int(place), dtype=a.dtype, shape=a.shape, device="cpu", copy=False)
+        if a.size:
+            wp.copy(host, a)
+        out.append(host)
+    wp.synchronize_stream(arrays[0].device)
+    return [host.numpy().copy() for host in out]
