@@ -9,7 +9,8 @@ import warp as wp
 __all__ = ["fetch"]
 
 _LINE = 256  # bytes that places in the staging memory are rounded up to
-_staging = threading.local()
+_staging: dict[str, wp.array] = {}  # by device
+_lock = threading.Lock()
 
 
 def fetch(arrays: Sequence[wp.array]) -> list[np.ndarray]:
@@ -21,15 +22,17 @@ def fetch(arrays: Sequence[wp.array]) -> list[np.ndarray]:
     if not arrays or not arrays[0].device.is_cuda:
         return [a.numpy().copy() for a in arrays]
     places = np.cumsum([0, *(-(-a.size * wp.types.type_size_in_bytes(a.dtype) // _LINE) * _LINE for a in arrays)])
-    memory = getattr(_staging, "memory", None)
-    if memory is None or memory.shape[0] < places[-1]:
-        memory = wp.empty(max(2 * int(places[-1]), 1 << 20), dtype=wp.uint8, device="cpu", pinned=True)
-        _staging.memory = memory
-    out = []
-    for a, place in zip(arrays, places, strict=False):
-        host = wp.array(ptr=memory.ptr + int(place), dtype=a.dtype, shape=a.shape, device="cpu", copy=False)
-        if a.size:
-            wp.copy(host, a)
-        out.append(host)
-    wp.synchronize_stream(arrays[0].device)
-    return [host.numpy().copy() for host in out]
+    device = arrays[0].device
+    with _lock:
+        memory = _staging.get(device.alias)
+        if memory is None or memory.shape[0] < places[-1]:
+            memory = wp.empty(max(2 * int(places[-1]), 1 << 20), dtype=wp.uint8, device="cpu", pinned=True)
+            _staging[device.alias] = memory
+        out = []
+        for a, place in zip(arrays, places, strict=False):
+            host = wp.array(ptr=memory.ptr + int(place), dtype=a.dtype, shape=a.shape, device="cpu", copy=False)
+            if a.size:
+                wp.copy(host, a, stream=device.stream)
+            out.append(host)
+        wp.synchronize_stream(device.stream)
+        return [host.numpy().copy() for host in out]
