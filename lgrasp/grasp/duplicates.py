@@ -69,10 +69,7 @@ class KeptRows:
             return np.zeros(0, int), 0
         end = self.count + len(pose)
         if end > len(self._pose):
-            self._pose = np.concatenate([self._pose[: self.count], np.zeros((2 * end - self.count, 7), np.float32)])
-            self._q = np.concatenate(
-                [self._q[: self.count], np.zeros((2 * end - self.count, self._q.shape[1]), np.float32)]
-            )
+            self._pose, self._q = (_longer(a, self.count, 2 * end) for a in (self._pose, self._q))
         self._pose[self.count : end], self._q[self.count : end] = pose, q
         keep = np.ones(end, bool)
         for row, before in self._near_before(end):
@@ -112,6 +109,13 @@ class KeptRows:
         for i, suspect in enumerate(suspects):
             part = slice(first[i], first[i + 1])
             yield int(suspect), other[part][same[part]]
+
+
+def _longer(array: np.ndarray, count: int, length: int) -> np.ndarray:
+    """The first rows of an array in one with room for more."""
+    out = np.empty((length, array.shape[1]), array.dtype)
+    out[:count] = array[:count]
+    return out
 
 
 def _near(pose_a: np.ndarray, q_a: np.ndarray, pose_b: np.ndarray, q_b: np.ndarray) -> np.ndarray:

@@ -158,7 +158,9 @@ def _grasps(arrays: dict[str, np.ndarray]) -> GraspTable:
 
 
 def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:
-    """Copies of some rows of a GraspTable, by index (n,)."""
+    """Some rows of a GraspTable, by rising index (n,): views when these are its first, else copies."""
+    if len(rows) and rows[-1] == len(rows) - 1:
+        return _grasps({name: values[: len(rows)] for name, values in grasp_arrays(table).items()})
     return _grasps({name: values[rows] for name, values in grasp_arrays(table).items()})
 
 
@@ -169,13 +171,18 @@ def user_poses(pose: np.ndarray, center: np.ndarray) -> np.ndarray:
         pose: of the object's internal frame, x y z, qx qy qz qw, (N, 7).
         center: origin of the internal frame in the user's frame [m], (3,).
     """
-    quaternion = pose[:, [6, 3, 4, 5]].astype(float)
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    w, v = quaternion[:, :1], quaternion[:, 1:]
-    c = np.broadcast_to(center.astype(float), v.shape)
-    turned = c + 2 * np.cross(v, np.cross(v, c) + w * c)
-    quaternion[quaternion[:, 0] < 0] *= -1
-    return np.hstack([pose[:, :3].astype(float) - turned, quaternion]).astype(np.float32)
+    x, y, z, w = pose[:, 3:].T.astype(float)
+    scale = np.where(w < 0, -1.0, 1.0) / np.sqrt(x * x + y * y + z * z + w * w)
+    w, x, y, z = w * scale, x * scale, y * scale, z * scale
+    a, b, c = map(float, center)
+    # R(q) center = center + 2 v x (v x center + w center)
+    i, j, k = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
+    out = np.empty((len(pose), 7), np.float32)
+    out[:, 0] = pose[:, 0] - (a + 2 * (y * k - z * j))
+    out[:, 1] = pose[:, 1] - (b + 2 * (z * i - x * k))
+    out[:, 2] = pose[:, 2] - (c + 2 * (x * j - y * i))
+    out[:, 3], out[:, 4], out[:, 5], out[:, 6] = w, x, y, z
+    return out
 
 
 def join_grasps(tables: list[GraspTable]) -> GraspTable:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.grasp.tables import (
@@ -15,6 +16,7 @@ from lgrasp.grasp.tables import (
     set_arrays,
     set_table,
     take_grasps,
+    user_poses,
 )
 
 
@@ -60,3 +62,16 @@ def test_take_and_join(tables):
     assert [len(p) for p in parts] == [3, 0, n - 3]
     assert_same(grasp_arrays(join_grasps(parts)), grasp_arrays(grasps))
     assert all(len(values) == n for values in grasp_arrays(grasps).values())
+
+
+def test_user_poses_move_the_same_points():
+    """A point of the object is in the same place of the hand's frame, whichever frame of the object it is given in."""
+    random = np.random.default_rng(0)
+    pose = np.hstack([random.normal(size=(50, 3)), Rotation.random(50, random_state=0).as_quat()]).astype(np.float32)
+    center, point = random.normal(size=3), random.normal(size=3)
+    written = user_poses(pose, center)
+    assert written.dtype == np.float32
+    assert (written[:, 3] >= 0).all()
+    internal = Rotation.from_quat(pose[:, 3:]).apply(point) + pose[:, :3]
+    user = Rotation.from_quat(written[:, [4, 5, 6, 3]]).apply(point + center) + written[:, :3]
+    np.testing.assert_allclose(user, internal, atol=2e-6)

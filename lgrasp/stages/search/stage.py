@@ -15,7 +15,7 @@ __all__ = ["VERSION", "run"]
 VERSION = 6
 
 _CPU_LANES = 2
-_GPU_LANES = 12
+_GPU_LANES = 5
 
 
 def run(
