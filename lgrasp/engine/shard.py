@@ -20,7 +20,7 @@ __all__ = ["Execution", "ShardResult", "add_counts", "make_shard", "shard_effort
 
 _LEAST_EFFORT = 65_536
 _CPU_BATCH = 256
-_GPU_LEAST, _GPU_MOST = 2_048, 65_536
+_GPU_LEAST, _GPU_WHOLE, _GPU_MOST = 2_048, 16_384, 65_536
 _STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
 
@@ -57,24 +57,30 @@ def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]
 
 
 def _batches(
-    pipeline: Pipeline, context: Context, execution: Execution, bank: Bank | None, limit: int, size: Callable[[], int]
+    pipeline: Pipeline,
+    context: Context,
+    execution: Execution,
+    bank: Bank | None,
+    limit: int,
+    size: Callable[[int], int],
 ) -> Generator[tuple[int, BatchResult]]:
     """Results of consecutive batches, in order; ``workers`` of them are worked on at a time.
 
     Closing the generator (or an error in a batch) drops the batches not begun and waits for those that were.
 
     Args:
-        size: candidates of the next batch.
+        size: candidates of the next batch, given how many are being worked on; 0: those should do.
     """
-    # a GPU is full with one batch: a second one in the queue would only be waste at the end of the shard
-    ahead = execution.workers if context.device == "cpu" else 0
     first = 0
     with ThreadPoolExecutor(execution.workers) as pool:
         waiting: deque[tuple[int, Future[BatchResult]]] = deque()
         try:
             while True:
-                while len(waiting) <= ahead and first < limit:
-                    count = min(size(), limit - first)
+                # one more than there are workers: it begins at once when a worker is free
+                while len(waiting) <= execution.workers and first < limit:
+                    count = min(size(sum(n for n, _ in waiting)), limit - first)
+                    if count == 0:
+                        break
                     waiting.append((count, pool.submit(run_batch, pipeline, context, first, count, bank)))
                     first += count
                 if not waiting:
@@ -86,11 +92,20 @@ def _batches(
                 future.cancel()
 
 
-def _batch_size(device: str, missing: int, rate: float) -> int:
-    """Candidates of a batch: on a GPU as many as should give the missing rows."""
+def _batch_size(device: str, missing: int, rate: float, running: int) -> int:
+    """Candidates of a batch when ``running`` others are worked on.
+
+    On a GPU as many as should give the missing rows, and none when those running should. Many are cut in two, so that
+    the rows of one part are taken over while the other is worked on.
+    """
     if device == "cpu":
         return _CPU_BATCH
-    return int(min(max(1.05 * missing / rate + 256, _GPU_LEAST), _GPU_MOST))
+    if running >= missing / rate > 0:
+        return 0
+    needed = 1.05 * missing / rate + 256 - running
+    if not running and needed > _GPU_WHOLE:
+        needed /= 2
+    return int(min(max(needed, _GPU_LEAST), _GPU_MOST))
 
 
 def shard_effort(pipeline: Pipeline, rows: int) -> int:
@@ -126,10 +141,10 @@ def make_shard(
     # later passes go over the poses of one batch, so its size decides the order of the rows
     fixed = BANK_CANDIDATES if bank is not None or pipeline.params("search").passes > 1 else execution.batch
 
-    def size() -> int:
+    def size(running: int) -> int:
         # going by those so far
         rate = kept.count / result.candidates if result and kept.count else execution.rate
-        return fixed or _batch_size(context.device, rows - kept.count, rate)
+        return fixed or _batch_size(context.device, rows - kept.count, rate, running)
 
     with closing(_batches(pipeline, context, execution, bank, limit, size)) as batches:
         for count, batch in batches:

@@ -49,13 +49,23 @@ def test_expected_rows_per_candidate(swift, inputs, monkeypatch, rate):
     expected = grasp_arrays(make_shard(swift, inputs, 0, 60, Execution(1, 512)).grasps)
     size, sizes = shard_module._batch_size, []
 
-    def as_on_a_gpu(device, missing, rate):
-        sizes.append(size("cuda:0", missing, rate))
+    def as_on_a_gpu(device, missing, rate, running):
+        sizes.append(size("cuda:0", missing, rate, running))
         return sizes[-1]
 
     monkeypatch.setattr(shard_module, "_batch_size", as_on_a_gpu)
     assert_same(expected, grasp_arrays(make_shard(swift, inputs, 0, 60, Execution(1, rate=rate)).grasps))
     assert sizes[0] == (int(1.05 * 60 / rate + 256) if rate < 0.1 else 2048)
+
+
+def test_batches_on_a_gpu_are_enough_and_not_more():
+    size = shard_module._batch_size
+    first = size("cuda:0", 50_000, 1.7, 0)
+    second = size("cuda:0", 50_000, 1.7, first)
+    assert first == pytest.approx(second, rel=0.01)
+    assert (first + second) * 1.7 > 50_000
+    assert size("cuda:0", 50_000, 1.7, first + second) == 0
+    assert size("cuda:0", 1000, 1e-3, 0) == 65_536
 
 
 def test_rows_do_not_depend_on_the_rate(run, job, grasps, tmp_path):
