@@ -11,7 +11,7 @@ from lgrasp.hand.arrays import Hand
 from lgrasp.hand.clearance import group_pairs_clear
 from lgrasp.object.arrays import Object
 
-__all__ = ["MAX_KEEP", "check_starts", "keep_sets", "list_usable", "take_sets", "try_starts"]
+__all__ = ["MAX_KEEP", "check_starts", "keep_sets", "list_hits", "list_usable", "take_sets", "try_starts"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -216,7 +216,21 @@ try_starts = {"fswo": _starts(_frictionless), "gswo": _starts(_with_friction)}
 
 
 @wp.kernel
+def list_hits(
+    score: wp.array2d(dtype=wp.float32),
+    number_out: wp.array(dtype=wp.int32),
+    hits_out: wp.array(dtype=wp.int32),
+):
+    """Flat places of the scores from 0 on, in any order."""
+    row, lane = wp.tid()
+    if score[row, lane] >= 0.0:
+        hits_out[wp.atomic_add(number_out, 0, 1)] = row * score.shape[1] + lane
+
+
+@wp.kernel
 def check_starts(
+    number: wp.array(dtype=wp.int32),
+    hits: wp.array(dtype=wp.int32),
     hand: Hand,
     obj: Object,
     friction: wp.float32,
@@ -230,10 +244,12 @@ def check_starts(
     chosen: wp.array3d(dtype=wp.int32),
     score_out: wp.array2d(dtype=wp.float32),
 ):
-    """Scores of the sets that friction does not balance, or whose realised fingers meet, go below 0."""
-    row, lane = wp.tid()
-    if score_out[row, lane] < 0.0:
+    """Scores of the hits that friction does not balance, or whose realised fingers meet, go below 0."""
+    i = wp.tid()
+    if i >= number[0]:
         return
+    row = hits[i] // score_out.shape[1]
+    lane = hits[i] - row * score_out.shape[1]
     G = hand.kin.groups
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)

@@ -7,7 +7,15 @@ from lgrasp.device.kinematics import MAX_GROUPS
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.stages.context import Context
-from lgrasp.stages.search.kernels import MAX_KEEP, check_starts, keep_sets, list_usable, take_sets, try_starts
+from lgrasp.stages.search.kernels import (
+    MAX_KEEP,
+    check_starts,
+    keep_sets,
+    list_hits,
+    list_usable,
+    take_sets,
+    try_starts,
+)
 from lgrasp.stages.search.params import SearchParams
 
 __all__ = ["VERSION", "run"]
@@ -15,7 +23,7 @@ __all__ = ["VERSION", "run"]
 VERSION = 6
 
 _CPU_LANES = 2
-_GPU_LANES = 5
+_GPU_LANES = 10
 
 
 def run(
@@ -76,10 +84,16 @@ def run(
             outputs=[tried, tried_score],
             device=d,
         )
+        # the few that found a set, side by side
+        hits = wp.empty(tried_score.size, dtype=wp.int32, device=d)
+        number_of_hits = wp.zeros(1, dtype=wp.int32, device=d)
+        wp.launch(list_hits, dim=tried_score.shape, inputs=[tried_score], outputs=[number_of_hits, hits], device=d)
         wp.launch(
             check_starts,
-            dim=tried_score.shape,
+            dim=tried_score.size,
             inputs=[
+                number_of_hits,
+                hits,
                 context.hand.struct,
                 context.object.struct,
                 params.friction,
