@@ -7,6 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 
+import warp as wp
+
 from lgrasp.engine.bank import BANK_CANDIDATES, Bank
 from lgrasp.engine.batch import BatchResult, run_batch
 from lgrasp.engine.cache import Cache
@@ -21,6 +23,7 @@ __all__ = ["Execution", "ShardResult", "add_counts", "make_shard", "shard_effort
 _LEAST_EFFORT = 65_536
 _CPU_BATCH = 256
 _GPU_LEAST, _GPU_WHOLE, _GPU_MOST = 2_048, 16_384, 65_536
+_GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
 _STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
 
@@ -92,11 +95,17 @@ def _batches(
                 future.cancel()
 
 
-def _batch_size(device: str, missing: int, rate: float, running: int) -> int:
+def _most_candidates(device: str, groups: int) -> int:
+    """Candidates that a batch may have on a GPU: two batches take at most half of the free memory."""
+    free = wp.get_device(device).free_memory
+    return int(min(max(free / 4 / (_GROUP_BYTES * groups), _GPU_LEAST), _GPU_MOST))
+
+
+def _batch_size(device: str, missing: int, rate: float, running: int, most: int = _GPU_MOST) -> int:
     """Candidates of a batch when ``running`` others are worked on.
 
-    On a GPU as many as should give the missing rows, and none when those running should. Many are cut in two, so that
-    the rows of one part are taken over while the other is worked on.
+    On a GPU as many as should give the missing rows, up to ``most``, and none when those running should. Many are cut
+    in two, so that the rows of one part are taken over while the other is worked on.
     """
     if device == "cpu":
         return _CPU_BATCH
@@ -105,7 +114,7 @@ def _batch_size(device: str, missing: int, rate: float, running: int) -> int:
     needed = 1.05 * missing / rate + 256 - running
     if not running and needed > _GPU_WHOLE:
         needed /= 2
-    return int(min(max(needed, _GPU_LEAST), _GPU_MOST))
+    return int(min(max(needed, _GPU_LEAST), most))
 
 
 def shard_effort(pipeline: Pipeline, rows: int) -> int:
@@ -141,10 +150,12 @@ def make_shard(
     # later passes go over the poses of one batch, so its size decides the order of the rows
     fixed = BANK_CANDIDATES if bank is not None or pipeline.params("search").passes > 1 else execution.batch
 
+    most = _GPU_MOST if context.device == "cpu" else _most_candidates(context.device, inputs.hand.model.groups)
+
     def size(running: int) -> int:
         # going by those so far
         rate = kept.count / result.candidates if result and kept.count else execution.rate
-        return fixed or _batch_size(context.device, rows - kept.count, rate, running)
+        return fixed or _batch_size(context.device, rows - kept.count, rate, running, most)
 
     with closing(_batches(pipeline, context, execution, bank, limit, size)) as batches:
         for count, batch in batches:

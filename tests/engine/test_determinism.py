@@ -49,8 +49,8 @@ def test_expected_rows_per_candidate(swift, inputs, monkeypatch, rate):
     expected = grasp_arrays(make_shard(swift, inputs, 0, 60, Execution(1, 512)).grasps)
     size, sizes = shard_module._batch_size, []
 
-    def as_on_a_gpu(device, missing, rate, running):
-        sizes.append(size("cuda:0", missing, rate, running))
+    def as_on_a_gpu(device, missing, rate, running, most):
+        sizes.append(size("cuda:0", missing, rate, running, most))
         return sizes[-1]
 
     monkeypatch.setattr(shard_module, "_batch_size", as_on_a_gpu)
@@ -66,6 +66,7 @@ def test_batches_on_a_gpu_are_enough_and_not_more():
     assert (first + second) * 1.7 > 50_000
     assert size("cuda:0", 50_000, 1.7, first + second) == 0
     assert size("cuda:0", 1000, 1e-3, 0) == 65_536
+    assert size("cuda:0", 1000, 1e-3, 0, 5_000) == 5_000
 
 
 def test_rows_do_not_depend_on_the_rate(run, job, grasps, tmp_path):
