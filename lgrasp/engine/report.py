@@ -4,6 +4,8 @@ import json
 import os
 import resource
 import sys
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,17 +22,18 @@ from lgrasp.engine.stages import STAGES
 from lgrasp.errors import OutputError
 from lgrasp.grasp.duplicates import near_pairs
 
-__all__ = ["SEED_FSWO", "Tally", "check_json", "peak_device_mb", "peak_rss_mb", "report", "survivors", "write_json"]
+__all__ = ["SEED_FSWO", "check_json", "peak_device_mb", "peak_rss_mb", "report", "survivors", "write_json"]
 
 SEED_FSWO = 0.15
 """Squared frictionless residual below which the published system counts a grasp."""
 
+_TALLY_THREADS = 4
 _SURVIVORS = {"place": "kept", "domain": "rich", "ik": "kept", "search": "sets", "filter": "kept"}
 
 
 @dataclass
-class Tally:
-    """Counts over shards on disk; one shard in memory at a time."""
+class _Tally:
+    """Counts over shards on disk."""
 
     moving: np.ndarray  # (L,) which links of the hand are moved by a finger
     rows: int = 0
@@ -55,6 +58,33 @@ class Tally:
             fswo = reader.column("metrics/fswo")
             self.seed_count += int(((fingers >= 3) & (fswo**2 < SEED_FSWO)).sum())
             add_counts(self.counts, _stage_counts(reader.statistics))
+
+    def merge(self, other: "_Tally") -> None:
+        """Add the counts of other shards."""
+        self.rows += other.rows
+        self.seed_count += other.seed_count
+        self.near_duplicates += other.near_duplicates
+        self.distinct_poses += other.distinct_poses
+        add_counts(self.counts, other.counts)
+
+
+def _tally(paths: Iterable[Path], moving: np.ndarray) -> _Tally:
+    """Counts over some shards, a few of them in memory at a time.
+
+    Raises:
+        ShardError: a file is damaged.
+    """
+
+    def one(path: Path) -> _Tally:
+        tally = _Tally(moving)
+        tally.add(path)
+        return tally
+
+    whole = _Tally(moving)
+    with ThreadPoolExecutor(_TALLY_THREADS) as pool:
+        for tally in pool.map(one, paths):
+            whole.merge(tally)
+    return whole
 
 
 def _stage_counts(statistics: dict[str, Any]) -> dict[str, dict[str, int]]:
@@ -84,11 +114,9 @@ def report(job: Job, outcome: Outcome) -> dict[str, Any]:
         ``device``, ``peak_device_mb`` and what was asked.
     """
     tree = outcome.inputs.hand.model.tree
-    made, present = (Tally(tree.body_group[tree.link_body] >= 0) for _ in range(2))
-    for path in outcome.written:
-        made.add(path)
-    for path in set(outcome.paths) - set(outcome.written):
-        present.add(path)
+    moving = tree.body_group[tree.link_body] >= 0
+    made = _tally(outcome.written, moving)
+    present = _tally(set(outcome.paths) - set(outcome.written), moving)
     wall = sum(r.wall for r in outcome.results)
     counts: dict[str, dict[str, int]] = {stage: {} for stage in job.pipeline.order}
     seconds = dict.fromkeys(job.pipeline.order, 0.0)
