@@ -16,7 +16,7 @@ from lgrasp.hand.geometry import MOST_FACES, thin_mesh
 from lgrasp.hand.jaws import find_jaws, make_base
 from lgrasp.hand.model import build_hand
 from lgrasp.hand.spec import HandSpec, load_spec
-from lgrasp.hand.urdf import find_mesh, read_urdf
+from lgrasp.hand.urdf import find_mesh, parse_robot, read_urdf
 from lgrasp.hand.write import write_spec
 from lgrasp.paths import user_dir
 
@@ -92,7 +92,7 @@ def _swap(new: Path, folder: Path) -> None:
 
 def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> tuple[HandSpec, list[str]]:
     """Write URDF, meshes and hand.yaml into a folder and build the hand once."""
-    robot = etree.fromstring(urdf.read_bytes(), etree.XMLParser(resolve_entities=False, no_network=True))
+    robot, _ = parse_robot(urdf, urdf.read_bytes())
     for note in [e for e in robot.iter() if not isinstance(e.tag, str)]:
         if note.getparent() is not None:
             note.getparent().remove(note)

@@ -73,7 +73,8 @@ def held_value(joint: Joint, share: float | None = None) -> float:
     """Where a joint is held: 0 when that is inside the limits, else the middle; or at a share of its range."""
     if share is None and joint.lower <= 0.0 <= joint.upper:
         return 0.0
-    return round(joint.lower + (0.5 if share is None else share) * (joint.upper - joint.lower), 4)
+    value = round(joint.lower + (0.5 if share is None else share) * (joint.upper - joint.lower), 4)
+    return min(max(value, joint.lower), joint.upper)
 
 
 def study_anatomy(urdf: Urdf, name: str, mover: str | None = None) -> Anatomy:

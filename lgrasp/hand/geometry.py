@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import cdist
 
 from lgrasp.decompose import Decompose
 from lgrasp.errors import DecomposeError, HandError
@@ -277,22 +278,26 @@ def inner_spheres(piece: Piece, count: int, rng: np.random.Generator) -> np.ndar
         t = np.linspace(0, 1, steps)[:, None] if np.any(a != b) else np.zeros((1, 1))
         return np.column_stack([a + t * (b - a), np.full(len(t), piece.radius)])[:count]
     low, high = piece.vertices.min(0), piece.vertices.max(0)
-    inside = rng.uniform(low, high, (6000, 3))
-    depth = -piece.depth(inside)
-    inside, depth = inside[depth > 0.0005][:1500], depth[depth > 0.0005][:1500]
+    drawn = rng.uniform(low, high, (6000, 3))
+    inside, depth = np.zeros((0, 3)), np.zeros(0)
+    for points in np.split(drawn, 6):
+        deep = -piece.depth(points)
+        inside, depth = np.vstack([inside, points[deep > 0.0005]]), np.append(depth, deep[deep > 0.0005])
+        if len(inside) >= 1500:
+            break
+    inside, depth = inside[:1500], depth[:1500]
     if len(inside) == 0:
         c = piece.vertices.mean(0)
         return np.append(c, max(-float(piece.depth(c[None])[0]), 1e-4))[None]
     centres = np.argsort(-depth)[:500]
     # a point counts as covered within 1.3 radii, so the spheres spread
-    near = np.linalg.norm(inside[centres][:, None] - inside[None], axis=2) < 1.3 * depth[centres][:, None]
-    out, left = [], np.ones(len(inside), bool)
-    while len(out) < count and left.any():
-        gain = (near & left).sum(1)
+    near = cdist(inside[centres], inside) < 1.3 * depth[centres][:, None]
+    gain, left = np.count_nonzero(near, axis=1), np.ones(len(inside), bool)
+    out = []
+    while len(out) < count and gain.max() > 0:
         best = int(np.argmax(gain))
-        if gain[best] == 0:
-            break
         out.append(np.append(inside[centres[best]], depth[centres[best]]))
+        gain -= np.count_nonzero(near[:, near[best] & left], axis=1)
         left &= ~near[best]
     return np.array(out)
 

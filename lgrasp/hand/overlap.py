@@ -13,7 +13,7 @@ import trimesh
 
 from lgrasp.hand.contacts import LinkGrid, box_grid
 
-__all__ = ["OVERLAP", "OverlapSide", "overlap_arrays", "overlap_sides"]
+__all__ = ["OVERLAP", "OverlapSide", "overlap_arrays", "overlap_depth", "overlap_sides"]
 
 OVERLAP = 8.5e-4
 """Depth [m] to which such pairs may overlap; a grasp is strictly valid to 1 mm."""
@@ -112,6 +112,24 @@ def overlap_sides(
         _side(bodies[0], bodies[1], meshes[0], meshes[1], np.linalg.inv(T_ab), device),
     ]
     return [side for side in found if side is not None and len(side.points)]
+
+
+def overlap_depth(
+    sides: Sequence[OverlapSide], bodies: tuple[int, int], T_base: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Depth (N,) [m] to which two links overlap by the points of their sides, 0 when apart.
+
+    Args:
+        bodies, T_base: as for :func:`overlap_sides`.
+    """
+    depth = np.zeros(len(T_base[0]))
+    pose = dict(zip(bodies, T_base, strict=True))
+    for side in sides:
+        T = np.linalg.inv(pose[side.grid_body]) @ pose[side.body]
+        for rows in np.array_split(np.arange(len(T)), max(1, len(T) * len(side.points) // 2_000_000)):
+            p = side.points @ T[rows, :3, :3].transpose(0, 2, 1) + T[rows, None, :3, 3]
+            depth[rows] = np.maximum(depth[rows], -_lookup(side.grid, p).min(1))
+    return depth
 
 
 def overlap_arrays(sides: Sequence[OverlapSide], key: Sequence[int], keys: int) -> dict[str, np.ndarray]:

@@ -9,7 +9,8 @@ from lgrasp.hand.palmar import Postures
 
 __all__ = ["Hold", "Touch", "best_hold", "finger_touches", "still_touches"]
 
-_CELL = 0.010  # [m]
+_CELL = 0.010  # [m], more where fingers reach farther than hands do
+_MOST_CELLS = 400_000
 _RADII = (0.02, 0.025, 0.03)  # of the balls that are held [m]
 _PALM_WEIGHT = 0.02  # of a finger against the palm, where fingers could face each other
 _FULL = 4.0  # votes at which a finger counts as able to touch from a direction
@@ -100,12 +101,13 @@ def best_hold(touches: list[Touch], blocked) -> Hold | None:
     if len(touches) < 2:
         return None
     centres = [np.vstack([t.points + r * t.normals for r in _RADII]) for t in touches]
-    low = np.min([c.min(0) for c in centres], 0)
-    shape = np.floor((np.max([c.max(0) for c in centres], 0) - low) / _CELL).astype(int) + 1
+    low, high = np.min([c.min(0) for c in centres], 0), np.max([c.max(0) for c in centres], 0)
+    size = max(_CELL, float(np.prod(high - low) / _MOST_CELLS) ** (1 / 3))
+    shape = np.floor((high - low) / size).astype(int) + 1
     axes = _directions()
     able = []
     for t, c in zip(touches, centres, strict=True):
-        cell = np.ravel_multi_index(tuple(np.floor((c - low) / _CELL).astype(int).T), tuple(shape))
+        cell = np.ravel_multi_index(tuple(np.floor((c - low) / size).astype(int).T), tuple(shape))
         side = np.tile(np.argmax(t.normals @ axes.T, 1), len(_RADII))
         votes = np.bincount(cell * len(axes) + side, minlength=int(shape.prod()) * len(axes)).astype(np.float32)
         # neighbouring directions count as well
@@ -113,7 +115,7 @@ def best_hold(touches: list[Touch], blocked) -> Hold | None:
             np.float32
         )
         able.append(np.minimum(votes * (20_000 / len(c)) / _FULL / 8, 1.0))
-    places = low + (np.stack(np.unravel_index(np.arange(shape.prod()), tuple(shape)), -1) + 0.5) * _CELL
+    places = low + (np.stack(np.unravel_index(np.arange(shape.prod()), tuple(shape)), -1) + 0.5) * size
     free = ~blocked(places)
     opposite = axes @ axes.T < -0.82
     partner = [np.stack([a[:, opposite[b]].max(1) for b in range(len(axes))], 1) for a in able]

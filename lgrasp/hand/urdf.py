@@ -13,7 +13,7 @@ from lxml import etree
 
 from lgrasp.errors import HandError
 
-__all__ = ["Geometry", "Joint", "Urdf", "check_mimic", "find_mesh", "read_urdf"]
+__all__ = ["Geometry", "Joint", "Urdf", "check_mimic", "find_mesh", "parse_robot", "read_urdf"]
 
 _MOVABLE = {"revolute", "prismatic", "continuous"}
 
@@ -68,7 +68,8 @@ def read_urdf(path: Path) -> Urdf:
         raw = path.read_bytes()
     except OSError as error:
         raise HandError(f"URDF {path} cannot be read: {error.strerror}") from None
-    robot = _parse(path, raw)
+    tree, raw = parse_robot(path, raw)
+    robot = _parse(path, tree)
     for part in (*robot.links, *robot.joints):
         if not part.name or not part.name.isprintable():
             raise HandError(f"URDF {path} has a link or joint named {part.name!r}; every one needs a printable name")
@@ -86,16 +87,48 @@ def read_urdf(path: Path) -> Urdf:
     return Urdf(path, robot.name or path.stem, raw.decode("utf-8", "replace"), root, links, tuple(ordered), meshes)
 
 
-def _parse(path: Path, raw: bytes) -> yourdfpy.urdf.Robot:
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
+def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
+    """The <robot> element of a URDF and its text, both without what other tools add under prefixes never declared.
+
+    Raises:
+        HandError: not XML, a DOCTYPE, or another root element.
+    """
     try:
-        tree = etree.fromstring(raw, parser)
+        tree = etree.fromstring(raw, _parser())
     except (etree.XMLSyntaxError, ValueError) as error:
-        raise HandError(f"URDF {path} is not XML: {_one_line(error)}") from None
+        tree = _without_prefixed(raw)
+        if tree is None:
+            raise HandError(f"URDF {path} is not XML: {_one_line(error)}") from None
+        raw = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
     if tree.getroottree().docinfo.doctype:
         raise HandError(f"URDF {path} declares a DOCTYPE; entity declarations are not accepted, remove them")
     if tree.tag != "robot":
         raise HandError(f"URDF {path}: root element is <{tree.tag}>, expected <robot>")
+    return tree, raw
+
+
+def _parser(**options: bool) -> etree.XMLParser:
+    return etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False, **options)
+
+
+def _without_prefixed(raw: bytes) -> etree._Element | None:
+    """The tree without elements and attributes of undeclared prefixes (drake:…); None when more than that is wrong."""
+    parser = _parser(recover=True)
+    try:
+        tree = etree.fromstring(raw, parser)
+    except (etree.XMLSyntaxError, ValueError):
+        return None
+    if tree is None or any(e.type != etree.ErrorTypes.NS_ERR_UNDEFINED_NAMESPACE for e in parser.error_log):
+        return None
+    for element in [e for e in tree.iter() if isinstance(e.tag, str)]:
+        for name in [name for name in element.attrib if ":" in str(name)]:
+            del element.attrib[name]
+        if ":" in str(element.tag) and not str(element.tag).startswith("{") and element.getparent() is not None:
+            element.getparent().remove(element)
+    return tree
+
+
+def _parse(path: Path, tree: etree._Element) -> yourdfpy.urdf.Robot:
     for element in tree.iter("limit"):
         # absent effort and velocity are common and of no use here
         for key in ("effort", "velocity"):

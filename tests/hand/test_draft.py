@@ -1,5 +1,6 @@
 """Rules drafted from a URDF alone: grippers, coupled jaws, other base frames, left hands, and what is refused."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,10 +11,12 @@ from reference.urdfs import fingers, gripper, turned
 
 from lgrasp.errors import HandError
 from lgrasp.hand.adopt import add_hand
+from lgrasp.hand.anatomy import held_value
 from lgrasp.hand.draft import draft_spec
 from lgrasp.hand.model import HandModel, build_hand
 from lgrasp.hand.palmar import sample_bodies
 from lgrasp.hand.spec import load_spec
+from lgrasp.hand.urdf import Joint
 
 ALLEGRO = ROOT / "hands" / "allegro" / "hand.urdf"
 TIPS = {"link_3.0_tip", "link_7.0_tip", "link_11.0_tip", "link_15.0_tip"}
@@ -170,3 +173,12 @@ def test_hand_file_explains_every_key(tmp_path):
     for above, line in pairwise(lines):
         if line.split(":")[0] in ("base_link", "locked", "contact", "palm", "canonical_box", "open_posture"):
             assert above.startswith("#"), line
+
+
+def test_joints_are_held_inside_their_limits():
+    """The middle and the ends of a range are rounded, but not out of it."""
+    joint = Joint("j", "a", "b", np.eye(4), True, False, np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, None)
+    for share in (0.0, 0.5, 1.0):
+        assert joint.lower <= held_value(joint, share) <= joint.upper
+    assert held_value(joint) == 0.0
+    assert held_value(replace(joint, lower=0.2)) == round((0.2 + np.pi) / 2, 4)

@@ -195,3 +195,17 @@ def test_good_urdf_reads_as_written(tmp_path):
     assert (urdf.joints[0].lower, urdf.joints[0].upper) == (-np.pi, np.pi)
     assert urdf.joints[1].prismatic
     assert (urdf.joints[1].lower, urdf.joints[1].upper) == (-0.1, 0.2)
+
+
+def test_undeclared_prefixes_of_other_tools_are_left_out(tmp_path):
+    """Simulators add elements such as <drake:...> to URDFs without declaring the prefix; only those are forgiven."""
+    extra = '<drake:filter drake:name="a"><drake:member link="x"/></drake:filter>'
+    text = robot(A, B.replace("<link", '<link drake:kind="0"'), joint("j", "a", "b"), extra)
+    path = tmp_path / "a.urdf"
+    path.write_text(text)
+    urdf = read_urdf(path)
+    assert [j.name for j in urdf.joints] == ["j"]
+    assert "drake" not in urdf.text
+    path.write_text(text.replace("</robot>", "</robott>"))
+    with pytest.raises(HandError, match="is not XML"):
+        read_urdf(path)
