@@ -82,7 +82,7 @@ def finger_points(
     for probe, least in ((1e-4, 0.0), (8e-3, 5e-3)):
         distance = np.min([signed_distance(m, points + probe * normals, device) for m in meshes], 0)
         keep &= distance > least
-    return _thin(points[keep], normals[keep], _POINTS_PER_LINK, rng)
+    return _thin(points, normals, keep, rng)
 
 
 def palm_points(
@@ -100,13 +100,15 @@ def palm_points(
         keep |= _in_cone(normals @ R, cone)
     distance = np.min([signed_distance(m, points + 1e-4 * normals, device) for m in meshes], 0)
     keep &= distance > 0
-    return _thin(points[keep], normals[keep], _POINTS_PER_LINK, rng)
+    return _thin(points, normals, keep, rng)
 
 
 def _thin(
-    points: np.ndarray, normals: np.ndarray, count: int, rng: np.random.Generator
+    points: np.ndarray, normals: np.ndarray, keep: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    chosen = rng.permutation(len(points))[:count]
+    """At most _POINTS_PER_LINK of the points to keep, in an order drawn for all: a point in doubt moves no other."""
+    order = rng.permutation(len(points))
+    chosen = order[keep[order]][:_POINTS_PER_LINK]
     return points[chosen], normals[chosen]
 
 

@@ -2,43 +2,12 @@
 
 import warp as wp
 
+from lgrasp.device.triangles import closest_on_triangle
+
 __all__ = ["draw_opposite", "far_distance", "fold_spread", "lattice_crossings", "nearest_face_band", "winding_sign"]
 
 wp.config.log_level = wp.LOG_ERROR
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
-
-
-@wp.func
-def closest_on_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3):
-    """Point of triangle abc closest to p (Ericson, Real-Time Collision Detection, 5.1.5)."""
-    ab = b - a
-    ac = c - a
-    ap = p - a
-    d1 = wp.dot(ab, ap)
-    d2 = wp.dot(ac, ap)
-    if d1 <= 0.0 and d2 <= 0.0:
-        return a
-    bp = p - b
-    d3 = wp.dot(ab, bp)
-    d4 = wp.dot(ac, bp)
-    if d3 >= 0.0 and d4 <= d3:
-        return b
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        return a + (d1 / (d1 - d3)) * ab
-    cp = p - c
-    d5 = wp.dot(ab, cp)
-    d6 = wp.dot(ac, cp)
-    if d6 >= 0.0 and d5 <= d6:
-        return c
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        return a + (d2 / (d2 - d6)) * ac
-    va = d3 * d6 - d5 * d4
-    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        return b + ((d4 - d3) / ((d4 - d3) + (d5 - d6))) * (c - b)
-    denom = 1.0 / (va + vb + vc)
-    return a + (vb * denom) * ab + (vc * denom) * ac
 
 
 @wp.kernel

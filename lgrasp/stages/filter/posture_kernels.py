@@ -4,6 +4,7 @@ import warp as wp
 
 from lgrasp.device.kinematics import clamp_dofs, group_forward, vec_dof
 from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.device.triangles import least_facing
 from lgrasp.field.arrays import Field, field_seed
 from lgrasp.grasp.clearance import body_clear
 from lgrasp.hand.arrays import Hand
@@ -13,6 +14,8 @@ from lgrasp.object.arrays import Object
 __all__ = ["fill_unused", "place_used"]
 
 wp.set_module_options(KERNEL_OPTIONS)
+
+_DOUBT = wp.constant(3.0e-5)  # [m]
 
 
 @wp.func
@@ -60,6 +63,7 @@ def place_used(
     k = int(0)
     gap = float(0.0)
     dot = float(1.0)
+    least = float(1.0)
     for g in range(G + 1):
         contact_out[i, g] = -1
         contact_surface_out[i, g] = -1
@@ -88,6 +92,9 @@ def place_used(
             if hit.result:
                 d = wp.length(local - wp.mesh_eval_position(mesh, hit.face, hit.u, hit.v))
                 a = wp.dot(inward, wp.transform_vector(B, wp.mesh_eval_face_normal(mesh, hit.face)))
+                # beside an edge rounding decides which facet is nearest, so all of them must do
+                turned = wp.transform_vector(wp.transform_inverse(B), inward)
+                least = wp.min(least, least_facing(mesh, local, d + _DOUBT, turned))
             gap = wp.max(gap, d)
             dot = wp.min(dot, a)
             contact_out[i, k] = c
@@ -95,7 +102,7 @@ def place_used(
             k += 1
     gap_out[i] = gap
     dot_out[i] = dot
-    if gap > max_gap or dot < cosine:
+    if gap > max_gap or wp.min(dot, least) < cosine:
         outcome_out[i] = 4
         return
     for g in range(G):

@@ -24,7 +24,7 @@ from lgrasp.stages.filter.quality_kernels import (
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 3
+VERSION = 4
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
