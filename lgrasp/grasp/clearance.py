@@ -7,14 +7,13 @@ from lgrasp.device.convex import point_depth
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.device.sdf import sdf_value
 from lgrasp.hand.arrays import Hand, hand_grid
-from lgrasp.object.arrays import BUNCH, Object
+from lgrasp.object.arrays import Object
 
 __all__ = ["body_clear", "body_depth"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _CLUSTER = wp.constant(CLUSTER_SIZE)
-_BUNCH = wp.constant(BUNCH)
 
 
 @wp.func
@@ -56,33 +55,27 @@ def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: 
     T_body = wp.transform_inverse(T)
     first = hand.pieces.body_first[body]
     end = hand.pieces.body_first[body + 1]
-    for bunch in range(obj.bunches):
-        ball = obj.bunch_sphere[bunch]
-        away = wp.vec3(ball[0], ball[1], ball[2]) - centre
-        near = b[3] + ball[3]
-        if wp.dot(away, away) >= near * near:
-            continue
-        for k in range(bunch * _BUNCH, wp.min((bunch + 1) * _BUNCH, obj.clusters)):
-            s = obj.cluster_sphere[k]
-            c = wp.vec3(s[0], s[1], s[2])
-            d = c - centre
-            reach = b[3] + s[3]
-            if wp.dot(d, d) < reach * reach:
-                p = wp.transform_point(T_body, c)
-                for piece in range(first, end):
-                    grid = hand.piece_grid[piece]
-                    if grid >= 0 and piece > first and hand.piece_grid[piece - 1] == grid:
-                        continue  # another piece of a link that is done
-                    if grid >= 0:
-                        # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
-                        sdf = hand_grid(hand.contacts, grid)
-                        if sdf_value(sdf, p) < s[3]:
-                            for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
-                                depth = wp.max(depth, -sdf_value(sdf, wp.transform_point(T_body, obj.obstacles[i])))
-                    elif point_depth(hand.pieces, piece, p) < s[3]:
+    for k in range(obj.clusters):
+        s = obj.cluster_sphere[k]
+        c = wp.vec3(s[0], s[1], s[2])
+        d = c - centre
+        reach = b[3] + s[3]
+        if wp.dot(d, d) < reach * reach:
+            p = wp.transform_point(T_body, c)
+            for piece in range(first, end):
+                grid = hand.piece_grid[piece]
+                if grid >= 0 and piece > first and hand.piece_grid[piece - 1] == grid:
+                    continue  # another piece of a link that is done
+                if grid >= 0:
+                    # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
+                    sdf = hand_grid(hand.contacts, grid)
+                    if sdf_value(sdf, p) < s[3]:
                         for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
-                            q = wp.transform_point(T_body, obj.obstacles[i])
-                            depth = wp.max(depth, -point_depth(hand.pieces, piece, q))
-                    if depth > limit:
-                        return depth
+                            depth = wp.max(depth, -sdf_value(sdf, wp.transform_point(T_body, obj.obstacles[i])))
+                elif point_depth(hand.pieces, piece, p) < s[3]:
+                    for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+                        q = wp.transform_point(T_body, obj.obstacles[i])
+                        depth = wp.max(depth, -point_depth(hand.pieces, piece, q))
+                if depth > limit:
+                    return depth
     return depth
