@@ -9,7 +9,7 @@ from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Joint, Urdf
 
-__all__ = ["Anatomy", "finger_names", "held_value", "probe_spec", "study_anatomy"]
+__all__ = ["Anatomy", "finger_names", "held_value", "probe_spec", "study_anatomy", "tip_link"]
 
 _MOST_FINGERS = 6
 
@@ -54,6 +54,11 @@ class Anatomy:
     def links(self, body: int) -> list[str]:
         """Links that ride on a body."""
         return [n for n, b in zip(self.tree.link_names, self.tree.link_body, strict=True) if b == body]
+
+
+def tip_link(urdf: Urdf, anatomy: Anatomy) -> str:
+    """A fingertip's link with collision geometry."""
+    return next(n for n in anatomy.links(anatomy.tips[0]) if urdf.links[n])
 
 
 def probe_spec(name: str, link: str, locked: dict[str, float], base_link: str | None) -> HandSpec:

@@ -7,7 +7,8 @@ import numpy as np
 
 from lgrasp.device.kinematics import MAX_JOINTS
 from lgrasp.errors import HandError
-from lgrasp.hand.anatomy import Anatomy, finger_names, held_value, study_anatomy
+from lgrasp.hand.anatomy import Anatomy, finger_names, held_value, probe_spec, study_anatomy, tip_link
+from lgrasp.hand.model import HandModel, build_hand
 from lgrasp.hand.palmar import sample_bodies
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.survey import Survey, survey_hand
@@ -90,29 +91,36 @@ def draft_spec(
 
 
 def _with_shared(urdf: Urdf, survey: Survey, spec: HandSpec, said: list[str]) -> tuple[HandSpec, list[str]]:
-    """Locked joints that move several fingers take a few values instead, unless the palm rides on them."""
+    """Locked joints that move several fingers take a few values instead, those aside that the palm rides on."""
     spread = [n for n in spec.locked if n not in survey.anatomy.carrying]
-    count = _SHARED_VALUES.get(len(spread), 0)
-    if count == 0:
-        return spec, said
+    spread = [n for n in spread if _freed(urdf, spec, {n: (spec.locked[n],)}) is not None]
     by_name = {j.name: j for j in urdf.joints}
+    count = _SHARED_VALUES.get(len(spread), 0)
     shared = {n: _around(spec.locked[n], by_name[n].lower, by_name[n].upper, count) for n in spread}
-    free = spec.model_copy(
-        update={"locked": {n: v for n, v in spec.locked.items() if n not in shared}, "shared": shared}
-    )
-    try:
-        tree = build_tree(urdf, free)
-    except HandError:  # a joint that mimics one of them does not reach as far
-        return spec, said
-    static = {n for n, b in zip(tree.link_names, tree.link_body, strict=True) if b == 0}
-    if not static.issuperset(spec.palm.links) or max(np.diff(tree.joint_first)) > MAX_JOINTS:
+    free = _freed(urdf, spec, shared) if count else None
+    if free is None:
         return spec, said
     told = [line for line in said if not any(line.startswith(f"joint '{n}' is locked") for n in shared)]
     told += [
         f"joint '{n}' moves several fingers: poses take it at {', '.join(f'{v:g}' for v in values)} (shared)"
         for n, values in shared.items()
     ]
-    return free.model_copy(update={"static_links": tuple(n for n in spec.static_links if n in static)}), told
+    return free, told
+
+
+def _freed(urdf: Urdf, spec: HandSpec, shared: dict[str, tuple[float, ...]]) -> HandSpec | None:
+    """The rules with locked joints shared; None where the palm would move or a mimic joint does not reach as far."""
+    free = spec.model_copy(
+        update={"locked": {n: v for n, v in spec.locked.items() if n not in shared}, "shared": shared}
+    )
+    try:
+        tree = build_tree(urdf, free)
+    except HandError:
+        return None
+    static = {n for n, b in zip(tree.link_names, tree.link_body, strict=True) if b == 0}
+    if not static.issuperset(spec.palm.links) or max(np.diff(tree.joint_first)) > MAX_JOINTS:
+        return None
+    return free.model_copy(update={"static_links": tuple(n for n in spec.static_links if n in static)})
 
 
 def _around(best: float, lower: float, upper: float, count: int) -> tuple[float, ...]:
@@ -134,7 +142,8 @@ def _check_coupled(urdf: Urdf, anatomy: Anatomy) -> None:
 def _best_survey(urdf: Urdf, anatomy: Anatomy, name: str, jaws: tuple[str, str] | None) -> Survey:
     """The survey of the lock values at which fingers oppose best: shared joints at 0, or at a share of their range.
 
-    An arm that is in the way of the fingers is held elsewhere.
+    An arm that is in the way of the fingers is held elsewhere. Values at which links overlap that other values part are
+    taken last: such grasps are invalid.
     """
     by_name = {j.name: j for j in urdf.joints}
     base = {n: held_value(by_name[n]) for n in anatomy.locked}
@@ -148,12 +157,42 @@ def _best_survey(urdf: Urdf, anatomy: Anatomy, name: str, jaws: tuple[str, str] 
         base = {**base, **{n: held_value(by_name[n], float(rng.uniform(0.2, 0.8))) for n in carrying}}
         survey = survey_hand(urdf, anatomy, name, base, jaws)
         best = max((best, survey), key=lambda s: (s.hold is not None, s.postures.clear.mean()))
+    apart = _kept_apart(_unlocked(urdf, name, anatomy, best.locked)) if spread else set()
+
+    def value(s: Survey) -> tuple[int, float]:
+        return -len(_stuck(s.model, apart)), s.hold.score if s.hold else 0.0
+
     for share in (0.0, 0.5, 1.0):
         locked = {**best.locked, **{n: held_value(by_name[n], share) for n in spread}}
         if locked != best.locked:
-            survey = survey_hand(urdf, anatomy, name, locked, jaws)
-            best = max((best, survey), key=lambda s: s.hold.score if s.hold else 0.0)
+            best = max((best, survey_hand(urdf, anatomy, name, locked, jaws)), key=value)
     return best
+
+
+def _unlocked(urdf: Urdf, name: str, anatomy: Anatomy, locked: dict[str, float]) -> HandModel | None:
+    """The hand with its locked spread joints at any value; None when that is too much for a group."""
+    held = {n: value for n, value in locked.items() if n in anatomy.carrying}
+    shared = {n: (value,) for n, value in locked.items() if n not in held}
+    spec = probe_spec(name, tip_link(urdf, anatomy), held, anatomy.base_link)
+    try:
+        return build_hand(urdf.path, spec.model_copy(update={"shared": shared}))
+    except HandError:
+        return None
+
+
+def _kept_apart(model: HandModel | None) -> set[tuple[str, str]]:
+    """Link pairs that must not touch, those decided on true surfaces aside."""
+    if model is None:
+        return set()
+    names = model.tree.link_names
+    return {(names[min(pair)], names[max(pair)]) for pair in model.piece_link[model.pairs].tolist()}
+
+
+def _stuck(model: HandModel, apart: set[tuple[str, str]]) -> set[tuple[str, str]]:
+    """Link pairs of ``apart`` on different bodies that the model does not keep apart: they touch in every posture."""
+    tree = model.tree
+    body = dict(zip(tree.link_names, tree.link_body, strict=True))
+    return {(a, b) for a, b in apart - _kept_apart(model) if body[a] != body[b]}
 
 
 def _check_size(urdf: Urdf, survey: Survey) -> None:

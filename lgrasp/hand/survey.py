@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lgrasp.hand.anatomy import Anatomy, probe_spec
+from lgrasp.hand.anatomy import Anatomy, probe_spec, tip_link
 from lgrasp.hand.geometry import Piece
 from lgrasp.hand.model import HandModel, build_hand
 from lgrasp.hand.palmar import Postures, Skin, link_skins, sample_bodies, see_skins
@@ -53,8 +53,7 @@ def survey_hand(
     Args:
         jaws: (static link, moving link) of a gripper whose one drive closes them; nothing else touches then.
     """
-    tip_link = next(n for n in anatomy.links(anatomy.tips[0]) if urdf.links[n])
-    model = build_hand(urdf.path, probe_spec(name, tip_link, locked, anatomy.base_link))
+    model = build_hand(urdf.path, probe_spec(name, tip_link(urdf, anatomy), locked, anatomy.base_link))
     rng = np.random.default_rng(0)
     tree = model.tree
     postures = sample_bodies(model, rng.uniform(tree.joint_lower, tree.joint_upper, (_POSTURES, model.dofs)))

@@ -16,7 +16,8 @@ from lgrasp.hand.draft import draft_spec
 from lgrasp.hand.model import HandModel, build_hand
 from lgrasp.hand.palmar import sample_bodies
 from lgrasp.hand.spec import load_spec
-from lgrasp.hand.urdf import Joint
+from lgrasp.hand.tree import build_tree
+from lgrasp.hand.urdf import Joint, read_urdf
 
 ALLEGRO = ROOT / "hands" / "allegro" / "hand.urdf"
 TIPS = {"link_3.0_tip", "link_7.0_tip", "link_11.0_tip", "link_15.0_tip"}
@@ -182,3 +183,18 @@ def test_joints_are_held_inside_their_limits():
         assert joint.lower <= held_value(joint, share) <= joint.upper
     assert held_value(joint) == 0.0
     assert held_value(replace(joint, lower=0.2)) == round((0.2 + np.pi) / 2, 4)
+
+
+def test_a_spread_joint_is_shared_and_no_link_is_stuck_where_joints_are_held():
+    """The thumb's opposition carries part of the palm, so it is held, at a value where no links overlap for ever."""
+    urdf = ROOT / "hands" / "schunk_svh" / "hand.urdf"
+    spec, said = draft_spec(urdf, "drafted")
+    assert set(spec.locked) == {"right_hand_Thumb_Opposition"}
+    assert set(spec.shared) == {"right_hand_Finger_Spread"}
+    assert len(spec.shared["right_hand_Finger_Spread"]) == 4
+    assert any("'right_hand_Finger_Spread' moves several fingers" in line for line in said)
+    build_tree(read_urdf(urdf), spec)
+    model = build_hand(urdf, spec)
+    names = model.tree.link_names
+    kept = {frozenset((names[a], names[b])) for a, b in model.piece_link[model.pairs]}
+    assert frozenset(("right_hand_a", "right_hand_e1")) in kept
