@@ -119,7 +119,7 @@ def hand_findings(model: HandModel, field: ContactField, names: dict[str, tuple[
             f"where the two contact surfaces face each other they are at most {1000 * widest:.0f} mm apart: objects "
             "with parallel sides must be narrower, or contact and palm must name surface that faces farther apart"
         )
-    notes = [n for n in model.notes if "hull" in n]
+    notes = [n for n in model.notes if "hull" in n and "convex pieces" not in n]
     if notes:
         found["filter"].append(
             f"{len(notes)} concave collision meshes count as their hulls, which blocks room: {notes[0]}"
