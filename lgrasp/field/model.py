@@ -18,7 +18,7 @@ from lgrasp.hand.model import HandModel
 
 __all__ = ["FIELD_VERSION", "ContactField", "build_field"]
 
-FIELD_VERSION = 3
+FIELD_VERSION = 4
 """Raised whenever the arrays of a ContactField change meaning."""
 
 _CLEARANCE = 5.0e-4  # [m] postures of the field keep this distance to the palm
@@ -140,9 +140,14 @@ def build_field(
         normal=gather("normal", np.uint16),
         posture=gather("posture", np.uint8),
         clear_share=np.array([p["clear"] for p in parts], np.float32),
-        **opposed_pairs(parts, groups, params.seed),
+        **opposed_pairs(parts, groups, _palm_part(hand.model), params.seed),
         **boxes,
     )
+
+
+def _palm_part(model: HandModel) -> dict[str, np.ndarray]:
+    index = np.arange(model.contact_first[model.groups], model.contact_first[model.groups + 1])
+    return {"position": model.contact_points[index], "direction": model.contact_normals[index], "index": index}
 
 
 def _bounded_cell(positions: list[np.ndarray], params: FieldParams) -> float:

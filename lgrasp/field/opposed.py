@@ -1,4 +1,4 @@
-"""Pairs of contact vectors of different fingers that press towards each other, by their distance."""
+"""Pairs of contact vectors of different fingers, or of a lone finger and the palm, that press towards each other."""
 
 import numpy as np
 
@@ -7,15 +7,19 @@ __all__ = ["opposed_pairs"]
 _DRAWN = 4_000_000  # pairs looked at, all settings together
 _KEPT = 65_536
 _CONE = np.cos(np.radians(35.0))  # of each hand normal to the line between the two, at least
+_PALM_CONE = np.cos(np.radians(16.0))  # of the palm's, which no finger can turn
 _WIDTHS = (0.002, 0.20)  # [m]
 
 
-def opposed_pairs(parts: list[dict[str, np.ndarray]], groups: int, seed: int) -> dict[str, np.ndarray]:
+def opposed_pairs(
+    parts: list[dict[str, np.ndarray]], groups: int, palm: dict[str, np.ndarray], seed: int
+) -> dict[str, np.ndarray]:
     """Pair arrays of a ContactField, in order of their widths.
 
     Args:
         parts: ``position`` (n, 3) [m] and unit ``direction`` (n, 3), the hand normal, of every slot.
         groups: number of groups of the hand; slot = setting * groups + group.
+        palm: the same of the palm's contact points, and ``index`` (n,), by which slot -1 - index names them.
     """
     rng = np.random.default_rng(seed)
     both = [
@@ -24,18 +28,21 @@ def opposed_pairs(parts: list[dict[str, np.ndarray]], groups: int, seed: int) ->
         for b in range(a + 1, len(parts))
         if a // groups == b // groups and len(parts[a]["position"]) and len(parts[b]["position"])
     ]
+    if groups == 1 and len(palm["position"]):  # a lone jaw closes against nothing else
+        both += [(a, -1) for a in range(len(parts)) if len(parts[a]["position"])]
     ends, normals, slots = [], [], []
     for a, b in both:
-        p, q = parts[a], parts[b]
+        p, q = parts[a], palm if b < 0 else parts[b]
         i, j = (rng.integers(len(x["position"]), size=_DRAWN // len(both)) for x in (p, q))
         line = q["position"][j] - p["position"][i]
         width = np.linalg.norm(line, axis=1)
         limit = _CONE * width
         good = (np.einsum("nd,nd->n", line, p["direction"][i]) > limit) & (width > _WIDTHS[0]) & (width < _WIDTHS[1])
-        good &= np.einsum("nd,nd->n", line, q["direction"][j]) < -limit
+        good &= np.einsum("nd,nd->n", line, q["direction"][j]) < -(_PALM_CONE * width if b < 0 else limit)
         ends.append(np.stack([p["position"][i[good]], q["position"][j[good]]], 1))
         normals.append(np.stack([p["direction"][i[good]], q["direction"][j[good]]], 1))
-        slots.append(np.broadcast_to([a, b], (int(good.sum()), 2)))
+        second = -1 - q["index"][j[good]] if b < 0 else np.full(int(good.sum()), b)
+        slots.append(np.stack([np.full(len(second), a), second], 1))
     end = np.concatenate([np.zeros((0, 2, 3)), *ends]).astype(np.float32)
     normal = np.concatenate([np.zeros((0, 2, 3)), *normals]).astype(np.float32)
     slot = np.concatenate([np.zeros((0, 2)), *slots]).astype(np.int32)

@@ -1,5 +1,6 @@
 """Kernels of the place stage: poses are proposed, the best is chosen, the rest is dropped."""
 
+import numpy as np
 import warp as wp
 
 from lgrasp.device.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward
@@ -18,6 +19,7 @@ _HITS = wp.constant(6)  # rated contacts per group
 _MAX_RATED = wp.constant(48)
 _STRIDE = wp.constant(7919)  # between the seeds of a candidate's proposals
 _PINCHES = wp.constant(32)  # draws of two opposite points and two opposed contact vectors
+_PALM_COS = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched object's normal to the palm's
 _PINCH_SLACK = wp.constant(0.002)  # [m] difference of their distances
 
 
@@ -31,12 +33,12 @@ def _aligned(p: wp.vec3, n: wp.vec3, point: wp.vec3, normal: wp.vec3, state: wp.
 
 @wp.func
 def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int32), state: wp.uint32):
-    """Pose that puts two opposite object points between two fingers that press towards each other, any roll.
+    """Pose that puts two opposite object points between two fingers, or finger and palm, that press towards each other.
 
     ``anchor`` gets the two points; all of them stay below 0 when no pose was found.
 
     Returns:
-        Pose and setting.
+        Pose, setting, palm contact (-1: none) and the object point on it.
     """
     G = hand.kin.groups
     T = wp.transform_identity()
@@ -67,17 +69,27 @@ def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int3
         middle = 0.5 * (obj.contact_points[i] + obj.contact_points[j])
         T = wp.transform(0.5 * (a + b) - wp.quat_rotate(R, middle), R)
         slot = field.pair_slot[pair]
+        palm = -1 - slot[1]
+        if palm >= 0:
+            T = wp.transform(b - wp.quat_rotate(R, obj.contact_points[j]), R)
+            if wp.dot(hand.contacts.normals[palm], -wp.quat_rotate(R, obj.contact_normals[j])) < _PALM_COS:
+                continue
         p = wp.transform_point(T, obj.contact_points[i])
         q = wp.transform_point(T, obj.contact_points[j])
-        if (
+        if palm >= 0:
+            if field_has(field, slot[0], p, -wp.quat_rotate(R, obj.contact_normals[i])) >= 0:
+                setting = slot[0] // G
+                anchor[slot[0] - setting * G] = i
+                return T, setting, palm, j
+        elif (
             field_has(field, slot[0], p, -wp.quat_rotate(R, obj.contact_normals[i])) >= 0
             and field_has(field, slot[1], q, -wp.quat_rotate(R, obj.contact_normals[j])) >= 0
         ):
             setting = slot[0] // G
             anchor[slot[0] - setting * G] = i
             anchor[slot[1] - setting * G] = j
-            return T, setting
-    return T, int(-1)
+            return T, setting, int(-1), j
+    return T, int(-1), int(-1), int(-1)
 
 
 @wp.func
@@ -187,7 +199,7 @@ def propose_poses(
         R = random_rotation(wp.rand_init(wp.randi(state)))
         T = wp.transform(p - wp.quat_rotate(R, point), R)
     elif u < canonical + pinch:
-        T, setting = _pinch(hand, field, obj, anchor, wp.rand_init(wp.randi(state)))
+        T, setting, palm, i = _pinch(hand, field, obj, anchor, wp.rand_init(wp.randi(state)))
         if setting < 0:
             rating = 0
     elif u < canonical + pinch + palm_share and palms > 0:

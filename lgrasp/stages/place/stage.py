@@ -11,7 +11,7 @@ from lgrasp.stages.place.params import PlaceParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 3
+VERSION = 4
 
 
 def run(inputs: tuple[int, int], params: PlaceParams, context: Context) -> tuple[PoseTable, dict[str, int]]:
