@@ -71,15 +71,16 @@ def finger_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals (n, 3) of a finger link's allowed surface, body frame.
 
-    A point is dropped when its normal (link frame) is in a forbidden cone, or when other parts of the link block it.
+    A point is dropped when its normal (link frame) is in a forbidden cone, or when other parts of the link stand in the
+    way of an object there: of a finger-sized ball half-way, of a ball of 2 cm radius by 1 mm (recessed points).
     """
     points, normals = map(np.vstack, zip(*(_sample(m, rng) for m in meshes), strict=True))
     R = T_body_link[:3, :3]
     keep = np.ones(len(points), bool)
     for cone in forbidden:
         keep &= ~_in_cone(normals @ R, cone)
-    # outside every solid of the link, and free above
-    for probe, least in ((1e-4, 0.0), (8e-3, 5e-3)):
+    # outside every solid of the link, free above, not recessed
+    for probe, least in ((1e-4, 0.0), (8e-3, 5e-3), (2e-2, 1.9e-2)):
         distance = np.min([signed_distance(m, points + probe * normals, device) for m in meshes], 0)
         keep &= distance > least
     return _thin(points, normals, keep, rng)

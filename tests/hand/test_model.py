@@ -9,6 +9,7 @@ from reference.convex import hull_distance
 from reference.hands import HANDS, hand_model, hand_source, minimal_spec
 
 from lgrasp.errors import HandError
+from lgrasp.hand.contacts import finger_points
 from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres
 from lgrasp.hand.model import HandModel, build_hand
 from lgrasp.hand.pairs import pieces_touch
@@ -278,3 +279,14 @@ def test_arrays_round_trip_and_two_builds_are_equal():
     assert back.tree.link_names == model.tree.link_names
     assert isinstance(back.tree.joint_names, tuple)
     assert back.notes == model.notes
+
+
+def test_recessed_surface_is_no_contact():
+    """Between two ribs an object meets the ribs first; their tops and the plate's underside may touch."""
+    plate = trimesh.creation.box((0.04, 0.04, 0.005))
+    ribs = [trimesh.creation.box((0.005, 0.04, 0.005)).apply_translation((x, 0, 0.005)) for x in (-0.0075, 0.0075)]
+    points, normals = finger_points([plate, *ribs], np.eye(4), (), np.random.default_rng(0))
+    up = normals[:, 2] > 0.99
+    assert (points[up, 2] > 0.0074).mean() > 0.5
+    assert not (up & (np.abs(points[:, 0]) < 0.005)).any()
+    assert (normals[:, 2] < -0.99).sum() > 50
