@@ -65,7 +65,8 @@ def run(
         outputs=[table.q, table.state, number],
         device=d,
     )
-    counts = dict(zip(("tried", "reached", "kept"), map(int, number.numpy()), strict=True))
+    tried, reached, clear = map(int, number.numpy())
+    counts = {"tried": tried, "reached": reached, "kept": clear}
     if sets is None:
         return table, counts
     state = table.state.numpy()
