@@ -23,7 +23,7 @@ def test_strictly_valid(run, name):
         "fswo (norm)": 2e-3,
         "gswo (norm, stored normals)": 0.014,  # the filter's bound and this stay below the strict one
         "gap [mm]": 0.15,
-        "penetration [mm]": 0.5,
+        "penetration [mm]": 1.1,  # both sample surfaces; the bound of the filter and this stay below the strict one
         "normal_error [deg]": 10.0,  # stored: of the facet hit; judged: the best of those that meet there
         "self_penetration [mm]": 0.5,
     }
