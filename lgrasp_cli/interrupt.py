@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-__all__ = ["Interrupted", "before_end", "on_interrupt", "stop_now"]
+__all__ = ["Interrupted", "before_end", "on_interrupt", "stop_asked", "stop_now"]
 
 _GRACE = 1.0  # [s] that native code may take before the process is ended
 _last: list[Callable[[], None]] = []  # what is still done then
+_asked = threading.Event()
 
 
 class Interrupted(BaseException):
@@ -24,10 +25,16 @@ def stop_now() -> None:
     Raises:
         Interrupted: always.
     """
+    _asked.set()
     last = threading.Timer(_GRACE, _end)
     last.daemon = True
     last.start()
     raise Interrupted
+
+
+def stop_asked() -> bool:
+    """Was :func:`stop_now` called? A module half-imported then may fail in its own way later."""
+    return _asked.is_set()
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from lgrasp_cli import bench, cache, dataset, generate, hands, objects, pipelines, prepare, run, stages
-from lgrasp_cli.interrupt import Interrupted, on_interrupt, stop_now
+from lgrasp_cli.interrupt import Interrupted, on_interrupt, stop_asked, stop_now
 
 __all__ = ["app", "main"]
 
@@ -63,6 +63,8 @@ def _explain(error: BaseException) -> tuple[str, int]:
     """One line for the user and the exit code of a failure."""
     from lgrasp.errors import LgraspError
 
+    if stop_asked():
+        return "interrupted", 130
     if isinstance(error, LgraspError):
         return f"error: {error}", error.exit_code
     if type(error).__name__ == "NoArgsIsHelpError":  # no command: its message, the help, is printed already
