@@ -2,7 +2,7 @@
 
 import warp as wp
 
-__all__ = ["Sdf", "sdf_gradient", "sdf_value"]
+__all__ = ["Sdf", "sdf_gradient", "sdf_part", "sdf_value"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -18,6 +18,22 @@ class Sdf:
     nz: wp.int32
     origin: wp.vec3
     inv_cell: wp.float32
+
+
+@wp.func
+def sdf_part(
+    values: wp.array(dtype=wp.float32), first: wp.int32, shape: wp.vec3i, origin: wp.vec3, inv_cell: wp.float32
+):
+    """The grid that begins at place ``first`` of a shared array."""
+    s = Sdf()
+    s.values = values
+    s.first = first
+    s.nx = shape[0]
+    s.ny = shape[1]
+    s.nz = shape[2]
+    s.origin = origin
+    s.inv_cell = inv_cell
+    return s
 
 
 @wp.func

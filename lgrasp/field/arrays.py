@@ -44,7 +44,6 @@ class Field:
     offset: wp.array(dtype=wp.int32)
     normal: wp.array(dtype=wp.uint16)
     posture: wp.array2d(dtype=wp.uint8)
-    pairs: wp.int32
     pair_point: wp.array2d(dtype=wp.vec3)
     pair_normal: wp.array2d(dtype=wp.vec3)
     pair_slot: wp.array(dtype=wp.vec2i)
@@ -91,7 +90,6 @@ def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArra
     field.offset = put(model.offset, wp.int32)
     field.normal = put(model.normal, wp.uint16)
     field.posture = put(model.posture, wp.uint8)
-    field.pairs = len(model.pair_width)
     field.pair_point = put(model.pair_point, wp.vec3)
     field.pair_normal = put(model.pair_normal, wp.vec3)
     field.pair_slot = put(model.pair_slot, wp.vec2i)

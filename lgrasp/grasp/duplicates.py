@@ -7,7 +7,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from lgrasp.device.runtime import start
-from lgrasp.grasp.near_kernels import list_near, near_earlier
+from lgrasp.grasp.near_kernels import list_near
 
 __all__ = ["NEAR_ANGLE", "NEAR_DISTANCE", "NEAR_JOINT", "KeptRows", "near_pairs", "new_rows"]
 
@@ -87,24 +87,26 @@ class KeptRows:
         position = wp.array(np.ascontiguousarray(self._pose[:end, :3]), dtype=wp.vec3, device=d)
         rotation = wp.array(np.ascontiguousarray(self._pose[:end, 3:]), dtype=wp.vec4, device=d)
         q = wp.array(self._q[:end], dtype=wp.float32, device=d)
-        near = wp.empty(end - self.count, dtype=wp.int32, device=d)
         self._grid.build(position, _REACH)
-        # with some slack for rounding: pairs are decided in double precision below
-        limits = [_REACH, float(np.cos(NEAR_ANGLE / 2)) - 1e-6, NEAR_JOINT * 1.00001]
-        rows = [self._grid.id, position, rotation, q]
-        wp.launch(near_earlier, len(near), [*rows, self.count, *limits], [near], device=d)
-        suspects = self.count + np.flatnonzero(near.numpy()).astype(np.int32)
+
+        def listed(asked: np.ndarray, places: np.ndarray, room: int) -> tuple[np.ndarray, np.ndarray]:
+            """How many rows are near before each one asked and, given places for them, which."""
+            number, others = (wp.empty(n, dtype=wp.int32, device=d) for n in (len(asked), room))
+            # with some slack for rounding: pairs are decided in double precision below
+            limits = [_REACH, float(np.cos(NEAR_ANGLE / 2)) - 1e-6, NEAR_JOINT * 1.00001]
+            given = [wp.array(a.astype(np.int32), dtype=wp.int32, device=d) for a in (asked, places)]
+            inputs = [self._grid.id, position, rotation, q, given[0], *limits, given[1]]
+            wp.launch(list_near, len(asked), inputs, [number, others], device=d)
+            return number.numpy(), others.numpy()
+
+        rows = np.arange(self.count, end)
+        number, _ = listed(rows, rows[:0], 0)
+        suspects, number = rows[number > 0], number[number > 0]
         if len(suspects) == 0:
             return
-        asked = wp.array(suspects, dtype=wp.int32, device=d)
-        number, none = (wp.empty(n, dtype=wp.int32, device=d) for n in (len(suspects), 0))
-        wp.launch(list_near, len(suspects), [*rows, asked, *limits, none], [number, none], device=d)
-        first = np.concatenate([[0], np.cumsum(number.numpy())]).astype(np.int32)
-        others = wp.empty(int(first[-1]), dtype=wp.int32, device=d)
-        places = wp.array(first[:-1], dtype=wp.int32, device=d)
-        wp.launch(list_near, len(suspects), [*rows, asked, *limits, places], [number, others], device=d)
-        other = others.numpy()
-        row = np.repeat(suspects, np.diff(first))
+        first = np.concatenate([[0], np.cumsum(number)])
+        _, other = listed(suspects, first[:-1], int(first[-1]))
+        row = np.repeat(suspects, number)
         same = _near(self._pose[other], self._q[other], self._pose[row], self._q[row])
         for i, suspect in enumerate(suspects):
             part = slice(first[i], first[i + 1])

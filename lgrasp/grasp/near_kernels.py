@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.device.runtime import KERNEL_OPTIONS
 
-__all__ = ["list_near", "near_earlier"]
+__all__ = ["list_near"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -57,27 +57,3 @@ def list_near(
                 near_out[first[i] + n] = other
             n += 1
     count_out[i] = n
-
-
-@wp.kernel
-def near_earlier(
-    grid: wp.uint64,
-    position: wp.array(dtype=wp.vec3),
-    rotation: wp.array(dtype=wp.vec4),
-    q: wp.array2d(dtype=wp.float32),
-    first: wp.int32,
-    reach: wp.float32,
-    cosine: wp.float32,
-    joint: wp.float32,
-    near_out: wp.array(dtype=wp.int32),
-):
-    """1 when a row before row first + i is within reach [m], half-angle cosine and joint [rad or m] of it, else 0."""
-    i = wp.tid()
-    row = first + i
-    near = int(0)
-    query = wp.hash_grid_query(grid, position[row], reach)
-    other = int(0)
-    while wp.hash_grid_query_next(query, other):
-        if near == 0 and other < row and _is_near(position, rotation, q, row, other, reach, cosine, joint):
-            near = 1
-    near_out[i] = near

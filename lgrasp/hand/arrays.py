@@ -8,7 +8,7 @@ import warp as wp
 from lgrasp.device.convex import Pieces
 from lgrasp.device.kinematics import MAX_JOINTS, Kinematics, group_forward, point_column, vec_dof
 from lgrasp.device.runtime import KERNEL_OPTIONS, start
-from lgrasp.device.sdf import Sdf
+from lgrasp.device.sdf import sdf_part
 from lgrasp.hand.model import HandModel
 
 __all__ = [
@@ -188,31 +188,13 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
 @wp.func
 def hand_grid(c: Contacts, i: wp.int32):
     """Distance grid of contact link i."""
-    s = Sdf()
-    s.values = c.grid_values
-    s.first = c.grid_first[i]
-    n = c.grid_shape[i]
-    s.nx = n[0]
-    s.ny = n[1]
-    s.nz = n[2]
-    s.origin = c.grid_origin[i]
-    s.inv_cell = c.grid_inv_cell[i]
-    return s
+    return sdf_part(c.grid_values, c.grid_first[i], c.grid_shape[i], c.grid_origin[i], c.grid_inv_cell[i])
 
 
 @wp.func
 def overlap_grid(c: Overlaps, i: wp.int32):
     """Distance grid of side i."""
-    s = Sdf()
-    s.values = c.grid_values
-    s.first = c.grid_first[i]
-    n = c.grid_shape[i]
-    s.nx = n[0]
-    s.ny = n[1]
-    s.nz = n[2]
-    s.origin = c.grid_origin[i]
-    s.inv_cell = c.grid_inv_cell[i]
-    return s
+    return sdf_part(c.grid_values, c.grid_first[i], c.grid_shape[i], c.grid_origin[i], c.grid_inv_cell[i])
 
 
 @wp.func

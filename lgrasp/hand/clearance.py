@@ -15,6 +15,19 @@ _OVERLAP = wp.constant(OVERLAP)
 
 
 @wp.func
+def _side_depth(hand: Hand, k: wp.int32, T: wp.transform, limit: wp.float32):
+    """Deepest point [m] of side k in its grid, 0 when apart; stops early above ``limit``. T = T_grid_points."""
+    grid = overlap_grid(hand.overlaps, k)
+    side = hand.overlaps.sides[k]
+    depth = float(0.0)
+    for i in range(side[2], side[3]):
+        depth = wp.max(depth, -sdf_value(grid, wp.transform_point(T, hand.overlaps.points[i])))
+        if depth > limit:
+            break
+    return depth
+
+
+@wp.func
 def group_pairs_clear(
     hand: Hand,
     a: wp.int32,
@@ -69,11 +82,8 @@ def group_pairs_clear(
             Tg = Xb[side[1] - jb]
         elif a > 0:
             Tg = Xa[side[1] - ja]
-        grid = overlap_grid(hand.overlaps, k)
-        T = wp.transform_inverse(Tg) * Tp
-        for i in range(side[2], side[3]):
-            if sdf_value(grid, wp.transform_point(T, hand.overlaps.points[i])) < -_OVERLAP:
-                return False
+        if _side_depth(hand, k, wp.transform_inverse(Tg) * Tp, _OVERLAP) > _OVERLAP:
+            return False
     return True
 
 
@@ -89,8 +99,5 @@ def overlap_depth(hand: Hand, X: wp.array2d(dtype=wp.transform), row: wp.int32):
             Tp = X[row, side[0] - 1]
         if side[1] > 0:
             Tg = X[row, side[1] - 1]
-        grid = overlap_grid(hand.overlaps, k)
-        T = wp.transform_inverse(Tg) * Tp
-        for i in range(side[2], side[3]):
-            depth = wp.max(depth, -sdf_value(grid, wp.transform_point(T, hand.overlaps.points[i])))
+        depth = wp.max(depth, _side_depth(hand, k, wp.transform_inverse(Tg) * Tp, 1.0))
     return depth

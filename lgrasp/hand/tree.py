@@ -45,9 +45,7 @@ class Tree:
     locked_names: tuple[str, ...]  # actuated joints held at a value; shards list them after those of q
     locked_values: np.ndarray  # (H,) [rad or m]
     locked_limits: np.ndarray  # (H, 2)
-    coupled_names: tuple[
-        str, ...
-    ]  # joints whose coupling only hand.yaml states; shards list them after the locked ones
+    coupled_names: tuple[str, ...]  # joints that only hand.yaml couples; shards list them after the locked ones
     coupled_column: np.ndarray  # (M,) i32: column of q that drives each
     coupled_mult: np.ndarray  # (M,)
     coupled_offset: np.ndarray  # (M,) [rad or m]

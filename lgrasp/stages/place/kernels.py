@@ -69,26 +69,23 @@ def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int3
         middle = 0.5 * (obj.contact_points[i] + obj.contact_points[j])
         T = wp.transform(0.5 * (a + b) - wp.quat_rotate(R, middle), R)
         slot = field.pair_slot[pair]
-        palm = -1 - slot[1]
+        palm = wp.max(-1 - slot[1], -1)
         if palm >= 0:
             T = wp.transform(b - wp.quat_rotate(R, obj.contact_points[j]), R)
-            if wp.dot(hand.contacts.normals[palm], -wp.quat_rotate(R, obj.contact_normals[j])) < _PALM_COS:
-                continue
         p = wp.transform_point(T, obj.contact_points[i])
-        q = wp.transform_point(T, obj.contact_points[j])
+        if field_has(field, slot[0], p, -wp.quat_rotate(R, obj.contact_normals[i])) < 0:
+            continue
+        across = -wp.quat_rotate(R, obj.contact_normals[j])
         if palm >= 0:
-            if field_has(field, slot[0], p, -wp.quat_rotate(R, obj.contact_normals[i])) >= 0:
-                setting = slot[0] // G
-                anchor[slot[0] - setting * G] = i
-                return T, setting, palm, j
-        elif (
-            field_has(field, slot[0], p, -wp.quat_rotate(R, obj.contact_normals[i])) >= 0
-            and field_has(field, slot[1], q, -wp.quat_rotate(R, obj.contact_normals[j])) >= 0
-        ):
-            setting = slot[0] // G
-            anchor[slot[0] - setting * G] = i
+            if wp.dot(hand.contacts.normals[palm], across) < _PALM_COS:
+                continue
+        elif field_has(field, slot[1], wp.transform_point(T, obj.contact_points[j]), across) < 0:
+            continue
+        setting = slot[0] // G
+        anchor[slot[0] - setting * G] = i
+        if palm < 0:
             anchor[slot[1] - setting * G] = j
-            return T, setting, int(-1), j
+        return T, setting, palm, j
     return T, int(-1), int(-1), int(-1)
 
 
