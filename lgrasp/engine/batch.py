@@ -1,63 +1,62 @@
 """One batch of candidates through the stages of a pipeline."""
 
-import time
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from lgrasp.engine.bank import Bank
 from lgrasp.engine.fit import fit_params
+from lgrasp.engine.meter import Meter
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.stages import STAGES
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, select_poses
 from lgrasp.stages.context import Context
 
-__all__ = ["BatchResult", "run_batch", "run_stages"]
+__all__ = ["BatchResult", "finish_batch", "run_batch", "run_stages"]
 
 
 @dataclass
 class BatchResult:
-    """What a batch gave: grasps in candidate order, counts and thread-seconds per stage."""
+    """What a batch gave: grasps in candidate order, counts and seconds per stage."""
 
     grasps: GraspTable
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-class _Meter:
-    def __init__(self) -> None:
-        self.counts: dict[str, dict[str, int]] = {}
-        self.seconds: dict[str, float] = {}
-
-    def run(self, stage: str, inputs: Any, pipeline: Pipeline, context: Context, **options: Any) -> Any:
-        params = fit_params(stage, pipeline.params(stage), context.hand.model)
-        start = time.perf_counter()
-        table, counts = STAGES[stage].run(inputs, params, context, **options)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-        total = self.counts.setdefault(stage, {})
-        for name, value in counts.items():
-            total[name] = total.get(name, 0) + value
-        return table
-
-
 def run_stages(
-    pipeline: Pipeline, context: Context, first: int, count: int, last: str, meter: _Meter | None = None
+    pipeline: Pipeline, context: Context, first: int | wp.array, count: int, last: str, meter: Meter | None = None
 ) -> Any:
     """The table of stage ``last`` for candidates ``first .. first + count - 1``, all stages before it included."""
-    meter = meter or _Meter()
+    meter = meter or Meter(context.device)
     table: Any = (first, count)
-    for stage in pipeline.order:
-        options = {"realised": _realised(pipeline)} if stage == "search" else {}
-        table = meter.run(stage, table, pipeline, context, **options)
-        if stage == last:
-            return table
-    raise AssertionError(f"stage {last} is not in the pipeline")
+    for stage in pipeline.order[: pipeline.order.index(last) + 1]:
+        table = _run(stage, table, pipeline, context, meter)
+    return table
+
+
+def _run(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter, salt: int = 0) -> Any:
+    params = fit_params(stage, pipeline.params(stage), context.hand.model)
+    options = {"realised": _realised(pipeline), "salt": salt} if stage == "search" else {}
+    start = meter.now()
+    table, counts = STAGES[stage].run(table, params, context, **options)
+    meter.add(stage, counts, start, meter.now())
+    return table
 
 
 def _realised(pipeline: Pipeline) -> bool:
     """Does ik come before search in this pipeline?"""
     return pipeline.order.index("ik") < pipeline.order.index("search")
+
+
+def finish_batch(pipeline: Pipeline, context: Context, sets: ContactSets, meter: Meter) -> BatchResult:
+    """What a batch gives whose stages up to search have been run."""
+    table: Any = sets
+    for stage in pipeline.order[pipeline.order.index("search") + 1 :]:
+        table = _run(stage, table, pipeline, context, meter)
+    return BatchResult(table, meter.counts, meter.seconds)
 
 
 def run_batch(pipeline: Pipeline, context: Context, first: int, count: int, bank: Bank | None = None) -> BatchResult:
@@ -70,34 +69,31 @@ def run_batch(pipeline: Pipeline, context: Context, first: int, count: int, bank
     Args:
         bank: where the candidates before search are kept between runs; None keeps nothing.
     """
-    meter = _Meter()
-    before_search = pipeline.order[pipeline.order.index("search") - 1]
+    meter = Meter(context.device)
+    at = pipeline.order.index("search")
     banked = bank.load(first, count) if bank else None
     if banked:
-        table, meter.counts = banked
+        table, counts = banked
+        for stage, own in counts.items():
+            meter.add(stage, own)
     else:
-        table = run_stages(pipeline, context, first, count, before_search, meter)
+        table = run_stages(pipeline, context, first, count, pipeline.order[at - 1], meter)
         if bank:
             bank.store(first, count, table, meter.counts)
     parts = []
-    for salt in range(pipeline.params("search").passes):
-        sets = meter.run("search", table, pipeline, context, realised=_realised(pipeline), salt=salt)
-        grasps = _finish(sets, pipeline, context, meter)
-        parts.append(grasps)
-        if salt == 0 and pipeline.params("search").passes > 1:
-            table = _richest(table, grasps, context)
+    passes = pipeline.params("search").passes
+    for salt in range(passes):
+        result: Any = table
+        for stage in pipeline.order[at:]:
+            result = _run(stage, result, pipeline, context, meter, salt)
+        parts.append(result)
+        if salt == 0 and passes > 1:
+            table = _richest(table, result, context)
     return BatchResult(join_grasps(parts), meter.counts, meter.seconds)
-
-
-def _finish(sets: ContactSets, pipeline: Pipeline, context: Context, meter: _Meter) -> GraspTable:
-    for stage in pipeline.order[pipeline.order.index("search") + 1 :]:
-        sets = meter.run(stage, sets, pipeline, context)
-    assert isinstance(sets, GraspTable)
-    return sets
 
 
 def _richest(table: CandidateTable, grasps: GraspTable, context: Context) -> CandidateTable:
     """The poses that gave grasps, those that gave most first."""
     index, number = np.unique(grasps.index, return_counts=True)
-    row = np.searchsorted(table.poses.index.numpy(), index)
+    row = np.searchsorted(table.poses.index.numpy()[: len(table.poses)], index)
     return select_poses(table, row[np.argsort(-number, kind="stable")], context.device)

@@ -16,6 +16,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder, clean_folder, present_shards, shard_path
 from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.recording import Recorder
 from lgrasp.engine.shard import Execution, ShardResult, make_shard, shard_effort
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.writing import BackgroundWriter
@@ -146,7 +147,9 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
         load_kernels(device.alias, kernel_modules("lgrasp.stages."), listener.loading)
         inputs.seconds["kernels"] = time.perf_counter() - begin
     workers = job.workers or (1 if device.is_cuda else os.cpu_count() or 1)
-    execution = Execution(workers, job.batch, listener.cancelled, job.rate)
+    replayed = device.is_cuda and workers == 1 and not job.reuse and pipeline.params("search").passes == 1
+    recorder = Recorder(pipeline) if replayed else None
+    execution = Execution(workers, job.batch, listener.cancelled, job.rate, recorder)
     listener.started(inputs, [s for s, _ in shards], list(present))
     outcome = Outcome(inputs, [], sum(present.values()), 0, sum(present.values()), [], 0.0, False)
     wanted = dict(shards)

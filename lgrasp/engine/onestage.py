@@ -93,9 +93,10 @@ def run_stage(
         table, counts = STAGES[stage].run(
             table, fit_params(stage, pipeline.params(stage), inputs.hand.model), context, **options
         )
+        counted = dict(counts)
         seconds = time.perf_counter() - start
-        cache.store(stage, files[stage], _arrays(table) | {"counts": np.asarray(json.dumps(counts))})
-        runs.append(StageRun(stage, False, counts, seconds, cache.path(stage, files[stage])))
+        cache.store(stage, files[stage], _arrays(table) | {"counts": np.asarray(json.dumps(counted))})
+        runs.append(StageRun(stage, False, counted, seconds, cache.path(stage, files[stage])))
     return runs
 
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 import warp as wp
 
 from lgrasp.engine.bank import BANK_CANDIDATES, Bank
-from lgrasp.engine.batch import BatchResult, run_batch
+from lgrasp.engine.batch import BatchResult, finish_batch, run_batch
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.recording import Recorder
 from lgrasp.engine.workspace import Inputs
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps, user_poses
@@ -35,6 +36,7 @@ class Execution:
     batch: int = 0  # candidates per batch; 0: by device
     cancelled: Callable[[], bool] = lambda: False
     rate: float = 1.0  # rows expected per candidate, until there are some: sizes the first batch on a GPU
+    recorder: Recorder | None = None  # replays batches; for one worker, without a bank, one pass
 
 
 @dataclass
@@ -60,31 +62,28 @@ def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]
 
 
 def _batches(
-    pipeline: Pipeline,
-    context: Context,
-    execution: Execution,
-    bank: Bank | None,
-    limit: int,
-    size: Callable[[int], int],
+    run: Callable[[int, int], BatchResult], workers: int, limit: int, size: Callable[[int], int]
 ) -> Generator[tuple[int, BatchResult]]:
     """Results of consecutive batches, in order; ``workers`` of them are worked on at a time.
 
     Closing the generator (or an error in a batch) drops the batches not begun and waits for those that were.
 
     Args:
+        run: makes the batch of candidates ``first .. first + count - 1`` from (first, count).
+        limit: candidates there may be.
         size: candidates of the next batch, given how many are being worked on; 0: those should do.
     """
     first = 0
-    with ThreadPoolExecutor(execution.workers) as pool:
+    with ThreadPoolExecutor(workers) as pool:
         waiting: deque[tuple[int, Future[BatchResult]]] = deque()
         try:
             while True:
                 # one more than there are workers: it begins at once when a worker is free
-                while len(waiting) <= execution.workers and first < limit:
+                while len(waiting) <= workers and first < limit:
                     count = min(size(sum(n for n, _ in waiting)), limit - first)
                     if count == 0:
                         break
-                    waiting.append((count, pool.submit(run_batch, pipeline, context, first, count, bank)))
+                    waiting.append((count, pool.submit(run, first, count)))
                     first += count
                 if not waiting:
                     return
@@ -148,6 +147,7 @@ def make_shard(
     stopped = False
     start = time.perf_counter()
     # later passes go over the poses of one batch, so its size decides the order of the rows
+    recorder = execution.recorder
     fixed = BANK_CANDIDATES if bank is not None or pipeline.params("search").passes > 1 else execution.batch
 
     most = _GPU_MOST if context.device == "cpu" else _most_candidates(context.device, inputs.hand.model.groups)
@@ -155,9 +155,15 @@ def make_shard(
     def size(running: int) -> int:
         # going by those so far
         rate = kept.count / result.candidates if result and kept.count else execution.rate
-        return fixed or _batch_size(context.device, rows - kept.count, rate, running, most)
+        wanted = fixed or _batch_size(context.device, rows - kept.count, rate, running, most)
+        return recorder.size(wanted) if recorder and not fixed and wanted else wanted
 
-    with closing(_batches(pipeline, context, execution, bank, limit, size)) as batches:
+    def run(first: int, count: int) -> BatchResult:
+        if recorder is None:
+            return run_batch(pipeline, context, first, count, bank)
+        return finish_batch(pipeline, context, *recorder.run(context, first, count))
+
+    with closing(_batches(run, execution.workers, limit, size)) as batches:
         for count, batch in batches:
             if result is None:
                 result = ShardResult(batch.grasps)

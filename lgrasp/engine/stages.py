@@ -1,6 +1,6 @@
 """The stages there are: name -> parameters, version and function."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +28,7 @@ class Stage:
     name: str
     params: type[BaseModel]
     version: int
-    run: Callable[..., tuple[Any, dict[str, int]]]
+    run: Callable[..., tuple[Any, Mapping[str, int]]]
 
 
 STAGES: dict[str, Stage] = {

@@ -1,6 +1,10 @@
-"""The tables that flow between stages: structures of arrays on one device."""
+"""The tables that flow between stages: structures of arrays on one device.
 
-from dataclasses import dataclass, fields
+Tables made on a device are as long as they may get, and tell on the device how many of their rows are in use: no stage
+waits for its number of rows.
+"""
+
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import warp as wp
@@ -22,6 +26,7 @@ __all__ = [
     "set_arrays",
     "set_table",
     "take_grasps",
+    "trim_sets",
     "user_poses",
 ]
 
@@ -36,9 +41,11 @@ class PoseTable:
     palm_surface: wp.array  # (P,) i32 object contact point that touches, -1
     setting: wp.array  # (P,) i32 setting of the hand's shared joints
     anchor: wp.array  # (P, G) i32 object contact point that each group can surely touch about, -1 unknown
+    rows: wp.array  # (1,) i32 how many of the P rows are in use: the first ones
 
     def __len__(self) -> int:
-        return self.index.shape[0]
+        """Rows in use; waits for the device."""
+        return int(self.rows.numpy()[0])
 
 
 @dataclass(frozen=True)
@@ -62,9 +69,11 @@ class ContactSets:
     slot: wp.array  # (S,) i32 number of the set within its pose
     chosen: wp.array  # (S, G) i32 candidate of each group, -1 = unused
     score: wp.array  # (S,) f32 norm of the frictionless residual
+    rows: wp.array  # (1,) i32 how many of the S rows are in use: the first ones
 
     def __len__(self) -> int:
-        return self.pose.shape[0]
+        """Rows in use; waits for the device."""
+        return int(self.rows.numpy()[0])
 
 
 @dataclass(frozen=True)
@@ -88,14 +97,15 @@ class GraspTable:
 
 
 def pose_arrays(table: PoseTable) -> dict[str, np.ndarray]:
-    """A PoseTable as NumPy arrays; ``pose`` is (P, 7) x y z, qx qy qz qw."""
+    """The rows in use of a PoseTable as NumPy arrays; ``pose`` is (P, 7) x y z, qx qy qz qw."""
+    n = len(table)
     return {
-        "index": table.index.numpy(),
-        "pose": table.pose.numpy().reshape(-1, 7),
-        "palm_point": table.palm_point.numpy(),
-        "palm_surface": table.palm_surface.numpy(),
-        "setting": table.setting.numpy(),
-        "anchor": table.anchor.numpy(),
+        "index": table.index.numpy()[:n],
+        "pose": table.pose.numpy().reshape(-1, 7)[:n],
+        "palm_point": table.palm_point.numpy()[:n],
+        "palm_surface": table.palm_surface.numpy()[:n],
+        "setting": table.setting.numpy()[:n],
+        "anchor": table.anchor.numpy()[:n],
     }
 
 
@@ -108,12 +118,14 @@ def pose_table(arrays: dict[str, np.ndarray], device: str) -> PoseTable:
         palm_surface=wp.array(arrays["palm_surface"], dtype=wp.int32, device=device),
         setting=wp.array(arrays["setting"], dtype=wp.int32, device=device),
         anchor=wp.array(arrays["anchor"], dtype=wp.int32, device=device),
+        rows=wp.full(1, len(arrays["index"]), dtype=wp.int32, device=device),
     )
 
 
 def candidate_arrays(table: CandidateTable) -> dict[str, np.ndarray]:
-    """A CandidateTable as NumPy arrays; ``q`` is (P, G, M, MAX_DOFS)."""
-    own = {name: getattr(table, name).numpy() for name in ("count", "surface", "record", "state", "q")}
+    """The rows in use of a CandidateTable as NumPy arrays; ``q`` is (P, G, M, MAX_DOFS)."""
+    n = len(table.poses)
+    own = {name: getattr(table, name).numpy()[:n] for name in ("count", "surface", "record", "state", "q")}
     return own | {f"poses.{name}": values for name, values in pose_arrays(table.poses).items()}
 
 
@@ -128,8 +140,9 @@ def candidate_table(arrays: dict[str, np.ndarray], device: str) -> CandidateTabl
 
 
 def set_arrays(table: ContactSets) -> dict[str, np.ndarray]:
-    """ContactSets as NumPy arrays."""
-    own = {name: getattr(table, name).numpy() for name in ("pose", "slot", "chosen", "score")}
+    """The rows in use of ContactSets as NumPy arrays."""
+    n = len(table)
+    own = {name: getattr(table, name).numpy()[:n] for name in ("pose", "slot", "chosen", "score")}
     return own | {f"candidates.{name}": values for name, values in candidate_arrays(table.candidates).items()}
 
 
@@ -138,7 +151,16 @@ def set_table(arrays: dict[str, np.ndarray], device: str) -> ContactSets:
     inner = {name.removeprefix("candidates."): a for name, a in arrays.items() if name.startswith("candidates.")}
     own = {name: wp.array(arrays[name], dtype=wp.int32, device=device) for name in ("pose", "slot", "chosen")}
     score = wp.array(arrays["score"], dtype=wp.float32, device=device)
-    return ContactSets(candidates=candidate_table(inner, device), score=score, **own)
+    rows = wp.full(1, len(arrays["score"]), dtype=wp.int32, device=device)
+    return ContactSets(candidates=candidate_table(inner, device), score=score, rows=rows, **own)
+
+
+def trim_sets(table: ContactSets) -> ContactSets:
+    """Views of the rows in use; waits for the device."""
+    n = len(table)
+    if n == table.pose.shape[0]:
+        return table
+    return replace(table, pose=table.pose[:n], slot=table.slot[:n], chosen=table.chosen[:n], score=table.score[:n])
 
 
 def select_poses(table: CandidateTable, rows: np.ndarray, device: str) -> CandidateTable:

@@ -1,6 +1,9 @@
 """What every stage is given beside its inputs and parameters."""
 
 from dataclasses import dataclass
+from dataclasses import field as with_default
+
+import warp as wp
 
 from lgrasp.field.arrays import FieldArrays
 from lgrasp.hand.arrays import HandArrays
@@ -21,6 +24,11 @@ class Context:
     base_seed: int
     shard: int
 
-    def seed(self, stage: str, salt: int = 0) -> int:
-        """31-bit seed of a stage in this shard."""
-        return stage_seed(self.base_seed, self.shard, stage, salt)
+    seeds: dict[tuple[str, int], wp.array] = with_default(default_factory=dict, repr=False, compare=False)
+
+    def seed(self, stage: str, salt: int = 0) -> wp.array:
+        """31-bit seed of a stage in this shard, (1,) i32 on the device."""
+        if (stage, salt) not in self.seeds:
+            value = stage_seed(self.base_seed, self.shard, stage, salt)
+            self.seeds[stage, salt] = wp.full(1, value, dtype=wp.int32, device=self.device)
+        return self.seeds[stage, salt]

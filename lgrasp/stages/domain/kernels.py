@@ -8,7 +8,7 @@ from lgrasp.field.arrays import Boxes, Field, boxes_pick, field_has, field_pick,
 from lgrasp.hand.arrays import Hand
 from lgrasp.object.arrays import Object
 
-__all__ = ["draw_domains", "draw_domains_bvh"]
+__all__ = ["draw_domains", "draw_domains_bvh", "drop_poor"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -20,10 +20,11 @@ def draw_domains(
     hand: Hand,
     field: Field,
     obj: Object,
-    seed: wp.int32,
+    seed: wp.array(dtype=wp.int32),
     attempts: wp.int32,
     keep: wp.int32,
     cosine: wp.float32,
+    rows: wp.array(dtype=wp.int32),
     index: wp.array(dtype=wp.int32),
     pose: wp.array(dtype=wp.transform),
     setting: wp.array(dtype=wp.int32),
@@ -35,8 +36,10 @@ def draw_domains(
 ):
     """Contact domain of each (pose, group): surface points that a contact vector of the group meets."""
     row, g = wp.tid()
+    if row >= rows[0]:
+        return
     slot = setting[row] * hand.kin.groups + g
-    state = wp.rand_init(seed, index[row] * hand.kin.groups + g)
+    state = wp.rand_init(seed[0], index[row] * hand.kin.groups + g)
     T = pose[row]
     R = wp.transform_get_rotation(T)
     t = wp.transform_get_translation(T)
@@ -72,10 +75,11 @@ def draw_domains_bvh(
     field: Field,
     boxes: Boxes,
     obj: Object,
-    seed: wp.int32,
+    seed: wp.array(dtype=wp.int32),
     attempts: wp.int32,
     keep: wp.int32,
     cosine: wp.float32,
+    rows: wp.array(dtype=wp.int32),
     index: wp.array(dtype=wp.int32),
     pose: wp.array(dtype=wp.transform),
     setting: wp.array(dtype=wp.int32),
@@ -87,8 +91,10 @@ def draw_domains_bvh(
 ):
     """The same domains from the published index: every patch of the group is asked, a hit one is picked at random."""
     row, g = wp.tid()
+    if row >= rows[0]:
+        return
     slot = setting[row] * hand.kin.groups + g
-    state = wp.rand_init(seed, index[row] * hand.kin.groups + g)
+    state = wp.rand_init(seed[0], index[row] * hand.kin.groups + g)
     T = pose[row]
     n = int(0)
     for _a in range(attempts):
@@ -104,3 +110,35 @@ def draw_domains_bvh(
             if n == keep:
                 break
     count_out[row, g] = n
+
+
+@wp.kernel
+def drop_poor(
+    fingers: wp.int32,
+    rows: wp.array(dtype=wp.int32),
+    palm_point: wp.array(dtype=wp.int32),
+    count_out: wp.array2d(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
+):
+    """Poses where too few fingers (and the palm) can touch lose their candidates.
+
+    ``counts_out`` grows by the poses, the rich ones and the candidates of those.
+    """
+    row = wp.tid()
+    if row >= rows[0]:
+        return
+    touching = int(0)
+    if palm_point[row] >= 0:
+        touching = 1
+    candidates = int(0)
+    for g in range(count_out.shape[1]):
+        if count_out[row, g] > 0:
+            touching += 1
+            candidates += count_out[row, g]
+    wp.atomic_add(counts_out, 0, 1)
+    if touching >= fingers:
+        wp.atomic_add(counts_out, 1, 1)
+        wp.atomic_add(counts_out, 2, candidates)
+    else:
+        for g in range(count_out.shape[1]):
+            count_out[row, g] = 0

@@ -6,8 +6,9 @@ import warp as wp
 
 from lgrasp.device.kinematics import vec_dof
 from lgrasp.grasp.tables import CandidateTable, PoseTable
+from lgrasp.grasp.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.domain.kernels import draw_domains, draw_domains_bvh
+from lgrasp.stages.domain.kernels import draw_domains, draw_domains_bvh, drop_poor
 from lgrasp.stages.domain.params import DomainParams
 
 __all__ = ["VERSION", "run"]
@@ -15,13 +16,13 @@ __all__ = ["VERSION", "run"]
 VERSION = 2
 
 
-def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[CandidateTable, dict[str, int]]:
+def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[CandidateTable, Tally]:
     """Contact domain of every pose and group (merged over the group's patches).
 
     Returns:
         The candidates, and counts ``poses``, ``rich`` (poses where enough fingers can touch), ``candidates``.
     """
-    d, groups, n = context.device, context.hand.model.groups, len(inputs)
+    d, groups, n = context.device, context.hand.model.groups, inputs.index.shape[0]
     count = wp.zeros((n, groups), dtype=wp.int32, device=d)
     surface, record = (wp.empty((n, groups, params.keep), dtype=wp.int32, device=d) for _ in range(2))
     q = wp.empty((n, groups, params.keep), dtype=vec_dof, device=d)
@@ -38,6 +39,7 @@ def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[Cand
             params.attempts,
             params.keep,
             math.cos(math.radians(params.angle)),
+            inputs.rows,
             inputs.index,
             inputs.pose,
             inputs.setting,
@@ -47,10 +49,12 @@ def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[Cand
         device=d,
     )
     state = wp.zeros((n, groups, params.keep), dtype=wp.int32, device=d)
-    counts = count.numpy()
-    rich = (counts > 0).sum(1) + (inputs.palm_point.numpy() >= 0) >= params.fingers
-    if not rich.all():
-        counts[~rich] = 0
-        count = wp.array(counts, dtype=wp.int32, device=d)
-    table = CandidateTable(inputs, count, surface, record, state, q)
-    return table, {"poses": n, "rich": int(rich.sum()), "candidates": int(counts.sum())}
+    tally = empty_tally(("poses", "rich", "candidates"), d)
+    wp.launch(
+        drop_poor,
+        dim=n,
+        inputs=[params.fingers, inputs.rows, inputs.palm_point],
+        outputs=[count, tally.device],
+        device=d,
+    )
+    return CandidateTable(inputs, count, surface, record, state, q), tally

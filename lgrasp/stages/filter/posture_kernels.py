@@ -122,7 +122,7 @@ def fill_unused(
     hand: Hand,
     field: Field,
     obj: Object,
-    seed: wp.int32,
+    seed: wp.array(dtype=wp.int32),
     max_depth: wp.float32,
     draws: wp.int32,
     slack: wp.float32,
@@ -150,7 +150,7 @@ def fill_unused(
         return
     row = set_pose[i]
     G = hand.kin.groups
-    state = wp.rand_init(seed, index[row] * 64 + set_slot[i])
+    state = wp.rand_init(seed[0], index[row] * 64 + set_slot[i])
     T_object = wp.transform_inverse(pose[row])
     X = body_out[i]
     for g in range(G):

@@ -10,7 +10,15 @@ from lgrasp.hand.arrays import Hand
 from lgrasp.hand.clearance import overlap_depth
 from lgrasp.object.arrays import Object
 
-__all__ = ["balance_grasps", "control_poses", "grasp_epsilon", "pack_rows", "self_overlap"]
+__all__ = [
+    "balance_grasps",
+    "control_poses",
+    "count_outcomes",
+    "grasp_epsilon",
+    "list_kept",
+    "pack_rows",
+    "self_overlap",
+]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -73,33 +81,63 @@ def balance_grasps(
 
 
 @wp.kernel
+def count_outcomes(
+    outcome: wp.array(dtype=wp.int32),
+    kept_out: wp.array(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
+):
+    """1 for sets that passed; ``counts_out`` grows by the sets of each outcome."""
+    i = wp.tid()
+    kept_out[i] = wp.where(outcome[i] == 0, 1, 0)
+    wp.atomic_add(counts_out, outcome[i], 1)
+
+
+@wp.kernel
+def list_kept(
+    outcome: wp.array(dtype=wp.int32),
+    upto: wp.array(dtype=wp.int32),
+    row_out: wp.array(dtype=wp.int32),
+):
+    """The sets that passed, ``upto[i]`` of them among the first ``i + 1``."""
+    i = wp.tid()
+    if outcome[i] == 0:
+        row_out[upto[i] - 1] = i
+
+
+@wp.kernel
 def grasp_epsilon(
     obj: Object,
-    seed: wp.int32,
+    seed: wp.array(dtype=wp.int32),
     friction: wp.float32,
     contact_surface: wp.array2d(dtype=wp.int32),
+    rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
     epsilon_out: wp.array(dtype=wp.float32),
 ):
     """Ferrari-Canny bound of the kept rows, about the object's centre of mass."""
     i = wp.tid()
+    if i >= rows[0]:
+        return
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     k = _contacts(obj, contact_surface[row[i]], points, normals)
     for c in range(k):
         points[c] = points[c] - obj.com
-    epsilon_out[i] = epsilon_bound(points, normals, k, friction, obj.radius, wp.rand_init(seed))
+    epsilon_out[i] = epsilon_bound(points, normals, k, friction, obj.radius, wp.rand_init(seed[0]))
 
 
 @wp.kernel
 def self_overlap(
     hand: Hand,
     body: wp.array2d(dtype=wp.transform),
+    rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
     depth_out: wp.array(dtype=wp.float32),
 ):
     """Overlap of links in the kept rows: of pairs that nearly always touch; all others are apart."""
     i = wp.tid()
+    if i >= rows[0]:
+        return
     depth_out[i] = overlap_depth(hand, body, row[i])
 
 
@@ -146,6 +184,7 @@ def control_poses(
     contact_surface: wp.array2d(dtype=wp.int32),
     body: wp.array2d(dtype=wp.transform),
     posture: wp.array2d(dtype=vec_dof),
+    rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
     q_out: wp.array2d(dtype=wp.float32),
     pregrasp_out: wp.array2d(dtype=wp.float32),
@@ -153,6 +192,8 @@ def control_poses(
 ):
     """One thread per (kept row, group): q, and q with the contact moved out of and into the object."""
     i, g = wp.tid()
+    if i >= rows[0]:
+        return
     s = row[i]
     x = posture[s, g]
     opened = x
@@ -189,6 +230,7 @@ def pack_rows(
     index: wp.array(dtype=wp.int32),
     set_slot: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float32),
+    rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
     pose_out: wp.array(dtype=wp.transform),
     point_out: wp.array2d(dtype=wp.vec3),
@@ -201,6 +243,8 @@ def pack_rows(
 ):
     """Pose and contacts of the kept rows; NaN and -1 where there is no contact."""
     i = wp.tid()
+    if i >= rows[0]:
+        return
     s = row[i]
     pose_out[i] = pose[set_pose[s]]
     index_out[i] = index[set_pose[s]]

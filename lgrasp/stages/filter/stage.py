@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.device.fetch import fetch
 from lgrasp.device.kinematics import vec_dof
-from lgrasp.grasp.tables import ContactSets, GraspTable
+from lgrasp.grasp.tables import ContactSets, GraspTable, trim_sets
+from lgrasp.grasp.tally import Tally, empty_tally, read_tallies
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.object_kernels import deepen
 from lgrasp.stages.filter.outcomes import METRICS, REASONS
@@ -17,7 +17,9 @@ from lgrasp.stages.filter.posture_kernels import fill_unused, place_used
 from lgrasp.stages.filter.quality_kernels import (
     balance_grasps,
     control_poses,
+    count_outcomes,
     grasp_epsilon,
+    list_kept,
     pack_rows,
     self_overlap,
 )
@@ -27,13 +29,16 @@ __all__ = ["VERSION", "run"]
 VERSION = 4
 
 
-def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
+def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, Tally]:
     """Fill unused fingers, check everything exactly on the final q, add control poses and metrics.
+
+    The one stage that waits for its number of rows: its tables are wide, and much fewer sets than there could be come.
 
     Returns:
         The grasps in (candidate, slot) order, and the number of sets per outcome (REASONS).
     """
-    d, n = context.device, len(inputs)
+    inputs = trim_sets(inputs)
+    d, n = context.device, inputs.pose.shape[0]
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
     groups, bodies = context.hand.model.groups, len(context.hand.model.piece_first) - 1
     table, poses = inputs.candidates, inputs.candidates.poses
@@ -108,11 +113,13 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
         outputs=[outcome, force, fswo, gswo],
         device=d,
     )
-    code = outcome.numpy()
-    keep = np.flatnonzero(code == 0).astype(np.int32)
-    counts = {reason: int((code == i).sum()) for i, reason in enumerate(REASONS)}
-    checked = _Checked(body, posture, contact, contact_surface, force, numbers)
-    return _kept_rows(inputs, checked, keep, params, context), counts
+    tally = empty_tally(REASONS, d)
+    row, upto = (wp.empty(n, dtype=wp.int32, device=d) for _ in range(2))
+    wp.launch(count_outcomes, dim=n, inputs=[outcome], outputs=[upto, tally.device], device=d)
+    wp.utils.array_scan(upto, upto, inclusive=True)
+    wp.launch(list_kept, dim=n, inputs=[outcome, upto], outputs=[row], device=d)
+    checked = _Checked(body, posture, contact, contact_surface, force, numbers, row)
+    return _kept_rows(inputs, checked, tally, params, context), tally
 
 
 @dataclass(frozen=True)
@@ -125,17 +132,17 @@ class _Checked:
     contact_surface: wp.array  # (n, groups + 1)
     force: wp.array  # (n, groups + 1)
     numbers: wp.array  # (5, n) gap, dot of normals, fswo, gswo, penetration
+    row: wp.array  # (n,) the sets that passed first
 
 
 def _kept_rows(
-    inputs: ContactSets, checked: _Checked, keep: np.ndarray, params: FilterParams, context: Context
+    inputs: ContactSets, checked: _Checked, tally: Tally, params: FilterParams, context: Context
 ) -> GraspTable:
-    """Rows of the sets ``keep`` (m,): control poses, epsilon and all that is stored."""
-    d, m = context.device, len(keep)
+    """Rows of the sets that passed: control poses, epsilon and all that is stored."""
+    d, m = context.device, checked.row.shape[0]
     hand, obj = context.hand.struct, context.object.struct
     groups, dofs = context.hand.model.groups, context.hand.model.dofs
-    poses = inputs.candidates.poses
-    row = wp.array(keep, dtype=wp.int32, device=d)
+    poses, rows, row = inputs.candidates.poses, tally.device[:1], checked.row
     q, pregrasp, squeeze = (wp.empty((m, dofs), dtype=wp.float32, device=d) for _ in range(3))
     wp.launch(
         control_poses,
@@ -151,6 +158,7 @@ def _kept_rows(
             checked.contact_surface,
             checked.body,
             checked.posture,
+            rows,
             row,
         ],
         outputs=[q, pregrasp, squeeze],
@@ -160,11 +168,11 @@ def _kept_rows(
     wp.launch(
         grasp_epsilon,
         dim=m,
-        inputs=[obj, context.seed("filter", 1), params.friction, checked.contact_surface, row],
+        inputs=[obj, context.seed("filter", 1), params.friction, checked.contact_surface, rows, row],
         outputs=[epsilon],
         device=d,
     )
-    wp.launch(self_overlap, dim=m, inputs=[hand, checked.body, row], outputs=[overlap], device=d)
+    wp.launch(self_overlap, dim=m, inputs=[hand, checked.body, rows, row], outputs=[overlap], device=d)
     pose = wp.empty(m, dtype=wp.transform, device=d)
     point, normal, push = (wp.empty((m, groups + 1), dtype=wp.vec3, device=d) for _ in range(3))
     link = wp.empty((m, groups + 1), dtype=wp.int32, device=d)
@@ -184,19 +192,23 @@ def _kept_rows(
             poses.index,
             inputs.slot,
             checked.numbers,
+            rows,
             row,
         ],
         outputs=[pose, point, normal, link, push, index, slot, numbers],
         device=d,
     )
-    fetched = fetch([index, slot, q, pregrasp, squeeze, pose, point, normal, link, push, numbers, epsilon, overlap])
-    (gap, dot, fswo, gswo, depth), epsilons, overlaps = fetched[-3:]
+    columns = [index, slot, q, pregrasp, squeeze, pose, point, normal, link, push, epsilon, overlap]
+    *fetched, measured = read_tallies([tally], [*columns, numbers])
+    kept = tally["kept"]
+    fetched = [values[:kept] for values in fetched]
+    gap, dot, fswo, gswo, depth = measured[:, :kept]
     values = {
         "fswo": fswo,
         "gswo": gswo,
-        "epsilon": epsilons,
+        "epsilon": fetched[10],
         "penetration": depth,
-        "self_penetration": overlaps,
+        "self_penetration": fetched[11],
         "gap": gap,
         "normal_error": np.arccos(np.clip(dot, -1, 1)),
     }

@@ -1,4 +1,4 @@
-"""Kernel of the ik stage: realises contacts finger by finger."""
+"""Kernels of the ik stage: contacts are realised finger by finger; of sets the whole ones are kept."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ from lgrasp.grasp.clearance import body_clear
 from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.object.arrays import Object
 
-__all__ = ["realise_contacts"]
+__all__ = ["flag_realised", "mark_chosen", "realise_contacts", "take_realised"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -154,3 +154,68 @@ def realise_contacts(
         wp.atomic_add(counts_out, 1, 1)
     if ok == 1:
         wp.atomic_add(counts_out, 2, 1)
+
+
+@wp.kernel
+def mark_chosen(
+    rows: wp.array(dtype=wp.int32),
+    pose: wp.array(dtype=wp.int32),
+    chosen: wp.array2d(dtype=wp.int32),
+    wanted_out: wp.array3d(dtype=wp.int32),
+):
+    """1 at every candidate that a set has chosen."""
+    i = wp.tid()
+    if i >= rows[0]:
+        return
+    for g in range(chosen.shape[1]):
+        if chosen[i, g] >= 0:
+            wanted_out[pose[i], g, chosen[i, g]] = 1
+
+
+@wp.kernel
+def flag_realised(
+    rows: wp.array(dtype=wp.int32),
+    pose: wp.array(dtype=wp.int32),
+    chosen: wp.array2d(dtype=wp.int32),
+    state: wp.array3d(dtype=wp.int32),
+    whole_out: wp.array(dtype=wp.int32),
+):
+    """1 for sets whose every contact was realised."""
+    i = wp.tid()
+    whole_out[i] = 0
+    if i >= rows[0]:
+        return
+    for g in range(chosen.shape[1]):
+        if chosen[i, g] >= 0 and state[pose[i], g, wp.max(chosen[i, g], 0)] != 1:
+            return
+    whole_out[i] = 1
+
+
+@wp.kernel
+def take_realised(
+    upto: wp.array(dtype=wp.int32),
+    pose: wp.array(dtype=wp.int32),
+    slot: wp.array(dtype=wp.int32),
+    chosen: wp.array2d(dtype=wp.int32),
+    score: wp.array(dtype=wp.float32),
+    pose_out: wp.array(dtype=wp.int32),
+    slot_out: wp.array(dtype=wp.int32),
+    chosen_out: wp.array2d(dtype=wp.int32),
+    score_out: wp.array(dtype=wp.float32),
+    rows_out: wp.array(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
+):
+    """The whole sets, ``upto[s]`` of them among the first ``s + 1``."""
+    s = wp.tid()
+    if s == upto.shape[0] - 1:
+        rows_out[0] = upto[s]
+        counts_out[3] = upto[s]
+    before = int(0)
+    if s > 0:
+        before = upto[s - 1]
+    if upto[s] > before:
+        pose_out[before] = pose[s]
+        slot_out[before] = slot[s]
+        score_out[before] = score[s]
+        for g in range(chosen.shape[1]):
+            chosen_out[before, g] = chosen[s, g]

@@ -1,14 +1,13 @@
 """ik: candidates (all of them, or those chosen by sets) -> realised contacts."""
 
 import math
-from dataclasses import replace
 
-import numpy as np
 import warp as wp
 
 from lgrasp.grasp.tables import CandidateTable, ContactSets
+from lgrasp.grasp.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.ik.kernels import realise_contacts
+from lgrasp.stages.ik.kernels import flag_realised, mark_chosen, realise_contacts, take_realised
 from lgrasp.stages.ik.params import IkParams
 
 __all__ = ["VERSION", "run"]
@@ -18,31 +17,53 @@ VERSION = 1
 
 def run(
     inputs: CandidateTable | ContactSets, params: IkParams, context: Context
-) -> tuple[CandidateTable | ContactSets, dict[str, int]]:
+) -> tuple[CandidateTable | ContactSets, Tally]:
     """Realise contacts finger by finger.
 
     Candidates come back with state 1 or below 0 and the realised q. Of contact sets only the chosen candidates are
     realised, and only sets whose every contact was realised come back.
 
     Returns:
-        The table of the kind that came in, and counts ``tried``, ``reached`` (gap and normals met), ``kept`` (clear).
+        The table of the kind that came in, and counts ``tried``, ``reached`` (gap and normals met), ``kept`` (clear),
+        of sets also ``sets`` (those that come back).
     """
-    sets = inputs if isinstance(inputs, ContactSets) else None
-    table = inputs.candidates if isinstance(inputs, ContactSets) else inputs
     d = context.device
-    shape = table.surface.shape
-    if sets is None:
-        wanted = wp.full(shape, 1, dtype=wp.int32, device=d)
-    else:
-        flags = np.zeros(shape, np.int32)
-        chosen, pose = sets.chosen.numpy(), sets.pose.numpy()
-        row, group = np.nonzero(chosen >= 0)
-        flags[pose[row], group, chosen[row, group]] = 1
-        wanted = wp.array(flags, dtype=wp.int32, device=d)
-    number = wp.zeros(3, dtype=wp.int32, device=d)
+    if isinstance(inputs, CandidateTable):
+        tally = empty_tally(("tried", "reached", "kept"), d)
+        wanted = wp.full(inputs.surface.shape, 1, dtype=wp.int32, device=d)
+        _realise(inputs, wanted, params, context, tally)
+        return inputs, tally
+    tally = empty_tally(("tried", "reached", "kept", "sets"), d)
+    table, n = inputs.candidates, inputs.pose.shape[0]
+    wanted = wp.zeros(table.surface.shape, dtype=wp.int32, device=d)
+    wp.launch(mark_chosen, dim=n, inputs=[inputs.rows, inputs.pose, inputs.chosen], outputs=[wanted], device=d)
+    _realise(table, wanted, params, context, tally)
+    upto = wp.empty(n, dtype=wp.int32, device=d)
+    flagged = [inputs.rows, inputs.pose, inputs.chosen, table.state]
+    wp.launch(flag_realised, dim=n, inputs=flagged, outputs=[upto], device=d)
+    wp.utils.array_scan(upto, upto, inclusive=True)
+    kept = ContactSets(
+        candidates=table,
+        pose=wp.empty_like(inputs.pose),
+        slot=wp.empty_like(inputs.slot),
+        chosen=wp.empty_like(inputs.chosen),
+        score=wp.empty_like(inputs.score),
+        rows=wp.zeros(1, dtype=wp.int32, device=d),
+    )
+    wp.launch(
+        take_realised,
+        dim=n,
+        inputs=[upto, inputs.pose, inputs.slot, inputs.chosen, inputs.score],
+        outputs=[kept.pose, kept.slot, kept.chosen, kept.score, kept.rows, tally.device],
+        device=d,
+    )
+    return kept, tally
+
+
+def _realise(table: CandidateTable, wanted: wp.array, params: IkParams, context: Context, tally: Tally) -> None:
     wp.launch(
         realise_contacts,
-        dim=shape,
+        dim=table.surface.shape,
         inputs=[
             context.hand.struct,
             context.field.struct,
@@ -62,23 +83,6 @@ def run(
             table.record,
             wanted,
         ],
-        outputs=[table.q, table.state, number],
-        device=d,
+        outputs=[table.q, table.state, tally.device],
+        device=context.device,
     )
-    tried, reached, clear = map(int, number.numpy())
-    counts = {"tried": tried, "reached": reached, "kept": clear}
-    if sets is None:
-        return table, counts
-    state = table.state.numpy()
-    good = np.where(
-        chosen >= 0, np.take_along_axis(state[pose], np.maximum(chosen, 0)[:, :, None], 2)[:, :, 0] == 1, True
-    )
-    keep = np.flatnonzero(good.all(1))
-    kept = replace(
-        sets,
-        pose=wp.array(pose[keep], dtype=wp.int32, device=d),
-        slot=wp.array(sets.slot.numpy()[keep], dtype=wp.int32, device=d),
-        chosen=wp.array(chosen[keep], dtype=wp.int32, device=d),
-        score=wp.array(sets.score.numpy()[keep], dtype=wp.float32, device=d),
-    )
-    return kept, counts | {"sets": len(keep)}

@@ -154,8 +154,8 @@ def propose_poses(
     hand: Hand,
     field: Field,
     obj: Object,
-    seed: wp.int32,
-    first: wp.int32,
+    seed: wp.array(dtype=wp.int32),
+    first: wp.array(dtype=wp.int32),
     canonical: wp.float32,
     pinch: wp.float32,
     palm_share: wp.float32,
@@ -173,7 +173,7 @@ def propose_poses(
     Functions get random states of their own: one handed over is a copy, so that its numbers would come again here.
     """
     row, b = wp.tid()
-    state = wp.rand_init(seed + b * _STRIDE, first + row)
+    state = wp.rand_init(seed[0] + b * _STRIDE, first[0] + row)
     G = hand.kin.groups
     palm0 = hand.contacts.first[G]
     palms = hand.contacts.first[G + 1] - palm0
@@ -241,9 +241,13 @@ def choose_poses(
     pose: wp.array2d(dtype=wp.transform),
     rating: wp.array2d(dtype=wp.int32),
     chosen_out: wp.array(dtype=wp.int32),
-    rating_out: wp.array(dtype=wp.int32),
+    kept_out: wp.array(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
 ):
-    """The best rated proposal of each candidate that is clear of static links to the last point."""
+    """The best rated proposal of each candidate that is clear of static links to the last point, if there is one.
+
+    ``counts_out`` grows by those tried, blocked and kept.
+    """
     row = wp.tid()
     chosen = int(-1)
     best = int(-1)
@@ -268,14 +272,19 @@ def choose_poses(
             best = ceiling
             break
     chosen_out[row] = chosen
-    rating_out[row] = best
+    kept_out[row] = wp.where(best > 0, 1, 0)
+    wp.atomic_add(counts_out, 0, 1)
+    if best < 0:
+        wp.atomic_add(counts_out, 1, 1)
+    if best > 0:
+        wp.atomic_add(counts_out, 2, 1)
 
 
 @wp.kernel
 def take_poses(
-    kept: wp.array(dtype=wp.int32),
+    upto: wp.array(dtype=wp.int32),
     chosen: wp.array(dtype=wp.int32),
-    first: wp.int32,
+    first: wp.array(dtype=wp.int32),
     pose: wp.array2d(dtype=wp.transform),
     palm_point: wp.array2d(dtype=wp.int32),
     surface: wp.array2d(dtype=wp.int32),
@@ -287,12 +296,17 @@ def take_poses(
     palm_surface_out: wp.array(dtype=wp.int32),
     setting_out: wp.array(dtype=wp.int32),
     anchor_out: wp.array2d(dtype=wp.int32),
+    rows_out: wp.array(dtype=wp.int32),
 ):
-    """Rows of the PoseTable: the chosen proposals of the candidates that are kept."""
-    i = wp.tid()
-    row = kept[i]
+    """Rows of the PoseTable: the chosen proposals, ``upto[row]`` of them among the first ``row + 1`` candidates."""
+    row = wp.tid()
+    if row == upto.shape[0] - 1:
+        rows_out[0] = upto[row]
     b = chosen[row]
-    index_out[i] = first + row
+    if b < 0:
+        return
+    i = upto[row] - 1
+    index_out[i] = first[0] + row
     pose_out[i] = pose[row, b]
     palm_point_out[i] = palm_point[row, b]
     palm_surface_out[i] = wp.where(palm_point[row, b] >= 0, surface[row, b], -1)

@@ -1,10 +1,10 @@
 """place: candidate indices -> object poses in the hand base frame that static links do not block."""
 
-import numpy as np
 import warp as wp
 
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import PoseTable
+from lgrasp.grasp.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
 from lgrasp.stages.place.params import PlaceParams
@@ -14,8 +14,11 @@ __all__ = ["VERSION", "run"]
 VERSION = 4
 
 
-def run(inputs: tuple[int, int], params: PlaceParams, context: Context) -> tuple[PoseTable, dict[str, int]]:
+def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Context) -> tuple[PoseTable, Tally]:
     """Poses of candidates ``first .. first + count - 1`` of the shard's stream.
+
+    Args:
+        inputs: ``first`` (a number, or an array (1,) i32 on the device) and ``count``.
 
     Returns:
         The poses that can hold, in candidate order, and counts ``tried``, ``blocked`` (by static links), ``kept``.
@@ -28,6 +31,8 @@ def run(inputs: tuple[int, int], params: PlaceParams, context: Context) -> tuple
     if total <= 0:
         raise ConfigError("place: weights canonical, exhaustive, pinch and palm are all 0; one must be positive")
     d = context.device
+    if not isinstance(first, wp.array):
+        first = wp.full(1, first, dtype=wp.int32, device=d)
     hand, obj = context.hand.struct, context.object.struct
     groups, shape = context.hand.model.groups, (count, params.proposals)
     pose = wp.empty(shape, dtype=wp.transform, device=d)
@@ -51,35 +56,31 @@ def run(inputs: tuple[int, int], params: PlaceParams, context: Context) -> tuple
         outputs=[pose, palm_point, surface, setting, anchor, rating],
         device=d,
     )
-    chosen, best = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(2))
+    chosen, upto = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(2))
+    tally = empty_tally(("tried", "blocked", "kept"), d)
     wp.launch(
-        choose_poses, dim=count, inputs=[hand, obj, params.clearance, pose, rating], outputs=[chosen, best], device=d
-    )
-    rated = best.numpy()
-    keep = np.flatnonzero(rated > 0).astype(np.int32)
-    n = len(keep)
-    table = PoseTable(
-        index=wp.empty(n, dtype=wp.int32, device=d),
-        pose=wp.empty(n, dtype=wp.transform, device=d),
-        palm_point=wp.empty(n, dtype=wp.int32, device=d),
-        palm_surface=wp.empty(n, dtype=wp.int32, device=d),
-        setting=wp.empty(n, dtype=wp.int32, device=d),
-        anchor=wp.empty((n, groups), dtype=wp.int32, device=d),
-    )
-    wp.launch(
-        take_poses,
-        dim=n,
-        inputs=[
-            wp.array(keep, dtype=wp.int32, device=d),
-            chosen,
-            first,
-            pose,
-            palm_point,
-            surface,
-            setting,
-            anchor,
-        ],
-        outputs=[table.index, table.pose, table.palm_point, table.palm_surface, table.setting, table.anchor],
+        choose_poses,
+        dim=count,
+        inputs=[hand, obj, params.clearance, pose, rating],
+        outputs=[chosen, upto, tally.device],
         device=d,
     )
-    return table, {"tried": count, "blocked": int((rated < 0).sum()), "kept": n}
+    wp.utils.array_scan(upto, upto, inclusive=True)
+    table = PoseTable(
+        index=wp.empty(count, dtype=wp.int32, device=d),
+        pose=wp.empty(count, dtype=wp.transform, device=d),
+        palm_point=wp.empty(count, dtype=wp.int32, device=d),
+        palm_surface=wp.empty(count, dtype=wp.int32, device=d),
+        setting=wp.empty(count, dtype=wp.int32, device=d),
+        anchor=wp.empty((count, groups), dtype=wp.int32, device=d),
+        rows=wp.zeros(1, dtype=wp.int32, device=d),
+    )
+    columns = [table.index, table.pose, table.palm_point, table.palm_surface, table.setting, table.anchor, table.rows]
+    wp.launch(
+        take_poses,
+        dim=count,
+        inputs=[upto, chosen, first, pose, palm_point, surface, setting, anchor],
+        outputs=columns,
+        device=d,
+    )
+    return table, tally

@@ -10,8 +10,18 @@ from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.clearance import group_pairs_clear
 from lgrasp.object.arrays import Object
+from lgrasp.stages.search.params import MAX_KINDS
 
-__all__ = ["MAX_KEEP", "check_starts", "keep_sets", "list_hits", "list_usable", "take_sets", "try_starts"]
+__all__ = [
+    "MAX_KEEP",
+    "check_starts",
+    "keep_sets",
+    "list_hits",
+    "list_usable",
+    "take_sets",
+    "try_starts",
+    "vec_kinds",
+]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -21,6 +31,7 @@ MAX_KEEP = 64
 _INSCRIBED = wp.constant(0.92388)
 """cos(22.5 deg): the round cone inside an 8-edge cone however the edges are turned."""
 vec_set = wp.types.vector(MAX_GROUPS, wp.int32)
+vec_kinds = wp.types.vector(MAX_KINDS, wp.int32)
 
 
 @wp.func
@@ -90,9 +101,10 @@ def _starts(measure: Any) -> Any:
     def try_starts(
         groups: wp.int32,
         obj: Object,
-        seed: wp.int32,
+        seed: wp.array(dtype=wp.int32),
         first: wp.int32,
-        contacts: wp.array(dtype=wp.int32),
+        contacts: vec_kinds,
+        kinds: wp.int32,
         friction: wp.float32,
         threshold: wp.float32,
         least_force: wp.float32,
@@ -118,13 +130,13 @@ def _starts(measure: Any) -> Any:
         if found[row] >= per_pose:
             return
         G = groups
-        state = wp.rand_init(seed, index[row] * 4096 + first + lane)
+        state = wp.rand_init(seed[0], index[row] * 4096 + first + lane)
         available = int(0)
         for g in range(G):
             if size[row, g] > 0:
                 available += 1
         palm = palm_surface[row]
-        k = contacts[wp.min(int(wp.randf(state) * float(contacts.shape[0])), contacts.shape[0] - 1)]
+        k = contacts[wp.min(int(wp.randf(state) * float(kinds)), kinds - 1)]
         if k > available:
             # the palm's contact may stand in for one finger
             if palm < 0 or k - 1 > available or available == 0:
@@ -157,7 +169,7 @@ def _starts(measure: Any) -> Any:
         score = measure(points, normals, n, friction, torque_scale)
         # the most finger contacts a set may come to have
         most = int(0)
-        for i in range(contacts.shape[0]):
+        for i in range(kinds):
             most = wp.max(most, contacts[i])
         most = wp.min(most, available)
         free = int(0)  # contacts before this one stay: they were searched in an earlier round
@@ -329,7 +341,8 @@ def keep_sets(
 
 @wp.kernel
 def take_sets(
-    first: wp.array(dtype=wp.int32),
+    upto: wp.array(dtype=wp.int32),
+    poses: wp.array(dtype=wp.int32),
     slot: wp.int32,
     found: wp.array(dtype=wp.int32),
     sets: wp.array3d(dtype=wp.int32),
@@ -338,11 +351,22 @@ def take_sets(
     slot_out: wp.array(dtype=wp.int32),
     chosen_out: wp.array2d(dtype=wp.int32),
     score_out: wp.array(dtype=wp.float32),
+    rows_out: wp.array(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
 ):
-    """Rows of the ContactSets, from place ``first`` on for each pose; slots are counted from ``slot``."""
+    """Rows of the ContactSets, ``upto[row]`` of them for the first ``row + 1`` poses; slots are counted from ``slot``.
+
+    ``counts_out`` gets the poses, those that yield and the sets.
+    """
     row = wp.tid()
+    if row == upto.shape[0] - 1:
+        rows_out[0] = upto[row]
+        counts_out[0] = poses[0]
+        counts_out[2] = upto[row]
+    if found[row] > 0:
+        wp.atomic_add(counts_out, 1, 1)
     for k in range(found[row]):
-        i = first[row] + k
+        i = upto[row] - found[row] + k
         pose_out[i] = row
         slot_out[i] = slot + k
         score_out[i] = score[row, k]

@@ -4,7 +4,10 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["SearchParams"]
+__all__ = ["MAX_KINDS", "SearchParams"]
+
+MAX_KINDS = 16
+"""Most entries of ``contacts``."""
 
 
 class SearchParams(BaseModel):
@@ -15,6 +18,7 @@ class SearchParams(BaseModel):
     contacts: tuple[int, ...] = Field(
         (3, 3, 3, 3, 4),
         min_length=1,
+        max_length=MAX_KINDS,
         description="Finger contacts k of the first round, drawn evenly; the largest bounds later rounds.",
     )
     score: Literal["fswo", "gswo"] = Field(

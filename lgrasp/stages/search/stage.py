@@ -1,11 +1,11 @@
 """search: candidates -> sets of contacts that balance."""
 
-import numpy as np
 import warp as wp
 
 from lgrasp.device.kinematics import MAX_GROUPS
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import CandidateTable, ContactSets
+from lgrasp.grasp.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.search.kernels import (
     MAX_KEEP,
@@ -15,8 +15,9 @@ from lgrasp.stages.search.kernels import (
     list_usable,
     take_sets,
     try_starts,
+    vec_kinds,
 )
-from lgrasp.stages.search.params import SearchParams
+from lgrasp.stages.search.params import MAX_KINDS, SearchParams
 
 __all__ = ["VERSION", "run"]
 
@@ -28,7 +29,7 @@ _GPU_LANES = 10
 
 def run(
     inputs: CandidateTable, params: SearchParams, context: Context, *, realised: bool = True, salt: int = 0
-) -> tuple[ContactSets, dict[str, int]]:
+) -> tuple[ContactSets, Tally]:
     """Block-wise zeroth-order search at every pose (Alg. 2).
 
     Args:
@@ -50,7 +51,8 @@ def run(
     size = wp.empty((n, groups), dtype=wp.int32, device=d)
     usable = wp.empty((n, groups, keep), dtype=wp.int32, device=d)
     wp.launch(list_usable, (n, groups), [int(realised), inputs.count, inputs.state], [size, usable], device=d)
-    contacts = wp.array(params.contacts, dtype=wp.int32, device=d)
+    kinds = len(params.contacts)
+    contacts = vec_kinds(*params.contacts, *[0] * (MAX_KINDS - kinds))
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
     lanes = min(params.restarts, _CPU_LANES if d == "cpu" else _GPU_LANES)
     tried = wp.empty((n, lanes, groups), dtype=wp.int32, device=d)
@@ -67,6 +69,7 @@ def run(
                 context.seed("search", salt),
                 first,
                 contacts,
+                kinds,
                 params.friction,
                 params.threshold,
                 params.least_force,
@@ -116,21 +119,23 @@ def run(
             outputs=[found, sets, score],
             device=d,
         )
-    number = found.numpy()
-    ends = np.cumsum(number, dtype=np.int32)
-    total = int(ends[-1]) if n else 0
+    upto = wp.empty(n, dtype=wp.int32, device=d)
+    wp.utils.array_scan(found, upto, inclusive=True)
+    most = n * params.per_pose
     table = ContactSets(
         candidates=inputs,
-        pose=wp.empty(total, dtype=wp.int32, device=d),
-        slot=wp.empty(total, dtype=wp.int32, device=d),
-        chosen=wp.empty((total, groups), dtype=wp.int32, device=d),
-        score=wp.empty(total, dtype=wp.float32, device=d),
+        pose=wp.empty(most, dtype=wp.int32, device=d),
+        slot=wp.empty(most, dtype=wp.int32, device=d),
+        chosen=wp.empty((most, groups), dtype=wp.int32, device=d),
+        score=wp.empty(most, dtype=wp.float32, device=d),
+        rows=wp.zeros(1, dtype=wp.int32, device=d),
     )
+    tally = empty_tally(("poses", "yielding", "sets"), d)
     wp.launch(
         take_sets,
         dim=n,
-        inputs=[wp.array(ends - number, dtype=wp.int32, device=d), salt * params.per_pose, found, sets, score],
-        outputs=[table.pose, table.slot, table.chosen, table.score],
+        inputs=[upto, inputs.poses.rows, salt * params.per_pose, found, sets, score],
+        outputs=[table.pose, table.slot, table.chosen, table.score, table.rows, tally.device],
         device=d,
     )
-    return table, {"poses": n, "yielding": int((number > 0).sum()), "sets": total}
+    return table, tally

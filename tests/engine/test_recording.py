@@ -1,0 +1,36 @@
+"""Recorded batches give the rows of batches launched step by step."""
+
+import numpy as np
+
+from lgrasp.engine.recording import Recorder
+from lgrasp.engine.shard import Execution, make_shard
+from lgrasp.grasp.tables import grasp_arrays
+
+
+def test_rows_and_counts_are_the_same(swift, inputs):
+    recorder = Recorder(swift)
+    for shard in (0, 1):
+        plain = make_shard(swift, inputs, shard, 150, Execution(1, 128))
+        replayed = make_shard(swift, inputs, shard, 150, Execution(1, 128, recorder=recorder))
+        assert replayed.counts == plain.counts
+        expected, given = grasp_arrays(plain.grasps), grasp_arrays(replayed.grasps)
+        for name, values in expected.items():
+            np.testing.assert_array_equal(given[name], values, err_msg=name)
+
+
+def test_two_sizes_take_turns(swift, context):
+    recorder = Recorder(swift)
+    for first, count in [(0, 40), (40, 64), (104, 40), (144, 64), (208, 40), (248, 50), (298, 50), (348, 64)]:
+        sets, meter = recorder.run(context, first, count)
+        expected, plain = Recorder(swift).run(context, first, count)
+        assert meter.counts == plain.counts
+        n = len(expected)
+        assert len(sets) == n
+        np.testing.assert_array_equal(sets.pose.numpy()[:n], expected.pose.numpy()[:n])
+        np.testing.assert_array_equal(sets.chosen.numpy()[:n], expected.chosen.numpy()[:n])
+
+
+def test_close_sizes_are_used_again(swift, context):
+    recorder = Recorder(swift)
+    recorder.run(context, 0, 200)
+    assert [recorder.size(n) for n in (190, 195, 200, 202, 205)] == [190, 200, 200, 200, 205]
