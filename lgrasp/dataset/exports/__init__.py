@@ -1,0 +1,22 @@
+"""Grasps in the formats of other programs: writers and readers."""
+
+from lgrasp.dataset.exports.dexgraspbench import read_dexgraspbench
+from lgrasp.dataset.exports.dexgraspnet import read_dexgraspnet
+from lgrasp.dataset.exports.formats import FORMATS, Exported, Format, export_shards, read_grasps
+from lgrasp.dataset.exports.isaac_grasp import read_isaac_grasp
+from lgrasp.dataset.exports.plan import HOLDS
+from lgrasp.dataset.exports.records import GraspSet, ReadObject
+
+__all__ = [
+    "FORMATS",
+    "HOLDS",
+    "Exported",
+    "Format",
+    "GraspSet",
+    "ReadObject",
+    "export_shards",
+    "read_dexgraspbench",
+    "read_dexgraspnet",
+    "read_grasps",
+    "read_isaac_grasp",
+]

@@ -1,0 +1,123 @@
+"""DexGraspBench, the layout of BODex: one .npy file per grasp, a dictionary of poses and joint vectors."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.dataset.exports.folder import GRASPS, OBJECTS, open_folder
+from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.exports.npy import load_objects, save_object
+from lgrasp.dataset.exports.plan import Plan
+from lgrasp.dataset.exports.poses import compose, inverse
+from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order_of
+from lgrasp.errors import ShardError
+
+__all__ = ["DEXGRASPBENCH_NOTES", "read_dexgraspbench", "write_dexgraspbench"]
+
+_POSTURES = ("grasp_qpos", "pregrasp_qpos", "squeeze_qpos")
+
+DEXGRASPBENCH_NOTES = """\
+grasps/CODE/NUMBER.npy    DexGraspBench (BODex) layout: np.load(FILE, allow_pickle=True).item() is a dictionary.
+
+  obj_path         mesh of the object, relative to this folder
+  obj_scale        1.0: the mesh is in metres as grasped
+  obj_pose         x y z [m] qw qx qy qz of the object in the world: the origin, not turned
+  pregrasp_qpos    x y z [m] qw qx qy qz of link {root} in the world, then the joints in the order of joint_names
+  grasp_qpos       the same at the grasp
+  squeeze_qpos     the same with joint targets that press on the object
+  joint_names      order of the joints, an addition of lgrasp
+
+{root} is the root link of hand/hand.urdf. A model of the hand that is turned or shifted against this URDF (as some
+MJCF files are) needs that turn applied to the first seven numbers.
+"""
+
+
+def write_dexgraspbench(out: Path, plan: Plan, frames: HandFrames, advance: Callable[[int], None]) -> None:
+    """Write ``grasps/CODE/NUMBER.npy`` for every row, numbered over the whole export.
+
+    Args:
+        out: Folder of the export.
+        plan: Rows of single objects.
+        frames: The plan's hand.
+        advance: Called with numbers of rows that are done.
+
+    Raises:
+        ShardError: A shard is damaged.
+        OutputError: The folder cannot be written.
+    """
+    for batch in plan.batches():
+        pose = frames.root_in_object(batch.object_pose[:, 0], batch.q)  # (n, 7)
+        postures = [np.concatenate([pose, q], -1) for q in (batch.q, batch.q_pregrasp, batch.q_squeeze)]
+        for row, number in enumerate(batch.number):
+            code = plan.objects[batch.object_index[row, 0]].code
+            entry = {
+                "obj_path": f"{OBJECTS}/{code}.obj",
+                "obj_scale": 1.0,
+                "obj_pose": np.array([0, 0, 0, 1.0, 0, 0, 0]),
+                **{name: values[row] for name, values in zip(_POSTURES, postures, strict=True)},
+                "joint_names": list(frames.joint_names),
+            }
+            save_object(out / GRASPS / code / f"{number:08d}.npy", entry)
+            advance(1)
+
+
+def read_dexgraspbench(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
+    """Read an export, a folder of .npy files of one grasp each, or one such file, by whichever program it was written.
+
+    The hand's pose is that of ``grasp_qpos``; a hand that moves between the postures is not represented.
+
+    Args:
+        path: Export, folder or file.
+        joint_names: Wanted order of q; by default that of the export, else that of the first file. Files without
+            ``joint_names`` are taken to be in this order.
+
+    Raises:
+        ShardError: A file is missing, damaged, of another format, or names other joints.
+    """
+    folder = open_folder(Path(path), ".npy", "dexgraspbench")
+    names = tuple(joint_names or folder.joint_names or ())
+    objects: list[ReadObject] = []
+    index, root, q, world = [], [], [], []
+    for file in folder.files:
+        entry = next(iter(load_objects(file)), None)
+        if not isinstance(entry, dict):
+            raise ShardError(f"{file}: no dictionary of one grasp")
+        listed = tuple(map(str, entry.get("joint_names", folder.joint_names or names)))
+        names = names or listed
+        if not names:
+            raise ShardError(f"{file}: does not name its joints; give joint_names")
+        order = order_of(listed, names, file)
+        postures = [_numbers(entry, posture, 7 + len(names), file) for posture in _POSTURES]
+        root.append(postures[0][:7])
+        q.append([values[7:][order] for values in postures])
+        world.append(_numbers(entry, "obj_pose", 7, file))
+        known = folder.object(_code(entry, file), float(_numbers(entry, "obj_scale", 1, file)[0]))
+        if known not in objects:
+            objects.append(known)
+        index.append([objects.index(known)])
+    in_object = compose(inverse(np.array(world)), np.array(root))
+    joints = np.array(q)  # (n, 3, K)
+    order = order_of(names, folder.joint_names or names, path)
+    pose = folder.object_pose(in_object, joints[:, 0][:, order])
+    return make_set(names, objects, joints, pose[:, None], np.array(index))
+
+
+def _code(entry: dict[str, Any], file: Path) -> str:
+    path = entry.get("obj_path")
+    if not isinstance(path, str):
+        raise ShardError(f"{file}: obj_path is {path!r}, expected the path of a mesh")
+    return Path(path).stem
+
+
+def _numbers(entry: dict[str, Any], key: str, count: int, file: Path) -> np.ndarray:
+    try:
+        values = np.asarray(entry[key], np.float64).reshape(-1)
+    except KeyError:
+        raise ShardError(f"{file}: has no {key!r}") from None
+    except (TypeError, ValueError) as error:
+        raise ShardError(f"{file}: {key} holds no numbers: {error}") from None
+    if len(values) != count or not np.isfinite(values).all():
+        raise ShardError(f"{file}: {key} has {len(values)} numbers, expected {count}, all finite")
+    return values

@@ -1,0 +1,121 @@
+"""DexGraspNet: one .npy file per object, a list of dictionaries with the wrist as Euler angles and the joints."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.dataset.exports.folder import GRASPS, open_folder
+from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.exports.npy import load_objects, save_objects
+from lgrasp.dataset.exports.plan import Batch, Plan
+from lgrasp.dataset.exports.poses import euler_from_quaternion, quaternion_from_euler
+from lgrasp.dataset.exports.records import GraspSet, make_set, order_of
+from lgrasp.errors import ShardError
+
+__all__ = ["DEXGRASPNET_NOTES", "read_dexgraspnet", "write_dexgraspnet"]
+
+_WRIST = ("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz")
+_POSTURES = ("qpos", "qpos_pregrasp", "qpos_squeeze")
+
+DEXGRASPNET_NOTES = """\
+grasps/CODE.npy    DexGraspNet layout: np.load(FILE, allow_pickle=True) is an array of dictionaries, one per grasp.
+
+  scale            1.0: objects/CODE.obj is in metres as grasped
+  qpos             WRJTx WRJTy WRJTz: position [m] of link {root} in the object's frame;
+                   WRJRx WRJRy WRJRz: its rotation [rad], Euler angles about the fixed axes x, y, z in this order
+                   (sxyz): R = Rz(WRJRz) Ry(WRJRy) Rx(WRJRx);
+                   then one value per joint, by name
+  qpos_pregrasp    the same before closing; qpos_squeeze: targets that press. Both are additions of lgrasp.
+
+The object is at the origin. {root} is the root link of hand/hand.urdf.
+"""
+
+
+def write_dexgraspnet(out: Path, plan: Plan, frames: HandFrames, advance: Callable[[int], None]) -> None:
+    """Write ``grasps/CODE.npy`` for every object; memory does not grow with the rows.
+
+    Args:
+        out: Folder of the export.
+        plan: Rows of single objects.
+        frames: The plan's hand.
+        advance: Called with numbers of rows that are done.
+
+    Raises:
+        ShardError: A shard is damaged.
+        OutputError: The folder cannot be written.
+    """
+    for place, item in enumerate(plan.objects):
+        rows = (entry for batch in plan.batches(place, advance) for entry in _entries(batch, frames))
+        save_objects(out / GRASPS / f"{item.code}.npy", plan.counts[place], rows)
+
+
+def _entries(batch: Batch, frames: HandFrames) -> Iterator[dict[str, Any]]:
+    pose = frames.root_in_object(batch.object_pose[:, 0], batch.q)  # (n, 7)
+    wrist = np.concatenate([pose[:, :3], euler_from_quaternion(pose[:, 3:])], -1)  # (n, 6)
+    names = (*_WRIST, *frames.joint_names)
+    postures = [np.concatenate([wrist, q], -1).tolist() for q in (batch.q, batch.q_pregrasp, batch.q_squeeze)]
+    for values in zip(*postures, strict=True):
+        qpos = (dict(zip(names, v, strict=True)) for v in values)
+        yield {"scale": 1.0} | dict(zip(_POSTURES, qpos, strict=True))
+
+
+def read_dexgraspnet(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
+    """Read an export, a folder of ``CODE.npy``, or one such file, by whichever program it was written.
+
+    What lacks ``qpos_pregrasp`` or ``qpos_squeeze`` gets the joints of the grasp there.
+
+    Args:
+        path: Export, folder or file.
+        joint_names: Wanted order of q; by default that of the export, else that of the first entry.
+
+    Raises:
+        ShardError: A file is missing, damaged, of another format, or names other joints.
+    """
+    folder = open_folder(Path(path), ".npy", "dexgraspnet")
+    names = tuple(joint_names or folder.joint_names or ())
+    objects, index, values = [], [], []
+    for file in folder.files:
+        for number, entry in enumerate(load_objects(file)):
+            where = f"{file}: entry {number}"
+            names = names or _joints(entry, where)
+            values.append([_row(entry, posture, names, where) for posture in _POSTURES])
+            known = folder.object(file.stem, _scale(entry, where))
+            if known not in objects:
+                objects.append(known)
+            index.append(objects.index(known))
+    table = np.array(values, np.float64).reshape(len(values), 3, len(_WRIST) + len(names))
+    wrist, q = table[:, 0, :6], table[:, :, 6:]
+    order = order_of(names, folder.joint_names or names, path)
+    pose = np.concatenate([wrist[:, :3], quaternion_from_euler(wrist[:, 3:])], -1)
+    pose = folder.object_pose(pose, q[:, 0][:, order])
+    return make_set(names, objects, q, pose[:, None], np.array(index, int).reshape(-1, 1))
+
+
+def _joints(entry: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(entry, dict) or not isinstance(entry.get("qpos"), dict):
+        raise ShardError(f"{where}: no dictionary with 'qpos', a dictionary of joint values")
+    return tuple(name for name in entry["qpos"] if name not in _WRIST)
+
+
+def _scale(entry: Any, where: str) -> float:
+    try:
+        return float(entry.get("scale", 1.0))
+    except (TypeError, ValueError):
+        raise ShardError(f"{where}: scale is {entry['scale']!r}, expected a number") from None
+
+
+def _row(entry: Any, posture: str, names: tuple[str, ...], where: str) -> list[float]:
+    """Wrist and joints of one posture."""
+    order_of(_joints(entry, where), names, where)
+    values = entry.get(posture, entry["qpos"])
+    try:
+        row = [float(values[name]) for name in (*_WRIST, *names)]
+    except KeyError as error:
+        raise ShardError(f"{where}: {posture} has no {error}") from None
+    except (TypeError, ValueError) as error:
+        raise ShardError(f"{where}: {posture} holds no numbers: {error}") from None
+    if not np.isfinite(row).all():
+        raise ShardError(f"{where}: {posture} is not finite")
+    return row

@@ -1,0 +1,122 @@
+"""Formats of other programs by name, and the export to one of them."""
+
+from collections.abc import Callable, Iterable, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgraspbench, write_dexgraspbench
+from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
+from lgrasp.dataset.exports.files import check_empty, write_file
+from lgrasp.dataset.exports.folder import write_assets, write_index
+from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
+from lgrasp.dataset.exports.plan import Plan, make_plan
+from lgrasp.dataset.exports.readme import readme
+from lgrasp.dataset.exports.records import GraspSet
+from lgrasp.dataset.exports.where import parse_condition
+from lgrasp.dataset.files import find_shards
+from lgrasp.errors import ConfigError
+
+__all__ = ["FORMATS", "Exported", "Format", "export_shards", "read_grasps"]
+
+
+class Format(NamedTuple):
+    """A format of another program."""
+
+    summary: str
+    single: bool
+    """Has every grasp one object?"""
+    notes: str
+    write: Callable[[Path, Plan, HandFrames, Callable[[int], None]], None]
+    read: Callable[..., GraspSet]
+
+
+FORMATS = {
+    "dexgraspnet": Format(
+        "one .npy per object, Euler angles", True, DEXGRASPNET_NOTES, write_dexgraspnet, read_dexgraspnet
+    ),
+    "dexgraspbench": Format(
+        "one .npy per grasp, the layout of BODex", True, DEXGRASPBENCH_NOTES, write_dexgraspbench, read_dexgraspbench
+    ),
+    "isaac-grasp": Format(
+        "one YAML per object, isaac_grasp 1.0", True, ISAAC_GRASP_NOTES, write_isaac_grasp, read_isaac_grasp
+    ),
+}
+"""Formats by the name that ``--to`` takes."""
+
+
+class Exported(NamedTuple):
+    """What an export wrote."""
+
+    rows: int
+    objects: tuple[str, ...]
+    """Codes of the objects."""
+
+
+def export_shards(
+    paths: str | PathLike[str] | Iterable[str | PathLike[str]],
+    out: str | PathLike[str],
+    to: str,
+    *,
+    where: Sequence[str] = (),
+    limit: int | None = None,
+    advance: Callable[[int, int], None] | None = None,
+) -> Exported:
+    """Write grasps of shards, all of one hand, into a folder in the format of another program.
+
+    The folder can be used alone: it has the hand's URDF and meshes, the objects' meshes and a README. Every file
+    appears whole; ``export.json`` is the last.
+
+    Args:
+        paths: Shard files or folders of them.
+        out: Folder to write; empty or not there yet.
+        to: A key of :data:`FORMATS`.
+        where: Conditions on columns that a row must satisfy, all of them, such as ``physics/fc_holds`` or
+            ``metrics/epsilon > 0.01``.
+        limit: Most rows.
+        advance: Called with rows done and rows in all.
+
+    Raises:
+        ConfigError: An unknown format, a condition that cannot be read, or a limit below 1.
+        ShardError: A shard is damaged, of another hand, lacks a column, holds what the format cannot; no row is left.
+        OutputError: The folder is not empty or cannot be written.
+    """
+    if to not in FORMATS:
+        raise ConfigError(f"--to '{to}': choose one of {', '.join(FORMATS)}")
+    if limit is not None and limit < 1:
+        raise ConfigError(f"--limit {limit}: must be at least 1")
+    form, conditions, out = FORMATS[to], [parse_condition(text) for text in where], Path(out)
+    check_empty(out)
+    plan = make_plan(find_shards(paths), where=conditions, limit=limit, single=form.single)
+    frames = HandFrames(plan.hand.urdf, plan.hand.base_link, plan.hand.joint_names, plan.shards[0])
+    done = 0
+
+    def count(rows: int) -> None:
+        nonlocal done
+        done += rows
+        if advance:
+            advance(done, plan.rows)
+
+    write_assets(out, plan)
+    write_file(out / "README.txt", readme(plan, frames, form.notes))
+    form.write(out, plan, frames, count)
+    write_index(out, plan, frames, to, list(map(str, conditions)))
+    return Exported(plan.rows, tuple(item.code for item in plan.objects))
+
+
+def read_grasps(path: str | PathLike[str], form: str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
+    """Read grasps in the format of another program.
+
+    Args:
+        path: An export, a folder or a file.
+        form: A key of :data:`FORMATS`.
+        joint_names: Wanted order of q; by default that of the export, else of the first grasp.
+
+    Raises:
+        ConfigError: An unknown format.
+        ShardError: A file is missing, damaged, of another format, or names other joints.
+    """
+    if form not in FORMATS:
+        raise ConfigError(f"unknown format '{form}': choose one of {', '.join(FORMATS)}")
+    return FORMATS[form].read(Path(path), joint_names=joint_names)

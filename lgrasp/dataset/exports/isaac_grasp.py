@@ -1,0 +1,130 @@
+"""isaac_grasp 1.0: one YAML file per object, the gripper's pose in the object's frame and joints by name."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from lgrasp.dataset.exports.files import writing
+from lgrasp.dataset.exports.folder import GRASPS, open_folder
+from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.exports.plan import Batch, Plan
+from lgrasp.dataset.exports.poses import inverse
+from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order_of
+from lgrasp.errors import ShardError
+
+__all__ = ["ISAAC_GRASP_NOTES", "read_isaac_grasp", "write_isaac_grasp"]
+
+_POSTURES = ("cspace_position", "pregrasp_cspace_position", "squeeze_cspace_position")
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+ISAAC_GRASP_NOTES = """\
+grasps/CODE.yaml   isaac_grasp format, version 1.0: all grasps of one object by name.
+
+  object_frame_link, gripper_frame_link    the object's mesh frame, and link {base} of hand/hand.urdf. NVIDIA's pages
+                   call them object_frame and gripper_frame as well; both are given.
+  confidence       1.0; 0.0 where a simulator saw the grasp fail
+  position         x y z [m] of {base} in the object's frame
+  orientation      w and xyz of its quaternion, unit, w >= 0
+  cspace_position  joints at the grasp by name [rad or m]
+  pregrasp_cspace_position    joints before closing
+  squeeze_cspace_position     joint targets that press on the object, an addition of lgrasp
+"""
+
+
+def write_isaac_grasp(out: Path, plan: Plan, frames: HandFrames, advance: Callable[[int], None]) -> None:
+    """Write ``grasps/CODE.yaml`` for every object; memory does not grow with the rows.
+
+    Args:
+        out: Folder of the export.
+        plan: Rows of single objects.
+        frames: The plan's hand.
+        advance: Called with numbers of rows that are done.
+
+    Raises:
+        ShardError: A shard is damaged.
+        OutputError: The folder cannot be written.
+    """
+    for place, item in enumerate(plan.objects):
+        head = {"format": "isaac_grasp", "format_version": 1.0}
+        head |= {"object_frame_link": item.code, "gripper_frame_link": frames.base}
+        head |= {"object_frame": item.code, "gripper_frame": frames.base}
+        with writing(out / GRASPS / f"{item.code}.yaml") as write:
+            write(yaml.safe_dump(head, sort_keys=False, allow_unicode=True).encode() + b"grasps:\n")
+            for batch in plan.batches(place, advance):
+                write(_entries(batch, frames).encode())
+
+
+def _entries(batch: Batch, frames: HandFrames) -> str:
+    """Grasps in YAML; numbers have nine decimals, names are quoted as in JSON, which YAML understands."""
+    pose = inverse(batch.object_pose[:, 0])  # (n, 7)
+    form = ", ".join(f"{json.dumps(name).replace(chr(37), chr(37) * 2)}: %.9f" for name in frames.joint_names)
+    lines = []
+    for row, number in enumerate(batch.number):
+        x, y, z, w, *v = (f"{value:.9f}" for value in pose[row])
+        lines += [
+            f"  grasp_{number}:",
+            f"    confidence: {batch.holds[row]:.1f}",
+            f"    position: [{x}, {y}, {z}]",
+            f"    orientation: {{w: {w}, xyz: [{', '.join(v)}]}}",
+        ]
+        postures = (batch.q[row], batch.q_pregrasp[row], batch.q_squeeze[row])
+        lines += [f"    {name}: {{{form % tuple(q)}}}" for name, q in zip(_POSTURES, postures, strict=True)]
+    return "\n".join(lines) + "\n"
+
+
+def read_isaac_grasp(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
+    """Read an export, a folder of YAML files, or one such file, by whichever program it was written.
+
+    What lacks a posture gets the joints of the grasp there. Names and confidences of grasps are not kept.
+
+    Args:
+        path: Export, folder or file.
+        joint_names: Wanted order of q; by default that of the export, else that of the first grasp.
+
+    Raises:
+        ShardError: A file is missing, damaged, of another format, or names other joints.
+    """
+    folder = open_folder(Path(path), ".yaml", "isaac-grasp")
+    names = tuple(joint_names or folder.joint_names or ())
+    objects: list[ReadObject] = []
+    index, poses, q = [], [], []
+    for place, file in enumerate(folder.files):
+        objects.append(folder.object(file.stem, 1.0))
+        for name, entry in _load(file).items():
+            where = f"{file}: {name}"
+            try:
+                names = names or tuple(map(str, entry["cspace_position"]))
+                turn = entry["orientation"]
+                poses.append([float(x) for x in (*entry["position"], turn["w"], *turn["xyz"])])
+                postures = [entry.get(posture, entry["cspace_position"]) for posture in _POSTURES]
+                for joints in postures:
+                    order_of(list(joints), names, where)
+                q.append([[float(joints[joint]) for joint in names] for joints in postures])
+            except KeyError as error:
+                raise ShardError(f"{where}: has no {error}") from None
+            except (TypeError, ValueError, AttributeError) as error:
+                raise ShardError(f"{where}: not as isaac_grasp 1.0 has it: {error}") from None
+            if len(poses[-1]) != 7 or not np.isfinite(poses[-1]).all() or not np.isfinite(q[-1]).all():
+                raise ShardError(f"{where}: expected 3 numbers of position, 4 of orientation, all finite")
+            index.append([place])
+    joints = np.array(q, np.float64).reshape(-1, 3, len(names))
+    pose = inverse(np.array(poses, np.float64).reshape(-1, 7))
+    return make_set(names, objects, joints, pose[:, None], np.array(index, int).reshape(-1, 1))
+
+
+def _load(file: Path) -> dict[str, Any]:
+    try:
+        document = yaml.load(file.read_bytes(), Loader=_Loader)
+        version = document["format"], float(document["format_version"])
+        grasps = document["grasps"]
+    except OSError as error:
+        raise ShardError(f"{file}: {error.strerror or error}") from error
+    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        raise ShardError(f"{file}: not an isaac_grasp file: {' '.join(str(error).split())[:200]}") from None
+    if version != ("isaac_grasp", 1.0) or not isinstance(grasps, dict):
+        raise ShardError(f"{file}: is {version[0]} {version[1]}, expected isaac_grasp 1.0 with a mapping of grasps")
+    return grasps

@@ -1,0 +1,114 @@
+"""Python objects in .npy files, written so that every NumPy reads them, and read without running foreign code.
+
+``np.save`` pickles whatever is no plain array. A pickle by NumPy 2 names a module that NumPy before 1.26 does not have,
+and ``np.load(allow_pickle=True)`` runs what a file says. Here the old name is written, object by object, so that memory
+does not grow with their number, and nothing but numbers, texts, lists, dictionaries and arrays is read.
+"""
+
+import os
+import pickle
+from collections.abc import Iterable
+from io import BytesIO
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.dataset.exports.files import write_small, writing
+from lgrasp.errors import ShardError
+
+__all__ = ["load_objects", "save_object", "save_objects"]
+
+_PROTOCOL = 3  # names are plain text in it, and every Python 3 reads it
+_BATCH = 1024  # objects written at once
+
+
+def save_object(path: Path, value: Any) -> None:
+    """Write one object; ``np.load(path, allow_pickle=True).item()`` gives it back.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    head, tail = _frame(())
+    write_small(path, head + _words(value) + tail)
+
+
+def save_objects(path: Path, count: int, values: Iterable[Any]) -> None:
+    """Write ``count`` objects; ``np.load(path, allow_pickle=True)`` gives an array of them, shape [count].
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    head, tail = _frame((count,))
+    rest = iter(values)
+    with writing(path) as write:
+        write(head)
+        while batch := b"".join(map(_words, islice(rest, _BATCH))):
+            write(batch)
+        write(tail)
+
+
+def load_objects(path: str | os.PathLike[str]) -> list[Any]:
+    """The objects of a .npy file in order, by whichever program it was written.
+
+    Raises:
+        ShardError: No such file, damaged, no .npy, or it holds more than numbers, texts, lists, dictionaries, arrays.
+    """
+    try:
+        with open(path, "rb") as file:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(file)
+            if not dtype.hasobject:
+                raise ValueError(f"it holds numbers of type {dtype}, not objects")
+            values = _Unpickler(file, encoding="latin1").load()
+    except OSError as error:
+        raise ShardError(f"{path}: {error.strerror or error}") from error
+    except Exception as error:  # damaged pickles fail in many ways
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ShardError(f"{path}: not a .npy file of grasps: {reason}") from error
+    if not isinstance(values, np.ndarray) or values.shape != shape:
+        raise ShardError(f"{path}: not a .npy file of grasps: what it holds is not of the promised shape {shape}")
+    return values.ravel().tolist()
+
+
+def _frame(shape: tuple[int, ...]) -> tuple[bytes, bytes]:
+    """What precedes and follows the items of an array of objects.
+
+    In the words of a pickle: make an array, give it this shape, the type of objects, and a list of these items.
+    """
+    header = BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "|O", "fortran_order": False, "shape": shape})
+    head = header.getvalue() + pickle.PROTO + bytes([_PROTOCOL])
+    head += pickle.GLOBAL + b"numpy.core.multiarray\n_reconstruct\n" + pickle.GLOBAL + b"numpy\nndarray\n"
+    head += _words((0,)) + _words(b"b") + pickle.TUPLE3 + pickle.REDUCE
+    head += pickle.MARK + _words(1) + _words(shape) + _words(np.dtype(object)) + _words(False)
+    head += pickle.EMPTY_LIST + pickle.MARK
+    return head, pickle.APPENDS + pickle.TUPLE + pickle.BUILD + pickle.STOP
+
+
+def _words(value: Any) -> bytes:
+    """The pickle of a value, without its first and last words, which frame it."""
+    words = pickle.dumps(value, protocol=_PROTOCOL)[2:-1]
+    return words.replace(pickle.GLOBAL + b"numpy._core.", pickle.GLOBAL + b"numpy.core.")
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads arrays and plain values; refuses to call anything else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        known = module.replace("numpy._core", "numpy.core")
+        if (known, name) in _READABLE:
+            return _READABLE[known, name]
+        raise pickle.UnpicklingError(f"it would call {module}.{name}; only numbers, texts, lists and arrays are read")
+
+
+_READABLE: dict[tuple[str, str], Any] = {
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+    ("numpy.core.multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],
+    ("numpy.core.multiarray", "scalar"): np.float64(0).__reduce__()[0],
+    ("numpy.core.numeric", "_frombuffer"): np.empty(0).__reduce_ex__(5)[0],
+    ("_codecs", "encode"): lambda text, _: text.encode("latin1"),
+}

@@ -1,0 +1,230 @@
+"""What an export holds: which rows of which shards, in which order, of which objects."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lgrasp.dataset.exports.where import Condition
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.records import HandRecord, ObjectRecord
+from lgrasp.dataset.schema import CHUNK_ROWS
+from lgrasp.errors import ShardError
+
+__all__ = ["HOLDS", "Batch", "ExportObject", "Plan", "make_plan"]
+
+HOLDS = "physics/fc_holds"
+"""Column that says whether a simulator saw the grasp hold."""
+
+
+class ExportObject(NamedTuple):
+    """An object of an export."""
+
+    code: str
+    """Name in the export, fit for a file name, unique."""
+    record: ObjectRecord
+    """As in the shard, without vertices and faces (both empty)."""
+    shard: Path
+    """A shard that holds the mesh."""
+
+    def mesh(self) -> ObjectRecord:
+        """The record with its mesh."""
+        with ShardReader(self.shard) as reader:
+            return reader.object(self.record.id)
+
+
+class Batch(NamedTuple):
+    """Some rows; ``n`` rows, ``K`` joints, ``O`` objects in a row (1 if the plan is of single objects)."""
+
+    number: np.ndarray
+    """Running number of each row in the export, shape [n]."""
+    q: np.ndarray
+    """Joint positions [rad or m] in the order of the plan's hand, float64, shape [n, K]."""
+    q_pregrasp: np.ndarray
+    q_squeeze: np.ndarray
+    object_pose: np.ndarray
+    """Object in the hand base frame, x y z [m] qw qx qy qz, float64, shape [n, O, 7]; NaN where absent."""
+    object_index: np.ndarray
+    """Position in the plan's objects, shape [n, O]; -1 where absent."""
+    holds: np.ndarray
+    """1 where a simulator saw the grasp hold or none ran, 0 where it saw it fail, shape [n]."""
+
+
+@dataclass(frozen=True)
+class _Source:
+    path: Path
+    rows: np.ndarray  # chosen, ascending
+    index: np.ndarray  # (n, O) of the chosen rows, in the plan's objects
+    columns: list[int]  # column of q for each joint of the plan
+    first: int  # running number of the first chosen row
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Rows to export, all of one hand."""
+
+    hand: HandRecord
+    objects: tuple[ExportObject, ...]
+    """Those that a chosen row holds, by code."""
+    counts: tuple[int, ...]
+    """How often each object is held."""
+    rows: int
+    single: bool
+    """Does every row hold exactly one object?"""
+    _sources: tuple[_Source, ...]
+
+    @property
+    def shards(self) -> list[Path]:
+        """The shards that rows are taken from."""
+        return [source.path for source in self._sources]
+
+    def batches(self, holding: int | None = None, advance: Callable[[int], None] | None = None) -> Iterator[Batch]:
+        """The rows in order, at most 4096 at a time.
+
+        Args:
+            holding: Only rows with this one of the objects.
+            advance: Called with the number of rows of each batch when the caller is done with it.
+
+        Raises:
+            ShardError: A shard is damaged.
+        """
+        for source in self._sources:
+            chosen = np.arange(len(source.rows))
+            if holding is not None:
+                chosen = chosen[(source.index == holding).any(1)]
+            if not len(chosen):
+                continue
+            with ShardReader(source.path) as reader:
+                for block in np.unique(source.rows[chosen] // CHUNK_ROWS):
+                    some = chosen[source.rows[chosen] // CHUNK_ROWS == block]
+                    yield self._read(reader, source, some, int(block) * CHUNK_ROWS)
+                    if advance:
+                        advance(len(some))
+
+    def _read(self, reader: ShardReader, source: _Source, some: np.ndarray, start: int) -> Batch:
+        rows = source.rows[some] - start
+        q = [reader.column(n, start, start + CHUNK_ROWS)[rows] for n in ("q", "q_pregrasp", "q_squeeze")]
+        pose, index = reader.column("object_pose", start, start + CHUNK_ROWS)[rows], source.index[some]
+        if self.single:
+            present = np.argmax(index >= 0, axis=1)[:, None]
+            pose = np.take_along_axis(pose, present[..., None], 1)
+            index = np.take_along_axis(index, present, 1)
+        holds = np.ones(len(rows))
+        if HOLDS in reader.columns:
+            holds = (reader.column(HOLDS, start, start + CHUNK_ROWS)[rows] > 0).astype(np.float64)
+        q, q_pregrasp, q_squeeze = (values[:, source.columns].astype(np.float64) for values in q)
+        return Batch(source.first + some, q, q_pregrasp, q_squeeze, pose.astype(np.float64), index, holds)
+
+
+def make_plan(
+    paths: Sequence[Path], *, where: Sequence[Condition] = (), limit: int | None = None, single: bool = False
+) -> Plan:
+    """Choose rows; reads what the conditions need and no grasp.
+
+    Args:
+        paths: Shard files.
+        where: Conditions that a row must satisfy, all of them.
+        limit: Most rows, counted over all shards in the order given.
+        single: Insist on one object in every row.
+
+    Raises:
+        ShardError: A shard cannot be read, hands differ, no row is left, or a row holds several objects and ``single``.
+    """
+    hand: HandRecord | None = None
+    known: dict[tuple[str, str, float], ExportObject] = {}
+    parts: list[tuple[Path, np.ndarray, np.ndarray, list[int]]] = []
+    left, seen = limit, 0
+    for path in paths:
+        with ShardReader(path) as reader:
+            this = reader.hand()
+            hand = hand or this
+            columns = _columns(path, this, paths[0], hand)
+            keys = _objects(reader, path, known)
+            rows = _choose(reader, where)[:left]
+            seen += len(reader)
+            index = reader.column("object_index")[rows]
+        several = np.flatnonzero((index >= 0).sum(1) != 1)
+        if single and len(several):
+            count = int((index[several[0]] >= 0).sum())
+            raise ShardError(f"{path}: row {rows[several[0]]} holds {count} objects; this format has one in a grasp")
+        parts.append((path, rows, keys[index], columns))
+        left = None if left is None else left - len(rows)
+        if left == 0:
+            break
+    assert hand is not None
+    if not any(len(rows) for _, rows, *_ in parts):
+        why = f"none satisfies {' and '.join(map(str, where))}" if where and seen else "there are none"
+        of = f"{len(parts)} shard{'s' * (len(parts) > 1)}, {seen:,} rows"
+        raise ShardError(f"{paths[0]}: no rows to export; {why} ({of})")
+    return _assemble(hand, list(known.values()), parts, single)
+
+
+def _columns(path: Path, hand: HandRecord, first_path: Path, first: HandRecord) -> list[int]:
+    """Column of q of each joint of the first shard's hand."""
+    if hand.sha256 != first.sha256 or sorted(hand.joint_names) != sorted(first.joint_names):
+        raise ShardError(f"{path}: another hand ({hand.name}) than {first_path} ({first.name}); export one at a time")
+    order = list(hand.joint_names)
+    return [order.index(name) for name in first.joint_names]
+
+
+def _objects(reader: ShardReader, path: Path, known: dict[tuple[str, str, float], ExportObject]) -> np.ndarray:
+    """Position in ``known`` of each object of a shard, which is added; -1 for the last, absent one."""
+    places = []
+    for record in reader.objects():
+        key = (record.id, record.sha256, record.scale)
+        if key not in known:
+            taken = {o.code.casefold() for o in known.values()}
+            bare = ObjectRecord(
+                id=record.id,
+                name=record.name,
+                scale=record.scale,
+                sha256=record.sha256,
+                watertight=record.watertight,
+                vertices=np.zeros((0, 3), np.float32),
+                faces=np.zeros((0, 3), np.int32),
+            )
+            known[key] = ExportObject(_code(record.id, taken), bare, path)
+        places.append(list(known).index(key))
+    return np.array([*places, -1])
+
+
+def _code(name: str, taken: set[str]) -> str:
+    safe = re.sub(r"[^A-Za-z0-9_-]+", "_", name)[:100].strip("_") or "object"
+    tries = (f"{safe}{number}" for number in ("", *(f"_{n}" for n in range(2, len(taken) + 3))))
+    return next(code for code in tries if code.casefold() not in taken)
+
+
+def _choose(reader: ShardReader, where: Sequence[Condition]) -> np.ndarray:
+    good = np.ones(len(reader), bool)
+    for condition in where:
+        good &= condition.holds(reader)
+    return np.flatnonzero(good)
+
+
+def _assemble(
+    hand: HandRecord,
+    known: list[ExportObject],
+    parts: list[tuple[Path, np.ndarray, np.ndarray, list[int]]],
+    single: bool,
+) -> Plan:
+    """Leave out objects that no chosen row holds, order the others by code, number the rows."""
+    count = np.bincount(np.concatenate([index[index >= 0] for _, _, index, _ in parts]), minlength=len(known))
+    order = sorted(np.flatnonzero(count), key=lambda i: known[i].code)
+    place = np.full(len(known) + 1, -1)
+    place[order] = np.arange(len(order))
+    sources, first = [], 0
+    for path, rows, index, columns in parts:
+        if len(rows):
+            sources.append(_Source(path, rows, place[index], columns, first))
+            first += len(rows)
+    return Plan(
+        hand=hand,
+        objects=tuple(known[i] for i in order),
+        counts=tuple(int(count[i]) for i in order),
+        rows=first,
+        single=single,
+        _sources=tuple(sources),
+    )

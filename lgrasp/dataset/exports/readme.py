@@ -1,0 +1,55 @@
+"""README.txt of an export: what lies where, frames, units, the order of joints."""
+
+from lgrasp.dataset.exports.folder import HAND, OBJECTS
+from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.exports.plan import Plan
+
+__all__ = ["readme"]
+
+_TEXT = """\
+{rows:,} grasps of the hand {hand}, exported by lgrasp from {shards}.
+
+{hand_folder}/hand.urdf     the hand, with its mesh files under {hand_folder}/meshes
+{objects_folder}/CODE.obj    the objects: {objects}
+export.json        hand, joints, objects and sources for machines; written last, so that an export with it is whole
+
+{notes}
+Units: metres, radians. Rotations: unit quaternions with w first and w >= 0, unless said otherwise above.
+An object's frame is that of its mesh file. Links and joints are those of hand.urdf; poses are of link frames.
+
+Joint order, where values have no names:
+{joints}
+{mimics}"""
+
+
+def readme(plan: Plan, frames: HandFrames, notes: str) -> str:
+    """The text.
+
+    Args:
+        plan: What is exported.
+        frames: The plan's hand.
+        notes: What is special about the format, with ``{root}`` and ``{base}`` for the names of the two links.
+    """
+    width = max(map(len, frames.joint_names))
+    limits = zip(frames.joint_names, plan.hand.joint_lower, plan.hand.joint_upper, strict=True)
+    joints = [
+        f"  {i:3d}  {name:{width}s}  {lower:8.4f} to {upper:.4f}" for i, (name, lower, upper) in enumerate(limits)
+    ]
+    mimics = [f"  {name} = {m:g} * {source} + {b:g}" for name, (source, m, b) in frames.mimics.items()]
+    said = "Joints that follow others (<mimic> in hand.urdf), which have no value of their own:"
+    counts = (f"{item.code} ({count:,})" for item, count in zip(plan.objects, plan.counts, strict=True))
+    return _TEXT.format(
+        rows=plan.rows,
+        hand=plan.hand.name,
+        shards=_few([path.name for path in plan.shards]),
+        hand_folder=HAND,
+        objects_folder=OBJECTS,
+        objects=_few(list(counts)),
+        notes=notes.format(root=frames.root, base=frames.base),
+        joints="\n".join(joints),
+        mimics="\n".join(["", said, *mimics, ""]) if mimics else "",
+    )
+
+
+def _few(names: list[str], most: int = 8) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most:,} more" if len(names) > most else "")
