@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lgrasp_cli.options import Quiet
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -78,6 +80,38 @@ def merge(
 
     rows = merge_shards(paths[0] if len(paths) == 1 else paths, out, manifest=manifest)
     typer.echo(f"{out}: {rows} rows")
+
+
+@app.command()
+def metrics(
+    paths: _Paths,
+    add: Annotated[str, typer.Option(help="Metrics, separated by commas: volume, epsilon_exact.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the new shards.", show_default=False)],
+    workers: Annotated[int, typer.Option(min=0, help="Processes; 0: all cores.")] = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Copy shards and add quality metrics to the copies; those that are in --out already are kept.
+
+    Subfolders are looked into and made in --out too. docs/metrics.md defines the metrics.
+
+    Example: lgrasp dataset metrics grasps/allegro-mug --add volume,epsilon_exact -o grasps/measured
+    """
+    import time
+
+    from lgrasp.dataset.metrics import add_metrics
+    from lgrasp.engine.folder import check_folder
+    from lgrasp_cli.counting import counting
+
+    check_folder(out)
+    start = time.monotonic()
+    with counting("measured", quiet=quiet) as progress:
+        names = [name.strip() for name in add.split(",")]
+        added = add_metrics(paths, out, names, workers=workers, progress=progress)
+    if not quiet:
+        kept = len(added.files) - added.written
+        there = f"; {kept} were there" if kept else ""
+        per_second = added.rows / max(time.monotonic() - start, 1e-9)
+        typer.echo(f"{out}: {added.written} shards, {added.rows:,} rows, {per_second:,.0f} rows/s{there}")
 
 
 def _shard_table(shards: list[dict[str, Any]]) -> "Table":

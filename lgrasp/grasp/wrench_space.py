@@ -90,7 +90,8 @@ def wrench_spaces(points: np.ndarray, normals: np.ndarray, center: np.ndarray, r
         radius: The object's largest distance from there [m].
     """
     out = np.zeros((len(points), 2))
-    for i, touches in enumerate(np.isfinite(points).all(-1)):
+    for i in range(len(points)):
+        touches = np.isfinite(points[i]).all(-1)
         p, n = points[i, touches].astype(float), normals[i, touches].astype(float)
         n /= np.linalg.norm(n, axis=1, keepdims=True)
         out[i] = wrench_space(primitive_wrenches(p, n, center=center, radius=radius))

@@ -1,0 +1,187 @@
+"""Further quality numbers of stored grasps, computed from the shards alone on all cores."""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+
+from lgrasp.dataset.extend import check_shard, extend_shard
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.records import GraspRows, ObjectRecord
+from lgrasp.dataset.tree import shard_tree
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.errors import ConfigError, OutputError
+from lgrasp.grasp.wrench_space import wrench_spaces
+
+__all__ = ["METRICS", "Added", "add_metrics", "mass_frame", "row_metrics"]
+
+METRICS = {"epsilon_exact": "", "volume": ""}
+"""Units of the metrics that can be added (docs/metrics.md defines them)."""
+
+_TASK_ROWS = 32
+_ROW = ("candidate", "q", "contact_points")  # what tells rows apart
+_Map = Callable[..., Iterable[np.ndarray]]
+
+
+class Added(NamedTuple):
+    """What :func:`add_metrics` did."""
+
+    files: list[Path]
+    """Shards with the metrics, written now or before."""
+    written: int
+    """How many of them were written now."""
+    rows: int
+    """Rows of those."""
+
+
+def add_metrics(
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    out: Path,
+    names: Sequence[str],
+    *,
+    workers: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Added:
+    """Copies of shards with more metrics, in a new folder; copies that are there already and whole are kept.
+
+    Args:
+        paths: Shard files or folders; what lies in subfolders of a folder goes to such subfolders of ``out``.
+        out: Folder of the copies.
+        names: Some of ``METRICS``.
+        workers: Processes; 0 is one per core, 1 computes in this process.
+        progress: Called with (rows done, rows in all) now and then.
+
+    Raises:
+        ConfigError: A name that is not in ``METRICS``.
+        ShardError: A shard cannot be read or does not conform.
+        OutputError: ``out`` cannot be written, holds the shards themselves, or a file of other rows.
+    """
+    unknown = [name for name in names if name not in METRICS]
+    if unknown or not names:
+        raise ConfigError(f"unknown metric '{''.join(unknown[:1])}'; known: {', '.join(METRICS)}")
+    _check_apart(paths, out)
+    sources = shard_tree(paths, leave_out=out)
+    total = sum(_length(path) for path in sources.values())
+    workers = workers or os.cpu_count() or 1
+    written = rows = done = 0
+
+    def report(now: int) -> None:
+        if progress:
+            progress(done + now, total)
+
+    with _process_map(workers) as each:
+        for place, source in sources.items():
+            n = _length(source)
+            if not _is_extended(out / place, source, names):
+                check_shard(source)
+                columns = _measure(source, each, 8 * workers * _TASK_ROWS, report)
+                extend_shard(source, out / place, {name: columns[name] for name in names}, METRICS)
+                written, rows = written + 1, rows + n
+            done += n
+            report(0)
+    return Added([out / place for place in sources], written, rows)
+
+
+def _measure(path: Path, each: _Map, step: int, report: Callable[[int], None]) -> dict[str, np.ndarray]:
+    """All metrics of a shard by name, each shape [N], ``step`` rows at a time; then ``report(rows done)`` is called."""
+    with ShardReader(path) as reader:
+        frames = [mass_frame(record) for record in reader.objects()]
+        table = np.zeros((len(reader), len(METRICS)), np.float32)
+        for start in range(0, len(reader), step):
+            table[start : start + step] = row_metrics(reader.rows(start, start + step), frames, each)
+            report(min(start + step, len(reader)))
+    return dict(zip(METRICS, table.T, strict=True))
+
+
+def row_metrics(rows: GraspRows, frames: Sequence[tuple[np.ndarray, float]], each: _Map = map) -> np.ndarray:
+    """The columns of ``METRICS`` for some rows, shape [n, 2]; of several objects in a row the least.
+
+    Args:
+        rows: Grasps.
+        frames: What :func:`mass_frame` says of each of the shard's objects, sorted by id.
+        each: ``map``, or another that works on several items at once and yields in order.
+    """
+    tasks = []  # rows of one object each
+    for o, present in enumerate(rows.object_index.T):
+        for i, (center, radius) in enumerate(frames):
+            chosen = np.flatnonzero(present == i)
+            for part in (chosen[at : at + _TASK_ROWS] for at in range(0, len(chosen), _TASK_ROWS)):
+                tasks.append((part, rows.contact_points[part, o], -rows.contact_normals[part, o], center, radius))
+    table = np.full((len(rows), len(METRICS)), np.inf)
+    if tasks:
+        parts, *arguments = zip(*tasks, strict=True)
+        for part, values in zip(parts, each(wrench_spaces, *arguments), strict=True):
+            table[part] = np.minimum(table[part], values)
+    return table
+
+
+def mass_frame(record: ObjectRecord) -> tuple[np.ndarray, float]:
+    """Centre of mass at uniform density (of the surface if the mesh is open) [m], shape [3], and the largest distance
+    of the surface from there [m]."""
+    mesh = trimesh.Trimesh(np.asarray(record.vertices, float), record.faces, process=False)
+    solid = record.watertight and mesh.volume > 1e-12 * mesh.extents.max() ** 3
+    center = np.asarray(mesh.center_mass if solid else mesh.centroid)
+    return center, float(np.linalg.norm(mesh.triangles.reshape(-1, 3) - center, axis=1).max())
+
+
+def _check_apart(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], out: Path) -> None:
+    given = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
+    for folder in (path if path.is_dir() else path.parent for path in given):
+        if folder.resolve() == out.resolve():
+            raise OutputError(f"--out {out} is the folder of the shards themselves; choose another")
+
+
+def _length(path: Path) -> int:
+    with ShardReader(path) as reader:
+        return len(reader)
+
+
+def _is_extended(target: Path, source: Path, names: Sequence[str]) -> bool:
+    """Is there a whole copy of a shard with the metrics already?
+
+    Raises:
+        OutputError: Something else is in its place.
+    """
+    if not os.path.lexists(target) or validate_shard(target):
+        return False
+    with ShardReader(source) as old, ShardReader(target) as new:
+        if _identity(old) != _identity(new) or not all(
+            np.array_equal(old.column(name), new.column(name), equal_nan=name != "candidate") for name in _ROW
+        ):
+            raise OutputError(f"{target} holds other rows than {source}; choose another --out")
+        return all(f"metrics/{name}" in new.columns for name in names)
+
+
+def _identity(reader: ShardReader) -> dict[str, Any]:
+    return {name: value for name, value in reader.attributes.items() if name != "text_sha256"}
+
+
+@contextmanager
+def _process_map(workers: int) -> Iterator[_Map]:
+    """A map over processes, or the plain one for a single worker."""
+    if workers == 1:
+        yield map
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_follow_parent) as pool:
+        try:
+            yield pool.map
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _follow_parent() -> None:
+    """In a worker: leave Ctrl-C to the parent, and end when the parent has ended in any way."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()

@@ -1,0 +1,177 @@
+"""Metrics added to shards, and the stored ones, against exact solutions."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from reference.wrench import cone_forces, epsilon, residual, wrenches
+from scipy.spatial import ConvexHull
+from typer.testing import CliRunner
+
+from lgrasp.dataset import read_shard, validate_shard, write_shard
+from lgrasp.dataset.metrics import add_metrics, mass_frame, row_metrics
+from lgrasp.errors import ConfigError, OutputError, ShardError
+from lgrasp_cli.dataset import app
+
+BOTH = ("volume", "epsilon_exact")
+
+
+def grip(shard, o=0):
+    """For each row of a shard: contact points, inward normals, and the object as a mesh."""
+    for r in range(len(shard.grasps)):
+        touch = shard.grasps.contact_links[r, o] >= 0
+        record = shard.objects[shard.grasps.object_index[r, o]]
+        points, normals = shard.grasps.contact_points[r, o, touch], -shard.grasps.contact_normals[r, o, touch]
+        mesh = trimesh.Trimesh(record.vertices, record.faces, process=False)
+        normals = normals / np.linalg.norm(normals.astype(float), axis=1, keepdims=True)
+        yield points.astype(float), normals, mesh
+
+
+@pytest.fixture
+def measured(run, tmp_path):
+    """Grasps of the pipeline with both metrics."""
+    run(rows=40, shard_rows=40)
+    add_metrics(tmp_path / "out", tmp_path / "more", BOTH, workers=1)
+    (path,) = (tmp_path / "more").glob("*.h5")
+    assert validate_shard(path) == []
+    return read_shard(path)
+
+
+def test_generated_grasps(measured):
+    """Epsilon of the shard is a bound from above, a close one; the added numbers are those of the exact hull."""
+    metrics, closed = measured.grasps.metrics, 0
+    for r, (points, normals, mesh) in enumerate(grip(measured)):
+        arms, radius = points - mesh.center_mass, np.linalg.norm(mesh.vertices - mesh.center_mass, axis=1).max()
+        exact = epsilon(arms, normals, 0.5, radius)
+        assert metrics["epsilon_exact"][r] == pytest.approx(exact, abs=1e-6)
+        assert metrics["epsilon"][r] >= exact - 2e-5 or exact < 2.5e-4
+        closed += exact > 1e-3
+        hull = ConvexHull(wrenches(arms, cone_forces(normals, 0.5, 8), 1 / radius))
+        volume = sum(abs(np.linalg.det(hull.points[s] - hull.points.mean(0))) for s in hull.simplices) / 720
+        assert metrics["volume"][r] == pytest.approx(volume if exact > 1e-7 else 0, rel=1e-4, abs=1e-9)
+    assert closed > 10
+    tight = metrics["epsilon"] - metrics["epsilon_exact"]
+    assert np.median(tight[metrics["epsilon_exact"] > 1e-3] / metrics["epsilon_exact"].max()) < 0.01
+
+
+def test_stored_residuals(measured):
+    """fswo and gswo are least norms, by non-negative least squares; gswo stops below 1e-4."""
+    metrics = measured.grasps.metrics
+    for r, (points, normals, _) in enumerate(grip(measured)):
+        arms = points - points.mean(0)
+        assert metrics["fswo"][r] == pytest.approx(residual(arms, normals, 0.0, 1, 10.0), abs=2e-4)
+        gswo = residual(arms, normals, 0.5, 8, 10.0)
+        assert gswo - 1e-4 <= metrics["gswo"][r] <= max(gswo, 1e-4) + 1e-4
+
+
+def test_all_else_stays(tmp_path, make_shard, same_rows):
+    shard = make_shard(70, contacts=5)
+    write_shard(tmp_path / "in" / "a.h5", shard)
+    with h5py.File(tmp_path / "in" / "a.h5", "r+") as file:
+        file["mine/numbers"] = np.arange(3)
+        del file.attrs["text_sha256"]
+    added = add_metrics(tmp_path / "in", tmp_path / "out", ["volume"], workers=1)
+    assert (added.files, added.written, added.rows) == ([tmp_path / "out" / "a.h5"], 1, 70)
+    assert validate_shard(tmp_path / "out" / "a.h5") == []
+    new = read_shard(tmp_path / "out" / "a.h5")
+    assert new.grasps.metric_units["volume"] == ""
+    metrics = {name: values for name, values in new.grasps.metrics.items() if name != "volume"}
+    units = {name: unit for name, unit in new.grasps.metric_units.items() if name != "volume"}
+    same_rows(shard.grasps, replace(new.grasps, metrics=metrics, metric_units=units))
+    assert (new.header, new.statistics) == (shard.header, shard.statistics)
+    with h5py.File(tmp_path / "out" / "a.h5") as file:
+        assert file["mine/numbers"][:].tolist() == [0, 1, 2]
+    # a metric that is there is replaced
+    again = tmp_path / "again" / "a.h5"
+    with h5py.File(tmp_path / "out" / "a.h5", "r+") as file:
+        file["grasps/metrics/volume"][:] = 7.0
+    add_metrics(tmp_path / "out", again.parent, ["volume"], workers=1)
+    np.testing.assert_array_equal(read_shard(again).grasps.metrics["volume"], new.grasps.metrics["volume"])
+
+
+def test_processes_change_nothing(tmp_path, make_shard):
+    for i in range(3):
+        write_shard(tmp_path / "in" / f"{i}.h5", make_shard([50, 0, 3][i], contacts=5, shard_index=i))
+    seen = []
+    add_metrics(tmp_path / "in", tmp_path / "one", BOTH, workers=1, progress=lambda *now: seen.append(now))
+    add_metrics(tmp_path / "in", tmp_path / "two", BOTH, workers=2)
+    assert seen[-1] == (53, 53)
+    assert seen == sorted(seen)
+    for i in range(3):
+        assert (tmp_path / "one" / f"{i}.h5").read_bytes() == (tmp_path / "two" / f"{i}.h5").read_bytes()
+
+
+def test_several_objects_give_the_least(make_shard):
+    """A row is as good as its worst object; absent objects and other shards' padding do not count."""
+    shard = make_shard(40, objects=3, columns=2, contacts=6)
+    frames = [mass_frame(record) for record in shard.objects]
+    got = row_metrics(shard.grasps, frames)
+    alone = []
+    for o in range(2):
+        one = {n: v[:, o : o + 1] for n, v in shard.grasps.columns().items() if n.startswith(("object_", "contact_"))}
+        values = row_metrics(replace(shard.grasps, **one), frames)
+        alone.append(np.where(shard.grasps.object_index[:, o, None] >= 0, values, np.inf))
+    np.testing.assert_array_equal(got, np.minimum(*alone))
+    assert np.isfinite(got).all()
+    assert (got > 0).any()
+    assert (shard.grasps.object_index[:, 1] < 0).any()
+
+
+def test_mass_frame(make_shard):
+    record = make_shard(1).objects[0]  # a tetrahedron
+    center, radius = mass_frame(record)
+    np.testing.assert_allclose(center, 0.05 / 4 * np.ones(3), atol=1e-9)
+    assert radius == pytest.approx(0.05 * np.sqrt(0.75**2 + 2 * 0.25**2))
+    corners = np.asarray(record.vertices, float)[record.faces[:3]]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    center, _ = mass_frame(replace(record, faces=record.faces[:3], watertight=False))
+    np.testing.assert_allclose(center, area @ corners.mean(1) / area.sum(), atol=1e-9)
+
+
+def test_resume(tmp_path, make_shard):
+    for i in range(3):
+        write_shard(tmp_path / "in" / "sub" / f"{i}.h5", make_shard(4, shard_index=i))
+    out = tmp_path / "in" / "out"  # inside the folder, and yet no input of its own
+    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1).written == 3
+    times = {path: path.stat().st_mtime_ns for path in out.rglob("*.h5")}
+    assert [path.relative_to(out).as_posix() for path in sorted(times)] == ["sub/0.h5", "sub/1.h5", "sub/2.h5"]
+    whole = (out / "sub" / "1.h5").read_bytes()
+    (out / "sub" / "1.h5").write_bytes(whole[:-50])
+    (out / "sub" / "2.h5").unlink()
+    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1)[1:] == (2, 8)
+    assert (out / "sub" / "1.h5").read_bytes() == whole
+    assert (out / "sub" / "0.h5").stat().st_mtime_ns == times[out / "sub" / "0.h5"]
+    assert add_metrics(tmp_path / "in", out, BOTH, workers=1).written == 3  # one more metric
+    write_shard(tmp_path / "in" / "sub" / "0.h5", make_shard(4, seed=9))
+    with pytest.raises(OutputError, match=r"0\.h5 holds other rows than .*choose another --out"):
+        add_metrics(tmp_path / "in", out, BOTH, workers=1)
+
+
+def test_what_cannot_be_done(tmp_path, make_shard):
+    write_shard(tmp_path / "a" / "0.h5", make_shard(4))
+    write_shard(tmp_path / "b" / "0.h5", make_shard(4, seed=1))
+    out = tmp_path / "out"
+    with pytest.raises(ConfigError, match="unknown metric 'volum'; known: epsilon_exact, volume"):
+        add_metrics(tmp_path / "a", out, ["volum"])
+    with pytest.raises(OutputError, match="is the folder of the shards"):
+        add_metrics(tmp_path / "a" / "0.h5", tmp_path / "a", ["volume"])
+    with pytest.raises(ShardError, match=r"place 0\.h5 is that of"):
+        add_metrics([tmp_path / "a", tmp_path / "b"], out, ["volume"])
+    with pytest.raises(ShardError, match="no such file"):
+        add_metrics(tmp_path / "c", out, ["volume"])
+    with h5py.File(tmp_path / "a" / "0.h5", "r+") as file:
+        file["grasps/q"][1, 1] = np.nan
+    with pytest.raises(ShardError, match=r"0\.h5: grasps/q: not finite"):
+        add_metrics(tmp_path / "a", out, ["volume"], workers=1)
+    assert not out.exists()
+
+
+def test_command(tmp_path, make_shard):
+    write_shard(tmp_path / "in" / "0.h5", make_shard(4))
+    arguments = ["metrics", str(tmp_path / "in"), "--add", "volume, epsilon_exact", "-o", str(tmp_path / "out")]
+    assert "1 shards, 4 rows" in CliRunner().invoke(app, [*arguments, "--workers", "1"]).stdout
+    assert "0 shards, 0 rows, 0 rows/s; 1 were there" in CliRunner().invoke(app, arguments).stdout
+    assert CliRunner().invoke(app, [*arguments, "--quiet"]).stdout == ""
+    assert set(read_shard(tmp_path / "out" / "0.h5").grasps.metrics) >= set(BOTH)
