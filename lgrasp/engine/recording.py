@@ -1,5 +1,6 @@
 """Batches of one size recorded as a graph: what is launched before a batch's size is known is launched as one."""
 
+import threading
 from dataclasses import dataclass, replace
 
 import warp as wp
@@ -13,6 +14,7 @@ from lgrasp.stages.context import Context
 
 __all__ = ["Recorder"]
 
+_WORTH = 3  # times that a size has come before it is recorded, which takes as long as several batches
 _KEPT = 2  # recordings: each holds the tables of a batch
 _CLOSE = (0.99, 1.03)  # of the candidates wanted: sizes that serve as well
 
@@ -29,12 +31,14 @@ class _Recording:
 class Recorder:
     """Place through search of one pipeline, hand and object, for one thread.
 
-    A size that comes for the second time is recorded; from then on it is replayed, with the seeds of the shard and the
+    A size that comes again and again is recorded; from then on it is replayed, with the seeds of the shard and the
     first candidate of the batch put where the recording reads them. The tables of a replay are overwritten by the next.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
+        self.recording = threading.Lock()
+        """Held while a batch is recorded: whoever else uses the device must hold it too."""
         self._seen: list[int] = []
         self._recordings: dict[int, _Recording] = {}
 
@@ -45,16 +49,13 @@ class Recorder:
 
     def run(self, context: Context, first: int, count: int) -> tuple[ContactSets, Meter]:
         """The sets of candidates ``first .. first + count - 1``, and their counts and seconds."""
-        known = count in self._seen
-        if known:
-            self._seen.remove(count)
         self._seen.append(count)
-        if not known:
+        if self._seen.count(count) <= _WORTH:
             meter = Meter(context.device)
             return run_stages(self._pipeline, context, first, count, "search", meter), meter
         if count not in self._recordings:
             while len(self._recordings) >= _KEPT:
-                del self._recordings[min(self._recordings, key=self._seen.index)]
+                del self._recordings[min(self._recordings, key=self._last)]
             self._recordings[count] = self._record(context, count)
         recording = self._recordings[count]
         recording.first.fill_(first)
@@ -63,6 +64,10 @@ class Recorder:
         wp.capture_launch(recording.graph)
         return recording.sets, recording.meter.again()
 
+    def _last(self, count: int) -> int:
+        """When a size came last."""
+        return max(i for i, n in enumerate(self._seen) if n == count)
+
     def _record(self, context: Context, count: int) -> _Recording:
         device = context.device
         own = replace(context, seeds={})
@@ -70,7 +75,7 @@ class Recorder:
             own.seed(stage)
         first = wp.zeros(1, dtype=wp.int32, device=device)
         meter = Meter(device)
-        with wp.ScopedCapture(device=device) as capture:
+        with self.recording, wp.ScopedCapture(device=device) as capture:
             sets = run_stages(self._pipeline, own, first, count, "search", meter)
         assert capture.graph is not None
         return _Recording(capture.graph, first, own.seeds, meter, sets)

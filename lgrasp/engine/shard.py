@@ -4,7 +4,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 
 import warp as wp
@@ -173,7 +173,8 @@ def make_shard(
                 result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
             # near-duplicates are defined on poses as they are written
             pose = user_poses(batch.grasps.pose, inputs.object.model.center)
-            new, duplicates = kept.add(pose, batch.grasps.q, rows - kept.count)
+            with recorder.recording if recorder else nullcontext():
+                new, duplicates = kept.add(pose, batch.grasps.q, rows - kept.count)
             result.duplicates += duplicates
             parts.append(take_grasps(batch.grasps, new))
             if progress:
