@@ -13,12 +13,12 @@ from trimesh.exchange.obj import export_obj
 import lgrasp
 from lgrasp.dataset.exports.files import write_file
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
-from lgrasp.dataset.exports.plan import Plan
+from lgrasp.dataset.exports.plan import ExportObject, Plan
 from lgrasp.dataset.exports.poses import inverse
 from lgrasp.dataset.exports.records import ReadObject
 from lgrasp.errors import ShardError
 
-__all__ = ["GRASPS", "HAND", "OBJECTS", "ExportFolder", "open_folder", "write_assets", "write_index"]
+__all__ = ["GRASPS", "HAND", "OBJECTS", "ExportFolder", "object_text", "open_folder", "write_assets", "write_index"]
 
 HAND, OBJECTS, GRASPS = "hand", "objects", "grasps"
 """Folders of an export."""
@@ -37,11 +37,19 @@ def write_assets(out: Path, plan: Plan) -> None:
     for name, data in files.items():
         write_file(out / HAND / name, data)
     for item in plan.objects:
-        record = item.mesh()
-        mesh = Trimesh(record.vertices, record.faces, process=False)
-        header = f"{record.name}, metres, as grasped"
-        text = export_obj(mesh, include_normals=False, include_texture=False, header=header, digits=9)
-        write_file(out / OBJECTS / f"{item.code}.obj", text)
+        write_file(out / OBJECTS / f"{item.code}.obj", object_text(item))
+
+
+def object_text(item: ExportObject) -> str:
+    """The mesh of an object as OBJ, in metres.
+
+    Raises:
+        ShardError: The shard is damaged.
+    """
+    record = item.mesh()
+    mesh = Trimesh(record.vertices, record.faces, process=False)
+    header = f"{record.name}, metres, as grasped"
+    return export_obj(mesh, include_normals=False, include_texture=False, header=header, digits=9)
 
 
 def write_index(out: Path, plan: Plan, frames: HandFrames, layout: str, conditions: Sequence[str]) -> None:

@@ -11,6 +11,7 @@ from lgrasp.dataset.exports.files import check_empty, write_file
 from lgrasp.dataset.exports.folder import write_assets, write_index
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
+from lgrasp.dataset.exports.mjcf import MJCF_NOTES, check_mjcf, read_mjcf, write_mjcf
 from lgrasp.dataset.exports.plan import Plan, make_plan
 from lgrasp.dataset.exports.readme import readme
 from lgrasp.dataset.exports.records import GraspSet
@@ -30,6 +31,8 @@ class Format(NamedTuple):
     notes: str
     write: Callable[[Path, Plan, HandFrames, Callable[[int], None]], None]
     read: Callable[..., GraspSet]
+    check: Callable[[Plan, HandFrames], None] = lambda plan, frames: None
+    """Called before anything is written."""
 
 
 FORMATS = {
@@ -42,6 +45,7 @@ FORMATS = {
     "isaac-grasp": Format(
         "one YAML per object, isaac_grasp 1.0", True, ISAAC_GRASP_NOTES, write_isaac_grasp, read_isaac_grasp
     ),
+    "mjcf": Format("one MuJoCo scene per grasp", False, MJCF_NOTES, write_mjcf, read_mjcf, check_mjcf),
 }
 """Formats by the name that ``--to`` takes."""
 
@@ -78,7 +82,7 @@ def export_shards(
         advance: Called with rows done and rows in all.
 
     Raises:
-        ConfigError: An unknown format, a condition that cannot be read, or a limit below 1.
+        ConfigError: An unknown format, a condition that cannot be read, a limit below 1, or MuJoCo is not installed.
         ShardError: A shard is damaged, of another hand, lacks a column, holds what the format cannot; no row is left.
         OutputError: The folder is not empty or cannot be written.
     """
@@ -90,6 +94,7 @@ def export_shards(
     check_empty(out)
     plan = make_plan(find_shards(paths), where=conditions, limit=limit, single=form.single)
     frames = HandFrames(plan.hand.urdf, plan.hand.base_link, plan.hand.joint_names, plan.shards[0])
+    form.check(plan, frames)
     done = 0
 
     def count(rows: int) -> None:

@@ -1,0 +1,220 @@
+"""What was exported is read back, and means the same to SciPy, yourdfpy and MuJoCo."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+import yourdfpy
+from scipy.spatial.transform import Rotation
+
+from lgrasp.dataset import pose_matrix
+from lgrasp.dataset.exports import FORMATS, export_shards, read_grasps
+
+SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp"]
+HANDS = ["allegro", "schunk_svh", "barrett", "shadow"]
+
+
+def matrix(position, rotation: Rotation) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation.as_matrix(), position
+    return T
+
+
+def wxyz(q) -> Rotation:
+    assert q[0] >= 0
+    assert np.linalg.norm(q) == pytest.approx(1, abs=1e-7)
+    return Rotation.from_quat(q, scalar_first=True)
+
+
+def raw_dexgraspnet(out: Path, row: int):
+    """T_object_link of the link that the format gives the pose of, that link, joints by name."""
+    entry = np.load(out / "grasps" / "cup.npy", allow_pickle=True)[row]
+    assert entry["scale"] == 1.0
+    q = dict(entry["qpos"])
+    angles = [q.pop(f"WRJR{axis}") for axis in "xyz"]
+    position = [q.pop(f"WRJT{axis}") for axis in "xyz"]
+    return matrix(position, Rotation.from_euler("xyz", angles)), "root_link", q
+
+
+def raw_dexgraspbench(out: Path, row: int):
+    entry = np.load(out / "grasps" / "cup" / f"{row:08d}.npy", allow_pickle=True).item()
+    assert (out / entry["obj_path"]).is_file()
+    assert entry["obj_scale"] == 1.0
+    T_world_object = matrix(entry["obj_pose"][:3], wxyz(entry["obj_pose"][3:]))
+    T_world_root = matrix(entry["grasp_qpos"][:3], wxyz(entry["grasp_qpos"][3:7]))
+    q = dict(zip(entry["joint_names"], entry["grasp_qpos"][7:], strict=True))
+    return np.linalg.inv(T_world_object) @ T_world_root, "root_link", q
+
+
+def raw_isaac_grasp(out: Path, row: int):
+    document = yaml.safe_load((out / "grasps" / "cup.yaml").read_text())
+    assert (document["format"], document["format_version"]) == ("isaac_grasp", 1.0)
+    entry = document["grasps"][f"grasp_{row}"]
+    assert entry["confidence"] == 1.0
+    turn = [entry["orientation"]["w"], *entry["orientation"]["xyz"]]
+    assert document["gripper_frame_link"] == json.loads((out / "export.json").read_text())["hand"]["base_link"]
+    return matrix(entry["position"], wxyz(turn)), "base_link", entry["cspace_position"]
+
+
+RAW = dict(zip(SINGLE, (raw_dexgraspnet, raw_dexgraspbench, raw_isaac_grasp), strict=True))
+
+
+def load(path: Path) -> yourdfpy.URDF:
+    return yourdfpy.URDF.load(str(path), build_collision_scene_graph=False)
+
+
+def posed(urdf: yourdfpy.URDF, q: dict[str, float]) -> yourdfpy.URDF:
+    assert set(q) == set(urdf.actuated_joint_names)
+    urdf.update_cfg(np.array([q[name] for name in urdf.actuated_joint_names]))
+    return urdf
+
+
+def assert_same(read, shard, form: str) -> None:
+    order = [read.joint_names.index(name) for name in shard.hand.joint_names]
+    for name in ("q", "q_pregrasp", "q_squeeze"):
+        np.testing.assert_allclose(getattr(read.grasps, name)[:, order], getattr(shard.grasps, name), atol=1e-5)
+    np.testing.assert_allclose(pose_matrix(read.grasps.object_pose), pose_matrix(shard.grasps.object_pose), atol=1e-5)
+    assert (read.grasps.object_pose[..., 3] >= 0).all(), form
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("hand", HANDS)
+def test_read_back(tmp_path, shards, hand, form):
+    shard = shards.make(tmp_path / "a.h5", hand)
+    done = export_shards(tmp_path / "a.h5", tmp_path / "out", form)
+    assert done == (6, ("cup",))
+    read = read_grasps(tmp_path / "out", form)
+    assert read.joint_names == tuple(shard.hand.joint_names)
+    assert_same(read, shard, form)
+    assert [(o.code, o.scale) for o in read.objects] == [("cup", 1.0)]
+    mesh = trimesh.load(read.objects[0].mesh, process=False)
+    np.testing.assert_allclose(mesh.vertices, shard.objects[0].vertices, atol=1e-8)
+    np.testing.assert_array_equal(mesh.faces, shard.objects[0].faces)
+    turned = tuple(reversed(read.joint_names))
+    assert_same(read_grasps(tmp_path / "out", form, joint_names=turned), shard, form)
+    assert read_grasps(tmp_path / "out", form, joint_names=turned).joint_names == turned
+
+
+@pytest.mark.parametrize("form", SINGLE)
+@pytest.mark.parametrize("hand", HANDS)
+def test_every_link_is_where_it_was(tmp_path, shards, hand, form):
+    """The raw files, posed by yourdfpy with the exported URDF, against the shard's URDF posed by the shard's rows."""
+    shard = shards.make(tmp_path / "a.h5", hand)
+    export_shards(tmp_path / "a.h5", tmp_path / "out", form)
+    index = json.loads((tmp_path / "out" / "export.json").read_text())["hand"]
+    (tmp_path / "hand.urdf").write_text(shard.hand.urdf)
+    theirs, ours = load(tmp_path / "out" / "hand" / "hand.urdf"), load(tmp_path / "hand.urdf")
+    assert theirs.base_link == index["root_link"]
+    for row, (q, pose) in enumerate(zip(shard.grasps.q, shard.grasps.object_pose[:, 0], strict=True)):
+        T_object_hand, link, joints = RAW[form](tmp_path / "out", row)
+        T_base_object = matrix(pose[:3], Rotation.from_quat(pose[3:], scalar_first=True))
+        posed(theirs, joints), posed(ours, dict(zip(shard.hand.joint_names, q, strict=True)))
+        for name in shard.hand.link_names:
+            got = T_object_hand @ theirs.get_transform(name, index[link])
+            expected = np.linalg.inv(T_base_object) @ ours.get_transform(name, shard.hand.base_link)
+            np.testing.assert_allclose(got, expected, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("hand", HANDS)
+def test_mujoco_opens_the_grasp(tmp_path, shards, hand):
+    mujoco = pytest.importorskip("mujoco")
+    shard = shards.make(tmp_path / "a.h5", hand)
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "mjcf")
+    check_scenes(mujoco, tmp_path, shard)
+
+
+def check_scenes(mujoco, folder: Path, shard) -> None:
+    """Links against yourdfpy, objects against the shard, mimic joints and targets, in every scene."""
+    shutil.move(folder / "out", folder / "elsewhere")
+    ours = yourdfpy.URDF.load(str(folder / "elsewhere" / "hand" / "hand.urdf"))
+    for row in range(len(shard.grasps)):
+        model = mujoco.MjModel.from_xml_path(str(folder / "elsewhere" / "grasps" / f"{row:08d}.xml"))
+        data = mujoco.MjData(model)
+        for key, posture, targets in (
+            ("grasp", "q", "q"),
+            ("pregrasp", "q_pregrasp", "q_pregrasp"),
+            ("squeeze", "q", "q_squeeze"),
+        ):
+            mujoco.mj_resetDataKeyframe(model, data, model.key(key).id)
+            mujoco.mj_kinematics(model, data)
+            q = dict(zip(shard.hand.joint_names, getattr(shard.grasps, posture)[row], strict=True))
+            posed(ours, q)
+            for name in shard.hand.link_names:
+                if name != "world":
+                    T = matrix(data.body(name).xpos, Rotation.from_quat(data.body(name).xquat, scalar_first=True))
+                    np.testing.assert_allclose(T, ours.get_transform(name), atol=1e-5, err_msg=name)
+            ctrl = {model.actuator(i).name: data.ctrl[i] for i in range(model.nu)}
+            expected = dict(zip(shard.hand.joint_names, getattr(shard.grasps, targets)[row], strict=True))
+            assert ctrl == pytest.approx(expected, abs=1e-6)
+            base = ours.get_transform(shard.hand.base_link)
+            present = np.flatnonzero(shard.grasps.object_index[row] >= 0)
+            for place, column in enumerate(present):
+                code = shard.objects[shard.grasps.object_index[row, column]].id
+                body = data.body(f"object_{place}_{code}")
+                T = matrix(body.xpos, Rotation.from_quat(body.xquat, scalar_first=True))
+                np.testing.assert_allclose(T, base @ pose_matrix(shard.grasps.object_pose[row, column]), atol=1e-5)
+        for joint in ours.robot.joints:
+            if joint.mimic:
+                source = data.joint(joint.mimic.joint).qpos[0]
+                relation = joint.mimic.multiplier * source + (joint.mimic.offset or 0)
+                assert data.joint(joint.name).qpos[0] == pytest.approx(relation, abs=1e-6)
+        assert model.neq == sum(joint.mimic is not None for joint in ours.robot.joints)
+        assert model.opt.gravity == pytest.approx([0, 0, 0])
+        for _ in range(20):
+            mujoco.mj_step(model, data)
+        assert np.isfinite(data.qpos).all()
+
+
+@pytest.mark.parametrize("hand", ["schunk_svh", "barrett"])
+def test_real_hands_can_be_used_alone(tmp_path, shards, hand):
+    """All meshes are in the folder: it is moved, and yourdfpy, trimesh and MuJoCo open it."""
+    mujoco = pytest.importorskip("mujoco")
+    shard = shards.make(tmp_path / "a.h5", shards.hand(hand, real=True), n=2)
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "mjcf")
+    assert_same(read_grasps(tmp_path / "out", "mjcf"), shard, "mjcf")
+    check_scenes(mujoco, tmp_path, shard)
+    urdf = yourdfpy.URDF.load(str(tmp_path / "elsewhere" / "hand" / "hand.urdf"), load_meshes=False)
+    shapes = [shape for link in urdf.link_map.values() for shape in (*link.visuals, *link.collisions)]
+    files = {shape.geometry.mesh.filename for shape in shapes if shape.geometry.mesh}
+    assert {f"meshes/{path.name}" for path in (tmp_path / "elsewhere" / "hand" / "meshes").iterdir()} == files
+    assert all(len(trimesh.load(tmp_path / "elsewhere" / "hand" / name, force="mesh").faces) for name in files)
+    text = (tmp_path / "elsewhere" / "README.txt").read_text()
+    assert all(
+        f"{name} = " in text
+        for name in json.loads((tmp_path / "elsewhere" / "export.json").read_text())["hand"]["mimic"]
+    )
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_joints_go_by_name(tmp_path, shards, form):
+    """A second shard of the same hand lists its joints in another order."""
+    first = shards.make(tmp_path / "a.h5", "schunk_svh", n=2)
+    hand = first.hand
+    order = np.random.default_rng(5).permutation(len(hand.joint_names))
+    mixed = replace(
+        hand,
+        joint_names=tuple(hand.joint_names[i] for i in order),
+        joint_lower=hand.joint_lower[order],
+        joint_upper=hand.joint_upper[order],
+    )
+    second = shards.make(tmp_path / "b.h5", mixed, n=3, seed=1)
+    export_shards([tmp_path / "a.h5", tmp_path / "b.h5"], tmp_path / "out", form)
+    read = read_grasps(tmp_path / "out", form)
+    assert read.joint_names == tuple(hand.joint_names)
+    np.testing.assert_allclose(read.grasps.q[2:][:, order], second.grasps.q, atol=1e-6)
+    np.testing.assert_allclose(read.grasps.q[:2], first.grasps.q, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_readme_says_what_matters(tmp_path, shards, form):
+    shard = shards.make(tmp_path / "a.h5", "shadow")
+    export_shards(tmp_path / "a.h5", tmp_path / "out", form)
+    text = (tmp_path / "out" / "README.txt").read_text()
+    words = ["metres, radians", "w first", "hand.urdf", "cup (6)", "a.h5"]
+    assert all(word in text for word in (*words, *shard.hand.joint_names)), text
+    assert ("palm" if form == "isaac-grasp" else "world") in text

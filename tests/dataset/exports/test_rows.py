@@ -1,0 +1,160 @@
+"""Which rows are exported, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lgrasp.dataset import pose_matrix
+from lgrasp.dataset.exports import FORMATS, export_shards, read_grasps
+from lgrasp.dataset.exports.where import Condition, parse_condition
+from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
+
+SINGLE = [name for name, form in FORMATS.items() if form.single]
+
+
+def exported(source, out, **options):
+    export_shards(source, out, "dexgraspnet", **options)
+    return read_grasps(out, "dexgraspnet").grasps
+
+
+def test_conditions_and_limit(tmp_path, shards):
+    holds = np.array([True, False, True, True, False, True])
+    first = shards.make(tmp_path / "a.h5", holds=holds).grasps
+    second = shards.make(tmp_path / "b.h5", seed=1, holds=holds).grasps
+    q, seen = np.concatenate([first.q, second.q]), []
+    for number, (options, rows) in enumerate(
+        [
+            ({}, range(12)),
+            ({"limit": 8}, range(8)),
+            ({"where": ["physics/fc_holds"]}, [0, 2, 3, 5, 6, 8, 9, 11]),
+            ({"where": ["physics/fc_holds"], "limit": 5}, [0, 2, 3, 5, 6]),
+            ({"where": ["physics/fc_holds", "metrics/epsilon>=0.5"]}, [3, 5, 9, 11]),
+        ]
+    ):
+        got = exported(tmp_path, tmp_path / f"out{number}", advance=lambda *done: seen.append(done), **options)
+        np.testing.assert_array_equal(got.q, q[list(rows)])
+        assert seen[-1] == (len(rows), len(rows))
+    index = json.loads((tmp_path / "out4" / "export.json").read_text())
+    assert (index["rows"], index["where"]) == (4, ["physics/fc_holds", "metrics/epsilon >= 0.5"])
+
+
+def test_failed_verdicts_lower_the_confidence(tmp_path, shards):
+    shards.make(tmp_path / "a.h5", n=3, holds=np.array([True, False, True]))
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "isaac-grasp")
+    text = (tmp_path / "out" / "grasps" / "cup.yaml").read_text()
+    assert [line.split()[1] for line in text.splitlines() if "confidence" in line] == ["1.0", "0.0", "1.0"]
+
+
+@pytest.mark.parametrize(
+    ("text", "condition"),
+    [
+        ("physics/fc_holds", Condition("physics/fc_holds")),
+        ("metrics/epsilon > 0.01", Condition("metrics/epsilon", ">", 0.01)),
+        ("metrics/a-b<=-1e-3", Condition("metrics/a-b", "<=", -1e-3)),
+        ("  candidate==7 ", Condition("candidate", "==", 7)),
+    ],
+)
+def test_conditions_are_read(text, condition):
+    assert parse_condition(text) == condition
+
+
+@pytest.mark.parametrize("text", ["", "a b", "a >> 1", "a > ", "a > b", "> 1", "a > nan"])
+def test_conditions_that_cannot_be_read(text):
+    with pytest.raises(ConfigError, match="--where"):
+        parse_condition(text)
+
+
+def several(shards, path):
+    """Rows of a cup and a ball, of a ball alone in the second place, of a cup."""
+    objects = [shards.object("ball", "2"), shards.object("cup", "1")]
+    return shards.make(path, n=3, objects=objects, index=np.array([[1, 0], [-1, 0], [1, -1]]))
+
+
+@pytest.mark.parametrize("form", SINGLE)
+def test_several_objects_are_refused(tmp_path, shards, form):
+    several(shards, tmp_path / "a.h5")
+    with pytest.raises(ShardError, match=r"a\.h5: row 0 holds 2 objects"):
+        export_shards(tmp_path / "a.h5", tmp_path / "out", form)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("form", SINGLE)
+def test_rows_of_one_object_each_beside_others(tmp_path, shards, form):
+    """The shard has room for two objects in a row; the chosen rows hold one each."""
+    shard = several(shards, tmp_path / "a.h5").grasps
+    export_shards(tmp_path / "a.h5", tmp_path / "out", form, where=["candidate > 0"])
+    read = read_grasps(tmp_path / "out", form)
+    assert [read.objects[i].code for i in read.grasps.object_index[:, 0]] == ["ball", "cup"]
+    expected = pose_matrix(shard.object_pose[[1, 2], [1, 0]])
+    np.testing.assert_allclose(pose_matrix(read.grasps.object_pose[:, 0]), expected, atol=1e-5)
+
+
+def test_scenes_hold_several_objects(tmp_path, shards):
+    mujoco = pytest.importorskip("mujoco")
+    shard = several(shards, tmp_path / "a.h5").grasps
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "mjcf")
+    read = read_grasps(tmp_path / "out", "mjcf")
+    codes = [[read.objects[i].code for i in row if i >= 0] for row in read.grasps.object_index]
+    assert codes == [["cup", "ball"], ["ball"], ["cup"]]
+    pose = read.grasps.object_pose
+    np.testing.assert_allclose(pose_matrix(pose[0]), pose_matrix(shard.object_pose[0]), atol=1e-5)
+    np.testing.assert_allclose(pose_matrix(pose[1, 0]), pose_matrix(shard.object_pose[1, 1]), atol=1e-5)
+    assert np.isnan(pose[1, 1]).all()
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "grasps" / "00000000.xml"))
+    assert model.nq == 16 + 14
+
+
+def test_objects_of_one_name_stay_apart(tmp_path, shards):
+    shards.make(tmp_path / "a.h5", n=1, objects=[shards.object("..my cup", "1")])
+    shards.make(tmp_path / "b.h5", n=2, objects=[shards.object("..my cup", "2")], seed=1)
+    shards.make(tmp_path / "c.h5", n=3, objects=[shards.object("..my cup", "1")], seed=2)
+    done = export_shards(tmp_path, tmp_path / "out", "dexgraspbench")
+    assert done == (6, ("my_cup", "my_cup_2"))
+    assert len(list((tmp_path / "out" / "grasps" / "my_cup").iterdir())) == 4
+    assert len(list((tmp_path / "out" / "grasps" / "my_cup_2").iterdir())) == 2
+    assert {p.name for p in (tmp_path / "out" / "objects").iterdir()} == {"my_cup.obj", "my_cup_2.obj"}
+
+
+def test_bad_input_leaves_nothing(tmp_path, shards):
+    shards.make(tmp_path / "a.h5")
+    shards.make(tmp_path / "b.h5", "barrett")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").write_text("x")
+    (tmp_path / "file").write_text("x")
+    for source, out, options, error, words in [
+        ("a.h5", "full", {}, OutputError, "full is not empty"),
+        ("a.h5", "file", {}, OutputError, "file is a file"),
+        ("a.h5", "out", {"limit": 0}, ConfigError, "--limit 0"),
+        ("a.h5", "out", {"where": ["physics/fc_holds"]}, ShardError, "lgrasp validate adds"),
+        ("a.h5", "out", {"where": ["q > 1"]}, ShardError, "one number per row: candidate, metrics/epsilon"),
+        ("a.h5", "out", {"where": ["metrics/epsilon > 2"]}, ShardError, "none satisfies metrics/epsilon > 2"),
+        ("c.h5", "out", {}, ShardError, "no such file"),
+        (".", "out", {}, ShardError, r"b\.h5: another hand"),
+    ]:
+        with pytest.raises(error, match=words):
+            export_shards(tmp_path / source, tmp_path / out, "dexgraspnet", **options)
+    with pytest.raises(ConfigError, match="dexgraspnet, dexgraspbench, isaac-grasp, mjcf"):
+        export_shards(tmp_path / "a.h5", tmp_path / "out", "urdf")
+    assert {p.name for p in tmp_path.iterdir()} == {"a.h5", "b.h5", "full", "file"}
+    assert [p.name for p in (tmp_path / "full").iterdir()] == ["mine"]
+
+
+def test_a_hand_that_cannot_be_used_is_named(tmp_path, shards):
+    hand = shards.hand("allegro")
+    for urdf, words in [
+        ("<robot", "not XML"),
+        (hand.urdf.replace('name="joint_3.0"', 'name="other"'), "no joint 'joint_3.0'"),
+        (
+            hand.urdf.replace(
+                "<collision>", '<collision><geometry><mesh filename="x.stl"/></geometry></collision><collision>', 1
+            ),
+            "x.stl",
+        ),
+    ]:
+        shards.make(tmp_path / "a.h5", replace(hand, urdf=urdf + "<robot" * (urdf == "<robot")), n=1)
+        for form in FORMATS:
+            with pytest.raises(LgraspError, match=words):
+                export_shards(tmp_path / "a.h5", tmp_path / "out", form)
+            assert not (tmp_path / "out").exists()
