@@ -9,6 +9,7 @@ __all__ = [
     "LgraspError",
     "ObjectError",
     "OutputError",
+    "PhysicsError",
     "ShardError",
     "StarvedError",
 ]
@@ -46,6 +47,10 @@ class OutputError(LgraspError):
 
 class ShardError(LgraspError):
     """A shard is truncated, corrupted or violates the format."""
+
+
+class PhysicsError(LgraspError):
+    """A simulator is missing, or refuses the scene."""
 
 
 class CacheError(LgraspError):

@@ -6,7 +6,20 @@ from typing import Annotated
 
 import typer
 
-from lgrasp_cli import bench, cache, dataset, export, generate, hands, objects, pipelines, prepare, run, stages
+from lgrasp_cli import (
+    bench,
+    cache,
+    dataset,
+    export,
+    generate,
+    hands,
+    objects,
+    pipelines,
+    prepare,
+    run,
+    stages,
+    validate,
+)
 from lgrasp_cli.interrupt import Interrupted, on_interrupt, stop_asked, stop_now
 
 __all__ = ["app", "main"]
@@ -17,7 +30,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (prepare, generate, run, stages, export):
+for module in (prepare, generate, run, validate, stages, export):
     module.register(app)
 for group in (bench, hands, objects, pipelines, cache, dataset):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])

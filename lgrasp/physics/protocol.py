@@ -1,0 +1,100 @@
+"""What is simulated: named protocols with every number, written beside each verdict."""
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from lgrasp.errors import ConfigError
+
+__all__ = ["DIRECTIONS", "PROTOCOLS", "Load", "Protocol", "find_protocol"]
+
+DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
+"""Directions of the load in the hand's base frame, in the order of the columns."""
+
+_GRAVITY = 9.8  # [m/s^2]
+
+
+class Load(BaseModel):
+    """What a protocol asks of one object and its hand."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mass: float
+    """Of the object [kg]."""
+    force: float
+    """Pull on the object's centre of mass [N]."""
+    stiffness: float
+    """Of the position control of revolute joints [N m/rad]."""
+
+
+class Protocol(BaseModel):
+    """Close the hand on a free object, then pull the object in six directions; it must stay where it was."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", description="Columns are named physics/NAME_...")
+    timestep: float = Field(0.004, gt=0, le=0.02, description="[s]")
+    friction: float = Field(0.6, gt=0, le=5, description="Sliding friction of every contact.")
+    torsion: float = Field(0.02, ge=0, le=1, description="Torsional friction of every contact [m].")
+    impratio: float = Field(10.0, ge=1, description="Stiffness of friction against that of contact normals.")
+    noslip: int = Field(2, ge=0, description="Iterations of the solver that takes the creep out of friction.")
+    stiffness: float = Field(5.0, gt=0, description="Of position control, per newton of load if scaled [N m/rad].")
+    stiffness_range: tuple[float, float] | None = Field(
+        None, description="Stiffness is scaled with the load and kept in this range; none: it is not scaled."
+    )
+    lever: float = Field(0.1, gt=0, description="A sliding joint is as stiff as a revolute one at this arm [m].")
+    damping_ratio: float = Field(1.0, gt=0, description="Of the position control; 1 is critical.")
+    armature: float = Field(2.0e-4, ge=0, description="Inertia of each drive [kg m^2] (sliding: over lever squared).")
+    kind: Literal["force", "weight"] = "force"
+    force: float = Field(1.0, gt=0, description="The pull [N], if kind is force.")
+    mass: float = Field(0.1, gt=0, description="Of the object [kg], if kind is force.")
+    density: float = Field(500.0, gt=0, description="Of the object, if kind is weight, which then pulls [kg/m^3].")
+    phase: float = Field(0.4, gt=0, description="Pregrasp to grasp, and grasp to squeeze [s], each.")
+    hold: float = Field(2.0, gt=0, description="How long each direction is pulled [s].")
+    most_penetration: float = Field(0.01, gt=0, description="Of hand and object, or hand and hand, at pregrasp [m].")
+    most_displacement: float = Field(0.05, gt=0, description="Of the object's centre of mass from its start [m].")
+    most_rotation: float = Field(15.0, gt=0, le=180, description="Of the object from its start [deg].")
+
+    def load(self, volume: float) -> Load:
+        """Mass, pull and stiffness for an object of some volume [m^3]."""
+        if self.kind == "force":
+            mass, force = self.mass, self.force
+        else:
+            mass = self.density * volume
+            force = _GRAVITY * mass
+        stiffness = self.stiffness
+        if self.stiffness_range is not None:
+            low, high = self.stiffness_range
+            stiffness = min(max(stiffness * force, low), high)
+        return Load(mass=mass, force=force, stiffness=stiffness)
+
+    def text(self, **resolved: Any) -> str:
+        """Every number as JSON: the ``protocol`` attribute of the columns. ``resolved`` is added."""
+        import json
+
+        return json.dumps(self.model_dump(mode="json") | resolved, sort_keys=True)
+
+
+def _protocols() -> dict[str, Protocol]:
+    gravity = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
+    made = (
+        Protocol(name="fc"),
+        Protocol(name="gravity6", friction=0.6, **gravity),
+        Protocol(name="gravity6_mu1", friction=1.0, **gravity),
+    )
+    return {protocol.name: protocol for protocol in made}
+
+
+PROTOCOLS: dict[str, Protocol] = _protocols()
+"""The named protocols: ``fc`` is DexGraspBench's, ``gravity6`` and ``gravity6_mu1`` ask for more."""
+
+
+def find_protocol(name: str) -> Protocol:
+    """A protocol by name.
+
+    Raises:
+        ConfigError: no protocol of that name.
+    """
+    if name not in PROTOCOLS:
+        raise ConfigError(f"unknown protocol '{name}'; choose {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]

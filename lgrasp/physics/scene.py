@@ -1,0 +1,113 @@
+"""What a simulator is given: a hand as URDF and convex pieces, an object as convex pieces and its mass properties."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import trimesh
+from lxml import etree
+
+from lgrasp.dataset.records import HandRecord, ObjectRecord, Shard
+from lgrasp.decompose import Decompose
+from lgrasp.decompose import decompose as cut_mesh
+from lgrasp.errors import ShardError
+from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh
+from lgrasp.hand.urdf import parse_robot, read_urdf
+from lgrasp.physics.solid import Solid, solid_of_mesh
+
+__all__ = ["HandSolids", "Scene", "hand_of_record", "object_of_record", "scene_of_shard"]
+
+
+@dataclass(frozen=True)
+class HandSolids:
+    """A hand's URDF text and the convex pieces of each link, link frame [m]."""
+
+    name: str
+    urdf: str
+    base_link: str
+    """Frame of all poses; it does not move."""
+    joint_names: tuple[str, ...]
+    """Columns of q."""
+    link_names: tuple[str, ...]
+    pieces: dict[str, list[Piece]]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A hand and an object, for any simulator and protocol."""
+
+    hand: HandSolids
+    object: Solid
+
+
+def scene_of_shard(shard: Shard, decompose: Decompose = cut_mesh, device: str = "cpu") -> Scene:
+    """The scene of a shard; nothing but the shard is read.
+
+    Args:
+        decompose: cuts dented meshes, perhaps with a cache (:func:`lgrasp.decompose.decompose`).
+        device: answers the geometric queries.
+
+    Raises:
+        ShardError: the shard has several objects, or lacks a mesh of its hand.
+        HandError: the hand's URDF or a mesh cannot be used.
+    """
+    if len(shard.objects) != 1 or shard.grasps.object_index.shape[1] != 1:
+        names = ", ".join(record.id for record in shard.objects)
+        raise ShardError(f"physics verdicts are for shards of one object; this one has {names}")
+    return Scene(hand_of_record(shard.hand, decompose, device), object_of_record(shard.objects[0], decompose, device))
+
+
+def hand_of_record(record: HandRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> HandSolids:
+    """The hand of a shard, cut into the convex pieces that the generator uses.
+
+    Raises:
+        ShardError: a mesh that the URDF names is not in the shard.
+        HandError: the URDF or a mesh cannot be used.
+    """
+    pieces, notes = {}, []
+    with TemporaryDirectory(prefix="lgrasp-hand-") as folder:
+        tree, _ = parse_robot(Path(f"{record.name}.urdf"), record.urdf.encode())
+        _write_meshes(tree, record, Path(folder))
+        path = Path(folder) / f"{PurePosixPath(record.name).name}.urdf"
+        path.write_bytes(etree.tostring(tree))
+        urdf = read_urdf(path)
+        for link, geometries in urdf.links.items():
+            found = []
+            for geometry in geometries:
+                parts, said = convex_pieces(urdf, geometry, geometry_mesh(urdf, geometry), decompose, device)
+                found += [part.moved(geometry.T_link_geometry) for part in parts]
+                notes += [f"link '{link}': {said}"] if said else []
+            pieces[link] = found
+    return HandSolids(
+        name=record.name,
+        urdf=record.urdf,
+        base_link=record.base_link,
+        joint_names=tuple(record.joint_names),
+        link_names=tuple(record.link_names),
+        pieces=pieces,
+        notes=tuple(notes),
+    )
+
+
+def _write_meshes(tree: etree._Element, record: HandRecord, folder: Path) -> None:
+    """Write the collision meshes that a URDF names under plain names, and name them so in the URDF."""
+    written: dict[str, str] = {}
+    for mesh in tree.iterfind(".//collision//mesh"):
+        name = mesh.get("filename", "")
+        if name not in record.meshes:
+            raise ShardError(f"hand '{record.name}': mesh '{name}' of its URDF is not in the shard")
+        if name not in written:
+            written[name] = f"{len(written)}{PurePosixPath(name).suffix}"
+            (folder / written[name]).write_bytes(record.meshes[name])
+        mesh.set("filename", written[name])
+
+
+def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> Solid:
+    """The object of a shard as a solid, in the frame of its vertices."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mesh = trimesh.Trimesh(np.asarray(record.vertices, float), np.asarray(record.faces), process=True)
+    return solid_of_mesh(record.name, mesh, decompose, device)

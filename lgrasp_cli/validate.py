@@ -1,0 +1,144 @@
+"""``lgrasp validate``: does each grasp hold its object in a physics simulation?"""
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache, warn
+
+if TYPE_CHECKING:
+    from lgrasp.engine.validate import Validated
+    from lgrasp.physics import Protocol
+
+__all__ = ["register", "validate"]
+
+_INTERVAL = 10.0  # [s] between lines of progress when standard error is no terminal
+
+
+def register(app: typer.Typer) -> None:
+    """Mount the commands of this file."""
+    app.command()(validate)
+
+
+def validate(
+    shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.", show_default=False)],
+    protocol: Annotated[
+        str, typer.Option("--protocol", "-p", help="What is simulated: fc, gravity6 or gravity6_mu1.")
+    ] = "fc",
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder of the results; default: that of the shards with -PROTOCOL added."),
+    ] = None,
+    threads: Annotated[int, typer.Option(min=0, help="Grasps simulated at a time; 0: all cores.")] = 0,
+    all_directions: Annotated[
+        bool, typer.Option("--all-directions", help="Go on after the first direction in which the object is lost.")
+    ] = False,
+    resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Keep results that are there.")] = True,
+    json_path: JsonPath = None,
+    cache_dir: CacheDir = None,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate grasps with MuJoCo and write the shards again with a verdict beside every row.
+
+    The hand closes from q_pregrasp over q to q_squeeze on the free object, then something pulls the object in six
+    directions; a grasp holds if the object stays in all of them. docs/physics.md says what exactly is simulated.
+
+    Example: lgrasp validate grasps/allegro-mug --out grasps/allegro-mug-fc --protocol fc
+    """
+    check_report(json_path)
+    from lgrasp.engine.validate import Validation, summary, validate_shards
+    from lgrasp.physics import find_protocol
+    from lgrasp_cli.tables import print_json
+
+    chosen = find_protocol(protocol)
+    cache = open_cache(cache_dir)
+    job = Validation(shards, chosen, out, threads=threads, all_directions=all_directions, resume=resume, cache=cache)
+    with _Progress(quiet) as progress:
+        done = validate_shards(job, progress.started, progress.advanced)
+    entries = summary(done, chosen)
+    for entry in entries:
+        for note in entry["notes"]:
+            warn(f"object {entry['object']}: {note}")
+    data = {"protocol": chosen.model_dump(mode="json"), "results": entries}
+    if json_path == "-":
+        print_json(data)
+    elif not quiet:
+        _show(entries, done, chosen)
+    if json_path and json_path != "-":
+        from lgrasp.engine.report import write_json
+
+        write_json(json_path, data)
+
+
+def _show(entries: list[dict[str, Any]], done: "list[Validated]", protocol: "Protocol") -> None:
+    from lgrasp.physics import DIRECTIONS
+    from lgrasp_cli.tables import print_pairs, print_table
+
+    names = ("hand", "object", "grasps", "hold", *DIRECTIONS, "at q", "at grasp", "mass", "stiffness", "/s")
+    rows = []
+    for entry in entries:
+        directions = zip(entry["directions_held"], entry["directions_run"], strict=True)
+        rows.append(
+            (
+                entry["hand"],
+                entry["object"],
+                f"{entry['rows']:,}",
+                _share(entry["held"], entry["rows"]),
+                *(_share(held, run) for held, run in directions),
+                "-" if entry["contact_at_q"] is None else f"{entry['contact_at_q']:.1f}",
+                "-" if entry["contact_at_grasp"] is None else f"{entry['contact_at_grasp']:.1f}",
+                f"{1e3 * entry['mass']:.0f} g",
+                f"{entry['stiffness']:.3g}",
+                "-" if entry["per_s"] is None else f"{entry['per_s']:.1f}",
+            )
+        )
+    print_table(names, rows, right=names[2:])
+    lost = {name: sum(entry[name] for entry in entries) for name in ("pregrasp_too_deep", "diverged")}
+    print_pairs(
+        [
+            ("protocol", f"{protocol.name}, friction {protocol.friction:g}; shares of the grasps run in a direction"),
+            ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate at q_pregrasp and are not simulated"),
+            ("diverged", f"{lost['diverged']:,} count as lost"),
+            ("where", f"{done[0].path.parent} ({len(done)} shard{'s' if len(done) != 1 else ''})"),
+        ]
+    )
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part / whole:.1%}" if whole else "-"
+
+
+class _Progress:
+    """Rows done and held: one line that is rewritten on a terminal, else a line every ten seconds, or nothing."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._quiet, self._live = quiet, sys.stderr.isatty()
+        self._name, self._rows = "", 0
+        self._start = self._said = time.monotonic()
+
+    def __enter__(self) -> "_Progress":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live and self._name and not self._quiet:
+            sys.stderr.write("\n")
+
+    def started(self, path: Path, rows: int) -> None:
+        """A shard is begun."""
+        self._name, self._rows, self._start = path.name, rows, time.monotonic()
+
+    def advanced(self, done: int, held: int) -> None:
+        """Some of its rows are done."""
+        now = time.monotonic()
+        if self._quiet or (now - self._said < (0.2 if self._live else _INTERVAL) and done < self._rows):
+            return
+        if not self._live and now - self._said < _INTERVAL:
+            return
+        self._said = now
+        per_second = done / max(now - self._start, 1e-9)
+        line = f"{self._name} {done:,}/{self._rows:,}  {held:,} hold  {per_second:.1f}/s"
+        sys.stderr.write(f"\r{line}\x1b[K" if self._live else f"{line}\n")
+        sys.stderr.flush()
