@@ -5,11 +5,19 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lgrasp_cli.options import Quiet
+from lgrasp_cli.options import CacheDir, Quiet, open_cache, warn
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+    from lgrasp.dataset import ObjectRecord
+    from lgrasp.dataset.exports.mjcf import Cut
 
 __all__ = ["export", "register"]
 
@@ -39,6 +47,7 @@ def export(
     only_holding: Annotated[
         bool, typer.Option("--only-holding", help="Only grasps that held in the simulator: --where physics/fc_holds.")
     ] = False,
+    cache_dir: CacheDir = None,
     quiet: Quiet = False,
 ) -> None:
     """Write grasps in the format of another program, with the hand's URDF and all meshes.
@@ -48,11 +57,30 @@ def export(
     from lgrasp.dataset.exports import HOLDS, export_shards
 
     conditions = [*(where or ()), *([HOLDS] if only_holding else ())]
+    cut = _cutter(cache_dir) if to == "mjcf" else None
     with _progress(quiet) as advance:
-        done = export_shards(shards, out, to, where=conditions, limit=limit, advance=advance)
+        done = export_shards(shards, out, to, where=conditions, limit=limit, cut=cut, advance=advance)
     if not quiet:
         objects = f"{len(done.objects)} object{'s' if len(done.objects) > 1 else ''}"
         typer.echo(f"{out}: {done.rows:,} grasps of {objects}, {to}")
+
+
+def _cutter(cache_dir: Path | None) -> "Cut":
+    """Convex pieces of objects as ``lgrasp validate`` makes them, from the cache; what is approximated is said."""
+    from functools import partial
+
+    from lgrasp.decompose import decompose
+    from lgrasp.physics.scene import object_of_record
+
+    cache = open_cache(cache_dir)
+
+    def cut(record: "ObjectRecord") -> "Sequence[np.ndarray]":
+        solid = object_of_record(record, partial(decompose, store=cache))
+        for note in solid.notes:
+            warn(f"object '{record.name}': {note}")
+        return solid.pieces
+
+    return cut
 
 
 @contextmanager

@@ -34,13 +34,13 @@ MJCF files are) needs that turn applied to the first seven numbers.
 """
 
 
-def write_dexgraspbench(out: Path, plan: Plan, frames: HandFrames, advance: Callable[[int], None]) -> None:
+def write_dexgraspbench(plan: Plan, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
     """Write ``grasps/CODE/NUMBER.npy`` for every row, numbered over the whole export.
 
     Args:
-        out: Folder of the export.
         plan: Rows of single objects.
         frames: The plan's hand.
+        out: Folder of the export.
         advance: Called with numbers of rows that are done.
 
     Raises:

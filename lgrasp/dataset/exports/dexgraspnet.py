@@ -33,13 +33,13 @@ The object is at the origin. {root} is the root link of hand/hand.urdf.
 """
 
 
-def write_dexgraspnet(out: Path, plan: Plan, frames: HandFrames, advance: Callable[[int], None]) -> None:
+def write_dexgraspnet(plan: Plan, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
     """Write ``grasps/CODE.npy`` for every object; memory does not grow with the rows.
 
     Args:
-        out: Folder of the export.
         plan: Rows of single objects.
         frames: The plan's hand.
+        out: Folder of the export.
         advance: Called with numbers of rows that are done.
 
     Raises:

@@ -1,6 +1,7 @@
 """Formats of other programs by name, and the export to one of them."""
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +12,7 @@ from lgrasp.dataset.exports.files import check_empty, write_file
 from lgrasp.dataset.exports.folder import write_assets, write_index
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
-from lgrasp.dataset.exports.mjcf import MJCF_NOTES, check_mjcf, read_mjcf, write_mjcf
+from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
 from lgrasp.dataset.exports.plan import Plan, make_plan
 from lgrasp.dataset.exports.readme import readme
 from lgrasp.dataset.exports.records import GraspSet
@@ -29,23 +30,31 @@ class Format(NamedTuple):
     single: bool
     """Has every grasp one object?"""
     notes: str
-    write: Callable[[Path, Plan, HandFrames, Callable[[int], None]], None]
+    writer: Callable[[Plan, HandFrames, Cut | None], Callable[[Path, Callable[[int], None]], None]]
+    """Refuses what it cannot hold, else gives what writes the grasps into a folder and says how far it is."""
     read: Callable[..., GraspSet]
-    check: Callable[[Plan, HandFrames], None] = lambda plan, frames: None
-    """Called before anything is written."""
+
+
+def _plain(write: Callable[[Plan, HandFrames, Path, Callable[[int], None]], None]):
+    """The writer of a format without solids."""
+    return lambda plan, frames, _: partial(write, plan, frames)
 
 
 FORMATS = {
     "dexgraspnet": Format(
-        "one .npy per object, Euler angles", True, DEXGRASPNET_NOTES, write_dexgraspnet, read_dexgraspnet
+        "one .npy per object, Euler angles", True, DEXGRASPNET_NOTES, _plain(write_dexgraspnet), read_dexgraspnet
     ),
     "dexgraspbench": Format(
-        "one .npy per grasp, the layout of BODex", True, DEXGRASPBENCH_NOTES, write_dexgraspbench, read_dexgraspbench
+        "one .npy per grasp, the layout of BODex",
+        True,
+        DEXGRASPBENCH_NOTES,
+        _plain(write_dexgraspbench),
+        read_dexgraspbench,
     ),
     "isaac-grasp": Format(
-        "one YAML per object, isaac_grasp 1.0", True, ISAAC_GRASP_NOTES, write_isaac_grasp, read_isaac_grasp
+        "one YAML per object, isaac_grasp 1.0", True, ISAAC_GRASP_NOTES, _plain(write_isaac_grasp), read_isaac_grasp
     ),
-    "mjcf": Format("one MuJoCo scene per grasp", False, MJCF_NOTES, write_mjcf, read_mjcf, check_mjcf),
+    "mjcf": Format("one MuJoCo scene per grasp", False, MJCF_NOTES, MjcfWriter, read_mjcf),
 }
 """Formats by the name that ``--to`` takes."""
 
@@ -65,6 +74,7 @@ def export_shards(
     *,
     where: Sequence[str] = (),
     limit: int | None = None,
+    cut: Cut | None = None,
     advance: Callable[[int, int], None] | None = None,
 ) -> Exported:
     """Write grasps of shards, all of one hand, into a folder in the format of another program.
@@ -79,10 +89,12 @@ def export_shards(
         where: Conditions on columns that a row must satisfy, all of them, such as ``physics/fc_holds`` or
             ``metrics/epsilon > 0.01``.
         limit: Most rows.
+        cut: Convex pieces of an object, for formats that simulate; without it the hull of its mesh collides.
         advance: Called with rows done and rows in all.
 
     Raises:
-        ConfigError: An unknown format, a condition that cannot be read, a limit below 1, or MuJoCo is not installed.
+        ConfigError: An unknown format, a condition that cannot be read, or a limit below 1.
+        PhysicsError: MuJoCo is not installed, or refuses the hand or an object (mjcf).
         ShardError: A shard is damaged, of another hand, lacks a column, holds what the format cannot; no row is left.
         OutputError: The folder is not empty or cannot be written.
     """
@@ -94,7 +106,7 @@ def export_shards(
     check_empty(out)
     plan = make_plan(find_shards(paths), where=conditions, limit=limit, single=form.single)
     frames = HandFrames(plan.hand.urdf, plan.hand.base_link, plan.hand.joint_names, plan.shards[0])
-    form.check(plan, frames)
+    write = form.writer(plan, frames, cut)
     done = 0
 
     def count(rows: int) -> None:
@@ -105,7 +117,7 @@ def export_shards(
 
     write_assets(out, plan)
     write_file(out / "README.txt", readme(plan, frames, form.notes))
-    form.write(out, plan, frames, count)
+    write(out, count)
     write_index(out, plan, frames, to, list(map(str, conditions)))
     return Exported(plan.rows, tuple(item.code for item in plan.objects))
 

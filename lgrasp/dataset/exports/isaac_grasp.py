@@ -35,13 +35,13 @@ grasps/CODE.yaml   isaac_grasp format, version 1.0: all grasps of one object by 
 """
 
 
-def write_isaac_grasp(out: Path, plan: Plan, frames: HandFrames, advance: Callable[[int], None]) -> None:
+def write_isaac_grasp(plan: Plan, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
     """Write ``grasps/CODE.yaml`` for every object; memory does not grow with the rows.
 
     Args:
-        out: Folder of the export.
         plan: Rows of single objects.
         frames: The plan's hand.
+        out: Folder of the export.
         advance: Called with numbers of rows that are done.
 
     Raises:

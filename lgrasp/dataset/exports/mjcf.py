@@ -1,22 +1,28 @@
 """MJCF: one MuJoCo scene per grasp, with keyframes before closing, at the grasp and squeezing."""
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
 from lxml import etree
+from trimesh import Trimesh
+from trimesh.exchange.obj import export_obj
 
-from lgrasp.dataset.exports.files import write_small
+from lgrasp.dataset.exports.files import write_file, write_small
 from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, object_text, open_folder
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
-from lgrasp.dataset.exports.mjcf_scene import Keyframe, Scene
+from lgrasp.dataset.exports.mjcf_scene import Keyframe, Scene, SceneObject
 from lgrasp.dataset.exports.plan import Batch, Plan
 from lgrasp.dataset.exports.poses import inverse
 from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order_of
+from lgrasp.dataset.records import ObjectRecord
 from lgrasp.errors import ShardError
 
-__all__ = ["MJCF_NOTES", "check_mjcf", "read_mjcf", "write_mjcf"]
+__all__ = ["MJCF_NOTES", "Cut", "MjcfWriter", "read_mjcf"]
+
+Cut = Callable[[ObjectRecord], Sequence[np.ndarray]]
+"""Convex pieces of an object, vertices [m] of each, shape [V, 3]."""
 
 _KEYS = ("grasp", "pregrasp", "squeeze")
 
@@ -32,58 +38,82 @@ grasps/NUMBER.xml  MuJoCo scene of one grasp: mujoco.MjModel.from_xml_path(FILE)
   bodies             the links of hand.urdf under their names; object_PLACE_CODE, free, 0.1 kg
 
 The world's frame is that of link {root}, the root link of hand/hand.urdf, which is fixed. No gravity; friction 0.6.
-MuJoCo collides with the convex hull of a mesh: hollows of an object, such as the inside of a mug, are filled, and the
-fingers may start inside them. Links whose hulls overlap at the grasp are kept from colliding with each other.
+An object collides with the convex pieces objects/CODE/piece_NN.obj; where there are none, with the hull of its mesh,
+which fills its hollows. A mesh of the hand collides with its hull; links whose hulls overlap at the grasp are kept from
+colliding with each other.
 """
 
 
-def check_mjcf(plan: Plan, frames: HandFrames) -> None:
-    """See that MuJoCo takes the hand and the objects of the first row, before anything is written.
-
-    Raises:
-        ConfigError: MuJoCo is not installed.
-        ShardError: MuJoCo refuses the hand or a mesh, or a shard is damaged.
-    """
-    index = next(plan.batches()).object_index[0]
-    _scene(plan, frames, tuple(index[index >= 0].tolist()))
-
-
-def write_mjcf(out: Path, plan: Plan, frames: HandFrames, advance: Callable[[int], None]) -> None:
-    """Write ``grasps/NUMBER.xml`` for every row, numbered over the whole export.
+class MjcfWriter:
+    """Writes ``grasps/NUMBER.xml`` for every row, numbered over the whole export.
 
     Args:
-        out: Folder of the export.
         plan: Rows of one or several objects.
         frames: The plan's hand.
-        advance: Called with numbers of rows that are done.
+        cut: Convex pieces of an object, vertices [m] of each, shape [V, 3]; without it the hull of its mesh collides.
 
     Raises:
-        ShardError: A shard is damaged, or MuJoCo refuses a mesh.
-        OutputError: The folder cannot be written.
+        PhysicsError: MuJoCo is not installed, or refuses the hand or an object of the first row.
+        ShardError: A shard is damaged.
     """
-    scene = lru_cache(maxsize=16)(lambda objects: _scene(plan, frames, objects))
-    for batch in plan.batches():
-        poses = _in_root(batch, frames)  # (n, O, 7)
-        joints = [frames.all_joints(values) for values in (batch.q, batch.q_pregrasp)]
-        for row, number in enumerate(batch.number):
-            present = batch.object_index[row] >= 0
-            objects = tuple(batch.object_index[row, present].tolist())
-            at, before = ({name: float(v[row]) for name, v in values.items()} for values in joints)
-            keys = [
-                Keyframe(_KEYS[0], at, batch.q[row], poses[row, present]),
-                Keyframe(_KEYS[1], before, batch.q_pregrasp[row], poses[row, present]),
-                Keyframe(_KEYS[2], at, batch.q_squeeze[row], poses[row, present]),
-            ]
-            write_small(out / GRASPS / f"{number:08d}.xml", scene(objects).text(keys).encode())
-            advance(1)
+
+    def __init__(self, plan: Plan, frames: HandFrames, cut: Cut | None = None) -> None:
+        self._plan, self._frames, self._cut = plan, frames, cut
+        self._hand = {f"{HAND}/{name}": data for name, data in hand_files(plan.hand, plan.shards[0]).items()}
+        self._object = cache(self._make_object)
+        self._scene = lru_cache(maxsize=16)(self._make_scene)
+        index = next(plan.batches()).object_index[0]
+        self._scene(tuple(index[index >= 0].tolist()))
+
+    def __call__(self, out: Path, advance: Callable[[int], None]) -> None:
+        """Write into the folder of an export.
+
+        Args:
+            out: The folder.
+            advance: Called with numbers of rows that are done.
+
+        Raises:
+            PhysicsError: MuJoCo refuses an object.
+            ShardError: A shard is damaged.
+            OutputError: The folder cannot be written.
+        """
+        for place in range(len(self._plan.objects)):
+            for name, data in self._object(place).pieces.items():
+                write_file(out / name, data)
+        for batch in self._plan.batches():
+            poses = _in_root(batch, self._frames)  # (n, O, 7)
+            joints = [self._frames.all_joints(values) for values in (batch.q, batch.q_pregrasp)]
+            for row, number in enumerate(batch.number):
+                present = batch.object_index[row] >= 0
+                pose, objects = poses[row, present], tuple(batch.object_index[row, present].tolist())
+                at, before = ({name: float(v[row]) for name, v in values.items()} for values in joints)
+                keys = [
+                    Keyframe(_KEYS[0], at, batch.q[row], pose),
+                    Keyframe(_KEYS[1], before, batch.q_pregrasp[row], pose),
+                    Keyframe(_KEYS[2], at, batch.q_squeeze[row], pose),
+                ]
+                write_small(out / GRASPS / f"{number:08d}.xml", self._scene(objects).text(keys).encode())
+                advance(1)
+
+    def _make_scene(self, objects: tuple[int, ...]) -> Scene:
+        return Scene(self._hand, self._frames, [self._object(place) for place in objects])
+
+    def _make_object(self, place: int) -> SceneObject:
+        item = self._plan.objects[place]
+        found = self._cut(item.mesh()) if self._cut else ()
+        hulls = [Trimesh(vertices).convex_hull for vertices in found]
+        names = [f"{OBJECTS}/{item.code}/piece_{number:02d}.obj" for number in range(len(hulls))]
+        return SceneObject(
+            code=item.code,
+            mesh=f"{OBJECTS}/{item.code}.obj",
+            text=object_text(item).encode(),
+            pieces={name: _obj(hull) for name, hull in zip(names, hulls, strict=True)},
+            volumes=[float(hull.volume) for hull in hulls],
+        )
 
 
-def _scene(plan: Plan, frames: HandFrames, objects: tuple[int, ...]) -> Scene:
-    files = {f"{HAND}/{name}": data for name, data in hand_files(plan.hand, plan.shards[0]).items()}
-    codes = [plan.objects[i].code for i in objects]
-    meshes = [f"{OBJECTS}/{code}.obj" for code in codes]
-    files |= {mesh: object_text(plan.objects[i]).encode() for i, mesh in zip(objects, meshes, strict=True)}
-    return Scene(files, frames, meshes, codes, "../")
+def _obj(mesh: Trimesh) -> bytes:
+    return export_obj(mesh, include_normals=False, include_texture=False, digits=9).encode()
 
 
 def _in_root(batch: Batch, frames: HandFrames) -> np.ndarray:

@@ -7,15 +7,19 @@ import numpy as np
 from lxml import etree
 
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.errors import ConfigError, ShardError
+from lgrasp.errors import PhysicsError
 
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["Keyframe", "Scene"]
+__all__ = ["Keyframe", "Scene", "SceneObject"]
 
 _COMPILER = {"strippath": "false", "discardvisual": "true", "balanceinertia": "true", "fusestatic": "false"}
-_STIFFNESS = {"hinge": 5.0, "slide": 500.0}  # of the position actuators [N m/rad, N/m]
+_COMPILER |= {"meshdir": "../"}  # of the export, seen from the scenes
+_TIMESTEP = 0.004  # [s]
+_STIFFNESS, _ARMATURE = 5.0, 2.0e-4  # of the drives of revolute joints [N m/rad], [kg m^2]
+_LEVER = 0.1  # a sliding joint is like a revolute one at this arm [m]
+_LEAST_MASS, _LEAST_INERTIA = 1.0e-3, 1.0e-7  # [kg], [kg m^2] of links whose URDF gives less
 _OBJECT_MASS = 0.1  # [kg]
 _FRICTION = (0.6, 0.02, 0.0001)
 _DEEP = 0.001  # links of the hand that overlap more at the grasp do so because hulls stand for meshes [m]
@@ -33,39 +37,52 @@ class Keyframe(NamedTuple):
     """x y z [m] qw qx qy qz of each object in the world, shape [O, 7]."""
 
 
+class SceneObject(NamedTuple):
+    """A free body. Files by their path in the export, OBJ in metres."""
+
+    code: str
+    mesh: str
+    text: bytes
+    """The file ``mesh``."""
+    pieces: Mapping[str, bytes]
+    """Convex pieces that collide; none: the hull of the mesh does."""
+    volumes: Sequence[float]
+    """Of the pieces [m^3]."""
+
+
 class Scene:
     """A hand, its root link at the origin of the world and fixed, and free objects.
 
     Args:
-        files: ``hand/hand.urdf``, the meshes it names and those of the objects, by their path in the export.
+        hand: ``hand/hand.urdf`` and the meshes it names, by their path in the export.
         frames: The hand.
-        meshes: Path of the mesh of each object.
-        codes: Name of each object.
-        up: Path from the folder of the scene to that of the export.
+        objects: The objects, in the order of the row.
 
     Raises:
-        ConfigError: MuJoCo is not installed.
-        ShardError: MuJoCo refuses the hand or a mesh.
+        PhysicsError: MuJoCo is not installed, or refuses the hand or a mesh.
     """
 
-    def __init__(
-        self, files: Mapping[str, bytes], frames: HandFrames, meshes: Sequence[str], codes: Sequence[str], up: str
-    ) -> None:
+    def __init__(self, hand: Mapping[str, bytes], frames: HandFrames, objects: Sequence[SceneObject]) -> None:
         try:
             import mujoco
         except ImportError:
-            raise ConfigError("--to mjcf needs MuJoCo: pip install 'lgrasp[sim]'") from None
+            raise PhysicsError('mjcf needs MuJoCo, which is not installed: pip install "lgrasp[sim]"') from None
         self._mujoco = mujoco
-        self._objects = [_object_body(place, code) for place, code in enumerate(codes)]
+        self._objects = [f"object_{place}_{item.code}" for place, item in enumerate(objects)]
+        files = dict(hand)
+        for item in objects:
+            files |= {item.mesh: item.text, **item.pieces}
         try:
-            spec = _hand_spec(mujoco, files, up)
-            for name, mesh in zip(self._objects, meshes, strict=True):
-                _add_object(mujoco, spec, name, mesh)
+            spec = _hand_spec(mujoco, files)
+            for name, item in zip(self._objects, objects, strict=True):
+                _add_object(mujoco, spec, name, item)
             _finish(mujoco, spec, frames.joint_names)
             self._model = spec.compile()
             self._xml = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:
-            raise ShardError(f"MuJoCo refuses the hand or an object: {' '.join(str(error).split())[:300]}") from None
+            names = ", ".join(item.code for item in objects)
+            reason = " ".join(str(error).split())[:300]
+            raise PhysicsError(f"MuJoCo refuses the hand with {names}: {reason}") from None
         self._data = mujoco.MjData(self._model)
 
     def text(self, keyframes: Sequence[Keyframe]) -> str:
@@ -111,42 +128,53 @@ class Scene:
         return found
 
 
-def _object_body(place: int, code: str) -> str:
-    """Name of the body, the joint and the mesh of the object at a place of a row."""
-    return f"object_{place}_{code}"
-
-
-def _hand_spec(mujoco, files: Mapping[str, bytes], up: str) -> "mujoco.MjSpec":
+def _hand_spec(mujoco, files: dict[str, bytes]) -> "mujoco.MjSpec":
     robot = etree.fromstring(files["hand/hand.urdf"])
     for mesh in robot.iter("mesh"):
         mesh.set("filename", f"hand/{mesh.get('filename')}")
     for old in robot.findall("mujoco"):
         robot.remove(old)
-    etree.SubElement(etree.SubElement(robot, "mujoco"), "compiler", {**_COMPILER, "meshdir": up})
-    return mujoco.MjSpec.from_string(etree.tostring(robot, encoding="unicode"), assets=dict(files))
+    etree.SubElement(etree.SubElement(robot, "mujoco"), "compiler", _COMPILER)
+    return mujoco.MjSpec.from_string(etree.tostring(robot, encoding="unicode"), assets=files)
 
 
-def _add_object(mujoco, spec: "mujoco.MjSpec", name: str, mesh: str) -> None:
-    spec.add_mesh(name=name, file=mesh)
+def _add_object(mujoco, spec: "mujoco.MjSpec", name: str, item: SceneObject) -> None:
+    """The mesh is what is seen; its pieces collide and weigh."""
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint(name=name)
-    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, mass=_OBJECT_MASS)
+    spec.add_mesh(name=name, file=item.mesh)
+    shape = {"type": mujoco.mjtGeom.mjGEOM_MESH}
+    if not item.pieces:
+        body.add_geom(name=name, meshname=name, mass=_OBJECT_MASS, **shape)
+        return
+    body.add_geom(name=name, meshname=name, mass=0, contype=0, conaffinity=0, group=2, **shape)
+    for number, (file, volume) in enumerate(zip(item.pieces, item.volumes, strict=True)):
+        piece = f"{name}_{number}"
+        spec.add_mesh(name=piece, file=file)
+        mass = _OBJECT_MASS * volume / sum(item.volumes)
+        body.add_geom(name=piece, meshname=piece, mass=mass, group=3, **shape)
 
 
 def _finish(mujoco, spec: "mujoco.MjSpec", joint_names: Sequence[str]) -> None:
     """No gravity, friction, position actuators on the joints of q."""
-    spec.option.timestep = 0.002
+    spec.option.timestep = _TIMESTEP
     spec.option.gravity = [0, 0, 0]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10
+    spec.option.impratio, spec.option.noslip_iterations = 10, 2
+    spec.compiler.boundmass, spec.compiler.boundinertia = _LEAST_MASS, _LEAST_INERTIA
     for geom in spec.geoms:
         geom.friction, geom.condim = _FRICTION, 4
-    for name in joint_names:
-        joint = spec.joint(name)
-        kind = "slide" if joint.type == mujoco.mjtJoint.mjJNT_SLIDE else "hinge"
+    for joint in spec.joints:
+        if joint.type != mujoco.mjtJoint.mjJNT_FREE:
+            joint.armature = _ARMATURE / _lever(mujoco, joint) ** 2
+    for name in joint_names:  # controls come in the order of q
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=_STIFFNESS[kind], dampratio=1.0)
+        actuator.set_to_position(kp=_STIFFNESS / _lever(mujoco, spec.joint(name)) ** 2, dampratio=1.0)
+
+
+def _lever(mujoco, joint: "mujoco.MjsJoint") -> float:
+    return _LEVER if joint.type == mujoco.mjtJoint.mjJNT_SLIDE else 1.0
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:

@@ -165,9 +165,6 @@ def check_scenes(mujoco, folder: Path, shard) -> None:
                 assert data.joint(joint.name).qpos[0] == pytest.approx(relation, abs=1e-6)
         assert model.neq == sum(joint.mimic is not None for joint in ours.robot.joints)
         assert model.opt.gravity == pytest.approx([0, 0, 0])
-        for _ in range(20):
-            mujoco.mj_step(model, data)
-        assert np.isfinite(data.qpos).all()
 
 
 @pytest.mark.parametrize("hand", ["schunk_svh", "barrett"])

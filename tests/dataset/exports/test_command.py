@@ -1,0 +1,145 @@
+"""``lgrasp export``: options, one line for every failure, Ctrl-C."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lgrasp.dataset.exports import FORMATS, export_shards, read_grasps
+from lgrasp_cli.main import main
+
+GENERATED = Path(__file__).parent / "allegro-tiny.h5"  # lgrasp generate --object tiny -n 10
+SCRIPT = "from lgrasp_cli.main import main; main()"
+
+
+@pytest.fixture
+def cli(monkeypatch, capfd, tmp_path):
+    """cli(*arguments): exit code, standard output, standard error."""
+    monkeypatch.setenv("LGRASP_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["lgrasp", "export", *map(str, arguments)])
+        with pytest.raises(SystemExit) as leaving:
+            main()
+        out, err = capfd.readouterr()
+        return int(leaving.value.code or 0), out, err
+
+    return call
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_export(cli, tmp_path, shards, form):
+    holds = np.array([True, False, True, True, False, True])
+    shards.make(tmp_path / "a.h5", holds=holds)
+    assert cli("a.h5", "--to", form, "--out", "made", "--limit", 3, "--only-holding", "--where", "candidate > 0") == (
+        0,
+        f"made: 3 grasps of 1 object, {form}\n",
+        "",
+    )
+    assert len(read_grasps(tmp_path / "made", form).grasps) == 3
+    assert {p.name for p in (tmp_path / "made").iterdir()} == {"README.txt", "export.json", "grasps", "hand", "objects"}
+    assert not list((tmp_path / "made").rglob("*.tmp"))
+    assert cli("a.h5", "--to", form, "--out", "quiet", "--quiet") == (0, "", "")
+
+
+def test_help(cli):
+    code, out, _ = cli("--help")
+    assert code == 0
+    assert "Example: lgrasp export" in out
+    assert all(form in out for form in FORMATS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["a.h5", "--to", "dexgraspnt", "--out", "made"], "choose one of dexgraspnet, dexgraspbench"),
+        (["a.h5", "--to", "mjcf"], "--out"),
+        (["a.h5", "--out", "made"], "--to"),
+        (["--to", "mjcf", "--out", "made"], "shards"),
+        (["b.h5", "--to", "mjcf", "--out", "made"], "b.h5: no such file"),
+        (["note.txt", "--to", "mjcf", "--out", "made"], "note.txt: not a whole HDF5 file"),
+        (["a.h5", "--to", "mjcf", "--out", "note.txt"], "note.txt is a file"),
+        (["a.h5", "--to", "mjcf", "--out", "."], ". is not empty (it holds a.h5)"),
+        (["a.h5", "--to", "mjcf", "--out", "/proc/none"], "/proc/none"),
+        (["a.h5", "--to", "mjcf", "--out", "made", "--limit", "0"], "--limit 0"),
+        (["a.h5", "--to", "mjcf", "--out", "made", "--limit", "x"], "--limit"),
+        (["a.h5", "--to", "mjcf", "--out", "made", "--where", "a ="], "--where 'a ='"),
+        (["a.h5", "--to", "mjcf", "--out", "made", "--only-holding"], "no column 'physics/fc_holds'"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input(cli, tmp_path, shards, arguments, words):
+    shards.make(tmp_path / "a.h5", n=1)
+    (tmp_path / "note.txt").write_text("mine")
+    code, out, err = cli(*arguments)
+    assert (code, out) == (2, "")
+    (line,) = err.splitlines()
+    assert line.startswith("error: ")
+    assert words in line
+    assert {p.name for p in tmp_path.iterdir()} <= {"a.h5", "note.txt", "cache"}
+
+
+def test_without_mujoco(cli, tmp_path, shards, monkeypatch):
+    shards.make(tmp_path / "a.h5", n=1)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    code, _, err = cli("a.h5", "--to", "mjcf", "--out", "made")
+    assert code == 2
+    assert 'pip install "lgrasp[sim]"' in err
+    assert not (tmp_path / "made").exists()
+
+
+def test_a_flat_object_is_refused_by_name(cli, tmp_path, shards):
+    flat = shards.object()
+    shards.make(tmp_path / "a.h5", n=1, objects=[replace(flat, vertices=flat.vertices * np.float32([1, 1, 0]))])
+    code, _, err = cli("a.h5", "--to", "mjcf", "--out", "made")
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "cup" in err
+    assert "flat" in err
+    assert not (tmp_path / "made").exists()
+
+
+def test_interrupted(tmp_path, shards):
+    """Ctrl-C: exit code 130, every file whole, the export marked as not whole."""
+    shards.make(tmp_path / "a.h5", n=50_000)
+    command = [sys.executable, "-c", SCRIPT, "export", "a.h5", "--to", "dexgraspbench", "--out", "made"]
+    job = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=os.environ)
+    folder = tmp_path / "made" / "grasps" / "cup"
+    end = time.monotonic() + 60
+    while not (folder.is_dir() and len(os.listdir(folder)) > 20) and time.monotonic() < end:
+        time.sleep(0.02)
+    job.send_signal(signal.SIGINT)
+    assert job.wait(20) == 130
+    assert job.stderr is not None
+    assert job.stderr.read() == "interrupted\n"
+    job.stderr.close()
+    files = sorted(folder.iterdir())
+    assert [path.name for path in files] == [f"{n:08d}.npy" for n in range(len(files))]
+    assert all(np.load(path, allow_pickle=True).item()["obj_scale"] == 1 for path in files[-5:])
+    assert not (tmp_path / "made" / "export.json").exists()
+
+
+def test_scenes_hold_their_grasps(tmp_path):
+    """Ten grasps of the generator in MuJoCo: nothing overlaps at the grasp, squeezing keeps objects in the hand."""
+    mujoco = pytest.importorskip("mujoco")
+    export_shards(GENERATED, tmp_path / "made", "mjcf")
+    kept = 0
+    for path in sorted((tmp_path / "made" / "grasps").iterdir()):
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, model.key("grasp").id)
+        mujoco.mj_forward(model, data)
+        assert min([0, *data.contact.dist[: data.ncon]]) > -2e-3
+        mujoco.mj_resetDataKeyframe(model, data, model.key("squeeze").id)
+        mujoco.mj_kinematics(model, data)
+        start = data.body("object_0_tiny").xpos.copy()
+        for _ in range(125):
+            mujoco.mj_step(model, data)
+        kept += np.linalg.norm(data.body("object_0_tiny").xpos - start) < 0.02
+    assert kept >= 9
