@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import Quiet
+from lgrasp_cli.options import JsonPath, Quiet, check_report, warn
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -112,6 +112,60 @@ def metrics(
         there = f"; {kept} were there" if kept else ""
         per_second = added.rows / max(time.monotonic() - start, 1e-9)
         typer.echo(f"{out}: {added.written} shards, {added.rows:,} rows, {per_second:,.0f} rows/s{there}")
+
+
+@app.command()
+def report(
+    paths: _Paths,
+    out: Annotated[Path, typer.Option("--out", "-o", help="HTML file to write.")] = Path("report.html"),
+    json_path: JsonPath = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write what a data set holds as one HTML page: validity, quality, diversity, coverage, physics.
+
+    Shards of several hands and objects may be given; subfolders are looked into. The page needs no other file and no
+    network.
+
+    Example: lgrasp dataset report grasps --out report.html --json report.json
+    """
+    check_report(json_path)
+    from lgrasp.engine.dataset_report import report_dataset
+    from lgrasp.engine.report import check_json, write_json
+    from lgrasp_cli.counting import counting
+    from lgrasp_cli.tables import print_json, print_pairs
+
+    check_json(out)
+    with counting("read", quiet=quiet) as progress:
+        numbers = report_dataset(paths, out, progress=progress)
+    if json_path == "-":
+        print_json(numbers)
+    elif json_path:
+        write_json(json_path, numbers)
+    for line in numbers["remarks"]:
+        warn(line)
+    if not quiet and json_path != "-":
+        print_pairs(_report_pairs(numbers, out))
+
+
+def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
+    groups = [group for hand in numbers["hands"] for group in hand["objects"]]
+    over = {}
+    for group in groups:
+        for name, metric in group["metrics"].items():
+            over[name] = over.get(name, 0) + (metric["over_bound"] or 0)
+    above = ", ".join(f"{name} {count:,}" for name, count in over.items() if count)
+    near = sum(group["near_duplicates"]["duplicates"] for group in groups)
+    pairs = [
+        ("grasps", f"{numbers['rows']:,} in {numbers['shards']:,} shards, {numbers['bytes'] / 1e6:,.1f} MB"),
+        ("hands", ", ".join(f"{h['hand']} ({len(h['objects'])} objects)" for h in numbers["hands"])),
+        ("above a strict bound", above or "none"),
+        ("near-duplicates", f"{near:,}"),
+        ("distinct poses", f"{sum(group['distinct_poses'] for group in groups):,}"),
+    ]
+    for name in sorted({name for group in groups for name in group["physics"]}):
+        found = [group["physics"][name] for group in groups if name in group["physics"]]
+        pairs.append((f"hold in {name}", f"{sum(f['held'] for f in found):,} of {sum(f['run'] for f in found):,}"))
+    return [*pairs, ("where", str(out))]
 
 
 def _shard_table(shards: list[dict[str, Any]]) -> "Table":

@@ -1,0 +1,114 @@
+"""The metrics that the report shows, and their distribution over any number of rows in bounded memory."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+__all__ = ["QUANTITIES", "Distribution", "Quantity"]
+
+_CELLS = 4096
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """How one metric is shown."""
+
+    name: str
+    title: str
+    top: float
+    """No value is larger, or it counts as this; in the file's unit."""
+    unit: str = ""
+    factor: float = 1.0
+    """From the file's unit to ``unit``."""
+    bound: float | None = None
+    """Largest value of a strict-valid grasp, in ``unit``."""
+    highest_is_worst: bool = True
+
+
+QUANTITIES = (
+    Quantity("penetration", "Penetration of hand and object", 1.0, "mm", 1e3, 2.0),
+    Quantity("self_penetration", "Self-penetration of the hand", 1.0, "mm", 1e3, 1.0),
+    Quantity("gap", "Gap at contacts", 1.0, "mm", 1e3, 2.0),
+    Quantity("normal_error", "Angle of the normals at contacts", np.pi, "deg", 180 / np.pi, 20.0),
+    Quantity("gswo", "Friction wrench residual (gswo)", 20.0, bound=0.05),
+    Quantity("epsilon", "Ferrari-Canny epsilon", 1.5, highest_is_worst=False),
+    Quantity("epsilon_exact", "Ferrari-Canny epsilon, exact hull", 1.5, highest_is_worst=False),
+    Quantity("volume", "Volume of the wrench hull", 2.0, highest_is_worst=False),
+)
+
+
+@dataclass
+class Distribution:
+    """Counts of a quantity's values in cells between fourth powers: medians within one or two percent."""
+
+    quantity: Quantity
+    counts: np.ndarray = field(default_factory=lambda: np.zeros(_CELLS, np.int64))
+    rows: int = 0
+    missing: int = 0
+    """Rows where it was not measured (NaN)."""
+    zeros: int = 0
+    """Rows where it is 0 (or less)."""
+    over: int = 0
+    """Rows above the bound."""
+    least: float = np.inf
+    most: float = -np.inf
+
+    def add(self, values: np.ndarray) -> None:
+        """Count further values, shape [n], in the file's unit."""
+        good = values[np.isfinite(values)].astype(float)
+        self.missing += len(values) - len(good)
+        self.rows += len(good)
+        if len(good):
+            cell = np.clip(good / self.quantity.top, 0, 1) ** 0.25 * _CELLS
+            self.counts += np.bincount(np.minimum(cell.astype(int), _CELLS - 1), minlength=_CELLS)
+            self.zeros += int((good <= 0).sum())
+            shown = good * self.quantity.factor
+            self.least, self.most = min(self.least, float(shown.min())), max(self.most, float(shown.max()))
+            if self.quantity.bound is not None:
+                self.over += int((shown > self.quantity.bound).sum())
+
+    def merge(self, other: "Distribution") -> None:
+        """Take the counts of another one of the same quantity."""
+        for name in ("counts", "rows", "missing", "zeros", "over"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.least, self.most = min(self.least, other.least), max(self.most, other.most)
+
+    def edges(self) -> np.ndarray:
+        """Edges of the cells in the shown unit, shape [cells + 1]."""
+        return self.quantity.top * self.quantity.factor * np.linspace(0, 1, _CELLS + 1) ** 4
+
+    def quantile(self, share: float) -> float:
+        """Value below which a share of the rows lies, in the shown unit."""
+        if not self.rows:
+            return np.nan
+        ends = np.concatenate([[0], np.cumsum(self.counts)])
+        return float(np.clip(np.interp(share * self.rows, ends, self.edges()), self.least, self.most))
+
+    def bars(self, number: int = 40) -> tuple[np.ndarray, np.ndarray]:
+        """Edges [number + 1] and counts [number] of even bins that show nearly all values above 0, and the bound."""
+        high = max(self.quantile(0.999), self.most if self.rows < 5000 else 0.0, self.quantity.bound or 0.0, 1e-9)
+        edges = np.linspace(0, 1.02 * high, number + 1)
+        middle = (self.edges()[1:] + self.edges()[:-1]) / 2
+        counts = self.counts.copy()
+        counts[0] -= self.zeros
+        return edges, np.histogram(np.minimum(middle, edges[-1]), edges, weights=counts)[0]
+
+    def numbers(self) -> dict[str, Any]:
+        """JSON-serialisable: worst, median and more, in ``unit``."""
+        q = self.quantity
+        if not self.rows:
+            return {"unit": q.unit, "rows": 0, "missing": self.missing}
+        return {
+            "unit": q.unit,
+            "rows": self.rows,
+            "missing": self.missing,
+            "min": self.least,
+            "median": self.quantile(0.5),
+            "p95": self.quantile(0.95),
+            "max": self.most,
+            "worst": self.most if q.highest_is_worst else self.least,
+            "zero": self.zeros,
+            "bound": q.bound,
+            "over_bound": self.over if q.bound is not None else None,
+        }

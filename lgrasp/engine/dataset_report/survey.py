@@ -1,0 +1,115 @@
+"""Finds the shards of a data set and tells its hands and objects apart."""
+
+import json
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lgrasp.dataset.heap import check_heaps
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.tree import shard_tree
+
+__all__ = ["Head", "survey"]
+
+
+class Head(NamedTuple):
+    """What a shard says of itself."""
+
+    path: Path
+    bytes: int
+    rows: int
+    hand: tuple[str, str]
+    """Name and hash."""
+    objects: list[tuple[str, str, float]]
+    """Id, hash and scale; sorted by id."""
+    labels: list[str]
+    """What to call the objects: the id, and more where one id stands for several things."""
+    pipeline: str
+    seed: int
+    created: str
+    version: str
+    parts: list[tuple[str, int]]
+    """Run and shard index of the rows; several in a merged file."""
+    stages: list[str]
+    """Of the pipeline, in order; empty if the config does not say."""
+    statistics: Mapping[str, int | float | str]
+
+
+def survey(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> tuple[list[Head], list[str]]:
+    """Heads of all shards, by hand and objects, and remarks on what looks wrong.
+
+    Raises:
+        ShardError: No shard is found, or one cannot be read.
+    """
+    heads = [_head(path) for path in shard_tree(paths).values()]
+    meanings: dict[str, set[tuple[str, str, float]]] = defaultdict(set)
+    for head in heads:
+        for key in head.objects:
+            meanings[key[0]].add(key)
+    heads = [head._replace(labels=[_label(key, meanings[key[0]]) for key in head.objects]) for head in heads]
+    return sorted(heads, key=lambda h: (h.hand, h.labels)), _remarks(heads)
+
+
+def _head(path: Path) -> Head:
+    check_heaps(path)
+    with ShardReader(path) as reader:
+        header, attributes = reader.header, reader.attributes
+        run = header.config.get("run_key") or json.dumps(dict(header.config), sort_keys=True)
+        indices = [part["shard_index"] for part in header.merged_from] or [header.shard_index]
+        hand = (str(attributes["hand"]), str(attributes["hand_sha256"]))
+        keys = [(o.id, o.sha256, o.scale) for o in reader.objects()]
+        return Head(
+            path=path,
+            bytes=path.stat().st_size,
+            rows=len(reader),
+            hand=hand,
+            objects=keys,
+            labels=[],
+            pipeline=header.pipeline,
+            seed=header.seed,
+            created=header.created,
+            version=header.lgrasp_version,
+            parts=[(f"{hand} {keys} {header.pipeline} {header.seed} {run}", index) for index in indices],
+            stages=_stages(header.config),
+            statistics=reader.statistics,
+        )
+
+
+def _stages(config: Mapping[str, Any]) -> list[str]:
+    try:
+        return [next(iter(stage)) for stage in config["pipeline"]["stages"]]
+    except (KeyError, TypeError, StopIteration):  # of another writer
+        return []
+
+
+def _label(key: tuple[str, str, float], others: set[tuple[str, str, float]]) -> str:
+    name, sha, scale = key
+    if len(others) == 1:
+        return name
+    if len({other[1] for other in others}) == 1:
+        return f"{name} (scale {scale:g})"
+    return f"{name} ({sha[:6]}, scale {scale:g})"
+
+
+def _remarks(heads: list[Head]) -> list[str]:
+    """Rows that are there twice; empty shards."""
+    holder: dict[Any, Path] = {}
+    twice, empty = [], [head.path.name for head in heads if not head.rows]
+    for head in heads:
+        for part in head.parts:
+            if part in holder:
+                twice.append(f"{head.path.name} and {holder[part].name}")
+            holder.setdefault(part, head.path)
+    remarks = []
+    if twice:
+        pairs = sorted(set(twice))
+        remarks.append(f"The same shard of a run is in {_listed(pairs)}: its rows are counted twice.")
+    if empty:
+        remarks.append(f"No rows are in {_listed(empty)}.")
+    return remarks
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

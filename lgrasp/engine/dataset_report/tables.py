@@ -1,0 +1,121 @@
+"""The report's tables."""
+
+import json
+from typing import Any
+
+from lgrasp.engine.dataset_report.parts import escape, number, table
+
+__all__ = ["diversity_table", "physics_table", "protocol_list", "run_tables", "validity_table"]
+
+_SHOWN = (  # metric, head, format
+    ("penetration", "penetration [mm]", ".2f"),
+    ("self_penetration", "self-pen. [mm]", ".2f"),
+    ("gap", "gap [mm]", ".2f"),
+    ("normal_error", "normals [deg]", ".1f"),
+    ("gswo", "gswo", ".3f"),
+    ("epsilon", "epsilon", ".3f"),
+)
+
+
+def run_tables(data: dict[str, Any]) -> str:
+    """Where a hand's rows come from, and what survived each stage."""
+    about = [
+        ("hand", f"{data['hand']} ({data['sha256'][:12]}…), {len(data['joints'])} joints"),
+        ("rows", f"{number(data['rows'])} in {number(data['shards'])} shard{'s' if data['shards'] != 1 else ''}"),
+        ("made", " to ".join(dict.fromkeys(data["created"])) + f", lgrasp {', '.join(data['lgrasp_versions'])}"),
+    ]
+    out = []
+    for run in data["runs"]:
+        seeds = ", ".join(map(str, run["seeds"][:8])) + ("…" if len(run["seeds"]) > 8 else "")
+        wall = run["seconds"].get("wall")
+        about.append(
+            (
+                f"pipeline {run['pipeline']}",
+                f"{number(run['rows'])} rows, seed {seeds}"
+                + (f", on {run['device']}" if run["device"] else "")
+                + (f", {run['rows'] / wall:,.0f} rows/s" if wall else ""),
+            )
+        )
+        if run["survivors"]:
+            rows = [_stage(name, left, run) for name, left in run["survivors"].items()]
+            caption = f"Survivors per stage of {run['pipeline']}, all shards together"
+            out.append(table(("stage", "survivors", "seconds", "counts"), rows, caption=caption, text=(3,)))
+    return table(("", ""), about, text=(1,)) + "".join(out)
+
+
+def _stage(name: str, left: int, run: dict[str, Any]) -> list[str]:
+    seconds = run["seconds"].get(name)
+    counts = ", ".join(f"{what} {number(n)}" for what, n in sorted(run["counts"][name].items(), key=lambda c: -c[1]))
+    return [name, number(left), "-" if seconds is None else f"{seconds:,.1f}", counts]
+
+
+def validity_table(data: dict[str, Any]) -> str:
+    """Median and worst of each metric, a row per object (or set of objects held at once) and one for all."""
+    shown = [s for s in _SHOWN if s[0] in data["metrics"]]
+    columns = ["object", "rows", *(w for s in shown for w in ("median", "best" if s[0] == "epsilon" else "worst"))]
+    groups = [("", 2), *((head, 2) for _, head, _ in shown)]
+    rows = [[" + ".join(group["objects"]), *_metrics(group, shown)] for group in data["objects"]]
+    if len(rows) > 1:
+        rows.append(["all", *_metrics(data, shown)])
+    caption = "Metrics as stored, of each grasp its worst contact. Orange: above the bound of strict validity."
+    return table(columns, rows, groups=groups, caption=caption, total=len(rows) > 1)
+
+
+def _metrics(of: dict[str, Any], shown: list[tuple[str, str, str]]) -> list[str]:
+    cells = [number(of["rows"])]
+    for name, _, style in shown:
+        found = of["metrics"].get(name)
+        for what in ("median", "max"):
+            bad = "!" if found and what == "max" and found["over_bound"] else ""
+            cells.append(f"{bad}{found[what]:{style}}" if found else "-")
+    return cells
+
+
+def diversity_table(data: dict[str, Any]) -> str:
+    """Poses, near-duplicates and coverage, a row per object (or set of objects held at once)."""
+    columns = ["object", "rows", "poses", "near-dup.", "contacts", "approach", "if uniform", "rotation", "if uniform"]
+    rows = []
+    for group in data["objects"]:
+        near = group["near_duplicates"]
+        contacts = sum(int(n) * rows for n, rows in group["contacts"].items()) / max(group["rows"], 1)
+        cells = [" + ".join(group["objects"]), number(group["rows"]), number(group["distinct_poses"])]
+        cells += [f"{near['share']:.2%}", f"{contacts:.2f}"]
+        first = next(iter(group["coverage"].values()), None)
+        for what in ("directions", "rotations"):
+            cells += [f"{first[what][share]:.0%}" if first else "-" for share in ("share", "share_if_uniform")]
+        rows.append(cells)
+    caption = (
+        "Poses: distinct object poses. Near-dup.: object within 5 mm and 5 deg and every joint within 0.1 rad of a row "
+        "before. Contacts: mean. Approach and rotation: share hit of equal-area bins of approach directions and of "
+        "equal-volume bins of rotations, and what as many uniform draws as there are poses would hit."
+    )
+    return table(columns, rows, caption=caption)
+
+
+def physics_table(data: dict[str, Any]) -> str:
+    """Share of the grasps of each object that hold, per protocol."""
+    names = sorted({name for group in data["objects"] for name in group["physics"]})
+    rows = []
+    for group in data["objects"]:
+        cells = [" + ".join(group["objects"]), number(group["rows"])]
+        for name in names:
+            found = group["physics"].get(name)
+            run = found and found["run"]
+            cells.append(f"{found['share']:.1%} of {number(run)}" if run else "-")
+        rows.append(cells)
+    return table(("object", "rows", *(f"{name} holds" for name in names)), rows)
+
+
+def protocol_list(data: dict[str, Any]) -> str:
+    """What the protocols of the verdicts say."""
+    found: dict[str, list[Any]] = {}
+    for group in data["objects"]:
+        for name, verdicts in group["physics"].items():
+            texts = found.setdefault(name, [])
+            texts += [text for text in verdicts["protocols"] if text not in texts]
+    out = []
+    for name, texts in found.items():
+        for text in texts:
+            shown = text if isinstance(text, str) else json.dumps(text, indent=1)
+            out.append(f"<details><summary>Protocol {escape(name)}</summary><pre>{escape(shown)}</pre></details>")
+    return "".join(out)
