@@ -107,6 +107,7 @@ def export_shards(
     plan = make_plan(find_shards(paths), where=conditions, limit=limit, single=form.single)
     frames = HandFrames(plan.hand.urdf, plan.hand.base_link, plan.hand.joint_names, plan.shards[0])
     write = form.writer(plan, frames, cut)
+    said = list(map(str, conditions))
     done = 0
 
     def count(rows: int) -> None:
@@ -116,9 +117,9 @@ def export_shards(
             advance(done, plan.rows)
 
     write_assets(out, plan)
-    write_file(out / "README.txt", readme(plan, frames, form.notes))
+    write_file(out / "README.txt", readme(plan, frames, form.notes, said))
     write(out, count)
-    write_index(out, plan, frames, to, list(map(str, conditions)))
+    write_index(out, plan, frames, to, said)
     return Exported(plan.rows, tuple(item.code for item in plan.objects))
 
 

@@ -12,7 +12,7 @@ from trimesh.exchange.obj import export_obj
 from lgrasp.dataset.exports.files import write_file, write_small
 from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, object_text, open_folder
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
-from lgrasp.dataset.exports.mjcf_scene import Keyframe, Scene, SceneObject
+from lgrasp.dataset.exports.mjcf_scene import Keyframe, MjcfScene, SceneObject
 from lgrasp.dataset.exports.plan import Batch, Plan
 from lgrasp.dataset.exports.poses import inverse
 from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order_of
@@ -95,8 +95,8 @@ class MjcfWriter:
                 write_small(out / GRASPS / f"{number:08d}.xml", self._scene(objects).text(keys).encode())
                 advance(1)
 
-    def _make_scene(self, objects: tuple[int, ...]) -> Scene:
-        return Scene(self._hand, self._frames, [self._object(place) for place in objects])
+    def _make_scene(self, objects: tuple[int, ...]) -> MjcfScene:
+        return MjcfScene(self._hand, self._frames, [self._object(place) for place in objects])
 
     def _make_object(self, place: int) -> SceneObject:
         item = self._plan.objects[place]

@@ -12,7 +12,7 @@ from lgrasp.errors import PhysicsError
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["Keyframe", "Scene", "SceneObject"]
+__all__ = ["Keyframe", "MjcfScene", "SceneObject"]
 
 _COMPILER = {"strippath": "false", "discardvisual": "true", "balanceinertia": "true", "fusestatic": "false"}
 _COMPILER |= {"meshdir": "../"}  # of the export, seen from the scenes
@@ -50,7 +50,7 @@ class SceneObject(NamedTuple):
     """Of the pieces [m^3]."""
 
 
-class Scene:
+class MjcfScene:
     """A hand, its root link at the origin of the world and fixed, and free objects.
 
     Args:

@@ -1,5 +1,7 @@
 """README.txt of an export: what lies where, frames, units, the order of joints."""
 
+from collections.abc import Sequence
+
 from lgrasp.dataset.exports.folder import HAND, OBJECTS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.plan import Plan
@@ -7,7 +9,7 @@ from lgrasp.dataset.exports.plan import Plan
 __all__ = ["readme"]
 
 _TEXT = """\
-{rows:,} grasps of the hand {hand}, exported by lgrasp from {shards}.
+{rows:,} grasps of the hand {hand}, exported by lgrasp from {shards}{chosen}.
 
 {hand_folder}/hand.urdf     the hand, with its mesh files under {hand_folder}/meshes
 {objects_folder}/CODE.obj    the objects: {objects}
@@ -22,13 +24,14 @@ Joint order, where values have no names:
 {mimics}"""
 
 
-def readme(plan: Plan, frames: HandFrames, notes: str) -> str:
+def readme(plan: Plan, frames: HandFrames, notes: str, conditions: Sequence[str]) -> str:
     """The text.
 
     Args:
         plan: What is exported.
         frames: The plan's hand.
         notes: What is special about the format, with ``{root}`` and ``{base}`` for the names of the two links.
+        conditions: What the rows satisfy.
     """
     width = max(map(len, frames.joint_names))
     limits = zip(frames.joint_names, plan.hand.joint_lower, plan.hand.joint_upper, strict=True)
@@ -42,6 +45,7 @@ def readme(plan: Plan, frames: HandFrames, notes: str) -> str:
         rows=plan.rows,
         hand=plan.hand.name,
         shards=_few([path.name for path in plan.shards]),
+        chosen=f", only rows with {' and '.join(conditions)}" if conditions else "",
         hand_folder=HAND,
         objects_folder=OBJECTS,
         objects=_few(list(counts)),

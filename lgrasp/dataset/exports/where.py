@@ -41,9 +41,9 @@ class Condition(NamedTuple):
         """
         single = [name for name, (shape, _) in reader.columns.items() if len(shape) == 1]
         if self.column not in single:
-            hint = "; lgrasp validate adds physics columns" if self.column.startswith("physics/") else ""
+            hint = " (lgrasp validate adds physics columns)" if self.column.startswith("physics/") else ""
             known = ", ".join(single)
-            raise ShardError(f"{reader.path}: no column {self.column!r} of one number per row: {known}{hint}")
+            raise ShardError(f"{reader.path}: no column {self.column!r}{hint}; with one number per row it has {known}")
         values = reader.column(self.column)
         return np.asarray(_OPERATORS[self.operator](values, self.value)) & ~np.isnan(values.astype(np.float64))
 

@@ -1,0 +1,45 @@
+"""The examples of docs/exports.md and docs/training.md run, and the network of the latter learns."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lgrasp.dataset import write_shard
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+
+
+def examples(name: str) -> str:
+    return "\n".join(re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(encoding="utf-8"), flags=re.DOTALL))
+
+
+@pytest.fixture
+def folder(tmp_path, shards, monkeypatch):
+    """Where the documents' grasps/allegro-mug has rows whose joints follow from the object's place."""
+    path = tmp_path / "grasps" / "allegro-mug" / "allegro-mug-00000.h5"
+    shard = shards.make(path, n=400, objects=[shards.object("mug")])
+    hand, place = shard.hand, shard.grasps.object_pose[:, 0, :3] / 0.3
+    share = 0.5 + 0.4 * place[:, np.arange(len(hand.joint_names)) % 3]
+    q = hand.joint_lower + share * (hand.joint_upper - hand.joint_lower)
+    write_shard(path, replace(shard, grasps=replace(shard.grasps, q=q.astype("f4"))))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_exports(folder, capsys):
+    pytest.importorskip("mujoco")
+    exec(examples("exports.md"), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "100 ('mug',)"
+    assert lines[-1] == "(100, 16) (100, 1, 7)"
+
+
+def test_training(folder, capsys):
+    exec(examples("training.md"), {})
+    *epochs, chosen = capsys.readouterr().out.splitlines()
+    errors = [float(re.fullmatch(r"epoch \d+: (\S+) rad", line).group(1)) for line in epochs]
+    assert errors[-1] < 0.8 * errors[0]
+    assert chosen == "200 of 400 grasps"
