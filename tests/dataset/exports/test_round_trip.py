@@ -104,7 +104,7 @@ def test_read_back(tmp_path, shards, hand, form):
 @pytest.mark.parametrize("hand", HANDS)
 def test_every_link_is_where_it_was(tmp_path, shards, hand, form):
     """The raw files, posed by yourdfpy with the exported URDF, against the shard's URDF posed by the shard's rows."""
-    shard = shards.make(tmp_path / "a.h5", hand)
+    shard = shards.make(tmp_path / "a.h5", hand, n=3)
     export_shards(tmp_path / "a.h5", tmp_path / "out", form)
     index = json.loads((tmp_path / "out" / "export.json").read_text())["hand"]
     (tmp_path / "hand.urdf").write_text(shard.hand.urdf)
@@ -123,7 +123,7 @@ def test_every_link_is_where_it_was(tmp_path, shards, hand, form):
 @pytest.mark.parametrize("hand", HANDS)
 def test_mujoco_opens_the_grasp(tmp_path, shards, hand):
     mujoco = pytest.importorskip("mujoco")
-    shard = shards.make(tmp_path / "a.h5", hand)
+    shard = shards.make(tmp_path / "a.h5", hand, n=3)
     export_shards(tmp_path / "a.h5", tmp_path / "out", "mjcf")
     check_scenes(mujoco, tmp_path, shard)
 
