@@ -181,10 +181,11 @@ def test_several_objects_are_near_together(make, make_shard, tmp_path):
 
 
 def test_physics(make, make_shard, tmp_path):
-    protocol = json.dumps({"name": "fc", "object_mass": 0.1})
+    protocol = json.dumps({"name": "fc", "mass": 0.1})
     ways = np.tile(np.array([[1, 1, 1, 1, 1, 1], [1, 0, -1, -1, -1, -1], [0, 1, 1, 1, 1, 0]], "i1"), (10, 1))
     shard = make_shard(30)
-    physics = {"fc_holds": ways.min(1) == 1, "fc_directions": ways, "fc_slip": np.zeros(30, "f4")}
+    slip = np.array([0.5, 0.0, np.nan] * 10, "f4")
+    physics = {"fc_holds": ways.min(1) == 1, "fc_directions": ways, "fc_slip": slip, "mine": slip}
     physics |= {"drop_holds": np.where(np.arange(30) < 20, 1.0, np.nan).astype("f4")}
     texts = dict.fromkeys(physics, protocol) | {"drop_holds": "from <1 m>"}
     write_shard(
@@ -201,7 +202,9 @@ def test_physics(make, make_shard, tmp_path):
     assert fc["directions"]["-z"] == {"run": 20, "failed": 10}
     assert (drop["run"], drop["held"], drop["protocols"]) == (20, 20, ["from <1 m>"])
     assert "Failures by direction" in text
-    assert "33.3% of 30" in text
+    assert "<td>33.3%</td>" in text
+    assert "<td>100</td>" in text
+    assert fc["means"] == {"slip": 0.25}
     assert "from &lt;1 m&gt;" in text
     check_page(text)
 

@@ -11,7 +11,7 @@ from lgrasp.dataset.reader import ShardReader, pose_matrix
 from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord
 from lgrasp.engine.dataset_report.coverage import Coverage
 from lgrasp.engine.dataset_report.near import NearRows
-from lgrasp.engine.dataset_report.physics import Verdicts
+from lgrasp.engine.dataset_report.physics import Verdicts, add_verdicts
 from lgrasp.engine.dataset_report.quantity import QUANTITIES, Distribution
 from lgrasp.engine.dataset_report.sample import EvenSample
 
@@ -125,8 +125,7 @@ class HandRows:
             middle = (vertices.min(0) + vertices.max(0)) / 2
             T = pose_matrix(rows.object_pose[:, o].astype(float))
             middles.append(group.coverage.setdefault(name, Coverage()).add(T, middle))
-        for name, protocol in rows.physics_protocols.items():
-            Verdicts.add(group.verdicts, name, rows.physics[name], protocol)
+        add_verdicts(group.verdicts, rows.physics, rows.physics_protocols)
         place = list(self.objects).index(names)
         self.sample.add({"q": rows.q, "position": middles[0].astype(np.float32), "group": np.full(len(rows), place)})
 

@@ -1,22 +1,23 @@
 """Verdicts of simulators: how many grasps hold, and in which direction the others fail."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-__all__ = ["DIRECTIONS", "Verdicts"]
+__all__ = ["DIRECTIONS", "Verdicts", "add_verdicts"]
 
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Of the six columns of ``P_directions``."""
 
-_NAMES = ("holds", "directions")
+_HOLDS, _DIRECTIONS = "_holds", "_directions"
 
 
 @dataclass
 class Verdicts:
-    """Counts of one protocol: of its columns ``P_holds`` [N] and ``P_directions`` [N, 6]."""
+    """Counts of one protocol P: of the columns ``P_holds`` [N], ``P_directions`` [N, 6] and further ``P_...`` [N]."""
 
     protocols: list[str] = field(default_factory=list)
     """Texts of the protocol, different ones once each."""
@@ -24,23 +25,21 @@ class Verdicts:
     held: int = 0
     direction_run: np.ndarray = field(default_factory=lambda: np.zeros(len(DIRECTIONS), np.int64))
     direction_failed: np.ndarray = field(default_factory=lambda: np.zeros(len(DIRECTIONS), np.int64))
+    sums: dict[str, tuple[int, float]] = field(default_factory=dict)
+    """Rows with a value and their sum, by further column."""
 
-    @staticmethod
-    def add(into: dict[str, "Verdicts"], column: str, values: np.ndarray, protocol: str) -> None:
-        """Count a column of ``physics/``; others than the two are passed over, values below 0 and NaN were not run."""
-        name, _, what = column.rpartition("_")
-        if what not in _NAMES or not name:
-            return
-        verdicts = into.setdefault(name, Verdicts())
-        if protocol not in verdicts.protocols:
-            verdicts.protocols.append(protocol)
+    def add(self, column: str, values: np.ndarray) -> None:
+        """Count one column, named without the protocol; values below 0 and NaN were not run."""
         run = values >= 0  # NaN: false
-        if what == "holds" and values.ndim == 1:
-            verdicts.run += int(run.sum())
-            verdicts.held += int((values[run] > 0).sum())
-        elif what == "directions" and values.shape[1:] == (len(DIRECTIONS),):
-            verdicts.direction_run += run.sum(0)
-            verdicts.direction_failed += (run & (values == 0)).sum(0)
+        if column == _HOLDS and values.ndim == 1:
+            self.run += int(run.sum())
+            self.held += int((values[run] > 0).sum())
+        elif column == _DIRECTIONS and values.shape[1:] == (len(DIRECTIONS),):
+            self.direction_run += run.sum(0)
+            self.direction_failed += (run & (values == 0)).sum(0)
+        elif values.ndim == 1:
+            count, total = self.sums.get(column[1:], (0, 0.0))
+            self.sums[column[1:]] = count + int(run.sum()), total + float(values[run].sum(dtype=float))
 
     def numbers(self) -> dict[str, Any]:
         """JSON-serialisable."""
@@ -52,8 +51,26 @@ class Verdicts:
                 way: {"run": int(run), "failed": int(failed)}
                 for way, run, failed in zip(DIRECTIONS, self.direction_run, self.direction_failed, strict=True)
             },
+            "means": {name: total / count if count else None for name, (count, total) in self.sums.items()},
             "protocols": [_parsed(text) for text in self.protocols],
         }
+
+
+def add_verdicts(into: dict[str, Verdicts], columns: Mapping[str, np.ndarray], texts: Mapping[str, str]) -> None:
+    """Count the columns of ``physics/`` of some rows, by protocol; what belongs to no ``P_holds`` is passed over.
+
+    Args:
+        into: Counts so far, by protocol.
+        columns: Verdicts [N, ...] by name.
+        texts: Protocol of each.
+    """
+    for name in [column.removesuffix(_HOLDS) for column in columns if column.endswith(_HOLDS)]:
+        verdicts = into.setdefault(name, Verdicts())
+        for column, values in columns.items():
+            if column.startswith(f"{name}_"):
+                verdicts.add(column.removeprefix(name), values)
+        if texts[name + _HOLDS] not in verdicts.protocols:
+            verdicts.protocols.append(texts[name + _HOLDS])
 
 
 def _parsed(text: str) -> Any:

@@ -150,6 +150,7 @@ def posture_chart(posture: Posture, scores: np.ndarray, group: np.ndarray, names
         at = np.arange(1, len(share) + 1)
         left.bar(at, share, color=_BAR, width=0.8, label="each")
         left.plot(at, np.cumsum(share), color=_BOUND, marker="o", markersize=3, linewidth=1.2, label="together")
+        left.xaxis.get_major_locator().set_params(integer=True)
         left.set_title("Variance of the joints explained")
         left.set_xlabel("principal component")
         left.set_ylabel("share [%]")

@@ -87,7 +87,7 @@ class Distribution:
 
     def bars(self, number: int = 40) -> tuple[np.ndarray, np.ndarray]:
         """Edges [number + 1] and counts [number] of even bins that show nearly all values above 0, and the bound."""
-        high = max(self.quantile(0.999), self.most if self.rows < 5000 else 0.0, self.quantity.bound or 0.0, 1e-9)
+        high = max(self.quantile(0.999), self.most if self.rows < 5000 else 0.0, self.quantity.bound or 0.0) or 1.0
         edges = np.linspace(0, 1.02 * high, number + 1)
         middle = (self.edges()[1:] + self.edges()[:-1]) / 2
         counts = self.counts.copy()

@@ -16,6 +16,14 @@ _SHOWN = (  # metric, head, format
     ("epsilon", "epsilon", ".3f"),
 )
 
+_VERDICTS = (  # column, head, factor, format
+    ("contact_at_q", "links at q", 1, ".1f"),
+    ("contact_at_grasp", "links at grasp", 1, ".1f"),
+    ("slip", "slip [mm]", 1e3, ".1f"),
+    ("settled", "settled [%]", 100, ".0f"),
+    ("diverged", "diverged [%]", 100, ".1f"),
+)
+
 
 def run_tables(data: dict[str, Any]) -> str:
     """Where a hand's rows come from, and what survived each stage."""
@@ -93,29 +101,41 @@ def diversity_table(data: dict[str, Any]) -> str:
 
 
 def physics_table(data: dict[str, Any]) -> str:
-    """Share of the grasps of each object that hold, per protocol."""
-    names = sorted({name for group in data["objects"] for name in group["physics"]})
-    rows = []
+    """What each protocol says of each object: share that holds, the object's mass, means of other verdicts."""
+    rows, columns = [], ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in _VERDICTS)]
     for group in data["objects"]:
-        cells = [" + ".join(group["objects"]), number(group["rows"])]
-        for name in names:
-            found = group["physics"].get(name)
-            run = found and found["run"]
-            cells.append(f"{found['share']:.1%} of {number(run)}" if run else "-")
-        rows.append(cells)
-    return table(("object", "rows", *(f"{name} holds" for name in names)), rows)
+        for name, found in sorted(group["physics"].items()):
+            share = f"{found['share']:.1%}" if found["run"] else "-"
+            cells = [" + ".join(group["objects"]), name, number(found["run"]), share, _mass(found["protocols"])]
+            for column, _, factor, style in _VERDICTS:
+                mean = found["means"].get(column)
+                cells.append("-" if mean is None else f"{factor * mean:{style}}")
+            rows.append(cells)
+    caption = "Means over the grasps that were run; links: of the hand, in contact with the object."
+    return table(columns, rows, caption=caption, text=(1,))
+
+
+def _mass(protocols: list[Any]) -> str:
+    """Mass of the object [g], if the protocols say one."""
+    masses = []
+    for protocol in protocols:
+        said = protocol if isinstance(protocol, dict) else {}
+        said = said | said["resolved"] if isinstance(said.get("resolved"), dict) else said
+        if isinstance(said.get("mass"), int | float):
+            masses.append(f"{1000 * said['mass']:.0f}")
+    return ", ".join(dict.fromkeys(masses)) or "-"
 
 
 def protocol_list(data: dict[str, Any]) -> str:
-    """What the protocols of the verdicts say."""
-    found: dict[str, list[Any]] = {}
+    """What the protocols of the verdicts say, each text once, with its objects."""
+    found: dict[tuple[str, str], list[str]] = {}
     for group in data["objects"]:
         for name, verdicts in group["physics"].items():
-            texts = found.setdefault(name, [])
-            texts += [text for text in verdicts["protocols"] if text not in texts]
-    out = []
-    for name, texts in found.items():
-        for text in texts:
-            shown = text if isinstance(text, str) else json.dumps(text, indent=1)
-            out.append(f"<details><summary>Protocol {escape(name)}</summary><pre>{escape(shown)}</pre></details>")
-    return "".join(out)
+            for text in verdicts["protocols"]:
+                shown = text if isinstance(text, str) else json.dumps(text, indent=1)
+                found.setdefault((name, shown), []).append(" + ".join(group["objects"]))
+    return "".join(
+        f"<details><summary>Protocol {escape(name)}: {escape(', '.join(objects))}</summary>"
+        f"<pre>{escape(shown)}</pre></details>"
+        for (name, shown), objects in found.items()
+    )
