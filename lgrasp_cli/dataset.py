@@ -61,7 +61,7 @@ def validate(
     if bad:
         raise typer.Exit(2)
     if not as_json:
-        typer.echo(f"{len(problems)} shard{'s' if len(problems) > 1 else ''} valid")
+        typer.echo(f"{_counted(len(problems), 'shard')} valid")
 
 
 @app.command()
@@ -109,9 +109,9 @@ def metrics(
         added = add_metrics(paths, out, names, workers=workers, progress=progress)
     if not quiet:
         kept = len(added.files) - added.written
-        there = f"; {kept} were there" if kept else ""
+        there = f"; {kept} there already" if kept else ""
         per_second = added.rows / max(time.monotonic() - start, 1e-9)
-        typer.echo(f"{out}: {added.written} shards, {added.rows:,} rows, {per_second:,.0f} rows/s{there}")
+        typer.echo(f"{out}: {_counted(added.written, 'shard')}, {added.rows:,} rows, {per_second:,.0f} rows/s{there}")
 
 
 @app.command()
@@ -123,8 +123,7 @@ def report(
 ) -> None:
     """Write what a data set holds as one HTML page: validity, quality, diversity, coverage, physics.
 
-    Shards of several hands and objects may be given; subfolders are looked into. The page needs no other file and no
-    network.
+    Shards of several hands and objects may be given; subfolders are looked into. The page stands alone, offline.
 
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """
@@ -156,8 +155,8 @@ def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
     above = ", ".join(f"{name} {count:,}" for name, count in over.items() if count)
     near = sum(group["near_duplicates"]["duplicates"] for group in groups)
     pairs = [
-        ("grasps", f"{numbers['rows']:,} in {numbers['shards']:,} shards, {numbers['bytes'] / 1e6:,.1f} MB"),
-        ("hands", ", ".join(f"{h['hand']} ({len(h['objects'])} objects)" for h in numbers["hands"])),
+        ("grasps", f"{numbers['rows']:,} in {_counted(numbers['shards'], 'shard')}, {numbers['bytes'] / 1e6:,.1f} MB"),
+        ("hands", ", ".join(f"{h['hand']} ({_counted(len(h['objects']), 'object')})" for h in numbers["hands"])),
         ("above a strict bound", above or "none"),
         ("near-duplicates", f"{near:,}"),
         ("distinct poses", f"{sum(group['distinct_poses'] for group in groups):,}"),
@@ -166,6 +165,10 @@ def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
         found = [group["physics"][name] for group in groups if name in group["physics"]]
         pairs.append((f"hold in {name}", f"{sum(f['held'] for f in found):,} of {sum(f['run'] for f in found):,}"))
     return [*pairs, ("where", str(out))]
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n:,} {what}{'' if n == 1 else 's'}"
 
 
 def _shard_table(shards: list[dict[str, Any]]) -> "Table":

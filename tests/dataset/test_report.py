@@ -347,7 +347,7 @@ def test_command(make_shard, tmp_path):
     out, to_json = tmp_path / "page.html", tmp_path / "page.json"
     result = CliRunner().invoke(app, ["report", str(tmp_path / "in"), "-o", str(out), "--json", str(to_json)])
     assert result.exit_code == 0
-    assert "4 in 1 shards" in result.stdout
+    assert "4 in 1 shard," in result.stdout
     assert json.loads(to_json.read_text())["rows"] == 4
     text = out.read_text(encoding="utf-8")
     printed = CliRunner().invoke(app, ["report", str(tmp_path / "in"), "-o", str(out), "--json", "-"])
