@@ -16,6 +16,7 @@ _SHOWN = (  # metric, head, format
     ("epsilon", "epsilon", ".3f"),
 )
 
+_NEAR_SHARE = 0.01  # most near-duplicates of a good data set
 _VERDICTS = (  # column, head, factor, format
     ("contact_at_q", "links at q", 1, ".1f"),
     ("contact_at_grasp", "links at grasp", 1, ".1f"),
@@ -87,14 +88,14 @@ def diversity_table(data: dict[str, Any]) -> str:
         near = group["near_duplicates"]
         contacts = sum(int(n) * rows for n, rows in group["contacts"].items()) / max(group["rows"], 1)
         cells = [" + ".join(group["objects"]), number(group["rows"]), number(group["distinct_poses"])]
-        cells += [f"{near['share']:.2%}", f"{contacts:.2f}"]
+        cells += [f"{'!' * (near['share'] > _NEAR_SHARE)}{near['share']:.2%}", f"{contacts:.2f}"]
         first = next(iter(group["coverage"].values()), None)
         for what in ("directions", "rotations"):
             cells += [f"{first[what][share]:.0%}" if first else "-" for share in ("share", "share_if_uniform")]
         rows.append(cells)
     caption = (
         "Poses: distinct object poses. Near-dup.: object within 5 mm and 5 deg and every joint within 0.1 rad of a row "
-        "before. Contacts: mean. Approach and rotation: share hit of equal-area bins of approach directions and of "
+        "before; orange: more than 1 %. Contacts: mean. Approach and rotation: share hit of equal-area bins of approach directions and of "
         "equal-volume bins of rotations, and what as many uniform draws as there are poses would hit."
     )
     return table(columns, rows, caption=caption)
