@@ -95,7 +95,7 @@ def diversity_table(data: dict[str, Any]) -> str:
         rows.append(cells)
     caption = (
         "Poses: distinct object poses. Near-dup.: object within 5 mm and 5 deg and every joint within 0.1 rad of a row "
-        "before; orange: more than 1 %. Contacts: mean. Approach and rotation: share hit of equal-area bins of approach "
+        "before; orange: over 1 %. Contacts: mean. Approach and rotation: share hit of equal-area bins of approach "
         "directions and of equal-volume bins of rotations, and what as many uniform draws as there are poses would hit."
     )
     return table(columns, rows, caption=caption)
