@@ -1,13 +1,14 @@
 """Exact small QPs: the point of least norm in the convex hull of contact wrenches (Wolfe's algorithm in 6-D).
 
-Both published scores are this problem: FSWO (eq. 1) over the k frictionless wrenches, GSWO (eq. 2) over friction cones.
+Both published scores are this problem: FSWO (eq. 1) over the k frictionless wrenches, GSWO (eq. 2) over friction
+cones. So is the resistance to an outside force, of a hull moved by that force.
 """
 
 import warp as wp
 
 from lgrasp.device.transforms import tangent
 
-__all__ = ["MAX_CONTACTS", "balance", "frictionless", "vec6", "wrench"]
+__all__ = ["MAX_CONTACTS", "balance", "disturbance", "frictionless", "vec6", "wrench"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -91,41 +92,48 @@ def _affine_weights(G: mat8, m: wp.int32):
 
 
 @wp.func
-def balance(
+def _least_norm(
     arms: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     k: wp.int32,
     mu: wp.float32,
     edges: wp.int32,
     torque_scale: wp.float32,
+    load: vec6,
+    total: wp.float32,
+    less: wp.int32,
     stop: wp.float32,
+    limit: wp.float32,
+    exact: wp.float32,
     forces: wp.array(dtype=wp.vec3),
 ):
-    """min |sum_i (f_i, torque_scale * arm_i x f_i)| with f_i in the friction cone of n_i and sum_i f_i . n_i = 1.
+    """Point of least norm of ``load`` plus wrenches with f_i in the friction cone of n_i, by Wolfe's algorithm.
+
+    The normal forces add up to ``total``, or to at most that when ``less`` is 1.
 
     Args:
-        arms, normals: local arrays; contact i acts at ``arms[i]`` [m] along unit inward normal ``normals[i]``.
-        k: number of contacts. mu: friction coefficient. edges: cone edges, 0 for the round cone.
         stop: return as soon as the norm is below this.
+        limit: return as soon as the least norm is known to be above this.
+        exact: relative error of the squared norm.
         forces: (local, MAX_CONTACTS) receives the optimal forces.
-
-    Returns:
-        The least norm.
     """
     P = mat86()
     F = mat83()
     owner = vec8()
     w = vec8()
     G = mat8()
-    # start at the first contact's normal wrench
-    x = wrench(arms[0], normals[0], torque_scale)
+    # start at no force at all, or at the first contact's normal wrench
+    x = load
     m = int(1)
+    owner[0] = -1.0
+    if less == 0:
+        x = load + wrench(arms[0], normals[0] * total, torque_scale)
+        F[0, 0] = normals[0][0] * total
+        F[0, 1] = normals[0][1] * total
+        F[0, 2] = normals[0][2] * total
+        owner[0] = 0.0
     for c in range(6):
         P[0, c] = x[c]
-    F[0, 0] = normals[0][0]
-    F[0, 1] = normals[0][1]
-    F[0, 2] = normals[0][2]
-    owner[0] = 0.0
     w[0] = 1.0
     G[0, 0] = wp.dot(x, x)
     norm2 = G[0, 0]
@@ -136,8 +144,10 @@ def balance(
         xf = wp.vec3(x[0], x[1], x[2])
         xt = wp.vec3(x[3], x[4], x[5]) * torque_scale
         best = float(1.0e30)
-        bi = int(0)
+        bi = int(-1)
         bf = wp.vec3(0.0)
+        if less == 1:
+            best = 0.0
         for i in range(k):
             a = xf + wp.cross(xt, arms[i])
             f = _best_direction(a, normals[i], mu, edges)
@@ -146,9 +156,15 @@ def balance(
                 best = s
                 bi = i
                 bf = f
-        if best > norm2 - 1.0e-6 - 1.0e-4 * norm2 or m >= _CORRAL_C:
+        best = best * total + wp.dot(x, load)
+        if best > norm2 - 1.0e-6 - exact * norm2 or m >= _CORRAL_C:
             break
-        y = wrench(arms[bi], bf, torque_scale)
+        if best > 0.0 and best * best > limit * limit * norm2:
+            break
+        y = load
+        if bi >= 0:
+            bf = bf * total
+            y = load + wrench(arms[bi], bf, torque_scale)
         for c in range(6):
             P[m, c] = y[c]
         F[m, 0] = bf[0]
@@ -200,28 +216,87 @@ def balance(
             if m <= 1:
                 w[0] = 1.0
                 break
-        total = float(0.0)
+        share = float(0.0)
         for j in range(m):
             w[j] = wp.max(w[j], 0.0)
-            total += w[j]
+            share += w[j]
         for c in range(6):
             s = float(0.0)
             for j in range(m):
                 s += w[j] * P[j, c]
-            x[c] = s / total
+            x[c] = s / share
         last = norm2
         norm2 = wp.dot(x, x)
         if norm2 > last * 0.99999:
             break
     for i in range(k):
         forces[i] = wp.vec3(0.0)
-    total = float(0.0)
+    share = float(0.0)
     for j in range(m):
-        total += w[j]
+        share += w[j]
     for j in range(m):
         i = int(owner[j])
-        forces[i] = forces[i] + wp.vec3(F[j, 0], F[j, 1], F[j, 2]) * (w[j] / total)
+        if i >= 0:
+            forces[i] = forces[i] + wp.vec3(F[j, 0], F[j, 1], F[j, 2]) * (w[j] / share)
     return wp.sqrt(norm2)
+
+
+@wp.func
+def balance(
+    arms: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    mu: wp.float32,
+    edges: wp.int32,
+    torque_scale: wp.float32,
+    stop: wp.float32,
+    forces: wp.array(dtype=wp.vec3),
+):
+    """min |sum_i (f_i, torque_scale * arm_i x f_i)| with f_i in the friction cone of n_i and sum_i f_i . n_i = 1.
+
+    Args:
+        arms, normals: local arrays; contact i acts at ``arms[i]`` [m] along unit inward normal ``normals[i]``.
+        k: number of contacts. mu: friction coefficient. edges: cone edges, 0 for the round cone.
+        stop: return as soon as the norm is below this.
+        forces: (local, MAX_CONTACTS) receives the optimal forces.
+
+    Returns:
+        The least norm.
+    """
+    return _least_norm(arms, normals, k, mu, edges, torque_scale, vec6(), 1.0, 0, stop, 1.0e15, 1.0e-4, forces)
+
+
+@wp.func
+def disturbance(
+    arms: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    mu: wp.float32,
+    turn: wp.quat,
+    limit: wp.float32,
+):
+    """How much of a unit force on the centre of mass stays unresisted, in the worst of six directions; 0 to 1.
+
+    max_e min |e + sum_i (f_i, arm_i x f_i / 5 cm)| over e = +-x, +-y, +-z of the hand's base frame, with f_i in the
+    round friction cone of n_i and sum_i f_i . n_i <= 5: what cannot be held with five times the load is not held.
+
+    Args:
+        arms: from the centre of mass [m]. normals: inward.
+        turn: from the hand's base frame to that of arms and normals.
+        limit: return as soon as the residual is known to be above this.
+    """
+    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    worst = float(0.0)
+    for direction in range(6):
+        e = wp.vec3(0.0)
+        e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
+        e = wp.quat_rotate(turn, e)
+        load = vec6(e[0], e[1], e[2], 0.0, 0.0, 0.0)
+        r = _least_norm(arms, normals, k, mu, 0, 20.0, load, 5.0, 1, worst, limit, 1.0e-3, forces)
+        worst = wp.max(worst, r)
+        if worst > limit:
+            break
+    return worst
 
 
 @wp.func

@@ -9,7 +9,7 @@ from lgrasp.device.sdf import sdf_value
 from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.object.arrays import Object
 
-__all__ = ["body_clear", "body_depth"]
+__all__ = ["body_apart", "body_clear", "body_depth"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -28,6 +28,23 @@ def body_clear(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, slack: 
         s = hand.spheres[k]
         if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3] - slack:
             return False
+    return True
+
+
+@wp.func
+def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
+    """Are all surface samples of the body farther than ``margin`` [m] from the object? T = T_object_body."""
+    b = hand.pieces.body_sphere[body]
+    if b[3] < 0.0:
+        return True
+    if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))) > b[3] + margin:
+        return True
+    for k in range(hand.cluster_first[body], hand.cluster_first[body + 1]):
+        s = hand.cluster_sphere[k]
+        if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3] + margin:
+            for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+                if sdf_value(obj.sdf, wp.transform_point(T, hand.samples[i])) < margin:
+                    return False
     return True
 
 

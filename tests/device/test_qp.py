@@ -5,10 +5,10 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.wrench import cone_forces, is_balanced, residual
+from reference.wrench import cone_forces, is_balanced, residual, unresisted
 from scipy.spatial.transform import Rotation
 
-from lgrasp.device.qp import MAX_CONTACTS, balance, frictionless
+from lgrasp.device.qp import MAX_CONTACTS, balance, disturbance, frictionless
 from lgrasp.device.runtime import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -73,6 +73,33 @@ def solve(device, arms, normals, count=None, *, mu=0.0, edges=0, stop=0.0) -> tu
     force = wp.zeros((n, MAX_CONTACTS), dtype=wp.vec3, device=device)
     wp.launch(_balance, n, inputs, [norm, force], device=device)
     return norm.numpy(), force.numpy()
+
+
+@wp.kernel
+def _disturbance(
+    arm: wp.array2d(dtype=wp.vec3),
+    normal: wp.array2d(dtype=wp.vec3),
+    turn: wp.array(dtype=wp.quat),
+    mu: wp.float32,
+    limit: wp.float32,
+    worst_out: wp.array(dtype=wp.float32),
+):
+    i = wp.tid()
+    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    for c in range(arm.shape[1]):
+        arms[c] = arm[i, c]
+        normals[c] = normal[i, c]
+    worst_out[i] = disturbance(arms, normals, arm.shape[1], mu, turn[i], limit)
+
+
+def unheld(device, arms, normals, turn, mu=0.5, limit=1.0) -> np.ndarray:
+    """Disturbance residuals (n,) of problems with arms and normals (n, k, 3), turned by ``turn`` (n quaternions)."""
+    inputs = [wp.array(a.astype(np.float32), dtype=wp.vec3, device=device) for a in (arms, normals)]
+    inputs.append(wp.array(turn.as_quat().astype(np.float32), dtype=wp.quat, device=device))
+    worst = wp.empty(len(arms), dtype=wp.float32, device=device)
+    wp.launch(_disturbance, len(arms), [*inputs, mu, limit], [worst], device=device)
+    return worst.numpy()
 
 
 def units(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -243,3 +270,40 @@ def test_frictionless_bounds_the_exact_residual(device, k):
     np.testing.assert_allclose(score[full], exact[full], atol=3e-3)
     np.testing.assert_allclose(least[full], shares[full], atol=2e-3)
     assert (shares[least == 0] < 1e-3).all()
+
+
+@pytest.mark.parametrize("k", [2, 3, 5])
+def test_disturbance_solves_the_bounded_problem(device, k):
+    rng = np.random.default_rng(k)
+    n = 25
+    arms = 0.04 * units(rng, n, k)
+    normals = -arms / 0.04 + 0.6 * units(rng, n, k)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    turn = Rotation.random(n, rng=rng)
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    expected = [unresisted(arms[i], normals[i], 0.5, turn[i].apply(axes)) for i in range(n)]
+    np.testing.assert_allclose(unheld(device, arms, normals, turn), expected, atol=4e-3)
+
+
+def test_disturbance_of_simple_grasps(device):
+    """Two fingers on a line through the centre of mass hold what a pull of 1 N asks; what is not held stays whole."""
+    turn = Rotation.from_quat([[0, 0, 0, 1.0]])
+    x = np.array([[[-0.03, 0, 0], [0.03, 0, 0]]])
+    # a pull along x: one finger; along y or z: friction of both, 2 mu f_n >= 1 within the bound of 5
+    assert unheld(device, x, -x / 0.03, turn)[0] < 0.01
+    # no friction: nothing resists y and z
+    assert unheld(device, x, -x / 0.03, turn, mu=1e-6)[0] == pytest.approx(1.0, abs=1e-3)
+    # far from the centre of mass the torque of a sideways pull is not held by points on one line
+    far = x + np.array([0, 0.3, 0])
+    assert unheld(device, far, -x / 0.03, turn)[0] > 0.8
+    # the bound binds: a pull that needs f_n = 1 / (2 mu) = 10 > 5 / 2 each
+    assert unheld(device, x, -x / 0.03, turn, mu=0.05)[0] == pytest.approx(1 - 5 * 0.05, abs=0.01)
+
+
+def test_disturbance_limit_only_ends_early(device):
+    rng = np.random.default_rng(1)
+    arms, normals = 0.04 * units(rng, 200, 3), units(rng, 200, 3)
+    turn = Rotation.random(200, rng=rng)
+    full, cut = unheld(device, arms, normals, turn), unheld(device, arms, normals, turn, limit=0.3)
+    np.testing.assert_array_equal(full > 0.3, cut > 0.3)
+    np.testing.assert_allclose(cut[full <= 0.3], full[full <= 0.3], atol=1e-6)

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.optimize import linprog, nnls
 from scipy.spatial import ConvexHull, QhullError
 
-__all__ = ["cone_forces", "epsilon", "is_balanced", "residual", "wrenches"]
+__all__ = ["cone_forces", "epsilon", "is_balanced", "residual", "unresisted", "wrenches"]
 
 
 def cone_forces(normals: np.ndarray, mu: float, edges: int) -> np.ndarray:
@@ -55,3 +55,18 @@ def epsilon(arms: np.ndarray, normals: np.ndarray, mu: float, radius: float) -> 
     except QhullError:
         return 0.0
     return max(0.0, float(-hull.equations[:, 6].max()))
+
+
+def unresisted(arms: np.ndarray, normals: np.ndarray, mu: float, loads: np.ndarray, edges: int = 96) -> float:
+    """Largest over loads (m, 3) of the least norm of (load, 0) plus wrenches, torque / 5 cm, sum of normal forces <= 5.
+
+    Cones of many edges stand for round ones. The bound is an equality with a slack, weighted heavily.
+    """
+    W = wrenches(arms, cone_forces(normals, mu, edges), 20.0).T
+    heavy = 1e3
+    A = np.vstack([np.column_stack([W, np.zeros(6)]), np.full(W.shape[1] + 1, heavy)])
+    worst = 0.0
+    for load in loads:
+        w, _ = nnls(A, np.concatenate([-load, np.zeros(3), [5.0 * heavy]]), maxiter=100 * A.shape[1])
+        worst = max(worst, float(np.linalg.norm(W @ w[:-1] + np.append(load, np.zeros(3)))))
+    return worst

@@ -2,8 +2,8 @@
 
 __all__ = ["METRICS", "REASONS"]
 
-REASONS = ("kept", "unused finger", "self-collision", "object collision", "contact", "balance")
+REASONS = ("kept", "unused finger", "self-collision", "object collision", "contact", "balance", "disturbance")
 """Outcome codes of a set."""
 
-METRICS = ("fswo", "gswo", "epsilon", "penetration", "self_penetration", "gap", "normal_error")
+METRICS = ("fswo", "gswo", "disturbance", "epsilon", "penetration", "self_penetration", "gap", "normal_error")
 """Columns of the metrics table."""

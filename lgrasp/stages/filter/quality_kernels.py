@@ -1,9 +1,8 @@
-"""Kernels that finish grasps: balance, control poses, quality, and packing of the rows that are kept."""
+"""Kernels that finish grasps: balance, quality, and packing of the rows that are kept."""
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
-from lgrasp.device.qp import MAX_CONTACTS, balance
+from lgrasp.device.qp import MAX_CONTACTS, balance, disturbance
 from lgrasp.device.quality import epsilon_bound
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
@@ -12,7 +11,6 @@ from lgrasp.object.arrays import Object
 
 __all__ = [
     "balance_grasps",
-    "control_poses",
     "count_outcomes",
     "grasp_epsilon",
     "list_kept",
@@ -21,6 +19,9 @@ __all__ = [
 ]
 
 wp.set_module_options(KERNEL_OPTIONS)
+
+_NARROWER = wp.constant(2)  # cones tried before the full one
+_SLACK = wp.constant(1.0e-3)  # by which their residual may be larger
 
 
 @wp.func
@@ -46,15 +47,22 @@ def balance_grasps(
     friction: wp.float32,
     balanced: wp.float32,
     torque_scale: wp.float32,
+    most: wp.float32,
     max_depth: wp.float32,
+    pose: wp.array(dtype=wp.transform),
+    set_pose: wp.array(dtype=wp.int32),
     contact_surface: wp.array2d(dtype=wp.int32),
     depth: wp.array(dtype=wp.float32),
     outcome_out: wp.array(dtype=wp.int32),
     force_out: wp.array2d(dtype=wp.vec3),
     fswo_out: wp.array(dtype=wp.float32),
     gswo_out: wp.array(dtype=wp.float32),
+    disturbance_out: wp.array(dtype=wp.float32),
 ):
-    """FSWO (eq. 1), GSWO (eq. 2, 8-edge cones) and its forces, object frame."""
+    """FSWO (eq. 1), GSWO (eq. 2, 8-edge cones), the disturbance residual, and balancing forces in the object's frame.
+
+    The forces are those of the narrowest of a few round cones that balances as well: far from slipping.
+    """
     i = wp.tid()
     if outcome_out[i] != 0:
         return
@@ -64,6 +72,7 @@ def balance_grasps(
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     k = _contacts(obj, contact_surface[i], arms, normals)
     centroid = wp.vec3(0.0)
     for c in range(k):
@@ -77,7 +86,21 @@ def balance_grasps(
         outcome_out[i] = 5
         return
     for c in range(k):
+        points[c] = arms[c] + centroid / float(k) - obj.com
+    turn = wp.quat_inverse(wp.transform_get_rotation(pose[set_pose[i]]))
+    worst = disturbance(points, normals, k, friction, turn, most)
+    disturbance_out[i] = worst
+    if worst > most:
+        outcome_out[i] = 6
+        return
+    for c in range(k):
         force_out[i, c] = forces[c]
+    for step in range(_NARROWER):
+        mu = friction * (float(step) + 1.0) / float(_NARROWER + 1)
+        if balance(arms, normals, k, mu, 0, torque_scale, gswo + 0.5 * _SLACK, forces) <= gswo + _SLACK:
+            for c in range(k):
+                force_out[i, c] = forces[c]
+            break
 
 
 @wp.kernel
@@ -139,83 +162,6 @@ def self_overlap(
     if i >= rows[0]:
         return
     depth_out[i] = overlap_depth(hand, body, row[i])
-
-
-@wp.func
-def _shift_contact(hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, point: wp.vec3, by: wp.vec3):
-    """Joint positions that move a point of the group's body j by ``by`` [m] (three damped steps), limits kept."""
-    j0 = hand.kin.joint_first[g]
-    dofs = hand.kin.dof_free[g]
-    q = q0
-    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    target = wp.vec3(0.0)
-    for it in range(3):
-        group_forward(hand.kin, g, q, X, 0)
-        p = wp.transform_point(X[j], point)
-        if it == 0:
-            target = p + by
-        e = target - p
-        J = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
-        a = j
-        while a >= 0:
-            d = hand.kin.joint_dof[j0 + a]
-            J[d] = J[d] + point_column(hand.kin, j0 + a, X[a], p)
-            a = hand.kin.joint_parent[j0 + a]
-        # damped right inverse: dq = J^T (J J^T + c I)^-1 e
-        A = wp.identity(n=3, dtype=wp.float32) * 1.0e-4
-        for d in range(dofs):
-            A = A + wp.outer(J[d], J[d])
-        y = wp.inverse(A) * e
-        for d in range(dofs):
-            q[d] = q[d] + wp.clamp(wp.dot(J[d], y), -0.4, 0.4)
-        q = clamp_dofs(hand.kin, g, q)
-    return q
-
-
-@wp.kernel
-def control_poses(
-    hand: Hand,
-    obj: Object,
-    open_distance: wp.float32,
-    press_distance: wp.float32,
-    pose: wp.array(dtype=wp.transform),
-    set_pose: wp.array(dtype=wp.int32),
-    contact: wp.array2d(dtype=wp.int32),
-    contact_surface: wp.array2d(dtype=wp.int32),
-    body: wp.array2d(dtype=wp.transform),
-    posture: wp.array2d(dtype=vec_dof),
-    rows: wp.array(dtype=wp.int32),
-    row: wp.array(dtype=wp.int32),
-    q_out: wp.array2d(dtype=wp.float32),
-    pregrasp_out: wp.array2d(dtype=wp.float32),
-    squeeze_out: wp.array2d(dtype=wp.float32),
-):
-    """One thread per (kept row, group): q, and q with the contact moved out of and into the object."""
-    i, g = wp.tid()
-    if i >= rows[0]:
-        return
-    s = row[i]
-    x = posture[s, g]
-    opened = x
-    pressed = x
-    j0 = hand.kin.joint_first[g]
-    for k in range(contact.shape[1]):
-        c = contact[s, k]
-        if c >= 0:
-            b = hand.contacts.body[c]
-            if b > j0 and b <= hand.kin.joint_first[g + 1]:
-                T = pose[set_pose[s]]
-                p = wp.transform_point(T, obj.contact_points[contact_surface[s, k]])
-                n = wp.transform_vector(T, obj.contact_normals[contact_surface[s, k]])
-                local = wp.transform_point(wp.transform_inverse(body[s, b - 1]), p)
-                opened = _shift_contact(hand, g, x, b - 1 - j0, local, n * open_distance)
-                pressed = _shift_contact(hand, g, x, b - 1 - j0, local, -n * press_distance)
-    first = hand.kin.dof_first[g]
-    for d in range(hand.kin.dof_first[g + 1] - first):
-        column = hand.kin.dof_index[first + d]
-        q_out[i, column] = x[d]
-        pregrasp_out[i, column] = opened[d]
-        squeeze_out[i, column] = pressed[d]
 
 
 @wp.kernel

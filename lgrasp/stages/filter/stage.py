@@ -10,13 +10,13 @@ from lgrasp.device.kinematics import vec_dof
 from lgrasp.grasp.tables import ContactSets, GraspTable, trim_sets
 from lgrasp.grasp.tally import Tally, empty_tally, read_tallies
 from lgrasp.stages.context import Context
+from lgrasp.stages.filter.control_kernels import control_poses, open_poses
 from lgrasp.stages.filter.object_kernels import deepen
 from lgrasp.stages.filter.outcomes import METRICS, REASONS
 from lgrasp.stages.filter.params import FilterParams
 from lgrasp.stages.filter.posture_kernels import fill_unused, place_used
 from lgrasp.stages.filter.quality_kernels import (
     balance_grasps,
-    control_poses,
     count_outcomes,
     grasp_epsilon,
     list_kept,
@@ -26,7 +26,7 @@ from lgrasp.stages.filter.quality_kernels import (
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 4
+VERSION = 5
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, Tally]:
@@ -46,8 +46,8 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     body = wp.empty((n, bodies - 1), dtype=wp.transform, device=d)
     posture = wp.empty((n, groups), dtype=vec_dof, device=d)
     contact, contact_surface = (wp.empty((n, groups + 1), dtype=wp.int32, device=d) for _ in range(2))
-    numbers = wp.zeros((5, max(n, 1)), dtype=wp.float32, device=d)
-    gap, dot, fswo, gswo, depth = (numbers[i] for i in range(5))
+    numbers = wp.zeros((6, max(n, 1)), dtype=wp.float32, device=d)
+    gap, dot, fswo, gswo, disturbance, depth = (numbers[i] for i in range(6))
     force = wp.empty((n, groups + 1), dtype=wp.vec3, device=d)
     wp.launch(
         place_used,
@@ -109,8 +109,19 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     wp.launch(
         balance_grasps,
         dim=n,
-        inputs=[obj, params.friction, params.balance, params.torque_scale, params.penetration, contact_surface, depth],
-        outputs=[outcome, force, fswo, gswo],
+        inputs=[
+            obj,
+            params.friction,
+            params.balance,
+            params.torque_scale,
+            params.disturbance,
+            params.penetration,
+            poses.pose,
+            inputs.pose,
+            contact_surface,
+            depth,
+        ],
+        outputs=[outcome, force, fswo, gswo, disturbance],
         device=d,
     )
     tally = empty_tally(REASONS, d)
@@ -131,7 +142,7 @@ class _Checked:
     contact: wp.array  # (n, groups + 1)
     contact_surface: wp.array  # (n, groups + 1)
     force: wp.array  # (n, groups + 1)
-    numbers: wp.array  # (5, n) gap, dot of normals, fswo, gswo, penetration
+    numbers: wp.array  # (6, n) gap, dot of normals, fswo, gswo, disturbance, penetration
     row: wp.array  # (n,) the sets that passed first
 
 
@@ -144,6 +155,7 @@ def _kept_rows(
     groups, dofs = context.hand.model.groups, context.hand.model.dofs
     poses, rows, row = inputs.candidates.poses, tally.device[:1], checked.row
     q, pregrasp, squeeze = (wp.empty((m, dofs), dtype=wp.float32, device=d) for _ in range(3))
+    opened = wp.empty((m, groups), dtype=vec_dof, device=d)
     wp.launch(
         control_poses,
         dim=(m, groups),
@@ -151,17 +163,38 @@ def _kept_rows(
             hand,
             obj,
             params.open_distance,
-            params.press_distance,
+            params.squeeze_force,
+            params.stiffness,
             poses.pose,
             inputs.pose,
             checked.contact,
             checked.contact_surface,
+            checked.force,
             checked.body,
             checked.posture,
             rows,
             row,
         ],
-        outputs=[q, pregrasp, squeeze],
+        outputs=[q, squeeze, opened],
+        device=d,
+    )
+    wp.launch(
+        open_poses,
+        dim=m,
+        inputs=[
+            hand,
+            obj,
+            params.open_margin,
+            params.self_margin,
+            poses.pose,
+            inputs.pose,
+            inputs.chosen,
+            checked.posture,
+            opened,
+            rows,
+            row,
+        ],
+        outputs=[pregrasp],
         device=d,
     )
     epsilon, overlap = (wp.empty(m, dtype=wp.float32, device=d) for _ in range(2))
@@ -177,7 +210,7 @@ def _kept_rows(
     point, normal, push = (wp.empty((m, groups + 1), dtype=wp.vec3, device=d) for _ in range(3))
     link = wp.empty((m, groups + 1), dtype=wp.int32, device=d)
     index, slot = (wp.empty(m, dtype=wp.int32, device=d) for _ in range(2))
-    numbers = wp.empty((5, m), dtype=wp.float32, device=d)
+    numbers = wp.empty((6, m), dtype=wp.float32, device=d)
     wp.launch(
         pack_rows,
         dim=m,
@@ -202,10 +235,11 @@ def _kept_rows(
     *fetched, measured = read_tallies([tally], [*columns, numbers])
     kept = tally["kept"]
     fetched = [values[:kept] for values in fetched]
-    gap, dot, fswo, gswo, depth = measured[:, :kept]
+    gap, dot, fswo, gswo, disturbance, depth = measured[:, :kept]
     values = {
         "fswo": fswo,
         "gswo": gswo,
+        "disturbance": disturbance,
         "epsilon": fetched[10],
         "penetration": depth,
         "self_penetration": fetched[11],

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from lgrasp.device.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward, vec_dof
-from lgrasp.device.qp import MAX_CONTACTS, balance, frictionless
+from lgrasp.device.qp import MAX_CONTACTS, balance, disturbance, frictionless
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.clearance import group_pairs_clear
@@ -247,16 +247,18 @@ def check_starts(
     obj: Object,
     friction: wp.float32,
     balanced: wp.float32,
+    most: wp.float32,
     torque_scale: wp.float32,
     margin: wp.float32,
     realised: wp.int32,
+    pose: wp.array(dtype=wp.transform),
     palm_surface: wp.array(dtype=wp.int32),
     surface: wp.array3d(dtype=wp.int32),
     q: wp.array3d(dtype=vec_dof),
     chosen: wp.array3d(dtype=wp.int32),
     score_out: wp.array2d(dtype=wp.float32),
 ):
-    """Scores of the hits that friction does not balance, or whose realised fingers meet, go below 0."""
+    """Scores of hits go below 0 when friction does not balance them or lets go of the object, or when fingers meet."""
     i = wp.tid()
     if i >= number[0]:
         return
@@ -282,6 +284,13 @@ def check_starts(
     if balance(arms, normals, n, friction * _INSCRIBED, 0, torque_scale, 0.5 * balanced, forces) > balanced:
         score_out[row, lane] = -1.0
         return
+    if most < 1.0:
+        for c in range(n):
+            points[c] = points[c] - obj.com
+        turn = wp.quat_inverse(wp.transform_get_rotation(pose[row]))
+        if disturbance(points, normals, n, friction, turn, most) > most:
+            score_out[row, lane] = -1.0
+            return
     if realised == 0:
         return
     Xa = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)

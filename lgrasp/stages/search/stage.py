@@ -21,7 +21,7 @@ from lgrasp.stages.search.params import MAX_KINDS, SearchParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 6
+VERSION = 7
 
 _CPU_LANES = 2
 _GPU_LANES = 10
@@ -101,9 +101,11 @@ def run(
                 context.object.struct,
                 params.friction,
                 params.balance,
+                params.disturbance,
                 params.torque_scale,
                 params.margin,
                 int(realised),
+                inputs.poses.pose,
                 inputs.poses.palm_surface,
                 inputs.surface,
                 inputs.q,

@@ -6,7 +6,6 @@ from reference.wrench import residual
 from scipy.spatial.transform import Rotation
 
 from lgrasp.grasp.tables import set_arrays, set_table
-from lgrasp.stages.filter.params import FilterParams
 from lgrasp.stages.filter.stage import REASONS, run
 
 
@@ -80,27 +79,66 @@ def test_contacts(finished, inputs, link_poses, link_distance):
 
 
 def test_control_poses(finished, inputs, link_poses):
-    """The pregrasp backs off from the object along the contact normals, the squeeze presses into it."""
-    grasps = finished[0]
+    """The pregrasp backs off along the contact normals; the squeeze presses with the balancing forces."""
+    grasps, _, params = finished
+    tree = inputs.hand.model.tree
     R, t = Rotation.from_quat(grasps.pose[:, 3:]), grasps.pose[:, :3]
-    base, opened, pressed = (link_poses(q) for q in (grasps.q, grasps.q_pregrasp, grasps.q_squeeze))
-    away = {"open": [], "press": []}
-    for c in range(inputs.hand.model.groups):
+    base, opened = (link_poses(q) for q in (grasps.q, grasps.q_pregrasp))
+    away, torque = [], np.zeros_like(grasps.q)
+    for c in range(inputs.hand.model.groups + 1):
         rows = np.flatnonzero(grasps.contact_links[:, c] >= 0)
+        if not len(rows):
+            continue
         link = grasps.contact_links[rows, c]
         p = R[rows].apply(grasps.contact_points[rows, c]) + t[rows]
         n = R[rows].apply(grasps.contact_normals[rows, c])
-        moving = inputs.hand.model.tree.link_body[link] > 0
+        f = R[rows].apply(grasps.contact_forces[rows, c]) * params.squeeze_force
         B = base[rows, link]
         local = np.einsum("nji,nj->ni", B[:, :3, :3], p - B[:, :3, 3])
-        for name, X in (("open", opened), ("press", pressed)):
+
+        def moved(X, rows=rows, link=link, local=local, p=p):
             T = X[rows, link]
-            shift = np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3] - p
-            away[name] += (shift * n).sum(1)[moving].tolist()
-    assert np.median(away["open"]) > 0.7 * FilterParams().open_distance
-    assert np.median(away["press"]) < -0.7 * FilterParams().press_distance
-    assert np.quantile(away["open"], 0.1) > 0
-    assert np.quantile(away["press"], 0.9) < 0
+            return np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3] - p
+
+        away += (moved(opened) * n).sum(1)[tree.link_body[link] > 0].tolist()
+        for d in range(grasps.q.shape[1]):  # J^T f by central differences
+            step = np.zeros_like(grasps.q)
+            step[:, d] = 1e-3
+            column = (moved(link_poses(grasps.q + step)) - moved(link_poses(grasps.q - step))) / 2e-3
+            torque[rows, d] += (column * f).sum(1)
+    assert np.median(away) > 0.7 * params.open_distance
+    assert np.quantile(away, 0.1) >= 0
+    wanted = grasps.q + torque / params.stiffness
+    inside = np.clip(wanted, tree.listed_limits[:, 0], tree.listed_limits[:, 1])
+    np.testing.assert_allclose(grasps.q_squeeze, inside, atol=2e-4)
+
+
+def test_pregrasp_is_clear(finished, inputs, link_poses, link_distance):
+    """Touching links are off the object by the margin, unless the pregrasp is the grasp itself."""
+    grasps, _, params = finished
+    X = link_poses(grasps.q_pregrasp)
+    vertices = inputs.object.model.obstacle_points[::7]
+    checked = 0
+    for i in range(0, len(grasps), 5):
+        if np.abs(grasps.q_pregrasp[i] - grasps.q[i]).max() < 1e-6:
+            continue
+        points = Rotation.from_quat(grasps.pose[i, 3:]).apply(vertices) + grasps.pose[i, :3]
+        for link in np.unique(grasps.contact_links[i]):
+            if link >= 0 and inputs.hand.model.tree.link_body[link] > 0:
+                local = (points - X[i, link, :3, 3]) @ X[i, link, :3, :3]
+                near = np.linalg.norm(local, axis=1) < 0.08
+                assert link_distance(int(link), local[near]).min() > 0.5 * params.open_margin
+                checked += 1
+    assert checked > 10
+
+
+def test_disturbance_is_bounded_where_asked(tables, context, swift):
+    params = swift.params("filter").model_copy(update={"disturbance": 0.2})
+    free, bound = run(tables.search, swift.params("filter"), context), run(tables.search, params, context)
+    assert (free[0].metrics["disturbance"] > 0.2).sum() == bound[1]["disturbance"] > 0
+    assert bound[0].metrics["disturbance"].max() <= 0.2
+    kept = free[0].metrics["disturbance"] <= 0.2
+    np.testing.assert_array_equal(free[0].q[kept], bound[0].q)
 
 
 def test_bounds_bind(tables, context, swift):

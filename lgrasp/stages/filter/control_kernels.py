@@ -1,0 +1,186 @@
+"""Kernels of the control poses: the hand opened before the grasp, and joint targets that press."""
+
+import warp as wp
+
+from lgrasp.device.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.grasp.clearance import body_apart
+from lgrasp.hand.arrays import Hand
+from lgrasp.hand.clearance import group_pairs_clear
+from lgrasp.object.arrays import Object
+
+__all__ = ["control_poses", "open_poses"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_LEVER = wp.constant(0.1)  # [m] a sliding joint is as stiff as a revolute one at this arm
+_SHARES = wp.constant(5)  # of the way open that are tried
+
+
+@wp.func
+def _shift_contact(hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, point: wp.vec3, by: wp.vec3):
+    """Joint positions that move a point of the group's body j by ``by`` [m] (three damped steps), limits kept."""
+    j0 = hand.kin.joint_first[g]
+    dofs = hand.kin.dof_free[g]
+    q = q0
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    target = wp.vec3(0.0)
+    for it in range(3):
+        group_forward(hand.kin, g, q, X, 0)
+        p = wp.transform_point(X[j], point)
+        if it == 0:
+            target = p + by
+        e = target - p
+        J = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
+        a = j
+        while a >= 0:
+            d = hand.kin.joint_dof[j0 + a]
+            J[d] = J[d] + point_column(hand.kin, j0 + a, X[a], p)
+            a = hand.kin.joint_parent[j0 + a]
+        # damped right inverse: dq = J^T (J J^T + c I)^-1 e
+        A = wp.identity(n=3, dtype=wp.float32) * 1.0e-4
+        for d in range(dofs):
+            A = A + wp.outer(J[d], J[d])
+        y = wp.inverse(A) * e
+        for d in range(dofs):
+            q[d] = q[d] + wp.clamp(wp.dot(J[d], y), -0.4, 0.4)
+        q = clamp_dofs(hand.kin, g, q)
+    return q
+
+
+@wp.func
+def _pressed(
+    hand: Hand,
+    g: wp.int32,
+    q0: vec_dof,
+    j: wp.int32,
+    body: wp.array(dtype=wp.transform),
+    p: wp.vec3,
+    f: wp.vec3,
+    k: wp.float32,
+):
+    """q + J^T f / stiffness: targets at which position control presses with force f [N] on point p of body j."""
+    j0 = hand.kin.joint_first[g]
+    q = q0
+    a = j
+    while a >= 0:
+        stiffness = k
+        if hand.kin.joint_prismatic[j0 + a] == 1:
+            stiffness = k / (_LEVER * _LEVER)
+        d = hand.kin.joint_dof[j0 + a]
+        if d < hand.kin.dof_free[g]:
+            q[d] = q[d] + wp.dot(point_column(hand.kin, j0 + a, body[j0 + a], p), f) / stiffness
+        a = hand.kin.joint_parent[j0 + a]
+    return clamp_dofs(hand.kin, g, q)
+
+
+@wp.kernel
+def control_poses(
+    hand: Hand,
+    obj: Object,
+    open_distance: wp.float32,
+    squeeze_force: wp.float32,
+    stiffness: wp.float32,
+    pose: wp.array(dtype=wp.transform),
+    set_pose: wp.array(dtype=wp.int32),
+    contact: wp.array2d(dtype=wp.int32),
+    contact_surface: wp.array2d(dtype=wp.int32),
+    force: wp.array2d(dtype=wp.vec3),
+    body: wp.array2d(dtype=wp.transform),
+    posture: wp.array2d(dtype=vec_dof),
+    rows: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    q_out: wp.array2d(dtype=wp.float32),
+    squeeze_out: wp.array2d(dtype=wp.float32),
+    opened_out: wp.array2d(dtype=vec_dof),
+):
+    """One thread per (kept row, group): q, q that presses, and the posture with the contact moved off the object.
+
+    The squeeze presses with the balancing forces, ``squeeze_force`` [N] in all along the normals.
+    """
+    i, g = wp.tid()
+    if i >= rows[0]:
+        return
+    s = row[i]
+    x = posture[s, g]
+    opened = x
+    pressed = x
+    j0 = hand.kin.joint_first[g]
+    for k in range(contact.shape[1]):
+        c = contact[s, k]
+        if c >= 0:
+            b = hand.contacts.body[c]
+            if b > j0 and b <= hand.kin.joint_first[g + 1]:
+                T = pose[set_pose[s]]
+                p = wp.transform_point(T, obj.contact_points[contact_surface[s, k]])
+                n = wp.transform_vector(T, obj.contact_normals[contact_surface[s, k]])
+                local = wp.transform_point(wp.transform_inverse(body[s, b - 1]), p)
+                opened = _shift_contact(hand, g, x, b - 1 - j0, local, n * open_distance)
+                f = wp.transform_vector(T, force[s, k]) * squeeze_force
+                pressed = _pressed(hand, g, x, b - 1 - j0, body[s], p, f, stiffness)
+    first = hand.kin.dof_first[g]
+    for d in range(hand.kin.dof_first[g + 1] - first):
+        column = hand.kin.dof_index[first + d]
+        q_out[i, column] = x[d]
+        squeeze_out[i, column] = pressed[d]
+    opened_out[i, g] = opened
+
+
+@wp.kernel
+def open_poses(
+    hand: Hand,
+    obj: Object,
+    margin: wp.float32,
+    self_margin: wp.float32,
+    pose: wp.array(dtype=wp.transform),
+    set_pose: wp.array(dtype=wp.int32),
+    chosen: wp.array2d(dtype=wp.int32),
+    posture: wp.array2d(dtype=vec_dof),
+    opened: wp.array2d(dtype=vec_dof),
+    rows: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    pregrasp_out: wp.array2d(dtype=wp.float32),
+):
+    """The touching fingers as far open as leaves them apart from the object and the rest of the hand by the margins.
+
+    Shares of the way from q to ``opened`` are tried from all of it down; q itself when none is clear.
+    """
+    i = wp.tid()
+    if i >= rows[0]:
+        return
+    s = row[i]
+    G = hand.kin.groups
+    T_object = wp.transform_inverse(pose[set_pose[s]])
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    share = float(1.0)
+    for t in range(_SHARES + 1):
+        share = 1.0 - float(t) / float(_SHARES)
+        clear = int(1)
+        for g in range(G):
+            x = posture[s, g] + share * (opened[i, g] - posture[s, g])
+            first = hand.kin.joint_first[g]
+            group_forward(hand.kin, g, x, X, first)
+            if chosen[s, g] >= 0:
+                for k in range(first, hand.kin.joint_first[g + 1]):
+                    if clear == 1 and not body_apart(hand, obj, 1 + k, T_object * X[k], margin):
+                        clear = 0
+        for b in range(G):
+            for a in range(b + 2):
+                at = int(0)
+                moves = int(0)
+                if chosen[s, b] >= 0:
+                    moves = 1
+                if a > 0:
+                    at = hand.kin.joint_first[a - 1]
+                    if chosen[s, a - 1] >= 0:
+                        moves = 1
+                to = hand.kin.joint_first[b]
+                if clear * moves == 1 and not group_pairs_clear(hand, a, b + 1, X, at, X, to, self_margin):
+                    clear = 0
+        if clear == 1:
+            break
+    for g in range(G):
+        first = hand.kin.dof_first[g]
+        x = posture[s, g] + share * (opened[i, g] - posture[s, g])
+        for d in range(hand.kin.dof_first[g + 1] - first):
+            pregrasp_out[i, hand.kin.dof_index[first + d]] = x[d]
