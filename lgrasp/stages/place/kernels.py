@@ -98,14 +98,17 @@ def rate_pose(
     setting: wp.int32,
     palm: wp.int32,
     samples: wp.int32,
+    reach: wp.float32,
     anchor: wp.array(dtype=wp.int32),
     state: wp.uint32,
 ):
-    """How many pairs of reachable contacts of different groups oppose each other.
+    """How many pairs of reachable contacts of different groups oppose each other about the centre of mass.
 
-    A pair counts when each contact's inward normal is within 40 degrees of the line to the other. ``anchor`` holds an
-    object contact point that each group can touch, or gets one.
+    A pair counts when each contact's inward normal is within 40 degrees of the line to the other, and the line passes
+    the centre of mass within ``reach`` [m]. ``anchor`` holds an object contact point that each group can touch, or gets
+    one.
     """
+    com = wp.transform_point(T, obj.com)
     points = wp.zeros(shape=(_MAX_RATED,), dtype=wp.vec3)
     normals = wp.zeros(shape=(_MAX_RATED,), dtype=wp.vec3)
     owner = wp.zeros(shape=(_MAX_RATED,), dtype=wp.int32)
@@ -145,7 +148,9 @@ def rate_pose(
                 # hand normals point into the object, so towards each other
                 limit = 0.766 * wp.length(d)
                 if a > limit and b > limit:
-                    rating += 1
+                    u = wp.clamp(wp.dot(com - points[i], d) / wp.dot(d, d), 0.0, 1.0)
+                    if wp.length(com - points[i] - d * u) < reach:
+                        rating += 1
     return rating
 
 
@@ -160,6 +165,7 @@ def propose_poses(
     pinch: wp.float32,
     palm_share: wp.float32,
     samples: wp.int32,
+    reach: wp.float32,
     clearance: wp.float32,
     pose_out: wp.array2d(dtype=wp.transform),
     palm_point_out: wp.array2d(dtype=wp.int32),
@@ -223,7 +229,7 @@ def propose_poses(
     if rating < 0 and body_clear(hand, obj, 0, wp.transform_inverse(T), clearance):
         rating = 1
         if samples > 0:
-            rating = rate_pose(hand, field, obj, T, setting, palm, samples, anchor, wp.rand_init(wp.randi(state)))
+            rating = rate_pose(hand, field, obj, T, setting, palm, samples, reach, anchor, wp.rand_init(wp.randi(state)))
     pose_out[row, b] = T
     palm_point_out[row, b] = palm
     surface_out[row, b] = i

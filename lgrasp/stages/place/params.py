@@ -24,4 +24,10 @@ class PlaceParams(BaseModel):
         8, ge=1, le=256, description="Poses tried per candidate; the one with the richest contacts stays."
     )
     samples: int = Field(24, ge=0, le=256, description="Surface points per finger that rate a pose; 0: no rating.")
+    reach: float = Field(
+        10.0,
+        gt=0,
+        le=10,
+        description="Contacts rate a pose when the line between two passes this near the centre of mass [m].",
+    )
     clearance: float = Field(0.0005, ge=0, le=0.01, description="Penetration of static links that is forgiven [m].")

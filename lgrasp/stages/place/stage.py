@@ -11,7 +11,7 @@ from lgrasp.stages.place.params import PlaceParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 4
+VERSION = 5
 
 
 def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Context) -> tuple[PoseTable, Tally]:
@@ -51,6 +51,7 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
             params.pinch / total,
             params.palm / total,
             params.samples,
+            params.reach,
             params.clearance,
         ],
         outputs=[pose, palm_point, surface, setting, anchor, rating],
