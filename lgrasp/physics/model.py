@@ -17,7 +17,6 @@ __all__ = ["Model", "build_model", "import_mujoco"]
 OBJECT = "lgrasp object"
 _POSTURES = 200
 _NEARLY = 0.95  # of all postures; links that touch so often are left to touch
-_MOST_VERTICES = 48  # of a colliding piece
 _LEAST_MASS, _LEAST_INERTIA = 1.0e-3, 1.0e-7  # [kg], [kg m^2] of links whose URDF gives less
 
 
@@ -89,9 +88,9 @@ def build_model(scene: Scene, protocol: Protocol, q: np.ndarray) -> Model:
         _add_pieces(mujoco, spec, hand)
         _add_drives(mujoco, spec, protocol, load)
         _add_object(mujoco, spec, scene, load)
-        for geom in spec.geoms:
+        for geom in spec.geoms:  # the larger condim of a pair counts: links slide on links without friction
             geom.friction = [protocol.friction, protocol.torsion, 1.0e-4]
-            geom.condim = 4
+            geom.condim = 4 if geom.parent.name == OBJECT else 1
         _exclude_neighbours(spec, hand)
         first = spec.compile()
         for a, b in _always_touching(mujoco, first):
@@ -130,7 +129,7 @@ def _add_pieces(mujoco: Any, spec: Any, hand: HandSolids) -> None:
 
 def _add_piece(mujoco: Any, spec: Any, body: Any, piece: Piece, name: str) -> None:
     if len(piece.planes):
-        _add_hull(mujoco, spec, body, piece.vertices, name)
+        _add_hull(mujoco, spec, body, _inflated(piece), name)
     elif len(piece.vertices) == 1:
         size = [piece.radius, 0, 0]
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=piece.vertices[0])
@@ -139,12 +138,23 @@ def _add_piece(mujoco: Any, spec: Any, body: Any, piece: Piece, name: str) -> No
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[piece.radius, 0, 0], fromto=ends)
 
 
+def _inflated(piece: Piece) -> np.ndarray:
+    """Vertices (V, 3) of a hull grown by the piece's radius, a fraction of a millimetre."""
+    if piece.radius == 0.0:
+        return piece.vertices
+    hull = ConvexHull(piece.vertices)
+    normals = np.zeros_like(piece.vertices)
+    for face in hull.simplices.T:
+        np.add.at(normals, face, hull.equations[:, :3])
+    return piece.vertices + piece.radius * normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-9)[:, None]
+
+
 def _add_hull(mujoco: Any, spec: Any, body: Any, vertices: np.ndarray, name: str) -> None:
     try:
         ConvexHull(vertices)
     except QhullError:  # a sliver
         return
-    mesh = spec.add_mesh(name=name, uservert=np.asarray(vertices, float).ravel(), maxhullvert=_MOST_VERTICES)
+    mesh = spec.add_mesh(name=name, uservert=np.asarray(vertices, float).ravel())
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
 

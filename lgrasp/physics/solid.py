@@ -12,10 +12,10 @@ from lgrasp.hand.distance import signed_distance
 
 __all__ = ["Solid", "solid_of_mesh"]
 
-_DENT = 1.5e-3  # dents shallower than this [m] may stay filled
-_MOST_PIECES = 64
-_TIMEOUT = 180.0  # [s]
-_SIMPLER = 3.0e-4  # surface details below this [m] only slow the cutting down
+_DENT = 2.0e-3  # dents shallower than this [m] may stay filled
+_MOST_PIECES = 128
+_EFFORTS = ((1.5e-4, _DENT, 180.0), (5.0e-4, 2 * _DENT, 120.0))
+# tried in turn: surface details [m] that are smoothed away first, dents [m] that may stay filled, time [s]
 _SLIVER = 1.0e-11  # [m^3] a piece of less volume is left out
 
 
@@ -59,11 +59,16 @@ def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device
     pieces = [mesh.vertices[hull.vertices]]
     excess = _excess(mesh, pieces, device)
     if excess > _DENT:
-        try:
-            pieces = _cut(mesh, decompose)
-            excess = _excess(mesh, pieces, device)
-        except DecomposeError as error:
-            notes.append(f"the convex hull stands for the mesh, its dents are filled ({error})")
+        failures = []
+        for effort in _EFFORTS:
+            try:
+                pieces = _cut(mesh, decompose, *effort)
+                excess = _excess(mesh, pieces, device)
+                break
+            except DecomposeError as error:
+                failures.append(str(error))
+        else:
+            notes.append(f"the convex hull stands for the mesh, its dents are filled ({failures[-1]})")
     return Solid(
         name=name,
         pieces=tuple(np.ascontiguousarray(piece, float) for piece in pieces),
@@ -75,21 +80,15 @@ def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device
     )
 
 
-def _cut(mesh: trimesh.Trimesh, decompose: Decompose) -> list[np.ndarray]:
+def _cut(mesh: trimesh.Trimesh, decompose: Decompose, detail: float, dent: float, timeout: float) -> list[np.ndarray]:
     """Vertices (V, 3) of convex pieces of a dented mesh.
 
     Raises:
         DecomposeError: time-out, crash, or nothing usable came back.
     """
-    simple = _simplified(mesh)
+    simple = _simplified(mesh, detail)
     points, triangles = np.asarray(simple.vertices), np.asarray(simple.faces)
-    found = decompose(
-        points,
-        triangles,
-        threshold=_DENT,
-        max_pieces=_MOST_PIECES,
-        timeout=_TIMEOUT,
-    )
+    found = decompose(points, triangles, threshold=dent, max_pieces=_MOST_PIECES, timeout=timeout)
     pieces = []
     for vertices in found:
         try:
@@ -103,15 +102,15 @@ def _cut(mesh: trimesh.Trimesh, decompose: Decompose) -> list[np.ndarray]:
     return pieces
 
 
-def _simplified(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh without details that only cost time; itself where it bounds no solid."""
+def _simplified(mesh: trimesh.Trimesh, detail: float) -> trimesh.Trimesh:
+    """The mesh without surface details below ``detail`` [m]; itself where it bounds no solid."""
     try:
         import manifold3d
     except ImportError:  # comes with trimesh[easy]
         return mesh
 
     given = manifold3d.Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
-    solid = manifold3d.Manifold(given).simplify(_SIMPLER)
+    solid = manifold3d.Manifold(given).simplify(detail)
     if solid.is_empty():
         return mesh
     made = solid.to_mesh()

@@ -108,7 +108,9 @@ class Trial:
                 if (step + 1) % self._chunk == 0 or step + 1 == steps:
                     moved = self._moved()
                     worst = (max(worst[0], moved[0]), max(worst[1], moved[1]))
-                    if self._wild() or worst[0] > self._limits[0] or worst[1] > self._limits[1]:
+                    if self._wild():
+                        return _Closed(contacts)
+                    if worst[0] > self._limits[0] or worst[1] > self._limits[1]:
                         return _Closed(contacts, displacement=worst[0], rotation=worst[1])
             if phase == 0:
                 contacts = self._links_touching(self._m, self._data)
@@ -131,7 +133,9 @@ class Trial:
             done += steps
             moved = self._moved()
             worst = (max(worst[0], moved[0]), max(worst[1], moved[1]))
-            if self._wild() or worst[0] > self._limits[0] or worst[1] > self._limits[1]:
+            if self._wild():
+                return 0, (np.nan, np.nan)
+            if worst[0] > self._limits[0] or worst[1] > self._limits[1]:
                 return 0, worst
             if self._settled_stop and self._is_safe(before, moved, (total - done) / steps):
                 break
