@@ -17,6 +17,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder
 from lgrasp.errors import ConfigError, OutputError, ShardError
 from lgrasp.physics import Protocol, Scene, protocol_text, scene_of_shard, verdicts
+from lgrasp.physics.model import import_mujoco
 
 __all__ = ["Validated", "Validation", "summary", "validate_shards"]
 
@@ -65,6 +66,7 @@ def validate_shards(
         OutputError: the output cannot be written, or holds other shards.
         PhysicsError: MuJoCo is missing or refuses a hand.
     """
+    import_mujoco()
     sources = find_shards(job.shards)
     targets = _targets(sources, job)
     cut = partial(decompose, store=job.cache)

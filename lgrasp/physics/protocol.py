@@ -33,27 +33,39 @@ class Protocol(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", description="Columns are named physics/NAME_...")
-    timestep: float = Field(0.004, gt=0, le=0.02, description="[s]")
-    friction: float = Field(0.6, gt=0, le=5, description="Sliding friction of every contact.")
-    torsion: float = Field(0.02, ge=0, le=1, description="Torsional friction of every contact [m].")
-    impratio: float = Field(10.0, ge=1, description="Stiffness of friction against that of contact normals.")
-    noslip: int = Field(2, ge=0, description="Iterations of the solver that takes the creep out of friction.")
-    stiffness: float = Field(5.0, gt=0, description="Of position control, per newton of load if scaled [N m/rad].")
-    stiffness_range: tuple[float, float] | None = Field(
-        None, description="Stiffness is scaled with the load and kept in this range; none: it is not scaled."
+    timestep: float = Field(default=0.004, gt=0, le=0.02, description="[s]")
+    friction: float = Field(default=0.6, gt=0, le=5, description="Sliding friction of every contact.")
+    torsion: float = Field(default=0.02, ge=0, le=1, description="Torsional friction of every contact [m].")
+    impratio: float = Field(default=10.0, ge=1, description="Stiffness of friction against that of contact normals.")
+    noslip: int = Field(default=2, ge=0, description="Iterations of the solver that takes the creep out of friction.")
+    stiffness: float = Field(
+        default=5.0, gt=0, description="Of position control, per newton of load if scaled [N m/rad]."
     )
-    lever: float = Field(0.1, gt=0, description="A sliding joint is as stiff as a revolute one at this arm [m].")
-    damping_ratio: float = Field(1.0, gt=0, description="Of the position control; 1 is critical.")
-    armature: float = Field(2.0e-4, ge=0, description="Inertia of each drive [kg m^2] (sliding: over lever squared).")
+    stiffness_range: tuple[float, float] | None = Field(
+        default=None, description="Stiffness is scaled with the load and kept in this range; none: it is not scaled."
+    )
+    lever: float = Field(
+        default=0.1, gt=0, description="A sliding joint is as stiff as a revolute one at this arm [m]."
+    )
+    damping_ratio: float = Field(default=1.0, gt=0, description="Of the position control; 1 is critical.")
+    armature: float = Field(
+        default=2.0e-4, ge=0, description="Inertia of each drive [kg m^2] (sliding: over lever squared)."
+    )
     kind: Literal["force", "weight"] = "force"
-    force: float = Field(1.0, gt=0, description="The pull [N], if kind is force.")
-    mass: float = Field(0.1, gt=0, description="Of the object [kg], if kind is force.")
-    density: float = Field(500.0, gt=0, description="Of the object, if kind is weight, which then pulls [kg/m^3].")
-    phase: float = Field(0.4, gt=0, description="Pregrasp to grasp, and grasp to squeeze [s], each.")
-    hold: float = Field(2.0, gt=0, description="How long each direction is pulled [s].")
-    most_penetration: float = Field(0.01, gt=0, description="Of hand and object, or hand and hand, at pregrasp [m].")
-    most_displacement: float = Field(0.05, gt=0, description="Of the object's centre of mass from its start [m].")
-    most_rotation: float = Field(15.0, gt=0, le=180, description="Of the object from its start [deg].")
+    force: float = Field(default=1.0, gt=0, description="The pull [N], if kind is force.")
+    mass: float = Field(default=0.1, gt=0, description="Of the object [kg], if kind is force.")
+    density: float = Field(
+        default=500.0, gt=0, description="Of the object, if kind is weight, which then pulls [kg/m^3]."
+    )
+    phase: float = Field(default=0.4, gt=0, description="Pregrasp to grasp, and grasp to squeeze [s], each.")
+    hold: float = Field(default=2.0, gt=0, description="How long each direction is pulled [s].")
+    most_penetration: float = Field(
+        default=0.01, gt=0, description="Of hand and object, or hand and hand, at pregrasp [m]."
+    )
+    most_displacement: float = Field(
+        default=0.05, gt=0, description="Of the object's centre of mass from its start [m]."
+    )
+    most_rotation: float = Field(default=15.0, gt=0, le=180, description="Of the object from its start [deg].")
 
     def load(self, volume: float) -> Load:
         """Mass, pull and stiffness for an object of some volume [m^3]."""

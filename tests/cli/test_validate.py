@@ -1,0 +1,75 @@
+"""lgrasp validate: the shards again, with verdicts."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from reference.jaws import Jaws
+
+from lgrasp.dataset import read_shard, validate_shard, write_shard
+
+pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
+
+
+@pytest.fixture
+def grasps(tmp_path):
+    """A folder of two shards: one grasp that holds, and two that press too little."""
+    jaws = Jaws(tmp_path)
+    write_shard(tmp_path / "grasps" / "jaws-cube-00000.h5", jaws.shard(0.004))
+    write_shard(tmp_path / "grasps" / "jaws-cube-00001.h5", jaws.shard(0.0001, count=2))
+    return tmp_path / "grasps"
+
+
+def test_adds_columns_and_keeps_the_rest(cli, grasps, tmp_path):
+    result = cli("validate", grasps)
+    assert result.code == 0, result
+    head, row = (line.split() for line in result.out.splitlines()[:2])
+    assert row[: head.index("+x")] == ["jaws", "cube", "3", "33.3%"]
+    for number, holds in ((0, [True]), (1, [False, False])):
+        name = f"jaws-cube-0000{number}.h5"
+        before, after = read_shard(grasps / name), read_shard(tmp_path / "grasps-fc" / name)
+        assert not validate_shard(tmp_path / "grasps-fc" / name)
+        for column, values in before.grasps.columns().items():
+            np.testing.assert_array_equal(values, after.grasps.columns()[column], err_msg=column)
+        assert after.grasps.physics["fc_holds"].tolist() == holds
+        assert after.grasps.physics["fc_directions"].dtype == np.int8
+        protocol = json.loads(after.grasps.physics_protocols["fc_slip"])
+        assert (protocol["name"], protocol["timestep"], protocol["resolved"]["mass"]) == ("fc", 0.004, 0.1)
+        assert after.header.config == before.header.config
+        assert after.statistics["fc_held"] == sum(holds)
+
+
+def test_goes_on_where_it_was(cli, grasps, tmp_path):
+    """What is there stays byte for byte; damage is made anew; a second protocol adds its own columns."""
+    out = tmp_path / "verdicts"
+    assert cli("validate", grasps, "--out", out, "--json", "-").code == 0
+    kept, lost = sorted(out.iterdir())
+    bytes_before = kept.read_bytes()
+    lost.write_bytes(lost.read_bytes()[:-50])
+    again = cli("validate", grasps, "--out", out, "--json", "-")
+    (entry,) = json.loads(again.out)["results"]
+    assert (entry["rows"], entry["held"]) == (3, 1)
+    assert kept.read_bytes() == bytes_before
+    assert not validate_shard(lost)
+    line = cli("validate", grasps, "--out", out, "--protocol", "gravity6").error()
+    assert "another protocol" in line
+    assert cli("validate", out, "--out", tmp_path / "both", "--protocol", "gravity6").code == 0
+    physics = read_shard(tmp_path / "both" / kept.name).grasps.physics
+    assert {"fc_holds", "gravity6_holds"} <= set(physics)
+
+
+def test_bad_input(cli, grasps, tmp_path, monkeypatch):
+    assert "unknown protocol 'fall'; choose fc" in cli("validate", grasps, "--protocol", "fall").error()
+    assert "no such file or folder" in cli("validate", tmp_path / "nothing").error()
+    assert "would be overwritten" in cli("validate", grasps, "--out", grasps).error()
+    (tmp_path / "text.h5").write_text("no shard")
+    assert "not a whole HDF5 file" in cli("validate", tmp_path / "text.h5", "--out", tmp_path / "a").error()
+    heavy = Jaws(tmp_path).shard(0.004)
+    urdf = heavy.hand.urdf.replace("</link>", '<inertial><mass value="-1"/></inertial></link>', 1)
+    write_shard(tmp_path / "heavy" / "a.h5", Jaws(tmp_path).shard(0.004, urdf=urdf))
+    assert "MuJoCo refuses hand 'jaws'" in cli("validate", tmp_path / "heavy").error()
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    assert 'pip install "lgrasp[sim]"' in cli("validate", grasps).error()
+    assert not (tmp_path / "a").exists()
+    assert not (tmp_path / "grasps-fc").exists()

@@ -1,0 +1,66 @@
+"""Verdicts of grasps that lgrasp generated."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lgrasp.dataset import GraspRows, ShardReader, read_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.generate import Job, generate
+from lgrasp.physics import PROTOCOLS, Scene, scene_of_shard, verdicts
+
+pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
+
+FC = PROTOCOLS["fc"]
+ROWS = 24
+
+
+@pytest.fixture(scope="module")
+def path(swift, cache_root, tmp_path_factory) -> Path:
+    """A shard of the shipped Allegro and ball."""
+    out = tmp_path_factory.mktemp("ball")
+    job = Job("allegro", "sphere", ROWS, swift, out, device="cpu", workers=1, cache=Cache(cache_root, pytest.fail))
+    return generate(job).paths[0]
+
+
+def first(path: Path, count: int = ROWS) -> GraspRows:
+    with ShardReader(path) as reader:
+        return reader.rows(0, count)
+
+
+@pytest.fixture(scope="module")
+def scene(path: Path) -> Scene:
+    return scene_of_shard(read_shard(path))
+
+
+@pytest.fixture(scope="module")
+def found(scene: Scene, path: Path) -> dict[str, np.ndarray]:
+    return verdicts(scene, first(path), FC)
+
+
+def test_most_hold_a_ball(found):
+    assert found["fc_holds"].mean() > 0.5
+    assert not found["fc_diverged"].any()
+    assert (found["fc_contact_at_q"] >= 2).mean() > 0.9
+
+
+def test_half_the_time_step_gives_the_same_verdicts(found, scene, path):
+    fine = verdicts(scene, first(path), FC.model_copy(update={"timestep": FC.timestep / 2}))
+    assert (fine["fc_holds"] == found["fc_holds"]).mean() >= 0.95
+
+
+def test_ending_early_changes_no_verdict(found, scene, path):
+    whole = verdicts(scene, first(path, 12), FC, settled_stop=False)
+    assert (whole["fc_holds"] == found["fc_holds"][:12]).all()
+
+
+def test_planted_failures(scene, path):
+    """Nothing holds an object that is elsewhere, that is slippery, or with open fingers."""
+    rows = first(path, 6)
+    away = rows.object_pose + np.array([0.05, 0, 0, 0, 0, 0, 0], "f4")
+    assert verdicts(scene, replace(rows, object_pose=away), FC)["fc_holds"].mean() < 0.2
+    assert not verdicts(scene, replace(rows, q=rows.q_pregrasp, q_squeeze=rows.q_pregrasp), FC)["fc_holds"].any()
+    slippery = FC.model_copy(update={"friction": 0.05})
+    assert verdicts(scene, rows, slippery)["fc_holds"].mean() < 0.2
