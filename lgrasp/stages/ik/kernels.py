@@ -56,6 +56,7 @@ def realise_contacts(
     damping: wp.float32,
     max_step: wp.float32,
     max_gap: wp.float32,
+    touch: wp.float32,
     cosine: wp.float32,
     slack: wp.float32,
     clearance: wp.int32,
@@ -105,12 +106,12 @@ def realise_contacts(
             gap = e[3]
         n = wp.transform_vector(B, out)
         dot = wp.dot(n, normal)
-        if it > 0 and wp.abs(gap) < 0.25 * max_gap and dot > 0.5 * (1.0 + cosine):
+        if it > 0 and wp.abs(gap + touch) < 0.25 * max_gap and dot > 0.5 * (1.0 + cosine):
             break
         if it == iterations:
             break
         p = wp.transform_point(B, point)
-        e1 = target - p
+        e1 = target + normal * touch - p
         e2 = e1 + (normal - n) * lever
         A = mat_dof()
         b = vec_dof()
@@ -132,7 +133,7 @@ def realise_contacts(
             q[a] = q[a] + wp.clamp(step[a], -max_step, max_step)
         q = clamp_dofs(hand.kin, g, q)
     ok = int(1)
-    if wp.abs(gap) > max_gap or dot < cosine:
+    if wp.abs(gap + touch) > max_gap or dot < cosine:
         ok = -1
     if ok == 1:
         for r in range(hand.contacts.rule_first[grid], hand.contacts.rule_first[grid + 1]):

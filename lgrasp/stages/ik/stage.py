@@ -12,7 +12,7 @@ from lgrasp.stages.ik.params import IkParams
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 1
+VERSION = 2
 
 
 def run(
@@ -74,6 +74,7 @@ def _realise(table: CandidateTable, wanted: wp.array, params: IkParams, context:
             params.damping,
             params.step,
             params.gap,
+            params.touch,
             math.cos(math.radians(params.angle)),
             params.slack,
             int(params.clearance),
