@@ -11,7 +11,8 @@ __all__ = ["COLUMNS", "stack_verdicts"]
 COLUMNS: dict[str, str] = {
     "holds": "bool [N]: the object stays in all six directions",
     "directions": "int8 [N, 6]: +x -x +y -y +z -z of the hand base frame; 1 held, 0 lost, -1 not run",
-    "displacement": "float32 [N, 6]: farthest that the object's centre of mass got from its start [m]; NaN: not run, or diverged",
+    "displacement": "float32 [N, 6]: farthest that the object's centre of mass got from its start [m]; NaN: not run or "
+    "diverged",
     "rotation": "float32 [N, 6]: farthest that the object turned from its start [rad]; NaN as above",
     "slip": "float32 [N]: at the end of closing, how far a link's point that touches a contact point at q is from that "
     "point of the object, largest of the grasp's contacts [m]; NaN: no contacts, or the object was lost before",

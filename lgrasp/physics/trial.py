@@ -113,10 +113,19 @@ class Trial:
                     if worst[0] > self._limits[0] or worst[1] > self._limits[1]:
                         return _Closed(contacts, displacement=worst[0], rotation=worst[1])
             if phase == 0:
-                contacts = self._links_touching(self._m, self._data)
+                contacts = self._touching_at_rest()
         velocity = self._data.qvel[-6:]
         rest = bool(np.linalg.norm(velocity[:3]) < _REST[0] and np.linalg.norm(velocity[3:]) < _REST[1])
         return _Closed(contacts, self._slip(rows, i, points), rest, *worst)
+
+    def _touching_at_rest(self) -> int:
+        """Links that touch the object once the hand has caught up with its targets; the trial goes on from before."""
+        lib = self._lib
+        lib.mj_getState(self._m, self._data, self._state, lib.mjtState.mjSTATE_INTEGRATION)
+        self._step(max(1, round(self._protocol.settle / self._m.opt.timestep)))
+        touching = self._links_touching(self._m, self._data)
+        lib.mj_setState(self._m, self._data, self._state, lib.mjtState.mjSTATE_INTEGRATION)
+        return touching
 
     def _pull(self, axis: np.ndarray, closed: _Closed) -> tuple[int, tuple[float, float]]:
         """Load one direction [hand base frame]; 1 or 0, and how far the object moved [m], [rad] at worst."""
