@@ -21,6 +21,8 @@ from lgrasp.physics.model import import_mujoco
 
 __all__ = ["Validated", "Validation", "summary", "validate_shards"]
 
+_CONTACTS = 2  # links that it takes to hold anything
+
 
 @dataclass(frozen=True)
 class Validation:
@@ -199,8 +201,8 @@ def _entry(group: list[Validated], protocol: Protocol) -> dict[str, Any]:
         "held": int(columns["holds"].sum()),
         "directions_held": (columns["directions"] == 1).sum(0).tolist(),
         "directions_run": run.sum(0).tolist(),
-        "contact_at_q": float(columns["contact_at_q"].mean()) if rows else None,
-        "contact_at_grasp": float(columns["contact_at_grasp"].mean()) if rows else None,
+        "contact_at_q": int((columns["contact_at_q"] >= _CONTACTS).sum()),
+        "contact_at_grasp": int((columns["contact_at_grasp"] >= _CONTACTS).sum()),
         "pregrasp_too_deep": int((columns["pregrasp_penetration"] > protocol.most_penetration).sum()),
         "diverged": int(columns["diverged"].sum()),
         "mass": group[0].mass,
