@@ -47,6 +47,12 @@ def generate(
     device: Device = "auto",
     workers: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
     batch: Annotated[int, typer.Option(min=0, help="Candidates per batch; 0: by device.")] = 0,
+    physics: Annotated[
+        str | None,
+        typer.Option(
+            help="Keep only grasps that pass this physics protocol: fc, gravity6 or gravity6_mu1.", show_default=False
+        ),
+    ] = None,
     shard_rows: Annotated[int, typer.Option(help="Rows of a shard; part of what decides the rows.")] = 10_000,
     reuse: Annotated[bool, typer.Option("--reuse", help="Keep the candidates in the cache for later runs.")] = False,
     resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Keep whole shards of the same run.")] = True,
@@ -77,12 +83,13 @@ def generate(
     from lgrasp.engine.jobs import array_task, default_out
 
     index, number = array_task(shard_index, num_shards)
+    chosen = choose_pipeline(pipeline, seed, contacts)
     job = Job(
         hand=hand,
         object=mesh,
         rows=rows,
-        pipeline=choose_pipeline(pipeline, seed, contacts),
-        out=out or default_out(hand, mesh),
+        pipeline=chosen.with_physics(physics) if physics else chosen,
+        out=out or default_out(hand, mesh, physics),
         scale=scale,
         device=device,
         workers=workers,

@@ -10,20 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
+from lgrasp.dataset import GraspRows, Shard, ShardHeader
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder, clean_folder, present_shards, shard_path
 from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.recording import Recorder
+from lgrasp.engine.records import hand_record, make_scene, mesh_blobs, object_record
 from lgrasp.engine.shard import Execution, ShardResult, make_shard, shard_effort
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.writing import BackgroundWriter
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import GraspTable, take_grasps, user_poses
-from lgrasp.hand.tree import Tree
-from lgrasp.hand.urdf import read_urdf
+from lgrasp.physics import find_protocol, protocol_text
+from lgrasp.physics.model import import_mujoco
 
 __all__ = ["Job", "Listener", "Outcome", "find_present", "generate", "job_shards"]
 
@@ -133,6 +134,8 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     shards = job_shards(job)
     device = resolve_device(job.device)
     pipeline = job.pipeline
+    if "validate" in pipeline.order:
+        import_mujoco()
     keys = input_keys(job.hand, job.object, job.scale, pipeline.object, pipeline.field)
     assert keys.mesh is not None
     check_folder(job.out)
@@ -142,7 +145,11 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
         clean_folder(path)
     present = find_present(job, files, key)
     inputs = load_inputs(job.cache, keys, job.scale, pipeline.object, pipeline.field, device, listener.loading)
+    meshes = mesh_blobs(keys.source.urdf)
     if len(present) < len(shards):
+        if "validate" in pipeline.order:
+            listener.loading("scene", 0.0)
+            inputs = replace(inputs, scene=make_scene(job.cache, inputs, meshes))
         begin = time.perf_counter()
         load_kernels(device.alias, kernel_modules("lgrasp.stages."), listener.loading)
         inputs.seconds["kernels"] = time.perf_counter() - begin
@@ -153,7 +160,6 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     listener.started(inputs, [s for s, _ in shards], list(present))
     outcome = Outcome(inputs, [], sum(present.values()), 0, sum(present.values()), [], 0.0, False)
     wanted = dict(shards)
-    meshes = _mesh_blobs(keys.source.urdf)
 
     def written(shard: int, result: ShardResult) -> None:
         found = len(result.grasps)
@@ -187,7 +193,7 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
                     outcome.cancelled = True
                     break
                 found = len(result.grasps)
-                kept = result.counts.get("filter", {}).get("kept", 0)
+                kept = result.counts.get("validate", {}).get("held", result.counts.get("filter", {}).get("kept", 0))
                 execution = replace(execution, rate=max(kept / result.candidates, 1e-3))
                 writer.put(shard, files[shard], _shard(job, inputs, meshes, key, shard, result), result)
             if found == 0:  # nor will the next shards give any
@@ -198,15 +204,8 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     return outcome
 
 
-def _mesh_blobs(urdf: Path) -> dict[str, bytes]:
-    """Collision meshes of a hand by the path its URDF names, read where the hand is now, not where it was cached."""
-    return {name: file.read_bytes() for name, file in read_urdf(urdf).mesh_files.items()}
-
-
 def _shard(job: Job, inputs: Inputs, meshes: dict[str, bytes], key: str, shard: int, result: ShardResult) -> Shard:
     """The shard as records; poses and contacts go from the internal to the user's frame of the object."""
-    hand, obj = inputs.hand.model, inputs.object.model
-    tree = hand.tree
     return Shard(
         header=ShardHeader(
             pipeline=job.pipeline.name,
@@ -222,29 +221,9 @@ def _shard(job: Job, inputs: Inputs, meshes: dict[str, bytes], key: str, shard: 
                 "locked": dict(inputs.keys.source.spec.locked),
             },
         ),
-        hand=HandRecord(
-            name=hand.name,
-            base_link=tree.base_link,
-            urdf=hand.urdf_text,
-            joint_names=tree.listed_names,
-            joint_lower=tree.listed_limits[:, 0],
-            joint_upper=tree.listed_limits[:, 1],
-            link_names=tree.link_names,
-            sha256=hand.sha256,
-            meshes=meshes,
-        ),
-        objects=[
-            ObjectRecord(
-                id=obj.name,
-                name=obj.name,
-                scale=obj.scale,
-                sha256=obj.sha256,
-                watertight=obj.watertight,
-                vertices=obj.vertices,
-                faces=obj.faces,
-            )
-        ],
-        grasps=_rows(result.grasps, obj.center, shard, tree),
+        hand=hand_record(inputs, meshes),
+        objects=[object_record(inputs)],
+        grasps=_rows(result.grasps, job.pipeline, inputs, shard),
         statistics=_statistics(inputs, result),
     )
 
@@ -262,7 +241,8 @@ def _statistics(inputs: Inputs, result: ShardResult) -> dict[str, Any]:
     return flat | {f"seconds_{stage}": seconds for stage, seconds in result.seconds.items()}
 
 
-def _rows(table: GraspTable, center: np.ndarray, shard: int, tree: Tree) -> GraspRows:
+def _rows(table: GraspTable, pipeline: Pipeline, inputs: Inputs, shard: int) -> GraspRows:
+    tree, center = inputs.hand.model.tree, inputs.object.model.center
     filled = table.contact_links >= 0
     width = max(1, int(filled.sum(1).max(initial=1)))
     points = (table.contact_points + center)[:, :width]
@@ -280,4 +260,13 @@ def _rows(table: GraspTable, center: np.ndarray, shard: int, tree: Tree) -> Gras
         candidate=(np.uint64(shard) << np.uint64(40)) + table.index.astype(np.uint64),
         metrics=dict(table.metrics) | {"contacts": filled.sum(1).astype(np.float32)},
         metric_units=METRIC_UNITS,
+        physics=table.physics,
+        physics_protocols=dict.fromkeys(table.physics, _protocol(pipeline, inputs)),
     )
+
+
+def _protocol(pipeline: Pipeline, inputs: Inputs) -> str:
+    """What was simulated, "" if nothing was."""
+    if inputs.scene is None:
+        return ""
+    return protocol_text(inputs.scene, find_protocol(pipeline.params("validate").protocol))

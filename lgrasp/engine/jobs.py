@@ -170,10 +170,10 @@ def array_task(
     return (task - first) // max(step, 1), count
 
 
-def default_out(hand: str, mesh: str) -> Path:
-    """``grasps/HAND-OBJECT`` for a hand and an object given by name or path.
+def default_out(hand: str, mesh: str, physics: str | None = None) -> Path:
+    """``grasps/HAND-OBJECT``, or with ``-PHYSICS`` after it, for a hand and an object given by name or path.
 
     Raises:
         HandError, ObjectError: there is no such hand or object.
     """
-    return Path("grasps") / f"{find_hand(hand).name}-{find_object(mesh).stem}"
+    return Path("grasps") / f"{find_hand(hand).name}-{find_object(mesh).stem}{f'-{physics}' if physics else ''}"

@@ -12,6 +12,8 @@ from lgrasp.errors import ConfigError
 from lgrasp.field.params import FieldParams
 from lgrasp.object.params import ObjectParams
 from lgrasp.paths import data_dirs
+from lgrasp.physics import find_protocol
+from lgrasp.stages.validate.params import ValidateParams
 
 __all__ = ["Pipeline", "load_pipeline", "pipeline_files"]
 
@@ -57,6 +59,16 @@ class Pipeline(BaseModel):
         changed = parse_model(STAGES[stage].params, self.params(stage).model_dump() | changes, where)
         stages = tuple((n, changed if n == stage else p) for n, p in self.stages)
         return self.model_copy(update={"stages": stages})
+
+    def with_physics(self, protocol: str) -> "Pipeline":
+        """A copy that keeps only grasps which pass a physics protocol.
+
+        Raises:
+            ConfigError: no such protocol.
+        """
+        params = ValidateParams(protocol=find_protocol(protocol).name)
+        stages = tuple((name, own) for name, own in self.stages if name != "validate")
+        return self.model_copy(update={"stages": (*stages, ("validate", params))})
 
     def describe(self) -> dict[str, Any]:
         """JSON-serialisable description, the same for equal pipelines; execution settings are not in it."""

@@ -22,7 +22,7 @@ from lgrasp.stages.context import Context
 __all__ = ["Execution", "ShardResult", "add_counts", "make_shard", "shard_effort"]
 
 _LEAST_EFFORT = 65_536
-_CPU_BATCH = 256
+_CPU_BATCH, _PHYSICS_BATCH = 256, 32  # rows of a simulation are dear
 _GPU_LEAST, _GPU_WHOLE, _GPU_MOST = 2_048, 16_384, 65_536
 _GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
 _STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
@@ -138,7 +138,8 @@ def make_shard(
         bank_cache: keep and use candidate banks there.
         progress: called with (rows so far, running result) after each batch.
     """
-    context = Context(inputs.hand, inputs.object, inputs.field, inputs.device.alias, pipeline.seed, shard)
+    device = inputs.device.alias
+    context = Context(inputs.hand, inputs.object, inputs.field, device, pipeline.seed, shard, inputs.scene)
     bank = Bank(bank_cache, pipeline, inputs.keys, shard, inputs.device.alias) if bank_cache else None
     limit = shard_effort(pipeline, rows)
     result: ShardResult | None = None
@@ -156,6 +157,8 @@ def make_shard(
         # going by those so far
         rate = kept.count / result.candidates if result and kept.count else execution.rate
         wanted = fixed or _batch_size(context.device, rows - kept.count, rate, running, most)
+        if context.scene and not fixed and context.device == "cpu":
+            wanted = _PHYSICS_BATCH
         return recorder.size(wanted) if recorder and not fixed and wanted else wanted
 
     def run(first: int, count: int) -> BatchResult:

@@ -23,6 +23,7 @@ from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel, preprocess_object
 from lgrasp.object.params import ObjectParams
+from lgrasp.physics.scene import Scene
 
 __all__ = [
     "OBJECT_VERSION",
@@ -65,6 +66,7 @@ class Inputs:
     device: Device
     seconds: dict[str, float] = with_default(default_factory=dict)
     hits: dict[str, bool] = with_default(default_factory=dict)
+    scene: Scene | None = None  # for a physics simulation, if there is one
 
 
 def input_keys(hand: str, mesh: str | None, scale: float, objects: ObjectParams, fields: FieldParams) -> InputKeys:

@@ -4,7 +4,7 @@ Tables made on a device are as long as they may get, and tell on the device how 
 waits for its number of rows.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import warp as wp
@@ -29,6 +29,8 @@ __all__ = [
     "trim_sets",
     "user_poses",
 ]
+
+_FAMILIES = ("metrics", "physics")  # columns of a GraspTable that come by name
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,7 @@ class GraspTable:
     contact_links: np.ndarray  # (N, C) i32 index in link_names, -1 padding
     contact_forces: np.ndarray  # (N, C, 3) object frame
     metrics: dict[str, np.ndarray]  # (N,) each
+    physics: dict[str, np.ndarray] = field(default_factory=dict)  # (N, ...) each: verdicts of a simulator
 
     def __len__(self) -> int:
         return len(self.index)
@@ -169,14 +172,20 @@ def select_poses(table: CandidateTable, rows: np.ndarray, device: str) -> Candid
 
 
 def grasp_arrays(table: GraspTable) -> dict[str, np.ndarray]:
-    """A GraspTable as flat NumPy arrays (metrics as ``metrics.NAME``)."""
-    own = {f.name: getattr(table, f.name) for f in fields(table) if f.name != "metrics"}
-    return own | {f"metrics.{name}": values for name, values in table.metrics.items()}
+    """A GraspTable as flat NumPy arrays (metrics as ``metrics.NAME``, verdicts as ``physics.NAME``)."""
+    out = {f.name: getattr(table, f.name) for f in fields(table) if f.name not in _FAMILIES}
+    for family in _FAMILIES:
+        out |= {f"{family}.{name}": values for name, values in getattr(table, family).items()}
+    return out
 
 
 def _grasps(arrays: dict[str, np.ndarray]) -> GraspTable:
-    metrics = {name.removeprefix("metrics."): a for name, a in arrays.items() if name.startswith("metrics.")}
-    return GraspTable(metrics=metrics, **{name: a for name, a in arrays.items() if not name.startswith("metrics.")})
+    own: dict[str, np.ndarray] = {}
+    families: dict[str, dict[str, np.ndarray]] = {family: {} for family in _FAMILIES}
+    for name, values in arrays.items():
+        family, dot, member = name.partition(".")
+        (families[family] if dot else own)[member or name] = values
+    return GraspTable(**own, metrics=families["metrics"], physics=families["physics"])
 
 
 def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:

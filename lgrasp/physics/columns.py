@@ -17,7 +17,8 @@ COLUMNS: dict[str, str] = {
     "slip": "float32 [N]: at the end of closing, how far a link's point that touches a contact point at q is from that "
     "point of the object, largest of the grasp's contacts [m]; NaN: no contacts, or the object was lost before",
     "contact_at_q": "int16 [N]: links within 1 mm of the object at exactly q; geometry, nothing is simulated",
-    "contact_at_grasp": "int16 [N]: links that touch the object when the hand has come to rest at targets q, no squeeze",
+    "contact_at_grasp": "int16 [N]: links that touch the object when the hand has come to rest with targets q, before "
+    "any squeeze",
     "pregrasp_penetration": "float32 [N]: deepest penetration at q_pregrasp, of the object or of links [m]",
     "settled": "bool [N]: object at rest when the pull begins (below 1 cm/s and 0.1 rad/s)",
     "diverged": "bool [N]: the simulation ran away; counts as lost",

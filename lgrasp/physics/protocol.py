@@ -58,6 +58,9 @@ class Protocol(BaseModel):
         default=500.0, gt=0, description="Of the object, if kind is weight, which then pulls [kg/m^3]."
     )
     phase: float = Field(default=0.4, gt=0, description="Pregrasp to grasp, and grasp to squeeze [s], each.")
+    settle: float = Field(
+        default=0.3, gt=0, description="Given to the hand at the grasp before its contacts are counted [s]."
+    )
     hold: float = Field(default=2.0, gt=0, description="How long each direction is pulled [s].")
     most_penetration: float = Field(
         default=0.01, gt=0, description="Of hand and object, or hand and hand, at pregrasp [m]."

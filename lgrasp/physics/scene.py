@@ -35,9 +35,9 @@ class HandSolids:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
-    """A hand and an object, for any simulator and protocol."""
+    """A hand and an object, for any simulator and protocol; each is itself only."""
 
     hand: HandSolids
     object: Solid

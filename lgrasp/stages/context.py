@@ -8,6 +8,7 @@ import warp as wp
 from lgrasp.field.arrays import FieldArrays
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
+from lgrasp.physics.scene import Scene
 from lgrasp.seeding import stage_seed
 
 __all__ = ["Context"]
@@ -24,6 +25,8 @@ class Context:
     base_seed: int
     shard: int
 
+    scene: Scene | None = None
+    """What a physics simulation is given; there if the pipeline has one."""
     seeds: dict[tuple[str, int], wp.array] = with_default(default_factory=dict, repr=False, compare=False)
 
     def seed(self, stage: str, salt: int = 0) -> wp.array:

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from lgrasp.engine.pipeline import pipeline_files
-from lgrasp.engine.stages import ORDERS, STAGES
+from lgrasp.engine.stages import OPTIONAL, ORDERS, STAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "pipeline.md"
@@ -20,7 +20,7 @@ def folders(path: Path) -> set[str]:
 def test_folders():
     assert folders(ROOT / "lgrasp" / "stages") == set(STAGES)
     assert folders(ROOT / "tests" / "stages") == set(STAGES)
-    assert all(set(order) == set(STAGES) for order in ORDERS)
+    assert all({*order, *OPTIONAL} == set(STAGES) for order in ORDERS)
     for name, stage in STAGES.items():
         assert stage.name == name
         assert stage.run.__module__ == f"lgrasp.stages.{name}.stage"
@@ -30,7 +30,7 @@ def test_folders():
 @pytest.mark.parametrize("name", sorted(pipeline_files()))
 def test_pipelines(name):
     declared = yaml.safe_load(pipeline_files()[name].read_text())
-    assert {stage for entry in declared["stages"] for stage in entry} == set(STAGES)
+    assert {stage for entry in declared["stages"] for stage in entry} | set(OPTIONAL) == set(STAGES)
 
 
 def test_commands():

@@ -1,0 +1,55 @@
+"""Hand and object of a job as the records of a shard, and as the scene of a simulator."""
+
+from functools import partial
+from pathlib import Path
+
+from lgrasp.dataset import HandRecord, ObjectRecord
+from lgrasp.decompose import decompose
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.workspace import Inputs
+from lgrasp.hand.urdf import read_urdf
+from lgrasp.physics.scene import Scene, hand_of_record, object_of_record
+
+__all__ = ["hand_record", "make_scene", "mesh_blobs", "object_record"]
+
+
+def mesh_blobs(urdf: Path) -> dict[str, bytes]:
+    """Collision meshes of a hand by the path its URDF names, read where the hand is now, not where it was cached."""
+    return {name: file.read_bytes() for name, file in read_urdf(urdf).mesh_files.items()}
+
+
+def hand_record(inputs: Inputs, meshes: dict[str, bytes]) -> HandRecord:
+    """The hand; ``meshes`` are its :func:`mesh_blobs`."""
+    hand, tree = inputs.hand.model, inputs.hand.model.tree
+    return HandRecord(
+        name=hand.name,
+        base_link=tree.base_link,
+        urdf=hand.urdf_text,
+        joint_names=tree.listed_names,
+        joint_lower=tree.listed_limits[:, 0],
+        joint_upper=tree.listed_limits[:, 1],
+        link_names=tree.link_names,
+        sha256=hand.sha256,
+        meshes=meshes,
+    )
+
+
+def object_record(inputs: Inputs) -> ObjectRecord:
+    """The object, in the user's frame."""
+    obj = inputs.object.model
+    return ObjectRecord(
+        id=obj.name,
+        name=obj.name,
+        scale=obj.scale,
+        sha256=obj.sha256,
+        watertight=obj.watertight,
+        vertices=obj.vertices,
+        faces=obj.faces,
+    )
+
+
+def make_scene(cache: Cache, inputs: Inputs, meshes: dict[str, bytes]) -> Scene:
+    """What the simulator is given: the scene of the job's shards."""
+    cut, device = partial(decompose, store=cache), inputs.device.alias
+    hand = hand_of_record(hand_record(inputs, meshes), cut, device)
+    return Scene(hand, object_of_record(object_record(inputs), cut, device))

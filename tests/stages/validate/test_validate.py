@@ -1,0 +1,84 @@
+"""Keeps the grasps that hold, and their verdicts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lgrasp.dataset import read_shard
+from lgrasp.engine.batch import run_stages
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.generate import generate
+from lgrasp.engine.records import make_scene, mesh_blobs
+from lgrasp.errors import ConfigError, OutputError, PhysicsError
+from lgrasp.grasp.tables import GraspTable, grasp_arrays
+from lgrasp.physics import COLUMNS, PROTOCOLS, scene_of_shard, verdicts
+from lgrasp.stages.context import Context
+from lgrasp.stages.validate.params import ValidateParams
+from lgrasp.stages.validate.stage import run
+
+pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
+
+
+@pytest.fixture(scope="module")
+def context(load, cache_root) -> Context:
+    inputs = load("sphere")
+    scene = make_scene(Cache(cache_root, pytest.fail), inputs, mesh_blobs(inputs.keys.source.urdf))
+    return Context(inputs.hand, inputs.object, inputs.field, "cpu", 0, 0, scene)
+
+
+@pytest.fixture(scope="module")
+def grasps(swift, context) -> GraspTable:
+    return run_stages(swift, context, 0, 16, "filter")
+
+
+def test_keeps_what_holds(grasps, context):
+    """Every second grasp is spoiled: its hand stays open. Those are dropped, the others stay as they were."""
+    assert len(grasps) >= 8
+    spoiled = np.arange(len(grasps)) % 2 == 1
+    squeeze = np.where(spoiled[:, None], grasps.q_pregrasp, grasps.q_squeeze)
+    q = np.where(spoiled[:, None], grasps.q_pregrasp, grasps.q)
+    kept, counts = run(replace(grasps, q=q, q_squeeze=squeeze), ValidateParams(), context)
+    assert counts["tried"] == len(grasps)
+    assert 0 < counts["held"] == len(kept) <= (~spoiled).sum()
+    assert set(kept.physics) == {f"fc_{name}" for name in COLUMNS}
+    assert kept.physics["fc_holds"].all()
+    assert kept.physics["fc_directions"].shape == (len(kept), 6)
+    keys = list(zip(grasps.index[~spoiled], grasps.slot[~spoiled], strict=True))
+    rows = [2 * keys.index(key) for key in zip(kept.index, kept.slot, strict=True)]
+    assert rows == sorted(rows)
+    for name, values in grasp_arrays(grasps).items():
+        np.testing.assert_array_equal(values[rows], grasp_arrays(kept)[name], err_msg=name)
+
+
+def test_no_grasps(grasps, context):
+    none = {name: values[:0] for name, values in grasp_arrays(grasps).items() if not name.startswith("metrics.")}
+    kept, counts = run(GraspTable(**none, metrics={}), ValidateParams(), context)
+    assert len(kept) == counts["tried"] == 0
+    assert kept.physics["fc_holds"].dtype == bool
+
+
+def test_needs_a_scene_and_a_known_protocol(grasps, context, swift):
+    with pytest.raises(PhysicsError, match="scene"):
+        run(grasps, ValidateParams(), replace(context, scene=None))
+    with pytest.raises(ConfigError, match="unknown protocol 'fd'; choose fc"):
+        swift.with_physics("fd")
+
+
+def test_generated_rows_hold(job, swift, tmp_path, raw_grasps):
+    """The shard holds what simulating it again gives; batches and threads change nothing; its folder is its own."""
+    checked = swift.with_physics("gravity6")
+    kwargs = {"object": "sphere", "rows": 8, "shard_rows": 8, "batch": 16}
+    outcome = generate(job(**kwargs, pipeline=checked))
+    shard = read_shard(outcome.paths[0])
+    physics = shard.grasps.physics
+    assert physics["gravity6_holds"].all()
+    assert len(shard.grasps) == 8
+    again = verdicts(scene_of_shard(shard), shard.grasps, PROTOCOLS["gravity6"])
+    for name, values in again.items():
+        np.testing.assert_array_equal(physics[name], values, err_msg=name)
+    assert shard.statistics["validate_tried"] >= shard.statistics["validate_held"] >= 8
+    other = generate(job(**kwargs | {"batch": 7, "workers": 2, "out": tmp_path / "other"}, pipeline=checked))
+    assert raw_grasps(other.paths[0].parent) == raw_grasps(outcome.paths[0].parent)
+    with pytest.raises(OutputError, match="another run"):
+        generate(job(**kwargs))
