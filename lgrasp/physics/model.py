@@ -48,6 +48,10 @@ class Model:
     center: np.ndarray
     """(3,) centre of mass in the object's frame [m]."""
 
+    def controls(self, q: np.ndarray) -> np.ndarray:
+        """Targets of the drives at joint positions q (K,)."""
+        return np.where(self.columns >= 0, q[self.columns], 0.0)
+
 
 def import_mujoco() -> Any:
     """The module mujoco.

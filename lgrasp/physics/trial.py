@@ -1,5 +1,6 @@
 """One grasp in MuJoCo: close the hand once, then pull the object in each direction from that same state."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,12 +8,16 @@ import numpy as np
 from lgrasp.dataset.records import GraspRows
 from lgrasp.physics.model import Model
 
-__all__ = ["Trial", "Verdict"]
+__all__ = ["AXES", "CHUNK", "REST", "WILD", "Trial", "Verdict", "is_safe"]
 
-_CHUNK = 0.1  # [s] between looks at the object
-_WILD = 1.0e3  # [m/s or rad/s]: no hand and no object is so fast, the simulation has diverged
-_REST = (0.01, 0.1)  # [m/s], [rad/s]
-_AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+CHUNK = 0.1
+"""[s] between looks at the object."""
+WILD = 1.0e3
+"""[m/s or rad/s]: no hand and no object is so fast, the simulation has diverged."""
+REST = (0.01, 0.1)
+"""[m/s], [rad/s]: slower is at rest."""
+AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+"""Directions of the load in the hand's base frame."""
 
 
 class Verdict(NamedTuple):
@@ -56,15 +61,13 @@ class Trial:
         self._data, self._near = mujoco.MjData(self._m), mujoco.MjData(model.mujoco_near)
         self._all, self._settled_stop = all_directions, settled_stop
         self._state = np.zeros(mujoco.mj_stateSize(self._m, mujoco.mjtState.mjSTATE_INTEGRATION))
-        self._chunk = max(1, round(_CHUNK / self._m.opt.timestep))
+        self._chunk = max(1, round(CHUNK / self._m.opt.timestep))
         self._limits = (self._protocol.most_displacement, np.radians(self._protocol.most_rotation))
         self.steps = 0
 
     def run(self, rows: GraspRows, i: int) -> Verdict:
         """Judge row ``i``."""
-        points, contact_at_q = self._look_at_q(rows, i)
-        self._place(self._m, self._data, rows.q_pregrasp[i], rows.object_pose[i, 0])
-        depth = self._deepest()
+        points, contact_at_q, depth, _ = self.look(rows, i)
         self._start = self._object()
         directions = np.full(6, -1, np.int8)
         moved = np.full((6, 2), np.nan)
@@ -77,7 +80,7 @@ class Trial:
                 directions[:], moved[:] = 0, (closed.displacement, closed.rotation)
             else:
                 self._lib.mj_getState(self._m, self._data, self._state, self._lib.mjtState.mjSTATE_INTEGRATION)
-                for k, axis in enumerate(_AXES):
+                for k, axis in enumerate(AXES):
                     directions[k], moved[k] = self._pull(axis, closed)
                     diverged |= self._wild()
                     if not directions[k] and not self._all:
@@ -95,13 +98,34 @@ class Trial:
             diverged,
         )
 
+    def look(self, rows: GraspRows, i: int) -> tuple[np.ndarray, int, float, np.ndarray]:
+        """Row ``i`` before it is simulated, hand at q_pregrasp.
+
+        Returns:
+            Contact points on their links at q (C, 3), links within 1 mm of the object at q, deepest penetration at
+            q_pregrasp [m], and the state there (qpos).
+        """
+        points, contact_at_q = self._look_at_q(rows, i)
+        self._place(self._m, self._data, rows.q_pregrasp[i], rows.object_pose[i, 0])
+        return points, contact_at_q, self._deepest(), self._data.qpos.copy()
+
+    def base_rotation(self) -> np.ndarray:
+        """Of the hand's base in the world, (3, 3)."""
+        self._lib.mj_kinematics(self._m, self._data)
+        return self._data.xmat[self._model.base_body].reshape(3, 3).copy()
+
+    def slip_at(self, rows: GraspRows, i: int, points: np.ndarray, qpos: np.ndarray) -> float:
+        """Slip of row ``i`` in a given state; ``points`` as of :meth:`look`."""
+        self._data.qpos[:] = qpos
+        return self._slip(rows, i, points)
+
     def _close(self, rows: GraspRows, i: int, points: np.ndarray) -> _Closed:
         """From pregrasp to grasp to squeeze, each target approached evenly; ends early when all is lost."""
         stops = [targets[i].astype(float) for targets in (rows.q_pregrasp, rows.q, rows.q_squeeze)]
         contacts, worst = 0, (0.0, 0.0)
         steps = max(1, round(self._protocol.phase / self._m.opt.timestep))
         for phase in (0, 1):
-            a, b = self._controls(stops[phase]), self._controls(stops[phase + 1])
+            a, b = self._model.controls(stops[phase]), self._model.controls(stops[phase + 1])
             for step in range(steps):
                 self._data.ctrl[:] = a + (b - a) * ((step + 1) / steps)
                 self._step(1)
@@ -115,7 +139,7 @@ class Trial:
             if phase == 0:
                 contacts = self._touching_at_rest()
         velocity = self._data.qvel[-6:]
-        rest = bool(np.linalg.norm(velocity[:3]) < _REST[0] and np.linalg.norm(velocity[3:]) < _REST[1])
+        rest = bool(np.linalg.norm(velocity[:3]) < REST[0] and np.linalg.norm(velocity[3:]) < REST[1])
         return _Closed(contacts, self._slip(rows, i, points), rest, *worst)
 
     def _touching_at_rest(self) -> int:
@@ -146,17 +170,10 @@ class Trial:
                 return 0, (np.nan, np.nan)
             if worst[0] > self._limits[0] or worst[1] > self._limits[1]:
                 return 0, worst
-            if self._settled_stop and self._is_safe(before, moved, (total - done) / steps):
+            if self._settled_stop and is_safe(before, moved, self._limits, (total - done) / steps):
                 break
             before = moved
         return 1, worst
-
-    def _is_safe(self, before: tuple[float, float], now: tuple[float, float], chunks: float) -> bool:
-        """Would the object stay inside half its bounds if it went on four times as fast to the end?"""
-        return all(
-            new + 4 * abs(new - old) * chunks < 0.5 * limit
-            for old, new, limit in zip(before, now, self._limits, strict=True)
-        )
 
     def _step(self, steps: int) -> None:
         self._lib.mj_step(self._m, self._data, steps)
@@ -167,7 +184,7 @@ class Trial:
         model, lib = self._model, self._lib
         lib.mj_resetData(m, data)
         data.qpos[model.joint_address] = model.joint_matrix @ q + model.joint_offset
-        data.ctrl[:] = self._controls(q)
+        data.ctrl[:] = self._model.controls(q)
         lib.mj_kinematics(m, data)
         at, turn = np.zeros(3), np.zeros(4)
         base = model.base_body
@@ -176,9 +193,6 @@ class Trial:
         lib.mj_kinematics(m, data)
         lib.mj_comPos(m, data)
         lib.mj_collision(m, data)
-
-    def _controls(self, q: np.ndarray) -> np.ndarray:
-        return np.where(self._model.columns >= 0, q[self._model.columns], 0.0)
 
     def _look_at_q(self, rows: GraspRows, i: int) -> tuple[np.ndarray, int]:
         """Contact points on their links at q, as (C, 3) in body frames [m], and the number of links within 1 mm."""
@@ -227,4 +241,11 @@ class Trial:
 
     def _wild(self) -> bool:
         """Has the simulation diverged?"""
-        return not np.abs(self._data.qvel).max() < _WILD or not np.isfinite(self._data.qpos).all()
+        return not np.abs(self._data.qvel).max() < WILD or not np.isfinite(self._data.qpos).all()
+
+
+def is_safe(before: Sequence[float], now: Sequence[float], limits: Sequence[float], chunks: float) -> bool:
+    """Would an object that moved so in a chunk stay inside half its bounds at four times that pace to the end?"""
+    return all(
+        new + 4 * abs(new - old) * chunks < 0.5 * limit for old, new, limit in zip(before, now, limits, strict=True)
+    )

@@ -1,0 +1,299 @@
+"""Verdicts of many grasps at once with MuJoCo Warp: worlds side by side on one device."""
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from lgrasp.dataset.records import GraspRows
+from lgrasp.errors import PhysicsError
+from lgrasp.physics.columns import stack_verdicts
+from lgrasp.physics.model import Model
+from lgrasp.physics.trial import AXES, CHUNK, REST, WILD, Trial, Verdict, is_safe
+
+__all__ = ["WorldTrials"]
+
+_CONTACTS = 96  # per world, on average
+_CONSTRAINTS = 640  # rows per world: four a contact, limits, couplings
+
+
+@wp.kernel
+def _drive(
+    start: wp.array2d(dtype=wp.float32),
+    end: wp.array2d(dtype=wp.float32),
+    ramp: wp.float32,
+    step: wp.array(dtype=wp.float32),
+    ctrl_out: wp.array2d(dtype=wp.float32),
+):
+    """Targets of the next step, evenly from start to end over ``ramp`` steps."""
+    world, u = wp.tid()
+    share = wp.min((step[world] + 1.0) / ramp, 1.0)
+    ctrl_out[world, u] = start[world, u] + (end[world, u] - start[world, u]) * share
+
+
+@wp.kernel
+def _count(step_out: wp.array(dtype=wp.float32)):
+    step_out[wp.tid()] = step_out[wp.tid()] + 1.0
+
+
+class _Worlds:
+    """W copies of one scene; their state is set and read as NumPy arrays, and stepped a chunk at a time."""
+
+    def __init__(self, model: Model, worlds: int, device: str) -> None:
+        try:
+            import mujoco_warp
+        except ImportError:
+            raise PhysicsError(
+                'physics on a GPU needs MuJoCo Warp, which is not installed: pip install "lgrasp[sim,gpu-sim]"'
+            ) from None
+        self._lib: Any = mujoco_warp
+        self._model, self._device, self.worlds = model, wp.get_device(device), worlds
+        m = model.mujoco
+        with wp.ScopedDevice(self._device):
+            self._m = mujoco_warp.put_model(m)
+            self._d = mujoco_warp.make_data(m, nworld=worlds, nconmax=_CONTACTS, njmax=_CONSTRAINTS)
+            shape = (worlds, m.nu)
+            self._start, self._end, self._step = (wp.zeros(s, dtype=wp.float32) for s in (shape, shape, (worlds,)))
+        self._ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
+        self.chunk = max(1, round(CHUNK / m.opt.timestep))
+        self._graph: Any = None
+        self.steps = 0
+
+    def advance(self) -> None:
+        """Step every world through one chunk."""
+        with wp.ScopedDevice(self._device):
+            if self._graph is None and self._device.is_cuda:
+                saved = self.state()
+                self._one_step()  # compiles what is needed
+                self.restore(saved)
+                with wp.ScopedCapture() as capture:
+                    self._one_step()
+                self._graph = capture.graph
+            for _ in range(self.chunk):
+                if self._graph is None:
+                    self._one_step()
+                else:
+                    wp.capture_launch(self._graph)
+        self.steps += self.chunk * self.worlds
+
+    def _one_step(self) -> None:
+        wp.launch(_drive, self._start.shape, [self._start, self._end, self._ramp, self._step], [self._d.ctrl])
+        wp.launch(_count, self.worlds, [], [self._step])
+        self._lib.step(self._m, self._d)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that decides what comes next, one row a world."""
+        d = self._d
+        arrays = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
+        own = {"start": self._start, "end": self._end, "step": self._step}
+        return {name: a.numpy().copy() for name, a in (arrays | own).items()}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Inverse of :meth:`state`."""
+        d = self._d
+        arrays = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
+        own = {"start": self._start, "end": self._end, "step": self._step}
+        for name, a in (arrays | own).items():
+            a.assign(state[name])
+
+    def touching(self) -> np.ndarray:
+        """Number of links that touch the object, (worlds,)."""
+        d, m = self._d, self._model.mujoco
+        n = min(int(d.nacon.numpy()[0]), d.naconmax)
+        geoms, world = d.contact.geom.numpy()[:n], d.contact.worldid.numpy()[:n]
+        close = (d.contact.dist.numpy()[:n] < 0) & (geoms >= 0).all(1)
+        bodies, world = m.geom_bodyid[geoms[close]], world[close]
+        with_object = (bodies == self._model.object_body).any(1)
+        other = np.where(bodies[:, 0] == self._model.object_body, bodies[:, 1], bodies[:, 0])
+        pairs = np.unique(np.column_stack([world[with_object], other[with_object]]), axis=0)
+        return np.bincount(pairs[:, 0], minlength=self.worlds) if len(pairs) else np.zeros(self.worlds, int)
+
+
+class WorldTrials:
+    """The same trials as :class:`Trial`, many at a time on one device.
+
+    Args:
+        device: Warp device.
+        worlds: simulated at a time.
+        all_directions, settled_stop: as of :class:`Trial`.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        device: str,
+        *,
+        worlds: int = 4096,
+        threads: int = 2,
+        all_directions: bool = False,
+        settled_stop: bool = True,
+    ) -> None:
+        self._model, self._protocol = model, model.protocol
+        self._sim = _Worlds(model, worlds, device)
+        self._threads, self._all, self._settled_stop = threads, all_directions, settled_stop
+        self._limits = np.array([self._protocol.most_displacement, np.radians(self._protocol.most_rotation)])
+        self._object = slice(model.object_address, model.object_address + 7)
+        self._base = Trial(model).base_rotation()
+
+    @property
+    def steps(self) -> int:
+        """World-steps simulated so far."""
+        return self._sim.steps
+
+    def run(self, rows: GraspRows, progress: Callable[[int, int], None] | None = None) -> dict[str, np.ndarray]:
+        """Columns of the verdicts of all rows."""
+        found: list[Verdict] = []
+        for first in range(0, len(rows), self._sim.worlds):
+            found += self._block(rows, np.arange(first, min(first + self._sim.worlds, len(rows))))
+            if progress:
+                progress(len(found), sum(verdict.holds for verdict in found))
+        return stack_verdicts(self._protocol.name, found)
+
+    def _block(self, rows: GraspRows, index: np.ndarray) -> list[Verdict]:
+        n = len(index)
+        looks = self._looks(rows, index)
+        points, contact_at_q, depth = ([look[k] for look in looks] for k in (0, 1, 2))
+        start = np.stack([look[3] for look in looks])  # qpos at pregrasp
+        alive = np.array(depth) <= self._protocol.most_penetration
+        stops = [
+            np.stack([self._model.controls(q[i].astype(float)) for i in index])
+            for q in (rows.q_pregrasp, rows.q, rows.q_squeeze)
+        ]
+        state = self._sim.state()
+        for name in ("qvel", "warm", "force", "step"):
+            state[name][:] = 0
+        state["qpos"][:n], state["start"][:n], state["end"][:n] = start, stops[0], stops[1]
+        state["qpos"][n:], state["start"][n:], state["end"][n:] = start[0], stops[0][0], stops[0][0]
+        origin = state["qpos"][:, self._object].copy()
+        worst, wild = np.zeros((n, 2)), np.zeros(n, bool)
+        self._sim.restore(state)
+        self._ramp(origin, worst, wild)
+        state = self._sim.state()
+        for _ in range(max(1, round(self._protocol.settle / CHUNK))):
+            self._sim.advance()
+        contacts = self._sim.touching()[:n]
+        state["start"][:n], state["end"][:n], state["step"][:] = stops[1], stops[2], 0
+        self._sim.restore(state)
+        self._ramp(origin, worst, wild)
+        closed = self._sim.state()
+        slip = self._slip(rows, index, points, closed["qpos"][:n])
+        speed = closed["qvel"][:n, -6:]
+        rest = (np.linalg.norm(speed[:, :3], axis=1) < REST[0]) & (np.linalg.norm(speed[:, 3:], axis=1) < REST[1])
+        lost = wild | (worst > self._limits).any(1)
+        directions, moved, ran_away = self._pull(closed, origin, worst, alive & ~lost)
+        directions[alive & lost] = 0
+        moved[alive & lost] = worst[alive & lost][:, None]
+        nan = np.nan
+        return [
+            Verdict(
+                bool((directions[i] == 1).all()),
+                directions[i],
+                moved[i, :, 0],
+                moved[i, :, 1],
+                float(slip[i]) if alive[i] and not lost[i] else nan,
+                contact_at_q[i],
+                int(contacts[i]) if alive[i] else 0,
+                depth[i],
+                bool(rest[i] and alive[i] and not lost[i]),
+                bool((wild[i] and alive[i]) or ran_away[i]),
+            )
+            for i in range(n)
+        ]
+
+    def _looks(self, rows: GraspRows, index: np.ndarray) -> list[tuple[np.ndarray, int, float, np.ndarray]]:
+        """What needs no simulation, by MuJoCo itself on several threads."""
+        trials = [Trial(self._model) for _ in range(self._threads)]
+
+        def look(part: int) -> list[tuple[np.ndarray, int, float, np.ndarray]]:
+            return [trials[part].look(rows, int(i)) for i in index[part :: self._threads]]
+
+        with ThreadPoolExecutor(self._threads) as pool:
+            parts = list(pool.map(look, range(self._threads)))
+        return [parts[k % self._threads][k // self._threads] for k in range(len(index))]
+
+    def _ramp(self, origin: np.ndarray, worst: np.ndarray, wild: np.ndarray) -> None:
+        """One phase of closing; ``worst`` and ``wild`` grow."""
+        n = len(worst)
+        for _ in range(max(1, round(self._protocol.phase / CHUNK))):
+            self._sim.advance()
+            state = self._sim.state()
+            worst[:] = np.maximum(worst, self._moved(state["qpos"], origin)[:n])
+            wild |= self._wild(state)[:n]
+
+    def _pull(
+        self, closed: dict[str, np.ndarray], origin: np.ndarray, worst: np.ndarray, good: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Every direction of every good grasp, in whatever world is free; as of :meth:`Trial.run`."""
+        n, worlds = len(good), self._sim.worlds
+        directions, moved = np.full((n, 6), -1, np.int8), np.full((n, 6, 2), np.nan)
+        ran_away, failed = np.zeros(n, bool), np.zeros(n, bool)
+        waiting = deque((int(i), k) for k in range(6) for i in np.flatnonzero(good))
+        total = max(1, round(self._protocol.hold / CHUNK))
+        job = np.full((worlds, 2), -1)
+        done, before, now = np.zeros(worlds, int), np.zeros((worlds, 2)), np.zeros((worlds, 2))
+        state = {name: values.copy() for name, values in closed.items()}
+        home = origin.copy()
+        base = self._base
+        while True:
+            fresh = []
+            for w in np.flatnonzero(job[:, 0] < 0):
+                while waiting and failed[waiting[0][0]] and not self._all:
+                    waiting.popleft()
+                if not waiting:
+                    break
+                i, k = waiting.popleft()
+                job[w], done[w] = (i, k), 0
+                now[w] = worst[i]
+                for name, values in closed.items():
+                    state[name][w] = values[i]
+                state["start"][w] = closed["end"][i]
+                state["force"][w] = 0
+                state["force"][w, self._model.object_body, :3] = self._model.load.force * (base @ AXES[k])
+                home[w] = origin[i]
+                fresh.append(w)
+            if fresh:
+                self._sim.restore(state)
+                before[fresh] = self._moved(state["qpos"], home)[fresh]
+            busy = np.flatnonzero(job[:, 0] >= 0)
+            if not len(busy):
+                return directions, moved, ran_away
+            self._sim.advance()
+            state = self._sim.state()
+            here, wild = self._moved(state["qpos"], home), self._wild(state)
+            now[:] = np.maximum(now, here)
+            for w in busy:
+                i, k = job[w]
+                done[w] += 1
+                lost = wild[w] or (now[w] > self._limits).any()
+                safe = self._settled_stop and is_safe(before[w], here[w], self._limits, total - done[w])
+                before[w] = here[w]
+                if lost or safe or done[w] >= total:
+                    directions[i, k], moved[i, k] = not lost, now[w]
+                    failed[i] |= lost
+                    ran_away[i] |= wild[w]
+                    job[w] = -1
+
+    def _moved(self, qpos: np.ndarray, origin: np.ndarray) -> np.ndarray:
+        """How far the objects are from their start: displacement [m] and rotation [rad], (worlds, 2)."""
+        pose, center = qpos[:, self._object].astype(float), self._model.center
+        start = origin.astype(float)
+
+        def middle(p: np.ndarray) -> np.ndarray:
+            t = 2 * np.cross(p[:, 4:], center)
+            return p[:, :3] + center + p[:, 3:4] * t + np.cross(p[:, 4:], t)
+
+        norm = np.linalg.norm(pose[:, 3:], axis=1) * np.linalg.norm(start[:, 3:], axis=1)
+        cosine = np.abs((pose[:, 3:] * start[:, 3:]).sum(1)) / np.maximum(norm, 1e-12)
+        turned = 2 * np.arccos(np.clip(cosine, 0, 1))
+        return np.column_stack([np.linalg.norm(middle(pose) - middle(start), axis=1), turned])
+
+    @staticmethod
+    def _wild(state: dict[str, np.ndarray]) -> np.ndarray:
+        return ~(np.abs(state["qvel"]).max(1) < WILD) | ~np.isfinite(state["qpos"]).all(1)
+
+    def _slip(self, rows: GraspRows, index: np.ndarray, points: list[np.ndarray], qpos: np.ndarray) -> np.ndarray:
+        trial = Trial(self._model)
+        return np.array([trial.slip_at(rows, int(i), p, q) for i, p, q in zip(index, points, qpos, strict=True)])
