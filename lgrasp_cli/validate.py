@@ -33,6 +33,9 @@ def validate(
         typer.Option("--out", help="Folder of the results; default: that of the shards with -PROTOCOL added."),
     ] = None,
     threads: Annotated[int, typer.Option(min=0, help="Grasps simulated at a time; 0: all cores.")] = 0,
+    device: Annotated[
+        str, typer.Option(help="cpu, or cuda:N for many at a time with MuJoCo Warp (extra gpu-sim).")
+    ] = "cpu",
     all_directions: Annotated[
         bool, typer.Option("--all-directions", help="Go on after the first direction in which the object is lost.")
     ] = False,
@@ -55,7 +58,8 @@ def validate(
 
     chosen = find_protocol(protocol)
     cache = open_cache(cache_dir)
-    job = Validation(shards, chosen, out, threads=threads, all_directions=all_directions, resume=resume, cache=cache)
+    options = {"threads": threads, "device": device, "all_directions": all_directions, "resume": resume}
+    job = Validation(shards, chosen, out, cache=cache, **options)
     with _Progress(quiet) as progress:
         done = validate_shards(job, progress.started, progress.advanced)
     entries = summary(done, chosen)

@@ -13,6 +13,7 @@ import numpy as np
 from lgrasp.dataset import GraspRows, Shard, find_shards, read_shard, write_shard
 from lgrasp.dataset.files import remove_leftovers
 from lgrasp.decompose import decompose
+from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder
 from lgrasp.errors import ConfigError, OutputError, ShardError
@@ -32,6 +33,7 @@ class Validation:
     protocol: Protocol
     out: Path | None = None  # folder; none: that of the shards with -PROTOCOL added
     threads: int = 0  # 0: all cores
+    device: str = "cpu"
     all_directions: bool = False
     resume: bool = True
     cache: Cache = field(default_factory=Cache)
@@ -69,6 +71,7 @@ def validate_shards(
         PhysicsError: MuJoCo is missing or refuses a hand.
     """
     import_mujoco()
+    device = resolve_device(job.device).alias
     sources = find_shards(job.shards)
     targets = _targets(sources, job)
     cut = partial(decompose, store=job.cache)
@@ -80,7 +83,7 @@ def validate_shards(
         if key not in scenes:
             scenes = {key: scene_of_shard(shard, cut)}
         scene = scenes[key]
-        text = protocol_text(scene, job.protocol, all_directions=job.all_directions)
+        text = protocol_text(scene, job.protocol, all_directions=job.all_directions, device=device)
         seconds = 0.0
         if not (job.resume and _is_done(target, shard.grasps, job.protocol, text)):
             if started:
@@ -93,6 +96,7 @@ def validate_shards(
                 threads=job.threads or os.cpu_count() or 1,
                 progress=progress,
                 all_directions=job.all_directions,
+                device=device,
             )
             seconds = time.perf_counter() - begin
             shard = _with_verdicts(shard, job.protocol, found, text, seconds)

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import warp as wp
 from lgrasp.dataset.records import GraspRows
 from lgrasp.errors import PhysicsError
 from lgrasp.physics.columns import stack_verdicts
-from lgrasp.physics.model import Model
+from lgrasp.physics.model import Model, import_mujoco
 from lgrasp.physics.trial import AXES, CHUNK, REST, WILD, Trial, Verdict, is_safe
 
 __all__ = ["WorldTrials"]
@@ -43,6 +44,7 @@ class _Worlds:
     """W copies of one scene; their state is set and read as NumPy arrays, and stepped a chunk at a time."""
 
     def __init__(self, model: Model, worlds: int, device: str) -> None:
+        mujoco = import_mujoco()
         try:
             import mujoco_warp
         except ImportError:
@@ -51,7 +53,8 @@ class _Worlds:
             ) from None
         self._lib: Any = mujoco_warp
         self._model, self._device, self.worlds = model, wp.get_device(device), worlds
-        m = model.mujoco
+        m = copy(model.mujoco)
+        m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
         with wp.ScopedDevice(self._device):
             self._m = mujoco_warp.put_model(m)
             self._d = mujoco_warp.make_data(m, nworld=worlds, nconmax=_CONTACTS, njmax=_CONSTRAINTS)
@@ -155,7 +158,8 @@ class WorldTrials:
     def _block(self, rows: GraspRows, index: np.ndarray) -> list[Verdict]:
         n = len(index)
         looks = self._looks(rows, index)
-        points, contact_at_q, depth = ([look[k] for look in looks] for k in (0, 1, 2))
+        points, contact_at_q = [look[0] for look in looks], [look[1] for look in looks]
+        depth = [look[2] for look in looks]
         start = np.stack([look[3] for look in looks])  # qpos at pregrasp
         alive = np.array(depth) <= self._protocol.most_penetration
         stops = [

@@ -1,4 +1,4 @@
-"""Verdicts of many grasps on the CPU, one thread per grasp at a time."""
+"""Verdicts of many grasps: on the CPU one thread per grasp at a time, on a GPU all side by side."""
 
 import queue
 import threading
@@ -19,6 +19,7 @@ from lgrasp.physics.trial import Trial, Verdict
 __all__ = ["protocol_text", "verdicts"]
 
 _HELD_TOLERANCE = 1.0e-4  # [rad or m]
+_LEAST_WORLDS, _MOST_WORLDS = 256, 8192  # on a GPU
 
 
 def verdicts(
@@ -30,6 +31,7 @@ def verdicts(
     *,
     all_directions: bool = False,
     settled_stop: bool = True,
+    device: str = "cpu",
 ) -> dict[str, np.ndarray]:
     """Simulate every grasp: columns PROTOCOL_... of :data:`lgrasp.physics.COLUMNS`.
 
@@ -43,6 +45,7 @@ def verdicts(
         progress: called on this thread with (rows done, rows held); what it raises ends the simulation.
         all_directions: go on after the first direction in which the object is lost.
         settled_stop: end a direction when the object has come to rest well inside its bounds.
+        device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0).
 
     Raises:
         PhysicsError: MuJoCo is missing or refuses the scene.
@@ -51,6 +54,12 @@ def verdicts(
         return stack_verdicts(protocol.name, [])
     model = build_model(scene, protocol, rows.q[0])
     _check_held(model, rows)
+    if device != "cpu":
+        from lgrasp.physics.gpu import WorldTrials
+
+        worlds = min(_MOST_WORLDS, max(_LEAST_WORLDS, 6 * len(rows)))
+        options = {"threads": threads, "all_directions": all_directions, "settled_stop": settled_stop}
+        return WorldTrials(model, device, worlds=worlds, **options).run(rows, progress)
     found: list[Verdict | None] = [None] * len(rows)
     trials: queue.SimpleQueue[Trial] = queue.SimpleQueue()
     for _ in range(threads):
@@ -93,7 +102,9 @@ def _silence() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = False) -> str:
+def protocol_text(
+    scene: Scene, protocol: Protocol, *, all_directions: bool = False, device: str = "cpu"
+) -> str:
     """All that decides a verdict besides its row, as JSON: the ``protocol`` attribute of the columns.
 
     Raises:
@@ -101,7 +112,7 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
     """
     solid = scene.object
     return protocol.text(
-        simulator=f"mujoco {import_mujoco().__version__}",
+        simulator=f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}",
         resolved=protocol.load(solid.volume).model_dump(),
         all_directions=all_directions,
         object={"pieces": len(solid.pieces), "excess": round(solid.excess, 6), "notes": list(solid.notes)},

@@ -1,6 +1,6 @@
 """One grasp in MuJoCo: close the hand once, then pull the object in each direction from that same state."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -244,7 +244,7 @@ class Trial:
         return not np.abs(self._data.qvel).max() < WILD or not np.isfinite(self._data.qpos).all()
 
 
-def is_safe(before: Sequence[float], now: Sequence[float], limits: Sequence[float], chunks: float) -> bool:
+def is_safe(before: Iterable[float], now: Iterable[float], limits: Iterable[float], chunks: float) -> bool:
     """Would an object that moved so in a chunk stay inside half its bounds at four times that pace to the end?"""
     return all(
         new + 4 * abs(new - old) * chunks < 0.5 * limit for old, new, limit in zip(before, now, limits, strict=True)
