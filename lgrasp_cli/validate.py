@@ -1,6 +1,7 @@
 """``lgrasp validate``: does each grasp hold its object in a physics simulation?"""
 
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["register", "validate"]
 
+_SLOW = 2.0  # [s]
 _INTERVAL = 10.0  # [s] between lines of progress when standard error is no terminal
 
 
@@ -61,7 +63,7 @@ def validate(
     options = {"threads": threads, "device": device, "all_directions": all_directions, "resume": resume}
     job = Validation(shards, chosen, out, cache=cache, **options)
     with _Progress(quiet) as progress:
-        done = validate_shards(job, progress.started, progress.advanced)
+        done = validate_shards(job, progress.started, progress.advanced, progress.preparing)
     entries = summary(done, chosen)
     for entry in entries:
         for note in entry["notes"]:
@@ -122,16 +124,31 @@ class _Progress:
         self._quiet, self._live = quiet, sys.stderr.isatty()
         self._name, self._rows = "", 0
         self._start = self._said = time.monotonic()
+        self._slow: threading.Timer | None = None
 
     def __enter__(self) -> "_Progress":
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._prepared()
         if self._live and self._name and not self._quiet:
             sys.stderr.write("\n")
 
+    def preparing(self, path: Path) -> None:
+        """Hand and object of a shard are cut; said when it takes a while."""
+        if not self._quiet:
+            line = f"{path.name}: cutting hand and object into convex pieces, which are kept in the cache"
+            self._slow = threading.Timer(_SLOW, typer.echo, (line,), {"err": True})
+            self._slow.daemon = True
+            self._slow.start()
+
+    def _prepared(self) -> None:
+        if self._slow:
+            self._slow.cancel()
+
     def started(self, path: Path, rows: int) -> None:
         """A shard is begun."""
+        self._prepared()
         self._name, self._rows, self._start = path.name, rows, time.monotonic()
 
     def advanced(self, done: int, held: int) -> None:

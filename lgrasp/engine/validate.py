@@ -58,12 +58,14 @@ def validate_shards(
     job: Validation,
     started: Callable[[Path, int], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    preparing: Callable[[Path], None] | None = None,
 ) -> list[Validated]:
     """Simulate the rows of shards; what is done already in the output folder stays.
 
     Args:
         started: called with (shard, rows) before its simulation.
         progress: called with (rows done, rows held); what it raises ends the job, whole shards stay.
+        preparing: called with a shard before its hand and object are cut into convex pieces.
 
     Raises:
         ShardError: a shard cannot be read, or holds several objects.
@@ -81,11 +83,13 @@ def validate_shards(
         shard = read_shard(source)
         key = (shard.hand.sha256, *(record.sha256 for record in shard.objects), *(str(o.scale) for o in shard.objects))
         if key not in scenes:
-            scenes = {key: scene_of_shard(shard, cut)}
+            if preparing:
+                preparing(source)
+            scenes = {key: scene_of_shard(shard, cut, device)}
         scene = scenes[key]
         text = protocol_text(scene, job.protocol, all_directions=job.all_directions, device=device)
         seconds = 0.0
-        if not (job.resume and _is_done(target, shard.grasps, job.protocol, text)):
+        if not (job.resume and _is_done(target, shard.grasps, job.protocol, text, job.cache.warn)):
             if started:
                 started(source, len(shard.grasps))
             begin = time.perf_counter()
@@ -130,7 +134,7 @@ def _targets(sources: list[Path], job: Validation) -> dict[Path, Path]:
     return targets
 
 
-def _is_done(target: Path, rows: GraspRows, protocol: Protocol, text: str) -> bool:
+def _is_done(target: Path, rows: GraspRows, protocol: Protocol, text: str, warn: Callable[[str], None]) -> bool:
     """Does a file hold these rows with verdicts of this protocol?
 
     Raises:
@@ -140,8 +144,9 @@ def _is_done(target: Path, rows: GraspRows, protocol: Protocol, text: str) -> bo
         return False
     try:
         found = read_shard(target).grasps
-    except ShardError:
-        return False  # damaged: made anew
+    except ShardError as error:
+        warn(f"{error}; it is made anew")
+        return False
     same = found.physics_protocols.get(f"{protocol.name}_holds") == text and all(
         np.array_equal(getattr(found, name), getattr(rows, name), equal_nan=True)
         for name in ("q", "q_pregrasp", "q_squeeze", "object_pose")

@@ -102,9 +102,7 @@ def _silence() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def protocol_text(
-    scene: Scene, protocol: Protocol, *, all_directions: bool = False, device: str = "cpu"
-) -> str:
+def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = False, device: str = "cpu") -> str:
     """All that decides a verdict besides its row, as JSON: the ``protocol`` attribute of the columns.
 
     Raises:

@@ -1,7 +1,9 @@
 """lgrasp validate: the shards again, with verdicts."""
 
 import json
+import signal
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -73,3 +75,17 @@ def test_bad_input(cli, grasps, tmp_path, monkeypatch):
     assert 'pip install "lgrasp[sim]"' in cli("validate", grasps).error()
     assert not (tmp_path / "a").exists()
     assert not (tmp_path / "grasps-fc").exists()
+
+
+def test_interruption_leaves_whole_shards(process, grasps, tmp_path):
+    write_shard(grasps / "jaws-cube-00002.h5", Jaws(tmp_path).shard(0.004, count=20_000))
+    out = tmp_path / "out"
+    running = process("validate", grasps, "--out", out, "--threads", 1)
+    until = time.monotonic() + 30
+    while len(list(out.glob("*.h5"))) < 2 and time.monotonic() < until:
+        time.sleep(0.05)
+    running.send_signal(signal.SIGINT)
+    _, errors = running.communicate(timeout=30)
+    assert (running.returncode, errors.splitlines()[-1]) == (130, "interrupted")
+    assert sorted(path.name for path in out.iterdir()) == ["jaws-cube-00000.h5", "jaws-cube-00001.h5"]
+    assert not any(map(validate_shard, out.iterdir()))
