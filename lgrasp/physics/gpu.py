@@ -3,120 +3,22 @@
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from copy import copy
-from typing import Any
 
 import numpy as np
-import warp as wp
 
 from lgrasp.dataset.records import GraspRows
-from lgrasp.errors import PhysicsError
 from lgrasp.physics.columns import stack_verdicts
-from lgrasp.physics.model import Model, import_mujoco
+from lgrasp.physics.model import Model
 from lgrasp.physics.trial import AXES, CHUNK, REST, WILD, Trial, Verdict, is_safe
+from lgrasp.physics.worlds import Worlds
 
 __all__ = ["WorldTrials"]
-
-_CONTACTS = 96  # per world, on average
-_CONSTRAINTS = 640  # rows per world: four a contact, limits, couplings
-
-
-@wp.kernel
-def _drive(
-    start: wp.array2d(dtype=wp.float32),
-    end: wp.array2d(dtype=wp.float32),
-    ramp: wp.float32,
-    step: wp.array(dtype=wp.float32),
-    ctrl_out: wp.array2d(dtype=wp.float32),
-):
-    """Targets of the next step, evenly from start to end over ``ramp`` steps."""
-    world, u = wp.tid()
-    share = wp.min((step[world] + 1.0) / ramp, 1.0)
-    ctrl_out[world, u] = start[world, u] + (end[world, u] - start[world, u]) * share
-
-
-@wp.kernel
-def _count(step_out: wp.array(dtype=wp.float32)):
-    step_out[wp.tid()] = step_out[wp.tid()] + 1.0
-
-
-class _Worlds:
-    """W copies of one scene; their state is set and read as NumPy arrays, and stepped a chunk at a time."""
-
-    def __init__(self, model: Model, worlds: int, device: str) -> None:
-        mujoco = import_mujoco()
-        try:
-            import mujoco_warp
-        except ImportError:
-            raise PhysicsError(
-                'physics on a GPU needs MuJoCo Warp, which is not installed: pip install "lgrasp[sim,gpu-sim]"'
-            ) from None
-        self._lib: Any = mujoco_warp
-        self._model, self._device, self.worlds = model, wp.get_device(device), worlds
-        m = copy(model.mujoco)
-        m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
-        with wp.ScopedDevice(self._device):
-            self._m = mujoco_warp.put_model(m)
-            self._d = mujoco_warp.make_data(m, nworld=worlds, nconmax=_CONTACTS, njmax=_CONSTRAINTS)
-            shape = (worlds, m.nu)
-            self._start, self._end, self._step = (wp.zeros(s, dtype=wp.float32) for s in (shape, shape, (worlds,)))
-        self._ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
-        self.chunk = max(1, round(CHUNK / m.opt.timestep))
-        self._graph: Any = None
-        self.steps = 0
-
-    def advance(self) -> None:
-        """Step every world through one chunk."""
-        with wp.ScopedDevice(self._device):
-            if self._graph is None and self._device.is_cuda:
-                saved = self.state()
-                self._one_step()  # compiles what is needed
-                self.restore(saved)
-                with wp.ScopedCapture() as capture:
-                    self._one_step()
-                self._graph = capture.graph
-            for _ in range(self.chunk):
-                if self._graph is None:
-                    self._one_step()
-                else:
-                    wp.capture_launch(self._graph)
-        self.steps += self.chunk * self.worlds
-
-    def _one_step(self) -> None:
-        wp.launch(_drive, self._start.shape, [self._start, self._end, self._ramp, self._step], [self._d.ctrl])
-        wp.launch(_count, self.worlds, [], [self._step])
-        self._lib.step(self._m, self._d)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Everything that decides what comes next, one row a world."""
-        d = self._d
-        arrays = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
-        own = {"start": self._start, "end": self._end, "step": self._step}
-        return {name: a.numpy().copy() for name, a in (arrays | own).items()}
-
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Inverse of :meth:`state`."""
-        d = self._d
-        arrays = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
-        own = {"start": self._start, "end": self._end, "step": self._step}
-        for name, a in (arrays | own).items():
-            a.assign(state[name])
-
-    def touching(self) -> np.ndarray:
-        """Number of links that touch the object, (worlds,)."""
-        d, m = self._d, self._model.mujoco
-        n = min(int(d.nacon.numpy()[0]), d.naconmax)
-        geoms, world = d.contact.geom.numpy()[:n], d.contact.worldid.numpy()[:n]
-        close = (d.contact.dist.numpy()[:n] < 0) & (geoms >= 0).all(1)
-        bodies, world = m.geom_bodyid[geoms[close]], world[close]
-        with_object = (bodies == self._model.object_body).any(1)
-        other = np.where(bodies[:, 0] == self._model.object_body, bodies[:, 1], bodies[:, 0])
-        pairs = np.unique(np.column_stack([world[with_object], other[with_object]]), axis=0)
-        return np.bincount(pairs[:, 0], minlength=self.worlds) if len(pairs) else np.zeros(self.worlds, int)
 
 
 class WorldTrials:
     """The same trials as :class:`Trial`, many at a time on one device.
+
+    A grasp whose world needs more contacts than there is room for is judged by :class:`Trial` instead.
 
     Args:
         device: Warp device.
@@ -135,11 +37,12 @@ class WorldTrials:
         settled_stop: bool = True,
     ) -> None:
         self._model, self._protocol = model, model.protocol
-        self._sim = _Worlds(model, worlds, device)
+        self._sim = Worlds(model, worlds, device)
         self._threads, self._all, self._settled_stop = threads, all_directions, settled_stop
+        self._spare = Trial(model, all_directions=all_directions, settled_stop=settled_stop)
         self._limits = np.array([self._protocol.most_displacement, np.radians(self._protocol.most_rotation)])
         self._object = slice(model.object_address, model.object_address + 7)
-        self._base = Trial(model).base_rotation()
+        self._base = self._spare.base_rotation()
 
     @property
     def steps(self) -> int:
@@ -172,27 +75,30 @@ class WorldTrials:
         state["qpos"][:n], state["start"][:n], state["end"][:n] = start, stops[0], stops[1]
         state["qpos"][n:], state["start"][n:], state["end"][n:] = start[0], stops[0][0], stops[0][0]
         origin = state["qpos"][:, self._object].copy()
-        worst, wild = np.zeros((n, 2)), np.zeros(n, bool)
+        worst, wild, full = np.zeros((n, 2)), np.zeros(n, bool), np.zeros(n, bool)
         self._sim.restore(state)
-        self._ramp(origin, worst, wild)
+        self._ramp(origin, worst, wild, full)
         state = self._sim.state()
         for _ in range(max(1, round(self._protocol.settle / CHUNK))):
             self._sim.advance()
         contacts = self._sim.touching()[:n]
+        full |= self._sim.overflowed()[:n]
         state["start"][:n], state["end"][:n], state["step"][:] = stops[1], stops[2], 0
         self._sim.restore(state)
-        self._ramp(origin, worst, wild)
+        self._ramp(origin, worst, wild, full)
         closed = self._sim.state()
         slip = self._slip(rows, index, points, closed["qpos"][:n])
         speed = closed["qvel"][:n, -6:]
         rest = (np.linalg.norm(speed[:, :3], axis=1) < REST[0]) & (np.linalg.norm(speed[:, 3:], axis=1) < REST[1])
         lost = wild | (worst > self._limits).any(1)
-        directions, moved, ran_away = self._pull(closed, origin, worst, alive & ~lost)
+        directions, moved, ran_away = self._pull(closed, origin, worst, alive & ~lost, full)
         directions[alive & lost] = 0
         moved[alive & lost] = worst[alive & lost][:, None]
         nan = np.nan
         return [
-            Verdict(
+            self._spare.run(rows, int(index[i]))
+            if full[i]
+            else Verdict(
                 bool((directions[i] == 1).all()),
                 directions[i],
                 moved[i, :, 0],
@@ -218,19 +124,20 @@ class WorldTrials:
             parts = list(pool.map(look, range(self._threads)))
         return [parts[k % self._threads][k // self._threads] for k in range(len(index))]
 
-    def _ramp(self, origin: np.ndarray, worst: np.ndarray, wild: np.ndarray) -> None:
-        """One phase of closing; ``worst`` and ``wild`` grow."""
+    def _ramp(self, origin: np.ndarray, worst: np.ndarray, wild: np.ndarray, full: np.ndarray) -> None:
+        """One phase of closing; ``worst``, ``wild`` and ``full`` grow."""
         n = len(worst)
         for _ in range(max(1, round(self._protocol.phase / CHUNK))):
             self._sim.advance()
             state = self._sim.state()
             worst[:] = np.maximum(worst, self._moved(state["qpos"], origin)[:n])
             wild |= self._wild(state)[:n]
+            full |= self._sim.overflowed()[:n]
 
     def _pull(
-        self, closed: dict[str, np.ndarray], origin: np.ndarray, worst: np.ndarray, good: np.ndarray
+        self, closed: dict[str, np.ndarray], origin: np.ndarray, worst: np.ndarray, good: np.ndarray, full: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Every direction of every good grasp, in whatever world is free; as of :meth:`Trial.run`."""
+        """Every direction of every good grasp, in whatever world is free; as of :meth:`Trial.run`. ``full`` grows."""
         n, worlds = len(good), self._sim.worlds
         directions, moved = np.full((n, 6), -1, np.int8), np.full((n, 6, 2), np.nan)
         ran_away, failed = np.zeros(n, bool), np.zeros(n, bool)
@@ -268,8 +175,10 @@ class WorldTrials:
             state = self._sim.state()
             here, wild = self._moved(state["qpos"], home), self._wild(state)
             now[:] = np.maximum(now, here)
+            short = self._sim.overflowed()
             for w in busy:
                 i, k = job[w]
+                full[i] |= short[w]
                 done[w] += 1
                 lost = wild[w] or (now[w] > self._limits).any()
                 safe = self._settled_stop and is_safe(before[w], here[w], self._limits, total - done[w])
