@@ -8,7 +8,7 @@ import warp as wp
 
 from lgrasp.device.transforms import tangent
 
-__all__ = ["MAX_CONTACTS", "balance", "disturbance", "frictionless", "vec6", "wrench"]
+__all__ = ["MAX_CONTACTS", "balance", "disturbance", "frictionless", "unresisted", "vec6", "wrench"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -267,6 +267,36 @@ def balance(
 
 
 @wp.func
+def unresisted(
+    arms: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    mu: wp.float32,
+    turn: wp.quat,
+    direction: wp.int32,
+    stop: wp.float32,
+    limit: wp.float32,
+):
+    """How much of a unit force e on the centre of mass stays unresisted, 0 to 1.
+
+    min |e + sum_i (f_i, arm_i x f_i / 5 cm)| with f_i in the round friction cone of n_i and sum_i f_i . n_i <= 5: what
+    cannot be held with five times the load is not held.
+
+    Args:
+        arms: from the centre of mass [m]. normals: inward.
+        turn: from the hand's base frame to that of arms and normals.
+        direction: of e in the hand's base frame: x, y, z, -x, -y, -z.
+        stop, limit: return as soon as the answer is known to be below, above this.
+    """
+    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    e = wp.vec3(0.0)
+    e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
+    e = wp.quat_rotate(turn, e)
+    load = vec6(e[0], e[1], e[2], 0.0, 0.0, 0.0)
+    return _least_norm(arms, normals, k, mu, 0, 20.0, load, 5.0, 1, stop, limit, 1.0e-3, forces)
+
+
+@wp.func
 def disturbance(
     arms: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
@@ -275,25 +305,10 @@ def disturbance(
     turn: wp.quat,
     limit: wp.float32,
 ):
-    """How much of a unit force on the centre of mass stays unresisted, in the worst of six directions; 0 to 1.
-
-    max_e min |e + sum_i (f_i, arm_i x f_i / 5 cm)| over e = +-x, +-y, +-z of the hand's base frame, with f_i in the
-    round friction cone of n_i and sum_i f_i . n_i <= 5: what cannot be held with five times the load is not held.
-
-    Args:
-        arms: from the centre of mass [m]. normals: inward.
-        turn: from the hand's base frame to that of arms and normals.
-        limit: return as soon as the residual is known to be above this.
-    """
-    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    """The worst of six directions of :func:`unresisted`; some value above the limit when it is above."""
     worst = float(0.0)
     for direction in range(6):
-        e = wp.vec3(0.0)
-        e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
-        e = wp.quat_rotate(turn, e)
-        load = vec6(e[0], e[1], e[2], 0.0, 0.0, 0.0)
-        r = _least_norm(arms, normals, k, mu, 0, 20.0, load, 5.0, 1, worst, limit, 1.0e-3, forces)
-        worst = wp.max(worst, r)
+        worst = wp.max(worst, unresisted(arms, normals, k, mu, turn, direction, worst, limit))
         if worst > limit:
             break
     return worst

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lgrasp.device.qp import MAX_CONTACTS, balance, disturbance
+from lgrasp.device.qp import MAX_CONTACTS, balance, unresisted
 from lgrasp.device.quality import epsilon_bound
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
@@ -11,10 +11,12 @@ from lgrasp.object.arrays import Object
 
 __all__ = [
     "balance_grasps",
+    "center_forces",
     "count_outcomes",
     "grasp_epsilon",
     "list_kept",
     "pack_rows",
+    "resist_loads",
     "self_overlap",
 ]
 
@@ -41,78 +43,130 @@ def _contacts(
     return k
 
 
+@wp.func
+def _balanced(
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    friction: wp.float32,
+    edges: wp.int32,
+    torque_scale: wp.float32,
+    stop: wp.float32,
+    forces: wp.array(dtype=wp.vec3),
+):
+    """:func:`balance` about the contacts' centroid."""
+    centroid = wp.vec3(0.0)
+    for c in range(k):
+        centroid = centroid + points[c]
+    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    for c in range(k):
+        arms[c] = points[c] - centroid / float(k)
+    return balance(arms, normals, k, friction, edges, torque_scale, stop, forces)
+
+
 @wp.kernel
 def balance_grasps(
     obj: Object,
     friction: wp.float32,
     balanced: wp.float32,
     torque_scale: wp.float32,
-    most: wp.float32,
     max_depth: wp.float32,
-    pose: wp.array(dtype=wp.transform),
-    set_pose: wp.array(dtype=wp.int32),
     contact_surface: wp.array2d(dtype=wp.int32),
     depth: wp.array(dtype=wp.float32),
     outcome_out: wp.array(dtype=wp.int32),
     force_out: wp.array2d(dtype=wp.vec3),
     fswo_out: wp.array(dtype=wp.float32),
     gswo_out: wp.array(dtype=wp.float32),
-    disturbance_out: wp.array(dtype=wp.float32),
 ):
-    """FSWO (eq. 1), GSWO (eq. 2, 8-edge cones), the disturbance residual, and balancing forces in the object's frame.
-
-    The forces are those of the narrowest of a few round cones that balances as well: far from slipping.
-    """
+    """FSWO (eq. 1), GSWO (eq. 2, 8-edge cones) and its forces, object frame."""
     i = wp.tid()
     if outcome_out[i] != 0:
         return
     if depth[i] > max_depth:
         outcome_out[i] = 3
         return
-    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    k = _contacts(obj, contact_surface[i], arms, normals)
-    centroid = wp.vec3(0.0)
-    for c in range(k):
-        centroid = centroid + arms[c]
-    for c in range(k):
-        arms[c] = arms[c] - centroid / float(k)
-    fswo_out[i] = balance(arms, normals, k, 0.0, 0, torque_scale, 0.0, forces)
-    gswo = balance(arms, normals, k, friction, 8, torque_scale, 1.0e-4, forces)
+    k = _contacts(obj, contact_surface[i], points, normals)
+    fswo_out[i] = _balanced(points, normals, k, 0.0, 0, torque_scale, 0.0, forces)
+    gswo = _balanced(points, normals, k, friction, 8, torque_scale, 1.0e-4, forces)
     gswo_out[i] = gswo
     if gswo > balanced:
         outcome_out[i] = 5
         return
     for c in range(k):
-        points[c] = arms[c] + centroid / float(k) - obj.com
-    turn = wp.quat_inverse(wp.transform_get_rotation(pose[set_pose[i]]))
-    worst = disturbance(points, normals, k, friction, turn, most)
-    disturbance_out[i] = worst
-    if worst > most:
-        outcome_out[i] = 6
-        return
-    for c in range(k):
         force_out[i, c] = forces[c]
+
+
+@wp.kernel
+def resist_loads(
+    obj: Object,
+    friction: wp.float32,
+    most: wp.float32,
+    pose: wp.array(dtype=wp.transform),
+    set_pose: wp.array(dtype=wp.int32),
+    contact_surface: wp.array2d(dtype=wp.int32),
+    outcome: wp.array(dtype=wp.int32),
+    disturbance_out: wp.array(dtype=wp.float32),
+):
+    """One thread per (direction, set): the disturbance residual grows to the worst direction's."""
+    direction, i = wp.tid()
+    worst = disturbance_out[i]
+    if outcome[i] != 0 or worst > most:
+        return
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    k = _contacts(obj, contact_surface[i], points, normals)
+    for c in range(k):
+        points[c] = points[c] - obj.com
+    turn = wp.quat_inverse(wp.transform_get_rotation(pose[set_pose[i]]))
+    wp.atomic_max(disturbance_out, i, unresisted(points, normals, k, friction, turn, direction, worst, most))
+
+
+@wp.kernel
+def center_forces(
+    obj: Object,
+    friction: wp.float32,
+    torque_scale: wp.float32,
+    contact_surface: wp.array2d(dtype=wp.int32),
+    gswo: wp.array(dtype=wp.float32),
+    rows: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    force_out: wp.array2d(dtype=wp.vec3),
+):
+    """Balancing forces of the kept rows in the narrowest of a few round cones that balances as well."""
+    i = wp.tid()
+    if i >= rows[0]:
+        return
+    s = row[i]
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    k = _contacts(obj, contact_surface[s], points, normals)
+    goal = gswo[s] + _SLACK
     for step in range(_NARROWER):
         mu = friction * (float(step) + 1.0) / float(_NARROWER + 1)
-        if balance(arms, normals, k, mu, 0, torque_scale, gswo + 0.5 * _SLACK, forces) <= gswo + _SLACK:
+        if _balanced(points, normals, k, mu, 0, torque_scale, goal - 0.5 * _SLACK, forces) <= goal:
             for c in range(k):
-                force_out[i, c] = forces[c]
+                force_out[s, c] = forces[c]
             break
 
 
 @wp.kernel
 def count_outcomes(
-    outcome: wp.array(dtype=wp.int32),
+    most: wp.float32,
+    disturbance: wp.array(dtype=wp.float32),
+    outcome_out: wp.array(dtype=wp.int32),
     kept_out: wp.array(dtype=wp.int32),
     counts_out: wp.array(dtype=wp.int32),
 ):
-    """1 for sets that passed; ``counts_out`` grows by the sets of each outcome."""
+    """1 for sets that passed, disturbance included; ``counts_out`` grows by the sets of each outcome."""
     i = wp.tid()
-    kept_out[i] = wp.where(outcome[i] == 0, 1, 0)
-    wp.atomic_add(counts_out, outcome[i], 1)
+    if outcome_out[i] == 0 and disturbance[i] > most:
+        outcome_out[i] = 6
+    kept_out[i] = wp.where(outcome_out[i] == 0, 1, 0)
+    wp.atomic_add(counts_out, outcome_out[i], 1)
 
 
 @wp.kernel

@@ -17,10 +17,12 @@ from lgrasp.stages.filter.params import FilterParams
 from lgrasp.stages.filter.posture_kernels import fill_unused, place_used
 from lgrasp.stages.filter.quality_kernels import (
     balance_grasps,
+    center_forces,
     count_outcomes,
     grasp_epsilon,
     list_kept,
     pack_rows,
+    resist_loads,
     self_overlap,
 )
 
@@ -114,19 +116,25 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
             params.friction,
             params.balance,
             params.torque_scale,
-            params.disturbance,
             params.penetration,
-            poses.pose,
-            inputs.pose,
             contact_surface,
             depth,
         ],
-        outputs=[outcome, force, fswo, gswo, disturbance],
+        outputs=[outcome, force, fswo, gswo],
+        device=d,
+    )
+    wp.launch(
+        resist_loads,
+        dim=(6, n),
+        inputs=[obj, params.friction, params.disturbance, poses.pose, inputs.pose, contact_surface, outcome],
+        outputs=[disturbance],
         device=d,
     )
     tally = empty_tally(REASONS, d)
     row, upto = (wp.empty(n, dtype=wp.int32, device=d) for _ in range(2))
-    wp.launch(count_outcomes, dim=n, inputs=[outcome], outputs=[upto, tally.device], device=d)
+    wp.launch(
+        count_outcomes, dim=n, inputs=[params.disturbance, disturbance], outputs=[outcome, upto, tally.device], device=d
+    )
     wp.utils.array_scan(upto, upto, inclusive=True)
     wp.launch(list_kept, dim=n, inputs=[outcome, upto], outputs=[row], device=d)
     checked = _Checked(body, posture, contact, contact_surface, force, numbers, row)
@@ -156,6 +164,13 @@ def _kept_rows(
     poses, rows, row = inputs.candidates.poses, tally.device[:1], checked.row
     q, pregrasp, squeeze = (wp.empty((m, dofs), dtype=wp.float32, device=d) for _ in range(3))
     opened = wp.empty((m, groups), dtype=vec_dof, device=d)
+    wp.launch(
+        center_forces,
+        dim=m,
+        inputs=[obj, params.friction, params.torque_scale, checked.contact_surface, checked.numbers[3], rows, row],
+        outputs=[checked.force],
+        device=d,
+    )
     wp.launch(
         control_poses,
         dim=(m, groups),

@@ -229,7 +229,8 @@ def propose_poses(
     if rating < 0 and body_clear(hand, obj, 0, wp.transform_inverse(T), clearance):
         rating = 1
         if samples > 0:
-            rating = rate_pose(hand, field, obj, T, setting, palm, samples, reach, anchor, wp.rand_init(wp.randi(state)))
+            own = wp.rand_init(wp.randi(state))
+            rating = rate_pose(hand, field, obj, T, setting, palm, samples, reach, anchor, own)
     pose_out[row, b] = T
     palm_point_out[row, b] = palm
     surface_out[row, b] = i
