@@ -1,6 +1,5 @@
 """Verdicts of many grasps at once with MuJoCo Warp: worlds side by side on one device."""
 
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -38,6 +37,7 @@ class WorldTrials:
     ) -> None:
         self._model, self._protocol = model, model.protocol
         self._sim = Worlds(model, worlds, device)
+        self._few = Worlds(model, max(1, worlds // 8), device)
         self._threads, self._all, self._settled_stop = threads, all_directions, settled_stop
         self._spare = Trial(model, all_directions=all_directions, settled_stop=settled_stop)
         self._limits = np.array([self._protocol.most_displacement, np.radians(self._protocol.most_rotation)])
@@ -47,7 +47,7 @@ class WorldTrials:
     @property
     def steps(self) -> int:
         """World-steps simulated so far."""
-        return self._sim.steps
+        return self._sim.steps + self._few.steps
 
     def run(self, rows: GraspRows, progress: Callable[[int, int], None] | None = None) -> dict[str, np.ndarray]:
         """Columns of the verdicts of all rows."""
@@ -138,56 +138,62 @@ class WorldTrials:
         self, closed: dict[str, np.ndarray], origin: np.ndarray, worst: np.ndarray, good: np.ndarray, full: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Every direction of every good grasp, in whatever world is free; as of :meth:`Trial.run`. ``full`` grows."""
-        n, worlds = len(good), self._sim.worlds
+        n, sim = len(good), self._sim
         directions, moved = np.full((n, 6), -1, np.int8), np.full((n, 6, 2), np.nan)
         ran_away, failed = np.zeros(n, bool), np.zeros(n, bool)
-        waiting = deque((int(i), k) for k in range(6) for i in np.flatnonzero(good))
+        waiting = [(int(i), k) for k in reversed(range(6)) for i in reversed(np.flatnonzero(good))]
         total = max(1, round(self._protocol.hold / CHUNK))
-        job = np.full((worlds, 2), -1)
-        done, before, now = np.zeros(worlds, int), np.zeros((worlds, 2)), np.zeros((worlds, 2))
+        job = np.full((sim.worlds, 2), -1)  # grasp and direction of each world
+        done, before, now = np.zeros(sim.worlds, int), np.zeros((sim.worlds, 2)), np.zeros((sim.worlds, 2))
         state = {name: values.copy() for name, values in closed.items()}
         home = origin.copy()
-        base = self._base
+        pulls = self._model.load.force * AXES @ self._base.T
         while True:
-            fresh = []
-            for w in np.flatnonzero(job[:, 0] < 0):
-                while waiting and failed[waiting[0][0]] and not self._all:
-                    waiting.popleft()
-                if not waiting:
-                    break
-                i, k = waiting.popleft()
-                job[w], done[w] = (i, k), 0
-                now[w] = worst[i]
+            free = np.flatnonzero(job[:, 0] < 0)
+            taken = []
+            while waiting and len(taken) < len(free):
+                i, k = waiting.pop()
+                if self._all or not failed[i]:
+                    taken.append((i, k))
+            fresh = free[: len(taken)]
+            if taken:
+                job[fresh] = taken
+                i, k = job[fresh].T
+                done[fresh], now[fresh], home[fresh] = 0, worst[i], origin[i]
                 for name, values in closed.items():
-                    state[name][w] = values[i]
-                state["start"][w] = closed["end"][i]
-                state["force"][w] = 0
-                state["force"][w, self._model.object_body, :3] = self._model.load.force * (base @ AXES[k])
-                home[w] = origin[i]
-                fresh.append(w)
-            if fresh:
-                self._sim.restore(state)
+                    state[name][fresh] = values[i]
+                state["start"][fresh], state["force"][fresh] = closed["end"][i], 0
+                state["force"][fresh, self._model.object_body, :3] = pulls[k]
                 before[fresh] = self._moved(state["qpos"], home)[fresh]
             busy = np.flatnonzero(job[:, 0] >= 0)
             if not len(busy):
                 return directions, moved, ran_away
-            self._sim.advance()
-            state = self._sim.state()
+            if not waiting and sim is self._sim and len(busy) <= self._few.worlds:  # stragglers
+                sim, rows = self._few, np.resize(busy, self._few.worlds)
+                state = {name: values[rows] for name, values in state.items()}
+                job, done, before, now, home = job[rows], done[rows], before[rows], now[rows], home[rows]
+                job[len(busy) :] = -1
+                busy, taken = np.arange(len(busy)), [(-1, -1)]
+            if taken:
+                sim.restore(state)
+            sim.advance()
+            state = sim.state()
             here, wild = self._moved(state["qpos"], home), self._wild(state)
             now[:] = np.maximum(now, here)
-            short = self._sim.overflowed()
-            for w in busy:
-                i, k = job[w]
-                full[i] |= short[w]
-                done[w] += 1
-                lost = wild[w] or (now[w] > self._limits).any()
-                safe = self._settled_stop and is_safe(before[w], here[w], self._limits, total - done[w])
-                before[w] = here[w]
-                if lost or safe or done[w] >= total:
-                    directions[i, k], moved[i, k] = not lost, now[w]
-                    failed[i] |= lost
-                    ran_away[i] |= wild[w]
-                    job[w] = -1
+            done += 1
+            lost = wild | (now > self._limits).any(1)
+            over = lost | (done >= total)
+            if self._settled_stop:
+                over |= is_safe(before.T, here.T, self._limits, total - done)
+            before = here
+            short = busy[sim.overflowed()[busy]]
+            full[job[short, 0]] = True
+            ended = busy[over[busy]]
+            i, k = job[ended].T
+            directions[i, k], moved[i, k] = ~lost[ended], now[ended]
+            failed[i[lost[ended]]] = True
+            ran_away[i[wild[ended]]] = True
+            job[ended] = -1
 
     def _moved(self, qpos: np.ndarray, origin: np.ndarray) -> np.ndarray:
         """How far the objects are from their start: displacement [m] and rotation [rad], (worlds, 2)."""

@@ -57,7 +57,7 @@ def verdicts(
     if device != "cpu":
         from lgrasp.physics.gpu import WorldTrials
 
-        worlds = min(_MOST_WORLDS, max(_LEAST_WORLDS, 6 * len(rows)))
+        worlds = min(max(len(rows), _LEAST_WORLDS), _MOST_WORLDS)
         options = {"threads": threads, "all_directions": all_directions, "settled_stop": settled_stop}
         return WorldTrials(model, device, worlds=worlds, **options).run(rows, progress)
     found: list[Verdict | None] = [None] * len(rows)

@@ -1,6 +1,5 @@
 """One grasp in MuJoCo: close the hand once, then pull the object in each direction from that same state."""
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -244,8 +243,11 @@ class Trial:
         return not np.abs(self._data.qvel).max() < WILD or not np.isfinite(self._data.qpos).all()
 
 
-def is_safe(before: Iterable[float], now: Iterable[float], limits: Iterable[float], chunks: float) -> bool:
-    """Would an object that moved so in a chunk stay inside half its bounds at four times that pace to the end?"""
-    return all(
-        new + 4 * abs(new - old) * chunks < 0.5 * limit for old, new, limit in zip(before, now, limits, strict=True)
-    )
+def is_safe(before: Any, now: Any, limits: Any, chunks: Any) -> Any:
+    """Would an object that moved so in a chunk stay inside half its bounds at four times that pace to the end?
+
+    Args:
+        before, now: displacement and rotation, (2,) or (2, N). limits: (2,). chunks: left, a number or (N,).
+    """
+    (d0, r0), (d1, r1), (d, r) = before, now, limits
+    return (d1 + 4 * abs(d1 - d0) * chunks < 0.5 * d) & (r1 + 4 * abs(r1 - r0) * chunks < 0.5 * r)
