@@ -22,9 +22,10 @@ MAY_IMPORT = {
     "object": {"device"},
     "field": {"device", "hand", "object"},
     "grasp": {"device", "hand", "object"},
-    "stages": {"device", "hand", "object", "field", "grasp"},
     "dataset": {"device", "hand", "object", "field", "grasp"},
-    "engine": {"device", "hand", "object", "field", "grasp", "stages", "dataset"},
+    "physics": {"device", "hand", "object", "dataset"},
+    "stages": {"device", "hand", "object", "field", "grasp", "dataset", "physics"},
+    "engine": {"device", "hand", "object", "field", "grasp", "stages", "dataset", "physics"},
 }
 """The packages of lgrasp, each with those it may import besides itself and the shared modules."""
 
