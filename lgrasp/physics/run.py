@@ -113,6 +113,7 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
         simulator=f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}",
         resolved=protocol.load(solid.volume).model_dump(),
         all_directions=all_directions,
+        ends_early=True,
         object={"pieces": len(solid.pieces), "excess": round(solid.excess, 6), "notes": list(solid.notes)},
     )
 

@@ -12,7 +12,7 @@ from reference.solids import YOU, prism
 from lgrasp.decompose import decompose
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import DecomposeError
-from lgrasp.physics import PROTOCOLS, Scene, scene_of_shard
+from lgrasp.physics import PROTOCOLS, Scene, scene_of_shard, verdicts
 from lgrasp.physics.model import build_model
 from lgrasp.physics.scene import hand_of_record, object_of_record
 
@@ -101,6 +101,28 @@ def test_a_mesh_that_is_not_closed_is_said():
     solid = object_of_record(mesh_record("open", cube), no_cut)
     assert solid.volume == pytest.approx(0.03**3)
     assert any("not closed" in note for note in solid.notes)
+
+
+@pytest.mark.parametrize("kind", ["fixed", "revolute", "prismatic"])
+def test_what_carries_the_base_does_not_matter(jaws: Jaws, kind: str):
+    """The base on a turned mount, or on a joint that is held somewhere: poses and pulls are in the base's frame."""
+    plain = jaws.shard(0.004)
+    limit = '<limit lower="-1" upper="1" effort="1" velocity="1"/>' if kind != "fixed" else ""
+    mount = (
+        f'<link name="mount"/><joint name="w" type="{kind}"><parent link="mount"/><child link="base"/>'
+        f'<origin xyz="0.1 -0.2 0.3" rpy="0.3 -1.2 2"/><axis xyz="0 0.6 0.8"/>{limit}</joint></robot>'
+    )
+    urdf = plain.hand.urdf.replace("</robot>", mount)
+    names = ("l", "r") if kind == "fixed" else ("l", "r", "w")
+    rows = plain.grasps
+    if kind != "fixed":
+        wide = {n: np.hstack([getattr(rows, n), [[np.float32(0.5)]]]) for n in ("q", "q_pregrasp", "q_squeeze")}
+        rows = replace(rows, **wide)
+    carried = replace(plain, hand=replace(plain.hand, urdf=urdf, joint_names=names), grasps=rows)
+    a, b = (verdicts(scene_of_shard(s), s.grasps, FC, all_directions=True) for s in (plain, carried))
+    assert a["fc_holds"].all()
+    for name, values in a.items():
+        np.testing.assert_allclose(values, b[name], atol=1e-5, err_msg=name)
 
 
 def test_neighbours_and_sockets_do_not_collide():
