@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.device.kinematics import vec_dof
+from lgrasp.device.scan import running_sums
 from lgrasp.grasp.tables import ContactSets, GraspTable, trim_sets
 from lgrasp.grasp.tally import Tally, empty_tally, read_tallies
 from lgrasp.stages.context import Context
@@ -135,7 +136,7 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     wp.launch(
         count_outcomes, dim=n, inputs=[params.disturbance, disturbance], outputs=[outcome, upto, tally.device], device=d
     )
-    wp.utils.array_scan(upto, upto, inclusive=True)
+    running_sums(upto)
     wp.launch(list_kept, dim=n, inputs=[outcome, upto], outputs=[row], device=d)
     checked = _Checked(body, posture, contact, contact_surface, force, numbers, row)
     return _kept_rows(inputs, checked, tally, params, context), tally

@@ -4,6 +4,7 @@ import math
 
 import warp as wp
 
+from lgrasp.device.scan import running_sums
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.grasp.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
@@ -41,7 +42,7 @@ def run(
     upto = wp.empty(n, dtype=wp.int32, device=d)
     flagged = [inputs.rows, inputs.pose, inputs.chosen, table.state]
     wp.launch(flag_realised, dim=n, inputs=flagged, outputs=[upto], device=d)
-    wp.utils.array_scan(upto, upto, inclusive=True)
+    running_sums(upto)
     kept = ContactSets(
         candidates=table,
         pose=wp.empty_like(inputs.pose),

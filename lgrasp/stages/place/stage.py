@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from lgrasp.device.scan import running_sums
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import PoseTable
 from lgrasp.grasp.tally import Tally, empty_tally
@@ -66,7 +67,7 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
         outputs=[chosen, upto, tally.device],
         device=d,
     )
-    wp.utils.array_scan(upto, upto, inclusive=True)
+    running_sums(upto)
     table = PoseTable(
         index=wp.empty(count, dtype=wp.int32, device=d),
         pose=wp.empty(count, dtype=wp.transform, device=d),

@@ -3,6 +3,7 @@
 import warp as wp
 
 from lgrasp.device.kinematics import MAX_GROUPS
+from lgrasp.device.scan import running_sums
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.grasp.tally import Tally, empty_tally
@@ -121,8 +122,8 @@ def run(
             outputs=[found, sets, score],
             device=d,
         )
-    upto = wp.empty(n, dtype=wp.int32, device=d)
-    wp.utils.array_scan(found, upto, inclusive=True)
+    upto = wp.clone(found)
+    running_sums(upto)
     most = n * params.per_pose
     table = ContactSets(
         candidates=inputs,

@@ -1,0 +1,15 @@
+"""Running sums on a device, in the order of its stream whatever thread asks."""
+
+import warp as wp
+
+__all__ = ["running_sums"]
+
+
+def running_sums(values: wp.array) -> None:
+    """Replace each number by the sum of all up to it.
+
+    Args:
+        values: (N,) i32.
+    """
+    with values.device.context_guard:  # the library scans in the stream of the thread's current context
+        wp.utils.array_scan(values, values, inclusive=True)
