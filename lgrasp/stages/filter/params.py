@@ -32,7 +32,7 @@ class FilterParams(BaseModel):
         0.001, ge=0, le=0.05, description="Least distance of touching fingers and object in q_pregrasp."
     )
     squeeze_force: float = Field(
-        20.0, ge=0, le=1000, description="Normal forces of all contacts together that q_squeeze presses with [N]."
+        15.0, ge=0, le=1000, description="Normal forces of all contacts together that q_squeeze presses with [N]."
     )
     stiffness: float = Field(
         5.0, gt=0, le=1e6, description="Stiffness of the position control that q_squeeze is meant for [N m/rad]."
