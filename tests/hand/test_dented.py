@@ -113,8 +113,9 @@ def test_pair_in_a_slot_is_tested_on_its_true_surfaces(tmp_path):
     q = np.column_stack([np.linspace(-0.003, 0.003, 31), np.zeros(31)]).astype(np.float32)
     body = wp.array(body_poses(hand, q)[:, 1:], dtype=wp.transform, device="cpu")
     depth = wp.zeros(31, dtype=wp.float32, device="cpu")
-    rows = wp.array(np.arange(31, dtype=np.int32), device="cpu")
-    wp.launch(self_overlap, dim=31, inputs=[hand.struct, body, rows], outputs=[depth], device="cpu")
+    row = wp.array(np.arange(31, dtype=np.int32), device="cpu")
+    rows = wp.full(1, 31, dtype=wp.int32, device="cpu")
+    wp.launch(self_overlap, dim=31, inputs=[hand.struct, body, rows, row], outputs=[depth], device="cpu")
     np.testing.assert_allclose(depth.numpy(), np.maximum(np.abs(q[:, 0]) - 0.001, 0), atol=1e-4)
 
 
