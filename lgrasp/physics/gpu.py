@@ -93,7 +93,7 @@ class WorldTrials:
         lost = wild | (worst > self._limits).any(1)
         directions, moved, ran_away = self._pull(closed, origin, worst, alive & ~lost, full)
         directions[alive & lost] = 0
-        moved[alive & lost] = worst[alive & lost][:, None]
+        moved[alive & lost] = np.where(wild[:, None], np.nan, worst)[alive & lost][:, None]
         nan = np.nan
         return [
             self._spare.run(rows, int(index[i]))
@@ -190,7 +190,8 @@ class WorldTrials:
             full[job[short, 0]] = True
             ended = busy[over[busy]]
             i, k = job[ended].T
-            directions[i, k], moved[i, k] = ~lost[ended], now[ended]
+            directions[i, k] = ~lost[ended]
+            moved[i, k] = np.where(wild[ended][:, None], np.nan, now[ended])
             failed[i[lost[ended]]] = True
             ran_away[i[wild[ended]]] = True
             job[ended] = -1
