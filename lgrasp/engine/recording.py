@@ -39,23 +39,23 @@ class Recorder:
         self._pipeline = pipeline
         self.recording = threading.Lock()
         """Held while a batch is recorded: whoever else uses the device must hold it too."""
-        self._seen: list[int] = []
+        self._times: dict[int, int] = {}  # by size, the latest last
         self._recordings: dict[int, _Recording] = {}
 
     def size(self, wanted: int) -> int:
         """Candidates for a batch that should have about ``wanted``: a size that was there before, if one is close."""
         low, high = (wanted * share for share in _CLOSE)
-        return next((n for n in reversed(self._seen) if low <= n <= high), wanted)
+        return next((n for n in reversed(self._times) if low <= n <= high), wanted)
 
     def run(self, context: Context, first: int, count: int) -> tuple[ContactSets, Meter]:
         """The sets of candidates ``first .. first + count - 1``, and their counts and seconds."""
-        self._seen.append(count)
-        if self._seen.count(count) <= _WORTH:
+        self._times[count] = self._times.pop(count, 0) + 1
+        if self._times[count] <= _WORTH:
             meter = Meter(context.device)
             return run_stages(self._pipeline, context, first, count, "search", meter), meter
         if count not in self._recordings:
             while len(self._recordings) >= _KEPT:
-                del self._recordings[min(self._recordings, key=self._last)]
+                del self._recordings[min(self._recordings, key=list(self._times).index)]
             self._recordings[count] = self._record(context, count)
         recording = self._recordings[count]
         recording.first.fill_(first)
@@ -63,10 +63,6 @@ class Recorder:
             seed.fill_(stage_seed(context.base_seed, context.shard, stage, salt))
         wp.capture_launch(recording.graph)
         return recording.sets, recording.meter.again()
-
-    def _last(self, count: int) -> int:
-        """When a size came last."""
-        return max(i for i, n in enumerate(self._seen) if n == count)
 
     def _record(self, context: Context, count: int) -> _Recording:
         device = context.device

@@ -140,25 +140,25 @@ def make_shard(
     """
     device = inputs.device.alias
     context = Context(inputs.hand, inputs.object, inputs.field, device, pipeline.seed, shard, inputs.scene)
-    bank = Bank(bank_cache, pipeline, inputs.keys, shard, inputs.device.alias) if bank_cache else None
+    bank = Bank(bank_cache, pipeline, inputs.keys, shard, device) if bank_cache else None
     limit = shard_effort(pipeline, rows)
     result: ShardResult | None = None
     parts: list[GraspTable] = []
-    kept = KeptRows(inputs.hand.model.dofs, inputs.device.alias)
+    kept = KeptRows(inputs.hand.model.dofs, device)
     stopped = False
     start = time.perf_counter()
-    # later passes go over the poses of one batch, so its size decides the order of the rows
-    recorder = execution.recorder
-    fixed = BANK_CANDIDATES if bank is not None or pipeline.params("search").passes > 1 else execution.batch
-
-    most = _GPU_MOST if context.device == "cpu" else _most_candidates(context.device, inputs.hand.model.groups)
+    recorder, fixed = execution.recorder, execution.batch
+    if bank is not None or pipeline.params("search").passes > 1:
+        # later passes go over the poses of one batch, so its size decides the order of the rows
+        fixed = BANK_CANDIDATES
+    elif not fixed and context.scene and device == "cpu":
+        fixed = _PHYSICS_BATCH
+    most = _GPU_MOST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups)
 
     def size(running: int) -> int:
         # going by those so far
         rate = kept.count / result.candidates if result and kept.count else execution.rate
-        wanted = fixed or _batch_size(context.device, rows - kept.count, rate, running, most)
-        if context.scene and not fixed and context.device == "cpu":
-            wanted = _PHYSICS_BATCH
+        wanted = fixed or _batch_size(device, rows - kept.count, rate, running, most)
         return recorder.size(wanted) if recorder and not fixed and wanted else wanted
 
     def run(first: int, count: int) -> BatchResult:
