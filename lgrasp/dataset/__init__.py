@@ -7,7 +7,7 @@ from lgrasp.dataset.info import describe
 from lgrasp.dataset.manifest import write_manifest
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import ShardReader, iter_grasps, pose_matrix, read_shard
-from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
+from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 from lgrasp.dataset.schema import FORMAT_VERSION
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
@@ -21,6 +21,7 @@ __all__ = [
     "GraspRows",
     "HandRecord",
     "ObjectRecord",
+    "SequenceRows",
     "Shard",
     "ShardHeader",
     "ShardReader",

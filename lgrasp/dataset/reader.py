@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.heap import check_heaps
-from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
-from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS
+from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
+from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 from lgrasp.dataset.structure import expand, format_problem, structure_problems
 from lgrasp.errors import ShardError
 
@@ -92,9 +92,16 @@ class ShardReader:
         return sorted(self._file["objects"])
 
     @cached_property
+    def space_names(self) -> tuple[str, ...] | None:
+        """Opposition spaces of the hand that ``sequence/space`` counts in; None if the rows are no sequences."""
+        with reading(self.path):
+            found = self._file.get("sequence/space_names")
+            return None if found is None else tuple(found.asstr()[()])
+
+    @cached_property
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
         """Shape and dtype of every row dataset by its flat name (``q``, ``metrics/gap``, ...)."""
-        names = list(GRASP_FIELDS)
+        names = [*GRASP_FIELDS, *(SEQUENCE_FIELDS if self.space_names is not None else ())]
         for group in ("metrics", "physics"):
             names += [path.removeprefix("grasps/") for path in expand(self._file, f"grasps/{group}/*")]
         return {name: (self._dataset(name).shape, self._dataset(name).dtype) for name in names}
@@ -121,6 +128,9 @@ class ShardReader:
             members = {n.partition("/")[2]: v for n, v in values.items() if n.startswith(f"{group}/")}
             fields[group] = members
             fields[texts] = {n: self._dataset(f"{group}/{n}").attrs[attribute] for n in members}
+        if self.space_names is not None:
+            steps = {name.removeprefix("sequence/"): values[name] for name in SEQUENCE_FIELDS}
+            fields["sequence"] = SequenceRows(space_names=self.space_names, **steps)
         return GraspRows(**fields)
 
     def blocks(self) -> Iterator[tuple[int, GraspRows]]:

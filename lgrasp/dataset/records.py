@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 import lgrasp
-from lgrasp.dataset.schema import GRASP_FIELDS
+from lgrasp.dataset.schema import GRASP_FIELDS, SEQUENCE_FIELDS
 
-__all__ = ["GraspRows", "HandRecord", "ObjectRecord", "Shard", "ShardHeader", "object_set_sha256"]
+__all__ = ["GraspRows", "HandRecord", "ObjectRecord", "SequenceRows", "Shard", "ShardHeader", "object_set_sha256"]
 
 
 def _now() -> str:
@@ -60,6 +60,30 @@ class ObjectRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SequenceRows:
+    """How rows of a hand that takes objects one after another came about, step by step.
+
+    Step s of a row grasps the object in slot s with one opposition space; joints that earlier steps moved stay where
+    they are, and so do earlier objects in the hand.
+    """
+
+    space_names: Sequence[str]
+    """Opposition spaces of the hand, the same for all rows of a file."""
+    space: np.ndarray
+    """Index in ``space_names`` of each step, shape [N, O], int16, -1 where absent."""
+    free_joints: np.ndarray
+    """Joints that the step moved, shape [N, O, K], bool, False where absent."""
+    parent: np.ndarray
+    """Row of the file that the row extends by one object, shape [N], int64, -1 for rows of one object."""
+    q: np.ndarray
+    """Joint positions at the grasp of each step [rad or m], shape [N, O, K], float32, NaN where absent."""
+    q_pregrasp: np.ndarray
+    """Joint positions before closing in each step [rad or m], shape [N, O, K], float32, NaN where absent."""
+    q_squeeze: np.ndarray
+    """Position targets that press in each step [rad or m], shape [N, O, K], float32, NaN where absent."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class GraspRows:
     """``N`` grasps; ``K`` actuated joints, ``O`` objects in a row, ``C`` most contacts per object."""
 
@@ -91,13 +115,17 @@ class GraspRows:
     """Simulator verdicts, each shape [N, ...]."""
     physics_protocols: Mapping[str, str] = field(default_factory=dict)
     """Protocol of each verdict (one per name in ``physics``)."""
+    sequence: SequenceRows | None = None
+    """Steps, where objects were taken one after another; then ``q...`` are those of the last step."""
 
     def __len__(self) -> int:
         return int(np.shape(self.q)[0])
 
     def columns(self) -> dict[str, np.ndarray]:
-        """All row arrays by flat name: the fields, then ``metrics/NAME`` and ``physics/NAME``."""
+        """All row arrays by flat name: fields, then ``sequence/NAME``, ``metrics/NAME`` and ``physics/NAME``."""
         flat = {name: getattr(self, name) for name in GRASP_FIELDS}
+        if self.sequence is not None:
+            flat |= {name: getattr(self.sequence, name.removeprefix("sequence/")) for name in SEQUENCE_FIELDS}
         flat |= {f"metrics/{name}": values for name, values in self.metrics.items()}
         return flat | {f"physics/{name}": values for name, values in self.physics.items()}
 

@@ -1,7 +1,8 @@
-"""The shard format 1.0 as data: the one place that names its groups, datasets, attributes, dtypes and shapes.
+"""The shard format 1.1 as data: the one place that names its groups, datasets, attributes, dtypes and shapes.
 
 Capital letters in a shape hold across the file (``N`` rows, ``K`` actuated joints, ``L`` links, ``O`` objects in a row,
-``C`` most contacts per object); lower-case letters are free per dataset; ``...`` is any number of further axes.
+``C`` most contacts per object, ``S`` opposition spaces); lower-case letters are free per dataset; ``...`` is any number
+of further axes.
 """
 
 from dataclasses import dataclass
@@ -17,12 +18,14 @@ __all__ = [
     "FORMAT_VERSION",
     "GRASP_FIELDS",
     "ROW_GROUPS",
+    "SEQUENCE_DATASETS",
+    "SEQUENCE_FIELDS",
     "AttributeSpec",
     "DatasetSpec",
 ]
 
 FORMAT = "lgrasp-shard"
-FORMAT_VERSION = "1.0"
+FORMAT_VERSION = "1.1"
 CHUNK_ROWS = 4096
 
 
@@ -70,6 +73,16 @@ GRASP_FIELDS: dict[str, DatasetSpec] = {
 }
 """Row datasets by their name in :class:`lgrasp.dataset.GraspRows`."""
 
+SEQUENCE_FIELDS: dict[str, DatasetSpec] = {
+    "sequence/space": DatasetSpec("grasps/sequence/space", "i2", ("N", "O"), fill=-1),
+    "sequence/free_joints": DatasetSpec("grasps/sequence/free_joints", "?", ("N", "O", "K"), fill=0),
+    "sequence/parent": DatasetSpec("grasps/sequence/parent", "i8", ("N",)),
+    "sequence/q": DatasetSpec("grasps/sequence/q", "f4", ("N", "O", "K"), "rad or m", _NAN),
+    "sequence/q_pregrasp": DatasetSpec("grasps/sequence/q_pregrasp", "f4", ("N", "O", "K"), "rad or m", _NAN),
+    "sequence/q_squeeze": DatasetSpec("grasps/sequence/q_squeeze", "f4", ("N", "O", "K"), "rad or m", _NAN),
+}
+"""Row datasets of sequences by their flat name; all or none of them are there."""
+
 ROW_GROUPS: dict[str, DatasetSpec] = {
     "metrics": DatasetSpec("grasps/metrics/*", "f4", ("N",)),
     "physics": DatasetSpec("grasps/physics/*", "any", ("N", "...")),
@@ -89,6 +102,12 @@ DATASETS: tuple[DatasetSpec, ...] = (
     *ROW_GROUPS.values(),
 )
 """Every dataset; a family may be empty (except ``objects``), all others are required."""
+
+SEQUENCE_DATASETS: tuple[DatasetSpec, ...] = (
+    DatasetSpec("sequence/space_names", "text", ("S",)),
+    *SEQUENCE_FIELDS.values(),
+)
+"""Datasets of a file of sequences; where one is there, all are required."""
 
 ATTRIBUTES: tuple[AttributeSpec, ...] = (
     AttributeSpec("", "format", "text"),

@@ -9,7 +9,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lgrasp.dataset.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION, AttributeSpec, DatasetSpec
+from lgrasp.dataset.schema import (
+    ATTRIBUTES,
+    DATASETS,
+    FORMAT,
+    FORMAT_VERSION,
+    SEQUENCE_DATASETS,
+    AttributeSpec,
+    DatasetSpec,
+)
 
 __all__ = ["expand", "format_problem", "structure_problems", "text_sha256"]
 
@@ -33,7 +41,8 @@ def structure_problems(file: h5py.File) -> list[str]:
     if not expand(file, "objects/*"):
         problems.append("objects: no object")
     dims: dict[str, int] = {}
-    for spec in DATASETS:
+    sequences = SEQUENCE_DATASETS if any(spec.path in file for spec in SEQUENCE_DATASETS) else ()
+    for spec in (*DATASETS, *sequences):
         for path in expand(file, spec.path):
             problems += _dataset_problems(file, path, spec, dims)
     for attribute in ATTRIBUTES:

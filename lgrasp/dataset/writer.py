@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,11 +12,11 @@ import numpy as np
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.files import new_shard_file
 from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, object_set_sha256
-from lgrasp.dataset.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS
+from lgrasp.dataset.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, DatasetSpec
 from lgrasp.dataset.structure import structure_problems, text_sha256
 from lgrasp.errors import ShardError
 
-__all__ = ["create_rows", "finish", "write_context", "write_shard"]
+__all__ = ["create_rows", "finish", "write_context", "write_shard", "write_spaces"]
 
 
 def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
@@ -30,6 +31,8 @@ def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
     rows = _as_format(shard.grasps, where=path)
     with new_shard_file(path) as file:
         write_context(file, shard.header, shard.hand, shard.objects, shard.statistics)
+        if rows.sequence is not None:
+            write_spaces(file, rows.sequence.space_names)
         for name, values in rows.columns().items():
             unit = rows.metric_units.get(name.removeprefix("metrics/"), "")
             protocol = rows.physics_protocols.get(name.removeprefix("physics/"), "")
@@ -76,6 +79,11 @@ def write_context(file: h5py.File, header: ShardHeader, hand: HandRecord, object
     for name in ("metrics", "physics", "provenance"):
         file.create_group(f"grasps/{name}")
     file.create_group("statistics").attrs.update(dict(statistics))
+
+
+def write_spaces(file: h5py.File, space_names: Sequence[str]) -> None:
+    """Write the opposition spaces that ``sequence/space`` counts in: what makes a file one of sequences."""
+    _create_texts(file.create_group("sequence"), "space_names", space_names)
 
 
 def _write_hand(group: h5py.Group, hand: HandRecord) -> None:
@@ -143,15 +151,21 @@ def _create_texts(group: h5py.Group, name: str, texts: Any) -> None:
 
 def _as_format(rows: GraspRows, *, where: Any) -> GraspRows:
     """The rows with the format's dtypes; an integer that does not fit is an error."""
-    columns: dict[str, Any] = {}
-    for name, spec in GRASP_FIELDS.items():
-        values = np.asarray(getattr(rows, name))
-        columns[name] = values.astype(spec.numpy, copy=False)
-        if spec.numpy.kind in "iu" and not np.array_equal(columns[name], values):
-            raise ShardError(f"cannot write {where}: {spec.path} holds values that do not fit {spec.numpy}")
+
+    def converted(source: Any, specs: Mapping[str, DatasetSpec]) -> dict[str, Any]:
+        columns = {}
+        for name, spec in specs.items():
+            member = name.removeprefix("sequence/")
+            values = np.asarray(getattr(source, member))
+            columns[member] = values.astype(spec.numpy, copy=False)
+            if spec.numpy.kind in "biu" and not np.array_equal(columns[member], values):
+                raise ShardError(f"cannot write {where}: {spec.path} holds values that do not fit {spec.numpy}")
+        return columns
+
     for name in rows.physics:
         if not rows.physics_protocols.get(name):
             raise ShardError(f"cannot write {where}: physics verdict {name!r} names no protocol")
     metrics = {name: np.asarray(values, dtype="f4") for name, values in sorted(rows.metrics.items())}
     physics = {name: np.asarray(values) for name, values in sorted(rows.physics.items())}
-    return replace(rows, **columns, metrics=metrics, physics=physics)
+    steps = rows.sequence and replace(rows.sequence, **converted(rows.sequence, SEQUENCE_FIELDS))
+    return replace(rows, **converted(rows, GRASP_FIELDS), metrics=metrics, physics=physics, sequence=steps)
