@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lgrasp.dataset.lineage import Column, check_parents, check_steps
 from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord
 
 __all__ = ["hand_problems", "object_problems", "row_problems"]
@@ -41,13 +42,16 @@ def object_problems(record: ObjectRecord) -> list[str]:
     return problems
 
 
-def row_problems(rows: GraspRows, hand: HandRecord, object_ids: Sequence[str], *, first_row: int = 0) -> list[str]:
+def row_problems(
+    rows: GraspRows, hand: HandRecord, object_ids: Sequence[str], column: Column, *, first_row: int = 0
+) -> list[str]:
     """What is wrong with the values of some rows, one line per kind of problem, naming the first row that has it.
 
     Args:
         rows: Rows with the shapes and dtypes of the format.
         hand: The hand they belong to.
         object_ids: The shard's sorted object ids.
+        column: Rows of the whole shard by flat name, for rows of sequences, which refer to others.
         first_row: Index of ``rows[0]`` in the shard, for the messages.
     """
     problems: list[str] = []
@@ -61,15 +65,22 @@ def row_problems(rows: GraspRows, hand: HandRecord, object_ids: Sequence[str], *
         _check_joints(rows, hand, require)
         _check_poses(rows, len(object_ids), require)
         _check_contacts(rows, len(hand.link_names), require)
+        if rows.sequence is not None:
+            check_steps(rows, rows.sequence, *_limits(hand), require)
+            check_parents(rows, rows.sequence, column, first_row, require)
     return problems
 
 
 def _check_joints(rows: GraspRows, hand: HandRecord, require) -> None:
     for name in ("q", "q_pregrasp", "q_squeeze"):
         require(np.isfinite(getattr(rows, name)), f"{name}: not finite")
-    lower = np.asarray(hand.joint_lower) - _LIMIT_TOLERANCE
-    upper = np.asarray(hand.joint_upper) + _LIMIT_TOLERANCE
+    lower, upper = _limits(hand)
     require(~((rows.q < lower) | (rows.q > upper)), "q: outside the joint limits by more than 1e-4")
+
+
+def _limits(hand: HandRecord) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest joint positions that are accepted, shape [K] each."""
+    return np.asarray(hand.joint_lower) - _LIMIT_TOLERANCE, np.asarray(hand.joint_upper) + _LIMIT_TOLERANCE
 
 
 def _check_poses(rows: GraspRows, objects: int, require) -> None:

@@ -20,7 +20,9 @@ def describe(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -
         paths: Shard files or folders of them.
 
     Returns:
-        For each shard: ``file``, ``bytes``, ``rows``, ``hand``, ``objects`` (ids), ``pipeline``, ``seed``,
+        For each shard: ``file``, ``bytes``, ``rows``, ``rows_by_objects`` (rows by the number of objects held),
+        ``rows_by_space`` (of sequences: rows by the opposition space of their last step; else None), ``hand``,
+        ``objects`` (ids), ``pipeline``, ``seed``,
         ``shard_index``, ``created``, ``lgrasp_version``, ``joints`` (names), ``columns`` (shape of each row dataset),
         ``metrics`` (unit, min, mean, max of the finite values; None if there are none) and ``statistics``.
 
@@ -34,10 +36,13 @@ def _describe(path: Path) -> dict[str, Any]:
     with ShardReader(path) as reader:
         header = reader.header
         units = reader.rows(0, 0).metric_units
+        held = (reader.column("object_index") >= 0).sum(1)
         return {
             "file": str(path),
             "bytes": path.stat().st_size,
             "rows": len(reader),
+            "rows_by_objects": {str(n): int(rows) for n, rows in enumerate(np.bincount(held)) if rows},
+            "rows_by_space": _last_spaces(reader, held),
             "hand": str(reader.attributes["hand"]),
             "objects": reader.object_ids,
             "pipeline": header.pipeline,
@@ -50,6 +55,13 @@ def _describe(path: Path) -> dict[str, Any]:
             "metrics": {n: {"unit": unit, **_range(reader.column(f"metrics/{n}"))} for n, unit in units.items()},
             "statistics": reader.statistics,
         }
+
+
+def _last_spaces(reader: ShardReader, held: np.ndarray) -> dict[str, int] | None:
+    if reader.space_names is None:
+        return None
+    last = np.take_along_axis(reader.column("sequence/space"), held[:, None] - 1, 1)
+    return {name: int((last == number).sum()) for number, name in enumerate(reader.space_names)}
 
 
 def _range(values: np.ndarray) -> dict[str, float | None]:

@@ -1,7 +1,7 @@
 """Puts the rows of many shards of one hand and one object set into one file."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ from lgrasp.dataset.heap import check_heaps
 from lgrasp.dataset.manifest import MANIFEST_NAME, check_manifest
 from lgrasp.dataset.padding import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.records import HandRecord, ShardHeader
-from lgrasp.dataset.schema import GRASP_FIELDS
-from lgrasp.dataset.writer import create_rows, finish, write_context
+from lgrasp.dataset.records import GraspRows, HandRecord, ShardHeader
+from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
+from lgrasp.dataset.writer import create_rows, finish, write_context, write_spaces
 from lgrasp.errors import ShardError
 
 __all__ = ["merge_shards", "sum_statistics"]
@@ -29,7 +29,8 @@ def merge_shards(paths: _Paths, out: str | os.PathLike[str], *, manifest: str | 
     """Copy the rows of shards, ordered by shard index, into one shard file; streams, so memory stays bounded.
 
     The shards must agree in hand, objects, pipeline, config and seed, and in the names of metrics and verdicts. Rows
-    with fewer objects or contacts than the widest shard are padded. Statistics are summed.
+    with fewer objects or contacts than the widest shard are padded. Statistics are summed. Of sequences, the rows of
+    one object of all shards come first, then those of two, and so on; ``sequence/parent`` follows.
 
     Args:
         paths: Shard files, or a folder of them.
@@ -82,6 +83,8 @@ class _Source:
     statistics: dict[str, int | float | str]
     identity: dict[str, Any]
     """What must agree, by a name for the message."""
+    starts: tuple[int, ...]
+    """First row of each number of objects, from 0 on, and the end; of rows that are no sequences: 0 and the end."""
     tails: dict[str, tuple[int, ...]]
     units: dict[str, str]
     protocols: dict[str, str]
@@ -101,13 +104,15 @@ def _survey(path: Path) -> _Source:
     check_heaps(path)
     with ShardReader(path) as reader:
         header, hand, empty = reader.header, reader.hand(), reader.rows(0, 0)
-        extra = {n: (shape[1:], dtype.str) for n, (shape, dtype) in reader.columns.items() if n not in GRASP_FIELDS}
+        known = GRASP_FIELDS | SEQUENCE_FIELDS
+        extra = {n: (len(shape), dtype.str) for n, (shape, dtype) in reader.columns.items() if n not in known}
         identity = {
             "hand": (hand.name, hand.sha256[:12], *hand.joint_names),
             "objects": [(o.id, o.sha256[:12], o.scale) for o in reader.objects()],
             "pipeline": header.pipeline,
             "config": dict(header.config),
             "seed": header.seed,
+            "opposition spaces": reader.space_names,
             "metrics and physics": extra,
             "metric units": dict(empty.metric_units),
             "physics protocols": dict(empty.physics_protocols),
@@ -117,12 +122,21 @@ def _survey(path: Path) -> _Source:
             rows=len(reader),
             header=header,
             statistics=reader.statistics,
+            starts=_starts(reader),
             identity=identity,
             tails={name: shape[1:] for name, (shape, _) in reader.columns.items()},
             units=dict(empty.metric_units),
             protocols=dict(empty.physics_protocols),
             dtypes={name: dtype for name, (_, dtype) in reader.columns.items()},
         )
+
+
+def _starts(reader: ShardReader) -> tuple[int, ...]:
+    if reader.space_names is None:
+        return 0, len(reader)
+    index = reader.column("object_index")  # (n, o)
+    held = np.bincount((index >= 0).sum(1), minlength=index.shape[1] + 1)
+    return 0, *np.cumsum(held).tolist()
 
 
 def _require_same(first: _Source, other: _Source) -> None:
@@ -157,6 +171,8 @@ def _write_head(file: h5py.File, sources: Sequence[_Source]) -> HandRecord:
         hand = reader.hand()
         statistics = sum_statistics([source.statistics for source in sources])
         write_context(file, header, hand, reader.objects(), statistics)
+        if reader.space_names is not None:
+            write_spaces(file, reader.space_names)
     return hand
 
 
@@ -168,15 +184,34 @@ def _copy_rows(file: h5py.File, sources: Sequence[_Source], hand: HandRecord) ->
         protocol = first.protocols.get(name.removeprefix("physics/"), "")
         shape = (total, *widest(source.tails[name] for source in sources))
         datasets[name] = create_rows(file, name, shape, dtype, unit=unit, protocol=protocol)
+    placed: dict[tuple[int, int], int] = {}  # where each part of each source begins
     done = 0
-    for source in sources:
-        with ShardReader(source.path) as reader:
-            for start, rows in reader.blocks():
-                problems = row_problems(rows, hand, reader.object_ids, first_row=start)
-                if problems:
-                    raise ShardError(f"{source.path}: {problems[0]}")
-                for name, values in rows.columns().items():
-                    dataset = datasets[name]
-                    if dataset.size:
-                        dataset[done : done + len(rows)] = pad_column(name, values, dataset.shape[1:])
-                done += len(rows)
+    for part in range(max(len(source.starts) for source in sources) - 1):
+        for place, source in enumerate(sources):
+            if part + 1 < len(source.starts):
+                placed[place, part] = done
+                shift = placed.get((place, part - 1), 0) - source.starts[max(part - 1, 0)]
+                for rows in _checked(source, hand, part):
+                    for name, values in rows.columns().items():
+                        if name == "sequence/parent":
+                            values = np.where(values < 0, values, values + shift)
+                        dataset = datasets[name]
+                        if dataset.size:
+                            dataset[done : done + len(rows)] = pad_column(name, values, dataset.shape[1:])
+                    done += len(rows)
+
+
+def _checked(source: _Source, hand: HandRecord, part: int) -> Iterator[GraspRows]:
+    """The rows between two of a source's ``starts``, some at a time.
+
+    Raises:
+        ShardError: They do not conform.
+    """
+    first, end = source.starts[part : part + 2]
+    with ShardReader(source.path) as reader:
+        for start in range(first, end, CHUNK_ROWS):
+            rows = reader.rows(start, min(start + CHUNK_ROWS, end))
+            problems = row_problems(rows, hand, reader.object_ids, reader.column, first_row=start)
+            if problems:
+                raise ShardError(f"{source.path}: {problems[0]}")
+            yield rows

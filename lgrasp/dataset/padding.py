@@ -4,13 +4,15 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from lgrasp.dataset.schema import GRASP_FIELDS
+from lgrasp.dataset.schema import GRASP_FIELDS, SEQUENCE_FIELDS
 
 __all__ = ["pad_column", "widest"]
 
 
 def pad_column(name: str, values: np.ndarray, tail: tuple[int, ...]) -> np.ndarray:
     """Values of one row dataset, padded at the end of each axis with the fill value of the format.
+
+    Verdicts of a simulator, which may have a number per object, are padded with what means not run: NaN, -1 or false.
 
     Args:
         name: Flat name, as in :meth:`GraspRows.columns`.
@@ -22,7 +24,9 @@ def pad_column(name: str, values: np.ndarray, tail: tuple[int, ...]) -> np.ndarr
     """
     if values.shape[1:] == tail:
         return values
-    padded = np.full((len(values), *tail), GRASP_FIELDS[name].fill, dtype=values.dtype)
+    spec = (GRASP_FIELDS | SEQUENCE_FIELDS).get(name)
+    fill = spec.fill if spec else {"f": np.nan, "i": -1}.get(values.dtype.kind, 0)
+    padded = np.full((len(values), *tail), fill, dtype=values.dtype)
     padded[tuple(slice(size) for size in values.shape)] = values
     return padded
 

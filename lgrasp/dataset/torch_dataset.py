@@ -15,7 +15,7 @@ from lgrasp.dataset.files import find_shards
 from lgrasp.dataset.padding import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.records import HandRecord, ObjectRecord
-from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS
+from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 from lgrasp.errors import ShardError
 
 __all__ = ["GraspDataset"]
@@ -27,6 +27,7 @@ class _Source(NamedTuple):
     hand_sha256: str
     objects: list[tuple[str, str, float]]
     """Id, hash and scale."""
+    space_names: tuple[str, ...] | None
     columns: dict[str, tuple[tuple[int, ...], np.dtype]]
 
 
@@ -35,7 +36,8 @@ class GraspDataset(torch.utils.data.Dataset):
 
     Keys are the flat names of the row datasets: ``q``, ``object_pose``, ..., ``metrics/NAME``, ``physics/NAME``, with
     the shapes of :class:`GraspRows` less the first axis, padded to the widest shard. ``object_index`` counts in
-    :attr:`objects`, the objects of all shards; ``candidate`` is int64.
+    :attr:`objects`, the objects of all shards; ``candidate`` is int64. If all shards are of sequences, there are
+    ``sequence/NAME`` too: ``sequence/space`` counts in :attr:`space_names`, ``sequence/parent`` in this data set.
 
     Blocks of 4096 rows are decoded at a time and the last used ones kept, so sequential reading is fast at any size and
     random reading as long as the data fits ``cache_bytes``. No file stays open: safe with worker processes, forked or
@@ -65,6 +67,8 @@ class GraspDataset(torch.utils.data.Dataset):
         self._ends = list(accumulate(source.rows for source in self._sources))
         self.objects: list[tuple[str, str, float]] = sorted({o for source in self._sources for o in source.objects})
         """Id, SHA-256 of the source mesh and scale of every object."""
+        self.space_names: tuple[str, ...] | None = first.space_names
+        """Opposition spaces of the hand, if the first shard is of sequences."""
         self.columns: list[str] = self._choose(columns)
         self._tails = {n: widest(source.columns[n][0][1:] for source in self._sources) for n in self.columns}
         self._cache_bytes = cache_bytes
@@ -109,7 +113,9 @@ class GraspDataset(torch.utils.data.Dataset):
     def _choose(self, columns: Sequence[str] | None) -> list[str]:
         def kind(source: _Source, name: str) -> Any:
             shape, dtype = source.columns[name]
-            return dtype if name in GRASP_FIELDS else (dtype, shape[1:])
+            if name in SEQUENCE_FIELDS:
+                return dtype, source.space_names
+            return dtype if name in GRASP_FIELDS else (dtype, len(shape))
 
         first = self._sources[0]
         common = [
@@ -148,6 +154,8 @@ class GraspDataset(torch.utils.data.Dataset):
                 if name == "object_index":
                     known = np.array([*(self.objects.index(o) for o in source.objects), -1], dtype=values.dtype)
                     values = known[values]  # -1, absent, takes the last
+                elif name == "sequence/parent":
+                    values = np.where(values < 0, values, values + self._ends[shard] - source.rows)
                 elif name == "candidate":
                     values = values.astype(np.int64)
                 block[name] = torch.from_numpy(pad_column(name, values, self._tails[name]))
@@ -161,4 +169,6 @@ def _bytes(block: dict[str, torch.Tensor]) -> int:
 def _survey(path: Path) -> _Source:
     with ShardReader(path) as reader:
         objects = [(o.id, o.sha256, o.scale) for o in reader.objects()]
-        return _Source(path, len(reader), str(reader.attributes["hand_sha256"]), objects, reader.columns)
+        return _Source(
+            path, len(reader), str(reader.attributes["hand_sha256"]), objects, reader.space_names, reader.columns
+        )

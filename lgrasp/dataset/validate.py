@@ -47,7 +47,7 @@ def _content_problems(reader: ShardReader) -> list[str]:
             problems.append(f"statistics: attribute {name} is neither a number nor a string")
     seen: set[str] = set()
     for first_row, rows in reader.blocks():
-        for problem in row_problems(rows, hand, reader.object_ids, first_row=first_row):
+        for problem in row_problems(rows, hand, reader.object_ids, reader.column, first_row=first_row):
             kind = problem.rpartition(" (row ")[0]
             if kind not in seen:  # the first block that shows it is enough
                 seen.add(kind)

@@ -43,7 +43,9 @@ def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
         problems = structure_problems(file) or [
             *hand_problems(shard.hand),
             *(problem for record in shard.objects for problem in object_problems(record)),
-            *row_problems(rows, shard.hand, [o.id for o in shard.objects]),
+            *row_problems(
+                rows, shard.hand, [o.id for o in shard.objects], lambda name, a, b: rows.columns()[name][a:b]
+            ),
         ]
         if problems:
             raise ShardError(f"cannot write {path}: {problems[0]}")

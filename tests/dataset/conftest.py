@@ -1,9 +1,11 @@
 """Made-up shards that conform."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
-from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
+from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 
 
 def sample_hand(joints=4, links=3) -> HandRecord:
@@ -88,18 +90,69 @@ def sample_shard(n=5, *, objects=1, shard_index=0, seed=0, created="2026-01-02T0
     )
 
 
+def sample_sequence(counts=(4, 5, 3), *, joints=6, contacts=3, spaces=4, seed=0, shard_index=0, columns=None) -> Shard:
+    """A shard with ``counts[n - 1]`` rows of n objects; each space frees two joints of a ring of joints."""
+    shard = sample_shard(
+        sum(counts), objects=3, columns=columns or len(counts), contacts=contacts, joints=joints, seed=seed
+    )
+    rng = np.random.default_rng([seed, shard_index])
+    rows, o = shard.grasps, shard.grasps.object_index.shape[1]
+    n, k = rows.q.shape
+    whole = sample_rows(n * o, objects=3, columns=1, contacts=contacts, joints=joints, seed=1000 * seed + shard_index)
+    values = {
+        f.name: np.array(getattr(rows, f.name)) for f in fields(rows) if f.name.startswith(("object_", "contact_"))
+    }
+    for name, column in values.items():  # all present, for a start
+        column[...] = getattr(whole, name).reshape(n, o, *column.shape[2:])
+    steps = {name: np.full((n, o, k), np.nan, "f4") for name in ("q", "q_pregrasp", "q_squeeze")}
+    space, free, parent = np.full((n, o), -1, "i2"), np.zeros((n, o, k), bool), np.full(n, -1)
+    held = np.repeat(np.arange(1, len(counts) + 1), counts)
+    masks = np.array([np.isin(np.arange(k), [s % k, (s + 1) % k]) for s in range(spaces)])
+    for row in range(n):
+        last = held[row] - 1
+        used = np.zeros(k, bool)
+        if last:
+            parent[row] = rng.choice(np.flatnonzero(held == last))
+            used = free[parent[row]].any(0)
+            for column in (*values.values(), *steps.values(), space, free):
+                column[row, :last] = column[parent[row], :last]
+        choice = [s for s in range(spaces) if s not in space[row] and (masks[s] & ~used).any()]
+        space[row, last] = rng.choice(choice)
+        free[row, last] = masks[space[row, last]] & ~used
+        for name, column in steps.items():
+            column[row, last] = rng.uniform(-1, 2, k)
+            if last:
+                kept = steps["q_squeeze" if name == "q_squeeze" else "q"][row, last - 1]
+                column[row, last] = np.where(free[row, last], column[row, last], kept)
+        for column in values.values():
+            column[row, last + 1 :] = -1 if column.dtype.kind == "i" else np.nan
+    final = {name: column[np.arange(n), held - 1] for name, column in steps.items()}
+    names = [f"finger {s}" for s in range(spaces)]
+    sequence = SequenceRows(space_names=names, space=space, free_joints=free, parent=parent, **steps)
+    candidate = np.arange(n, dtype="u8") + 1000 * shard_index
+    rows = replace(rows, **values, **final, candidate=candidate, sequence=sequence)
+    header = replace(shard.header, shard_index=shard_index, pipeline="sequence")
+    return replace(shard, header=header, grasps=rows)
+
+
 def assert_same_rows(a: GraspRows, b: GraspRows) -> None:
     assert set(a.columns()) == set(b.columns())
     for name, values in a.columns().items():
         np.testing.assert_array_equal(b.columns()[name], values, err_msg=name)
         assert b.columns()[name].dtype == values.dtype, name
     assert a.metric_units == b.metric_units
+    assert (a.sequence and tuple(a.sequence.space_names)) == (b.sequence and tuple(b.sequence.space_names))
     assert a.physics_protocols == b.physics_protocols
 
 
 @pytest.fixture(scope="session")
 def make_shard():
     return sample_shard
+
+
+@pytest.fixture(scope="session")
+def make_sequence():
+    return sample_sequence
 
 
 @pytest.fixture(scope="session")
