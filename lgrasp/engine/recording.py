@@ -66,7 +66,7 @@ class Recorder:
 
     def _record(self, context: Context, count: int) -> _Recording:
         device = context.device
-        own = replace(context, seeds={})
+        own = replace(context, seeds={}, holding=context.held)
         for stage in self._pipeline.order[: self._pipeline.order.index("search") + 1]:
             own.seed(stage)
         first = wp.zeros(1, dtype=wp.int32, device=device)

@@ -1,4 +1,4 @@
-"""Hand against object: a fast test for searching and an exact one for what is emitted."""
+"""Hand against object: a fast test for searching and an exact one for what is emitted; object against object."""
 
 import warp as wp
 
@@ -9,7 +9,7 @@ from lgrasp.device.sdf import sdf_value
 from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.object.arrays import Object
 
-__all__ = ["body_apart", "body_clear", "body_depth"]
+__all__ = ["body_apart", "body_clear", "body_depth", "objects_apart"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -96,3 +96,23 @@ def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: 
                 if depth > limit:
                     return depth
     return depth
+
+
+@wp.func
+def _points_apart(a: Object, b: Object, T: wp.transform, margin: wp.float32):
+    """Are all obstacle points of a farther than ``margin`` [m] from b? T = T_b_a."""
+    for k in range(a.clusters):
+        s = a.cluster_sphere[k]
+        if sdf_value(b.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3] + margin:
+            for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+                if sdf_value(b.sdf, wp.transform_point(T, a.obstacles[i])) < margin:
+                    return False
+    return True
+
+
+@wp.func
+def objects_apart(a: Object, b: Object, T: wp.transform, margin: wp.float32):
+    """Are the surface points of either object farther than ``margin`` [m] from the other? T = T_b_a."""
+    if sdf_value(b.sdf, wp.transform_point(T, a.com)) > a.radius + margin:
+        return True
+    return _points_apart(a, b, T, margin) and _points_apart(b, a, wp.transform_inverse(T), margin)

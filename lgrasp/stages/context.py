@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 from dataclasses import field as with_default
+from functools import cached_property
 
 import warp as wp
 
 from lgrasp.field.arrays import FieldArrays
+from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.spaces import Space
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.physics.scene import Scene
 from lgrasp.seeding import stage_seed
@@ -27,7 +30,16 @@ class Context:
 
     scene: Scene | None = None
     """What a physics simulation is given; there if the pipeline has one."""
+    space: Space | None = None
+    """Opposition space that grasps must use; hand and field are then those of the space."""
+    holding: HeldArrays | None = None
+    """What the hand holds already, and what of it may not move; None: nothing."""
     seeds: dict[tuple[str, int], wp.array] = with_default(default_factory=dict, repr=False, compare=False)
+
+    @cached_property
+    def held(self) -> HeldArrays:
+        """What the hand holds already, of no rows but one if nothing."""
+        return self.holding or hold_nothing(self.hand)
 
     def seed(self, stage: str, salt: int = 0) -> wp.array:
         """31-bit seed of a stage in this shard, (1,) i32 on the device."""

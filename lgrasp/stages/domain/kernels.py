@@ -5,10 +5,11 @@ import warp as wp
 from lgrasp.device.kinematics import vec_dof
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.field.arrays import Boxes, Field, boxes_pick, field_has, field_pick, field_seed
+from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.hand.arrays import Hand
 from lgrasp.object.arrays import Object
 
-__all__ = ["draw_domains", "draw_domains_bvh", "drop_poor"]
+__all__ = ["draw_domains", "draw_domains_bvh", "drop_poor", "keep_frozen"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -110,6 +111,26 @@ def draw_domains_bvh(
             if n == keep:
                 break
     count_out[row, g] = n
+
+
+@wp.kernel
+def keep_frozen(
+    hand: Hand,
+    held: Held,
+    rows: wp.array(dtype=wp.int32),
+    index: wp.array(dtype=wp.int32),
+    count_out: wp.array2d(dtype=wp.int32),
+    q_out: wp.array3d(dtype=vec_dof),
+):
+    """Groups that must stay as they are lose their candidates; seeds of others take over what is frozen."""
+    row, g = wp.tid()
+    if row >= rows[0]:
+        return
+    h = index[row] // held.tries
+    if group_fixed(hand, held, h, g):
+        count_out[row, g] = 0
+    for m in range(count_out[row, g]):
+        q_out[row, g, m] = with_frozen(hand, held, h, g, q_out[row, g, m])
 
 
 @wp.kernel

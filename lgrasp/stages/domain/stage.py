@@ -8,7 +8,7 @@ from lgrasp.device.kinematics import vec_dof
 from lgrasp.grasp.tables import CandidateTable, PoseTable
 from lgrasp.grasp.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.domain.kernels import draw_domains, draw_domains_bvh, drop_poor
+from lgrasp.stages.domain.kernels import draw_domains, draw_domains_bvh, drop_poor, keep_frozen
 from lgrasp.stages.domain.params import DomainParams
 
 __all__ = ["VERSION", "run"]
@@ -48,6 +48,9 @@ def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[Cand
         outputs=[count, surface, record, q],
         device=d,
     )
+    if context.space:
+        frozen = [context.hand.struct, context.held.struct, inputs.rows, inputs.index]
+        wp.launch(keep_frozen, dim=(n, groups), inputs=frozen, outputs=[count, q], device=d)
     state = wp.zeros((n, groups, params.keep), dtype=wp.int32, device=d)
     tally = empty_tally(("poses", "rich", "candidates"), d)
     wp.launch(

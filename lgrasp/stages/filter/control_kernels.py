@@ -5,6 +5,7 @@ import warp as wp
 from lgrasp.device.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.grasp.clearance import body_apart
+from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.clearance import group_pairs_clear
 from lgrasp.object.arrays import Object
@@ -130,8 +131,10 @@ def control_poses(
 def open_poses(
     hand: Hand,
     obj: Object,
+    held: Held,
     margin: wp.float32,
     self_margin: wp.float32,
+    index: wp.array(dtype=wp.int32),
     pose: wp.array(dtype=wp.transform),
     set_pose: wp.array(dtype=wp.int32),
     chosen: wp.array2d(dtype=wp.int32),
@@ -141,7 +144,7 @@ def open_poses(
     row: wp.array(dtype=wp.int32),
     pregrasp_out: wp.array2d(dtype=wp.float32),
 ):
-    """The touching fingers as far open as leaves them apart from the object and the rest of the hand by the margins.
+    """The touching fingers as far open as leaves them apart from the objects and the rest of the hand by the margins.
 
     Shares of the way from q to ``opened`` are tried from all of it down; q itself when none is clear.
     """
@@ -149,6 +152,7 @@ def open_poses(
     if i >= rows[0]:
         return
     s = row[i]
+    h = index[set_pose[s]] // held.tries
     G = hand.kin.groups
     T_object = wp.transform_inverse(pose[set_pose[s]])
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
@@ -163,6 +167,8 @@ def open_poses(
             if chosen[s, g] >= 0:
                 for k in range(first, hand.kin.joint_first[g + 1]):
                     if clear == 1 and not body_apart(hand, obj, 1 + k, T_object * X[k], margin):
+                        clear = 0
+                    if clear == 1 and not body_clear_of_held(hand, held, h, 1 + k, X[k], self_margin):
                         clear = 0
         for b in range(G):
             for a in range(b + 2):

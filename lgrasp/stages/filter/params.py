@@ -12,6 +12,7 @@ class FilterParams(BaseModel):
 
     penetration: float = Field(0.0008, ge=0, le=0.01, description="Largest hand-object penetration.")
     self_margin: float = Field(0.0003, ge=0, le=0.01, description="Least distance of non-adjacent links.")
+    apart: float = Field(0.0005, ge=0, le=0.05, description="Least distance of the object from objects held.")
     gap: float = Field(0.0013, gt=0, le=0.01, description="Largest distance of link and object at a contact.")
     angle: float = Field(17.0, gt=0, le=60, description="Largest angle of the normals at a contact [deg].")
     friction: float = Field(0.5, gt=0, le=2, description="Friction coefficient of gswo and epsilon.")

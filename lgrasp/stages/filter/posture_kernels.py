@@ -7,6 +7,7 @@ from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.device.triangles import least_facing
 from lgrasp.field.arrays import Field, field_seed
 from lgrasp.grasp.clearance import body_clear
+from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.clearance import group_pairs_clear
 from lgrasp.object.arrays import Object
@@ -32,9 +33,11 @@ def place_used(
     hand: Hand,
     field: Field,
     obj: Object,
+    held: Held,
     margin: wp.float32,
     max_gap: wp.float32,
     cosine: wp.float32,
+    index: wp.array(dtype=wp.int32),
     pose: wp.array(dtype=wp.transform),
     palm_point: wp.array(dtype=wp.int32),
     palm_surface: wp.array(dtype=wp.int32),
@@ -53,12 +56,17 @@ def place_used(
 ):
     """Postures and bodies of the touching fingers; contacts on the links' true meshes; collisions among these fingers.
 
-    Contacts come in group order, the palm's last; unused places hold -1.
+    Contacts come in group order, that of the palm (or of a finger that stays as it is) last; unused places hold -1.
     """
     i = wp.tid()
     row = set_pose[i]
+    h = index[row] // held.tries
     G = hand.kin.groups
     X = body_out[i]
+    for g in range(G):
+        if group_fixed(hand, held, h, g):
+            posture_out[i, g] = held.posture[h, g]
+            group_forward(hand.kin, g, held.posture[h, g], X, hand.kin.joint_first[g])
     T = pose[row]
     k = int(0)
     gap = float(0.0)
@@ -75,6 +83,8 @@ def place_used(
             if palm_point[row] >= 0:
                 s = palm_surface[row]
                 c = palm_point[row]
+                if hand.contacts.body[c] > 0:
+                    B = X[hand.contacts.body[c] - 1]
         elif chosen[i, g] >= 0:
             x = clamp_dofs(hand.kin, g, q[row, g, chosen[i, g]])
             posture_out[i, g] = x
@@ -108,9 +118,9 @@ def place_used(
     for g in range(G):
         if chosen[i, g] >= 0:
             clear = _group_pairs_clear(hand, 0, g + 1, X, margin)
-            for h in range(g + 1):
-                if clear and chosen[i, h] >= 0:
-                    clear = _group_pairs_clear(hand, h + 1, g + 1, X, margin)
+            for f in range(G):
+                if clear and (f == g or (chosen[i, f] >= 0 and f < g) or group_fixed(hand, held, h, f)):
+                    clear = _group_pairs_clear(hand, wp.min(f, g) + 1, wp.max(f, g) + 1, X, margin)
             if not clear:
                 outcome_out[i] = 2
                 return
@@ -122,6 +132,7 @@ def fill_unused(
     hand: Hand,
     field: Field,
     obj: Object,
+    held: Held,
     seed: wp.array(dtype=wp.int32),
     max_depth: wp.float32,
     draws: wp.int32,
@@ -150,11 +161,12 @@ def fill_unused(
         return
     row = set_pose[i]
     G = hand.kin.groups
+    h = index[row] // held.tries
     state = wp.rand_init(seed[0], index[row] * 64 + set_slot[i])
     T_object = wp.transform_inverse(pose[row])
     X = body_out[i]
     for g in range(G):
-        if chosen[i, g] < 0:
+        if chosen[i, g] < 0 and not group_fixed(hand, held, h, g):
             slot = setting[row] * G + g
             r0 = field.start[field.cell_first[slot] * 64]
             r1 = field.start[field.cell_first[slot + 1] * 64]
@@ -171,6 +183,7 @@ def fill_unused(
                     drawn = field_seed(field, hand.kin, slot, r)
                     # the values of shared joints are the same in both
                     x = x + share * (drawn - x)
+                x = with_frozen(hand, held, h, g, x)
                 group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
                 clear = int(1)
                 for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
@@ -180,11 +193,11 @@ def fill_unused(
                     clear = 0
                 if clear == 1 and not _group_pairs_clear(hand, g + 1, g + 1, X, margin):
                     clear = 0
-                for h in range(G):
-                    # used fingers, and unused ones that are placed already
-                    if h != g and (chosen[i, h] >= 0 or h < g):
-                        a = wp.min(g, h) + 1
-                        b = wp.max(g, h) + 1
+                for f in range(G):
+                    # used fingers, those that stay, and unused ones that are placed already
+                    if f != g and (chosen[i, f] >= 0 or f < g or group_fixed(hand, held, h, f)):
+                        a = wp.min(g, f) + 1
+                        b = wp.max(g, f) + 1
                         if clear == 1 and not _group_pairs_clear(hand, a, b, X, margin):
                             clear = 0
                 if clear == 1:

@@ -12,7 +12,7 @@ from lgrasp.grasp.tables import ContactSets, GraspTable, trim_sets
 from lgrasp.grasp.tally import Tally, empty_tally, read_tallies
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.control_kernels import control_poses, open_poses
-from lgrasp.stages.filter.object_kernels import deepen
+from lgrasp.stages.filter.object_kernels import deepen, deepen_held
 from lgrasp.stages.filter.outcomes import METRICS, REASONS
 from lgrasp.stages.filter.params import FilterParams
 from lgrasp.stages.filter.posture_kernels import fill_unused, place_used
@@ -29,7 +29,7 @@ from lgrasp.stages.filter.quality_kernels import (
 
 __all__ = ["VERSION", "run"]
 
-VERSION = 5
+VERSION = 6
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, Tally]:
@@ -59,9 +59,11 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
             hand,
             field,
             obj,
+            context.held.struct,
             params.self_margin,
             params.gap,
             math.cos(math.radians(params.angle)),
+            poses.index,
             poses.pose,
             poses.palm_point,
             poses.palm_surface,
@@ -92,6 +94,7 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
             hand,
             field,
             obj,
+            context.held.struct,
             context.seed("filter"),
             params.penetration,
             params.draws,
@@ -109,6 +112,25 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
         device=d,
     )
     measure(0)
+    if context.space:
+        wp.launch(
+            deepen_held,
+            dim=(bodies, n),
+            inputs=[
+                hand,
+                obj,
+                context.held.struct,
+                params.penetration,
+                params.apart,
+                poses.index,
+                poses.pose,
+                inputs.pose,
+                body,
+                outcome,
+            ],
+            outputs=[depth],
+            device=d,
+        )
     wp.launch(
         balance_grasps,
         dim=n,
@@ -200,8 +222,10 @@ def _kept_rows(
         inputs=[
             hand,
             obj,
+            context.held.struct,
             params.open_margin,
             params.self_margin,
+            poses.index,
             poses.pose,
             inputs.pose,
             inputs.chosen,

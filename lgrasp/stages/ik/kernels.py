@@ -7,10 +7,12 @@ from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.device.sdf import sdf_gradient
 from lgrasp.field.arrays import Field
 from lgrasp.grasp.clearance import body_clear
+from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.hand.arrays import Hand, hand_grid
+from lgrasp.hand.clearance import group_pairs_clear
 from lgrasp.object.arrays import Object
 
-__all__ = ["flag_realised", "mark_chosen", "realise_contacts", "take_realised"]
+__all__ = ["avoid_held", "flag_realised", "mark_chosen", "realise_contacts", "take_realised"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -60,6 +62,9 @@ def realise_contacts(
     cosine: wp.float32,
     slack: wp.float32,
     clearance: wp.int32,
+    tries: wp.int32,
+    frozen: wp.array2d(dtype=wp.int32),
+    index: wp.array(dtype=wp.int32),
     pose: wp.array(dtype=wp.transform),
     count: wp.array2d(dtype=wp.int32),
     surface: wp.array3d(dtype=wp.int32),
@@ -71,7 +76,8 @@ def realise_contacts(
 ):
     """Joint positions that put a candidate's contact on the object (eq. 7), and whether they do.
 
-    ``q_out`` holds the seed on entry. Candidates with ``wanted`` 0 are left alone. ``counts_out`` grows by those tried,
+    ``q_out`` holds the seed on entry; its ``frozen`` dofs do not move (:class:`Held`). Candidates with ``wanted`` 0 are
+    left alone. ``counts_out`` grows by those tried,
     reached and kept.
     """
     row, g, m = wp.tid()
@@ -87,6 +93,7 @@ def realise_contacts(
     j0 = hand.kin.joint_first[g]
     body = hand.contacts.body[c] - 1 - j0
     dofs = hand.kin.dof_free[g]
+    still = frozen[index[row] // tries, g]
     q = q_out[row, g, m]
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     point = hand.contacts.points[c]
@@ -124,6 +131,9 @@ def realise_contacts(
             J2[d] = J2[d] + point_column(hand.kin, j0 + j, X[j], p + n * lever)
             j = hand.kin.joint_parent[j0 + j]
         for a in range(dofs):
+            if ((still >> a) & 1) == 1:
+                J1[a] = wp.vec3(0.0)
+                J2[a] = wp.vec3(0.0)
             b[a] = wp.dot(J1[a], e1) + w2 * wp.dot(J2[a], e2)
             for k in range(a + 1):
                 A[a, k] = wp.dot(J1[a], J1[k]) + w2 * wp.dot(J2[a], J2[k])
@@ -155,6 +165,43 @@ def realise_contacts(
         wp.atomic_add(counts_out, 1, 1)
     if ok == 1:
         wp.atomic_add(counts_out, 2, 1)
+
+
+@wp.kernel
+def avoid_held(
+    hand: Hand,
+    held: Held,
+    margin: wp.float32,
+    self_margin: wp.float32,
+    index: wp.array(dtype=wp.int32),
+    count: wp.array2d(dtype=wp.int32),
+    q: wp.array3d(dtype=vec_dof),
+    state_out: wp.array3d(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
+):
+    """Realised candidates whose finger meets a held object, or a finger that stays as it is, fail."""
+    row, g, m = wp.tid()
+    if m >= count[row, g] or state_out[row, g, m] != 1:
+        return
+    h = index[row] // held.tries
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    Y = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    j0 = group_forward(hand.kin, g, q[row, g, m], X, 0)
+    ok = int(1)
+    for j in range(hand.kin.joint_first[g + 1] - j0):
+        if ok == 1 and not body_clear_of_held(hand, held, h, 1 + j0 + j, X[j], margin):
+            ok = 0
+    for f in range(hand.kin.groups):
+        if ok == 1 and f != g and group_fixed(hand, held, h, f):
+            group_forward(hand.kin, f, held.posture[h, f], Y, 0)
+            if f < g:
+                if not group_pairs_clear(hand, f + 1, g + 1, Y, 0, X, 0, self_margin):
+                    ok = 0
+            elif not group_pairs_clear(hand, g + 1, f + 1, X, 0, Y, 0, self_margin):
+                ok = 0
+    if ok == 0:
+        state_out[row, g, m] = -2
+        wp.atomic_sub(counts_out, 2, 1)
 
 
 @wp.kernel

@@ -19,4 +19,6 @@ class IkParams(BaseModel):
     gap: float = Field(0.001, gt=0, le=0.01, description="Largest difference from that.")
     angle: float = Field(15.0, gt=0, le=60, description="Largest angle of the normals at the contact [deg].")
     slack: float = Field(0.0005, ge=0, le=0.01, description="Penetration of inner spheres that is forgiven.")
+    apart: float = Field(0.0003, ge=0, le=0.05, description="Least distance of the finger from objects held.")
+    self_margin: float = Field(0.0003, ge=0, le=0.01, description="Least distance from fingers that hold an object.")
     clearance: bool = Field(True, description="Also require the whole finger to be clear of the object.")

@@ -8,7 +8,7 @@ from lgrasp.device.scan import running_sums
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.grasp.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.ik.kernels import flag_realised, mark_chosen, realise_contacts, take_realised
+from lgrasp.stages.ik.kernels import avoid_held, flag_realised, mark_chosen, realise_contacts, take_realised
 from lgrasp.stages.ik.params import IkParams
 
 __all__ = ["VERSION", "run"]
@@ -79,6 +79,9 @@ def _realise(table: CandidateTable, wanted: wp.array, params: IkParams, context:
             math.cos(math.radians(params.angle)),
             params.slack,
             int(params.clearance),
+            context.held.struct.tries,
+            context.held.struct.frozen,
+            table.poses.index,
             table.poses.pose,
             table.count,
             table.surface,
@@ -88,3 +91,19 @@ def _realise(table: CandidateTable, wanted: wp.array, params: IkParams, context:
         outputs=[table.q, table.state, tally.device],
         device=context.device,
     )
+    if context.space:
+        wp.launch(
+            avoid_held,
+            dim=table.surface.shape,
+            inputs=[
+                context.hand.struct,
+                context.held.struct,
+                params.apart,
+                params.self_margin,
+                table.poses.index,
+                table.count,
+                table.q,
+            ],
+            outputs=[table.state, tally.device],
+            device=context.device,
+        )

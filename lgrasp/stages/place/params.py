@@ -31,3 +31,7 @@ class PlaceParams(BaseModel):
         description="Contacts rate a pose when the line between two passes this near the centre of mass [m].",
     )
     clearance: float = Field(0.0005, ge=0, le=0.01, description="Penetration of static links that is forgiven [m].")
+    spins: int = Field(
+        16, ge=1, le=360, description="Rolls about the contact normal tried for two points in an opposition space."
+    )
+    apart: float = Field(0.0005, ge=0, le=0.05, description="Least distance of the object from objects held [m].")

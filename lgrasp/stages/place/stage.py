@@ -8,6 +8,7 @@ from lgrasp.grasp.tables import PoseTable
 from lgrasp.grasp.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
+from lgrasp.stages.place.opposed_kernels import propose_opposed
 from lgrasp.stages.place.params import PlaceParams
 
 __all__ = ["VERSION", "run"]
@@ -17,6 +18,8 @@ VERSION = 5
 
 def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Context) -> tuple[PoseTable, Tally]:
     """Poses of candidates ``first .. first + count - 1`` of the shard's stream.
+
+    In an opposition space all of them are between its two sides, and the weights are of no account.
 
     Args:
         inputs: ``first`` (a number, or an array (1,) i32 on the device) and ``count``.
@@ -39,25 +42,16 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     pose = wp.empty(shape, dtype=wp.transform, device=d)
     palm_point, surface, setting, rating = (wp.empty(shape, dtype=wp.int32, device=d) for _ in range(4))
     anchor = wp.empty((*shape, groups), dtype=wp.int32, device=d)
-    wp.launch(
-        propose_poses,
-        dim=shape,
-        inputs=[
-            hand,
-            context.field.struct,
-            obj,
-            context.seed("place"),
-            first,
-            params.canonical / total,
-            params.pinch / total,
-            params.palm / total,
-            params.samples,
-            params.reach,
-            params.clearance,
-        ],
-        outputs=[pose, palm_point, surface, setting, anchor, rating],
-        device=d,
-    )
+    if context.space:
+        kernel = propose_opposed
+        how = [*context.space.groups, params.spins, params.reach, params.clearance, params.apart]
+        asked = [hand, context.field.struct, obj, context.held.struct, context.seed("place"), first, *how]
+    else:
+        kernel = propose_poses
+        weights = [params.canonical / total, params.pinch / total, params.palm / total]
+        how = [*weights, params.samples, params.reach, params.clearance]
+        asked = [hand, context.field.struct, obj, context.seed("place"), first, *how]
+    wp.launch(kernel, shape, asked, [pose, palm_point, surface, setting, anchor, rating], device=d)
     chosen, upto = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(2))
     tally = empty_tally(("tried", "blocked", "kept"), d)
     wp.launch(

@@ -1,0 +1,141 @@
+"""What a hand holds already when it takes another object: frozen joints and the objects, one row a sequence."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from lgrasp.device.kinematics import MAX_DOFS, vec_dof
+from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.grasp.clearance import body_apart, body_depth
+from lgrasp.hand.arrays import Hand, HandArrays
+from lgrasp.object.arrays import Object, ObjectArrays
+
+__all__ = [
+    "Held",
+    "HeldArrays",
+    "body_clear_of_held",
+    "body_depth_in_held",
+    "group_fixed",
+    "hold",
+    "hold_nothing",
+    "with_frozen",
+]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+
+@wp.struct
+class Held:
+    """H sequences so far; candidate c of a stream goes on from row ``c // tries``."""
+
+    tries: wp.int32
+    posture: wp.array2d(dtype=vec_dof)  # (H, G) [rad or m]
+    frozen: wp.array2d(dtype=wp.int32)  # (H, G) bit d: dof d of the group must not move
+    setting: wp.array(dtype=wp.int32)  # (H,) setting of the shared joints, -1: any
+    objects: wp.int32  # n held by every row
+    object: wp.array(dtype=Object)  # (n,)
+    pose: wp.array2d(dtype=wp.transform)  # (H, n) T_hand_object of the internal frames
+
+
+@dataclass(frozen=True)
+class HeldArrays:
+    """The held of H rows on one device; keeps the objects alive."""
+
+    struct: "Held"
+    rows: int
+    objects: tuple[ObjectArrays, ...] = ()
+
+
+def hold_nothing(hand: HandArrays) -> HeldArrays:
+    """An empty hand with every joint free: one row, from which all candidates go on."""
+    open_posture = hand.model.tree.joint_open[None].astype(np.float32)
+    free: np.ndarray = np.zeros(open_posture.shape, bool)
+    return hold(hand, open_posture, free, (), np.zeros((1, 0, 7), np.float32), tries=2**31 - 1, any_setting=True)
+
+
+def hold(
+    hand: HandArrays,
+    q: np.ndarray,
+    frozen: np.ndarray,
+    objects: tuple[ObjectArrays, ...],
+    pose: np.ndarray,
+    *,
+    tries: int,
+    any_setting: bool = False,
+) -> HeldArrays:
+    """Put what H sequences hold on the hand's device.
+
+    Args:
+        q: joint positions [rad or m], (H, K).
+        frozen: joints that must not move, (H, K) bool.
+        objects: the n objects that every row holds.
+        pose: their poses in the hand frame, internal frames, x y z qx qy qz qw, (H, n, 7).
+        tries: candidates that go on from each row.
+        any_setting: shared joints may still take any of their values; else they have those of q.
+    """
+    tree, d = hand.model.tree, hand.device
+    rows, groups = len(q), tree.groups
+    posture = np.zeros((rows, groups, MAX_DOFS), np.float32)
+    bits = np.zeros((rows, groups), np.int32)
+    for g in range(groups):
+        columns = tree.dof_index[tree.dof_first[g] : tree.dof_first[g + 1]]
+        posture[:, g, : len(columns)] = q[:, columns]
+        bits[:, g] = (frozen[:, columns] << np.arange(len(columns))).sum(1)
+    setting = np.full(rows, -1) if any_setting else _settings(q, tree.settings)
+    held = Held()
+    held.tries = tries
+    held.posture = wp.array(posture, dtype=vec_dof, device=d)
+    held.frozen = wp.array(bits, dtype=wp.int32, device=d)
+    held.setting = wp.array(setting.astype(np.int32), dtype=wp.int32, device=d)
+    held.objects = len(objects)
+    held.object = wp.array([o.struct for o in objects], dtype=Object, device=d)
+    flat = np.ascontiguousarray(pose, np.float32).reshape(-1, 7)
+    held.pose = wp.array(flat, dtype=wp.transform, device=d).reshape((rows, len(objects)))
+    return HeldArrays(held, rows, objects)
+
+
+def _settings(q: np.ndarray, settings: np.ndarray) -> np.ndarray:
+    """Setting whose shared joints q has, (H,); only these differ between settings."""
+    shared = np.ptp(settings, axis=0) > 0
+    return np.abs(q[:, None, shared] - settings[None][:, :, shared]).sum(2).argmin(1)
+
+
+@wp.func
+def group_fixed(hand: Hand, held: Held, row: wp.int32, g: wp.int32):
+    """Must the whole group stay as it is?"""
+    own = (1 << hand.kin.dof_free[g]) - 1
+    return own > 0 and (held.frozen[row, g] & own) == own
+
+
+@wp.func
+def with_frozen(hand: Hand, held: Held, row: wp.int32, g: wp.int32, q: vec_dof):
+    """q of the group with its frozen dofs as they are held."""
+    x = q
+    bits = held.frozen[row, g]
+    if bits != 0:
+        for d in range(hand.kin.dof_first[g + 1] - hand.kin.dof_first[g]):
+            if ((bits >> d) & 1) == 1:
+                x[d] = held.posture[row, g][d]
+    return x
+
+
+@wp.func
+def body_clear_of_held(hand: Hand, held: Held, row: wp.int32, body: wp.int32, B: wp.transform, margin: wp.float32):
+    """Are all surface samples of the body farther than ``margin`` [m] from every held object? B = T_hand_body."""
+    for k in range(held.objects):
+        if not body_apart(hand, held.object[k], body, wp.transform_inverse(held.pose[row, k]) * B, margin):
+            return False
+    return True
+
+
+@wp.func
+def body_depth_in_held(hand: Hand, held: Held, row: wp.int32, body: wp.int32, B: wp.transform, limit: wp.float32):
+    """Deepest penetration of the body and the held objects [m]; stops early above ``limit``. B = T_hand_body."""
+    depth = float(0.0)
+    for k in range(held.objects):
+        T = wp.transform_inverse(held.pose[row, k]) * B
+        depth = wp.max(depth, body_depth(hand, held.object[k], body, T, limit))
+        if depth > limit:
+            break
+    return depth
