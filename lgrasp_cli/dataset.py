@@ -23,7 +23,7 @@ def info(
     paths: _Paths,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Show rows, hand, objects, pipeline, size and metrics of each shard.
+    """Show rows, hand, objects, pipeline, size and metrics of each shard; of sequences, rows by number of objects.
 
     Example: lgrasp dataset info out/mug
     """
@@ -38,6 +38,10 @@ def info(
     console = Console()
     console.print(_shard_table(shards))
     console.print(_metric_table(shards))
+    if any(set(s["rows_by_objects"]) - {"1"} for s in shards):
+        console.print(_count_table(shards, "objects in the hand", "rows_by_objects"))
+    if any(s["rows_by_space"] for s in shards):
+        console.print(_count_table(shards, "opposition space of the last step", "rows_by_space"))
 
 
 @app.command()
@@ -197,4 +201,19 @@ def _metric_table(shards: list[dict[str, Any]]) -> "Table":
         for metric, values in s["metrics"].items():
             numbers = ("-" if values[k] is None else f"{values[k]:.4g}" for k in ("min", "mean", "max"))
             table.add_row(Path(s["file"]).name, metric, values["unit"], *numbers)
+    return table
+
+
+def _count_table(shards: list[dict[str, Any]], what: str, key: str) -> "Table":
+    """Rows of all shards by the names under ``key``."""
+    from rich.table import Table
+
+    counts: dict[str, int] = {}
+    for s in shards:
+        for name, rows in (s[key] or {}).items():
+            counts[name] = counts.get(name, 0) + rows
+    table = Table(what)
+    table.add_column("rows", justify="right")
+    for name, rows in counts.items():
+        table.add_row(name, f"{rows:,}")
     return table

@@ -30,6 +30,8 @@ def test_archived_shard_is_readable(path):
     assert shard.grasps.metric_units == expected["metric_units"]
     assert shard.grasps.physics_protocols == expected["physics_protocols"]
     assert shard.statistics == expected["statistics"]
+    sequence = shard.grasps.sequence
+    assert (sequence and list(sequence.space_names)) == expected.get("space_names")
 
 
 def _assert_record(record, expected):
