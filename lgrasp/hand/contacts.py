@@ -7,13 +7,27 @@ import trimesh
 
 from lgrasp.errors import HandError
 from lgrasp.hand.distance import signed_distance
-from lgrasp.hand.spec import Cone, HandSpec
+from lgrasp.hand.spec import Cone, HandSpec, Surface
 
-__all__ = ["LinkGrid", "box_grid", "check_contact_links", "cover_patches", "finger_points", "link_grid", "palm_points"]
+__all__ = [
+    "LinkGrid",
+    "body_cones",
+    "box_grid",
+    "check_contact_links",
+    "cover_patches",
+    "finger_points",
+    "link_grid",
+    "palm_points",
+    "side_points",
+]
 
 _GRID_CELL = 8.0e-4
 _GRID_PAD = 6.0e-3
 _POINTS_PER_LINK = 600
+_DRAWN_AREA = 1.0e-6  # [m^2] of a link's surface to a point drawn for a side, if that is _DRAWN points
+_DRAWN = (4_800, 60_000)
+_SIDE_AREA = 2.5e-6  # [m^2] of a side to a point that is kept, if that is _SIDE_POINTS points of a link
+_SIDE_POINTS = (200, 2_400)
 _PATCH_RADIUS = 0.010
 _PATCH_CONE = np.radians(36.0)
 
@@ -56,8 +70,16 @@ def _in_cone(normals: np.ndarray, cone: Cone) -> np.ndarray:
     return normals @ (axis / np.linalg.norm(axis)) > np.cos(np.radians(cone.angle))
 
 
-def _sample(mesh: trimesh.Trimesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    count = 8 * _POINTS_PER_LINK
+def body_cones(cones: tuple[Cone, ...], T_body_link: np.ndarray) -> np.ndarray:
+    """Cones of the link frame as rows (axis in the body frame, cosine), (n, 4)."""
+    axes = [T_body_link[:3, :3] @ (np.array(c.axis) / np.linalg.norm(c.axis)) for c in cones]
+    cosines = [np.cos(np.radians(c.angle)) for c in cones]
+    return np.array([[*a, c] for a, c in zip(axes, cosines, strict=True)]).reshape(-1, 4)
+
+
+def _sample(
+    mesh: trimesh.Trimesh, rng: np.random.Generator, count: int = 8 * _POINTS_PER_LINK
+) -> tuple[np.ndarray, np.ndarray]:
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))[:2]
     return points, mesh.face_normals[faces]
 
@@ -79,11 +101,23 @@ def finger_points(
     keep = np.ones(len(points), bool)
     for cone in forbidden:
         keep &= ~_in_cone(normals @ R, cone)
-    # outside every solid of the link, free above, not recessed
-    for probe, least in ((1e-4, 0.0), (8e-3, 5e-3), (2e-2, 1.9e-2)):
-        distance = np.min([signed_distance(m, points + probe * normals, device) for m in meshes], 0)
-        keep &= distance > least
+    keep &= _free(meshes, points, normals, ((1e-4, 0.0), (8e-3, 5e-3), (2e-2, 1.9e-2)), device)
     return _thin(points, normals, keep, rng)
+
+
+def _free(
+    meshes: list[trimesh.Trimesh],
+    points: np.ndarray,
+    normals: np.ndarray,
+    probes: tuple[tuple[float, float], ...],
+    device: str,
+) -> np.ndarray:
+    """(n,) bool: is every place ``probe`` [m] above a point farther than ``least`` [m] from a link's solids?"""
+    free = np.ones(len(points), bool)
+    for probe, least in probes:
+        distance = np.min([signed_distance(m, points + probe * normals, device) for m in meshes], 0)
+        free &= distance > least
+    return free
 
 
 def palm_points(
@@ -99,17 +133,47 @@ def palm_points(
     keep = np.zeros(len(points), bool)
     for cone in allowed:
         keep |= _in_cone(normals @ R, cone)
-    distance = np.min([signed_distance(m, points + 1e-4 * normals, device) for m in meshes], 0)
-    keep &= distance > 0
+    keep &= _free(meshes, points, normals, ((1e-4, 0.0),), device)
     return _thin(points, normals, keep, rng)
 
 
-def _thin(
-    points: np.ndarray, normals: np.ndarray, keep: np.ndarray, rng: np.random.Generator
+def side_points(
+    meshes: list[trimesh.Trimesh],
+    around: list[trimesh.Trimesh],
+    T_body_link: np.ndarray,
+    surface: Surface,
+    rng: np.random.Generator,
+    device: str = "cpu",
 ) -> tuple[np.ndarray, np.ndarray]:
-    """At most _POINTS_PER_LINK of the points to keep, in an order drawn for all: a point in doubt moves no other."""
+    """Points and normals (n, 3) of a link's part of one side of an opposition space, body frame, in even density.
+
+    A point is dropped when the body is in the way of a finger-sized ball half-way, or of one of 2 cm radius by 2 mm.
+
+    Args:
+        meshes: solids of the link. around: those of all links on its body.
+    """
+    area = sum(float(m.area) for m in meshes)
+    drawn = np.clip(area / _DRAWN_AREA, *_DRAWN)
+    shares = [max(1, round(drawn * float(m.area) / area)) for m in meshes]
+    parts = [_sample(m, rng, count) for m, count in zip(meshes, shares, strict=True)]
+    points, normals = map(np.vstack, zip(*parts, strict=True))
+    R, t = T_body_link[:3, :3], T_body_link[:3, 3]
+    keep = _in_cone(normals @ R, surface)
+    if surface.box is not None:
+        local = (points - t) @ R
+        keep &= ((local >= surface.box.min) & (local <= surface.box.max)).all(1)
+    points, normals = points[keep], normals[keep]
+    keep = _free(around, points, normals, ((1e-4, 0.0), (8e-3, 5e-3), (2e-2, 1.8e-2)), device)
+    wanted = np.clip(keep.sum() * area / drawn / _SIDE_AREA, *_SIDE_POINTS)
+    return _thin(points, normals, keep, rng, int(wanted))
+
+
+def _thin(
+    points: np.ndarray, normals: np.ndarray, keep: np.ndarray, rng: np.random.Generator, most: int = _POINTS_PER_LINK
+) -> tuple[np.ndarray, np.ndarray]:
+    """At most ``most`` of the points to keep, in an order drawn for all: a point in doubt moves no other."""
     order = rng.permutation(len(points))
-    chosen = order[keep[order]][:_POINTS_PER_LINK]
+    chosen = order[keep[order]][:most]
     return points[chosen], normals[chosen]
 
 

@@ -13,10 +13,12 @@ from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.decompose import Decompose
 from lgrasp.device.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 from lgrasp.errors import HandError
-from lgrasp.hand.contacts import LinkGrid, check_contact_links, cover_patches, finger_points, link_grid, palm_points
+from lgrasp.hand.contacts import body_cones, check_contact_links, finger_points, palm_points
 from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh, inner_spheres, surface_samples
+from lgrasp.hand.opposition import check_spaces
 from lgrasp.hand.overlap import overlap_arrays
 from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.surface import ContactLink, contact_arrays, csr, stack_rows
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 
@@ -148,16 +150,9 @@ def _digest(urdf: Urdf, spec: HandSpec) -> str:
     for name in sorted(urdf.mesh_files):
         h.update(name.encode())
         h.update(urdf.mesh_files[name].read_bytes())
-    h.update(spec.model_dump_json().encode())
+    # opposition spaces change nothing in a HandModel; their views have digests of their own
+    h.update(spec.model_dump_json(exclude={"opposition_spaces"}).encode())
     return h.hexdigest()
-
-
-def _csr(counts: list[int]) -> np.ndarray:
-    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-
-
-def _stack(parts: list[np.ndarray], width: int, dtype: type = np.float32) -> np.ndarray:
-    return np.vstack(parts).astype(dtype) if parts else np.zeros((0, width), dtype)
 
 
 def build_hand(
@@ -175,27 +170,28 @@ def build_hand(
     tree = build_tree(urdf, spec)
     _check_size(spec, tree)
     check_contact_links(spec, tree.link_names, dict(urdf.links))
+    check_spaces(spec, tree, dict(urdf.links))
     rng = np.random.default_rng(0)
     solids = _Solids(urdf, tree, rng, decompose, device)
-    contacts = _contacts(spec, tree, solids, rng, device)
+    contacts = contact_arrays(tree, _contact_links(spec, tree, solids, rng, device), solids.meshes, rng, device)
     bodies = len(tree.joint_dof) + 1
     order = np.argsort([p[0] for p in solids.pieces], kind="stable")
     pieces = [solids.pieces[i] for i in order]
     per_body = [[p for p in pieces if p[0] == b] for b in range(bodies)]
     arrays = {
-        "piece_first": _csr([len(p) for p in per_body]),
+        "piece_first": csr([len(p) for p in per_body]),
         "body_sphere": np.array([_body_sphere([p[2] for p in group]) for group in per_body], np.float32),
-        "vertex_first": _csr([len(p[2].vertices) for p in pieces]),
-        "vertices": _stack([p[2].vertices for p in pieces], 3),
-        "plane_first": _csr([len(p[2].planes) for p in pieces]),
-        "planes": _stack([p[2].planes for p in pieces], 4),
-        "piece_sphere": _stack([p[2].sphere[None] for p in pieces], 4),
+        "vertex_first": csr([len(p[2].vertices) for p in pieces]),
+        "vertices": stack_rows([p[2].vertices for p in pieces], 3),
+        "plane_first": csr([len(p[2].planes) for p in pieces]),
+        "planes": stack_rows([p[2].planes for p in pieces], 4),
+        "piece_sphere": stack_rows([p[2].sphere[None] for p in pieces], 4),
         "piece_radius": np.array([p[2].radius for p in pieces], np.float32),
         "piece_body": np.array([p[0] for p in pieces], np.int32),
         "piece_link": np.array([p[1] for p in pieces], np.int32),
-        "sphere_first": _csr([sum(len(s) for b, s in solids.spheres if b == body) for body in range(bodies)]),
-        "spheres": _stack([s for body in range(bodies) for b, s in solids.spheres if b == body], 4),
-        **_clusters([_stack([s for b, s in solids.samples if b == body], 3) for body in range(bodies)]),
+        "sphere_first": csr([sum(len(s) for b, s in solids.spheres if b == body) for body in range(bodies)]),
+        "spheres": stack_rows([s for body in range(bodies) for b, s in solids.spheres if b == body], 4),
+        **_clusters([stack_rows([s for b, s in solids.samples if b == body], 3) for body in range(bodies)]),
     }
     model = HandModel(
         name=spec.name,
@@ -235,10 +231,10 @@ def _clusters(samples: list[np.ndarray]) -> dict[str, np.ndarray]:
     for points in samples:
         points = np.resize(points, (-(-len(points) // CLUSTER_SIZE) * CLUSTER_SIZE, 3))
         runs.append(points[cluster_order(points)] if len(points) else points)
-    flat = _stack(runs, 3)
+    flat = stack_rows(runs, 3)
     centre, radius = bounding_spheres(flat)
     return {
-        "cluster_first": _csr([len(r) // CLUSTER_SIZE for r in runs]),
+        "cluster_first": csr([len(r) // CLUSTER_SIZE for r in runs]),
         "cluster_sphere": np.column_stack([centre, radius]).astype(np.float32),
         "samples": flat,
     }
@@ -287,78 +283,26 @@ class _Solids:
             raise HandError(f"URDF {urdf.path} has no collision geometry; a hand's solid is its collision geometry")
 
 
-def _contacts(
+def _contact_links(
     spec: HandSpec, tree: Tree, solids: _Solids, rng: np.random.Generator, device: str
-) -> dict[str, np.ndarray]:
-    """Contact arrays of a HandModel: finger points by group, then palm points."""
-    groups = tree.groups
-    body_group = tree.body_group
-    per_group: list[list[tuple[int, int, np.ndarray, np.ndarray]]] = [[] for _ in range(groups + 1)]
-    grids, grid_link, rules, meshes = [], [], [], []
-    made: dict[bytes, LinkGrid] = {}
-
-    def grid(link: str) -> LinkGrid:
-        # fingertips of one shape share one grid's work
-        key = b"".join(np.round(m.vertices, 9).tobytes() for m in solids.meshes[link])
-        if key not in made:
-            made[key] = link_grid(solids.meshes[link], device)
-        return made[key]
-
+) -> list[ContactLink]:
+    """Contact surface of the links that the rules name, palm links last."""
+    out = []
     for rule in spec.contact:
         for link in rule.links:
             index = tree.link_names.index(link)
-            group = int(body_group[tree.link_body[index]])
+            group = int(tree.body_group[tree.link_body[index]])
             if group < 0:
                 raise HandError(f"hand '{spec.name}': contact link '{link}' does not move; list it under palm")
             T = tree.T_body_link[index]
             points, normals = finger_points(solids.meshes[link], T, rule.forbidden, rng, device)
             if len(points) == 0:
                 raise HandError(f"hand '{spec.name}': the forbidden cones leave no surface on contact link '{link}'")
-            per_group[group].append((index, len(grids), points, normals))
-            grids.append(grid(link))
-            grid_link.append(index)
-            meshes.append(trimesh.util.concatenate(solids.meshes[link]))
-            axes = [
-                (T[:3, :3] @ (np.array(c.axis) / np.linalg.norm(c.axis)), np.cos(np.radians(c.angle)))
-                for c in rule.forbidden
-            ]
-            rules.append(np.array([[*a, c] for a, c in axes]).reshape(-1, 4))
+            out.append(ContactLink(link, group, points, normals, body_cones(rule.forbidden, T)))
     for link in spec.palm.links:
         index = tree.link_names.index(link)
-        if body_group[tree.link_body[index]] >= 0:
+        if tree.body_group[tree.link_body[index]] >= 0:
             raise HandError(f"hand '{spec.name}': palm link '{link}' moves; list it under contact")
         points, normals = palm_points(solids.meshes[link], tree.T_body_link[index], spec.palm.allowed, rng, device)
-        per_group[groups].append((index, len(grids), points, normals))
-        grids.append(grid(link))
-        grid_link.append(index)
-        meshes.append(trimesh.util.concatenate(solids.meshes[link]))
-        rules.append(np.zeros((0, 4)))
-    flat = [entry for group in per_group for entry in group]
-    patches, count = [], 0
-    for _, _, points, normals in flat:
-        patch = cover_patches(points, normals, rng) if len(points) else np.zeros(0, np.int32)
-        patches.append(patch + count)
-        count += int(patch.max()) + 1 if len(patch) else 0
-    repeat = [len(points) for _, _, points, _ in flat]
-    links = np.repeat([i for i, *_ in flat], repeat).astype(np.int32)
-    return {
-        "contact_first": _csr([sum(len(e[2]) for e in group) for group in per_group]),
-        "contact_points": _stack([e[2] for e in flat], 3),
-        "contact_normals": _stack([e[3] for e in flat], 3),
-        "contact_body": tree.link_body[links].astype(np.int32),
-        "contact_link": links,
-        "contact_patch": np.concatenate(patches).astype(np.int32) if patches else np.zeros(0, np.int32),
-        "contact_grid": np.repeat([g for _, g, *_ in flat], repeat).astype(np.int32),
-        "grid_first": _csr([g.values.size for g in grids]),
-        "grid_shape": np.array([g.values.shape for g in grids], np.int32),
-        "grid_origin": np.array([g.origin for g in grids], np.float32),
-        "grid_cell": np.array([g.cell for g in grids], np.float32),
-        "grid_values": np.concatenate([g.values.ravel() for g in grids]),
-        "grid_link": np.array(grid_link, np.int32),
-        "rule_first": _csr([len(r) for r in rules]),
-        "rules": _stack(rules, 4),
-        "mesh_vertex_first": _csr([len(m.vertices) for m in meshes]),
-        "mesh_vertices": _stack([m.vertices for m in meshes], 3),
-        "mesh_face_first": _csr([len(m.faces) for m in meshes]),
-        "mesh_faces": _stack([m.faces for m in meshes], 3, np.int32),
-    }
+        out.append(ContactLink(link, tree.groups, points, normals, np.zeros((0, 4))))
+    return out

@@ -3,14 +3,25 @@
 import difflib
 import reprlib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from lgrasp.errors import HandError
 
-__all__ = ["Box", "Cone", "ContactRule", "Coupling", "HandSpec", "PalmRule", "load_spec", "spec_problem"]
+__all__ = [
+    "Box",
+    "Cone",
+    "ContactRule",
+    "Coupling",
+    "HandSpec",
+    "OppositionSpace",
+    "PalmRule",
+    "Surface",
+    "load_spec",
+    "spec_problem",
+]
 
 Vec3 = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
@@ -49,7 +60,7 @@ class PalmRule(_Strict):
 
 
 class Box(_Strict):
-    """Axis-aligned box in the hand base frame [m]."""
+    """Axis-aligned box [m], in the hand base frame or, for a Surface, in its link's frame."""
 
     min: Vec3
     max: Vec3
@@ -69,6 +80,38 @@ class Coupling(_Strict):
     offset: float = 0.0
 
 
+class Surface(Cone):
+    """Surface of links whose outward normal is in the cone (link frame), as far as it lies in ``box`` (link frame)."""
+
+    links: tuple[Name, ...] = Field(min_length=1)
+    box: Box | None = None
+
+
+def _one_or_more(value: Any) -> Any:
+    return (value,) if isinstance(value, dict) else value
+
+
+Side = Annotated[tuple[Surface, ...], Field(min_length=1), BeforeValidator(_one_or_more)]
+
+
+class OppositionSpace(_Strict):
+    """Two sides that press towards each other, and the driven joints that move them; a side is one Surface or several.
+
+    The links of a side ride on one finger, or all of them are static.
+    """
+
+    joints: tuple[Name, ...] = Field(min_length=1)
+    sides: tuple[Side, Side]
+
+    @field_validator("joints")
+    @classmethod
+    def _once_each(cls, joints: tuple[str, ...]) -> tuple[str, ...]:
+        for name in joints:
+            if joints.count(name) > 1:
+                raise ValueError(f"names '{name}' twice")
+        return joints
+
+
 class HandSpec(_Strict):
     """Contents of hand.yaml."""
 
@@ -86,6 +129,7 @@ class HandSpec(_Strict):
     contacts: tuple[int, ...] = ()
     open_posture: dict[str, float] = Field(default_factory=dict)
     fingers: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    opposition_spaces: dict[Name, OppositionSpace] = Field(default_factory=dict)
     licence: str = ""
     source: str = ""
     notes: str | tuple[str, ...] = ""
@@ -93,10 +137,13 @@ class HandSpec(_Strict):
 
 def spec_problem(error: ValidationError) -> str:
     """First problem of a pydantic error as one phrase: key, value, what is wrong, the nearest valid key."""
-    first = error.errors()[0]
+    found = error.errors()
+    # a misspelt key is the cause of one that is missing
+    first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
     key = ".".join(str(part) for part in first["loc"]) or "file"
     if first["type"] == "extra_forbidden":
-        known = [name for kind in (HandSpec, ContactRule, PalmRule, Cone, Box, Coupling) for name in kind.model_fields]
+        kinds = (HandSpec, ContactRule, PalmRule, Surface, Box, Coupling, OppositionSpace)
+        known = list(dict.fromkeys(name for kind in kinds for name in kind.model_fields))
         near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
         return f"unknown key '{key}'" + (f"; did you mean '{near[0]}'?" if near else f"; keys: {', '.join(known)}")
     what = " ".join(first["msg"].removeprefix("Value error, ").split())

@@ -1,0 +1,79 @@
+"""Do the opposition spaces of hand.yaml fit the hand?"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lgrasp.errors import HandError
+from lgrasp.hand.spec import HandSpec, OppositionSpace
+from lgrasp.hand.tree import Tree
+
+__all__ = ["check_spaces", "moving_joints", "side_links"]
+
+
+def side_links(space: OppositionSpace) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Links of both sides."""
+    first, second = ((link for surface in side for link in surface.links) for side in space.sides)
+    return tuple(first), tuple(second)
+
+
+def moving_joints(tree: Tree, body: int) -> np.ndarray:
+    """(K,) bool: actuated joints that move a body, shared ones included."""
+    moved = np.zeros(len(tree.joint_names), bool)
+    group = int(tree.body_group[body])
+    j = body - 1
+    while group >= 0 and j >= 0:
+        moved[tree.dof_index[tree.dof_first[group] + tree.joint_dof[j]]] = True
+        up = int(tree.joint_parent[j])
+        j = -1 if up < 0 else int(tree.joint_first[group]) + up
+    return moved
+
+
+def check_spaces(spec: HandSpec, tree: Tree, geometry: Mapping[str, object]) -> None:
+    """Links and joints of the opposition spaces exist and fit together.
+
+    Args:
+        geometry: collision geometry of every link.
+
+    Raises:
+        HandError: naming the space, the value and what is accepted.
+    """
+    for name, space in spec.opposition_spaces.items():
+        problem = _problem(spec, tree, space, geometry)
+        if problem:
+            raise HandError(f"hand '{spec.name}': opposition space '{name}': {problem}")
+
+
+def _problem(spec: HandSpec, tree: Tree, space: OppositionSpace, geometry: Mapping[str, object]) -> str:
+    driven = [n for n in tree.joint_names if n not in tree.shared_names]
+    for joint in space.joints:
+        held = "locked" if joint in spec.locked else "shared" if joint in spec.shared else "no driven joint"
+        if joint not in driven:
+            return f"joint '{joint}' is {held}; driven joints: {', '.join(driven)}"
+    body = dict(zip(tree.link_names, tree.link_body, strict=True))
+    groups, moved = [], np.zeros(len(tree.joint_names), bool)
+    both = side_links(space)
+    for links in both:
+        for link in links:
+            if link not in body:
+                return f"link '{link}' does not exist; links: {', '.join(tree.link_names)}"
+            if not geometry.get(link):
+                return f"link '{link}' has no collision geometry; name links that have"
+            if (both[0] + both[1]).count(link) > 1:
+                return f"link '{link}' is in it twice; name it once"
+            moved |= moving_joints(tree, int(body[link]))
+        of_link = [int(tree.body_group[body[link]]) for link in links]
+        other = next((link for link, group in zip(links, of_link, strict=True) if group != of_link[0]), None)
+        if other is not None:
+            return (
+                f"links '{links[0]}' and '{other}' of one side do not move with one finger; all links of a side ride "
+                "on one finger, or all are static"
+            )
+        groups.append(of_link[0])
+    if groups[0] == groups[1]:
+        return "both sides are static" if groups[0] < 0 else "both sides ride on one finger; name surface of two"
+    able = [n for n in driven if moved[tree.joint_names.index(n)]]
+    for joint in space.joints:
+        if joint not in able:
+            return f"joint '{joint}' moves neither side; joints that do: {', '.join(able)}"
+    return ""

@@ -1,0 +1,97 @@
+"""Contact arrays of a HandModel from the contact surfaces of its links."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from lgrasp.hand.contacts import LinkGrid, cover_patches, link_grid
+from lgrasp.hand.tree import Tree
+
+__all__ = ["ContactLink", "contact_arrays", "csr", "stack_rows"]
+
+
+def csr(counts: list[int]) -> np.ndarray:
+    """(n + 1,) i32: first entry of each of n runs, and their total."""
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+
+
+def stack_rows(parts: list[np.ndarray], width: int, dtype: type = np.float32) -> np.ndarray:
+    """(n, width): all rows of ``parts``, of which there may be none."""
+    return np.vstack(parts).astype(dtype) if parts else np.zeros((0, width), dtype)
+
+
+@dataclass(frozen=True)
+class ContactLink:
+    """Contact surface of one link, body frame."""
+
+    link: str
+    group: int  # that moves it; the number of groups for static links
+    points: np.ndarray  # (n, 3) [m]
+    normals: np.ndarray  # (n, 3)
+    rules: np.ndarray  # (r, 4) forbidden cones: axis, cosine
+
+
+def contact_arrays(
+    tree: Tree,
+    links: Sequence[ContactLink],
+    meshes: Mapping[str, list[trimesh.Trimesh]],
+    rng: np.random.Generator,
+    device: str,
+) -> dict[str, np.ndarray]:
+    """Arrays ``contact_*``, ``grid_*``, ``rule*`` and ``mesh_*`` of a HandModel.
+
+    Args:
+        meshes: solids of each link, body frame.
+    """
+    made: dict[bytes, LinkGrid] = {}
+
+    def grid(link: str) -> LinkGrid:
+        # fingertips of one shape share one grid's work
+        key = b"".join(np.round(m.vertices, 9).tobytes() for m in meshes[link])
+        if key not in made:
+            made[key] = link_grid(meshes[link], device)
+        return made[key]
+
+    grids = [grid(entry.link) for entry in links]
+    joined = [_joined(meshes[entry.link]) for entry in links]
+    # grids in the order given, points group by group
+    order = sorted(range(len(links)), key=lambda i: links[i].group)
+    flat = [links[i] for i in order]
+    patches, count = [], 0
+    for entry in flat:
+        patch = cover_patches(entry.points, entry.normals, rng) if len(entry.points) else np.zeros(0, np.int32)
+        patches.append(patch + count)
+        count += int(patch.max()) + 1 if len(patch) else 0
+    repeat = [len(entry.points) for entry in flat]
+    index = {entry.link: tree.link_names.index(entry.link) for entry in links}
+    of_point = np.repeat([index[entry.link] for entry in flat], repeat).astype(np.int32)
+    per_group = [sum(len(e.points) for e in flat if e.group == g) for g in range(tree.groups + 1)]
+    return {
+        "contact_first": csr(per_group),
+        "contact_points": stack_rows([e.points for e in flat], 3),
+        "contact_normals": stack_rows([e.normals for e in flat], 3),
+        "contact_body": tree.link_body[of_point].astype(np.int32),
+        "contact_link": of_point,
+        "contact_patch": np.concatenate(patches).astype(np.int32) if patches else np.zeros(0, np.int32),
+        "contact_grid": np.repeat(order, repeat).astype(np.int32),
+        "grid_first": csr([g.values.size for g in grids]),
+        "grid_shape": np.array([g.values.shape for g in grids], np.int32),
+        "grid_origin": np.array([g.origin for g in grids], np.float32),
+        "grid_cell": np.array([g.cell for g in grids], np.float32),
+        "grid_values": np.concatenate([g.values.ravel() for g in grids]),
+        "grid_link": np.array([index[entry.link] for entry in links], np.int32),
+        "rule_first": csr([len(entry.rules) for entry in links]),
+        "rules": stack_rows([entry.rules for entry in links], 4),
+        "mesh_vertex_first": csr([len(m.vertices) for m in joined]),
+        "mesh_vertices": stack_rows([m.vertices for m in joined], 3),
+        "mesh_face_first": csr([len(m.faces) for m in joined]),
+        "mesh_faces": stack_rows([m.faces for m in joined], 3, np.int32),
+    }
+
+
+def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    whole = trimesh.util.concatenate(meshes)
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole
