@@ -41,7 +41,8 @@ def export(
     where: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only rows of which this is true: a column, or COLUMN OP NUMBER; may be repeated.", show_default=False
+            help="Only rows of which this is true: a column, or COLUMN OP NUMBER, as in objects == 1; may be repeated.",
+            show_default=False,
         ),
     ] = None,
     only_holding: Annotated[

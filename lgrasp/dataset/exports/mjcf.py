@@ -35,7 +35,9 @@ grasps/NUMBER.xml  MuJoCo scene of one grasp: mujoco.MjModel.from_xml_path(FILE)
   keyframe squeeze   the hand at the grasp, its actuators pressing on the object
   actuators          one position servo per joint of the list below, named as it is: 5 N m/rad (500 N/m for sliding
                      joints), critically damped. Joints that follow others are tied by equality constraints.
-  bodies             the links of hand.urdf under their names; object_PLACE_CODE, free, 0.1 kg
+  bodies             the links of hand.urdf under their names; object_PLACE_CODE, free, 0.1 kg. PLACE counts the objects
+                     in the hand from 0, in the order in which they were taken; all are where they are at the grasp of
+                     the last one, which keyframe pregrasp is before.
 
 The world's frame is that of link {root}, the root link of hand/hand.urdf, which is fixed. No gravity; friction 0.6.
 An object collides with the convex pieces objects/CODE/piece_NN.obj; where there are none, with the hull of its mesh,

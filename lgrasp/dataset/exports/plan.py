@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lgrasp.dataset.exports.where import Condition
+from lgrasp.dataset.exports.where import OBJECTS_HELD, Condition
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.records import HandRecord, ObjectRecord
 from lgrasp.dataset.schema import CHUNK_ROWS
@@ -149,7 +149,8 @@ def make_plan(
         several = np.flatnonzero((index >= 0).sum(1) != 1)
         if single and len(several):
             count = int((index[several[0]] >= 0).sum())
-            raise ShardError(f"{path}: row {rows[several[0]]} holds {count} objects; this format has one in a grasp")
+            hint = f"choose rows with --where '{OBJECTS_HELD} == 1', or --to mjcf"
+            raise ShardError(f"{path}: row {rows[several[0]]} holds {count} objects, this format one; {hint}")
         parts.append((path, rows, keys[index], columns))
         left = None if left is None else left - len(rows)
         if left == 0:

@@ -1,4 +1,4 @@
-"""Conditions on rows, written as text: ``physics/fc_holds``, ``metrics/epsilon > 0.01``."""
+"""Conditions on rows, written as text: ``physics/fc_holds``, ``metrics/epsilon > 0.01``, ``objects == 1``."""
 
 import operator
 import re
@@ -9,7 +9,10 @@ import numpy as np
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ConfigError, ShardError
 
-__all__ = ["Condition", "parse_condition"]
+__all__ = ["OBJECTS_HELD", "Condition", "parse_condition"]
+
+OBJECTS_HELD = "objects"
+"""The number of objects in the hand, as if it were a column."""
 
 _OPERATORS = {
     ">=": operator.ge,
@@ -39,12 +42,15 @@ class Condition(NamedTuple):
         Raises:
             ShardError: The shard has no such column, or not one number per row.
         """
-        single = [name for name, (shape, _) in reader.columns.items() if len(shape) == 1]
+        single = [OBJECTS_HELD, *(name for name, (shape, _) in reader.columns.items() if len(shape) == 1)]
         if self.column not in single:
             hint = " (lgrasp validate adds physics columns)" if self.column.startswith("physics/") else ""
             known = ", ".join(single)
             raise ShardError(f"{reader.path}: no column {self.column!r}{hint}; with one number per row it has {known}")
-        values = reader.column(self.column)
+        if self.column == OBJECTS_HELD:
+            values = (reader.column("object_index") >= 0).sum(1)
+        else:
+            values = reader.column(self.column)
         return np.asarray(_OPERATORS[self.operator](values, self.value)) & ~np.isnan(values.astype(np.float64))
 
 

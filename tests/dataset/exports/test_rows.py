@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lxml import etree
 
 from lgrasp.dataset import pose_matrix
 from lgrasp.dataset.exports import FORMATS, export_shards, read_grasps
@@ -75,16 +76,17 @@ def several(shards, path):
 @pytest.mark.parametrize("form", SINGLE)
 def test_several_objects_are_refused(tmp_path, shards, form):
     several(shards, tmp_path / "a.h5")
-    with pytest.raises(ShardError, match=r"a\.h5: row 0 holds 2 objects"):
+    with pytest.raises(ShardError, match=r"a\.h5: row 0 holds 2 objects, this format one; .* 'objects == 1', or --to"):
         export_shards(tmp_path / "a.h5", tmp_path / "out", form)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("form", SINGLE)
-def test_rows_of_one_object_each_beside_others(tmp_path, shards, form):
+@pytest.mark.parametrize("where", ["candidate > 0", "objects == 1"])
+def test_rows_of_one_object_each_beside_others(tmp_path, shards, form, where):
     """The shard has room for two objects in a row; the chosen rows hold one each."""
     shard = several(shards, tmp_path / "a.h5").grasps
-    export_shards(tmp_path / "a.h5", tmp_path / "out", form, where=["candidate > 0"])
+    export_shards(tmp_path / "a.h5", tmp_path / "out", form, where=[where])
     read = read_grasps(tmp_path / "out", form)
     assert [read.objects[i].code for i in read.grasps.object_index[:, 0]] == ["ball", "cup"]
     expected = pose_matrix(shard.object_pose[[1, 2], [1, 0]])
@@ -104,6 +106,18 @@ def test_scenes_hold_several_objects(tmp_path, shards):
     assert np.isnan(pose[1, 1]).all()
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "grasps" / "00000000.xml"))
     assert model.nq == 16 + 14
+
+
+def test_one_object_twice_in_the_hand(tmp_path, shards):
+    """As a sequence of equal objects has it: bodies of their own, each where its slot says."""
+    pytest.importorskip("mujoco")
+    shard = shards.make(tmp_path / "a.h5", n=2, index=np.array([[0, -1, -1], [0, 0, 0]])).grasps
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "mjcf", where=["objects >= 3"])
+    read = read_grasps(tmp_path / "out", "mjcf")
+    assert read.grasps.object_index.tolist() == [[0, 0, 0]]
+    np.testing.assert_allclose(pose_matrix(read.grasps.object_pose[0]), pose_matrix(shard.object_pose[1]), atol=1e-5)
+    names = etree.parse(tmp_path / "out" / "grasps" / "00000000.xml").xpath("//body[@name]/@name")
+    assert [name for name in names if name.startswith("object_")] == ["object_0_cup", "object_1_cup", "object_2_cup"]
 
 
 def test_objects_of_one_name_stay_apart(tmp_path, shards):
@@ -133,7 +147,7 @@ def test_bad_input_leaves_nothing(tmp_path, shards):
             "out",
             {"where": ["q > 1"]},
             ShardError,
-            "no column 'q'; with one number per row it has candidate, metrics/epsilon",
+            "no column 'q'; with one number per row it has objects, candidate, metrics/epsilon",
         ),
         ("a.h5", "out", {"where": ["metrics/epsilon > 2"]}, ShardError, "none satisfies metrics/epsilon > 2"),
         ("c.h5", "out", {}, ShardError, "no such file"),
