@@ -20,12 +20,13 @@ MAY_IMPORT = {
     "device": set(),
     "hand": {"device"},
     "object": {"device"},
+    "differentiable": {"device", "hand", "object"},
     "field": {"device", "hand", "object"},
     "grasp": {"device", "hand", "object"},
     "dataset": {"device", "hand", "object", "field", "grasp"},
     "physics": {"device", "hand", "object", "dataset"},
-    "stages": {"device", "hand", "object", "field", "grasp", "dataset", "physics"},
-    "engine": {"device", "hand", "object", "field", "grasp", "stages", "dataset", "physics"},
+    "stages": {"device", "hand", "object", "field", "grasp", "differentiable", "dataset", "physics"},
+    "engine": {"device", "hand", "object", "field", "grasp", "differentiable", "stages", "dataset", "physics"},
 }
 """The packages of lgrasp, each with those it may import besides itself and the shared modules."""
 

@@ -1,0 +1,103 @@
+"""Distance grids in torch against the Warp look-up, a sphere, and finite differences."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from lgrasp.device.runtime import KERNEL_OPTIONS, start
+from lgrasp.device.sdf import Sdf, sdf_gradient, sdf_value
+from lgrasp.differentiable.distance import DistanceGrids, SurfaceNormals
+from lgrasp.object.sdf import SdfGrid
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+RADIUS = 0.02
+
+
+@wp.kernel
+def _look_up(s: Sdf, p: wp.array(dtype=wp.vec3), value_out: wp.array(dtype=float), slope_out: wp.array(dtype=wp.vec4)):
+    i = wp.tid()
+    value_out[i] = sdf_value(s, p[i])
+    slope_out[i] = sdf_gradient(s, p[i])
+
+
+def in_warp(grid: SdfGrid, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values (n,) and gradients (n, 3)."""
+    start()
+    s = Sdf()
+    s.values = wp.array(grid.values.ravel(), dtype=wp.float32, device="cpu")
+    s.nx, s.ny, s.nz = grid.values.shape
+    s.origin, s.inv_cell = wp.vec3(*grid.origin.tolist()), 1 / grid.cell
+    value, slope = wp.empty(len(p), dtype=float, device="cpu"), wp.empty(len(p), dtype=wp.vec4, device="cpu")
+    points = wp.array(p.astype(np.float32), dtype=wp.vec3, device="cpu")
+    wp.launch(_look_up, len(p), [s, points], [value, slope], device="cpu")
+    return value.numpy(), slope.numpy()[:, :3]
+
+
+def sphere(cell: float, shape: tuple[int, int, int], origin: list[float]) -> SdfGrid:
+    at = np.array(origin) + cell * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+    return SdfGrid((np.linalg.norm(at, axis=-1) - RADIUS).astype(np.float32), np.array(origin, np.float32), cell)
+
+
+GRIDS = [sphere(0.004, (21, 26, 31), [-0.04, -0.05, -0.06]), sphere(0.003, (23, 19, 21), [-0.031, -0.028, -0.03])]
+
+
+def around(grid: SdfGrid, n: int, reach: float) -> np.ndarray:
+    """Points in a box about the grid's, ``reach`` times as large."""
+    half = 0.5 * grid.cell * (np.array(grid.values.shape) - 1)
+    return grid.origin + half + reach * half * np.random.default_rng(0).uniform(-1, 1, (n, 3))
+
+
+@pytest.mark.parametrize("reach", [0.95, 2.5])
+def test_values_equal_those_of_the_kernels_in_each_grid(reach):
+    both = DistanceGrids(GRIDS)
+    points = [around(g, 2000, reach).astype(np.float32) for g in GRIDS]
+    p = torch.from_numpy(np.concatenate(points))
+    number = torch.arange(2).repeat_interleave(2000)
+    value = both.value(p, number)
+    x, y, z = p.unbind(-1)
+    again, gradient = both.value_and_gradient((x, y, z), number)
+    theirs = [in_warp(g, points) for g, points in zip(GRIDS, points, strict=True)]
+    np.testing.assert_allclose(value.numpy(), np.concatenate([v for v, _ in theirs]), atol=2e-7)
+    torch.testing.assert_close(again, value)
+    if reach < 1:  # the kernels give unit vectors
+        slope = torch.stack(gradient, -1).numpy()
+        slope /= np.linalg.norm(slope, axis=1, keepdims=True)
+        np.testing.assert_allclose(slope, np.concatenate([g for _, g in theirs]), atol=2e-3)
+
+
+@pytest.mark.parametrize("reach", [0.95, 2.5])
+def test_derivatives_equal_finite_differences(reach):
+    grids = DistanceGrids(GRIDS, dtype=torch.float64)
+    p = torch.from_numpy(around(GRIDS[1], 40, reach)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: grids.value(p, 1), p, eps=1e-8, atol=1e-6)
+    assert torch.autograd.gradgradcheck(lambda p: grids.value(p, 1), p, eps=1e-8, atol=1e-4)
+    normals = SurfaceNormals(GRIDS[1], dtype=torch.float64)
+    assert torch.autograd.gradcheck(normals, p, eps=1e-8, atol=1e-5)
+
+
+def test_beyond_the_grid_values_stay_below_the_distance_and_grow_with_it():
+    grid = GRIDS[0]
+    p = around(grid, 3000, 3.0)
+    value = DistanceGrids([grid], dtype=torch.float64).value(torch.from_numpy(p)).numpy()
+    true = np.linalg.norm(p, axis=1) - RADIUS
+    assert (value < true + 5e-4).all()  # half a millimetre of interpolation at cells of 4 mm
+    further = DistanceGrids([grid], dtype=torch.float64).value(torch.from_numpy(p * 1.1)).numpy()
+    assert (further > value)[true > 0].all()
+
+
+def test_normals_of_a_sphere_and_how_they_turn():
+    grid = sphere(0.002, (31, 31, 31), [-0.03, -0.03, -0.03])
+    normals = SurfaceNormals(grid, dtype=torch.float64)
+    d = np.random.default_rng(1).normal(size=(200, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    p = torch.from_numpy(RADIUS * d).requires_grad_()
+    n = normals(p)
+    assert ((n.detach().numpy() * d).sum(1) > np.cos(np.radians(0.5))).all()
+    # a sphere's normals turn by 1 / radius per metre in every tangent direction
+    turning = torch.stack([torch.autograd.grad(n[:, a].sum(), p, retain_graph=True)[0] for a in range(3)], 1)
+    outward = d[:, :, None] * d[:, None]
+    np.testing.assert_allclose(turning.numpy() * RADIUS, np.eye(3) - outward, atol=0.2)
+    beyond = torch.from_numpy(0.2 * d)
+    assert ((normals(beyond).numpy() * d).sum(1) > np.cos(np.radians(8))).all()
