@@ -6,6 +6,7 @@ import importlib.util
 import io
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -230,6 +231,119 @@ def test_object_against_object() -> None:
     T[0, :3, 3] = [0, 0, 0.02 + 0.0015 - 0.001]
     T[1, :3, 3] = [0, 0, 0.02 + 0.0015 + 0.001]
     assert J.object_object_penetration(one, two, T) == pytest.approx([1e-3, 0.0], abs=1e-6)
+
+
+# Two pairs of prismatic jaws side by side over a palm, each pair for one object.
+PAIRS = """<robot name="pairs">
+  <link name="palm"><collision><origin xyz="0.03 0 -0.02"/>
+    <geometry><box size="0.2 0.12 0.02"/></geometry></collision></link>"""
+for _name, _x, _sign in (("a", 0.0, 1), ("b", 0.0, -1), ("c", 0.06, 1), ("d", 0.06, -1)):
+    PAIRS += f"""
+  <link name="{_name}"><collision><origin xyz="0 0 0.03"/>
+    <geometry><box size="0.02 0.01 0.06"/></geometry></collision></link>
+  <joint name="slide_{_name}" type="prismatic"><parent link="palm"/><child link="{_name}"/><origin xyz="{_x} 0 0"/>
+    <axis xyz="0 {_sign} 0"/><limit lower="0" upper="0.06" effort="1" velocity="1"/></joint>"""
+PAIRS += "</robot>"
+
+
+def _sequence(path: Path, **changes: Callable[[dict[str, np.ndarray]], None]) -> Path:
+    """Two cubes: row 0 takes one with the first pair, rows 1 and on extend it by another in the second pair."""
+    n = 2 + len(changes)
+    shut, wide = 0.025, 0.05
+    q = np.full((n, 2, 4), [[shut, shut, wide, wide], [shut] * 4])
+    squeeze = np.full((n, 2, 4), [[0.02, 0.02, wide, wide], [0.02] * 4])
+    pose = np.full((n, 2, 7), [[0, 0, 0.035, 1, 0, 0, 0], [0.06, 0, 0.035, 1, 0, 0, 0]])
+    points = np.full((n, 2, 2, 3), [[0, 0.02, 0.001], [0, -0.02, 0.001]])
+    normals = np.full((n, 2, 2, 3), [[0, 1, 0], [0, -1, 0]])
+    values: dict[str, np.ndarray] = {
+        "object_pose": pose.astype("f4"),
+        "object_index": np.zeros((n, 2), "i4"),
+        "contact_points": points.astype("f4"),
+        "contact_normals": normals.astype("f4"),
+        "contact_forces": (-normals / 2).astype("f4"),
+        "contact_links": np.full((n, 2, 2), [[1, 2], [3, 4]], "i2"),
+        "sequence/q": q.astype("f4"),
+        "sequence/q_pregrasp": q.astype("f4"),
+        "sequence/q_squeeze": squeeze.astype("f4"),
+        "sequence/space": np.full((n, 2), [0, 1], "i2"),
+        "sequence/free_joints": np.full((n, 2, 4), [[True, True, False, False], [False, False, True, True]]),
+        "sequence/parent": np.array([-1, *[0] * (n - 1)]),
+    }
+    for value in values.values():  # the first row has but one object
+        if value.ndim > 1:
+            value[0, 1] = {"f": np.nan, "i": -1, "b": False}[value.dtype.kind]
+    for row, change in enumerate(changes.values(), 2):
+        change({name: value[row : row + 1] for name, value in values.items()})
+    held = (values["object_index"] >= 0).sum(1)
+    for name in ("q", "q_pregrasp", "q_squeeze"):
+        values[name] = values[f"sequence/{name}"][np.arange(n), held - 1]
+    with h5py.File(path, "w") as f:
+        f.create_group("hand").attrs["base_link"] = "palm"
+        f["hand/urdf"] = PAIRS
+        f["hand/joint_names"] = [f"slide_{k}" for k in "abcd"]
+        f["hand/link_names"] = ["palm", *"abcd"]
+        group = f.create_group("objects/cube")
+        group["vertices"], group["faces"] = CUBE.vertices.astype("f4"), CUBE.faces.astype("i4")
+        for name, value in values.items():
+            f[f"grasps/{name}"] = value
+    return path
+
+
+def _put(name: str, where: Any, value: Any) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(row: dict[str, np.ndarray]) -> None:
+        row[name][(0, *where)] = value
+
+    return change
+
+
+def _closer(row: dict[str, np.ndarray]) -> None:
+    """The second cube 3 mm into the first, still between its jaws."""
+    row["object_pose"][0, 1, 0] = 0.037
+    row["contact_points"][0, 1, :, 0] = 0.0195
+
+
+def _same_joint(row: dict[str, np.ndarray]) -> None:
+    """The second step moves a jaw that holds the first cube, and says so."""
+    row["sequence/free_joints"][0, :, 1] = [False, True]
+    row["sequence/q"][0, 1, 1] += 1e-4
+
+
+def test_sequences(tmp_path: Path) -> None:
+    """What is planted in rows of two objects is found, and rows of fewer and more are counted apart."""
+    cases = {
+        "loose": (_put("sequence/q", (1, slice(2, 4)), 0.03), {"contact_on_link"}),
+        "first_loose": (_put("sequence/q", (slice(0, 2), 0), 0.03), {"contact_on_link", "parent", "frozen"}),
+        "overlap": (_closer, {"object_object"}),
+        "creep": (_put("sequence/q", (1, 0), 0.02501), {"frozen"}),
+        "pregrasp": (_put("sequence/q_pregrasp", (1, 1), 0.03), {"frozen"}),
+        "let_go": (_put("sequence/q_squeeze", (1, 0), 0.025), {"frozen"}),
+        "twice": (_put("sequence/free_joints", (1, 0), True), {"frozen"}),
+        "carried": (_same_joint, {"frozen", "parent"}),
+        "orphan": (_put("sequence/parent", (), -1), {"parent"}),
+        "ahead": (_put("sequence/parent", (), 15), {"parent"}),
+        "other": (_put("object_pose", (0, 2), 0.0351), {"parent"}),
+        "space": (_put("sequence/space", (1,), 0), {"parent"}),
+        "one_sided": (_put("contact_links", (1, 1), -1), {"residual"}),
+    }
+    _sequence(tmp_path / "s.h5", **{name: change for name, (change, _) in cases.items()})
+    report = J.judge(tmp_path)
+    found = _failed(report)
+    assert found[:2] == [set(), set()]
+    assert dict(zip(cases, found[2:], strict=True)) == {name: wanted for name, (_, wanted) in cases.items()}
+    assert {k: (d["rows"], d["valid"]) for k, d in report.by_objects.items()} == {1: (1, 1), 2: (14, 1)}
+    assert report.values["object_object_mm"][4] == pytest.approx(3.0, abs=1e-3)
+    assert "objects held" in str(report)
+
+
+def test_which_joints_carry_a_link() -> None:
+    blob = JAW.export(file_type="obj").encode()
+    resolve = J._resolver({"package://jaws/meshes/jaw.obj": blob}, None)
+    names = ["slide_left", "slide_right", "swing"]
+    moves = J.Hand(URDF, resolve).riders(names)
+    assert moves.sum() == 5  # a jaw by its slide, a jaw by its slide, thumb, tip and lever by the swing
+    assert [names[k] for k in moves.argmax(axis=0)[1:]] == ["slide_left", "slide_right", "swing", "swing", "swing"]
+    seen = J.Hand(URDF, resolve, "tip").riders(names)  # from the tip all else swings
+    assert seen[2].tolist() == [True, True, True, False, False, True]
 
 
 def _closest_brute(p: np.ndarray, tri: np.ndarray) -> float:

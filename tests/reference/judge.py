@@ -5,11 +5,15 @@ that wrote the shard: its own URDF reader and forward kinematics, its own primit
 volume hierarchy with winding-number signs, convex depths from coal, wrench residuals from an exact non-negative least
 squares.
 
-    python judge.py SHARD... [--urdf PATH] [--mesh [ID=]PATH] [--rows N] [--json]
+    python judge.py SHARD|FOLDER... [--urdf PATH] [--mesh [ID=]PATH] [--rows N] [--json]
 
 Without options the URDF, the link meshes and the object meshes come from the shard; ``--urdf`` and ``--mesh`` put the
 original files in their place (the mesh is multiplied by the stored scale). Units: metres, radians, newtons, unless a
 name says otherwise.
+
+A row with several objects is judged at its q with all of them, whichever step took them: penetration, contacts and
+wrenches of each, overlap of each two. A row of a sequence must also leave alone what earlier steps did: checks
+``frozen`` and ``parent``.
 """
 
 from __future__ import annotations
@@ -478,6 +482,22 @@ class Hand:
             value(joint.name)
         return out
 
+    def riders(self, joint_names: Sequence[str]) -> np.ndarray:
+        """Which joints of q (K of them) move which links against the base link, also by way of mimics, (K, L)."""
+        by_name = {j.name: j for j in self.movable}
+        columns = {name: k for k, name in enumerate(joint_names)}
+        path: dict[str, frozenset[str]] = {self.root: frozenset()}
+        for j in self._order:
+            path[j.child] = path[j.parent] | ({j.name} if j.kind != "fixed" else set())
+        moves = np.zeros((len(joint_names), len(self.links)), bool)
+        for link, name in ((k, name) for k, v in path.items() for name in v ^ path[self.base]):
+            source = by_name[name]
+            while source.name not in columns and source.mimic is not None:
+                source = by_name[source.mimic[0]]
+            if source.name in columns:
+                moves[columns[source.name], self.index[link]] = True
+        return moves
+
     def forward(self, q: Mapping[str, np.ndarray], count: int) -> np.ndarray:
         """Poses of the links in the base link frame, (count, L, 4, 4), from every movable joint's value."""
         T = np.zeros((count, len(self.links), 4, 4))
@@ -624,7 +644,10 @@ def hand_object_penetration(hand: Hand, obj: Object, T_object_links: np.ndarray)
 def object_object_penetration(a: Object, b: Object, T_ab: np.ndarray) -> np.ndarray:
     """Deepest surface point of one object inside the other, (n,), from poses of b in a (n, 4, 4)."""
     out = np.zeros(len(T_ab))
-    for i, T in enumerate(T_ab):
+    centre = T_ab[:, :3, :3] @ b.centre_of_mass + T_ab[:, :3, 3]
+    near = np.linalg.norm(centre - a.centre_of_mass, axis=1) <= a.radius + b.radius
+    for i in np.flatnonzero(near):
+        T = T_ab[i]
         inverse = _inverse(T)
         out[i] = max(
             a.field.depth(b.samples @ T[:3, :3].T + T[:3, 3]).max(),
@@ -770,6 +793,7 @@ class Shard:
     objects: list[Object]
     object_keys: list[str]
     grasps: dict[str, np.ndarray]
+    steps: dict[str, np.ndarray]
     metrics: dict[str, tuple[np.ndarray, str]]
     notes: list[str]
 
@@ -840,10 +864,11 @@ def read_shard(path: Path, urdf: Path | None, mesh: Mapping[str, Path]) -> Shard
                 notes.append(f"object {name} is not watertight: inside is decided by the winding number")
         g = f["grasps"]
         grasps = {k: v[()] for k, v in g.items() if isinstance(v, h5py.Dataset)}
+        steps = {k: v[()] for k, v in g["sequence"].items()} if "sequence" in g else {}
         metrics = {
             k: (v[()], _text(v.attrs.get("unit", ""))) for k, v in (g["metrics"].items() if "metrics" in g else [])
         }
-    return Shard(hand, digest.hexdigest(), joint_names, link_names, objects, keys, grasps, metrics, notes)
+    return Shard(hand, digest.hexdigest(), joint_names, link_names, objects, keys, grasps, steps, metrics, notes)
 
 
 # --------------------------------------------------------------------------------------------------------------- judge
@@ -863,6 +888,8 @@ STRICT = (
     "stored_normal",
     "residual",
     "object_object",
+    "frozen",
+    "parent",
 )
 
 
@@ -880,6 +907,8 @@ class Report:
         near_duplicates, near_duplicates_max: rows of the whole input (``total_rows``) with an earlier row within one
             scaled distance, by root of the summed squares and by the largest ratio.
         distinct_object_poses: rows of the whole input whose object pose differs from all earlier by more than 1e-6.
+        by_objects: of the judged rows, by the number of objects held: rows, valid rows, and of these the largest and
+            the median penetration of hand and objects and of objects [mm].
         solver_gap: largest optimality gap of the wrench problems.
         self_pairs: link pairs with self-penetration beyond the bound, and their rows.
     """
@@ -894,6 +923,7 @@ class Report:
     near_duplicates: int
     near_duplicates_max: int
     distinct_object_poses: int
+    by_objects: dict[int, dict[str, float]]
     solver_gap: float
     self_pairs: dict[str, int]
     notes: list[str]
@@ -930,6 +960,7 @@ class Report:
             "near_duplicates_max": self.near_duplicates_max,
             "near_duplicate_share": self.near_duplicates / max(self.total_rows, 1),
             "distinct_object_poses": self.distinct_object_poses,
+            "by_objects": self.by_objects,
             "solver_gap": self.solver_gap,
             "self_penetration_pairs": self.self_pairs,
             "notes": self.notes,
@@ -954,6 +985,11 @@ class Report:
             f"{'value':<22}{'max':>12}{'p99':>12}{'p50':>12}",
             *(f"{n:<22}{d['max']:>12.4g}{d['p99']:>12.4g}{d['p50']:>12.4g}" for n, d in self.distributions.items()),
         ]
+        if set(self.by_objects) - {1}:
+            head = [next(iter(self.by_objects.values()))]
+            lines += ["", "objects held" + "".join(f"{name:>12}" for name in head[0])]
+            for held, d in self.by_objects.items():
+                lines.append(f"{held:<12}" + "".join(f"{value:>12.4g}" for value in d.values()))
         if self.metrics:
             lines += ["", f"{'stored metric':<34}{'max dev':>12}{'p99':>12}{'mean':>12}"]
             lines += [f"{n:<34}{d['max']:>12.4g}{d['p99']:>12.4g}{d['mean']:>12.4g}" for n, d in self.metrics.items()]
@@ -1027,6 +1063,9 @@ class _ShardJudge:
         self._penetration(good, T_links, T_objects)
         self._contacts(good, T_links, T_objects)
         self._wrenches(good)
+        if self.s.steps:
+            self._frozen()
+            self._parents()
 
     def _shape(self) -> None:
         """Finite numbers, unit quaternions and indices that exist."""
@@ -1224,6 +1263,42 @@ class _ShardJudge:
             v["contacts"][r] = sum(len(x) for x in links)
             v["links_in_contact"][r] = len(np.unique(np.concatenate(links)))
 
+    def _frozen(self) -> None:
+        """Steps move only joints of their own, and none that carries a link which an earlier object touches."""
+        steps = {k: v[self.rows] for k, v in self.s.steps.items()}
+        present, free = self.index >= 0, np.asarray(steps["free_joints"], bool)  # (n, O), (n, O, K)
+        bad = (present[:, 1:] & ~present[:, :-1]).any(axis=1) | (free.sum(axis=1) > 1).any(axis=1)
+        bad |= (free.any(axis=2) != present).any(axis=1)
+        last = np.maximum(present.sum(axis=1) - 1, 0)
+        for name, held in (("q", "q"), ("q_pregrasp", "q"), ("q_squeeze", "q_squeeze")):
+            still = present[:, 1:, None] & ~free[:, 1:]
+            bad |= (still & (steps[name][:, 1:] != steps[held][:, :-1])).any(axis=(1, 2))
+            bad |= (steps[name][np.arange(self.n), last] != self.g[name]).any(axis=1)
+        riders = self.s.hand.riders(self.s.joint_names)  # (K, L)
+        for o in range(self.index.shape[1] - 1):
+            later = free[:, o + 1 :].any(axis=1)  # (n, K)
+            carried = later.astype(int) @ riders.astype(int) > 0  # (n, L)
+            touched = np.take_along_axis(carried, np.maximum(self.link_of[:, o], 0), 1) & self.used[:, o]
+            bad |= touched.any(axis=1)
+        self.failed["frozen"] = bad & ~self.failed["finite"] & ~self.failed["indices"]
+
+    def _parents(self) -> None:
+        """A row of n objects extends an earlier row of n - 1: all of that one's steps are its own, bit by bit."""
+        grasps, steps = self.s.grasps, self.s.steps
+        index = np.asarray(grasps["object_index"])
+        count, parent = (index >= 0).sum(axis=1), np.asarray(steps["parent"], int)
+        names = ("object_pose", "contact_points", "contact_normals", "contact_links", "contact_forces")
+        columns = [index, *(grasps[k] for k in names if k in grasps)]
+        columns += [steps[k] for k in ("space", "free_joints", "q", "q_pregrasp", "q_squeeze")]
+        for i, r in enumerate(self.rows):
+            p, n = parent[r], count[r] - 1
+            good = bool(p == -1 if n == 0 else 0 <= p < r and count[p] == n)
+            if good and n > 0:
+                good = all(v[r, :n].tobytes() == v[p, :n].tobytes() for v in columns)
+            spaces = steps["space"][r, : n + 1]
+            self.failed["parent"][i] = not (good and len(np.unique(spaces)) == n + 1)
+        self.failed["parent"] &= ~self.failed["finite"] & ~self.failed["indices"]
+
     def compare_metrics(self) -> dict[str, np.ndarray]:
         """Absolute deviation of stored metrics from recomputed values, recognised by name and unit."""
         v, out = self.values, {}
@@ -1268,7 +1343,7 @@ def judge(
     """Judge grasp shards.
 
     Args:
-        shard_paths: shard files of format version 1.
+        shard_paths: shard files of format version 1, or folders of them.
         urdf: original URDF instead of the stored one; meshes are looked up beside it.
         mesh: original object mesh instead of the stored one (multiplied by the stored scale), or a mapping by id.
         rows: judge only this many rows, drawn at random with a fixed seed; duplicates and poses are counted over all.
@@ -1276,7 +1351,10 @@ def judge(
     Returns:
         The findings.
     """
-    paths = [Path(shard_paths)] if isinstance(shard_paths, (str, Path)) else [Path(p) for p in shard_paths]
+    given = [Path(shard_paths)] if isinstance(shard_paths, (str, Path)) else [Path(p) for p in shard_paths]
+    paths = [file for p in given for file in (sorted(p.rglob("*.h5")) if p.is_dir() else [p])]
+    if not paths:
+        raise FileNotFoundError(f"no shard (*.h5) in {', '.join(map(str, given))}")
     meshes = {} if mesh is None else mesh if isinstance(mesh, Mapping) else {"": mesh}
     start = time.perf_counter()
     sources = {k: Path(p) for k, p in meshes.items()}
@@ -1305,6 +1383,8 @@ def judge(
     values = {k: np.concatenate([p.values[k] for p in parts]) for k in VALUES}
     failed = {k: np.concatenate([p.failed[k] for p in parts]) for k in STRICT}
     seconds = time.perf_counter() - loaded
+    valid = ~np.any(list(failed.values()), axis=0)
+    held = np.concatenate([(np.asarray(p.g["object_index"]).reshape(p.n, -1) >= 0).sum(axis=1) for p in parts])
     combined, largest, distinct = _dataset_counts(shards)
     deviations = {}
     for name, arrays in metrics.items():
@@ -1319,7 +1399,7 @@ def judge(
     return Report(
         rows=len(chosen),
         total_rows=total,
-        valid=~np.any(list(failed.values()), axis=0),
+        valid=valid,
         failures={k: int(v.sum()) for k, v in failed.items()},
         values={k: v for k, v in values.items() if np.isfinite(v).any()},
         failed=failed,
@@ -1327,12 +1407,24 @@ def judge(
         near_duplicates=combined,
         near_duplicates_max=largest,
         distinct_object_poses=distinct,
+        by_objects={int(k): _held_counts(values, valid, held == k) for k in np.unique(held)},
         solver_gap=max((p.solver_gap for p in parts), default=0.0),
         self_pairs=dict(sorted(self_pairs.items(), key=lambda item: -item[1])),
         notes=notes,
         seconds=seconds,
         seconds_load=loaded - start,
     )
+
+
+def _held_counts(values: Mapping[str, np.ndarray], valid: np.ndarray, mask: np.ndarray) -> dict[str, float]:
+    """Rows of one number of objects, and penetration [mm] of the valid ones."""
+    out: dict[str, float] = {"rows": int(mask.sum()), "valid": int((mask & valid).sum())}
+    for name, key in (("hand", "penetration_mm"), ("objects", "object_object_mm")):
+        found = values[key][mask & valid]
+        found = found[np.isfinite(found)]
+        out[f"{name} max"] = float(found.max()) if len(found) else math.nan
+        out[f"{name} p50"] = float(np.median(found)) if len(found) else math.nan
+    return out
 
 
 def _dataset_counts(shards: Sequence[Shard]) -> tuple[int, int, int]:
