@@ -53,7 +53,7 @@ def build_field(
         print_json(data)
         return
     f"; {data['note']}" if data["note"] else ""
-    clear = "  ".join(f"{share:.0%}" for share in data["clear_share"])
+    clear = "  ".join("-" if share is None else f"{share:.0%}" for share in data["clear_share"])
     print_pairs(
         [
             (

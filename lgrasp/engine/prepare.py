@@ -41,8 +41,9 @@ def prepare_field(
     where = resolve_device(device)
     keys = input_keys(hand, None, 1.0, ObjectParams(), params)
     start = time.perf_counter()
-    model, _ = load_hand(cache, keys, where)
+    model, _ = load_hand(cache, keys.source, keys.hand, where)
     field, hit = load_field(cache, keys, upload_hand(model, where.alias), params, report)
+    clear = field.clear_share.reshape(-1, model.groups).mean(0)
     return {
         "hand": model.name,
         "note": keys.source.note,
@@ -56,7 +57,7 @@ def prepare_field(
         "cell": field.cell,
         "megabytes": field.megabytes,
         "settings": len(model.tree.settings),
-        "clear_share": [float(share) for share in field.clear_share.reshape(-1, model.groups).mean(0)],
+        "clear_share": [None if np.isnan(share) else float(share) for share in clear],
         "seconds": time.perf_counter() - start,
         "cached": hit,
         "device": where.name,

@@ -18,7 +18,7 @@ from lgrasp.hand.model import HandModel
 
 __all__ = ["FIELD_VERSION", "ContactField", "build_field"]
 
-FIELD_VERSION = 4
+FIELD_VERSION = 5
 """Raised whenever the arrays of a ContactField change meaning."""
 
 _CLEARANCE = 5.0e-4  # [m] postures of the field keep this distance to the palm
@@ -46,8 +46,9 @@ class ContactField:
     offset: np.ndarray  # (N,) i32 place inside the voxel, 3 x 8 bits
     normal: np.ndarray  # (N,) u16 octahedral hand normal
     posture: np.ndarray  # (N, D) u8 joint seed, share of each joint's range
-    clear_share: np.ndarray  # (S,) share of uniform postures clear of the palm
-    # contact vectors of two fingers that press towards each other, by distance
+    clear_share: np.ndarray  # (S,) share of uniform postures clear of the palm, NaN for groups without contact surface
+    # contact vectors of two fingers, or of the only one with contact surface and the palm, that press towards each
+    # other, by distance
     pair_point: np.ndarray  # (P, 2, 3) f32 [m]
     pair_normal: np.ndarray  # (P, 2, 3) f32 hand normals
     pair_slot: np.ndarray  # (P, 2) i32
@@ -81,7 +82,7 @@ class ContactField:
 def build_field(
     hand: HandArrays, params: FieldParams, progress: Callable[[str, float], None] | None = None
 ) -> ContactField:
-    """Sample and index the contact field of a hand (Def. 4.2).
+    """Sample and index the contact field of a hand (Def. 4.2); groups without contact surface have no vectors.
 
     Args:
         progress: called with (what, share done).
@@ -176,12 +177,13 @@ def _check_clear(model: HandModel, clear: np.ndarray) -> None:
 
 
 def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, np.ndarray]:
-    """Contact vectors of a group in a setting; none without contact surface or when no posture is clear."""
+    """Contact vectors of a group in a setting; none when no posture is clear."""
     model, device = hand.model, hand.device
     settings = len(model.tree.settings)
     setting, group = divmod(slot, model.groups)
     width = int(np.diff(model.tree.dof_first).max())
-    surface = int(model.contact_first[group + 1] - model.contact_first[group])
+    if model.contact_first[group + 1] == model.contact_first[group]:
+        return _no_vectors(width)
     # vectors may fill half of the memory bound, the table the rest
     room = int(0.5e6 * params.max_mb / _VECTOR_BYTES / (model.groups * settings))
     records = params.records if settings == 1 else max(params.records // settings, min(params.records, _LEAST_RECORDS))
@@ -192,7 +194,7 @@ def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, 
     inputs = [hand.struct, group, setting, seed, _CLEARANCE]
     wp.launch(sample_postures, postures, inputs, [posture, clear], device=device)
     good = np.flatnonzero(clear.numpy())
-    count = min(records, room) if surface and len(good) else 0
+    count = min(records, room) if len(good) else 0
     chosen = np.resize(np.repeat(good, _PER_POSTURE), count).astype(np.int32)
     kinds = (wp.int32, wp.vec3, wp.int32, wp.int32, wp.vec3)
     out = [wp.empty(count, dtype=t, device=device) for t in kinds]
@@ -209,4 +211,17 @@ def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, 
         "direction": direction.reshape(-1, 3),
         "posture": posture.numpy()[chosen],
         "clear": np.asarray(len(good) / postures, np.float32),
+    }
+
+
+def _no_vectors(width: int) -> dict[str, np.ndarray]:
+    """What _sample_slot gives for a group without contact surface."""
+    return {
+        "point": np.zeros(0, np.int32),
+        "position": np.zeros((0, 3), np.float32),
+        "bin": np.zeros(0, np.int32),
+        "normal": np.zeros(0, np.int32),
+        "direction": np.zeros((0, 3), np.float32),
+        "posture": np.zeros((0, width), np.uint8),
+        "clear": np.asarray(np.nan, np.float32),
     }

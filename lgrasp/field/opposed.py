@@ -28,7 +28,8 @@ def opposed_pairs(
         for b in range(a + 1, len(parts))
         if a // groups == b // groups and len(parts[a]["position"]) and len(parts[b]["position"])
     ]
-    if groups == 1 and len(palm["position"]):  # a lone jaw closes against nothing else
+    fingers = {slot % groups for slot, part in enumerate(parts) if len(part["position"])}
+    if len(fingers) == 1 and len(palm["position"]):  # a lone jaw closes against nothing else
         both += [(a, -1) for a in range(len(parts)) if len(parts[a]["position"])]
     ends, normals, slots = [], [], []
     for a, b in both:

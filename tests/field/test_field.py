@@ -16,6 +16,7 @@ from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import Hand, body_poses, upload_hand
 from lgrasp.hand.model import HandModel, build_hand
 from lgrasp.hand.pairs import pieces_touch
+from lgrasp.hand.spaces import space_view
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -312,6 +313,35 @@ def test_same_seed_same_field(model, field):
         np.testing.assert_array_equal(value, again.to_arrays()[key], err_msg=key)
     assert len(other.point) == len(field.point)
     assert (other.point != field.point).any()
+
+
+@pytest.mark.parametrize("name", ["index-palm", "thumb-palm", "index-middle", "thumb-index"])
+def test_field_of_an_opposition_space(name):
+    """Vectors of its fingers only, and pairs of its two sides, whose normals point towards each other."""
+    start()
+    urdf, spec = hand_source("shipped")
+    whole = hand_model("shipped")
+    view = space_view(urdf, spec, whole, name)
+    field = build_field(upload_hand(view, "cpu"), PARAMS)
+    fingers = set(np.flatnonzero(np.diff(view.contact_first)[:-1]))
+    assert set(groups_of(field)) == fingers
+    assert np.isnan(field.clear_share).sum() == whole.groups - len(fingers)
+    p, _ = realised(view, field)
+    _, corner, _ = homes(field)
+    assert (p > corner - 1e-6).all()
+    assert (p < corner + field.cell + 1e-6).all()
+    assert len(field.pair_width) > 1000
+    if len(fingers) == 2:
+        assert {tuple(sorted(s)) for s in field.pair_slot} == {tuple(sorted(fingers))}
+    else:
+        assert set(field.pair_slot[:, 0]) == fingers
+        palm = -1 - field.pair_slot[:, 1]
+        assert palm.min() >= view.contact_first[whole.groups]
+        np.testing.assert_allclose(field.pair_point[:, 1], view.contact_points[palm], atol=1e-6)
+    line = field.pair_point[:, 1] - field.pair_point[:, 0]
+    np.testing.assert_allclose(np.linalg.norm(line, axis=1), field.pair_width, atol=1e-6)
+    assert (np.einsum("nd,nd->n", line, field.pair_normal[:, 0]) > 0.8 * field.pair_width).all()
+    assert (np.einsum("nd,nd->n", line, field.pair_normal[:, 1]) < -0.8 * field.pair_width).all()
 
 
 def test_hand_that_is_never_clear(tmp_path):
