@@ -165,6 +165,12 @@ def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
         ("near-duplicates", f"{near:,}"),
         ("distinct poses", f"{sum(group['distinct_poses'] for group in groups):,}"),
     ]
+    held: dict[str, int] = {}
+    for hand in numbers["hands"]:
+        for n, group in hand["held"].items():
+            held[n] = held.get(n, 0) + group["rows"]
+    if set(held) - {"1"}:
+        pairs.append(("objects in the hand", ", ".join(f"{n}: {rows:,}" for n, rows in sorted(held.items()))))
     for name in sorted({name for group in groups for name in group["physics"]}):
         found = [group["physics"][name] for group in groups if name in group["physics"]]
         pairs.append((f"hold in {name}", f"{sum(f['held'] for f in found):,} of {sum(f['run'] for f in found):,}"))

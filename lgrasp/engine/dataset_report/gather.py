@@ -10,6 +10,7 @@ import numpy as np
 from lgrasp.dataset.reader import ShardReader, pose_matrix
 from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord
 from lgrasp.engine.dataset_report.coverage import Coverage
+from lgrasp.engine.dataset_report.held import HeldRows, add_held
 from lgrasp.engine.dataset_report.near import NearRows
 from lgrasp.engine.dataset_report.physics import Verdicts, add_verdicts
 from lgrasp.engine.dataset_report.quantity import QUANTITIES, Distribution
@@ -52,6 +53,8 @@ class HandRows:
         """Contacts of each link."""
         self.sum_q, self.sum_qq = np.zeros(k), np.zeros((k, k))
         self.objects: dict[tuple[str, ...], ObjectRows] = {}
+        self.held: dict[int, HeldRows] = {}
+        """By the number of objects in the hand."""
         self.sample = EvenSample(_SAMPLE_ROWS)
         """q [K], position of the (first) object's middle in the hand's frame [3], place of its group in ``objects``."""
 
@@ -70,6 +73,7 @@ class HandRows:
         for start in range(0, len(reader), BLOCK_ROWS):
             rows = reader.rows(start, start + BLOCK_ROWS)
             self._add_postures(rows)
+            add_held(self.held, rows)
             for index in np.unique(rows.object_index, axis=0):
                 chosen = np.flatnonzero((rows.object_index == index).all(1))
                 self._add_rows(_take(rows, chosen), index, records, labels)

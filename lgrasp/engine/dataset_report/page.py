@@ -18,6 +18,7 @@ from lgrasp.engine.dataset_report.plots import (
 from lgrasp.engine.dataset_report.posture import principal_postures
 from lgrasp.engine.dataset_report.tables import (
     diversity_table,
+    held_tables,
     physics_table,
     protocol_list,
     run_tables,
@@ -57,6 +58,12 @@ def _hands(numbers: dict[str, Any]) -> str:
     return what + f"{objects} object{'s' if objects != 1 else ''}"
 
 
+def _groups(groups: list[dict[str, Any]]) -> str:
+    if any(len(group["objects"]) > 1 for group in groups):
+        return "sets of objects in a hand"
+    return "pairs of hand and object" if len(groups) != 1 else "object"
+
+
 def _head(title: str, numbers: dict[str, Any]) -> str:
     groups = [group for hand in numbers["hands"] for group in hand["objects"]]
     compared = sum(group["near_duplicates"]["compared"] for group in groups)
@@ -65,7 +72,7 @@ def _head(title: str, numbers: dict[str, Any]) -> str:
     shown = [
         (number(numbers["rows"]), "grasps"),
         (number(len(numbers["hands"])), "hands" if len(numbers["hands"]) != 1 else "hand"),
-        (number(len(groups)), "pairs of hand and object" if len(groups) != 1 else "object"),
+        (number(len(groups)), _groups(groups)),
         (number(numbers["shards"]), f"shards, {numbers['bytes'] / 1e6:,.1f} MB"),
         (number(over), "values above a strict bound"),
         (f"{near / compared:.2%}" if compared else "-", "near-duplicates"),
@@ -89,7 +96,8 @@ def _hand(data: dict[str, Any], hand: HandRows) -> str:
     every = data["sample"]["every"]
     dots = f"Dots: {number(data['sample']['rows'])} of {number(data['rows'])} grasps"
     dots += f", one in {every}." if every > 1 else "."
-    parts += ["<h3>Validity</h3>", validity_table(data), *_histograms(hand), *_physics(data), *_contacts(data)]
+    parts += ["<h3>Validity</h3>", validity_table(data), *_histograms(hand), *_held(data), *_physics(data)]
+    parts += _contacts(data)
     parts += ["<h3>Diversity</h3>", diversity_table(data), *_poses(hand, sample, dots)]
     return "\n".join([*parts, *_postures(data, hand, sample, dots)])
 
@@ -113,6 +121,11 @@ def _histograms(hand: HandRows) -> list[str]:
         )
         out += ["<h3>Quality</h3>", figure(quantity_chart(free), text)]
     return out
+
+
+def _held(data: dict[str, Any]) -> list[str]:
+    tables = held_tables(data)
+    return ["<h3>Objects in the hand</h3>", tables] if tables else []
 
 
 def _contacts(data: dict[str, Any]) -> list[str]:

@@ -5,6 +5,7 @@ from typing import Any
 
 from lgrasp.dataset.merge import sum_statistics
 from lgrasp.engine.dataset_report.gather import HandRows, ObjectRows
+from lgrasp.engine.dataset_report.held import held_numbers
 from lgrasp.engine.dataset_report.posture import principal_postures
 from lgrasp.engine.dataset_report.survey import Head
 from lgrasp.engine.report import survivors
@@ -39,6 +40,7 @@ def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, 
         "runs": [_run(name, [h for h in heads if h.pipeline == name]) for name in sorted({h.pipeline for h in heads})],
         "metrics": {name: d.numbers() for name, d in hand.together().items() if d.rows},
         "objects": [_objects(group) for group in hand.objects.values()],
+        "held": held_numbers(hand.held),
         "contact_links": dict(sorted(shares.items(), key=lambda item: -item[1])),
         "posture": posture.numbers(),
         "sample": {"rows": len(hand.sample.columns().get("group", ())), "every": hand.sample.step},

@@ -5,7 +5,7 @@ from typing import Any
 
 from lgrasp.engine.dataset_report.parts import escape, number, table
 
-__all__ = ["diversity_table", "physics_table", "protocol_list", "run_tables", "validity_table"]
+__all__ = ["diversity_table", "held_tables", "physics_table", "protocol_list", "run_tables", "validity_table"]
 
 _SHOWN = (  # metric, head, format
     ("penetration", "penetration [mm]", ".2f"),
@@ -99,6 +99,38 @@ def diversity_table(data: dict[str, Any]) -> str:
         "directions and of equal-volume bins of rotations, and what as many uniform draws as there are poses would hit."
     )
     return table(columns, rows, caption=caption)
+
+
+def held_tables(data: dict[str, Any]) -> str:
+    """Rows by the number of objects in the hand, and by the opposition space of the last step; "" if all hold one."""
+    held, counts = data["held"], list(data["held"])
+    spaces = list(dict.fromkeys(name for group in held.values() for name in group["spaces"]))
+    if counts in ([], ["1"]) and not spaces:
+        return ""
+    protocols = sorted({name for group in held.values() for name in group["physics"]})
+    columns = ["objects", "rows", "penetration [mm]: median", "max", *(f"hold ({name})" for name in protocols)]
+    rows = []
+    for n, group in held.items():
+        deep = group["penetration"]
+        depth = [f"{deep['median']:.2f}", f"{'!' * bool(deep['over_bound'])}{deep['max']:.2f}"] if deep else ["-", "-"]
+        rows.append([n, number(group["rows"]), *depth, *(_share(group, name) for name in protocols)])
+    out = table(columns, rows, caption="By the number of objects in the hand. Orange: above the strict bound.")
+    if spaces:
+        heads = ["rows", *(f"hold ({name})" for name in protocols)]
+        rows = []
+        for name in spaces:
+            found = [held[n]["spaces"].get(name, {"rows": 0, "physics": {}}) for n in counts]
+            cells = [[number(part["rows"]), *(_share(part, p) for p in protocols)] for part in found]
+            rows.append([name, *(cell for part in cells for cell in part)])
+        groups = [("", 1), *((f"as object {n}", len(heads)) for n in counts)]
+        caption = "Rows by the opposition space that took their last object, by which object it is."
+        out += table(["space", *heads * len(counts)], rows, groups=groups, caption=caption)
+    return out
+
+
+def _share(group: dict[str, Any], protocol: str) -> str:
+    found = group["physics"].get(protocol, {"run": 0})
+    return f"{found['share']:.1%}" if found["run"] else "-"
 
 
 def physics_table(data: dict[str, Any]) -> str:
