@@ -38,12 +38,14 @@ def test_exports(folder, capsys):
     assert lines[-1] == "(100, 16) (100, 1, 7)"
 
 
-def test_training(folder, capsys):
+def test_training(folder, make_sequence, capsys):
+    write_shard(folder / "sequences" / "four-00000.h5", make_sequence())
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small matrices: more threads only wait for each other
     exec(examples("training.md"), {})
     torch.set_num_threads(threads)
-    *epochs, chosen = capsys.readouterr().out.splitlines()
+    *epochs, chosen, moved = capsys.readouterr().out.splitlines()
     errors = [float(re.fullmatch(r"epoch \d+: (\S+) rad", line).group(1)) for line in epochs]
     assert errors[-1] < 0.8 * errors[0]
     assert chosen == "200 of 400 grasps"
+    assert moved == "tensor(0.)"
