@@ -7,11 +7,12 @@ __all__ = ["CLUSTER_SIZE", "bounding_spheres", "cluster_order"]
 CLUSTER_SIZE = 32
 
 
-def cluster_order(points: np.ndarray) -> np.ndarray:
-    """Order that makes every run of ``CLUSTER_SIZE`` points compact: recursive median split of the longest axis.
+def cluster_order(points: np.ndarray, *, size: int = CLUSTER_SIZE) -> np.ndarray:
+    """Order that makes every run of ``size`` points compact: recursive median split of the longest axis.
 
     Args:
         points: Points [m], shape (n, 3); all runs but the last are full.
+        size: Points of a run.
 
     Returns:
         Permutation, shape (n,), int64; consecutive clusters are near each other as well.
@@ -20,27 +21,30 @@ def cluster_order(points: np.ndarray) -> np.ndarray:
     stack = [np.arange(len(points))]
     while stack:
         index = stack.pop()
-        if len(index) <= CLUSTER_SIZE:
+        if len(index) <= size:
             runs.append(index)
             continue
         axis = int(np.argmax(np.ptp(points[index], axis=0)))
-        half = (len(index) // CLUSTER_SIZE + 1) // 2 * CLUSTER_SIZE
+        half = (len(index) // size + 1) // 2 * size
         index = index[np.argsort(points[index, axis], kind="stable")]
         stack += [index[half:], index[:half]]
     return np.concatenate(runs)
 
 
-def bounding_spheres(points: np.ndarray, *, iterations: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """Nearly smallest balls around runs of ``CLUSTER_SIZE`` points (Bădoiu–Clarkson core-set iteration).
+def bounding_spheres(
+    points: np.ndarray, *, size: int = CLUSTER_SIZE, iterations: int = 64
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nearly smallest balls around runs of ``size`` points (Bădoiu–Clarkson core-set iteration).
 
     Args:
-        points: Points [m], shape (n, 3), n a multiple of ``CLUSTER_SIZE``.
+        points: Points [m], shape (n, 3), n a multiple of ``size``.
+        size: Points of a run.
         iterations: Steps toward the farthest point; the radius is within 1/iterations of the smallest.
 
     Returns:
-        Centres [m], shape (n / CLUSTER_SIZE, 3), and radii [m], shape (n / CLUSTER_SIZE,), f32, rounded up.
+        Centres [m], shape (n / size, 3), and radii [m], shape (n / size,), f32, rounded up.
     """
-    group = np.asarray(points, np.float64).reshape(-1, CLUSTER_SIZE, 3)  # (k, c, 3)
+    group = np.asarray(points, np.float64).reshape(-1, size, 3)  # (k, c, 3)
     center = group.mean(axis=1)
     row = np.arange(len(group))
     for step in range(1, iterations + 1):

@@ -1,0 +1,182 @@
+"""How deep rigid solids are in one another, summed over points of their surfaces, with derivatives by their poses."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from lgrasp.differentiable.distance import DistanceGrids
+from lgrasp.differentiable.solids import RUN, Solid
+
+__all__ = ["PenetrationSums"]
+
+_QUANTUM = 2.0**-48
+"""Sums are made in integers of this unit: exact in any order, so no result depends on batch, threads or atomics. Their
+range is 32,768: metres, or points that pull."""
+
+
+class _Entries(NamedTuple):
+    """Runs of points that may be inside a solid; all (E,) int64."""
+
+    row: torch.Tensor
+    points: torch.Tensor  # solid of the points
+    grid: torch.Tensor  # solid that they are looked up in
+    term: torch.Tensor
+    run: torch.Tensor
+
+    def where(self, mask: torch.Tensor) -> "_Entries":
+        at = mask.nonzero()[:, 0]
+        return _Entries(*(column.index_select(0, at) for column in self))
+
+
+def _counted(x: torch.Tensor) -> torch.Tensor:
+    return (x * (1 / _QUANTUM)).round().to(torch.int64)
+
+
+def _product(A: torch.Tensor, B: torch.Tensor) -> torch.Tensor:
+    """A B of matrices (..., 3, 3), with the same rounding for any number of them."""
+    return A[..., :1] * B[..., :1, :] + A[..., 1:2] * B[..., 1:2, :] + A[..., 2:] * B[..., 2:, :]
+
+
+def _turned(R: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """R v of vectors (..., 3)."""
+    return R[..., 0] * v[..., :1] + R[..., 1] * v[..., 1:2] + R[..., 2] * v[..., 2:]
+
+
+class PenetrationSums:
+    """Sums of depths [m] over surface points, by term, of pairs of solids that ride on frames.
+
+    Both ways: points of each solid of a pair in the distance grid of the other. Balls around solids and around runs of
+    points leave out what is apart.
+
+    Args:
+        solids: P of them. frame: the frame that each rides on, (P,).
+        pairs: (Q, 2) solids; where the two differ in size, the smaller first is faster.
+        terms: (Q, 2) the sum that counts the points of the first, and of the second, of a pair.
+    """
+
+    def __init__(
+        self,
+        solids: Sequence[Solid],
+        frame: Sequence[int] | np.ndarray,
+        pairs: np.ndarray,
+        terms: np.ndarray,
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        def put(a: np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device)
+
+        def index(a: Sequence[int] | np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(np.ascontiguousarray(a), dtype=torch.int64, device=device)
+
+        runs = [len(s.run_ball) for s in solids]
+        self.terms = int(np.max(terms, initial=-1)) + 1
+        self._grids = DistanceGrids([s.grid for s in solids], dtype=dtype, device=device)
+        self._frame, self._pairs, self._pair_terms = index(frame), index(pairs), index(terms)
+        self._ball = put(np.stack([s.ball for s in solids]))
+        self._run_ball = put(np.concatenate([s.run_ball for s in solids]))
+        self._run_frame = index(np.repeat(np.asarray(frame), runs))
+        self._run_first, self._run_count = index(np.cumsum([0, *runs[:-1]])), index(runs)
+        points = np.concatenate([s.points for s in solids])
+        self._points = put(points.reshape(-1, RUN * 3))
+
+    def __call__(self, R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        """Sums of depths [m], (N, terms), with frames at R (N, F, 3, 3) and t (N, F, 3) [m]; differentiable once."""
+        out = _Sums.apply(R, t, self)
+        assert isinstance(out, torch.Tensor)
+        return out
+
+    def near(self, R: torch.Tensor, t: torch.Tensor) -> _Entries:
+        """Runs of points that may be inside the other solid of their pair."""
+        flat = R.reshape(-1, 3, 3), t.reshape(-1, 3)
+        frames = t.shape[1]
+        centre = self._centres(R, t, self._frame, self._ball)  # (N, P, 3)
+        a, b = self._pairs.unbind(1)
+        gap = [x.index_select(1, a) - x.index_select(1, b) for x in centre.unbind(2)]
+        reach = self._ball[a, 3] + self._ball[b, 3]
+        row, pair = (gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2] < reach * reach).nonzero().unbind(1)
+
+        def distance(row: torch.Tensor, centre: torch.Tensor, grid: torch.Tensor) -> torch.Tensor:
+            """Of points (E, 3) of the common frame, in the grids of solids."""
+            at = row * frames + self._frame[grid]
+            p, M = (centre - flat[1][at]).unbind(1), flat[0][at].reshape(-1, 9).unbind(1)
+            local = tuple(M[k] * p[0] + M[3 + k] * p[1] + M[6 + k] * p[2] for k in range(3))
+            return self._grids.value_and_gradient((local[0], local[1], local[2]), grid)[0] - self._grids.cell[grid]
+
+        a, b = a[pair], b[pair]
+        keep = (distance(row, centre[row, a], b) < self._ball[a, 3]).nonzero()[:, 0]
+        row, a, b, pair = row[keep], a[keep], b[keep], pair[keep]
+        # both ways, and every run of the points' solid
+        row, points, grid = torch.cat([row, row]), torch.cat([a, b]), torch.cat([b, a])
+        term = self._pair_terms[pair].t().reshape(-1)
+        count = self._run_count[points]
+        entry = torch.repeat_interleave(count)
+        ends = count.cumsum(0)
+        run = torch.arange(len(entry), device=R.device) - (ends - count - self._run_first[points])[entry]
+        entries = _Entries(row[entry], points[entry], grid[entry], term[entry], run)
+        run_centre = self._centres(R, t, self._run_frame, self._run_ball)  # (N, runs, 3)
+        gap = run_centre[entries.row, entries.run] - centre[entries.row, entries.grid]
+        x, y, z = gap.unbind(1)
+        reach = self._run_ball[entries.run, 3] + self._ball[entries.grid, 3]
+        entries = entries.where(x * x + y * y + z * z < reach * reach)
+        apart = distance(entries.row, run_centre[entries.row, entries.run], entries.grid)
+        return entries.where(apart < self._run_ball[entries.run, 3])
+
+    def _centres(self, R: torch.Tensor, t: torch.Tensor, frame: torch.Tensor, ball: torch.Tensor) -> torch.Tensor:
+        return _turned(R.index_select(1, frame), ball[:, :3]) + t.index_select(1, frame)
+
+    def slopes(self, R: torch.Tensor, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The sums (N, terms) and their derivatives by [R | t] of each frame, (N, terms, F, 3, 4)."""
+        rows, frames = t.shape[:2]
+        e = self.near(R, t)
+        at_a, at_b = e.row * frames + self._frame[e.points], e.row * frames + self._frame[e.grid]
+        flat = R.reshape(-1, 3, 3), t.reshape(-1, 3)
+        Ra, Rb = flat[0][at_a], flat[0][at_b]
+        back = Rb.transpose(1, 2)
+        R_ba, t_ba = _product(back, Ra), _turned(back, flat[1][at_a] - flat[1][at_b])
+        x = self._points[e.run].reshape(-1, RUN, 3).unbind(2)  # each (E, RUN)
+        M, m = R_ba.reshape(-1, 9, 1).unbind(1), t_ba[..., None].unbind(1)
+        z = [M[3 * k] * x[0] + M[3 * k + 1] * x[1] + M[3 * k + 2] * x[2] + m[k] for k in range(3)]
+        value, gradient = self._grids.value_and_gradient((z[0], z[1], z[2]), e.grid[:, None])
+        inside = value < 0
+        depth = torch.where(inside, -value, 0)
+        h = [torch.where(inside, -g, 0) for g in gradient]  # of the depth, frame of the grid
+
+        def total(y: torch.Tensor) -> torch.Tensor:
+            return _counted(y).sum(1).to(R.dtype) * _QUANTUM
+
+        pull = torch.stack([total(g) for g in h], 1)  # (E, 3)
+        lever = torch.stack([total(g * p) for g in h for p in x], 1).reshape(-1, 3, 3)  # sum of h x^T
+        force = _turned(Rb, pull)
+        by_a = torch.cat([_product(Rb, lever), force[..., None]], 2)
+        moment = _product(R_ba, lever.transpose(1, 2)) + t_ba[..., None] * pull[:, None]  # sum of z h^T
+        by_b = torch.cat([_product(Rb, moment), -force[..., None]], 2)
+        slot = e.row * self.terms + e.term
+        sums = torch.zeros(rows * self.terms, dtype=torch.int64, device=R.device)
+        sums.index_add_(0, slot, _counted(depth).sum(1))
+        place = torch.cat([slot * frames + self._frame[e.points], slot * frames + self._frame[e.grid]])
+        slopes = torch.zeros(rows * self.terms * frames, 12, dtype=torch.int64, device=R.device)
+        slopes.index_add_(0, place, _counted(torch.cat([by_a, by_b])).reshape(-1, 12))
+        slopes = slopes.to(R.dtype) * _QUANTUM
+        return (sums.to(R.dtype) * _QUANTUM).reshape(rows, -1), slopes.reshape(rows, self.terms, frames, 3, 4)
+
+
+class _Sums(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, R: torch.Tensor, t: torch.Tensor, scene: PenetrationSums) -> torch.Tensor:
+        sums, slopes = scene.slopes(R, t)
+        ctx.save_for_backward(slopes)
+        return sums
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *grads: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None]:
+        (slopes,) = ctx.saved_tensors
+        weighted = slopes * grads[0][..., None, None, None]
+        total = weighted[:, 0]
+        for k in range(1, weighted.shape[1]):
+            total = total + weighted[:, k]
+        return total[..., :3], total[..., 3], None

@@ -1,0 +1,142 @@
+"""Rigid solids of hands and objects: points of their surface, and grids of their distance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
+from lgrasp.hand.geometry import Piece
+from lgrasp.hand.model import HandModel
+from lgrasp.object.model import ObjectModel
+from lgrasp.object.sdf import SdfGrid
+
+__all__ = ["RUN", "HandSolids", "Solid", "hand_solids", "object_solid"]
+
+RUN = 16
+"""Surface points are in compact runs of this many."""
+
+_CELL = 0.001
+_MOST_NODES = 120_000
+_MOST_STILL = 0.25  # of a hand's points, on links that do not move
+_PAD = 2.0  # cells
+_BURIED = 0.001  # [m]
+_CHUNK = 1 << 22  # most point-plane distances held at once
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A rigid solid in its own frame; lengths in metres."""
+
+    points: np.ndarray
+    """On its surface, in compact runs of RUN, (n, 3)."""
+    run_ball: np.ndarray
+    """Ball around each run: centre and radius, (n / RUN, 4)."""
+    ball: np.ndarray
+    """Ball around the solid, (4,)."""
+    grid: SdfGrid
+
+
+@dataclass(frozen=True)
+class HandSolids:
+    """Links of a hand that have collision geometry, each in the frame of the body that it rides on."""
+
+    links: np.ndarray
+    """Index in ``link_names``, (L,)."""
+    body: np.ndarray
+    """Body of each, (L,)."""
+    solids: tuple[Solid, ...]
+    pairs: np.ndarray
+    """Pairs of them that must stay apart: not joined by a joint, not touching always, (P, 2)."""
+
+
+def hand_solids(model: HandModel, count: int) -> HandSolids:
+    """The links of a hand as solids, with about ``count`` surface points together (more on small links).
+
+    A link is the union of its convex pieces, which stand for its collision geometry in all of lgrasp.
+    """
+    pieces = [_piece(model, i) for i in range(len(model.piece_body))]
+    members = {int(k): np.flatnonzero(model.piece_link == k) for k in np.unique(model.piece_link)}
+    static = int(model.cluster_first[1]) * CLUSTER_SIZE
+    still = min(count * static / len(model.samples), count * _MOST_STILL)
+    share = {True: still / max(static, 1), False: (count - still) / max(len(model.samples) - static, 1)}
+    solids = []
+    for own in members.values():
+        samples = _link_samples(model, pieces, own)
+        chosen = [pieces[i] for i in own]
+        part = share[bool(model.piece_body[own[0]] == 0)]
+        solids.append(_solid(_thinned(samples, round(part * len(samples))), _ball(chosen), _grid(chosen)))
+    links = np.array(list(members))
+    place = {link: i for i, link in enumerate(members)}
+    pairs = np.unique(np.sort(model.piece_link[model.pairs], axis=1), axis=0)
+    return HandSolids(
+        links=links,
+        body=model.tree.link_body[links],
+        solids=tuple(solids),
+        pairs=np.array([[place[int(a)], place[int(b)]] for a, b in pairs], int).reshape(-1, 2),
+    )
+
+
+def object_solid(model: ObjectModel, count: int) -> Solid:
+    """An object in its internal frame, with about ``count`` surface points."""
+    points = model.obstacle_points
+    ball = np.array([0.0, 0.0, 0.0, np.linalg.norm(points, axis=1).max()])  # the centre of the bounding box
+    return _solid(_thinned(points, count), ball, SdfGrid(model.sdf, model.sdf_origin, model.sdf_cell))
+
+
+def _thinned(points: np.ndarray, count: int) -> np.ndarray:
+    """About ``count`` of the points, at least RUN, evenly out of their order."""
+    count = min(max(count, RUN), len(points))
+    return points[((np.arange(count) + 0.5) * len(points) / count).astype(int)]
+
+
+def _solid(points: np.ndarray, ball: np.ndarray, grid: SdfGrid) -> Solid:
+    points = np.resize(points, (-(-len(points) // RUN) * RUN, 3))  # the last run is filled with repeats
+    points = points[cluster_order(points, size=RUN)].astype(np.float32)
+    centre, radius = bounding_spheres(points, size=RUN)
+    return Solid(points, np.column_stack([centre, radius]), ball.astype(np.float32), grid)
+
+
+def _piece(model: HandModel, i: int) -> Piece:
+    vertices = model.vertices[model.vertex_first[i] : model.vertex_first[i + 1]]
+    planes = model.planes[model.plane_first[i] : model.plane_first[i + 1]]
+    return Piece(vertices.astype(float), planes.astype(float), float(model.piece_radius[i]))
+
+
+def _link_samples(model: HandModel, pieces: list[Piece], own: np.ndarray) -> np.ndarray:
+    """Surface samples of the link with pieces ``own``: those of its body nearest to the surface of one of them.
+
+    Samples inside another piece of the link are left out: two of its pieces meet there.
+    """
+    body = int(model.piece_body[own[0]])
+    first, end = model.cluster_first[body] * CLUSTER_SIZE, model.cluster_first[body + 1] * CLUSTER_SIZE
+    samples = model.samples[first:end]
+    same = np.flatnonzero(model.piece_body == body)
+    depth = np.array([pieces[i].depth(samples) for i in same])  # (pieces, n)
+    nearest = np.abs(depth).argmin(0)
+    np.put_along_axis(depth, nearest[None], np.inf, 0)
+    buried = (depth[np.isin(same, own)] < -_BURIED).any(0)
+    return samples[np.isin(same[nearest], own) & ~buried]
+
+
+def _ball(pieces: list[Piece]) -> np.ndarray:
+    """Ball around pieces, (4,) [m]."""
+    vertices = np.concatenate([p.vertices for p in pieces])
+    centre = 0.5 * (vertices.min(0) + vertices.max(0))
+    return np.append(centre, max(np.linalg.norm(p.vertices - centre, axis=1).max() + p.radius for p in pieces))
+
+
+def _grid(pieces: list[Piece]) -> SdfGrid:
+    """Signed distances of the union of convex pieces, a lower bound outside."""
+    low = np.min([p.vertices.min(0) - p.radius for p in pieces], 0)
+    high = np.max([p.vertices.max(0) + p.radius for p in pieces], 0)
+    cell = max(_CELL, float(np.prod(high - low + 4 * _CELL) / _MOST_NODES) ** (1 / 3))
+    origin = low - _PAD * cell
+    shape = np.ceil((high - low) / cell + 2 * _PAD).astype(int) + 1
+    nodes = origin + cell * np.indices(shape).reshape(3, -1).T
+    values = np.full(len(nodes), np.inf)
+    for piece in pieces:
+        rows = max(1, _CHUNK // max(1, len(piece.planes)))
+        for at in range(0, len(nodes), rows):
+            part = slice(at, at + rows)
+            values[part] = np.minimum(values[part], piece.depth(nodes[part]))
+    return SdfGrid(values.reshape(shape).astype(np.float32), origin.astype(np.float32), cell)
