@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from lgrasp.dataset import GraspDataset, ShardReader, describe, merge_shards, read_shard, validate_shard, write_shard
+from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.metrics import METRICS, add_metrics
 from lgrasp.dataset.schema import SEQUENCE_DATASETS
 from lgrasp.errors import ShardError
@@ -146,7 +147,7 @@ def test_space_names_are_unique(path, make_sequence):
         write_shard(path, replace(shard, grasps=replace(shard.grasps, sequence=names)))
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     counts=st.lists(st.integers(1, 6), min_size=1, max_size=3),
     more=st.lists(st.integers(1, 6), min_size=1, max_size=3),
@@ -171,6 +172,35 @@ def test_merged_rows_are_the_same_sequences(tmp_path, make_sequence, same_rows, 
         assert rows_of(merged) == [steps for _, steps in sorted(parts, key=lambda part: part[0])]
     else:
         assert [len(steps) for steps in rows_of(merged)] == held(merged).tolist()
+
+
+_POSES = ("sequence/q", "sequence/q_pregrasp", "sequence/q_squeeze")
+_EARLIER = (*_POSES, "sequence/space", "sequence/free_joints", "object_pose", "contact_points", "contact_forces")
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_no_number_of_an_earlier_step_can_change(make_sequence, data):
+    """Nor any control pose of the last one: wherever one value differs, something is said."""
+    shard = make_sequence(COUNTS)
+    columns = {name: values.copy() for name, values in shard.grasps.columns().items()}
+    count = held(shard.grasps)
+    name = data.draw(st.sampled_from(_EARLIER))
+    steps = count - (name not in _POSES)
+    row = data.draw(st.sampled_from(np.flatnonzero(steps).tolist()))
+    place = [row, data.draw(st.integers(0, int(steps[row]) - 1))]
+    place += [data.draw(st.integers(0, size - 1)) for size in columns[name].shape[2:]]
+    value = columns[name][tuple(place)]
+    columns[name][tuple(place)] = ~value if value.dtype == bool else np.nan_to_num(value) * -0.5 + 1
+    grasps = replace(
+        shard.grasps,
+        **{n: v for n, v in columns.items() if "/" not in n},
+        sequence=replace(
+            shard.grasps.sequence, **{n.partition("/")[2]: v for n, v in columns.items() if n.startswith("sequence/")}
+        ),
+    )
+    ids = [record.id for record in shard.objects]
+    assert row_problems(grasps, shard.hand, ids, lambda n, start, stop: columns[n][start:stop])
 
 
 def test_parents_in_other_blocks(tmp_path, make_sequence):
