@@ -53,7 +53,8 @@ class PenetrationSums:
     Args:
         solids: P of them. frame: the frame that each rides on, (P,).
         pairs: (Q, 2) solids; where the two differ in size, the smaller first is faster.
-        terms: (Q, 2) the sum that counts the points of the first, and of the second, of a pair.
+        counts: (Q, 2) the sum that counts the points of the first, and of the second, of a pair.
+        terms: how many sums.
     """
 
     def __init__(
@@ -61,7 +62,8 @@ class PenetrationSums:
         solids: Sequence[Solid],
         frame: Sequence[int] | np.ndarray,
         pairs: np.ndarray,
-        terms: np.ndarray,
+        counts: np.ndarray,
+        terms: int,
         *,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
@@ -73,9 +75,9 @@ class PenetrationSums:
             return torch.as_tensor(np.ascontiguousarray(a), dtype=torch.int64, device=device)
 
         runs = [len(s.run_ball) for s in solids]
-        self.terms = int(np.max(terms, initial=-1)) + 1
+        self.terms = terms
         self._grids = DistanceGrids([s.grid for s in solids], dtype=dtype, device=device)
-        self._frame, self._pairs, self._pair_terms = index(frame), index(pairs), index(terms)
+        self._frame, self._pairs, self._pair_terms = index(frame), index(pairs), index(counts)
         self._ball = put(np.stack([s.ball for s in solids]))
         self._run_ball = put(np.concatenate([s.run_ball for s in solids]))
         self._run_frame = index(np.repeat(np.asarray(frame), runs))

@@ -77,15 +77,15 @@ def hand_solids(model: HandModel, count: int) -> HandSolids:
 
 
 def object_solid(model: ObjectModel, count: int) -> Solid:
-    """An object in its internal frame, with about ``count`` surface points."""
+    """An object in its internal frame, with ``count`` surface points (rounded up to whole runs)."""
     points = model.obstacle_points
     ball = np.array([0.0, 0.0, 0.0, np.linalg.norm(points, axis=1).max()])  # the centre of the bounding box
     return _solid(_thinned(points, count), ball, SdfGrid(model.sdf, model.sdf_origin, model.sdf_cell))
 
 
 def _thinned(points: np.ndarray, count: int) -> np.ndarray:
-    """About ``count`` of the points, at least RUN, evenly out of their order."""
-    count = min(max(count, RUN), len(points))
+    """``count`` of the points, at least RUN, evenly out of their order; repeated where there are not so many."""
+    count = max(count, RUN)
     return points[((np.arange(count) + 0.5) * len(points) / count).astype(int)]
 
 

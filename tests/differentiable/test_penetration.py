@@ -78,7 +78,7 @@ def every_point(scene, R: torch.Tensor, t: torch.Tensor) -> np.ndarray:
 
 def test_nothing_is_left_out(scene):
     R, t = poses(5, 5)
-    found = PenetrationSums(*scene, dtype=torch.float64)(R, t).numpy()
+    found = PenetrationSums(*scene, 3, dtype=torch.float64)(R, t).numpy()
     expected = every_point(scene, R, t)
     assert (expected > 0.01).any(0).all()
     np.testing.assert_allclose(found, expected, atol=1e-8)
@@ -88,7 +88,7 @@ def test_two_balls():
     """The cap that is inside another ball, integrated."""
     r, gap = 0.02, 0.03
     solids = [ball(r, 8192), ball(r, 8192)]
-    sums = PenetrationSums(solids, [0, 1], np.array([[0, 1]]), np.array([[0, 1]]), dtype=torch.float64)
+    sums = PenetrationSums(solids, [0, 1], np.array([[0, 1]]), np.array([[0, 1]]), 2, dtype=torch.float64)
     R = torch.eye(3, dtype=torch.float64).expand(1, 2, 3, 3)
     t = torch.tensor([[[0.0, 0, 0], [0, gap, 0]]], dtype=torch.float64)
     c = np.linspace(gap / 2 / r, 1, 20_001)  # cosine from the axis; the surface is uniform in it
@@ -99,7 +99,7 @@ def test_two_balls():
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_derivatives_equal_finite_differences(scene, seed):
-    sums = PenetrationSums(*scene, dtype=torch.float64)
+    sums = PenetrationSums(*scene, 3, dtype=torch.float64)
     R, t = poses(2, seed)
     rng = np.random.default_rng(seed)
     weight = torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
@@ -118,7 +118,7 @@ def test_derivatives_equal_finite_differences(scene, seed):
 
 
 def test_rows_do_not_depend_on_their_neighbours(scene):
-    sums = PenetrationSums(*scene)
+    sums = PenetrationSums(*scene, 3)
     R, t = poses(12, 3, torch.float32)
     together, slopes = sums.slopes(R, t)
     for row in range(12):
@@ -130,7 +130,7 @@ def test_rows_do_not_depend_on_their_neighbours(scene):
 def test_solids_that_are_apart_add_nothing(scene):
     R, t = poses(3, 4)
     t[:, -1] += 1.0
-    sums, slopes = PenetrationSums(*scene, dtype=torch.float64).slopes(R, t)
+    sums, slopes = PenetrationSums(*scene, 3, dtype=torch.float64).slopes(R, t)
     assert not sums[:, :2].any()
     assert not slopes[:, :2].any()
 
