@@ -17,6 +17,7 @@ from lgrasp_cli import (
     pipelines,
     prepare,
     run,
+    sequence,
     stages,
     validate,
 )
@@ -30,7 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (prepare, generate, run, validate, stages, export):
+for module in (prepare, generate, sequence, run, validate, stages, export):
     module.register(app)
 for group in (bench, hands, objects, pipelines, cache, dataset):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])

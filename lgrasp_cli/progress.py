@@ -16,8 +16,7 @@ from lgrasp_cli.interrupt import on_interrupt, stop_now
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from lgrasp.engine.shard import ShardResult
-    from lgrasp.engine.workspace import Inputs
+    from lgrasp.engine.shard import Found
 
 __all__ = ["JobProgress", "interruptible", "say"]
 
@@ -71,18 +70,18 @@ class JobProgress(Listener):
     def loading(self, what: str, share: float) -> None:
         self._show("loading", None, f"{what} {share:.0%}" if share else what)
 
-    def started(self, inputs: "Inputs", shards: list[int], present: list[int]) -> None:
+    def started(self, inputs: Any, shards: list[int], present: list[int]) -> None:
         self.running = True
         self._done = sum(self._shards[s] for s in present)
         self._start = time.monotonic()
 
-    def advanced(self, shard: int, rows: int, result: "ShardResult") -> None:
+    def advanced(self, shard: int, rows: int, result: "Found") -> None:
         per_second = rows / max(time.monotonic() - self._start, 1e-9)
         flow = "  ".join(f"{stage} {count:,}" for stage, count in survivors(result.counts).items())
         self._show(f"shard {shard}", self._done + rows, f"{per_second:,.0f}/s  {flow}")
 
-    def wrote(self, shard: int, path: "Path", result: "ShardResult") -> None:
-        self._done += len(result.grasps)
+    def wrote(self, shard: int, path: "Path", result: "Found") -> None:
+        self._done += len(result)
         self._start = time.monotonic()
 
     def cancelled(self) -> bool:

@@ -112,6 +112,7 @@ def _read(path: Path) -> _Found | None:
             config, statistics = reader.header.config, reader.statistics
             key = config.get("run_key") if isinstance(config, dict) else None
             tried = int(statistics.get("candidates", 0)) if statistics.get("exhausted") else 0
-            return _Found(key, len(reader), tried)
+            # of a file with sequences only the whole ones count
+            return _Found(key, int(statistics.get("sequences", len(reader))), tried)
     except (ShardError, ValueError):
         return None

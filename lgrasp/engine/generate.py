@@ -18,7 +18,7 @@ from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.recording import Recorder
 from lgrasp.engine.records import hand_record, make_scene, mesh_blobs, object_record
-from lgrasp.engine.shard import Execution, ShardResult, make_shard, shard_effort
+from lgrasp.engine.shard import Execution, Found, ShardResult, make_shard, shard_effort
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.writing import BackgroundWriter
 from lgrasp.errors import ConfigError
@@ -59,13 +59,13 @@ class Listener:
     def loading(self, what: str, share: float) -> None:
         """An input is being loaded or made."""
 
-    def started(self, inputs: Inputs, shards: list[int], present: list[int]) -> None:
+    def started(self, inputs: Any, shards: list[int], present: list[int]) -> None:
         """Inputs are ready; ``present`` of ``shards`` are on disk already."""
 
-    def advanced(self, shard: int, rows: int, result: ShardResult) -> None:
+    def advanced(self, shard: int, rows: int, result: Found) -> None:
         """A batch of a shard is done; ``rows`` of it are found so far."""
 
-    def wrote(self, shard: int, path: Path, result: ShardResult) -> None:
+    def wrote(self, shard: int, path: Path, result: Found) -> None:
         """A shard is on disk."""
 
     def cancelled(self) -> bool:
@@ -104,6 +104,8 @@ def job_shards(job: Job) -> list[tuple[int, int]]:
         raise ConfigError(f"--workers {job.workers} --batch {job.batch}: must be at least 0 (0: by device)")
     if not 0 < job.rate < math.inf:
         raise ConfigError(f"rate {job.rate}: the rows expected per candidate must be positive and finite")
+    if "sequence" in job.pipeline.order:
+        raise ConfigError(f"pipeline '{job.pipeline.name}' is for several objects: lgrasp sequence OBJECT OBJECT ...")
     if job.num_shards <= 0 or not 0 <= job.shard_index < job.num_shards:
         raise ConfigError(f"--shard-index {job.shard_index} --num-shards {job.num_shards}: need 0 <= index < number")
     total = -(-job.rows // job.shard_rows)
@@ -221,8 +223,8 @@ def _shard(job: Job, inputs: Inputs, meshes: dict[str, bytes], key: str, shard: 
                 "locked": dict(inputs.keys.source.spec.locked),
             },
         ),
-        hand=hand_record(inputs, meshes),
-        objects=[object_record(inputs)],
+        hand=hand_record(inputs.hand.model, meshes),
+        objects=[object_record(inputs.object.model)],
         grasps=_rows(result.grasps, job.pipeline, inputs, shard),
         statistics=_statistics(inputs, result),
     )

@@ -7,8 +7,10 @@ from lgrasp.dataset import HandRecord, ObjectRecord
 from lgrasp.decompose import decompose
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.workspace import Inputs
+from lgrasp.hand.model import HandModel
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.physics.scene import Scene, hand_of_record, object_of_record
+from lgrasp.object.model import ObjectModel
+from lgrasp.physics.scene import Scene, scene_of
 
 __all__ = ["hand_record", "make_scene", "mesh_blobs", "object_record"]
 
@@ -18,9 +20,9 @@ def mesh_blobs(urdf: Path) -> dict[str, bytes]:
     return {name: file.read_bytes() for name, file in read_urdf(urdf).mesh_files.items()}
 
 
-def hand_record(inputs: Inputs, meshes: dict[str, bytes]) -> HandRecord:
+def hand_record(hand: HandModel, meshes: dict[str, bytes]) -> HandRecord:
     """The hand; ``meshes`` are its :func:`mesh_blobs`."""
-    hand, tree = inputs.hand.model, inputs.hand.model.tree
+    tree = hand.tree
     return HandRecord(
         name=hand.name,
         base_link=tree.base_link,
@@ -34,11 +36,10 @@ def hand_record(inputs: Inputs, meshes: dict[str, bytes]) -> HandRecord:
     )
 
 
-def object_record(inputs: Inputs) -> ObjectRecord:
-    """The object, in the user's frame."""
-    obj = inputs.object.model
+def object_record(obj: ObjectModel, id: str | None = None) -> ObjectRecord:
+    """The object, in the user's frame; its name is its id where nothing else is said."""
     return ObjectRecord(
-        id=obj.name,
+        id=id or obj.name,
         name=obj.name,
         scale=obj.scale,
         sha256=obj.sha256,
@@ -51,5 +52,4 @@ def object_record(inputs: Inputs) -> ObjectRecord:
 def make_scene(cache: Cache, inputs: Inputs, meshes: dict[str, bytes]) -> Scene:
     """What the simulator is given: the scene of the job's shards."""
     cut, device = partial(decompose, store=cache), inputs.device.alias
-    hand = hand_of_record(hand_record(inputs, meshes), cut, device)
-    return Scene(hand, object_of_record(object_record(inputs), cut, device))
+    return scene_of(hand_record(inputs.hand.model, meshes), [object_record(inputs.object.model)], cut, device)

@@ -28,7 +28,15 @@ SEED_FSWO = 0.15
 """Squared frictionless residual below which the published system counts a grasp."""
 
 _TALLY_THREADS = 4
-_SURVIVORS = {"place": "kept", "domain": "rich", "ik": "kept", "search": "sets", "filter": "kept", "validate": "held"}
+_SURVIVORS = {
+    "place": "kept",
+    "domain": "rich",
+    "ik": "kept",
+    "search": "sets",
+    "filter": "kept",
+    "sequence": "kept",
+    "validate": "held",
+}
 
 
 @dataclass

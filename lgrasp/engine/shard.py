@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import warp as wp
 
@@ -19,7 +20,7 @@ from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps, user_poses
 from lgrasp.stages.context import Context
 
-__all__ = ["Execution", "ShardResult", "add_counts", "make_shard", "shard_effort"]
+__all__ = ["Execution", "Found", "ShardResult", "add_counts", "make_shard", "shard_effort"]
 
 _LEAST_EFFORT = 65_536
 _CPU_BATCH, _PHYSICS_BATCH = 256, 32  # rows of a simulation are dear
@@ -39,6 +40,15 @@ class Execution:
     recorder: Recorder | None = None  # replays batches; for one worker, without a bank, one pass
 
 
+class Found(Protocol):
+    """Rows that were found, and the survivors of each stage."""
+
+    @property
+    def counts(self) -> dict[str, dict[str, int]]: ...
+
+    def __len__(self) -> int: ...
+
+
 @dataclass
 class ShardResult:
     """Rows of a shard and how they came about."""
@@ -51,6 +61,9 @@ class ShardResult:
     duplicates: int = 0
     exhausted: bool = False  # the effort bound was reached before the rows were
     cancelled: bool = False
+
+    def __len__(self) -> int:
+        return len(self.grasps)
 
 
 def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]) -> None:

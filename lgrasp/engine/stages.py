@@ -17,6 +17,8 @@ from lgrasp.stages.place import stage as place
 from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.search import stage as search
 from lgrasp.stages.search.params import SearchParams
+from lgrasp.stages.sequence import stage as sequence
+from lgrasp.stages.sequence.params import SequenceParams
 from lgrasp.stages.validate import stage as validate
 from lgrasp.stages.validate.params import ValidateParams
 
@@ -39,20 +41,22 @@ STAGES: dict[str, Stage] = {
     "ik": Stage("ik", IkParams, ik.VERSION, ik.run),
     "search": Stage("search", SearchParams, search.VERSION, search.run),
     "filter": Stage("filter", FilterParams, filter_.VERSION, filter_.run),
+    "sequence": Stage("sequence", SequenceParams, sequence.VERSION, sequence.run),
     "validate": Stage("validate", ValidateParams, validate.VERSION, validate.run),
 }
 
 ORDERS = (("place", "domain", "ik", "search", "filter"), ("place", "domain", "search", "ik", "filter"))
 """Accepted orders: contacts realised before they are combined, or (the published order) after."""
 
-OPTIONAL = ("validate",)
-"""Stages that may follow."""
+OPTIONAL = ("sequence", "validate")
+"""Stages of which one may follow: sequences go on with the next object, other grasps are simulated."""
 
 
 def check_order(names: tuple[str, ...], where: str) -> None:
-    """Raises ConfigError unless ``names`` is one of ORDERS, perhaps with OPTIONAL after it."""
-    if names not in ORDERS and names not in [(*order, *OPTIONAL) for order in ORDERS]:
+    """Raises ConfigError unless ``names`` is one of ORDERS, perhaps with one of OPTIONAL after it."""
+    if names not in ORDERS and names not in [(*order, last) for order in ORDERS for last in OPTIONAL]:
         choices = " or ".join(", ".join(order) for order in ORDERS)
         raise ConfigError(
-            f"{where}: stages {', '.join(names)}; accepted: {choices}, each with {', '.join(OPTIONAL)} after it or not"
+            f"{where}: stages {', '.join(names)}; accepted: {choices}, each with {' or '.join(OPTIONAL)} after it "
+            "or not"
         )

@@ -98,14 +98,14 @@ def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str
     return path, content_key("object", OBJECT_VERSION, content=content, **described)
 
 
-def load_hand(cache: Cache, keys: InputKeys, device: Device) -> tuple[HandModel, bool]:
+def load_hand(cache: Cache, source: HandSource, key: str, device: Device) -> tuple[HandModel, bool]:
     """The HandModel from the cache, or built and cached; and whether it was a hit."""
 
     def make():
-        source, cut = keys.source, partial(decompose, store=cache)
+        cut = partial(decompose, store=cache)
         return build_hand(source.urdf, source.spec, device.alias, decompose=cut).to_arrays()
 
-    arrays, hit = cache.get("hand", keys.hand, make)
+    arrays, hit = cache.get("hand", key, make)
     return HandModel.from_arrays(arrays), hit
 
 
@@ -151,7 +151,7 @@ def load_inputs(
 
     assert keys.mesh is not None
     mesh = keys.mesh
-    hand_model = timed("hand", lambda: load_hand(cache, keys, device))
+    hand_model = timed("hand", lambda: load_hand(cache, keys.source, keys.hand, device))
     object_model = timed("object", lambda: load_object(cache, mesh, keys.object, scale, objects, device.alias))
     hand = upload_hand(hand_model, device.alias)
     field_model = timed("field", lambda: load_field(cache, keys, hand, fields, report))

@@ -4,26 +4,29 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
+from typing import Generic, TypeVar
 
 from lgrasp.dataset import Shard, write_shard
-from lgrasp.engine.shard import ShardResult
+from lgrasp.engine.shard import Found
 
 __all__ = ["BackgroundWriter"]
 
+Result = TypeVar("Result", bound=Found)
 
-class BackgroundWriter:
+
+class BackgroundWriter(Generic[Result]):
     """A context that writes shards on another thread, one at a time and in order.
 
     Args:
         written: called on the caller's thread with (shard, result) when a shard is on disk.
     """
 
-    def __init__(self, written: Callable[[int, ShardResult], None]) -> None:
+    def __init__(self, written: Callable[[int, Result], None]) -> None:
         self._written = written
         self._pool = ThreadPoolExecutor(1)
-        self._pending: tuple[int, ShardResult, Future[None]] | None = None
+        self._pending: tuple[int, Result, Future[None]] | None = None
 
-    def put(self, shard: int, path: Path, contents: Shard, result: ShardResult) -> None:
+    def put(self, shard: int, path: Path, contents: Shard, result: Result) -> None:
         """Wait for the shard before, then begin to write this one.
 
         Raises:
@@ -44,7 +47,7 @@ class BackgroundWriter:
             future.result()
             self._written(shard, result)
 
-    def __enter__(self) -> "BackgroundWriter":
+    def __enter__(self) -> "BackgroundWriter[Result]":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, _: BaseException | None, __: TracebackType | None) -> None:

@@ -1,6 +1,7 @@
 """Sequences of grasps: a table that grows by one object a step, as NumPy arrays."""
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -113,8 +114,9 @@ def extend(
     return SequenceTable(parent=row.astype(np.int64), candidate=grasps.index, metrics=metrics, **longer)
 
 
-def take_sequences(table: SequenceTable, rows: np.ndarray) -> SequenceTable:
-    """Some rows, by index or mask."""
+def take_sequences(table: SequenceTable, rows: np.ndarray, **changes: Any) -> SequenceTable:
+    """Some rows, by index, after ``changes`` of the table."""
+    table = replace(table, **changes)
     own = {f.name: getattr(table, f.name)[rows] for f in fields(table) if f.name not in _FAMILIES}
     families = {f: {name: values[rows] for name, values in getattr(table, f).items()} for f in _FAMILIES}
     return replace(table, **own, **families)

@@ -25,6 +25,7 @@ __all__ = [
     "select_poses",
     "set_arrays",
     "set_table",
+    "sort_grasps",
     "take_grasps",
     "trim_sets",
     "user_poses",
@@ -193,6 +194,12 @@ def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:
     if len(rows) and rows[-1] == len(rows) - 1:
         return _grasps({name: values[: len(rows)] for name, values in grasp_arrays(table).items()})
     return _grasps({name: values[rows] for name, values in grasp_arrays(table).items()})
+
+
+def sort_grasps(table: GraspTable) -> GraspTable:
+    """The rows in candidate order."""
+    order = np.argsort(table.index, kind="stable")
+    return _grasps({name: values[order] for name, values in grasp_arrays(table).items()})
 
 
 def user_poses(pose: np.ndarray, center: np.ndarray) -> np.ndarray:
