@@ -28,7 +28,8 @@ def register(app: typer.Typer) -> None:
 def validate(
     shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.", show_default=False)],
     protocol: Annotated[
-        str, typer.Option("--protocol", "-p", help="What is simulated: fc, gravity6 or gravity6_mu1.")
+        str,
+        typer.Option("--protocol", "-p", help="What is simulated: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06."),
     ] = "fc",
     out: Annotated[
         Path | None,
@@ -39,7 +40,7 @@ def validate(
         str, typer.Option(help="cpu, or cuda:N for many at a time with MuJoCo Warp (extra gpu-sim).")
     ] = "cpu",
     all_directions: Annotated[
-        bool, typer.Option("--all-directions", help="Go on after the first direction in which the object is lost.")
+        bool, typer.Option("--all-directions", help="Go on after the first direction in which an object is lost.")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Keep results that are there.")] = True,
     json_path: JsonPath = None,
@@ -48,8 +49,9 @@ def validate(
 ) -> None:
     """Simulate grasps with MuJoCo and write the shards again with a verdict beside every row.
 
-    The hand closes from q_pregrasp over q to q_squeeze on the free object, then something pulls the object in six
-    directions; a grasp holds if the object stays in all of them. docs/physics.md says what exactly is simulated.
+    The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
+    directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects: the
+    hand starts at q, and every object must still touch it. docs/physics.md says what exactly is simulated.
 
     Example: lgrasp validate grasps/allegro-mug --out grasps/allegro-mug-fc --protocol fc
     """
@@ -65,9 +67,8 @@ def validate(
     with _Progress(quiet) as progress:
         done = validate_shards(job, progress.started, progress.advanced, progress.preparing)
     entries = summary(done, chosen)
-    for entry in entries:
-        for note in entry["notes"]:
-            warn(f"object {entry['object']}: {note}")
+    for note in dict.fromkeys(note for entry in entries for note in entry["notes"]):
+        warn(note)
     data = {"protocol": chosen.model_dump(mode="json"), "results": entries}
     if json_path == "-":
         print_json(data)
@@ -83,7 +84,8 @@ def _show(entries: list[dict[str, Any]], done: "list[Validated]", protocol: "Pro
     from lgrasp.physics import DIRECTIONS
     from lgrasp_cli.tables import print_pairs, print_table
 
-    names = ("hand", "object", "grasps", "hold", *DIRECTIONS, "at q", "at grasp", "mass", "stiffness", "/s")
+    stay = ("stay",) if any(entry["stay"] is not None for entry in entries) else ()
+    names = ("hand", "object", "grasps", "hold", *stay, *DIRECTIONS, "at q", "at grasp", "mass", "stiffness", "/s")
     rows = []
     for entry in entries:
         directions = zip(entry["directions_held"], entry["directions_run"], strict=True)
@@ -93,6 +95,7 @@ def _show(entries: list[dict[str, Any]], done: "list[Validated]", protocol: "Pro
                 entry["object"],
                 f"{entry['rows']:,}",
                 _share(entry["held"], entry["rows"]),
+                *(_share(entry["stay"], entry["rows"]) for _ in stay),
                 *(_share(held, run) for held, run in directions),
                 _share(entry["contact_at_q"], entry["rows"]),
                 _share(entry["contact_at_grasp"], entry["rows"]),
@@ -102,11 +105,12 @@ def _show(entries: list[dict[str, Any]], done: "list[Validated]", protocol: "Pro
             )
         )
     print_table(names, rows, right=names[2:])
+    start = "q" if protocol.start == "grasp" else "q_pregrasp"
     lost = {name: sum(entry[name] for entry in entries) for name in ("pregrasp_too_deep", "diverged")}
     print_pairs(
         [
             ("protocol", f"{protocol.name}, friction {protocol.friction:g}; shares of the grasps run in a direction"),
-            ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate at q_pregrasp and are not simulated"),
+            ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate at {start} and are not simulated"),
             ("diverged", f"{lost['diverged']:,} count as lost"),
             ("where", f"{done[0].path.parent} ({len(done)} shard{'s' if len(done) != 1 else ''})"),
         ]
@@ -135,9 +139,9 @@ class _Progress:
             sys.stderr.write("\n")
 
     def preparing(self, path: Path) -> None:
-        """Hand and object of a shard are cut; said when it takes a while."""
+        """Hand and objects of a shard are cut; said when it takes a while."""
         if not self._quiet:
-            line = f"{path.name}: cutting hand and object into convex pieces, which are kept in the cache"
+            line = f"{path.name}: cutting hand and objects into convex pieces, which are kept in the cache"
             self._slow = threading.Timer(_SLOW, typer.echo, (line,), {"err": True})
             self._slow.daemon = True
             self._slow.start()

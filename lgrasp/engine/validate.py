@@ -17,8 +17,9 @@ from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder
 from lgrasp.errors import ConfigError, OutputError, ShardError
-from lgrasp.physics import Protocol, Scene, protocol_text, scene_of_shard, verdicts
+from lgrasp.physics import COLUMNS, OBJECT_COLUMNS, Protocol, Scene, protocol_text, scene_of_shard, verdicts
 from lgrasp.physics.model import import_mujoco
+from lgrasp.physics.solid import Solid
 
 __all__ = ["Validated", "Validation", "summary", "validate_shards"]
 
@@ -45,13 +46,10 @@ class Validated:
 
     path: Path
     hand: str
-    object: str
+    objects: tuple[Solid, ...]  # sorted by their ids
+    object_index: np.ndarray  # (N, O) position in them, -1 absent
     columns: dict[str, np.ndarray]  # of the protocol, without its name
     seconds: float  # 0: the shard was there already
-    mass: float  # [kg]
-    stiffness: float  # [N m/rad]
-    pieces: int  # convex pieces of the object
-    notes: tuple[str, ...]
 
 
 def validate_shards(
@@ -65,10 +63,10 @@ def validate_shards(
     Args:
         started: called with (shard, rows) before its simulation.
         progress: called with (rows done, rows held); what it raises ends the job, whole shards stay.
-        preparing: called with a shard before its hand and object are cut into convex pieces.
+        preparing: called with a shard before its hand and objects are cut into convex pieces.
 
     Raises:
-        ShardError: a shard cannot be read, or holds several objects.
+        ShardError: a shard cannot be read.
         OutputError: the output cannot be written, or holds other shards.
         PhysicsError: MuJoCo is missing or refuses a hand.
     """
@@ -176,49 +174,67 @@ def _with_verdicts(
 
 
 def _validated(path: Path, shard: Shard, scene: Scene, protocol: Protocol, seconds: float) -> Validated:
-    prefix, load = f"{protocol.name}_", protocol.load(scene.object.volume)
+    prefix = f"{protocol.name}_"
+    columns = {n: shard.grasps.physics.get(prefix + n) for n in COLUMNS | OBJECT_COLUMNS}
     return Validated(
         path=path,
         hand=shard.hand.name,
-        object=scene.object.name,
-        columns={n.removeprefix(prefix): v for n, v in shard.grasps.physics.items() if n.startswith(prefix)},
+        objects=scene.objects,
+        object_index=np.asarray(shard.grasps.object_index),
+        columns={n: values for n, values in columns.items() if values is not None},
         seconds=seconds,
-        mass=load.mass,
-        stiffness=load.stiffness,
-        pieces=len(scene.object.pieces),
-        notes=scene.object.notes,
     )
 
 
 def summary(done: Sequence[Validated], protocol: Protocol) -> list[dict[str, Any]]:
-    """One entry per hand and object: shares of grasps that hold, contacts, load and speed."""
-    groups: dict[tuple[str, str], list[Validated]] = {}
-    for entry in done:
-        groups.setdefault((entry.hand, entry.object), []).append(entry)
+    """One entry per hand and objects of a grasp, in the order of its slots: shares that hold, contacts, load, speed."""
+    groups: dict[tuple[str, tuple[str, ...]], list[Validated]] = {}
+    for one in done:
+        sets, which = np.unique(one.object_index, axis=0, return_inverse=True)
+        for number in np.lexsort([*sets.T[::-1], (sets >= 0).sum(1)]):
+            part = _part(one, which.ravel() == number)
+            groups.setdefault((one.hand, tuple(solid.name for solid in part.objects)), []).append(part)
     return [_entry(group, protocol) for group in groups.values()]
 
 
+def _part(one: Validated, chosen: np.ndarray) -> Validated:
+    """The chosen rows (N,), which have the same objects in the same order, and these objects alone."""
+    index = one.object_index[chosen]
+    return replace(
+        one,
+        objects=tuple(one.objects[k] for k in index[0] if k >= 0),
+        object_index=index,
+        columns={name: values[chosen] for name, values in one.columns.items()},
+        seconds=one.seconds * chosen.mean(),
+    )
+
+
 def _entry(group: list[Validated], protocol: Protocol) -> dict[str, Any]:
-    columns = {n: np.concatenate([one.columns[n] for one in group]) for n in group[0].columns}
+    columns = {n: np.concatenate([one.columns[n] for one in group]) for n in group[0].columns if "object_" not in n}
     rows, simulated = len(columns["holds"]), sum(len(one.columns["holds"]) for one in group if one.seconds)
-    seconds = sum(one.seconds for one in group)
+    seconds = float(sum(one.seconds for one in group))
     run = columns["directions"] >= 0
+    solids = group[0].objects
+    loads = [protocol.load(solid.volume) for solid in solids]
     return {
         "hand": group[0].hand,
-        "object": group[0].object,
+        "object": "+".join(solid.name for solid in solids),
+        "objects": [solid.name for solid in solids],
         "rows": rows,
         "held": int(columns["holds"].sum()),
+        "stay": int(columns["stays"].sum()) if "stays" in columns else None,
+        "penetration": float(np.median(columns["penetration"])) if "penetration" in columns else None,
         "directions_held": (columns["directions"] == 1).sum(0).tolist(),
         "directions_run": run.sum(0).tolist(),
         "contact_at_q": int((columns["contact_at_q"] >= _CONTACTS).sum()),
         "contact_at_grasp": int((columns["contact_at_grasp"] >= _CONTACTS).sum()),
         "pregrasp_too_deep": int((columns["pregrasp_penetration"] > protocol.most_penetration).sum()),
         "diverged": int(columns["diverged"].sum()),
-        "mass": group[0].mass,
+        "mass": sum(load.mass for load in loads),
         "friction": protocol.friction,
-        "stiffness": group[0].stiffness,
-        "pieces": group[0].pieces,
-        "notes": list(group[0].notes),
+        "stiffness": max(load.stiffness for load in loads),
+        "pieces": sum(len(solid.pieces) for solid in solids),
+        "notes": [f"object {solid.name}: {note}" for solid in solids for note in solid.notes],
         "seconds": seconds,
         "per_s": simulated / seconds if seconds else None,
         "shards": [str(one.path) for one in group],

@@ -1,18 +1,20 @@
-"""Physics verdicts: does a grasp hold its object when something pulls at it?"""
+"""Physics verdicts: does a grasp hold its objects when something pulls at them?"""
 
-from lgrasp.physics.columns import COLUMNS
+from lgrasp.physics.columns import COLUMNS, OBJECT_COLUMNS
 from lgrasp.physics.protocol import DIRECTIONS, PROTOCOLS, Protocol, find_protocol
 from lgrasp.physics.run import protocol_text, verdicts
-from lgrasp.physics.scene import Scene, scene_of_shard
+from lgrasp.physics.scene import Scene, scene_of, scene_of_shard
 
 __all__ = [
     "COLUMNS",
     "DIRECTIONS",
+    "OBJECT_COLUMNS",
     "PROTOCOLS",
     "Protocol",
     "Scene",
     "find_protocol",
     "protocol_text",
+    "scene_of",
     "scene_of_shard",
     "verdicts",
 ]

@@ -1,6 +1,6 @@
 """Scene and protocol -> MuJoCo's specification of them: bodies, solids, drives, options."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,38 +9,48 @@ from scipy.spatial import ConvexHull, QhullError
 from lgrasp.errors import PhysicsError
 from lgrasp.hand.geometry import Piece
 from lgrasp.physics.protocol import Load, Protocol
-from lgrasp.physics.scene import HandSolids, Scene
+from lgrasp.physics.scene import HandSolids
+from lgrasp.physics.solid import Solid
 from lgrasp.physics.urdf import bare_urdf, joint_ends
 
 __all__ = ["OBJECT", "assemble"]
 
 OBJECT = "lgrasp object"
-"""Name of the object's body."""
+"""Begins the name of every object's body; its number follows."""
 
 _POSTURES = 200
 _NEARLY = 0.95  # of all postures; links that touch so often are left to touch
 _LEAST_MASS, _LEAST_INERTIA = 1.0e-3, 1.0e-7  # [kg], [kg m^2] of links whose URDF gives less
 
 
-def assemble(mujoco: Any, scene: Scene, protocol: Protocol, load: Load, held: Mapping[str, float]) -> Any:
-    """The MjSpec of a scene.
+def assemble(
+    mujoco: Any,
+    hand: HandSolids,
+    objects: Sequence[Solid],
+    protocol: Protocol,
+    held: Mapping[str, float],
+) -> Any:
+    """The MjSpec of a hand with some objects; the drives are as stiff as the object needs that needs the stiffest.
 
     Args:
         mujoco: the module.
+        objects: one may be there twice.
         held: joints above the base link and where they are welded [rad or m].
 
     Raises:
         ValueError: MuJoCo refuses the hand.
     """
-    spec = mujoco.MjSpec.from_string(bare_urdf(scene.hand.urdf, held))
+    loads = [protocol.load(solid.volume) for solid in objects]
+    spec = mujoco.MjSpec.from_string(bare_urdf(hand.urdf, held))
     _set_options(mujoco, spec, protocol)
-    _add_pieces(mujoco, spec, scene.hand)
-    _add_drives(mujoco, spec, protocol, load)
-    _add_object(mujoco, spec, scene, load)
+    _add_pieces(mujoco, spec, hand)
+    _add_drives(mujoco, spec, protocol, max(load.stiffness for load in loads))
+    for number, (solid, load) in enumerate(zip(objects, loads, strict=True)):
+        _add_object(mujoco, spec, f"{OBJECT} {number}", solid, load)
     for geom in spec.geoms:  # the larger condim of a pair counts: links slide on links without friction
         geom.friction = [protocol.friction, protocol.torsion, 1.0e-4]
-        geom.condim = 4 if geom.parent.name == OBJECT else 1
-    _exclude_neighbours(spec, scene.hand)
+        geom.condim = 4 if geom.parent.name.startswith(OBJECT) else 1
+    _exclude_neighbours(spec, hand)
     model = spec.compile()
     for a, b in _always_touching(mujoco, model):
         spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
@@ -101,7 +111,7 @@ def _add_hull(mujoco: Any, spec: Any, body: Any, vertices: np.ndarray, name: str
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
 
 
-def _add_drives(mujoco: Any, spec: Any, protocol: Protocol, load: Load) -> None:
+def _add_drives(mujoco: Any, spec: Any, protocol: Protocol, stiffness: float) -> None:
     """Position control of every joint that follows no other."""
     followers = {e.name1 for e in spec.equalities}
     for joint in spec.joints:
@@ -112,15 +122,14 @@ def _add_drives(mujoco: Any, spec: Any, protocol: Protocol, load: Load) -> None:
         joint.frictionloss = 0.0
         if joint.name not in followers:
             drive = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            drive.set_to_position(kp=load.stiffness * scale, dampratio=protocol.damping_ratio)
+            drive.set_to_position(kp=stiffness * scale, dampratio=protocol.damping_ratio)
 
 
-def _add_object(mujoco: Any, spec: Any, scene: Scene, load: Load) -> None:
-    solid = scene.object
-    body = spec.worldbody.add_body(name=OBJECT)
+def _add_object(mujoco: Any, spec: Any, name: str, solid: Solid, load: Load) -> None:
+    body = spec.worldbody.add_body(name=name)
     body.add_freejoint()
     for number, vertices in enumerate(solid.pieces):
-        _add_hull(mujoco, spec, body, vertices, f"{OBJECT} {number}")
+        _add_hull(mujoco, spec, body, vertices, f"{name} {number}")
     inertia = solid.inertia * (load.mass / solid.volume)
     body.mass = load.mass
     body.ipos = solid.center
@@ -144,10 +153,11 @@ def _always_touching(mujoco: Any, model: Any) -> list[tuple[int, int]]:
     limits = np.where(bounded, model.jnt_range[joints], [-np.pi, np.pi])
     rng = np.random.default_rng(0)
     count: dict[tuple[int, int], int] = {}
-    away = model.jnt_qposadr[free][0]
+    away = model.jnt_qposadr[free]
     for _ in range(_POSTURES):
         data.qpos[model.jnt_qposadr[joints]] = rng.uniform(limits[:, 0], limits[:, 1])
-        data.qpos[away : away + 7] = [100, 0, 0, 1, 0, 0, 0]
+        for number, address in enumerate(away):
+            data.qpos[address : address + 7] = [100 * (number + 1), 0, 0, 1, 0, 0, 0]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)

@@ -1,5 +1,6 @@
 """Scene and protocol -> a MuJoCo model, with the tables that map rows of a shard to its state."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -8,8 +9,9 @@ import numpy as np
 
 from lgrasp.errors import PhysicsError
 from lgrasp.physics.assemble import OBJECT, assemble
-from lgrasp.physics.protocol import Load, Protocol
-from lgrasp.physics.scene import Scene
+from lgrasp.physics.protocol import Protocol
+from lgrasp.physics.scene import HandSolids, Scene
+from lgrasp.physics.solid import Solid
 from lgrasp.physics.urdf import welded_joints
 
 __all__ = ["Model", "build_model", "import_mujoco"]
@@ -19,14 +21,15 @@ _NEAR = 1.0e-3  # [m]
 
 @dataclass(frozen=True)
 class Model:
-    """A compiled scene; K columns of q, J joints of the hand in MuJoCo, B bodies."""
+    """A hand and O objects of a scene, compiled; K columns of q, J joints of the hand in MuJoCo."""
 
     mujoco: Any
     """MjModel"""
     mujoco_near: Any
-    """MjModel in which hand and object touch within 1 mm."""
+    """MjModel in which hand and objects touch within 1 mm."""
     protocol: Protocol
-    load: Load
+    forces: np.ndarray
+    """(O,) pull on each object [N]."""
     joint_address: np.ndarray
     """(J,) place of each joint in qpos."""
     joint_matrix: np.ndarray
@@ -37,20 +40,21 @@ class Model:
     """Columns of q in the order of the controls."""
     held: dict[str, tuple[int, float]]
     """Joints above the base link: column and the value at which they are welded [rad or m]."""
-    object_address: int
-    """Place of the object's seven numbers in qpos."""
-    object_body: int
+    object_address: np.ndarray
+    """(O, 7) places of each object's position and quaternion in qpos."""
+    object_velocity: np.ndarray
+    """(O, 6) places of each object's linear and angular velocity in qvel."""
+    object_body: np.ndarray
+    """(O,)"""
     base_body: int
     link_body: np.ndarray
     """(L,) body of each of the shard's links, -1: none."""
-    hand_bodies: np.ndarray
-    """(B,) bool: links of the hand."""
-    center: np.ndarray
-    """(3,) centre of mass in the object's frame [m]."""
+    centers: np.ndarray
+    """(O, 3) centre of mass in each object's frame [m]."""
 
     def controls(self, q: np.ndarray) -> np.ndarray:
-        """Targets of the drives at joint positions q (K,)."""
-        return np.where(self.columns >= 0, q[self.columns], 0.0)
+        """Targets of the drives at joint positions q (..., K)."""
+        return np.where(self.columns >= 0, q[..., self.columns], 0.0)
 
 
 def import_mujoco() -> Any:
@@ -66,11 +70,12 @@ def import_mujoco() -> Any:
     return mujoco
 
 
-def build_model(scene: Scene, protocol: Protocol, q: np.ndarray) -> Model:
-    """Compile a scene; the last few are kept.
+def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequence[int] = (0,)) -> Model:
+    """Compile a hand with some objects of its scene; the last few are kept.
 
     Args:
         q: one row of joint positions (K,) [rad or m]; joints above the base link are welded there.
+        objects: positions in ``scene.objects``; one may be there twice.
 
     Raises:
         PhysicsError: MuJoCo is missing or refuses the hand; its reason is in the message.
@@ -78,38 +83,38 @@ def build_model(scene: Scene, protocol: Protocol, q: np.ndarray) -> Model:
     import_mujoco()
     joints = scene.hand.joint_names
     carried = [name for name in welded_joints(scene.hand.urdf, scene.hand.base_link) if name in joints]
-    return _build(scene, protocol.model_dump_json(), tuple((name, float(q[joints.index(name)])) for name in carried))
+    held = tuple((name, float(q[joints.index(name)])) for name in carried)
+    return _build(scene, protocol.model_dump_json(), held, tuple(objects))
 
 
-@lru_cache(maxsize=4)
-def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...]) -> Model:
+@lru_cache(maxsize=8)
+def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects: tuple[int, ...]) -> Model:
     mujoco = import_mujoco()
     protocol = Protocol.model_validate_json(text)
-    load = protocol.load(scene.object.volume)
+    solids = [scene.objects[index] for index in objects]
     try:
-        spec = assemble(mujoco, scene, protocol, load, dict(held))
+        spec = assemble(mujoco, scene.hand, solids, protocol, dict(held))
         model = spec.compile()
-        for geom in spec.body(OBJECT).geoms:
-            geom.margin = _NEAR
+        for geom in spec.geoms:
+            if geom.parent.name.startswith(OBJECT):
+                geom.margin = _NEAR
         near = spec.compile()
     except (ValueError, KeyError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:300]
-        raise PhysicsError(
-            f"MuJoCo refuses hand '{scene.hand.name}' with object '{scene.object.name}': {reason}"
-        ) from None
-    return _tables(mujoco, model, near, scene, protocol, load, held)
+        names = ", ".join(f"'{solid.name}'" for solid in solids)
+        raise PhysicsError(f"MuJoCo refuses hand '{scene.hand.name}' with object {names}: {reason}") from None
+    return _tables(mujoco, model, near, scene.hand, protocol, solids, held)
 
 
 def _tables(
     mujoco: Any,
     model: Any,
     near: Any,
-    scene: Scene,
+    hand: HandSolids,
     protocol: Protocol,
-    load: Load,
+    solids: list[Solid],
     held: tuple[tuple[str, float], ...],
 ) -> Model:
-    hand = scene.hand
     column = {name: k for k, name in enumerate(hand.joint_names)}
     joints = np.flatnonzero(model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
     follows = {
@@ -127,22 +132,23 @@ def _tables(
         if model.joint(at).name in column:
             matrix[row, column[model.joint(at).name]] = factor
     driven = [model.actuator(i).name for i in range(model.nu)]
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, OBJECT)
+    bodies = np.array([model.body(f"{OBJECT} {number}").id for number in range(len(solids))])
+    free = model.body_jntadr[bodies]
     base = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, hand.base_link)
     return Model(
         mujoco=model,
         mujoco_near=near,
         protocol=protocol,
-        load=load,
+        forces=np.array([protocol.load(solid.volume).force for solid in solids]),
         joint_address=model.jnt_qposadr[joints].copy(),
         joint_matrix=matrix,
         joint_offset=offset,
         columns=np.array([column.get(name, -1) for name in driven]),
         held={name: (column[name], value) for name, value in held},
-        object_address=int(model.jnt_qposadr[model.body_jntadr[body]]),
-        object_body=body,
+        object_address=model.jnt_qposadr[free][:, None] + np.arange(7),
+        object_velocity=model.jnt_dofadr[free][:, None] + np.arange(6),
+        object_body=bodies,
         base_body=base,
         link_body=np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in hand.link_names]),
-        hand_bodies=np.arange(model.nbody) != body,
-        center=scene.object.center,
+        centers=np.stack([solid.center for solid in solids]),
     )

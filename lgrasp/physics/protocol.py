@@ -1,10 +1,15 @@
 """What is simulated: named protocols with every number, written beside each verdict."""
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from lgrasp.errors import ConfigError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from lgrasp.dataset.records import GraspRows
 
 __all__ = ["DIRECTIONS", "PROTOCOLS", "Load", "Protocol", "find_protocol"]
 
@@ -28,7 +33,7 @@ class Load(BaseModel):
 
 
 class Protocol(BaseModel):
-    """Close the hand on a free object, then pull the object in six directions; it must stay where it was."""
+    """Close the hand on free objects, then pull them in six directions; they must stay in the hand."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -57,18 +62,26 @@ class Protocol(BaseModel):
     density: float = Field(
         default=500.0, gt=0, description="Of the object, if kind is weight, which then pulls [kg/m^3]."
     )
+    start: Literal["pregrasp", "grasp"] = Field(
+        default="pregrasp", description="Where the hand is when the simulation starts."
+    )
     phase: float = Field(default=0.4, gt=0, description="Pregrasp to grasp, and grasp to squeeze [s], each.")
     settle: float = Field(
         default=0.3, gt=0, description="Given to the hand at the grasp before its contacts are counted [s]."
     )
     hold: float = Field(default=2.0, gt=0, description="How long each direction is pulled [s].")
+    success: Literal["stays", "touches"] = Field(
+        default="stays",
+        description="stays: every object stays within most_displacement and most_rotation all the time; touches: every "
+        "object touches the hand at the end of a direction, and penetrates nothing by most_penetration at any time.",
+    )
     most_penetration: float = Field(
-        default=0.01, gt=0, description="Of hand and object, or hand and hand, at pregrasp [m]."
+        default=0.01, gt=0, description="At the start, of all pairs [m]; what is deeper is not simulated."
     )
     most_displacement: float = Field(
-        default=0.05, gt=0, description="Of the object's centre of mass from its start [m]."
+        default=0.05, gt=0, description="Of an object's centre of mass from its start [m]."
     )
-    most_rotation: float = Field(default=15.0, gt=0, le=180, description="Of the object from its start [deg].")
+    most_rotation: float = Field(default=15.0, gt=0, le=180, description="Of an object from its start [deg].")
 
     def load(self, volume: float) -> Load:
         """Mass, pull and stiffness for an object of some volume [m^3]."""
@@ -83,6 +96,11 @@ class Protocol(BaseModel):
             stiffness = min(max(stiffness * force, low), high)
         return Load(mass=mass, force=force, stiffness=stiffness)
 
+    def stops(self, rows: "GraspRows") -> "tuple[np.ndarray, ...]":
+        """Joint positions (N, K) that the hand goes through, from the start over q to q_squeeze [rad or m]."""
+        closing = (rows.q, rows.q_squeeze)
+        return closing if self.start == "grasp" else (rows.q_pregrasp, *closing)
+
     def text(self, **resolved: Any) -> str:
         """Every number as JSON: the ``protocol`` attribute of the columns. ``resolved`` is added."""
         import json
@@ -92,16 +110,21 @@ class Protocol(BaseModel):
 
 def _protocols() -> dict[str, Protocol]:
     gravity = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
+    # 100 steps of 1/60 s, each cut in four
+    sequence = {"start": "grasp", "success": "touches", "hold": 100 / 60, "timestep": 1 / 240, "most_rotation": 180.0}
     made = (
         Protocol(name="fc"),
         Protocol(name="gravity6", friction=0.6, **gravity),
         Protocol(name="gravity6_mu1", friction=1.0, **gravity),
+        Protocol(name="seq6", friction=2.0, **gravity, **sequence),
+        Protocol(name="seq6_mu06", friction=0.6, **gravity, **sequence),
     )
     return {protocol.name: protocol for protocol in made}
 
 
 PROTOCOLS: dict[str, Protocol] = _protocols()
-"""The named protocols: ``fc`` is DexGraspBench's, ``gravity6`` and ``gravity6_mu1`` ask for more."""
+"""The named protocols: ``fc`` is DexGraspBench's, ``gravity6`` and ``gravity6_mu1`` ask for more; ``seq6`` is the one
+that sequences of objects were published with, ``seq6_mu06`` the same on smoother objects."""
 
 
 def find_protocol(name: str) -> Protocol:

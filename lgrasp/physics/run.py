@@ -11,10 +11,12 @@ import numpy as np
 from lgrasp.dataset.records import GraspRows
 from lgrasp.errors import PhysicsError
 from lgrasp.physics.columns import stack_verdicts
+from lgrasp.physics.groups import group_rows
 from lgrasp.physics.model import Model, build_model, import_mujoco
 from lgrasp.physics.protocol import Protocol
 from lgrasp.physics.scene import Scene
-from lgrasp.physics.trial import Trial, Verdict
+from lgrasp.physics.trial import Trial
+from lgrasp.physics.verdict import Verdict
 
 __all__ = ["protocol_text", "verdicts"]
 
@@ -33,37 +35,59 @@ def verdicts(
     settled_stop: bool = True,
     device: str = "cpu",
 ) -> dict[str, np.ndarray]:
-    """Simulate every grasp: columns PROTOCOL_... of :data:`lgrasp.physics.COLUMNS`.
+    """Simulate every grasp: columns PROTOCOL_... of :data:`lgrasp.physics.COLUMNS`, and of
+    :data:`lgrasp.physics.OBJECT_COLUMNS` where rows have several slots or the protocol's success is to touch.
 
-    A verdict depends on its row only, not on the number of threads or the other rows.
+    A verdict depends on its row only, not on the number of threads or the other rows; a row sees the objects that it
+    has and no others of the scene.
 
     Args:
-        scene: hand and object of the rows.
-        rows: grasps of that object; rows, K columns of q and contacts as in a shard.
+        scene: hand and objects of the rows.
+        rows: N grasps of O objects at most; K columns of q and contacts as in a shard.
         protocol: what is simulated.
         threads: grasps simulated at a time.
         progress: called on this thread with (rows done, rows held); what it raises ends the simulation.
-        all_directions: go on after the first direction in which the object is lost.
-        settled_stop: end a direction when the object has come to rest well inside its bounds.
+        all_directions: go on after the first direction in which an object is lost.
+        settled_stop: end a direction when the objects have come to rest well inside their bounds.
         device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0).
 
     Raises:
-        PhysicsError: MuJoCo is missing or refuses the scene.
+        PhysicsError: MuJoCo is missing or refuses the scene, or a row has an object that the scene lacks.
     """
-    if not len(rows):
-        return stack_verdicts(protocol.name, [])
-    model = build_model(scene, protocol, rows.q[0])
-    _check_held(model, rows)
-    if device != "cpu":
-        from lgrasp.physics.gpu import WorldTrials
+    slots = np.full(np.shape(rows.object_index), -1)
+    found: list[Verdict | None] = [None] * len(rows)
+    options = {"all_directions": all_directions, "settled_stop": settled_stop}
+    before = [0, 0]  # rows done and held
 
-        worlds = min(max(len(rows), _LEAST_WORLDS), _MOST_WORLDS)
-        options = {"threads": threads, "all_directions": all_directions, "settled_stop": settled_stop}
-        return WorldTrials(model, device, worlds=worlds, **options).run(rows, progress)
+    def advanced(done: int, held: int) -> None:
+        if progress:
+            progress(before[0] + done, before[1] + held)
+
+    for group in group_rows(rows, len(scene.objects)):
+        model = build_model(scene, protocol, rows.q[0], group.objects)
+        _check_held(model, group.rows)
+        if device == "cpu":
+            some = _on_threads(model, group.rows, threads, advanced, options)
+        else:
+            from lgrasp.physics.gpu import WorldTrials
+
+            worlds = min(max(len(group.rows), _LEAST_WORLDS), _MOST_WORLDS)
+            some = WorldTrials(model, device, worlds=worlds, threads=threads, **options).run(group.rows, advanced)
+        slots[group.index] = group.slots
+        for row, verdict in zip(group.index, some, strict=True):
+            found[row] = verdict
+        before = [before[0] + len(some), before[1] + sum(verdict.holds for verdict in some)]
+    return stack_verdicts(protocol, [verdict for verdict in found if verdict is not None], slots)
+
+
+def _on_threads(
+    model: Model, rows: GraspRows, threads: int, progress: Callable[[int, int], None], options: dict[str, bool]
+) -> list[Verdict]:
+    """A verdict of every row, by MuJoCo."""
     found: list[Verdict | None] = [None] * len(rows)
     trials: queue.SimpleQueue[Trial] = queue.SimpleQueue()
     for _ in range(threads):
-        trials.put(Trial(model, all_directions=all_directions, settled_stop=settled_stop))
+        trials.put(Trial(model, **options))
     stop = threading.Event()
 
     def judge(i: int) -> bool:
@@ -82,12 +106,11 @@ def verdicts(
             for future in as_completed([pool.submit(judge, i) for i in range(len(rows))]):
                 done += 1
                 held += future.result()
-                if progress:
-                    progress(done, held)
+                progress(done, held)
         except BaseException:
             stop.set()
             raise
-    return stack_verdicts(protocol.name, [verdict for verdict in found if verdict is not None])
+    return [verdict for verdict in found if verdict is not None]
 
 
 @contextmanager
@@ -108,13 +131,16 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
     Raises:
         PhysicsError: MuJoCo is missing.
     """
-    solid = scene.object
+    objects = [
+        {"name": solid.name, "pieces": len(solid.pieces), "excess": round(solid.excess, 6), "notes": list(solid.notes)}
+        | protocol.load(solid.volume).model_dump()
+        for solid in scene.objects
+    ]
     return protocol.text(
         simulator=f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}",
-        resolved=protocol.load(solid.volume).model_dump(),
         all_directions=all_directions,
         ends_early=True,
-        object={"pieces": len(solid.pieces), "excess": round(solid.excess, 6), "notes": list(solid.notes)},
+        objects=objects,
     )
 
 

@@ -1,6 +1,7 @@
-"""What a simulator is given: a hand as URDF and convex pieces, an object as convex pieces and its mass properties."""
+"""What a simulator is given: a hand as URDF and convex pieces, objects as convex pieces and their mass properties."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -17,7 +18,7 @@ from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh
 from lgrasp.hand.urdf import parse_robot, read_urdf
 from lgrasp.physics.solid import Solid, solid_of_mesh
 
-__all__ = ["HandSolids", "Scene", "hand_of_record", "object_of_record", "scene_of_shard"]
+__all__ = ["HandSolids", "Scene", "hand_of_record", "object_of_record", "scene_of", "scene_of_shard"]
 
 
 @dataclass(frozen=True)
@@ -37,27 +38,34 @@ class HandSolids:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A hand and an object, for any simulator and protocol; each is itself only."""
+    """A hand and objects, for any simulator and protocol; each is itself only."""
 
     hand: HandSolids
-    object: Solid
+    objects: tuple[Solid, ...]
+    """In the order that ``object_index`` of the rows counts."""
 
 
-def scene_of_shard(shard: Shard, decompose: Decompose = cut_mesh, device: str = "cpu") -> Scene:
-    """The scene of a shard; nothing but the shard is read.
+def scene_of(
+    hand: HandRecord, objects: Sequence[ObjectRecord], decompose: Decompose = cut_mesh, device: str = "cpu"
+) -> Scene:
+    """The scene of a hand and the objects that rows may have, in whatever order they are given.
 
     Args:
         decompose: cuts dented meshes, perhaps with a cache (:func:`lgrasp.decompose.decompose`).
         device: answers the geometric queries.
 
     Raises:
-        ShardError: the shard has several objects, or lacks a mesh of its hand.
+        ShardError: a mesh of the hand is missing.
         HandError: the hand's URDF or a mesh cannot be used.
+        ObjectError: an object is flat.
     """
-    if len(shard.objects) != 1 or shard.grasps.object_index.shape[1] != 1:
-        names = ", ".join(record.id for record in shard.objects)
-        raise ShardError(f"physics verdicts are for shards of one object; this one has {names}")
-    return Scene(hand_of_record(shard.hand, decompose, device), object_of_record(shard.objects[0], decompose, device))
+    solids = [object_of_record(record, decompose, device) for record in sorted(objects, key=lambda record: record.id)]
+    return Scene(hand_of_record(hand, decompose, device), tuple(solids))
+
+
+def scene_of_shard(shard: Shard, decompose: Decompose = cut_mesh, device: str = "cpu") -> Scene:
+    """The scene of a shard; nothing but the shard is read. Arguments and errors as of :func:`scene_of`."""
+    return scene_of(shard.hand, shard.objects, decompose, device)
 
 
 def hand_of_record(record: HandRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> HandSolids:

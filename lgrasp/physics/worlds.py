@@ -9,15 +9,15 @@ import warp as wp
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.errors import PhysicsError
 from lgrasp.physics.model import Model, import_mujoco
-from lgrasp.physics.trial import CHUNK
+from lgrasp.physics.verdict import CHUNK, WILD, links_touching
 
 __all__ = ["Worlds"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_CONTACTS = 96  # per world, on average
+_CONTACTS = 96  # per world and object, on average
 _FULL = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # buffers that may be full
-_CONSTRAINTS = 640  # rows per world: four a contact, limits, couplings
+_CONSTRAINTS = 640  # rows per world and object: four a contact, limits, couplings
 
 
 @wp.kernel
@@ -53,11 +53,14 @@ class Worlds:
         self._lib: Any = mujoco_warp
         self._model, self._device, self.worlds = model, wp.get_device(device), worlds
         m = copy(model.mujoco)
+        if len(model.object_body) > 1:  # objects that press on each other: in single precision Newton's method fails
+            m.opt.solver = mujoco.mjtSolver.mjSOL_CG
         m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
         with wp.ScopedDevice(self._device):
             self._m = mujoco_warp.put_model(m)
             self._m.opt.warn_overflow = 0  # said by :meth:`overflowed`
-            self._d = mujoco_warp.make_data(m, nworld=worlds, nconmax=_CONTACTS, njmax=_CONSTRAINTS)
+            room = {"nconmax": _CONTACTS * len(model.object_body), "njmax": _CONSTRAINTS * len(model.object_body)}
+            self._d = mujoco_warp.make_data(m, nworld=worlds, **room)
             shape = (worlds, m.nu)
             self._start, self._end, self._step = (wp.zeros(s, dtype=wp.float32) for s in (shape, shape, (worlds,)))
         self._ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
@@ -103,20 +106,44 @@ class Worlds:
         for name, a in (arrays | own).items():
             a.assign(state[name])
 
+    def moved(self, state: dict[str, np.ndarray], home: np.ndarray) -> np.ndarray:
+        """How far objects are from where they started: displacement [m] and rotation [rad], (worlds, O, 2).
+
+        Args:
+            home: poses at the start, (worlds, O, 7).
+        """
+        pose, center = state["qpos"][:, self._model.object_address].astype(float), self._model.centers
+        start = home.astype(float)
+
+        def middle(p: np.ndarray) -> np.ndarray:
+            t = 2 * np.cross(p[..., 4:], center)
+            return p[..., :3] + center + p[..., 3:4] * t + np.cross(p[..., 4:], t)
+
+        norm = np.linalg.norm(pose[..., 3:], axis=2) * np.linalg.norm(start[..., 3:], axis=2)
+        cosine = np.abs((pose[..., 3:] * start[..., 3:]).sum(2)) / np.maximum(norm, 1e-12)
+        turned = 2 * np.arccos(np.clip(cosine, 0, 1))
+        return np.stack([np.linalg.norm(middle(pose) - middle(start), axis=2), turned], axis=2)
+
+    @staticmethod
+    def wild(state: dict[str, np.ndarray]) -> np.ndarray:
+        """(worlds,) bool: where the simulation has diverged."""
+        return ~(np.abs(state["qvel"]).max(1) < WILD) | ~np.isfinite(state["qpos"]).all(1)
+
     def overflowed(self) -> np.ndarray:
         """(worlds,) bool: where a buffer was full since the last call, so that the state there is worth nothing."""
         full = (self._d.overflow.numpy() & self._full) != 0
         self._d.overflow.zero_()
         return full
 
-    def touching(self) -> np.ndarray:
-        """Number of links that touch the object, (worlds,)."""
+    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Number of links that touch each object, (worlds, O), and deepest penetration of any object [m], (worlds,)."""
         d, m = self._d, self._model.mujoco
         n = min(int(d.nacon.numpy()[0]), d.naconmax)
-        geoms, world = d.contact.geom.numpy()[:n], d.contact.worldid.numpy()[:n]
-        close = (d.contact.dist.numpy()[:n] < 0) & (geoms >= 0).all(1)
-        bodies, world = m.geom_bodyid[geoms[close]], world[close]
-        with_object = (bodies == self._model.object_body).any(1)
-        other = np.where(bodies[:, 0] == self._model.object_body, bodies[:, 1], bodies[:, 0])
-        pairs = np.unique(np.column_stack([world[with_object], other[with_object]]), axis=0)
-        return np.bincount(pairs[:, 0], minlength=self.worlds) if len(pairs) else np.zeros(self.worlds, int)
+        geoms, world, dist = (a[:n].numpy() for a in (d.contact.geom, d.contact.worldid, d.contact.dist))
+        close = (dist < 0) & (geoms >= 0).all(1)
+        bodies, world, dist = m.geom_bodyid[geoms[close]], world[close], dist[close]
+        links = links_touching(bodies, self._model.object_body, m.nbody, world, self.worlds)
+        of_object = np.isin(bodies, self._model.object_body).any(1)
+        depth = np.zeros(self.worlds)
+        np.maximum.at(depth, world[of_object], -dist[of_object])
+        return links, depth

@@ -37,7 +37,7 @@ def test_adds_columns_and_keeps_the_rest(cli, grasps, tmp_path):
         assert after.grasps.physics["fc_holds"].tolist() == holds
         assert after.grasps.physics["fc_directions"].dtype == np.int8
         protocol = json.loads(after.grasps.physics_protocols["fc_slip"])
-        assert (protocol["name"], protocol["timestep"], protocol["resolved"]["mass"]) == ("fc", 0.004, 0.1)
+        assert (protocol["name"], protocol["timestep"], protocol["objects"][0]["mass"]) == ("fc", 0.004, 0.1)
         assert after.header.config == before.header.config
         assert after.statistics["fc_held"] == sum(holds)
 

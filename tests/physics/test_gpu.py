@@ -1,14 +1,18 @@
 """MuJoCo Warp judges as MuJoCo does."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import warp as wp
 from reference.jaws import Jaws
+from reference.twins import in_one_gripper, twin_rows, twin_shard
 
 from lgrasp.device.runtime import start
 from lgrasp.physics import PROTOCOLS, scene_of_shard, verdicts
+from lgrasp.physics.columns import stack_verdicts
+from lgrasp.physics.groups import group_rows
 from lgrasp.physics.model import build_model
 
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed (extra gpu-sim)")
@@ -30,11 +34,13 @@ def six(jaws: Jaws):
     return scene_of_shard(shard), Jaws.rows(shard, q_squeeze=shard.grasps.q - depth)
 
 
-def judge(scene, rows, worlds: int = 8):
+def judge(scene, rows, worlds: int = 8, protocol=FC):
     from lgrasp.physics.gpu import WorldTrials
 
-    model = build_model(scene, FC, rows.q[0])
-    return WorldTrials(model, "cuda:0" if GPU else "cpu", worlds=worlds, all_directions=True).run(rows)
+    (group,) = group_rows(rows, len(scene.objects))
+    model = build_model(scene, protocol, rows.q[0], group.objects)
+    trials = WorldTrials(model, "cuda:0" if GPU else "cpu", worlds=worlds, all_directions=True)
+    return stack_verdicts(protocol, trials.run(group.rows), group.slots)
 
 
 def test_same_verdicts(six):
@@ -57,3 +63,26 @@ def test_a_world_without_room_is_judged_by_mujoco(six, monkeypatch):
     here, there = verdicts(*six, FC, all_directions=True), judge(*six)
     for name, values in here.items():
         np.testing.assert_array_equal(values, there[name], err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["seq6", "gravity6"])
+def test_two_objects(name: str):
+    """Held in a gripper each, one let go, one inside the other, both in one gripper."""
+    protocol, rows = PROTOCOLS[name], twin_rows(count=4)
+    squeeze, q, start, pose = rows.q_squeeze.copy(), rows.q.copy(), rows.q_pregrasp.copy(), rows.object_pose.copy()
+    pose[1, 1, 2] += 0.3
+    pose[2, 0] = pose[2, 1]
+    pose[2, 0, 0] += 0.02
+    one = in_one_gripper(0.004)
+    squeeze[3], q[3], start[3], pose[3] = one.q_squeeze[0], one.q[0], one.q_pregrasp[0], one.object_pose[0]
+    rows = replace(rows, q=q, q_squeeze=squeeze, q_pregrasp=start, object_pose=pose)
+    scene = scene_of_shard(twin_shard(rows))
+    here, there = verdicts(scene, rows, protocol, all_directions=True), judge(scene, rows, protocol=protocol)
+    assert here[f"{name}_holds"].tolist() == [True, False, False, True]
+    for column in ("holds", "directions", "stays", "object_touches", "settled", "diverged", "contact_at_q"):
+        np.testing.assert_array_equal(here[f"{name}_{column}"], there[f"{name}_{column}"], err_msg=column)
+    for column, bound in (("object_displacement", 2e-3), ("penetration", 1e-4), ("slip", 2e-4)):
+        kept = [0, 3]
+        np.testing.assert_allclose(
+            here[f"{name}_{column}"][kept], there[f"{name}_{column}"][kept], atol=bound, err_msg=column
+        )

@@ -33,7 +33,7 @@ def test_links_are_where_the_urdf_puts_them(name: str):
     cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
     rng = np.random.default_rng(0)
     rows = tree.listed_values(rng.uniform(tree.joint_lower, tree.joint_upper).astype("f4")[None])
-    model = build_model(Scene(hand_of_record(record, no_cut), cube), FC, rows[0])
+    model = build_model(Scene(hand_of_record(record, no_cut), (cube,)), FC, rows[0])
     data = mujoco.MjData(model.mujoco)
     data.qpos[model.joint_address] = model.joint_matrix @ rows[0] + model.joint_offset
     mujoco.mj_kinematics(model.mujoco, data)
@@ -52,9 +52,9 @@ def test_drives_are_near_critically_damped(jaws: Jaws):
     record, _, tree = shipped_hand("allegro")
     cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
     q = tree.listed_values(tree.joint_open[None])[0]
-    m = build_model(Scene(hand_of_record(record, no_cut), cube), FC, q)
+    m = build_model(Scene(hand_of_record(record, no_cut), (cube,)), FC, q)
     data = mujoco.MjData(m.mujoco)
-    data.qpos[m.object_address] = 10.0
+    data.qpos[m.object_address[0, 0]] = 10.0
     data.qpos[m.joint_address] = m.joint_matrix @ q + m.joint_offset
     data.ctrl[:] = q[m.columns]
     data.ctrl[2] += 0.2
@@ -72,7 +72,7 @@ def test_inertia_is_that_of_the_mesh(jaws: Jaws):
     shard = replace(shard, objects=[mesh_record("you", mesh)])
     scene = scene_of_shard(shard, no_cut)
     model = build_model(scene, FC, shard.grasps.q[0])
-    body = model.object_body
+    (body,) = model.object_body
     mesh.density = FC.mass / mesh.volume
     assert model.mujoco.body_mass[body] == pytest.approx(FC.mass)
     np.testing.assert_allclose(model.mujoco.body_ipos[body], mesh.center_mass, atol=1e-7)
@@ -130,9 +130,9 @@ def test_neighbours_and_sockets_do_not_collide():
     record, _, tree = shipped_hand("allegro")
     cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
     q = tree.listed_values(tree.joint_open[None])[0]
-    m = build_model(Scene(hand_of_record(record, no_cut), cube), FC, q)
+    m = build_model(Scene(hand_of_record(record, no_cut), (cube,)), FC, q)
     data = mujoco.MjData(m.mujoco)
-    data.qpos[m.object_address] = 10.0
+    data.qpos[m.object_address[0, 0]] = 10.0
     data.qpos[m.joint_address] = m.joint_matrix @ q + m.joint_offset
     mujoco.mj_forward(m.mujoco, data)
     assert data.ncon == 0

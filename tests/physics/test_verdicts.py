@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from reference.jaws import EDGE, Jaws
 
-from lgrasp.errors import ConfigError, PhysicsError, ShardError
+from lgrasp.errors import ConfigError, PhysicsError
 from lgrasp.physics import COLUMNS, PROTOCOLS, find_protocol, protocol_text, scene_of_shard, verdicts
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
@@ -149,7 +149,8 @@ def test_protocol_text_names_every_number(jaws: Jaws):
     assert text["name"] == "fc"
     for name, value in FC.model_dump(mode="json").items():
         assert text[name] == value
-    assert text["resolved"] == {"mass": 0.1, "force": 1.0, "stiffness": 5.0}
+    (cube,) = text["objects"]
+    assert (cube["name"], cube["mass"], cube["force"], cube["stiffness"]) == ("cube", 0.1, 1.0, 5.0)
     assert text["simulator"].startswith("mujoco ")
 
 
@@ -157,10 +158,9 @@ def test_errors(jaws: Jaws, monkeypatch):
     with pytest.raises(ConfigError, match="unknown protocol 'fd'; choose fc, gravity6"):
         find_protocol("fd")
     shard = jaws.shard()
-    cube = shard.objects[0]
-    two = replace(shard, objects=[cube, replace(cube, id="other", name="other")])
-    with pytest.raises(ShardError, match="one object; this one has cube, other"):
-        scene_of_shard(two)
+    for index, said in ((-1, r"row 1 has object_index \[-1\]"), (1, r"\[1\]; one object at least, of 1 that there")):
+        with pytest.raises(PhysicsError, match=said):
+            judge(shard, rows=jaws.rows(jaws.shard(count=2), object_index=np.array([[0], [index]])))
     heavy = shard.hand.urdf.replace("</link>", '<inertial><mass value="-1"/></inertial></link>', 1)
     with pytest.raises(PhysicsError, match="MuJoCo refuses hand 'jaws'"):
         judge(jaws.shard(urdf=heavy))
