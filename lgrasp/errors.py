@@ -2,6 +2,7 @@
 
 __all__ = [
     "CacheError",
+    "CloudError",
     "ConfigError",
     "DecomposeError",
     "DeviceError",
@@ -27,6 +28,10 @@ class HandError(LgraspError):
 
 class ObjectError(LgraspError):
     """An object mesh (file, scale or name) cannot be used."""
+
+
+class CloudError(LgraspError):
+    """A point cloud, its mask or its viewpoint cannot be used."""
 
 
 class DecomposeError(LgraspError):

@@ -1,0 +1,148 @@
+"""Files of point clouds and masks: bytes to arrays, nothing judged but their form."""
+
+import contextlib
+import io
+import logging
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from lgrasp.errors import CloudError
+
+__all__ = ["CLOUD_SUFFIXES", "read_arrays", "read_mask"]
+
+CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz")
+
+_MASK_SUFFIXES = (".npy", ".npz")
+_LABELS = ("label", "labels")  # names that a file may give to the label of a point
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """What a cloud's file says of n points: ``points`` (n, 3), and perhaps ``normals`` (n, 3) and ``labels`` (n,).
+
+    An image of points, (h, w, 3), is read row by row.
+
+    Raises:
+        CloudError: no such file, an unknown suffix, or not the form of that suffix.
+    """
+    data = _read_bytes(path, CLOUD_SUFFIXES, "a point cloud")
+    kind = path.suffix.lower()
+    try:
+        with _silence():
+            found = _parse_ply(data) if kind == ".ply" else _parse_xyz(data) if kind == ".xyz" else _parse_numpy(data)
+    except Exception as error:  # the parsers raise anything on garbage
+        why = " ".join(str(error).split())[:120] or type(error).__name__
+        raise CloudError(f"{path}: not a readable {kind} cloud ({why})") from None
+    if "points" not in found:
+        raise CloudError(f"{path}: has {', '.join(found) or 'nothing'}; an array 'points' of shape (n, 3) is needed")
+    points = found["points"]
+    if points.ndim not in (2, 3) or points.shape[-1] not in (3, 6) or points.dtype.kind not in "fiu":
+        raise CloudError(
+            f"{path}: points are an array of {points.dtype} of shape {points.shape}; numbers of shape (n, 3), "
+            "(n, 6) with normals, or (h, w, 3) are accepted"
+        )
+    flat = points.reshape(-1, points.shape[-1]).astype(np.float64)
+    out = {"points": flat[:, :3]}
+    if flat.shape[1] == 6:
+        out["normals"] = flat[:, 3:]
+    for name, width in (("normals", 3), ("labels", 1)):
+        if name not in found:
+            continue
+        values = np.asarray(found[name])
+        if values.size != len(flat) * width:
+            raise CloudError(f"{path}: {name} have shape {values.shape}, the points {points.shape}")
+        out[name] = values.reshape(len(flat), 3).astype(np.float64) if width == 3 else values.ravel()
+    return out
+
+
+def read_mask(path: Path, count: int) -> np.ndarray:
+    """Labels of the ``count`` points of a cloud, shape (count,), int64, from .npy or from ``labels`` of an .npz.
+
+    Raises:
+        CloudError: no such file, not integers or flags, or of another length.
+    """
+    data = _read_bytes(path, _MASK_SUFFIXES, "a mask")
+    try:
+        values = np.load(io.BytesIO(data), allow_pickle=False)
+        if not isinstance(values, np.ndarray):
+            values = next((values[name] for name in (*_LABELS, "mask") if name in values), None)
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise CloudError(f"{path}: not a readable mask ({' '.join(str(error).split())[:120]})") from None
+    if values is None:
+        raise CloudError(f"{path}: has no array 'labels'")
+    return check_labels(np.asarray(values), count, str(path))
+
+
+def check_labels(values: np.ndarray, count: int, where: str) -> np.ndarray:
+    """Labels as (count,) int64.
+
+    Raises:
+        CloudError: not integers or flags, or of another length.
+    """
+    whole = values.dtype.kind in "biu" or (values.dtype.kind == "f" and bool((values == np.round(values)).all()))
+    if not whole:
+        raise CloudError(f"{where}: labels are {values.dtype}, whole numbers or flags are accepted")
+    if values.size != count:
+        raise CloudError(f"{where}: {values.size:,} labels for a cloud of {count:,} points; one for each is accepted")
+    return values.ravel().astype(np.int64)
+
+
+def _read_bytes(path: Path, suffixes: tuple[str, ...], what: str) -> bytes:
+    accepted = ", ".join(suffixes)
+    if not path.is_file():
+        state = "is a folder" if path.is_dir() else "does not exist"
+        raise CloudError(f"{path}: {state}; {what} ({accepted}) is accepted")
+    if path.suffix.lower() not in suffixes:
+        raise CloudError(f"{path}: suffix '{path.suffix}' is unknown; accepted are {accepted}")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CloudError(f"{path}: cannot be read ({error.strerror})") from None
+    if not data:
+        raise CloudError(f"{path}: 0 bytes; {what} ({accepted}) is accepted")
+    return data
+
+
+@contextlib.contextmanager
+def _silence():
+    """Keep the parsers from warning or logging: whatever matters is checked on their result."""
+    log = logging.getLogger("trimesh")
+    before, log.disabled = log.disabled, True
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.disabled = before
+
+
+def _parse_ply(data: bytes) -> dict[str, np.ndarray]:
+    loaded = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
+    columns = loaded.metadata["_ply_raw"]["vertex"]["data"]  # a record array, or a dict for text
+    names = columns.dtype.names if isinstance(columns, np.ndarray) else columns
+
+    def stack(wanted: tuple[str, ...]) -> np.ndarray:
+        return np.stack([np.ravel(columns[name]) for name in wanted], axis=-1)
+
+    out = {"points": stack(("x", "y", "z"))}
+    if {"nx", "ny", "nz"} <= set(names):
+        out["normals"] = stack(("nx", "ny", "nz"))
+    label = next((name for name in _LABELS if name in names), None)
+    return out if label is None else out | {"labels": np.ravel(columns[label])}
+
+
+def _parse_xyz(data: bytes) -> dict[str, np.ndarray]:
+    return {"points": np.atleast_2d(np.loadtxt(io.StringIO(data.decode()), comments="#"))}
+
+
+def _parse_numpy(data: bytes) -> dict[str, np.ndarray]:
+    loaded: Any = np.load(io.BytesIO(data), allow_pickle=False)
+    if isinstance(loaded, np.ndarray):
+        return {"points": loaded}
+    found = {name: loaded[name] for name in ("points", "normals") if name in loaded}
+    label = next((name for name in _LABELS if name in loaded), None)
+    return found if label is None else found | {"labels": loaded[label]}

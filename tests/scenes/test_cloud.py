@@ -1,0 +1,188 @@
+"""Reading point clouds: what is accepted, what is repaired and told, what is refused."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from lgrasp.errors import CloudError
+from lgrasp.scenes.cloud import read_cloud
+
+CENTRE = np.array([0.1, -0.2, 0.7])
+RADIUS = 0.05
+
+
+@pytest.fixture
+def ball(tmp_path):
+    """ball(name, **arrays): a sphere's points, its true normals and labels, and a file of some of them."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(2000, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = CENTRE + RADIUS * normals
+
+    def write(name="ball.npy", change=lambda p: p, **arrays):
+        path = tmp_path / name
+        if path.suffix == ".npz":
+            np.savez(path, points=change(points.copy()), **arrays)
+        elif path.suffix == ".xyz":
+            np.savetxt(path, change(points.copy()))
+        else:
+            np.save(path, change(points.copy()))
+        return path
+
+    return write, points, normals
+
+
+def write_ply(path, columns, *, binary):
+    kind = "binary_little_endian" if binary else "ascii"
+    types = {name: "int" if values.dtype.kind == "i" else "float" for name, values in columns.items()}
+    lines = ["ply", f"format {kind} 1.0", f"element vertex {len(next(iter(columns.values())))}"]
+    lines += [f"property {types[name]} {name}" for name in columns] + ["end_header", ""]
+    rows = np.zeros(len(columns["x"]), [(n, "<i4" if types[n] == "int" else "<f4") for n in columns])
+    for name, values in columns.items():
+        rows[name] = values
+    body = rows.tobytes() if binary else "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode()
+    path.write_bytes("\n".join(lines).encode() + body)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_ply_with_normals_and_labels(tmp_path, ball, binary):
+    _, points, normals = ball
+    columns = dict(zip(("x", "y", "z", "nx", "ny", "nz"), np.hstack([points, normals]).T, strict=True))
+    labels = (np.arange(len(points)) % 3).astype(np.int32)
+    write_ply(tmp_path / "a.ply", columns | {"label": labels}, binary=binary)
+    cloud = read_cloud(tmp_path / "a.ply", label=2)
+    np.testing.assert_allclose(cloud.points, points, atol=1e-6)
+    np.testing.assert_allclose(cloud.normals, normals, atol=1e-6)
+    np.testing.assert_array_equal(cloud.target, labels == 2)
+    assert not cloud.notes
+    part = cloud.only(cloud.target)
+    assert len(part) == int((labels == 2).sum())
+    assert set(part.labels) == {2}
+
+
+def test_ply_of_trimesh(tmp_path, ball):
+    _, points, _ = ball
+    trimesh.PointCloud(points).export(tmp_path / "a.ply")
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.ply").points, points, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ball.npy", "ball.npz", "ball.xyz"])
+def test_normals_are_estimated_and_face_the_camera(ball, name):
+    write, points, normals = ball
+    cloud = read_cloud(write(name))  # a camera at the origin
+    facing = np.einsum("nd,nd->n", normals, -points)
+    sign = np.where(facing < 0, -1.0, 1.0)[:, None]
+    cosine = np.einsum("nd,nd->n", cloud.normals, normals * sign)
+    sure = np.abs(facing) > 0.2 * np.linalg.norm(points, axis=1)  # not beside the silhouette
+    assert cosine[sure].min() > np.cos(np.radians(10.0))
+    assert any("estimated" in note for note in cloud.notes)
+
+
+def test_given_normals_are_turned_to_the_viewpoint(ball):
+    write, _, normals = ball
+    cloud = read_cloud(write("ball.npz", normals=-normals), viewpoint=[0.1, -0.2, 5.0])
+    up = normals[:, 2] > 0.1
+    np.testing.assert_allclose(cloud.normals[up], normals[up], atol=1e-6)
+    assert any("turned" in note for note in cloud.notes)
+
+
+def test_some_missing_normals_are_filled(ball):
+    write, _, normals = ball
+    holes = normals.copy()
+    holes[:7] = np.nan
+    cloud = read_cloud(write("ball.npz", normals=holes))
+    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(cloud.normals[7:], normals[7:], atol=1e-6)
+    assert any("7 of 2,000" in note for note in cloud.notes)
+
+
+def test_nan_and_zero_depth_are_dropped_and_told(ball):
+    write, points, _ = ball
+
+    def holes(p):
+        p[10:30] = np.nan
+        p[40:45] = 0.0
+        return p.reshape(40, 50, 3)
+
+    labels = np.arange(2000).reshape(40, 50) // 1000
+    cloud = read_cloud(write("ball.npz", holes, labels=labels), label=0)
+    kept = np.delete(np.arange(2000), [*range(10, 30), *range(40, 45)])
+    np.testing.assert_allclose(cloud.points, points[kept], atol=1e-6)
+    np.testing.assert_array_equal(cloud.target, kept < 1000)
+    assert any("dropped 20 of 2,000" in n for n in cloud.notes)
+    assert any("dropped 5 of 2,000" in n for n in cloud.notes)
+
+
+def test_mask_file(ball, tmp_path):
+    write, points, _ = ball
+    np.save(tmp_path / "mask.npy", points[:, 2] > CENTRE[2])
+    cloud = read_cloud(write(), tmp_path / "mask.npy")
+    np.testing.assert_array_equal(cloud.target, points[:, 2] > CENTRE[2])
+
+
+def test_scale(ball):
+    write, points, _ = ball
+    cloud = read_cloud(write("ball.npy", lambda p: 1000 * p), scale=0.001)
+    np.testing.assert_allclose(cloud.points, points, atol=1e-6)
+
+
+def fill(value):
+    return lambda p: np.full_like(p, value)
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "words"),
+    [
+        (fill(np.nan), {}, "all 2,000 points are NaN"),
+        (lambda p: p[:12], {}, "12 usable points; at least 50"),
+        (lambda p: 1000 * p, {}, "millimetres use --scale 0.001"),
+        (lambda p: p, {"scale": 0.001}, "in metres already: use --scale 1"),
+        (lambda p: p, {"scale": -1}, "scale -1 cannot be used"),
+        (lambda p: p - CENTRE, {}, "give --viewpoint"),
+        (lambda p: p, {"viewpoint": [0, 0]}, "x y z of the camera"),
+        (lambda p: p, {"label": 1}, "has no labels; give --mask"),
+        (lambda p: p[:, :2], {}, "shape (2000, 2)"),
+    ],
+)
+def test_refused(ball, change, options, words):
+    write, _, _ = ball
+    path = write("ball.npy", change)
+    with pytest.raises(CloudError, match=r"^.*$") as caught:
+        read_cloud(path, **options)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_mask_that_selects_nothing_names_its_labels(ball, tmp_path):
+    write, _, _ = ball
+    np.save(tmp_path / "mask.npy", np.repeat([0, 4], [500, 1500]))
+    with pytest.raises(CloudError, match=r"label 9 selects 0 points.*its labels are 0 \(500 points\), 4 \(1,500 "):
+        read_cloud(write(), tmp_path / "mask.npy", 9)
+    with pytest.raises(CloudError, match="give --label; its labels are 0"):
+        read_cloud(write(), tmp_path / "mask.npy")
+    np.save(tmp_path / "mask.npy", np.zeros(7, int))
+    with pytest.raises(CloudError, match="7 labels for a cloud of 2,000 points"):
+        read_cloud(write(), tmp_path / "mask.npy", 1)
+    np.save(tmp_path / "mask.npy", np.full(2000, 0.5))
+    with pytest.raises(CloudError, match="whole numbers"):
+        read_cloud(write(), tmp_path / "mask.npy", 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("a.pcd", b"x", "suffix '.pcd' is unknown"),
+        ("a.ply", b"", "0 bytes"),
+        ("a.ply", b"ply\nnonsense", "not a readable .ply cloud"),
+        ("a.npy", b"nonsense", "not a readable .npy cloud"),
+        ("a.npz", b"PK\x03\x04", "not a readable .npz cloud"),
+        ("a.xyz", b"one two three", "not a readable .xyz cloud"),
+    ],
+)
+def test_files_that_are_no_clouds(tmp_path, name, data, words):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(CloudError) as caught:
+        read_cloud(tmp_path / name)
+    assert words in str(caught.value)
+    with pytest.raises(CloudError, match="does not exist"):
+        read_cloud(tmp_path / "absent.npy")
