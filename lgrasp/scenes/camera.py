@@ -1,0 +1,70 @@
+"""Pinhole depth cameras: intrinsics, poses, where they stand around a table.
+
+Camera frame: x to the right, y down, z forward. The centre of the pixel in row i and column j is at (j, i) of the
+image. A depth is the z of what is seen [m], not the length of the ray.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lgrasp.dataset.exports.poses import canonical
+from lgrasp.scenes.params import CameraParams
+
+__all__ = ["Intrinsics", "intrinsics_of", "look_at", "place_cameras"]
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera: pixel (j, i) = (fx x / z + cx, fy y / z + cy) of a point x y z in the camera frame."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def points(self, depth: np.ndarray) -> np.ndarray:
+        """Points [m], shape (..., h, w, 3), in the camera frame, of depths [m], shape (..., h, w)."""
+        x = (np.arange(self.width) - self.cx) / self.fx
+        y = (np.arange(self.height)[:, None] - self.cy) / self.fy
+        return np.stack([x * depth, y * depth, depth], axis=-1)
+
+
+def intrinsics_of(params: CameraParams) -> Intrinsics:
+    """Square pixels, the optical axis through the middle of the image."""
+    f = 0.5 * params.width / np.tan(np.radians(0.5 * params.angle))
+    return Intrinsics(
+        params.width, params.height, float(f), float(f), 0.5 * (params.width - 1), 0.5 * (params.height - 1)
+    )
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Poses T_scene_camera of cameras that look at a point with the image's upper edge up, z of the scene.
+
+    Args:
+        eye: positions [m], shape (v, 3), not straight above or below the target.
+        target: [m], shape (3,).
+
+    Returns:
+        x y z [m] qw qx qy qz, shape (v, 7).
+    """
+    from scipy.spatial.transform import Rotation
+
+    forward = target - eye
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    R = np.stack([right, np.cross(forward, right), forward], axis=-1)
+    return np.hstack([eye, canonical(Rotation.from_matrix(R).as_quat(scalar_first=True))])
+
+
+def place_cameras(params: CameraParams, rng: np.random.Generator) -> np.ndarray:
+    """Poses T_scene_camera, shape (v, 7), of cameras evenly around the origin, from a random direction on."""
+    azimuth = 2.0 * np.pi * (rng.random() + np.arange(params.views) / params.views)
+    elevation = np.radians(rng.uniform(*params.elevation, params.views))
+    distance = rng.uniform(*params.distance, params.views)
+    level = np.cos(elevation)
+    direction = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    return look_at(distance[:, None] * direction, np.zeros(3))

@@ -1,0 +1,64 @@
+"""Parameters of scenes; all of them decide what a scene holds, and so enter its key."""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+__all__ = ["CameraParams", "DropParams", "SceneParams"]
+
+_Length = Annotated[float, Field(gt=0.0, le=5.0)]
+
+
+class CameraParams(BaseModel):
+    """Depth cameras around the table; lengths in metres, angles in degrees."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    views: int = Field(3, ge=1, le=16, description="Cameras, evenly around the table from a random direction on.")
+    width: int = Field(320, ge=16, le=4096, description="Pixels.")
+    height: int = Field(240, ge=16, le=4096, description="Pixels.")
+    angle: float = Field(55.0, gt=5.0, le=150.0, description="Field of view across the width.")
+    distance: tuple[_Length, _Length] = Field((0.7, 0.9), description="Range from the middle of the table.")
+    elevation: tuple[float, float] = Field((35.0, 60.0), description="Range above the horizon.")
+    noise: float = Field(0.001, ge=0.0, le=0.1, description="Standard deviation of a depth, near the camera.")
+    noise_square: float = Field(0.0015, ge=0.0, le=0.1, description="More of it, times the depth squared [1/m].")
+    calibration: float = Field(0.01, ge=0.0, le=0.1, description="Each view is displaced by so much, in any direction.")
+    window: int = Field(3, ge=1, le=15, description="Normals: plane through the pixels at most so far away.")
+    voxel: float = Field(0.003, ge=0.0, le=0.1, description="Edge of the cubes of which one point is kept; 0: all.")
+
+    @model_validator(mode="after")
+    def _ranges(self) -> "CameraParams":
+        for name, (low, high) in (("distance", self.distance), ("elevation", self.elevation)):
+            if not low <= high:
+                raise ValueError(f"{name} [{low:g}, {high:g}] is empty")
+        if not (self.elevation[0] >= 5.0 and self.elevation[1] <= 89.0):
+            raise ValueError(f"elevation {list(self.elevation)} must lie within 5 to 89 degrees")
+        return self
+
+
+class DropParams(BaseModel):
+    """How objects come to lie on the table; lengths in metres, times in seconds."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    radius: _Length = Field(0.2, description="Objects are dropped within this distance of the table's middle.")
+    gap: float = Field(0.01, ge=0.0, le=1.0, description="Least distance of dropped objects to all others at first.")
+    friction: float = Field(0.6, gt=0.0, le=5.0)
+    timestep: float = Field(0.002, gt=0.0, le=0.01)
+    longest: float = Field(6.0, gt=0.0, le=60.0, description="Objects that still move after this are dropped anew.")
+    tries: int = Field(10, ge=1, le=1000, description="Times that objects are dropped until they stay on the table.")
+
+
+class SceneParams(BaseModel):
+    """What decides a scene, beside the objects, the grasps and the seed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    objects: int = Field(5, ge=1, le=32, description="Objects on the table.")
+    table: _Length = Field(0.8, description="Side of the square table [m].")
+    grasps: int = Field(200, ge=0, le=100_000, description="Grasps of each object that are brought into the scene.")
+    tolerance: float = Field(
+        0.001, ge=0.0, le=0.01, description="How deep a hand may sink into table and other objects [m]."
+    )
+    camera: CameraParams = Field(default_factory=lambda: CameraParams.model_validate({}))
+    drop: DropParams = Field(default_factory=lambda: DropParams.model_validate({}))

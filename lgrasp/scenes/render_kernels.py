@@ -1,0 +1,85 @@
+"""Kernels of the depth camera: rays against a mesh, normals from a depth image."""
+
+import warp as wp
+
+from lgrasp.device.runtime import KERNEL_OPTIONS
+
+__all__ = ["cast_rays", "fit_normals"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+
+@wp.kernel
+def cast_rays(
+    mesh: wp.uint64,
+    face_label: wp.array(dtype=wp.int32),
+    focal: wp.vec2,
+    centre: wp.vec2,
+    far: wp.float32,
+    camera: wp.array(dtype=wp.transform),
+    depth_out: wp.array3d(dtype=wp.float32),
+    label_out: wp.array3d(dtype=wp.int32),
+):
+    """One thread per (view, row, column): depth [m] and label of the first face hit; 0 and -1 where there is none."""
+    v, i, j = wp.tid()
+    way = wp.vec3((float(j) - centre[0]) / focal[0], (float(i) - centre[1]) / focal[1], 1.0)
+    length = wp.length(way)
+    T = camera[v]
+    direction = wp.transform_vector(T, way / length)
+    hit = wp.mesh_query_ray(mesh, wp.transform_get_translation(T), direction, far * length)
+    if hit.result:
+        depth_out[v, i, j] = hit.t / length
+        label_out[v, i, j] = face_label[hit.face]
+    else:
+        depth_out[v, i, j] = 0.0
+        label_out[v, i, j] = -1
+
+
+@wp.kernel
+def fit_normals(
+    point: wp.array3d(dtype=wp.vec3),
+    window: wp.int32,
+    step: wp.float32,
+    normal_out: wp.array3d(dtype=wp.vec3),
+):
+    """One thread per (view, row, column): normal of the plane through the pixels around, turned to the camera.
+
+    Of the window only points count whose depth differs by less than ``step`` times the depth per pixel in between. Zero
+    where fewer than six do, or where they lie on a line.
+    """
+    v, i, j = wp.tid()
+    p = point[v, i, j]
+    normal_out[v, i, j] = wp.vec3(0.0)
+    if p[2] <= 0.0:
+        return
+    rows = point.shape[1]
+    columns = point.shape[2]
+    count = float(0.0)
+    total = wp.vec3(0.0)
+    spread = wp.mat33(0.0)
+    for a in range(wp.max(i - window, 0), wp.min(i + window + 1, rows)):
+        for b in range(wp.max(j - window, 0), wp.min(j + window + 1, columns)):
+            near = point[v, a, b] - p
+            apart = float(wp.max(wp.abs(a - i), wp.abs(b - j)))
+            if point[v, a, b][2] > 0.0 and wp.abs(near[2]) <= step * p[2] * wp.max(apart, 1.0):
+                count = count + 1.0
+                total = total + near
+                spread = spread + wp.outer(near, near)
+    if count < 6.0:
+        return
+    spread = spread - wp.outer(total, total) / count
+    largest = wp.trace(spread)
+    if largest <= 0.0:
+        return
+    axes, sizes = wp.eig3(spread / largest)
+    least = int(0)
+    for k in range(1, 3):
+        if sizes[k] < sizes[least]:
+            least = k
+    middle = 1.0 - sizes[least] - wp.max(sizes)
+    if middle < 1.0e-3:
+        return
+    n = wp.normalize(wp.vec3(axes[0, least], axes[1, least], axes[2, least]))
+    if wp.dot(n, p) > 0.0:
+        n = -n
+    normal_out[v, i, j] = n
