@@ -13,7 +13,7 @@ from lgrasp.physics.scene import HandSolids
 from lgrasp.physics.solid import Solid
 from lgrasp.physics.urdf import bare_urdf, joint_ends
 
-__all__ = ["OBJECT", "assemble"]
+__all__ = ["OBJECT", "add_hull", "assemble"]
 
 OBJECT = "lgrasp object"
 """Begins the name of every object's body; its number follows."""
@@ -81,7 +81,7 @@ def _add_pieces(mujoco: Any, spec: Any, hand: HandSolids) -> None:
 
 def _add_piece(mujoco: Any, spec: Any, body: Any, piece: Piece, name: str) -> None:
     if len(piece.planes):
-        _add_hull(mujoco, spec, body, _inflated(piece), name)
+        add_hull(mujoco, spec, body, _inflated(piece), name)
     elif len(piece.vertices) == 1:
         size = [piece.radius, 0, 0]
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=piece.vertices[0])
@@ -101,10 +101,11 @@ def _inflated(piece: Piece) -> np.ndarray:
     return piece.vertices + piece.radius * normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-9)[:, None]
 
 
-def _add_hull(mujoco: Any, spec: Any, body: Any, vertices: np.ndarray, name: str) -> None:
+def add_hull(mujoco: Any, spec: Any, body: Any, vertices: np.ndarray, name: str) -> None:
+    """Give a body of a MjSpec the convex hull of vertices (V, 3) [m] to collide with; a sliver is left out."""
     try:
         ConvexHull(vertices)
-    except QhullError:  # a sliver
+    except QhullError:
         return
     mesh = spec.add_mesh(name=name, uservert=np.asarray(vertices, float).ravel())
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
@@ -129,7 +130,7 @@ def _add_object(mujoco: Any, spec: Any, name: str, solid: Solid, load: Load) -> 
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint()
     for number, vertices in enumerate(solid.pieces):
-        _add_hull(mujoco, spec, body, vertices, f"{name} {number}")
+        add_hull(mujoco, spec, body, vertices, f"{name} {number}")
     inertia = solid.inertia * (load.mass / solid.volume)
     body.mass = load.mass
     body.ipos = solid.center

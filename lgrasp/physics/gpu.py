@@ -137,7 +137,8 @@ class WorldTrials:
                 hands.contacts = self._touching_at_rest(hands, a)
             hands.state["start"][:n], hands.state["end"][:n], hands.state["step"][:] = a, b, 0
             self._sim.restore(hands.state)
-            for _ in range(max(1, round(self._protocol.phase / CHUNK))):
+            seconds = self._protocol.phase + (self._protocol.rest if b is stops[-1] else 0.0)
+            for _ in range(max(1, round(seconds / CHUNK))):
                 self._sim.advance()
                 hands.state = self._sim.state()
                 hands.worst = np.maximum(hands.worst, self._sim.moved(hands.state, hands.home)[:n])

@@ -69,6 +69,7 @@ class Protocol(BaseModel):
     settle: float = Field(
         default=0.3, gt=0, description="Given to the hand at the grasp before its contacts are counted [s]."
     )
+    rest: float = Field(default=0.0, ge=0, description="Given to the closed hand before the pull [s].")
     hold: float = Field(default=2.0, gt=0, description="How long each direction is pulled [s].")
     success: Literal["stays", "touches"] = Field(
         default="stays",
@@ -111,7 +112,8 @@ class Protocol(BaseModel):
 def _protocols() -> dict[str, Protocol]:
     gravity = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
     # 100 steps of 1/60 s, each cut in four
-    sequence = {"start": "grasp", "success": "touches", "hold": 100 / 60, "timestep": 1 / 240, "most_rotation": 180.0}
+    sequence = {"start": "grasp", "success": "touches", "rest": 0.6, "hold": 100 / 60, "timestep": 1 / 240}
+    sequence |= {"most_rotation": 180.0}
     made = (
         Protocol(name="fc"),
         Protocol(name="gravity6", friction=0.6, **gravity),

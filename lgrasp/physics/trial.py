@@ -84,12 +84,13 @@ class Trial:
         """From the start to the squeeze, each target approached evenly; ends early when all is lost."""
         stops = [self._model.controls(targets[i].astype(float)) for targets in self._protocol.stops(rows)]
         contacts, worst, depth = 0, np.zeros((len(self._model.object_body), 2)), look.object_depth
-        steps = max(1, round(self._protocol.phase / self._m.opt.timestep))
+        ramp = steps = max(1, round(self._protocol.phase / self._m.opt.timestep))
         for a, b in pairwise(stops):
             if b is stops[-1]:  # the targets are q, the squeeze is next
                 contacts = self._touching_at_rest()
+                steps += round(self._protocol.rest / self._m.opt.timestep)
             for step in range(steps):
-                self._data.ctrl[:] = a + (b - a) * ((step + 1) / steps)
+                self._data.ctrl[:] = a + (b - a) * min((step + 1) / ramp, 1.0)
                 self._step(1)
                 if (step + 1) % self._chunk == 0 or step + 1 == steps:
                     worst = np.maximum(worst, self._moved())

@@ -4,10 +4,12 @@ import json
 import signal
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from reference.jaws import Jaws
+from reference.twins import twin_rows, twin_shard
 
 from lgrasp.dataset import read_shard, validate_shard, write_shard
 
@@ -40,6 +42,37 @@ def test_adds_columns_and_keeps_the_rest(cli, grasps, tmp_path):
         assert (protocol["name"], protocol["timestep"], protocol["objects"][0]["mass"]) == ("fc", 0.004, 0.1)
         assert after.header.config == before.header.config
         assert after.statistics["fc_held"] == sum(holds)
+
+
+def test_several_objects(cli, tmp_path):
+    """A line for every set of objects held, in the order of their slots; verdicts of each object beside its row."""
+    rows = twin_rows(count=3)
+    pose, index, links = rows.object_pose.copy(), rows.object_index.copy(), rows.contact_links.copy()
+    pose[1, 1, 2] += 0.3  # in the air
+    absent = {"object_pose": pose, "object_index": index, "contact_links": links}
+    absent |= {n: getattr(rows, n).copy() for n in ("contact_points", "contact_normals", "contact_forces")}
+    for name, values in absent.items():
+        values[2, 1] = -1 if name in ("object_index", "contact_links") else np.nan
+    path = tmp_path / "twins" / "a.h5"
+    write_shard(path, twin_shard(replace(rows, **absent)))
+    result = cli("validate", path.parent, "--protocol", "seq6", "--json", tmp_path / "report.json")
+    assert result.code == 0, result
+    lines = [line.split() for line in result.out.splitlines()[:3]]
+    assert [line[1:4] for line in lines] == [
+        ["object", "grasps", "hold"],
+        ["one", "1", "100.0%"],
+        ["one+two", "2", "50.0%"],
+    ]
+    assert lines[0][4] == "stay"
+    one, both = json.loads((tmp_path / "report.json").read_text())["results"]
+    assert (one["objects"], both["objects"], both["stay"]) == (["one"], ["one", "two"], 1)
+    assert both["mass"] == pytest.approx(2 * one["mass"])
+    out = tmp_path / "twins-seq6" / "a.h5"
+    assert not validate_shard(out)
+    found = read_shard(out).grasps
+    assert found.physics["seq6_object_touches"].tolist() == [[1, 1], [1, 0], [1, -1]]
+    objects = json.loads(found.physics_protocols["seq6_holds"])["objects"]
+    assert [entry["name"] for entry in objects] == ["one", "two"]
 
 
 def test_goes_on_where_it_was(cli, grasps, tmp_path):

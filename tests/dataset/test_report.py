@@ -187,6 +187,7 @@ def test_physics(make, make_shard, tmp_path):
     slip = np.array([0.5, 0.0, np.nan] * 10, "f4")
     physics = {"fc_holds": ways.min(1) == 1, "fc_directions": ways, "fc_slip": slip, "mine": slip}
     physics |= {"drop_holds": np.where(np.arange(30) < 20, 1.0, np.nan).astype("f4")}
+    physics |= {"fc_slow_holds": np.ones(30, bool), "fc_slow_slip": np.ones(30, "f4")}  # fc is not fc_slow
     texts = dict.fromkeys(physics, protocol) | {"drop_holds": "from <1 m>"}
     write_shard(
         tmp_path / "a.h5", replace(shard, grasps=replace(shard.grasps, physics=physics, physics_protocols=texts))

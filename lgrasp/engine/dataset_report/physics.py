@@ -59,18 +59,21 @@ class Verdicts:
 def add_verdicts(into: dict[str, Verdicts], columns: Mapping[str, np.ndarray], texts: Mapping[str, str]) -> None:
     """Count the columns of ``physics/`` of some rows, by protocol; what belongs to no ``P_holds`` is passed over.
 
+    Where one protocol's name begins another's, a column is of the longer one.
+
     Args:
         into: Counts so far, by protocol.
         columns: Verdicts [N, ...] by name.
         texts: Protocol of each.
     """
-    for name in [column.removesuffix(_HOLDS) for column in columns if column.endswith(_HOLDS)]:
-        verdicts = into.setdefault(name, Verdicts())
-        for column, values in columns.items():
-            if column.startswith(f"{name}_"):
-                verdicts.add(column.removeprefix(name), values)
-        if texts[name + _HOLDS] not in verdicts.protocols:
-            verdicts.protocols.append(texts[name + _HOLDS])
+    names = [column.removesuffix(_HOLDS) for column in columns if column.endswith(_HOLDS)]
+    for column, values in columns.items():
+        name = max((name for name in names if column.startswith(f"{name}_")), key=len, default=None)
+        if name is not None:
+            into.setdefault(name, Verdicts()).add(column.removeprefix(name), values)
+    for name in names:
+        if texts[name + _HOLDS] not in into[name].protocols:
+            into[name].protocols.append(texts[name + _HOLDS])
 
 
 def _parsed(text: str) -> Any:
