@@ -14,7 +14,7 @@ from lgrasp.engine.stages import STAGES
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, select_poses
 from lgrasp.stages.context import Context
 
-__all__ = ["BatchResult", "finish_batch", "run_batch", "run_stages"]
+__all__ = ["BatchResult", "finish_batch", "run_batch", "run_stage", "run_stages"]
 
 
 @dataclass
@@ -33,11 +33,12 @@ def run_stages(
     meter = meter or Meter(context.device)
     table: Any = (first, count)
     for stage in pipeline.order[: pipeline.order.index(last) + 1]:
-        table = _run(stage, table, pipeline, context, meter)
+        table = run_stage(stage, table, pipeline, context, meter)
     return table
 
 
-def _run(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter, salt: int = 0) -> Any:
+def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter, salt: int = 0) -> Any:
+    """The table that one stage makes of another."""
     params = fit_params(stage, pipeline.params(stage), context.hand.model)
     options = {"realised": _realised(pipeline), "salt": salt} if stage == "search" else {}
     start = meter.now()
@@ -55,7 +56,7 @@ def finish_batch(pipeline: Pipeline, context: Context, sets: ContactSets, meter:
     """What a batch gives whose stages up to search have been run."""
     table: Any = sets
     for stage in pipeline.order[pipeline.order.index("search") + 1 :]:
-        table = _run(stage, table, pipeline, context, meter)
+        table = run_stage(stage, table, pipeline, context, meter)
     return BatchResult(table, meter.counts, meter.seconds)
 
 
@@ -85,7 +86,7 @@ def run_batch(pipeline: Pipeline, context: Context, first: int, count: int, bank
     for salt in range(passes):
         result: Any = table
         for stage in pipeline.order[at:]:
-            result = _run(stage, result, pipeline, context, meter, salt)
+            result = run_stage(stage, result, pipeline, context, meter, salt)
         parts.append(result)
         if salt == 0 and passes > 1:
             table = _richest(table, result, context)

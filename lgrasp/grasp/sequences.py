@@ -47,7 +47,7 @@ class SequenceTable:
     @property
     def used(self) -> np.ndarray:
         """Joints that hold an object, (N, K) bool."""
-        return self.free.any(1)
+        return np.asarray(self.free.any(1))
 
     def posture(self, tree: Tree) -> np.ndarray:
         """Joint positions now, (N, K) f32: those of the last step, or the open posture."""
@@ -116,10 +116,12 @@ def extend(
 
 def take_sequences(table: SequenceTable, rows: np.ndarray, **changes: Any) -> SequenceTable:
     """Some rows, by index, after ``changes`` of the table."""
-    table = replace(table, **changes)
-    own = {f.name: getattr(table, f.name)[rows] for f in fields(table) if f.name not in _FAMILIES}
+    if changes:
+        table = replace(table, **changes)
+    own: dict[str, Any] = {f.name: getattr(table, f.name)[rows] for f in fields(table) if f.name not in _FAMILIES}
     families = {f: {name: values[rows] for name, values in getattr(table, f).items()} for f in _FAMILIES}
-    return replace(table, **own, **families)
+    own |= families
+    return replace(table, **own)
 
 
 def join_sequences(tables: list[SequenceTable]) -> SequenceTable:

@@ -1,12 +1,13 @@
 """One round: sequences begun together, object by object."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from lgrasp.engine.batch import run_stages
+from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.meter import Meter
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.sequence.inputs import SequenceInputs
@@ -16,14 +17,14 @@ from lgrasp.grasp.sequences import SequenceTable, empty_sequences, join_sequence
 from lgrasp.grasp.tables import GraspTable, join_grasps, sort_grasps
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
-from lgrasp.stages.sequence.policy import choose_spaces
+from lgrasp.stages.sequence.optimised_sets import optimised_sets
+from lgrasp.stages.sequence.policy import space_orders
 from lgrasp.stages.sequence.stage import go_on
 from lgrasp.stages.sequence.stage import run as grow
 
 __all__ = ["Round", "Verdicts", "run_round"]
 
 _CPU_CHUNK = 1024  # candidates of a thread at a time
-_FIRST_WAVE = 64  # candidates that every sequence is given
 _CHOICE = 4  # grasps among which policy lookahead chooses, for each that goes on
 
 Verdicts = Callable[[list[SequenceTable]], dict[str, np.ndarray]]
@@ -39,10 +40,12 @@ class Round:
     seconds: dict[str, float] = field(default_factory=dict)
     spaces: list[dict[str, dict[str, dict[str, int]]]] = field(default_factory=list)  # step, space, stage: survivors
 
-    def add(self, space: str, counts: dict[str, dict[str, int]]) -> None:
-        """Count survivors of the step that is being made."""
+    def add(self, space: str, counts: dict[str, dict[str, int]], seconds: Mapping[str, float] | None = None) -> None:
+        """Count survivors of the step that is being made, and thread-seconds."""
         add_counts(self.counts, counts)
         add_counts(self.spaces[-1].setdefault(space, {}), counts)
+        for stage, more in (seconds or {}).items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + more
 
 
 def run_round(
@@ -85,18 +88,15 @@ def _step(
 ) -> SequenceTable:
     """The rows that are one object longer, by row that they go on from."""
     params, step = pipeline.params("sequence"), rows.steps
-    row, space = choose_spaces(rows, inputs.spaces, params.policy, len(inputs.objects) - step - 1, seed)
-    parts: list[SequenceTable] = []
-    for number in np.unique(space):
-        chosen = row[space == number]
-        before = take_sequences(rows, chosen)
-        seeds = [stage_seed(seed, step, inputs.spaces[number].name, wave) for wave in range(len(_waves(params.tries)))]
-        grasps = _grasps(pipeline, inputs, before, int(number), seeds, pool, result)
-        context = _context(inputs, before, int(number), params.tries, seeds[0])
-        longer, counts = grow((before, int(number), grasps), params, context)
-        result.add(inputs.spaces[number].name, {"sequence": counts})
-        candidate = chosen[longer.parent] * params.tries + longer.candidate % params.tries
-        parts.append(replace(longer, parent=chosen[longer.parent], candidate=candidate))
+    order = space_orders(rows, inputs.spaces, params.policy, len(inputs.objects) - step - 1, seed)
+    search = _Search(pipeline, inputs, rows, seed, pool, result)
+    if params.method != "field":
+        search.optimise(order[:, 0])
+    for wave in range(params.waves if params.method == "field" else 0):
+        space = order[np.arange(len(rows)), wave % np.maximum((order >= 0).sum(1), 1)]
+        for number in np.unique(space[space >= 0]):
+            search.go_on(np.flatnonzero((space == number) & search.wanting), int(number), wave)
+    parts = [search.longer(number) for number in search.tried]
     if not parts:
         return take_sequences(rows, np.zeros(0, int))
     table = join_sequences(parts)
@@ -104,12 +104,100 @@ def _step(
     return take_sequences(table, go_on(table.parent, table.metrics["room"], params))
 
 
-def _waves(tries: int) -> list[int]:
-    """Candidates of each sequence that are tried one after another, until some grasp is found."""
-    waves = [min(_FIRST_WAVE, tries)]
-    while sum(waves) < tries:
-        waves.append(min(3 * sum(waves), tries - sum(waves)))
-    return waves
+class _Search:
+    """Grasps of the next object for some sequences, wave by wave of candidates, until each has enough."""
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        inputs: SequenceInputs,
+        rows: SequenceTable,
+        seed: int,
+        pool: ThreadPoolExecutor,
+        result: Round,
+    ) -> None:
+        self._pipeline, self._inputs, self._rows, self._seed = pipeline, inputs, rows, seed
+        self._pool, self._result = pool, result
+        self._params = pipeline.params("sequence")
+        self._have = np.zeros(len(rows), int)
+        self._found: dict[int, list[GraspTable]] = {}
+        self.tried: dict[int, np.ndarray] = {}
+        """Rows that were gone on from with each space, (N,) bool."""
+
+    @property
+    def wanting(self) -> np.ndarray:
+        """Rows that have not enough grasps yet, (N,) bool."""
+        return self._have < self._params.branch * (_CHOICE if self._params.policy == "lookahead" else 1)
+
+    def go_on(self, chosen: np.ndarray, number: int, wave: int) -> None:
+        """Give some rows a wave of candidates with a space."""
+        if not len(chosen):
+            return
+        name, size = self._inputs.spaces[number].name, self._params.wave
+        seed = stage_seed(self._seed, self._rows.steps, name, wave)
+        context = _context(self._inputs, take_sequences(self._rows, chosen), number, size, seed)
+        grasps, meters = _from_field(self._pipeline, context, len(chosen) * size, self._pool)
+        self._take(grasps, meters, chosen, number, size, wave * size)
+
+    def optimise(self, space: np.ndarray) -> None:
+        """One grasp of each row with its space, by the optimiser."""
+        from lgrasp.stages.sequence.anneal_optimise import optimise  # torch
+
+        inputs, rows, params = self._inputs, self._rows, self._params
+        able = np.flatnonzero(space >= 0)
+        if not len(able):
+            return
+        joints = np.array([own.joints for own in inputs.spaces])
+        free = joints[space[able]] & ~rows.used[able]
+        start = time.perf_counter()
+        grasps = optimise(
+            inputs.hand,
+            [view.hand.model for view in inputs.views],
+            inputs.spaces,
+            [obj.model for obj in inputs.objects[: rows.steps + 1]],
+            space=space[able],
+            q=rows.posture(inputs.hand.tree)[able],
+            free=free,
+            held=rows.pose[able],
+            seed=np.array([stage_seed(self._seed, rows.steps, params.method, int(i)) for i in able]),
+            params=params.optimiser,
+            method=params.method,
+            device=inputs.device.alias,
+        )
+        spent = self._result.seconds
+        spent[params.method] = spent.get(params.method, 0.0) + time.perf_counter() - start
+        for number in np.unique(space[able]):
+            own = np.flatnonzero(space[able] == number)
+            part = replace(grasps, **{f.name: getattr(grasps, f.name)[own] for f in fields(grasps)})
+            context = _context(inputs, take_sequences(rows, able[own]), int(number), 1, self._seed)
+            meter = Meter(context.device)
+            sets = optimised_sets(part, free[own], context)
+            table = run_stage("filter", sets, self._pipeline, context, meter)
+            self._take(table, [meter], able[own], int(number), 1, 0)
+
+    def _take(
+        self, grasps: GraspTable, meters: list[Meter], chosen: np.ndarray, number: int, size: int, before: int
+    ) -> None:
+        """Keep grasps by candidates that go on from ``chosen`` rows, ``size`` each, after ``before`` others."""
+        for meter in meters:
+            self._result.add(self._inputs.spaces[number].name, meter.counts, meter.seconds)
+        row = chosen[grasps.index // size]
+        candidate = row * self._params.tries + before + grasps.index % size
+        self._found.setdefault(number, []).append(replace(grasps, index=candidate))
+        self.tried.setdefault(number, np.zeros(len(self._rows), bool))[chosen] = True
+        self._have += np.bincount(row, minlength=len(self._rows))
+
+    def longer(self, number: int) -> SequenceTable:
+        """The sequences that go on with a space; their candidates are counted through all rows."""
+        tries, rows = self._params.tries, np.flatnonzero(self.tried[number])
+        grasps = sort_grasps(join_grasps(self._found[number]))
+        place = np.searchsorted(rows, grasps.index // tries) * tries + grasps.index % tries
+        before = take_sequences(self._rows, rows)
+        context = _context(self._inputs, before, number, tries, self._seed)
+        table, counts = grow((before, number, replace(grasps, index=place)), self._params, context)
+        self._result.add(self._inputs.spaces[number].name, {"sequence": counts})
+        parent = rows[table.parent]
+        return replace(table, parent=parent, candidate=parent * tries + table.candidate % tries)
 
 
 def _context(inputs: SequenceInputs, before: SequenceTable, number: int, tries: int, seed: int) -> Context:
@@ -119,40 +207,6 @@ def _context(inputs: SequenceInputs, before: SequenceTable, number: int, tries: 
     holding = hold(view.hand, posture, frozen, inputs.objects[:step], before.pose, tries=tries)
     alias = inputs.device.alias
     return Context(view.hand, inputs.objects[step], view.field, alias, seed, 0, space=space, holding=holding)
-
-
-def _grasps(
-    pipeline: Pipeline,
-    inputs: SequenceInputs,
-    before: SequenceTable,
-    number: int,
-    seeds: list[int],
-    pool: ThreadPoolExecutor,
-    result: Round,
-) -> GraspTable:
-    """Grasps of the next object with an opposition space; candidates are counted through ``before``, ``tries`` a row.
-
-    Rows that have as many grasps as they may go on with are not tried any further.
-    """
-    params, name = pipeline.params("sequence"), inputs.spaces[number].name
-    enough = params.branch * (_CHOICE if params.policy == "lookahead" else 1)
-    found, have, done = [], np.zeros(len(before), int), 0
-    for tries, seed in zip(_waves(params.tries), seeds, strict=True):
-        pending = np.flatnonzero(have < enough)
-        if not len(pending):
-            break
-        context = _context(inputs, take_sequences(before, pending), number, tries, seed)
-        grasps, meters = _from_field(pipeline, context, len(pending) * tries, pool)
-        for meter in meters:
-            result.add(name, meter.counts)
-            for stage, seconds in meter.seconds.items():
-                result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
-        row = pending[grasps.index // tries]
-        found.append(replace(grasps, index=row * params.tries + done + grasps.index % tries))
-        have += np.bincount(row, minlength=len(before))
-        done += tries
-    whole = join_grasps(found)
-    return sort_grasps(whole)
 
 
 def _from_field(

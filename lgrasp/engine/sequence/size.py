@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,11 +54,7 @@ def object_scales(meshes: Sequence[Path], size: Size, seed: int, params: ObjectP
     drawn: dict[Path, float] = {}
     for path in meshes:
         if path not in drawn:
-            drawn[path] = float(rng.uniform(*size)) / _longest_side(path, params)
+            any_size = params.model_copy(update={"min_extent": 0.0, "max_extent": math.inf})
+            side = float(np.ptp(load_mesh(path, params=any_size).vertices, axis=0).max())
+            drawn[path] = float(rng.uniform(*size)) / side
     return tuple(drawn[path] for path in meshes)
-
-
-@lru_cache(maxsize=4096)
-def _longest_side(path: Path, params: ObjectParams) -> float:
-    any_size = params.model_copy(update={"min_extent": 0.0, "max_extent": math.inf})
-    return float(np.ptp(load_mesh(path, params=any_size).vertices, axis=0).max())

@@ -2,7 +2,9 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from lgrasp.stages.sequence.anneal_params import OptimiserParams
 
 __all__ = ["SequenceParams"]
 
@@ -19,7 +21,22 @@ class SequenceParams(BaseModel):
         "uniform",
         description="Opposition space of a step: any that is left; or those, and grasps, that leave most for later.",
     )
-    width: int = Field(256, ge=1, le=65_536, description="Sequences begun in a round.")
-    tries: int = Field(256, ge=1, le=65_536, description="Candidates that go on from a sequence in each step (field).")
+    width: int = Field(320, ge=1, le=65_536, description="Sequences begun in a round.")
+    wave: int = Field(
+        128, ge=1, le=65_536, description="Candidates tried with one space before the next is tried (field)."
+    )
+    waves: int = Field(8, ge=1, le=256, description="Waves of a step before a sequence is given up (field).")
     branch: int = Field(1, ge=1, le=1024, description="Most sequences that go on from one.")
+    optimiser: OptimiserParams = Field(OptimiserParams(), description="Numbers of the methods anneal and mala.")
     rounds: int = Field(64, ge=1, le=65_536, description="Rounds per width of sequences asked, before giving up.")
+
+    @property
+    def tries(self) -> int:
+        """Most candidates that go on from a sequence in a step."""
+        return self.wave * self.waves
+
+    @model_validator(mode="after")
+    def _numbers_fit(self) -> "SequenceParams":
+        if self.width * self.tries > 2**24:
+            raise ValueError(f"width * wave * waves = {self.width * self.tries}, at most 2^24 candidates have numbers")
+        return self
