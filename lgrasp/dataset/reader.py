@@ -17,7 +17,16 @@ from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 from lgrasp.dataset.structure import expand, format_problem, structure_problems
 from lgrasp.errors import ShardError
 
-__all__ = ["ShardReader", "iter_grasps", "open_hdf5", "pose_matrix", "read_shard", "reading"]
+__all__ = [
+    "ShardReader",
+    "iter_grasps",
+    "open_hdf5",
+    "pose_matrix",
+    "read_hand",
+    "read_object",
+    "read_shard",
+    "reading",
+]
 
 
 @contextmanager
@@ -156,35 +165,14 @@ class ShardReader:
     def hand(self) -> HandRecord:
         """The hand, with its mesh files."""
         with reading(self.path):
-            group = self._file["hand"]
-            blobs = [group["meshes"][name] for name in sorted(group.get("meshes", ()), key=lambda n: (len(n), n))]
-            return HandRecord(
-                name=self._file.attrs["hand"],
-                base_link=group.attrs["base_link"],
-                urdf=group["urdf"].asstr()[()],
-                joint_names=tuple(group["joint_names"].asstr()[()]),
-                joint_lower=group["joint_lower"][()],
-                joint_upper=group["joint_upper"][()],
-                link_names=tuple(group["link_names"].asstr()[()]),
-                sha256=self._file.attrs["hand_sha256"],
-                meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
-            )
+            return read_hand(self._file)
 
     def object(self, object_id: str) -> ObjectRecord:
         """One object with its mesh."""
         with reading(self.path):
             if object_id not in self.object_ids:
                 raise ShardError(f"{self.path}: no object {object_id!r}; it has {', '.join(self.object_ids)}")
-            group = self._file["objects"][object_id]
-            return ObjectRecord(
-                id=object_id,
-                name=group.attrs["name"],
-                scale=float(group.attrs["scale"]),
-                sha256=group.attrs["sha256"],
-                watertight=bool(group.attrs["watertight"]),
-                vertices=group["vertices"][()],
-                faces=group["faces"][()],
-            )
+            return read_object(self._file, object_id)
 
     def objects(self) -> tuple[ObjectRecord, ...]:
         """All objects, sorted by id."""
@@ -200,6 +188,37 @@ class ShardReader:
     def _dataset(self, name: str) -> h5py.Dataset:
         with reading(self.path):
             return self._file[GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"]
+
+
+def read_hand(file: h5py.File) -> HandRecord:
+    """The hand of an open file, with its mesh files."""
+    group = file["hand"]
+    blobs = [group["meshes"][name] for name in sorted(group.get("meshes", ()), key=lambda n: (len(n), n))]
+    return HandRecord(
+        name=file.attrs["hand"],
+        base_link=group.attrs["base_link"],
+        urdf=group["urdf"].asstr()[()],
+        joint_names=tuple(group["joint_names"].asstr()[()]),
+        joint_lower=group["joint_lower"][()],
+        joint_upper=group["joint_upper"][()],
+        link_names=tuple(group["link_names"].asstr()[()]),
+        sha256=file.attrs["hand_sha256"],
+        meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
+    )
+
+
+def read_object(file: h5py.File, object_id: str) -> ObjectRecord:
+    """One object of an open file, with its mesh."""
+    group = file["objects"][object_id]
+    return ObjectRecord(
+        id=object_id,
+        name=group.attrs["name"],
+        scale=float(group.attrs["scale"]),
+        sha256=group.attrs["sha256"],
+        watertight=bool(group.attrs["watertight"]),
+        vertices=group["vertices"][()],
+        faces=group["faces"][()],
+    )
 
 
 def read_shard(path: str | os.PathLike[str]) -> Shard:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 
@@ -19,7 +20,7 @@ from lgrasp.dataset.schema import (
     DatasetSpec,
 )
 
-__all__ = ["expand", "format_problem", "structure_problems", "text_sha256"]
+__all__ = ["expand", "format_problem", "schema_problems", "structure_problems", "text_sha256"]
 
 
 def format_problem(file: h5py.File) -> str | None:
@@ -40,17 +41,24 @@ def structure_problems(file: h5py.File) -> list[str]:
     problems: list[str] = []
     if not expand(file, "objects/*"):
         problems.append("objects: no object")
-    dims: dict[str, int] = {}
     sequences = SEQUENCE_DATASETS if any(spec.path in file for spec in SEQUENCE_DATASETS) else ()
-    for spec in (*DATASETS, *sequences):
+    problems += schema_problems(file, (*DATASETS, *sequences), ATTRIBUTES)
+    if "statistics" not in file:
+        problems.append("statistics: missing group")
+    return problems
+
+
+def schema_problems(file: h5py.File, datasets: Sequence[DatasetSpec], attributes: Sequence[AttributeSpec]) -> list[str]:
+    """Differences between a file's datasets and attributes and those of a format, one line each."""
+    problems: list[str] = []
+    dims: dict[str, int] = {}
+    for spec in datasets:
         for path in expand(file, spec.path):
             problems += _dataset_problems(file, path, spec, dims)
-    for attribute in ATTRIBUTES:
+    for attribute in attributes:
         for path in expand(file, attribute.path):
             if attribute.path in ("", *file) or path in file:
                 problems += _attribute_problems(file[path or "/"].attrs, path, attribute)
-    if "statistics" not in file:
-        problems.append("statistics: missing group")
     return problems
 
 

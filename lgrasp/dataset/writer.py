@@ -16,7 +16,16 @@ from lgrasp.dataset.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIEL
 from lgrasp.dataset.structure import structure_problems, text_sha256
 from lgrasp.errors import ShardError
 
-__all__ = ["create_rows", "finish", "write_context", "write_shard", "write_spaces"]
+__all__ = [
+    "create_array",
+    "create_rows",
+    "finish",
+    "write_context",
+    "write_hand",
+    "write_object",
+    "write_shard",
+    "write_spaces",
+]
 
 
 def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
@@ -75,9 +84,9 @@ def write_context(file: h5py.File, header: ShardHeader, hand: HandRecord, object
     )
     if header.merged_from:
         file.attrs["merged_from"] = json.dumps([dict(m) for m in header.merged_from])
-    _write_hand(file.create_group("hand"), hand)
+    write_hand(file.create_group("hand"), hand)
     for record in objects:
-        _write_object(file.create_group(f"objects/{record.id}"), record)
+        write_object(file.create_group(f"objects/{record.id}"), record)
     for name in ("metrics", "physics", "provenance"):
         file.create_group(f"grasps/{name}")
     file.create_group("statistics").attrs.update(dict(statistics))
@@ -88,24 +97,26 @@ def write_spaces(file: h5py.File, space_names: Sequence[str]) -> None:
     _create_texts(file.create_group("sequence"), "space_names", space_names)
 
 
-def _write_hand(group: h5py.Group, hand: HandRecord) -> None:
+def write_hand(group: h5py.Group, hand: HandRecord) -> None:
+    """Write a hand into its empty group."""
     group.attrs["base_link"] = hand.base_link
     group.create_dataset("urdf", data=hand.urdf, dtype=h5py.string_dtype())
     _create_texts(group, "joint_names", hand.joint_names)
     _create_texts(group, "link_names", hand.link_names)
-    _create(group, "joint_lower", np.asarray(hand.joint_lower, dtype="f4"))
-    _create(group, "joint_upper", np.asarray(hand.joint_upper, dtype="f4"))
+    create_array(group, "joint_lower", np.asarray(hand.joint_lower, dtype="f4"))
+    create_array(group, "joint_upper", np.asarray(hand.joint_upper, dtype="f4"))
     for number, (mesh_path, blob) in enumerate(hand.meshes.items()):
-        dataset = _create(group, f"meshes/{number}", np.frombuffer(blob, dtype="u1"))
+        dataset = create_array(group, f"meshes/{number}", np.frombuffer(blob, dtype="u1"))
         dataset.attrs["path"] = mesh_path
 
 
-def _write_object(group: h5py.Group, record: ObjectRecord) -> None:
+def write_object(group: h5py.Group, record: ObjectRecord) -> None:
+    """Write an object into its empty group."""
     group.attrs.update(
         name=record.name, scale=float(record.scale), sha256=record.sha256, watertight=bool(record.watertight)
     )
-    _create(group, "vertices", np.asarray(record.vertices, dtype="f4"))
-    _create(group, "faces", np.asarray(record.faces, dtype="i4"))
+    create_array(group, "vertices", np.asarray(record.vertices, dtype="f4"))
+    create_array(group, "faces", np.asarray(record.faces, dtype="i4"))
 
 
 def create_rows(file: h5py.File, name: str, shape, dtype, *, unit: str = "", protocol: str = "") -> h5py.Dataset:
@@ -139,7 +150,7 @@ def _filters(chunks: tuple[int, ...]) -> dict[str, Any]:
     return {"chunks": chunks, "compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 
 
-def _create(group: h5py.Group, name: str, data: np.ndarray) -> h5py.Dataset:
+def create_array(group: h5py.Group, name: str, data: np.ndarray) -> h5py.Dataset:
     """A dataset in one chunk (HDF5 allows none for an empty one)."""
     return group.create_dataset(name, data=data, **(_filters(data.shape) if data.size else {}))
 
@@ -148,7 +159,7 @@ def _create_texts(group: h5py.Group, name: str, texts: Any) -> None:
     """Strings of fixed length, which the checksum covers (those of variable length live outside the chunk)."""
     encoded = [text.encode() for text in texts]
     dtype = h5py.string_dtype("utf-8", max((len(e) for e in encoded), default=1) or 1)
-    _create(group, name, np.array(encoded, dtype=dtype))
+    create_array(group, name, np.array(encoded, dtype=dtype))
 
 
 def _as_format(rows: GraspRows, *, where: Any) -> GraspRows:

@@ -1,0 +1,58 @@
+"""Kernels of grasps in a scene: does a hand sink into the table or into objects?"""
+
+import warp as wp
+
+from lgrasp.device.convex import Pieces
+from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.grasp.clearance import body_depth
+from lgrasp.hand.arrays import Hand
+from lgrasp.object.arrays import Object
+
+__all__ = ["hand_depths"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+
+@wp.func
+def _lowest(pieces: Pieces, body: wp.int32, T: wp.transform):
+    """Least z of a body's convex pieces [m]. T = T_scene_body."""
+    low = float(1.0e9)
+    s = pieces.body_sphere[body]
+    if s[3] < 0.0:
+        return low
+    centre = wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))
+    if centre[2] - s[3] > 0.0:
+        return centre[2] - s[3]
+    for piece in range(pieces.body_first[body], pieces.body_first[body + 1]):
+        for k in range(pieces.vertex_first[piece], pieces.vertex_first[piece + 1]):
+            low = wp.min(low, wp.transform_point(T, pieces.vertices[k])[2] - pieces.radius[piece])
+    return low
+
+
+@wp.kernel
+def hand_depths(
+    hand: Hand,
+    objects: wp.array(dtype=Object),
+    own: wp.int32,
+    T_object_scene: wp.array(dtype=wp.transform),
+    T_scene_hand: wp.array(dtype=wp.transform),
+    body: wp.array2d(dtype=wp.transform),
+    limit: wp.float32,
+    table_out: wp.array(dtype=wp.float32),
+    object_out: wp.array(dtype=wp.float32),
+):
+    """One thread per (hand, body): how deep a hand sinks into z < 0 and into all objects but ``own`` [m].
+
+    Depths above ``limit`` may be given too small, but not below it.
+    """
+    i, b = wp.tid()
+    T = T_scene_hand[i] * body[i, b]
+    table = -_lowest(hand.pieces, b, T)
+    if table > 0.0:
+        wp.atomic_max(table_out, i, table)
+    depth = float(0.0)
+    for k in range(objects.shape[0]):
+        if k != own and depth <= limit:
+            depth = wp.max(depth, body_depth(hand, objects[k], b, T_object_scene[k] * T, limit))
+    if depth > 0.0:
+        wp.atomic_max(object_out, i, depth)

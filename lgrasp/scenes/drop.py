@@ -1,0 +1,141 @@
+"""Objects dropped on a table, simulated by MuJoCo until they lie still."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lgrasp.dataset import pose_matrix
+from lgrasp.dataset.exports.poses import canonical
+from lgrasp.errors import PhysicsError
+from lgrasp.physics.assemble import add_hull
+from lgrasp.physics.model import import_mujoco
+from lgrasp.physics.solid import Solid
+from lgrasp.scenes.params import DropParams
+
+__all__ = ["Settled", "drop"]
+
+_DENSITY = 500.0  # [kg/m^3]
+_STILL = (2.0e-3, 0.02)  # [m/s], [rad/s] below which an object lies still
+_QUIET = 0.2  # [s] for which it must
+_THICK = 0.1  # [m] of the table
+_SINK = 2.0e-3  # [m] an object may sink into the table at rest
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Objects at rest on a table."""
+
+    pose: np.ndarray
+    """T_scene_object, x y z [m] qw qx qy qz with qw >= 0, shape (n, 7), f64."""
+    tries: int
+    """How often they were dropped until all stayed."""
+    seconds: float
+    """Simulated time until they lay still [s]."""
+
+
+def drop(solids: Sequence[Solid], table: float, params: DropParams, rng: np.random.Generator) -> Settled:
+    """Drop objects near the middle of a square table, each turned at random; those that roll off are dropped again.
+
+    The scene frame has its origin in the middle of the table's top, z up.
+
+    Args:
+        table: side [m].
+
+    Raises:
+        PhysicsError: MuJoCo is missing or refuses an object, or the objects never came to rest on the table.
+    """
+    mujoco = import_mujoco()
+    try:
+        model = _model(mujoco, solids, table, params)
+    except (ValueError, RuntimeError) as error:
+        names = ", ".join(f"'{solid.name}'" for solid in solids)
+        raise PhysicsError(f"MuJoCo refuses objects {names}: {' '.join(str(error).split())[:300]}") from None
+    data = mujoco.MjData(model)
+    for number in range(1, params.tries + 1):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = _start(solids, params, rng).ravel()
+        seconds = _settle(mujoco, model, data, params)
+        pose = data.qpos.reshape(-1, 7).copy()
+        if seconds is not None and _on_table(solids, pose, table):
+            return Settled(np.hstack([pose[:, :3], canonical(pose[:, 3:])]), number, seconds)
+    names = ", ".join(f"'{solid.name}'" for solid in solids)
+    raise PhysicsError(
+        f"objects {names} did not come to rest on a table of {table:g} m in {params.tries} tries; "
+        "use fewer objects, a larger table or a longer drop"
+    )
+
+
+def _model(mujoco: Any, solids: Sequence[Solid], table: float, params: DropParams) -> Any:
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep = params.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 5.0
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    half = 0.5 * table
+    top = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[half, half, 0.5 * _THICK])
+    top.pos = [0, 0, -0.5 * _THICK]
+    for k, solid in enumerate(solids):
+        body = spec.worldbody.add_body(name=f"object {k}")
+        body.add_freejoint()
+        for number, vertices in enumerate(solid.pieces):
+            add_hull(mujoco, spec, body, vertices, f"object {k} {number}")
+        body.mass = _DENSITY * solid.volume
+        body.ipos = solid.center
+        body.fullinertia = _DENSITY * solid.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        body.explicitinertial = True
+    for geom in spec.geoms:
+        # rolling resistance, so that balls come to rest
+        geom.condim, geom.friction = 6, [params.friction, 0.005, 0.001]
+        geom.solref = [2.5 * params.timestep, 1.0]
+    return spec.compile()
+
+
+def _start(solids: Sequence[Solid], params: DropParams, rng: np.random.Generator) -> np.ndarray:
+    """Random poses (n, 7), each as low as the balls around the objects before it and the table allow."""
+    pose = np.empty((len(solids), 7))
+    radius = np.array([max(np.linalg.norm(p - s.center, axis=1).max() for p in s.pieces) for s in solids])
+    centre = np.empty((len(solids), 3))
+    for k, solid in enumerate(solids):
+        turn, way = canonical(rng.standard_normal(4)), 2.0 * np.pi * rng.random()
+        away = params.radius * np.sqrt(rng.random())
+        x, y = away * np.cos(way), away * np.sin(way)
+        # lowest height at which the ball around it is clear of the table and of earlier balls
+        height = radius[k] + params.gap
+        for i in range(k):
+            reach = radius[k] + radius[i] + params.gap
+            rest = reach**2 - (x - centre[i, 0]) ** 2 - (y - centre[i, 1]) ** 2
+            if rest > 0.0:
+                height = max(height, centre[i, 2] + np.sqrt(rest))
+        centre[k] = x, y, height
+        pose[k, 3:] = turn
+        pose[k, :3] = 0.0
+        pose[k, :3] = centre[k] - pose_matrix(pose[k])[:3, :3] @ solid.center
+    return pose
+
+
+def _settle(mujoco: Any, model: Any, data: Any, params: DropParams) -> float | None:
+    """Simulate until nothing has moved for a while; the time [s], or None when that never happened."""
+    chunk, quiet = max(1, round(0.02 / params.timestep)), 0.0
+    while data.time < params.longest:
+        for _ in range(chunk):
+            mujoco.mj_step(model, data)
+        if not np.isfinite(data.qpos).all() or (data.qpos.reshape(-1, 7)[:, 2] < -1.0).any():
+            return None
+        speed = np.abs(data.qvel.reshape(-1, 2, 3)).max(axis=(0, 2))
+        quiet = quiet + chunk * params.timestep if (speed < _STILL).all() else 0.0
+        if quiet >= _QUIET:
+            return float(data.time)
+    return None
+
+
+def _on_table(solids: Sequence[Solid], pose: np.ndarray, table: float) -> bool:
+    """Is every object above the table, none sunk into it?"""
+    for solid, T in zip(solids, pose_matrix(pose), strict=True):
+        points = np.vstack(solid.pieces) @ T[:3, :3].T + T[:3, 3]
+        if np.abs(points[:, :2]).max() > 0.5 * table or points[:, 2].min() < -_SINK:
+            return False
+    return True
