@@ -1,0 +1,33 @@
+"""Parameters of the local search and its energy; lengths in metres, angles in radians."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["LocalSearch"]
+
+
+class LocalSearch(BaseModel):
+    """Weights of the energy, and how far and how often poses are moved."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    outer: int = Field(20, ge=0, le=1000, description="Outer steps: correspondences are matched anew.")
+    inner: int = Field(10, ge=1, le=1000, description="Gradient steps per outer step.")
+    optimizer: Literal["adam", "sgd"] = Field("adam", description="adam, or sgd with momentum.")
+    momentum: float = Field(0.9, ge=0, lt=1, description="Of sgd; the decay of adam's first moment.")
+    shift: float = Field(0.0015, gt=0, le=0.1, description="Largest translation of the hand in one step.")
+    turn: float = Field(0.015, gt=0, le=1, description="Largest rotation of the hand in one step.")
+    bend: float = Field(0.02, gt=0, le=1, description="Largest motion of a joint in one step.")
+    decay: float = Field(0.05, gt=0, le=1, description="Size of the last step over that of the first.")
+    reach: float = Field(0.02, gt=0, le=1, description="Points farther from the object do not pull, first outer step.")
+    reach_end: float = Field(0.01, gt=0, le=1, description="The same in the last outer step.")
+    touching: int = Field(4, ge=1, le=16, description="Palmar points of a link, nearest first, that pull.")
+    points: float = Field(1.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared.")
+    normals: float = Field(0.02, ge=0, le=1e6, description="Weight of normals that do not oppose.")
+    force: float = Field(0.05, ge=0, le=1e6, description="Weight of the net wrench of four contacts.")
+    barrier: float = Field(0.02, ge=0, le=1e6, description="Weight of the barrier against penetration.")
+    limits: float = Field(0.01, ge=0, le=1e6, description="Weight of the barrier at the joint limits.")
+    margin: float = Field(0.003, gt=0, le=0.05, description="Distance below which the barrier acts.")
+    contacts: int = Field(4, ge=2, le=16, description="Contacts that the net wrench is made of.")
+    nearest: float = Field(0.2, gt=0, le=1, description="Share of the palmar points, nearest first, they come from.")

@@ -1,0 +1,251 @@
+"""Refiner: gradient-based local search of grasps, fast, unrolled, or as a training loss."""
+
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from lgrasp.differentiable.kinematics import BodyKinematics
+from lgrasp.differentiable.rotations import so3_exp
+from lgrasp.hand.model import HandModel
+from lgrasp.object.model import ObjectModel
+from lgrasp.refine.energy import Energies, Matches, limit_energy, matching_energies, wrench_energy
+from lgrasp.refine.params import LocalSearch
+from lgrasp.refine.surface import HandSurface, hand_surface
+from lgrasp.refine.target import Target
+
+__all__ = ["Pose", "Refined", "Refiner"]
+
+_TINY = 1e-12
+_SECOND = 0.99  # decay of adam's second moment
+
+
+class Pose(NamedTuple):
+    """Hands in the object's internal frame, N of them."""
+
+    R: torch.Tensor
+    """Rotation of the base, (N, 3, 3)."""
+    t: torch.Tensor
+    """Origin of the base [m], (N, 3)."""
+    q: torch.Tensor
+    """Joint positions [rad or m], (N, K)."""
+
+
+class Refined(NamedTuple):
+    """What the fast mode gives."""
+
+    pose: Pose
+    energies: Energies
+    """At ``pose``, matched anew, every point within the first reach pulling."""
+
+
+class _Gradient(NamedTuple):
+    """Of the total energy by motions of the base about the hand's middle and by the joints."""
+
+    shift: torch.Tensor  # (N, 3)
+    turn: torch.Tensor  # (N, 3)
+    bend: torch.Tensor  # (N, K)
+
+
+class Refiner(nn.Module):
+    """Moves hands by the gradient of E* (:mod:`lgrasp.refine.energy`) until their surface fits the object's.
+
+    Three modes: :meth:`forward` is fast and keeps no graph; :meth:`unrolled` can be differentiated by the poses that
+    it is given; :meth:`energy` is E* itself, as a loss. What becomes of a sample does not depend on the others.
+
+    Args:
+        hand: any hand; coupled joints move with their drive.
+        target: an object, or a :class:`Target` with surroundings.
+        surface: the hand's points; default: :func:`hand_surface`.
+    """
+
+    lower: torch.Tensor
+    upper: torch.Tensor
+
+    def __init__(
+        self,
+        hand: HandModel,
+        target: ObjectModel | Target,
+        params: LocalSearch | None = None,
+        *,
+        surface: HandSurface | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        super().__init__()
+        surface = surface or hand_surface(hand)
+        self.params = params or LocalSearch()
+        self.target = target if isinstance(target, Target) else Target(target, dtype=dtype, device=device)
+        self._bodies = BodyKinematics(hand.tree, dtype=dtype, device=device)
+        self._block = torch.as_tensor(surface.body, dtype=torch.int64, device=device)
+
+        def put(a: object) -> torch.Tensor:
+            return torch.as_tensor(a, dtype=dtype, device=device)
+
+        self._points, self._normals, self._weight = put(surface.points), put(surface.normals), put(surface.weight)
+        self._sum = float(surface.weight.sum())
+        palmar = surface.weight.reshape(-1) > 0
+        self._palmar = torch.as_tensor(palmar.nonzero()[0], device=device)
+        self.register_buffer("lower", put(hand.tree.joint_lower), persistent=False)
+        self.register_buffer("upper", put(hand.tree.joint_upper), persistent=False)
+        q = put(hand.tree.joint_open)[None]
+        R, t = self._bodies(q)
+        x = (R[0, self._block] @ self._points.mT).mT + t[0, self._block, None]
+        self._middle = x.reshape(-1, 3)[self._palmar].mean(0)  # of the palmar side, base frame
+
+    def forward(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, outer: int | None = None) -> Refined:
+        """Refine hands: ``outer`` (default: the parameters') times match, then ``inner`` gradient steps.
+
+        Args:
+            R: rotations of the hand's base in the object's internal frame, (N, 3, 3). t: its origin [m], (N, 3).
+            q: joint positions [rad or m], (N, K); outside the limits they are clamped first.
+        """
+        p = self.params
+        outer = p.outer if outer is None else outer
+        pose = Pose(R.detach(), t.detach(), self._clamped(q.detach()))
+        moments = _Moments(pose)
+        steps = max(outer * p.inner - 1, 1)
+        for i in range(outer):
+            share = i / max(outer - 1, 1)
+            matches = self.match(*pose, reach=p.reach * (p.reach_end / p.reach) ** share)
+            for j in range(p.inner):
+                size = p.decay ** ((i * p.inner + j) / steps)
+                pose = self._moved(pose, moments.step(self._gradient(pose, matches), p, size))
+        with torch.no_grad():
+            return Refined(pose, self.energy(*pose))
+
+    def unrolled(
+        self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, steps: int = 5, matches: Matches | None = None
+    ) -> Pose:
+        """``steps`` plain clipped gradient steps on one matching; differentiable by R, t and q.
+
+        A step has the size of the parameters' (``shift``, ``turn``, ``bend``) times the gradient over
+        sqrt(1 + |gradient|^2), per sample.
+
+        Args:
+            matches: default: those of the poses given.
+        """
+        matches = matches or self.match(R, t, q)
+        pose = Pose(R, t, q)
+        for _ in range(steps):
+            g = self._gradient(pose, matches, graph=True)
+            pose = self._moved(pose, _clipped(g, self.params))
+        return pose
+
+    def energy(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, matches: Matches | None = None) -> Energies:
+        """E* of hands, term by term, differentiable by R, t and q; correspondences are constants.
+
+        Args:
+            matches: default: those of these poses, with the parameters' first reach.
+        """
+        matches = matches or self.match(R, t, q)
+        x, m = self._placed(R, t, q)
+        points, normals, kept_out = matching_energies(x, m, matches, self._sum, self.params)
+        at = matches.contacts[..., None].expand(-1, -1, 3)
+        contacts = x.flatten(1, 2).gather(1, at)
+        force = wrench_energy(contacts, -self.target.normals(contacts), self.target.com, self.target.radius, self.params)
+        return Energies(points, normals, force, kept_out, limit_energy(q, self.lower, self.upper, self.params))
+
+    @torch.no_grad()
+    def match(
+        self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, reach: float | None = None
+    ) -> Matches:
+        """Nearest points of the object for every point of the hands, and the contacts that make the net wrench."""
+        reach = self.params.reach if reach is None else reach
+        x, _ = self._placed(R, t, q)
+        d, n = self.target.nearest(x)
+        apart = torch.where(self._weight > 0, d.abs(), torch.inf)
+        # the part of each link that is nearest to the object: a surface that fits nowhere else is no error
+        least = apart.kthvalue(self.params.touching, dim=2, keepdim=True).values
+        pull = self._weight * (apart <= least) * (apart < reach)
+        offset = (x * n).sum(-1) - d
+        block_d, block_n = self.target.nearest_obstacle(x, d, n)
+        block_offset = (x * block_n).sum(-1) - block_d
+        return Matches(offset, n, pull, block_offset, block_n, self._contacts(x, d))
+
+    def _contacts(self, x: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+        """Farthest points among the nearest of the palmar ones, (N, C); the nearest of all first."""
+        p = self.params
+        x, d = x.flatten(1, 2)[:, self._palmar], d.flatten(1, 2)[:, self._palmar]
+        near = d.topk(max(p.contacts, int(p.nearest * d.shape[1])), largest=False).indices  # (N, n), rising
+        x = x.gather(1, near[..., None].expand(-1, -1, 3))
+        chosen = [torch.zeros_like(near[:, :1])]
+        gap = torch.full_like(x[..., 0], torch.inf)
+        for _ in range(p.contacts - 1):
+            last = x.gather(1, chosen[-1][..., None].expand(-1, -1, 3))
+            gap = gap.minimum(((x - last) ** 2).sum(-1))
+            chosen.append(gap.argmax(1, keepdim=True))
+        return self._palmar[near.gather(1, torch.cat(chosen, 1))]
+
+    def _placed(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Points [m] and normals of the hands in the object's frame, (N, L, P, 3)."""
+        body_R, body_t = self._bodies(q)
+        R_block = R[:, None] @ body_R[:, self._block]  # (N, L, 3, 3)
+        t_block = (R[:, None] @ body_t[:, self._block, :, None])[..., 0] + t[:, None]
+        turned = R_block.mT
+        return self._points @ turned + t_block[:, :, None], self._normals @ turned
+
+    def _gradient(self, pose: Pose, matches: Matches, *, graph: bool = False) -> _Gradient:
+        R, t, q = pose if graph else (x.detach() for x in pose)
+        with torch.enable_grad():
+            if graph:
+                R, t, q = (x if x.requires_grad else x.detach().requires_grad_() for x in (R, t, q))
+            else:
+                R, t, q = (x.requires_grad_() for x in (R, t, q))
+            total = self.energy(R, t, q, matches=matches).total.sum()
+            by_R, by_t, by_q = torch.autograd.grad(total, [R, t, q], create_graph=graph)
+            arm = t - self._centre(R, t)
+            turn = torch.linalg.cross(R, by_R, dim=1).sum(2) + torch.linalg.cross(arm, by_t)
+        return _Gradient(by_t, turn, by_q) if graph else _Gradient(by_t, turn.detach(), by_q)
+
+    def _centre(self, R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        return t + R @ self._middle
+
+    def _moved(self, pose: Pose, by: _Gradient) -> Pose:
+        """The poses after a translation, a rotation about the hand's middle, and a motion of the joints."""
+        centre = self._centre(pose.R, pose.t)
+        T = so3_exp(by.turn)
+        t = centre + by.shift + (T @ (pose.t - centre)[..., None])[..., 0]
+        return Pose(T @ pose.R, t, self._clamped(pose.q + by.bend))
+
+    def _clamped(self, q: torch.Tensor) -> torch.Tensor:
+        return q.maximum(self.lower).minimum(self.upper)
+
+
+def _clipped(g: _Gradient, p: LocalSearch) -> _Gradient:
+    """A step down, at most the parameters' sizes, per sample."""
+
+    def down(x: torch.Tensor, size: float) -> torch.Tensor:
+        scaled = x * size
+        return -size * scaled / (1 + (scaled * scaled).sum(-1, keepdim=True)).sqrt()
+
+    return _Gradient(down(g.shift, p.shift), down(g.turn, p.turn), down(g.bend, p.bend))
+
+
+class _Moments:
+    """Running means of gradients, per sample and coordinate."""
+
+    def __init__(self, pose: Pose) -> None:
+        zeros = (torch.zeros_like(pose.t), torch.zeros_like(pose.t), torch.zeros_like(pose.q))
+        self._first, self._second, self._steps = list(zeros), list(zeros), 0
+
+    def step(self, g: _Gradient, p: LocalSearch, size: float) -> _Gradient:
+        """The step down that adam, or sgd with momentum, takes; ``size``: share of the parameters' sizes."""
+        self._steps += 1
+        out = []
+        for i, (x, most) in enumerate(zip(g, (p.shift, p.turn, p.bend), strict=True)):
+            if p.optimizer == "sgd":
+                # clipped per sample, then averaged
+                x = x / x.norm(dim=-1, keepdim=True).clamp_min(1.0)
+                self._first[i] = p.momentum * self._first[i] + (1 - p.momentum) * x
+                out.append(-most * size * self._first[i])
+                continue
+            self._first[i] = p.momentum * self._first[i] + (1 - p.momentum) * x
+            # one scale for the three axes: steps do not depend on the frame
+            square = x * x if i == 2 else (x * x).mean(-1, keepdim=True).expand_as(x)
+            self._second[i] = _SECOND * self._second[i] + (1 - _SECOND) * square
+            mean = self._first[i] / (1 - p.momentum**self._steps)
+            root = (self._second[i] / (1 - _SECOND**self._steps)).sqrt()
+            move = mean / (root + _TINY)
+            out.append(-most * size * move.clamp(-1, 1))
+        return _Gradient(*out)

@@ -1,0 +1,113 @@
+"""Points of a hand's surface for the local search, with weights: palmar points pull, all of them are kept out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lgrasp.clusters import CLUSTER_SIZE
+from lgrasp.hand.model import HandModel
+
+__all__ = ["BLOCK", "DISTAL", "OTHER", "HandSurface", "farthest_points", "hand_surface", "weighted_surface"]
+
+BLOCK = 24
+"""Points are in blocks of this many, each on one body."""
+DISTAL, OTHER = 1.0, 0.2
+"""Weight of palmar points on the last link of a finger, and of the others."""
+
+_PALMAR = 16  # of a block
+_AREA_BLOCKS = 4  # most blocks of one body
+_PER_BLOCK = 500  # surface samples of a body to a block
+
+
+@dataclass(frozen=True)
+class HandSurface:
+    """Blocks of surface points, each riding on one body; a hand of L blocks."""
+
+    body: np.ndarray
+    """Body of each block, (L,)."""
+    points: np.ndarray
+    """In the frame of that body [m], (L, BLOCK, 3)."""
+    normals: np.ndarray
+    """Outward unit normals, zero where the weight is zero, (L, BLOCK, 3)."""
+    weight: np.ndarray
+    """How strongly each point is drawn to the object, 0 for points that are only kept out, (L, BLOCK)."""
+
+
+def farthest_points(points: np.ndarray, count: int, *, first: int = 0) -> np.ndarray:
+    """Indices of ``count`` points, each the farthest from those before (all and repeats when there are fewer).
+
+    Args:
+        points: (n, 3), n >= 1. first: where to begin.
+    """
+    chosen = [first]
+    gap = np.linalg.norm(points - points[first], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(gap.argmax()))
+        gap = np.minimum(gap, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.resize(chosen, count)
+
+
+def hand_surface(model: HandModel, *, distal: float = DISTAL, other: float = OTHER) -> HandSurface:
+    """Surface of a hand whose palmar side is where hand.yaml lets it touch.
+
+    Args:
+        distal, other: weight of palmar points on the last links of fingers, and elsewhere.
+    """
+    return weighted_surface(
+        model, model.contact_body, model.contact_points, model.contact_normals, distal=distal, other=other
+    )
+
+
+def weighted_surface(
+    model: HandModel,
+    body: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    *,
+    distal: float = DISTAL,
+    other: float = OTHER,
+) -> HandSurface:
+    """Surface of a hand whose palmar side is given by points.
+
+    Args:
+        body: body of each palmar point, (n,). points, normals: in its frame, (n, 3).
+    """
+    last = _last_bodies(model)
+    bodies, blocks = [], []
+    for b in range(len(model.piece_first) - 1):
+        first, end = (model.cluster_first[b : b + 2] * CLUSTER_SIZE).tolist()
+        samples, own = model.samples[first:end], np.flatnonzero(body == b)
+        if len(samples) == 0:
+            continue
+        count = int(np.clip(len(samples) // _PER_BLOCK, 1, _AREA_BLOCKS))
+        palmar = min(_PALMAR, BLOCK) * count if len(own) else 0
+        rest = samples[farthest_points(samples, BLOCK * count - palmar)]
+        weight = np.zeros((count, BLOCK))
+        p, n = np.zeros((count, BLOCK, 3)), np.zeros((count, BLOCK, 3))
+        if palmar:
+            chosen = own[farthest_points(points[own], palmar)]
+            p[:, :_PALMAR] = points[chosen].reshape(count, -1, 3)
+            n[:, :_PALMAR] = normals[chosen].reshape(count, -1, 3)
+            weight[:, :_PALMAR] = distal if b in last else other
+            p[:, _PALMAR:] = rest.reshape(count, -1, 3)
+        else:
+            p[:] = rest.reshape(count, -1, 3)
+        bodies += [b] * count
+        blocks.append((p, n, weight))
+    p, n, weight = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    return HandSurface(np.array(bodies), p, n, weight)
+
+
+def _last_bodies(model: HandModel) -> set[int]:
+    """Bodies with geometry that no body with geometry rides on: the last links of fingers."""
+    tree = model.tree
+    group = np.repeat(np.arange(tree.groups), np.diff(tree.joint_first))
+    parent = np.where(tree.joint_parent < 0, -1, tree.joint_parent + tree.joint_first[group])  # joint of each joint
+    solid = {int(b) for b in model.piece_body if b > 0}
+    inner = set()
+    for b in solid:
+        j = int(parent[b - 1])
+        while j >= 0:
+            inner.add(1 + j)
+            j = int(parent[j])
+    return solid - inner
