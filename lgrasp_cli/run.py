@@ -44,14 +44,19 @@ def run(
     """
     cache = open_cache(cache_dir, fresh=force)
     from lgrasp.config import parse_model
-    from lgrasp.engine.jobs import JobConfig, array_task, load_config, plan_jobs
+    from lgrasp.engine.jobs import JobConfig, array_task, load_config, plan_jobs, plan_sequences
+    from lgrasp_cli.seqset import run_sets
 
     changes = {
         "rows": rows, "out": out, "object_dir": object_dir, "device": device, "workers": workers, "seed": seed
     }  # fmt: skip
     given = {name: value for name, value in changes.items() if value is not None}
     chosen = parse_model(JobConfig, load_config(config).model_dump() | given, f"config {config}")
-    jobs = plan_jobs(chosen, cache, array=array_task(shard_index, num_shards), resume=resume and not force)
+    task, keep = array_task(shard_index, num_shards), resume and not force
+    if chosen.sequences:
+        run_sets(plan_sequences(chosen, cache, array=task, resume=keep), json_path, dry_run=dry_run, quiet=quiet)
+        return
+    jobs = plan_jobs(chosen, cache, array=task, resume=keep)
     if dry_run:
         _show_plans(jobs)
         return

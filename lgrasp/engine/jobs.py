@@ -2,15 +2,17 @@
 
 import difflib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lgrasp.config import parse_model, read_yaml
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.generate import Job
-from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.engine.sequence.job import SequenceJob, sequence_name
+from lgrasp.engine.sequence.sets import SequenceSets, object_sequences
 from lgrasp.errors import ConfigError
 from lgrasp.hand.find import find_hand
 from lgrasp.object.find import find_object
@@ -26,6 +28,7 @@ __all__ = [
     "in_folder",
     "load_config",
     "plan_jobs",
+    "plan_sequences",
 ]
 
 
@@ -47,7 +50,7 @@ class JobConfig(BaseModel):
     description: str = ""
     hands: tuple[str, ...] = Field(("allegro",), min_length=1, description="Names or paths.")
     hand_dir: Path | None = Field(None, description="Folder where NAME/NAME.urdf is looked up first.")
-    objects: tuple[str, ...] = Field(min_length=1, description="Names or paths.")
+    objects: tuple[str, ...] = Field((), description="Names or paths; none: all meshes of object_dir.")
     object_dir: Path | None = Field(None, description="Folder where the names of objects are looked up first.")
     pipelines: tuple[str, ...] = Field(("swift",), min_length=1, description="Names or paths.")
     rows: int = Field(1000, ge=1, description="Grasps per hand, object and pipeline.")
@@ -62,6 +65,13 @@ class JobConfig(BaseModel):
     shard_rows: int = Field(10_000, ge=1)
     reuse: bool = False
     published: Published | None = Field(None, description="Figures of others; for lgrasp bench table1.")
+    sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn of them.")
+
+    @model_validator(mode="after")
+    def _has_objects(self) -> "JobConfig":
+        if not self.objects and not self.object_dir and not self.sequences:
+            raise ValueError("objects: name at least one")
+        return self
 
 
 def config_files() -> dict[str, Path]:
@@ -101,17 +111,11 @@ def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1
     Raises:
         ConfigError: a pipeline that cannot be used, a folder of hands or objects that does not exist.
     """
-    for key, folder in (("hand_dir", config.hand_dir), ("object_dir", config.object_dir)):
-        if folder is not None and not folder.expanduser().is_dir():
-            raise ConfigError(f"{key} {folder} is not a folder")
+    objects = _objects(config)
     jobs = []
-    for name in config.pipelines:
-        pipeline = load_pipeline(name)
-        if config.seed is not None:
-            pipeline = pipeline.model_copy(update={"seed": config.seed})
-        out = config.out / pipeline.name if len(config.pipelines) > 1 else config.out
+    for pipeline, out in _pipelines(config):
         for hand in config.hands:
-            for mesh in config.objects:
+            for mesh in objects:
                 jobs.append(
                     Job(
                         hand=_urdf_in_folder(config.hand_dir, hand),
@@ -132,6 +136,66 @@ def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1
                     )
                 )
     return jobs
+
+
+def plan_sequences(
+    config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1), resume: bool = True
+) -> list[SequenceJob]:
+    """One job for each pipeline, hand and sequence of objects; tasks of an array share the sequences.
+
+    Raises:
+        ConfigError: a config without ``sequences``, a pipeline or a folder that cannot be used, too few objects.
+    """
+    sets = config.sequences
+    if sets is None:
+        raise ConfigError("the config has no sequences")
+    drawn = object_sequences(_objects(config), sets, config.seed or 0)
+    changes = {name: value for name, value in (("method", sets.method), ("policy", sets.policy)) if value}
+    jobs = [
+        SequenceJob(
+            hand=_urdf_in_folder(config.hand_dir, hand),
+            objects=tuple(in_folder(config.object_dir, mesh) for mesh in sequence),
+            rows=config.rows,
+            pipeline=pipeline.with_params("sequence", **changes) if changes else pipeline,
+            out=out / sequence_name(Path(hand).stem, sequence),
+            size=sets.size,
+            physics=sets.physics,
+            device=config.device,
+            workers=config.workers,
+            shard_rows=min(config.shard_rows, 1000),
+            resume=resume,
+            cache=cache,
+        )
+        for pipeline, out in _pipelines(config)
+        for hand in config.hands
+        for sequence in drawn
+    ]
+    return jobs[array[0] :: array[1]]
+
+
+def _pipelines(config: JobConfig) -> Iterator[tuple[Pipeline, Path]]:
+    """Each pipeline with the config's seed, and the folder of its output."""
+    for name in config.pipelines:
+        pipeline = load_pipeline(name)
+        if config.seed is not None:
+            pipeline = pipeline.model_copy(update={"seed": config.seed})
+        yield pipeline, config.out / pipeline.name if len(config.pipelines) > 1 else config.out
+
+
+def _objects(config: JobConfig) -> tuple[str, ...]:
+    """The objects of a config, those of its folder if it names none."""
+    for key, folder in (("hand_dir", config.hand_dir), ("object_dir", config.object_dir)):
+        if folder is not None and not folder.expanduser().is_dir():
+            raise ConfigError(f"{key} {folder} is not a folder")
+    if config.objects:
+        return config.objects
+    if config.object_dir is None:
+        raise ConfigError("the config names no objects; give object_dir, a folder of meshes (--object-dir)")
+    folder = config.object_dir.expanduser()
+    found = tuple(sorted(p.name for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES))
+    if not found:
+        raise ConfigError(f"object_dir {config.object_dir} holds no mesh; accepted: {', '.join(MESH_SUFFIXES)}")
+    return found
 
 
 def _urdf_in_folder(folder: Path | None, hand: str) -> str:
