@@ -30,7 +30,15 @@ from lgrasp.physics import find_protocol, protocol_text, verdicts
 from lgrasp.physics.model import import_mujoco
 from lgrasp.physics.scene import Scene, scene_of
 
-__all__ = ["SequenceJob", "SequenceOutcome", "generate_sequences", "sequence_name", "sequence_shards"]
+__all__ = [
+    "SequenceJob",
+    "SequenceOutcome",
+    "generate_sequences",
+    "make_sequence_scene",
+    "sequence_name",
+    "sequence_shards",
+    "simulated",
+]
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,7 @@ def generate_sequences(job: SequenceJob, listener: Listener | None = None) -> Se
     if len(present) < len(shards):
         if job.physics:
             listener.loading("scene", 0.0)
-            inputs = replace(inputs, scene=_scene(job.cache, inputs, meshes))
+            inputs = replace(inputs, scene=make_sequence_scene(job.cache, inputs))
         begin = time.perf_counter()
         load_kernels(device.alias, kernel_modules("lgrasp.stages."), listener.loading)
         inputs.seconds["kernels"] = time.perf_counter() - begin
@@ -156,7 +164,7 @@ def generate_sequences(job: SequenceJob, listener: Listener | None = None) -> Se
                 workers,
                 cancelled=listener.cancelled,
                 progress=lambda found, running, shard=shard: listener.advanced(shard, found, running),
-                verdicts=_simulated(inputs, job.physics, workers) if job.physics else None,
+                verdicts=simulated(inputs, job.physics) if job.physics else None,
             )
             if result.cancelled:
                 outcome.cancelled = True
@@ -171,20 +179,22 @@ def generate_sequences(job: SequenceJob, listener: Listener | None = None) -> Se
     return outcome
 
 
-def _scene(cache: Cache, inputs: SequenceInputs, meshes: dict[str, bytes]) -> Scene:
+def make_sequence_scene(cache: Cache, inputs: SequenceInputs) -> Scene:
+    """What the simulator is given: hand and objects of the job's shards."""
     cut = partial(decompose, store=cache)
-    return scene_of(hand_record(inputs.hand, meshes), object_records(inputs), cut, inputs.device.alias)
+    record = hand_record(inputs.hand, mesh_blobs(inputs.keys.source.urdf))
+    return scene_of(record, object_records(inputs), cut, inputs.device.alias)
 
 
-def _simulated(inputs: SequenceInputs, physics: str, threads: int) -> Verdicts:
-    """Verdicts of the rows of the last of some levels."""
+def simulated(inputs: SequenceInputs, physics: str) -> Verdicts:
+    """A function that simulates the rows of the last of some levels, on all cores."""
     protocol, scene = find_protocol(physics), inputs.scene
     assert scene is not None
 
     def run(levels: list[SequenceTable]) -> dict[str, np.ndarray]:
         last = replace(levels[-1], physics={})
         rows = sequence_rows([last], inputs, 0, objects=len(inputs.objects))
-        return verdicts(scene, rows, protocol, threads=os.cpu_count() or threads)
+        return verdicts(scene, rows, protocol, threads=os.cpu_count() or 1)
 
     return run
 

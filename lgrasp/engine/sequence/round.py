@@ -39,6 +39,7 @@ class Round:
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     spaces: list[dict[str, dict[str, dict[str, int]]]] = field(default_factory=list)  # step, space, stage: survivors
+    walls: list[float] = field(default_factory=list)  # of each step, simulation not counted [s]
 
     def add(self, space: str, counts: dict[str, dict[str, int]], seconds: Mapping[str, float] | None = None) -> None:
         """Count survivors of the step that is being made, and thread-seconds."""
@@ -71,7 +72,9 @@ def run_round(
     with ThreadPoolExecutor(workers) as pool:
         while rows.steps < len(inputs.objects) and len(rows) and not cancelled():
             result.spaces.append({})
+            start = time.perf_counter()
             rows = _step(pipeline, inputs, rows, seed, pool, result)
+            result.walls.append(time.perf_counter() - start)
             result.levels.append(rows)
             if verdicts and len(rows):
                 result.levels[-1] = rows = _that_hold(rows, verdicts(result.levels), inputs, result)

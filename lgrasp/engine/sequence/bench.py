@@ -1,0 +1,148 @@
+"""The published tables of sequential grasps, measured: success by opposition space and by number of objects."""
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lgrasp.device.runtime import resolve_device
+from lgrasp.engine.kernels import kernel_modules, load_kernels
+from lgrasp.engine.sequence.inputs import SequenceInputs, load_sequence_inputs, sequence_keys
+from lgrasp.engine.sequence.job import SequenceJob, make_sequence_scene, simulated
+from lgrasp.engine.sequence.round import Round, Verdicts, run_round
+from lgrasp.engine.shard import add_counts
+from lgrasp.grasp.sequences import SequenceTable
+from lgrasp.hand.spaces import consumed
+
+__all__ = ["PUBLISHED", "measure_sequences"]
+
+PUBLISHED: dict[str, Any] = {
+    "source": "Grasping a Handful (Lu et al., 2025), Tables II and III, Allegro hand, one NVIDIA A100",
+    "spaces": {
+        "middle-ring": 14.30,
+        "index-middle": 13.90,
+        "thumb-index": 5.75,
+        "ring-palm": 45.57,
+        "middle-palm": 37.74,
+        "index-palm": 35.52,
+        "thumb-palm": 17.67,
+    },
+    "consumed": [0.0, 3.88, 49.68, 100.0],
+    "success": [50.04, 21.21, 19.49, 2.93],
+    "penetration": [1.73, 2.14, 2.23, 2.70],
+    "seconds_per_256": [900.0, 900.0, 900.0, 900.0],
+    "diversity": [0.332, 0.367, 0.349, 0.312],
+}
+"""Success and consumed shares [%], mean largest penetration [mm], seconds for a batch of 256, diversity [rad]."""
+
+
+def measure_sequences(
+    jobs: list[SequenceJob], rounds: int, progress: Callable[[str], None] | None = None
+) -> dict[str, Any]:
+    """Run rounds of each job, simulate every row and go on from those that hold; nothing is written.
+
+    Args:
+        jobs: the same method on several sequences of objects; each names a physics protocol.
+        rounds: of each job.
+        progress: called with one line before each round.
+
+    Returns:
+        ``spaces`` (name -> sequences tried with it, strict-valid rows found, rows that held), ``objects`` (for each
+        number of objects: rows simulated and held, consumed, ``seconds`` of the step, penetration of all rows [mm],
+        diversity [rad]), ``strict_per_s`` (whole rows of two objects, simulation not counted).
+    """
+    device = resolve_device(jobs[0].device)
+    length = max(len(job.objects) for job in jobs)
+    spaces: dict[str, dict[str, int]] = {}
+    objects = [_Objects() for _ in range(length)]
+    two, seconds = 0, 0.0
+    for job in jobs:
+        pipeline, cache = job.pipeline, job.cache
+        keys = sequence_keys(job.hand, job.objects, job.size, pipeline.seed, pipeline.object, pipeline.field)
+        inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device)
+        inputs = replace(inputs, scene=make_sequence_scene(cache, inputs))
+        load_kernels(device.alias, kernel_modules("lgrasp.stages."))
+        assert job.physics
+        simulate = simulated(inputs, job.physics)
+        for number in range(rounds):
+            if progress:
+                names = " ".join(inputs.object_ids)
+                progress(f"{pipeline.params('sequence').method}, {names}: round {number + 1} of {rounds}")
+            seen: list[SequenceTable] = []
+
+            watched = _watched(simulate, seen)
+            found = run_round(pipeline, inputs, 0, number, job.workers or os.cpu_count() or 1, verdicts=watched)
+            _count_spaces(spaces, found)
+            for step, table in enumerate(seen):
+                objects[step].add(table, found.levels[step], inputs, found.walls[step])
+            two += len(seen[1]) if len(seen) > 1 else 0
+            seconds += sum(found.walls[:2])
+    return {
+        "spaces": spaces,
+        "objects": [entry.summary() for entry in objects],
+        "strict_per_s": two / seconds if seconds else 0.0,
+    }
+
+
+def _watched(simulate: Verdicts, seen: list[SequenceTable]) -> Verdicts:
+    """The same simulation; the rows that it is given are kept."""
+
+    def run(levels: list[SequenceTable]) -> dict[str, np.ndarray]:
+        seen.append(levels[-1])
+        return simulate(levels)
+
+    return run
+
+
+def _count_spaces(spaces: dict[str, dict[str, int]], found: Round) -> None:
+    for step in found.spaces:
+        for name, counts in step.items():
+            grown, simulated_ = counts.get("sequence", {}), counts.get("validate", {})
+            more = {
+                "tried": grown.get("sequences", 0),
+                "found": simulated_.get("tried", 0),
+                "held": simulated_.get("held", 0),
+            }
+            add_counts(spaces, {name: more})
+
+
+class _Objects:
+    """Rows of one number of objects, over rounds and sequences."""
+
+    def __init__(self) -> None:
+        self._simulated = self._held = self._consumed = 0
+        self._seconds = 0.0
+        self._depth: list[np.ndarray] = []
+        self._q: list[np.ndarray] = []
+
+    def add(self, tried: SequenceTable, held: SequenceTable, inputs: SequenceInputs, seconds: float) -> None:
+        self._simulated += len(tried)
+        self._held += len(held)
+        used = held.used
+        self._consumed += sum(
+            consumed(inputs.spaces, frozenset(s.tolist()), u) for s, u in zip(held.space, used, strict=True)
+        )
+        self._seconds += seconds
+        self._depth.append(1e3 * tried.metrics["penetration"])
+        self._q.append(held.q[:, -1])
+
+    def summary(self) -> dict[str, Any]:
+        depth = np.concatenate(self._depth) if self._depth else np.zeros(0)
+        q = np.concatenate(self._q) if self._q else np.zeros((0, 1))
+        return {
+            "simulated": self._simulated,
+            "held": self._held,
+            "success": _percent(self._held, self._simulated),
+            "consumed": _percent(self._consumed, self._held),
+            "penetration_median": float(np.median(depth)) if len(depth) else None,
+            "penetration_max": float(depth.max()) if len(depth) else None,
+            "seconds": self._seconds,
+            "seconds_per_256": 256 * self._seconds / self._simulated if self._simulated else None,
+            "diversity": float(q.std(0).mean()) if len(q) > 1 else None,
+        }
+
+
+def _percent(part: int, whole: int) -> float | None:
+    return 100.0 * part / whole if whole else None
