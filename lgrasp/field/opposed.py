@@ -2,13 +2,12 @@
 
 import numpy as np
 
+from lgrasp.hand.facing import opposed
+
 __all__ = ["opposed_pairs"]
 
 _DRAWN = 4_000_000  # pairs looked at, all settings together
 _KEPT = 65_536
-_CONE = np.cos(np.radians(35.0))  # of each hand normal to the line between the two, at least
-_PALM_CONE = np.cos(np.radians(16.0))  # of the palm's, which no finger can turn
-_WIDTHS = (0.002, 0.20)  # [m]
 
 
 def opposed_pairs(
@@ -35,11 +34,8 @@ def opposed_pairs(
     for a, b in both:
         p, q = parts[a], palm if b < 0 else parts[b]
         i, j = (rng.integers(len(x["position"]), size=_DRAWN // len(both)) for x in (p, q))
-        line = q["position"][j] - p["position"][i]
-        width = np.linalg.norm(line, axis=1)
-        limit = _CONE * width
-        good = (np.einsum("nd,nd->n", line, p["direction"][i]) > limit) & (width > _WIDTHS[0]) & (width < _WIDTHS[1])
-        good &= np.einsum("nd,nd->n", line, q["direction"][j]) < -(_PALM_CONE * width if b < 0 else limit)
+        first, second = (p["position"][i], p["direction"][i]), (q["position"][j], q["direction"][j])
+        good, _ = opposed(*first, *second, still=b < 0)
         ends.append(np.stack([p["position"][i[good]], q["position"][j[good]]], 1))
         normals.append(np.stack([p["direction"][i[good]], q["direction"][j[good]]], 1))
         second = -1 - q["index"][j[good]] if b < 0 else np.full(int(good.sum()), b)

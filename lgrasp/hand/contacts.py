@@ -144,8 +144,8 @@ def side_points(
     surface: Surface,
     rng: np.random.Generator,
     device: str = "cpu",
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals (n, 3) of a link's part of one side of an opposition space, body frame, in even density.
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Points and normals (n, 3) of a link's part of one side of an opposition space, body frame, and its area [m^2].
 
     A point is dropped when the body is in the way of a finger-sized ball half-way, or of one of 2 cm radius by 2 mm.
 
@@ -164,8 +164,8 @@ def side_points(
         keep &= ((local >= surface.box.min) & (local <= surface.box.max)).all(1)
     points, normals = points[keep], normals[keep]
     keep = _free(around, points, normals, ((1e-4, 0.0), (8e-3, 5e-3), (2e-2, 1.8e-2)), device)
-    wanted = np.clip(keep.sum() * area / drawn / _SIDE_AREA, *_SIDE_POINTS)
-    return _thin(points, normals, keep, rng, int(wanted))
+    kept = float(keep.sum() * area / sum(shares))
+    return *_thin(points, normals, keep, rng, int(np.clip(kept / _SIDE_AREA, *_SIDE_POINTS))), kept
 
 
 def _thin(

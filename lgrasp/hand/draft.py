@@ -8,8 +8,10 @@ import numpy as np
 from lgrasp.device.kinematics import MAX_JOINTS
 from lgrasp.errors import HandError
 from lgrasp.hand.anatomy import Anatomy, finger_names, held_value, probe_spec, study_anatomy, tip_link
+from lgrasp.hand.flanks import rounded_axis
 from lgrasp.hand.model import HandModel, build_hand
 from lgrasp.hand.palmar import sample_bodies
+from lgrasp.hand.propose import propose_spaces
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.survey import Survey, survey_hand
 from lgrasp.hand.tree import build_tree
@@ -87,7 +89,11 @@ def draft_spec(
     }
     said += [f"note: {note}" for note in survey.model.notes]
     spec = HandSpec.model_validate(data)
-    return (spec, said) if jaws is not None else _with_shared(urdf, survey, spec, said)
+    if jaws is None:
+        spec, said = _with_shared(urdf, survey, spec, said)
+    model = build_hand(urdf.path, spec) if spec.shared else survey.model
+    spaces, told = propose_spaces(urdf, spec, survey, names, model)
+    return spec.model_copy(update={"opposition_spaces": spaces}), [*said, *told]
 
 
 def _with_shared(urdf: Urdf, survey: Survey, spec: HandSpec, said: list[str]) -> tuple[HandSpec, list[str]]:
@@ -244,23 +250,13 @@ def _say_locked(survey: Survey) -> list[str]:
     return said
 
 
-def _rounded(axis: np.ndarray) -> list[float]:
-    """An axis with two decimals, or a coordinate axis when it is within 8 degrees of one."""
-    main = int(np.argmax(np.abs(axis)))
-    if abs(axis[main]) > 0.99:
-        snapped = np.zeros(3)
-        snapped[main] = np.sign(axis[main])
-        return snapped.tolist()
-    return (np.round(axis, 2) + 0.0).tolist()
-
-
 def _contact_rules(survey: Survey) -> list[dict[str, Any]]:
     """One rule per set of links with the same forbidden cones."""
     rules: dict[tuple[tuple[float, ...], ...], list[str]] = {}
     named: set[str] = set()
     for side in (s for sides in survey.sides.values() for s in sides):
         if side.skin.link not in named:
-            key = tuple((*_rounded(axis), angle) for axis, angle in side.forbidden)
+            key = tuple((*rounded_axis(axis), angle) for axis, angle in side.forbidden)
             rules.setdefault(key, []).append(side.skin.link)
             named.add(side.skin.link)
     return [
@@ -273,7 +269,7 @@ def _palm_rule(survey: Survey) -> dict[str, Any]:
     if not survey.palm:
         return {}
     links = [side.skin.link for side in survey.palm]
-    return {"links": links, "allowed": [{"axis": _rounded(survey.palm[0].axis), "angle": 45.0}]}
+    return {"links": links, "allowed": [{"axis": rounded_axis(survey.palm[0].axis), "angle": 45.0}]}
 
 
 def _say_contacts(survey: Survey, names: list[str]) -> list[str]:

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lgrasp.errors import HandError
+from lgrasp.hand.opposition import space_problem
 from lgrasp.hand.packages import PACKAGE_HANDS, drafted_folder, package_urdf
 from lgrasp.hand.spec import Coupling, HandSpec, load_spec
-from lgrasp.hand.urdf import Joint, read_urdf
+from lgrasp.hand.tree import build_tree
+from lgrasp.hand.urdf import Joint, Urdf, read_urdf
 from lgrasp.paths import data_dirs
 
 __all__ = ["HandSource", "find_hand", "known_hands"]
@@ -102,8 +104,24 @@ def _rules_of_known(path: Path, known: dict[str, Path]) -> HandSource | None:
                 note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
             stated = {j.name for j in urdf.joints if j.mimic is not None}
             added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
-            return HandSource(source.name, path, source.spec.model_copy(update={"mimic": added | missing}), note)
+            spec, told = _without_misfits(urdf, source.spec.model_copy(update={"mimic": added | missing}))
+            return HandSource(source.name, path, spec, note + told)
     return None
+
+
+def _without_misfits(urdf: Urdf, spec: HandSpec) -> tuple[HandSpec, str]:
+    """The rules without opposition spaces that do not fit this URDF, and what to tell the user."""
+    try:
+        tree = build_tree(urdf, spec)
+    except HandError:  # said when the hand is built
+        return spec, ""
+    problems = {n: space_problem(spec, tree, space, dict(urdf.links)) for n, space in spec.opposition_spaces.items()}
+    unfit = {name: problem for name, problem in problems.items() if problem}
+    if not unfit:
+        return spec, ""
+    fit = {name: space for name, space in spec.opposition_spaces.items() if name not in unfit}
+    told = f", without the opposition spaces {', '.join(unfit)}, which do not fit: {next(iter(unfit.values()))}"
+    return spec.model_copy(update={"opposition_spaces": fit}), told
 
 
 def _missing_couplings(joints: tuple[Joint, ...], known: tuple[Joint, ...]) -> dict[str, Coupling]:

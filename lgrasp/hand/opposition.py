@@ -8,7 +8,7 @@ from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec, OppositionSpace
 from lgrasp.hand.tree import Tree
 
-__all__ = ["check_spaces", "moving_joints", "side_links"]
+__all__ = ["check_spaces", "moving_joints", "side_links", "space_problem"]
 
 
 def side_links(space: OppositionSpace) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -39,12 +39,13 @@ def check_spaces(spec: HandSpec, tree: Tree, geometry: Mapping[str, object]) -> 
         HandError: naming the space, the value and what is accepted.
     """
     for name, space in spec.opposition_spaces.items():
-        problem = _problem(spec, tree, space, geometry)
+        problem = space_problem(spec, tree, space, geometry)
         if problem:
             raise HandError(f"hand '{spec.name}': opposition space '{name}': {problem}")
 
 
-def _problem(spec: HandSpec, tree: Tree, space: OppositionSpace, geometry: Mapping[str, object]) -> str:
+def space_problem(spec: HandSpec, tree: Tree, space: OppositionSpace, geometry: Mapping[str, object]) -> str:
+    """Why a space does not fit the hand, in words that name the value and what is accepted; empty when it does."""
     driven = [n for n in tree.joint_names if n not in tree.shared_names]
     for joint in space.joints:
         held = "locked" if joint in spec.locked else "shared" if joint in spec.shared else "no driven joint"

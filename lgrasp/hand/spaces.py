@@ -20,7 +20,18 @@ from lgrasp.hand.surface import ContactLink, contact_arrays
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 
-__all__ = ["Space", "available", "consumed", "free_joints", "hand_spaces", "longest", "space_view"]
+__all__ = [
+    "Space",
+    "SpaceSide",
+    "available",
+    "consumed",
+    "free_joints",
+    "hand_spaces",
+    "longest",
+    "side_surface",
+    "space_sides",
+    "space_view",
+]
 
 
 @dataclass(frozen=True)
@@ -84,6 +95,54 @@ def _longest(masks: tuple[int, ...], joints: int) -> int:
     return max((1 + _longest(masks, joints | mask) for mask in masks if mask & ~joints), default=0)
 
 
+@dataclass(frozen=True)
+class SpaceSide:
+    """One side of an opposition space, body frame."""
+
+    links: tuple[ContactLink, ...]
+    area: float  # [m^2]
+
+
+def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface], device: str = "cpu") -> SpaceSide | None:
+    """The surface of one side of a space, links without any left out; None when there is none at all."""
+    rng = np.random.default_rng(0)
+    surfaces = [(tree.link_names.index(link), part) for part in side for link in part.links]
+    meshes = _body_meshes(urdf, tree, {int(tree.link_body[index]) for index, _ in surfaces})
+    found, total = [], 0.0
+    for index, surface in surfaces:
+        link, T, body = tree.link_names[index], tree.T_body_link[index], tree.link_body[index]
+        around = [m for n, b in zip(tree.link_names, tree.link_body, strict=True) if b == body for m in meshes[n]]
+        points, normals, area = side_points(meshes[link], around, T, surface, rng, device)
+        group = int(tree.body_group[body])
+        rules = body_cones(_outside(surface) if group >= 0 else (), T)
+        if len(points):
+            found.append(ContactLink(link, group if group >= 0 else tree.groups, points, normals, rules))
+            total += area
+    return SpaceSide(tuple(found), total) if found else None
+
+
+def space_sides(urdf: Urdf, spec: HandSpec, tree: Tree, name: str, device: str = "cpu") -> tuple[SpaceSide, SpaceSide]:
+    """The surface of both sides of a space.
+
+    Raises:
+        HandError: no space of that name, or a side without any surface.
+    """
+    space = spec.opposition_spaces.get(name)
+    if space is None:
+        known = ", ".join(spec.opposition_spaces) or "none"
+        raise HandError(f"hand '{spec.name}' has no opposition space '{name}'; its spaces: {known}")
+    found = []
+    for number, side in enumerate(space.sides, 1):
+        surface = side_surface(urdf, tree, side, device)
+        if surface is None:
+            raise HandError(
+                f"hand '{spec.name}': opposition space '{name}': side {number} ({', '.join(side[0].links)}) has no "
+                f"surface within {side[0].angle:g} degrees of {list(side[0].axis)}; change axis, angle or box"
+            )
+        found.append(surface)
+    return found[0], found[1]
+
+
 def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, device: str = "cpu") -> HandModel:
     """The same hand with the two sides of an opposition space as its only contact surface.
 
@@ -94,36 +153,14 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
         urdf_path, spec: what ``model`` was built from. device: answers the geometric queries.
 
     Raises:
-        HandError: no space of that name, or a side without any surface.
+        HandError: see :func:`space_sides`.
     """
-    space = spec.opposition_spaces.get(name)
-    if space is None:
-        known = ", ".join(spec.opposition_spaces) or "none"
-        raise HandError(f"hand '{spec.name}' has no opposition space '{name}'; its spaces: {known}")
     urdf, tree = read_urdf(urdf_path), model.tree
-    rng = np.random.default_rng(0)
-    named = [tree.link_names.index(link) for links in side_links(space) for link in links]
-    meshes = _body_meshes(urdf, tree, {int(tree.link_body[i]) for i in named})
-    entries: list[ContactLink] = []
-    for number, (side, links) in enumerate(zip(space.sides, side_links(space), strict=True), 1):
-        found = []
-        for link, surface in [(link, part) for part in side for link in part.links]:
-            index = tree.link_names.index(link)
-            T, body = tree.T_body_link[index], tree.link_body[index]
-            around = [m for n, b in zip(tree.link_names, tree.link_body, strict=True) if b == body for m in meshes[n]]
-            points, normals = side_points(meshes[link], around, T, surface, rng, device)
-            group = int(tree.body_group[body])
-            rules = body_cones(_outside(surface) if group >= 0 else (), T)
-            if len(points):
-                found.append(ContactLink(link, group if group >= 0 else tree.groups, points, normals, rules))
-        if not found:
-            raise HandError(
-                f"hand '{spec.name}': opposition space '{name}': side {number} ({', '.join(links)}) has no surface "
-                f"within {side[0].angle:g} degrees of {list(side[0].axis)}; change axis, angle or box"
-            )
-        entries += found
-    arrays = contact_arrays(tree, entries, meshes, rng, device)
-    digest = hashlib.sha256(json.dumps([model.sha256, name, space.model_dump(mode="json")]).encode()).hexdigest()
+    links = [link for side in space_sides(urdf, spec, tree, name, device) for link in side.links]
+    meshes = _body_meshes(urdf, tree, {int(tree.link_body[tree.link_names.index(link.link)]) for link in links})
+    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device)
+    described = spec.opposition_spaces[name].model_dump(mode="json")
+    digest = hashlib.sha256(json.dumps([model.sha256, name, described]).encode()).hexdigest()
     return replace(model, sha256=digest, contacts=(), **arrays)
 
 

@@ -11,7 +11,7 @@ from lgrasp.hand.palmar import Postures, Skin, link_skins, sample_bodies, see_sk
 from lgrasp.hand.reach import Hold, Touch, best_hold, finger_touches, still_touches
 from lgrasp.hand.urdf import Urdf
 
-__all__ = ["Side", "Survey", "static_depth", "survey_hand"]
+__all__ = ["Side", "Survey", "pad_axis", "static_depth", "survey_hand"]
 
 _POSTURES = 1200
 _LEAST_TIP = 5.0e-5  # [m^2] distal half of a fingertip
@@ -40,6 +40,7 @@ class Survey:
     anatomy: Anatomy
     locked: dict[str, float]
     postures: Postures
+    skins: list[Skin]  # of all links, with what the mean fingertip sees
     sides: dict[int, list[Side]]  # tip body -> contact links, the most distal first
     palm: list[Side]
     hold: Hold | None
@@ -81,7 +82,7 @@ def survey_hand(
     if palm:
         points, normals = _allowed(palm, 0)
         hold = best_hold([*touches, still_touches("palm", points, normals, 8 * _POSTURES)], blocked)
-    return Survey(model, anatomy, locked, postures, sides, palm, hold)
+    return Survey(model, anatomy, locked, postures, skins, sides, palm, hold)
 
 
 def _nearest_static(skins: list[Skin], postures: Postures, body: int, tip: np.ndarray) -> np.ndarray:
@@ -130,17 +131,14 @@ def _finger_sides(anatomy: Anatomy, model: HandModel, skins: list[Skin], tip: in
     if axis is None:
         return []
     along = _along(distal)
-    hinged = not model.tree.joint_prismatic[tip - 1] and np.linalg.norm(axis - (axis @ along) * along) > 0.3
-    if hinged and len(anatomy.driven_by(tip)) >= 3:
-        across = axis - (axis @ along) * along
-        across /= np.linalg.norm(across)
+    across = _across(model, axis, along, tip)
+    if across is not None and len(anatomy.driven_by(tip)) >= 3:
         sides = [_side(s, [(-along, 91.0), (-across, 60.0)]) for s in distal]
         sides = [side for side in sides if side.area >= _LEAST_TIP]
         if sides:
             return sides
-    tilted = axis - (axis @ along) * along
-    if hinged:
-        axis = tilted / np.linalg.norm(tilted) + 0.5 * along
+    if across is not None:
+        axis = across + 0.5 * along
         axis /= np.linalg.norm(axis)
     sides = [_side(s, [(-axis, 105.0)]) for s in distal]
     sides = [side for side in sides if side.area >= _LEAST_AREA]
@@ -178,6 +176,26 @@ def _palmar_axis(model: HandModel, skins: list[Skin], body: int) -> np.ndarray |
         if np.linalg.norm(flat) > 0.35:
             m = flat / np.linalg.norm(flat)
     return m
+
+
+def _across(model: HandModel, axis: np.ndarray, along: np.ndarray, body: int) -> np.ndarray | None:
+    """The palmar direction of a body that turns, square to its length; None when it lies along it."""
+    across = axis - (axis @ along) * along
+    size = float(np.linalg.norm(across))
+    return None if model.tree.joint_prismatic[body - 1] or size <= 0.3 else across / size
+
+
+def pad_axis(model: HandModel, skins: list[Skin], tip: int) -> np.ndarray | None:
+    """Direction of a fingertip's pad, (3,), body frame; None when no finger sees it.
+
+    Args:
+        skins: of the links on the body ``tip``.
+    """
+    axis = _palmar_axis(model, skins, tip)
+    if axis is None:
+        return None
+    across = _across(model, axis, _along(skins), tip)
+    return axis if across is None else across
 
 
 def _side(skin: Skin, forbidden: list[tuple[np.ndarray, float]]) -> Side:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import yaml
 
-from lgrasp.hand.spec import Cone, HandSpec
+from lgrasp.hand.spec import Cone, HandSpec, OppositionSpace, Surface
 
-__all__ = ["write_spec"]
+__all__ = ["space_lines", "write_spec"]
 
 
 def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
@@ -71,6 +71,12 @@ def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
     lines += _mapping("open_posture", spec.open_posture)
     lines += ["", "# Names of the fingers, for reports."]
     lines += ["fingers:", *(f"  {_plain(name)}: {_plain(list(links))}" for name, links in spec.fingers.items())]
+    lines += [
+        "",
+        "# For sequences of grasps: joints, and two sides that they press towards each other. A side is the surface of",
+        "# `links` whose normal lies within `angle` degrees of `axis`, inside `box` (link frame, metres).",
+    ]
+    lines += space_lines(spec.opposition_spaces)
     lines += ["", "# Yours to fill in: the licence and the source of the model."]
     lines += [f"licence: {_plain(spec.licence)}", f"source: {_plain(spec.source)}", ""]
     path.write_text("\n".join(lines), encoding="utf-8")
@@ -83,6 +89,30 @@ def _plain(value: object) -> str:
 
 def _cone(cone: Cone) -> str:
     return f"{{axis: {_plain(list(cone.axis))}, angle: {cone.angle:g}}}"
+
+
+def space_lines(spaces: dict[str, OppositionSpace]) -> list[str]:
+    """Opposition spaces as lines of hand.yaml."""
+    if not spaces:
+        return ["opposition_spaces: {}"]
+    lines = ["opposition_spaces:"]
+    for name, space in spaces.items():
+        lines += [f"  {_plain(name)}:", f"    joints: {_plain(list(space.joints))}", "    sides:"]
+        for side in space.sides:
+            if len(side) == 1:
+                lines += [f"      - {_surface(side[0])}"]
+            else:
+                lines += [f"      {'-' if i == 0 else ' '} - {_surface(part)}" for i, part in enumerate(side)]
+    return lines
+
+
+def _surface(part: Surface) -> str:
+    box = f", box: {{min: {_numbers(part.box.min)}, max: {_numbers(part.box.max)}}}" if part.box else ""
+    return f"{{links: {_plain(list(part.links))}, axis: {_numbers(part.axis)}, angle: {part.angle:g}{box}}}"
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return f"[{', '.join(f'{v:g}' for v in values)}]"
 
 
 def _mapping(key: str, values: dict[str, float]) -> list[str]:
