@@ -142,8 +142,9 @@ class WorldTrials:
                 self._sim.advance()
                 hands.state = self._sim.state()
                 hands.worst = np.maximum(hands.worst, self._sim.moved(hands.state, hands.home)[:n])
-                hands.depth = np.maximum(hands.depth, self._sim.contacts()[1][:n])
                 hands.wild |= self._sim.wild(hands.state)[:n]
+                deep = np.maximum(hands.depth, self._sim.contacts()[1][:n])
+                hands.depth = np.where(hands.wild, hands.depth, deep)
                 hands.full |= self._sim.overflowed()[:n]
         return hands
 
@@ -202,7 +203,7 @@ class WorldTrials:
             state = sim.state()
             here, wild = sim.moved(state, home), sim.wild(state)
             links, deep = sim.contacts()
-            worst, depth = np.maximum(worst, here), np.maximum(depth, deep)
+            worst, depth = np.maximum(worst, here), np.where(wild, depth, np.maximum(depth, deep))
             done += 1
             held = ~wild & bounds.held(worst, links > 0, depth)
             over = wild | bounds.lost(worst) | (done >= total)

@@ -104,8 +104,7 @@ class Trial:
         return Closed(contacts, self._slip(rows, i, look.points), bool(rest.all()), worst, depth)
 
     def _touching_at_rest(self) -> int:
-        """Links on the object that the fewest touch, once the hand has caught up with its targets; the trial goes on
-        from before."""
+        """Links on the object that the fewest touch, at rest at the targets; the trial then goes on from before."""
         lib = self._lib
         lib.mj_getState(self._m, self._data, self._state, lib.mjtState.mjSTATE_INTEGRATION)
         self._step(max(1, round(self._protocol.settle / self._m.opt.timestep)))
