@@ -17,6 +17,7 @@ from lgrasp_cli import (
     pipelines,
     prepare,
     run,
+    scenes,
     sequence,
     stages,
     validate,
@@ -33,7 +34,7 @@ app = typer.Typer(
 )
 for module in (prepare, generate, sequence, run, validate, stages, export):
     module.register(app)
-for group in (bench, hands, objects, pipelines, cache, dataset):
+for group in (bench, hands, objects, pipelines, cache, dataset, scenes):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])
 
 

@@ -41,7 +41,7 @@ class DropParams(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    radius: _Length = Field(0.2, description="Objects are dropped within this distance of the table's middle.")
+    radius: _Length = Field(0.25, description="Objects are dropped within this distance of the table's middle.")
     gap: float = Field(0.01, ge=0.0, le=1.0, description="Least distance of dropped objects to all others at first.")
     friction: float = Field(0.6, gt=0.0, le=5.0)
     timestep: float = Field(0.002, gt=0.0, le=0.01)
@@ -56,7 +56,9 @@ class SceneParams(BaseModel):
 
     objects: int = Field(5, ge=1, le=32, description="Objects on the table.")
     table: _Length = Field(0.8, description="Side of the square table [m].")
-    grasps: int = Field(200, ge=0, le=100_000, description="Grasps of each object that are brought into the scene.")
+    tested: int = Field(1000, ge=0, le=1_000_000, description="Grasps of each object that are brought and tested.")
+    grasps: int = Field(200, ge=0, le=1_000_000, description="Collision-free ones of each object kept at most.")
+    colliding: int = Field(40, ge=0, le=1_000_000, description="Others of each object kept at most.")
     tolerance: float = Field(
         0.001, ge=0.0, le=0.01, description="How deep a hand may sink into table and other objects [m]."
     )

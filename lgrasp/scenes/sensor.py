@@ -7,8 +7,11 @@ import numpy as np
 from lgrasp.dataset import pose_matrix
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.render import Images, image_normals
+from lgrasp.scenes.schema import DEPTH_UNIT
 
 __all__ = ["Merged", "add_noise", "draw_offsets", "merge_views"]
+
+_MOST_STEPS = 2**16 - 1  # that a file can hold
 
 
 @dataclass(frozen=True)
@@ -26,10 +29,11 @@ class Merged:
 
 
 def add_noise(images: Images, params: CameraParams, rng: np.random.Generator) -> Images:
-    """Images with Gaussian noise of ``noise + noise_square * depth^2`` [m] on every depth."""
+    """Images with Gaussian noise of ``noise + noise_square * depth^2`` [m] on every depth, in steps of DEPTH_UNIT."""
     error = rng.standard_normal(images.depth.shape).astype(np.float32)
     depth = images.depth + error * (params.noise + params.noise_square * images.depth**2)
-    return replace(images, depth=np.where(images.depth > 0.0, np.maximum(depth, 1e-6), 0.0).astype(np.float32))
+    steps = np.clip(np.rint(depth / DEPTH_UNIT), 1, _MOST_STEPS) * DEPTH_UNIT
+    return replace(images, depth=np.where(images.depth > 0.0, steps, 0.0).astype(np.float32))
 
 
 def draw_offsets(params: CameraParams, rng: np.random.Generator) -> np.ndarray:

@@ -1,0 +1,59 @@
+"""configs/scenes/*.yaml: what lies on the table, whose grasps, how many scenes, where they go."""
+
+import difflib
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from lgrasp.config import parse_model, read_yaml
+from lgrasp.errors import ConfigError
+from lgrasp.paths import data_dirs
+from lgrasp.scenes.params import SceneParams
+
+__all__ = ["SceneConfig", "load_scene_config", "scene_configs"]
+
+
+class SceneConfig(BaseModel):
+    """Scenes of one hand. Paths are relative to the current folder."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    description: str = ""
+    hand: str | None = Field(None, description="Name or path; default: that of the grasps, else allegro.")
+    objects: tuple[str, ...] = Field((), description="Names or paths; default: all objects of the grasps.")
+    scale: float = Field(1.0, gt=0, description="Factor from the meshes' unit to metres.")
+    grasps: Path | None = Field(None, description="Folder of shards; default: grasps are generated.")
+    pipeline: str = Field("swift", description="Generates grasps where no folder of them is given.")
+    stock: int = Field(1000, ge=1, description="Grasps that are generated of each object.")
+    scenes: int = Field(100, ge=1)
+    seed: int = Field(0, ge=0, lt=2**63)
+    out: Path = Field(Path("scenes"), description="Folder of the scenes.")
+    device: str = "auto"
+    workers: int = Field(0, ge=0, description="Scenes made at once; 0: one a core.")
+    scene: SceneParams = Field(default_factory=lambda: SceneParams.model_validate({}))
+
+
+def scene_configs() -> dict[str, Path]:
+    """Name -> file of every config of scenes on the search path."""
+    found: dict[str, Path] = {}
+    for folder in data_dirs("configs"):
+        for path in sorted((folder / "scenes").glob("*.yaml")):
+            found.setdefault(path.stem, path)
+    return found
+
+
+def load_scene_config(name: str) -> SceneConfig:
+    """A config by path or by name.
+
+    Raises:
+        ConfigError: no such config, or a wrong key or value in it.
+    """
+    files, path = scene_configs(), Path(name).expanduser()
+    if not path.is_file():
+        if name not in files:
+            near = difflib.get_close_matches(path.stem, files, n=1)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            names = ", ".join(files) or "none"
+            raise ConfigError(f"unknown config of scenes '{name}'; {hint}known: {names}, or the path of a YAML file")
+        path = files[name]
+    return parse_model(SceneConfig, read_yaml(path), f"config {path}")

@@ -1,0 +1,148 @@
+"""One scene from start to end: objects drawn, dropped, seen by cameras, grasps brought in and tested."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lgrasp.dataset import HandRecord, ObjectRecord, pose_matrix
+from lgrasp.hand.arrays import HandArrays
+from lgrasp.object.arrays import ObjectArrays
+from lgrasp.physics.solid import Solid
+from lgrasp.scenes.camera import intrinsics_of, place_cameras
+from lgrasp.scenes.drop import drop
+from lgrasp.scenes.params import CameraParams, SceneParams
+from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord
+from lgrasp.scenes.render import Surface, join_surfaces, render, table_surface
+from lgrasp.scenes.schema import DEPTH_UNIT
+from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
+from lgrasp.scenes.transfer import find_collisions, hand_poses
+from lgrasp.seeding import stage_seed
+
+__all__ = ["Item", "draw_items", "make_scene", "observe"]
+
+
+@dataclass(frozen=True)
+class Item:
+    """An object that may lie on the table, and its grasps by one hand."""
+
+    record: ObjectRecord
+    solid: Solid
+    arrays: ObjectArrays
+    T_hand_object: np.ndarray
+    """x y z [m] qw qx qy qz of each grasp, shape (n, 7), as in a shard; so are the others."""
+    q: np.ndarray
+    q_pregrasp: np.ndarray
+    q_squeeze: np.ndarray
+    candidate: np.ndarray
+
+
+def draw_items(items: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """``count`` of ``items`` objects, shape (count,); none comes again before all others have come."""
+    rounds = [rng.permutation(items) for _ in range(-(-count // items))]
+    return np.concatenate(rounds)[:count]
+
+
+def make_scene(
+    hand: HandArrays,
+    hand_record: HandRecord,
+    items: Sequence[Item],
+    params: SceneParams,
+    seed: int,
+    index: int,
+    device: str = "cpu",
+) -> SceneRecord:
+    """Scene ``index`` of a run: a pure function of the arguments on one type of device.
+
+    Raises:
+        PhysicsError: MuJoCo is missing, or the objects never came to rest on the table.
+    """
+
+    def stream(what: str) -> np.random.Generator:
+        return np.random.default_rng(stage_seed(seed, index, what))
+
+    chosen = [items[i] for i in draw_items(len(items), params.objects, stream("draw"))]
+    settled = drop([item.solid for item in chosen], params.table, params.drop, stream("drop"))
+    pose = settled.pose.astype(np.float32).astype(np.float64)  # as the file has it
+    objects = sorted({item.record.id: item.record for item in chosen}.values(), key=lambda record: record.id)
+    place = {record.id: at for at, record in enumerate(objects)}
+    surfaces = [table_surface(params.table), *_surfaces(chosen, pose)]
+    views, cloud = observe(join_surfaces(surfaces), params.camera, stream("cameras"), device)
+    grasps, counts = _transfer(hand, chosen, pose, params, stream("grasps"))
+    return SceneRecord(
+        seed=seed,
+        index=index,
+        hand=hand_record,
+        objects=objects,
+        table=params.table,
+        object_index=np.array([place[item.record.id] for item in chosen], np.int32),
+        object_pose=pose.astype(np.float32),
+        views=views,
+        cloud=cloud,
+        grasps=grasps,
+        statistics=counts | {"drops": settled.tries, "seconds_simulated": settled.seconds},
+    )
+
+
+def observe(
+    surface: Surface, params: CameraParams, rng: np.random.Generator, device: str = "cpu"
+) -> tuple[ViewsRecord, CloudRecord]:
+    """What cameras around the table see of a surface, and the cloud that is made of it."""
+    camera, pose = intrinsics_of(params), place_cameras(params, rng).astype(np.float32)
+    offsets = draw_offsets(params, rng).astype(np.float32)
+    images = add_noise(render(surface, camera, pose, device), params, rng)
+    merged = merge_views(images, offsets, params, device)
+    views = ViewsRecord(
+        intrinsics=camera,
+        pose=pose,
+        offset=offsets,
+        depth=np.rint(images.depth / DEPTH_UNIT).astype(np.uint16),
+        labels=images.labels.astype(np.int16),
+    )
+    labels, view = merged.labels.astype(np.int16), merged.view.astype(np.int16)
+    return views, CloudRecord(points=merged.points, normals=merged.normals, labels=labels, view=view)
+
+
+def _surfaces(chosen: Sequence[Item], pose: np.ndarray) -> list[Surface]:
+    """The objects' meshes where they lie, labelled from 1 on."""
+    found = []
+    for label, (item, T) in enumerate(zip(chosen, pose_matrix(pose), strict=True), 1):
+        vertices = np.asarray(item.record.vertices, float) @ T[:3, :3].T + T[:3, 3]
+        found.append(Surface(vertices, np.asarray(item.record.faces), np.full(len(item.record.faces), label)))
+    return found
+
+
+def _transfer(
+    hand: HandArrays, chosen: Sequence[Item], pose: np.ndarray, params: SceneParams, rng: np.random.Generator
+) -> tuple[SceneGrasps, dict[str, int]]:
+    """Grasps of every object in the scene, how deep the hand sinks into what is around, and counts of those tested."""
+    K, parts, limit = hand.model.dofs, [], np.float32(params.tolerance)
+    counts = {"grasps_tested": 0, "grasps_free": 0, "grasps_into_table": 0, "grasps_into_objects": 0}
+    for target, item in enumerate(chosen):
+        rows = rng.permutation(len(item.q))[: params.tested]
+        at = hand_poses(pose[target], item.T_hand_object[rows].astype(float)).astype(np.float32)
+        q, before = item.q[rows], item.q_pregrasp[rows]
+        arrays = [i.arrays for i in chosen]
+        found = find_collisions(hand, arrays, pose, target, at, before[:, :K], q[:, :K], params.tolerance)
+        table, objects = (found.table > limit).any(axis=1), (found.objects > limit).any(axis=1)
+        free = np.logical_not(table | objects)
+        for name, flags in zip(counts, (np.ones_like(free), free, table, objects), strict=True):
+            counts[name] += int(flags.sum())
+        kept = np.sort(
+            np.concatenate([np.flatnonzero(free)[: params.grasps], np.flatnonzero(~free)[: params.colliding]])
+        )
+        parts.append(
+            {
+                "target": np.full(len(kept), target, np.int32),
+                "hand_pose": at[kept],
+                "q": q[kept],
+                "q_pregrasp": before[kept],
+                "q_squeeze": item.q_squeeze[rows[kept]],
+                "table_depth": found.table[kept],
+                "object_depth": found.objects[kept],
+                "collision_free": free[kept],
+                "candidate": item.candidate[rows[kept]],
+            }
+        )
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return SceneGrasps(**joined, tolerance=params.tolerance), counts

@@ -1,0 +1,103 @@
+"""What a scene file holds, in memory: frozen records of NumPy arrays."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+import lgrasp
+from lgrasp.dataset import HandRecord, ObjectRecord
+from lgrasp.scenes.camera import Intrinsics
+
+__all__ = ["CloudRecord", "SceneGrasps", "SceneRecord", "ViewsRecord"]
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewsRecord:
+    """What ``V`` depth cameras saw, noise included."""
+
+    intrinsics: Intrinsics
+    pose: np.ndarray
+    """T_scene_camera where the cameras truly were, x y z [m] qw qx qy qz, shape [V, 7], float32."""
+    offset: np.ndarray
+    """By how much the points of each view are displaced in the cloud [m], shape [V, 3], float32."""
+    depth: np.ndarray
+    """Along the optical axis in 0.1 mm, 0 where nothing is seen, shape [V, H, W], uint16."""
+    labels: np.ndarray
+    """-1 nothing, 0 table, k + 1 object k, shape [V, H, W], int16: the masks."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudRecord:
+    """All views merged; ``P`` points in the scene frame."""
+
+    points: np.ndarray
+    """[m], shape [P, 3], float32."""
+    normals: np.ndarray
+    """Estimated from the depth image, unit, towards the camera, shape [P, 3], float32."""
+    labels: np.ndarray
+    """0 table, k + 1 object k, shape [P], int16."""
+    view: np.ndarray
+    """Camera that saw the point, shape [P], int16."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneGrasps:
+    """``N`` grasps in a scene, ``K`` listed joints."""
+
+    target: np.ndarray
+    """Object that is grasped, 0 to M - 1, shape [N], int32."""
+    hand_pose: np.ndarray
+    """T_scene_base of the hand's base link, x y z [m] qw qx qy qz, shape [N, 7], float32."""
+    q: np.ndarray
+    """Joint positions [rad or m], shape [N, K], float32."""
+    q_pregrasp: np.ndarray
+    """Joint positions before closing [rad or m], shape [N, K], float32."""
+    q_squeeze: np.ndarray
+    """Position targets that press on the object [rad or m], shape [N, K], float32."""
+    table_depth: np.ndarray
+    """How deep the hand sinks into the table at q_pregrasp and q [m], shape [N, 2], float32."""
+    object_depth: np.ndarray
+    """The same for all other objects; above the tolerance perhaps too small [m], shape [N, 2], float32."""
+    collision_free: np.ndarray
+    """Are all four depths within the tolerance? Shape [N], bool."""
+    candidate: np.ndarray
+    """Global candidate index in the shard that the grasp comes from, shape [N], uint64."""
+    tolerance: float
+    """[m]"""
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneRecord:
+    """One scene: ``M`` objects on a table, what cameras see of them, and grasps."""
+
+    seed: int
+    index: int
+    """Number of the scene in its run."""
+    hand: HandRecord
+    objects: Sequence[ObjectRecord]
+    """Those that lie on the table, each once, sorted by id."""
+    table: float
+    """Side of the table [m]; its top is z = 0 about the origin."""
+    object_index: np.ndarray
+    """Position of object k in ``objects``, shape [M], int32; one may lie there twice."""
+    object_pose: np.ndarray
+    """T_scene_object, x y z [m] qw qx qy qz, shape [M, 7], float32."""
+    views: ViewsRecord
+    cloud: CloudRecord
+    grasps: SceneGrasps
+    config: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters that decide the scene, JSON-serialisable."""
+    statistics: Mapping[str, int | float | str] = field(default_factory=dict)
+    created: str = field(default_factory=_now)
+    """ISO 8601 with time zone."""
+    lgrasp_version: str = lgrasp.__version__

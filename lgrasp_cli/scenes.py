@@ -1,0 +1,254 @@
+"""``lgrasp scenes``: tables with objects, what depth cameras see of them, and grasps that fit in."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache
+
+if TYPE_CHECKING:
+    from lgrasp.engine.scenes.config import SceneConfig
+    from lgrasp.engine.scenes.job import SceneOutcome
+
+__all__ = ["app"]
+
+app = typer.Typer(help="Tables with objects: point clouds, masks and grasps that fit in.", no_args_is_help=True)
+
+_INTERVAL = 10.0  # [s] between lines of progress
+
+
+@app.command()
+def make(
+    objects: Annotated[
+        list[str] | None,
+        typer.Argument(help="Names or mesh files of objects; or one config of scenes.", show_default=False),
+    ] = None,
+    hand: Annotated[
+        str | None, typer.Option(help="Hand; default: that of --grasps, else allegro.", show_default=False)
+    ] = None,
+    scenes: Annotated[
+        int | None, typer.Option("-n", "--scenes", help="Scenes asked; default: 100.", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the scenes; default: scenes.", show_default=False)
+    ] = None,
+    grasps: Annotated[
+        Path | None,
+        typer.Option(help="Folder of shards (lgrasp generate); default: grasps are generated.", show_default=False),
+    ] = None,
+    pipeline: Annotated[
+        str | None, typer.Option("--pipeline", "-p", help="Generates the grasps; default: swift.", show_default=False)
+    ] = None,
+    stock: Annotated[
+        int | None, typer.Option(help="Grasps generated of each object; default: 1000.", show_default=False)
+    ] = None,
+    on_table: Annotated[int | None, typer.Option(help="Objects on a table; default: 5.", show_default=False)] = None,
+    views: Annotated[int | None, typer.Option(help="Depth cameras; default: 3.", show_default=False)] = None,
+    scale: Annotated[
+        float | None, typer.Option(help="Factor from the meshes' unit to metres.", show_default=False)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Base seed; default: 0.", show_default=False)] = None,
+    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda:N; default: auto.", show_default=False)] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Scenes made at once; default: one a core (1 on a GPU).", show_default=False)
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Keep whole scenes of the same run.")] = True,
+    shard_index: Annotated[
+        int | None, typer.Option(help="Task of an array; default: SLURM_ARRAY_TASK_ID.", show_default=False)
+    ] = None,
+    num_shards: Annotated[
+        int | None, typer.Option(help="Tasks of the array; default: SLURM_ARRAY_TASK_COUNT.", show_default=False)
+    ] = None,
+    json_path: JsonPath = None,
+    cache_dir: CacheDir = None,
+    quiet: Quiet = False,
+) -> None:
+    """Drop objects on a table, look at them with depth cameras, bring in grasps and write one file a scene.
+
+    Grasps come from shards (--grasps), or are generated first into OUT/grasps. Those whose hand would run into the
+    table or other objects are told from those that fit. A scene depends on its number and the seed only.
+
+    Example: lgrasp scenes make mug bowl bottle box sphere hammer --hand allegro -n 100 --out scenes
+    """
+    cache = open_cache(cache_dir)
+    from lgrasp.engine.jobs import array_task
+    from lgrasp.engine.scenes.job import SceneJob, scene_numbers
+
+    changes = {
+        "hand": hand,
+        "scenes": scenes,
+        "out": out,
+        "grasps": grasps,
+        "pipeline": pipeline,
+        "stock": stock,
+        "scale": scale,
+        "seed": seed,
+        "device": device,
+        "workers": workers,
+    }
+    config = _config(objects or [], changes, on_table, views)
+    index, number = array_task(shard_index, num_shards)
+    check_report(json_path)
+    job = SceneJob(config, shard_index=index, num_shards=number, resume=resume, cache=cache)
+    outcome = _run(job, len(scene_numbers(job)), quiet=quiet)
+    from lgrasp.engine.scenes.report import report
+
+    data = report(outcome, len(scene_numbers(job)), config.out)
+    _show(data, json_path, quiet)
+    if outcome.cancelled:
+        typer.echo(f"interrupted: {len(outcome.paths)} scenes in {config.out}; the same command goes on", err=True)
+        raise typer.Exit(130)
+
+
+@app.command()
+def check(
+    paths: Annotated[list[Path], typer.Argument(help="Scene files, or folders of *.h5 files.", show_default=False)],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")] = False,
+) -> None:
+    """Check every byte and value of each scene against the format; exit code 2 if one has a problem.
+
+    Example: lgrasp scenes check scenes
+    """
+    from lgrasp.dataset import find_shards
+    from lgrasp.scenes.reader import check_scene
+    from lgrasp_cli.tables import print_json
+
+    problems = {str(path): check_scene(path) for path in find_shards(paths)}
+    if as_json:
+        print_json(problems)
+    for path, lines in problems.items():
+        for line in lines:
+            typer.echo(f"{path}: {line}", err=True)
+    if any(problems.values()):
+        raise typer.Exit(2)
+    if not as_json:
+        typer.echo(f"{len(problems):,} scene{'' if len(problems) == 1 else 's'} valid")
+
+
+@app.command()
+def info(
+    paths: Annotated[list[Path], typer.Argument(help="Scene files, or folders of *.h5 files.", show_default=False)],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Show how many points and grasps scenes hold, object by object.
+
+    Example: lgrasp scenes info scenes
+    """
+    from lgrasp.dataset import find_shards
+    from lgrasp.engine.scenes.report import describe_scenes
+    from lgrasp_cli.tables import print_json
+
+    data = describe_scenes(find_shards(paths))
+    if as_json:
+        print_json(data)
+    else:
+        _print(data, [("scenes", f"{data['scenes']:,}")])
+
+
+def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, views: int | None) -> "SceneConfig":
+    """The config that is named, or one of the objects, with what the command line replaces."""
+    from lgrasp.config import parse_model
+    from lgrasp.engine.scenes.config import SceneConfig, load_scene_config, scene_configs
+
+    data: dict[str, Any] = {"objects": objects}
+    if len(objects) == 1 and (objects[0].endswith((".yaml", ".yml")) or objects[0] in scene_configs()):
+        data = load_scene_config(objects[0]).model_dump()
+    data |= {name: value for name, value in changes.items() if value is not None}
+    scene = data.setdefault("scene", {})
+    if on_table is not None:
+        scene["objects"] = on_table
+    if views is not None:
+        scene.setdefault("camera", {})["views"] = views
+    return parse_model(SceneConfig, data, "scenes make")
+
+
+def _run(job: Any, asked: int, *, quiet: bool) -> "SceneOutcome":
+    """Make the scenes with a line of progress every ten seconds; Ctrl-C ends the job after the running ones."""
+    from lgrasp.engine.scenes.job import SceneListener, make_scenes
+    from lgrasp_cli.interrupt import on_interrupt, stop_now
+
+    class Progress(SceneListener):
+        running = stop = False
+        done = 0
+        said = time.monotonic()
+
+        def _say(self, line: str) -> None:
+            if not quiet and time.monotonic() - self.said >= _INTERVAL:
+                self.said = time.monotonic()
+                typer.echo(line, err=True)
+
+        def loading(self, what: str) -> None:
+            self._say(f"loading {what}")
+
+        def started(self, scenes: int, present: int) -> None:
+            self.running, self.done = True, present
+
+        def wrote(self, index: int, path: Path) -> None:
+            self.done += 1
+            self._say(f"scenes {self.done:,}/{asked:,}")
+
+        def cancelled(self) -> bool:
+            return self.stop
+
+    listener = Progress()
+
+    def stop() -> None:
+        if listener.stop or not listener.running:
+            stop_now()
+        listener.stop = True
+        typer.echo("stopping after the running scenes; Ctrl-C again stops at once", err=True)
+
+    with on_interrupt(stop):
+        return make_scenes(job, listener)
+
+
+def _show(data: dict[str, Any], json_path: str | None, quiet: bool) -> None:
+    from lgrasp_cli.tables import print_json
+
+    if json_path == "-":
+        print_json(data)
+    elif not quiet:
+        extra = f" ({data['present']:,} were there)" if data["present"] else ""
+        speed = f", {data['scenes_per_minute']:.1f} scenes/min" if data["made"] else ""
+        head = [
+            ("scenes", f"{data['scenes']:,} of {data['asked']:,} asked{extra}"),
+            ("where", data["out"]),
+            ("hand", data["hand"]),
+            ("wall", f"{data['seconds']:.2f} s{speed}"),
+        ]
+        _print(data, head)
+    if json_path and json_path != "-":
+        from lgrasp.engine.report import write_json
+
+        write_json(json_path, data)
+
+
+def _print(data: dict[str, Any], head: list[tuple[str, str]]) -> None:
+    from lgrasp_cli.tables import print_pairs, print_table
+
+    scenes, tested = max(data["scenes"], 1), max(data["grasps_tested"], 1)
+    table, others = data["grasps_into_table"] / tested, data["grasps_into_objects"] / tested
+    print_pairs(
+        [
+            *head,
+            ("points", f"{data['points'] / scenes:,.0f} a scene, {data['object_points'] / scenes:,.0f} on objects"),
+            ("grasps", f"{data['grasps_tested']:,} tested, {data['grasps_free'] / tested:.1%} collision-free"),
+            ("collide", f"{table:.1%} with the table, {others:.1%} with other objects"),
+            ("size", f"{data['bytes'] / 1e6 / scenes:.1f} MB a scene"),
+        ]
+    )
+    rows = [
+        (
+            name,
+            f"{found['scenes']:,}",
+            f"{found['points'] / found['scenes']:,.0f}",
+            f"{found['free']:,}",
+            f"{found['kept'] - found['free']:,}",
+            f"{found['without']:,}",
+        )
+        for name, found in data["objects"].items()
+    ]
+    columns = ("object", "times", "points", "free", "colliding", "without a free one")
+    print_table(columns, rows, right=columns[1:])
