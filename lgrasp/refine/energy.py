@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import torch
 
+from lgrasp.refine.links import Intrusions
 from lgrasp.refine.params import LocalSearch
 
-__all__ = ["LENGTH", "Energies", "Matches", "barrier", "limit_energy", "matching_energies", "wrench_energy"]
+__all__ = ["LENGTH", "Energies", "Matches", "barrier", "intrusion_energies", "limit_energy", "matching_energies", "wrench_energy"]
 
 LENGTH = 0.01
 """Distances are counted in this unit [m]."""
@@ -32,6 +33,8 @@ class Matches(NamedTuple):
     """(N, L, P, 3)."""
     contacts: torch.Tensor
     """Points, counted over L P, that the net wrench is made of, (N, C) int64."""
+    intrusions: Intrusions
+    """What is in the links, or nearly so."""
 
 
 class Energies(NamedTuple):
@@ -41,12 +44,13 @@ class Energies(NamedTuple):
     normals: torch.Tensor
     force: torch.Tensor
     barrier: torch.Tensor
+    overlap: torch.Tensor
     limits: torch.Tensor
 
     @property
     def total(self) -> torch.Tensor:
         """E*, (N,)."""
-        return self.points + self.normals + self.force + self.barrier + self.limits
+        return self.points + self.normals + self.force + self.barrier + self.overlap + self.limits
 
 
 def barrier(u: torch.Tensor) -> torch.Tensor:
@@ -70,7 +74,7 @@ def matching_energies(
     """E_p, E_n and the barrier, weighted, (N,) each.
 
     E_p = sum W ((x - y) . n)^2 / sum W in cm^2; E_n = sum W (m . n + 1)^2 / sum W; the barrier is summed over all
-    points and divided by a tenth of them.
+    points.
 
     Args:
         x, m: points [m] and normals of the hand in the object's frame, (N, L, P, 3).
@@ -81,8 +85,20 @@ def matching_energies(
     align = (m * matches.normal).sum(-1) + 1
     normals = (matches.pull * align * align).sum((1, 2)) * (params.normals / total_weight)
     u = ((x * matches.block_normal).sum(-1) - matches.block_offset) / params.margin
-    kept_out = barrier(u).sum((1, 2)) * (params.barrier * 10 / (x.shape[1] * x.shape[2]))
-    return points, normals, kept_out
+    return points, normals, params.barrier * barrier(u).sum((1, 2))
+
+
+def intrusion_energies(
+    object_distance: torch.Tensor, link_distance: torch.Tensor, params: LocalSearch
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Barriers of what is in the links: the object's points, and those of other links, weighted, (N,) each.
+
+    Args:
+        object_distance: (N, S, k) [m]. link_distance: (N, Q, k) [m].
+    """
+    of_object = barrier(object_distance / params.margin).sum((1, 2))
+    of_links = barrier(link_distance / params.self_margin).sum((1, 2))
+    return params.barrier * of_object, params.barrier * of_links
 
 
 def wrench_energy(

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["LocalSearch"]
+__all__ = ["Bounds", "LocalSearch"]
 
 
 class LocalSearch(BaseModel):
@@ -22,12 +22,35 @@ class LocalSearch(BaseModel):
     decay: float = Field(0.05, gt=0, le=1, description="Size of the last step over that of the first.")
     reach: float = Field(0.02, gt=0, le=1, description="Points farther from the object do not pull, first outer step.")
     reach_end: float = Field(0.01, gt=0, le=1, description="The same in the last outer step.")
+    soft: float = Field(0.004, gt=0, le=1, description="Distance about which pulls stop growing.")
     touching: int = Field(4, ge=1, le=16, description="Palmar points of a link, nearest first, that pull.")
     points: float = Field(1.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared.")
     normals: float = Field(0.02, ge=0, le=1e6, description="Weight of normals that do not oppose.")
     force: float = Field(0.05, ge=0, le=1e6, description="Weight of the net wrench of four contacts.")
-    barrier: float = Field(0.02, ge=0, le=1e6, description="Weight of the barrier against penetration.")
+    barrier: float = Field(0.002, ge=0, le=1e6, description="Weight of the barriers against penetration, per point.")
     limits: float = Field(0.01, ge=0, le=1e6, description="Weight of the barrier at the joint limits.")
     margin: float = Field(0.003, gt=0, le=0.05, description="Distance below which the barrier acts.")
+    self_margin: float = Field(0.001, gt=0, le=0.05, description="The same between links.")
     contacts: int = Field(4, ge=2, le=16, description="Contacts that the net wrench is made of.")
     nearest: float = Field(0.2, gt=0, le=1, description="Share of the palmar points, nearest first, they come from.")
+
+
+class Bounds(BaseModel):
+    """What a finished grasp must satisfy, and its control poses; tighter than strict validity. Angles in degrees."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    penetration: float = Field(0.0008, ge=0, le=0.01, description="Largest hand-object penetration.")
+    self_margin: float = Field(0.0003, ge=0, le=0.01, description="Least distance of non-adjacent links.")
+    gap: float = Field(0.0013, gt=0, le=0.02, description="Largest distance of link and object at a contact.")
+    angle: float = Field(17.0, gt=0, le=90, description="Largest angle of the normals at a contact [deg].")
+    friction: float = Field(0.5, gt=0, le=2, description="Friction coefficient of gswo and epsilon.")
+    balance: float = Field(0.035, gt=0, le=10, description="Largest gswo residual (norm).")
+    torque_scale: float = Field(10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")
+    disturbance: float = Field(
+        1.0, gt=0, le=1, description="Largest disturbance residual: unresisted part of a unit force."
+    )
+    open_distance: float = Field(0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the normals.")
+    open_margin: float = Field(0.001, ge=0, le=0.05, description="Least distance of hand and object in q_pregrasp.")
+    squeeze_force: float = Field(15.0, ge=0, le=1000, description="Normal forces that q_squeeze presses with [N].")
+    stiffness: float = Field(5.0, gt=0, le=1e6, description="Stiffness that q_squeeze is meant for [N m/rad].")

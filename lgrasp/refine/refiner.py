@@ -9,7 +9,15 @@ from lgrasp.differentiable.kinematics import BodyKinematics
 from lgrasp.differentiable.rotations import so3_exp
 from lgrasp.hand.model import HandModel
 from lgrasp.object.model import ObjectModel
-from lgrasp.refine.energy import Energies, Matches, limit_energy, matching_energies, wrench_energy
+from lgrasp.refine.energy import (
+    Energies,
+    Matches,
+    intrusion_energies,
+    limit_energy,
+    matching_energies,
+    wrench_energy,
+)
+from lgrasp.refine.links import LinkSolids
 from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.surface import HandSurface, hand_surface
 from lgrasp.refine.target import Target
@@ -17,6 +25,7 @@ from lgrasp.refine.target import Target
 __all__ = ["Pose", "Refined", "Refiner"]
 
 _TINY = 1e-12
+_ADVANCES = 30
 _SECOND = 0.99  # decay of adam's second moment
 
 
@@ -77,6 +86,7 @@ class Refiner(nn.Module):
         self.params = params or LocalSearch()
         self.target = target if isinstance(target, Target) else Target(target, dtype=dtype, device=device)
         self._bodies = BodyKinematics(hand.tree, dtype=dtype, device=device)
+        self._links = LinkSolids(hand, self.target.cloud, self.params.margin, dtype=dtype, device=device)
         self._block = torch.as_tensor(surface.body, dtype=torch.int64, device=device)
 
         def put(a: object) -> torch.Tensor:
@@ -139,12 +149,15 @@ class Refiner(nn.Module):
             matches: default: those of these poses, with the parameters' first reach.
         """
         matches = matches or self.match(R, t, q)
-        x, m = self._placed(R, t, q)
+        bodies = self._bodies(q)
+        x, m = self._placed(R, t, bodies)
         points, normals, kept_out = matching_energies(x, m, matches, self._sum, self.params)
         at = matches.contacts[..., None].expand(-1, -1, 3)
         contacts = x.flatten(1, 2).gather(1, at)
         force = wrench_energy(contacts, -self.target.normals(contacts), self.target.com, self.target.radius, self.params)
-        return Energies(points, normals, force, kept_out, limit_energy(q, self.lower, self.upper, self.params))
+        into, overlap = intrusion_energies(*self._links.distances(matches.intrusions, R, t, *bodies), self.params)
+        limits = limit_energy(q, self.lower, self.upper, self.params)
+        return Energies(points, normals, force, kept_out + into, overlap, limits)
 
     @torch.no_grad()
     def match(
@@ -152,16 +165,33 @@ class Refiner(nn.Module):
     ) -> Matches:
         """Nearest points of the object for every point of the hands, and the contacts that make the net wrench."""
         reach = self.params.reach if reach is None else reach
-        x, _ = self._placed(R, t, q)
+        bodies = self._bodies(q)
+        x, _ = self._placed(R, t, bodies)
         d, n = self.target.nearest(x)
         apart = torch.where(self._weight > 0, d.abs(), torch.inf)
         # the part of each link that is nearest to the object: a surface that fits nowhere else is no error
         least = apart.kthvalue(self.params.touching, dim=2, keepdim=True).values
-        pull = self._weight * (apart <= least) * (apart < reach)
+        pull = self._weight * (apart <= least) * (apart < reach) / (1 + d.abs() / self.params.soft)
         offset = (x * n).sum(-1) - d
         block_d, block_n = self.target.nearest_obstacle(x, d, n)
         block_offset = (x * block_n).sum(-1) - block_d
-        return Matches(offset, n, pull, block_offset, block_n, self._contacts(x, d))
+        return Matches(offset, n, pull, block_offset, block_n, self._contacts(x, d), self._links.match(R, t, *bodies))
+
+    @torch.no_grad()
+    def advanced(self, pose: Pose, direction: torch.Tensor, travel: torch.Tensor, clearance: float) -> Pose:
+        """Hands moved straight until a point of theirs is ``clearance`` [m] from anything, or by ``travel`` (N,) [m].
+
+        Args:
+            direction: unit vectors in the object's frame, (N, 3).
+        """
+        x, _ = self._placed(pose.R, pose.t, self._bodies(pose.q))
+        gone = torch.zeros_like(travel)
+        for _ in range(_ADVANCES):
+            at = x + (gone[:, None] * direction)[:, None, None]
+            d, n = self.target.nearest(at)
+            d, _ = self.target.nearest_obstacle(at, d, n)
+            gone = (gone + (d.amin((1, 2)) - clearance).clamp_min(0)).minimum(travel)
+        return pose._replace(t=pose.t + gone[:, None] * direction)
 
     def _contacts(self, x: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
         """Farthest points among the nearest of the palmar ones, (N, C); the nearest of all first."""
@@ -177,9 +207,11 @@ class Refiner(nn.Module):
             chosen.append(gap.argmax(1, keepdim=True))
         return self._palmar[near.gather(1, torch.cat(chosen, 1))]
 
-    def _placed(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _placed(
+        self, R: torch.Tensor, t: torch.Tensor, bodies: tuple[torch.Tensor, torch.Tensor]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Points [m] and normals of the hands in the object's frame, (N, L, P, 3)."""
-        body_R, body_t = self._bodies(q)
+        body_R, body_t = bodies
         R_block = R[:, None] @ body_R[:, self._block]  # (N, L, 3, 3)
         t_block = (R[:, None] @ body_t[:, self._block, :, None])[..., 0] + t[:, None]
         turned = R_block.mT

@@ -11,6 +11,9 @@ from lgrasp.object.sdf import SdfGrid
 __all__ = ["Target"]
 
 
+_CLOUD = 512
+
+
 class Target:
     """An object, perhaps among others that are only kept out of, in the object's internal frame.
 
@@ -31,6 +34,10 @@ class Target:
         self._around = None if around is None else _Volume(around, dtype, device)
         self.normals = SurfaceNormals(_grid(model), dtype=dtype, device=device)
         """Outward unit normals (..., 3) at points (..., 3) [m]: smooth, differentiable."""
+        solids = [model] if around is None else [model, around]
+        clouds = [m.obstacle_points[_evenly(len(m.obstacle_points), _CLOUD)] for m in solids]
+        self.cloud = np.concatenate(clouds)
+        """Points of the surface of all that the hand is kept out of [m], (n, 3)."""
         self.com = torch.as_tensor(model.com, dtype=dtype, device=device)
         """Centre of mass [m], (3,)."""
         self.radius = float(np.linalg.norm(model.obstacle_points - model.com, axis=1).max())
@@ -76,6 +83,11 @@ class _Volume:
         far = way.norm(dim=-1)
         out = (beyond != 0).any(-1)
         return torch.where(out, far, d), torch.where(out[..., None], way / far.clamp_min(1e-9)[..., None], n)
+
+
+def _evenly(length: int, count: int) -> np.ndarray:
+    count = min(count, length)
+    return ((np.arange(count) + 0.5) * length / count).astype(int)
 
 
 def _grid(model: ObjectModel) -> SdfGrid:

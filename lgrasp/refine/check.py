@@ -1,0 +1,174 @@
+"""Finished grasps of hands in a posture: contacts found, every claim computed on the final joints, control poses."""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from lgrasp.device.qp import MAX_CONTACTS
+from lgrasp.grasp.tables import GraspTable
+from lgrasp.hand.arrays import HandArrays
+from lgrasp.object.arrays import ObjectArrays
+from lgrasp.refine.check_kernels import (
+    balance_rows,
+    choose_contacts,
+    clear_of_itself,
+    control_rows,
+    deepen_rows,
+    link_contacts,
+)
+from lgrasp.refine.params import Bounds
+
+__all__ = ["OUTCOMES", "check_grasps"]
+
+OUTCOMES = ("kept", "contact", "self-collision", "object collision", "balance", "disturbance")
+"""Outcome codes of a row: the first check that it failed."""
+
+_FAR = 0.03  # [m] depths above this are of no account
+
+
+def check_grasps(
+    hand: HandArrays,
+    obj: ObjectArrays,
+    pose: np.ndarray,
+    q: np.ndarray,
+    bounds: Bounds,
+    *,
+    around: ObjectArrays | None = None,
+    index: np.ndarray | None = None,
+) -> tuple[GraspTable, np.ndarray]:
+    """All rows as a table in the order given, and their outcomes (OUTCOMES), (N,).
+
+    Args:
+        pose: T_hand_object of the object's internal frame, x y z [m] qx qy qz qw, (N, 7).
+        q: joint positions within their limits [rad or m], (N, K).
+        around: what else the hand must not penetrate, in the object's internal frame.
+        index: candidate index of each row; default: the row.
+    """
+    d, n = hand.device, len(q)
+    runs = _link_runs(hand.model.contact_link)
+    links, width = len(runs) - 1, min(MAX_CONTACTS, len(runs) - 1)
+    poses = wp.array(np.ascontiguousarray(pose, np.float32), dtype=wp.transform, device=d)
+    joints = wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=d)
+    contact = wp.empty((n, links), dtype=wp.int32, device=d)
+    gap, dot = (wp.zeros((n, links), dtype=wp.float32, device=d) for _ in range(2))
+    point, normal = (wp.zeros((n, links), dtype=wp.vec3, device=d) for _ in range(2))
+    wp.launch(
+        link_contacts,
+        dim=(links, n),
+        inputs=[
+            hand.struct,
+            obj.struct,
+            wp.array(runs, dtype=wp.int32, device=d),
+            bounds.gap,
+            math.cos(math.radians(bounds.angle)),
+            poses,
+            joints,
+        ],
+        outputs=[contact, gap, dot, point, normal],
+        device=d,
+    )
+    chosen = wp.empty((n, width), dtype=wp.int32, device=d)
+    groups, clear = (wp.empty(n, dtype=wp.int32, device=d) for _ in range(2))
+    wp.launch(
+        choose_contacts, dim=n, inputs=[hand.struct, contact, gap], outputs=[chosen, groups], device=d
+    )
+    body = wp.empty((n, len(hand.model.piece_first) - 2), dtype=wp.transform, device=d)
+    wp.launch(
+        clear_of_itself, dim=n, inputs=[hand.struct, bounds.self_margin, joints], outputs=[body, clear], device=d
+    )
+    depth = wp.zeros(n, dtype=wp.float32, device=d)
+    for solid in (obj, around):
+        if solid is not None:
+            wp.launch(
+                deepen_rows,
+                dim=(len(hand.model.piece_first) - 1, n),
+                inputs=[hand.struct, solid.struct, _FAR, poses, joints],
+                outputs=[depth],
+                device=d,
+            )
+    force = wp.zeros((n, width), dtype=wp.vec3, device=d)
+    numbers = wp.zeros((4, n), dtype=wp.float32, device=d)
+    wp.launch(
+        balance_rows,
+        dim=n,
+        inputs=[obj.struct, 0, bounds.friction, bounds.torque_scale, poses, chosen, point, normal],
+        outputs=[force, numbers],
+        device=d,
+    )
+    pregrasp, squeeze = wp.clone(joints), wp.clone(joints)
+    wp.launch(
+        control_rows,
+        dim=n,
+        inputs=[
+            hand.struct,
+            obj.struct,
+            bounds.open_distance,
+            bounds.open_margin,
+            bounds.self_margin,
+            bounds.squeeze_force,
+            bounds.stiffness,
+            poses,
+            joints,
+            body,
+            chosen,
+            contact,
+            point,
+            normal,
+            force,
+        ],
+        outputs=[pregrasp, squeeze],
+        device=d,
+    )
+    at = chosen.numpy()
+    filled = at >= 0
+    fswo, gswo, disturbance, epsilon = numbers.numpy()
+    deep = depth.numpy()
+    outcome = np.select(
+        [
+            groups.numpy() < 2,
+            clear.numpy() == 0,
+            deep > bounds.penetration,
+            gswo > bounds.balance,
+            disturbance > bounds.disturbance,
+        ],
+        range(1, len(OUTCOMES)),
+        0,
+    )
+
+    def column(values: wp.array, none: float) -> np.ndarray:
+        """A column by link as one by contact."""
+        v = values.numpy()
+        picked = np.take_along_axis(v, np.where(filled, at, 0).reshape(at.shape + (1,) * (v.ndim - 2)), 1)
+        return np.where(filled.reshape(picked.shape[:2] + (1,) * (v.ndim - 2)), picked, none).astype(v.dtype)
+
+    hit = column(contact, 0)
+    metrics = {
+        "fswo": fswo,
+        "gswo": gswo,
+        "disturbance": disturbance,
+        "epsilon": epsilon,
+        "penetration": deep,
+        "self_penetration": np.zeros(n, np.float32),
+        "gap": column(gap, 0).max(1, initial=0),
+        "normal_error": np.arccos(np.clip(column(dot, 1).min(1, initial=1), -1, 1)),
+    }
+    table = GraspTable(
+        index=np.arange(n) if index is None else np.asarray(index, np.int64),
+        slot=np.zeros(n, np.int32),
+        q=joints.numpy(),
+        q_pregrasp=pregrasp.numpy(),
+        q_squeeze=squeeze.numpy(),
+        pose=np.ascontiguousarray(pose, np.float32),
+        contact_points=column(point, np.nan),
+        contact_normals=column(normal, np.nan),
+        contact_links=np.where(filled, hand.model.contact_link[hit], -1).astype(np.int32),
+        contact_forces=np.where(filled[..., None], force.numpy(), np.nan),
+        metrics={name: values.astype(np.float32) for name, values in metrics.items()},
+    )
+    return table, outcome
+
+
+def _link_runs(contact_link: np.ndarray) -> np.ndarray:
+    """First contact point of each run of points on one link, and their number."""
+    return np.concatenate([[0], np.flatnonzero(np.diff(contact_link)) + 1, [len(contact_link)]]).astype(np.int32)
