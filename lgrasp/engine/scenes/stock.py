@@ -21,7 +21,8 @@ from lgrasp.engine.scenes.config import SceneConfig
 from lgrasp.engine.workspace import OBJECT_VERSION, input_keys, load_hand
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.hand.find import find_hand
+from lgrasp.hand.find import HandSource, find_hand
+from lgrasp.hand.model import hand_digest
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel, preprocess_object
@@ -63,10 +64,10 @@ def load_stock(config: SceneConfig, cache: Cache, device: Device, report: Callab
         wanted = [_source_hash(name) for name in config.objects] or None
     found = _read_shards(shards)
     name = config.hand or next(iter(found.values())).hand[0]
+    chosen = {key: part for key, part in found.items() if wanted is None or part.record.sha256 in wanted}
+    _check(config, find_hand(name), found, chosen, wanted)
     hand, record = _load_hand(name, cache, device, report)
     items, digest = [], hashlib.sha256(record.sha256.encode())
-    chosen = {key: part for key, part in found.items() if wanted is None or part.record.sha256 in wanted}
-    _check(config, record, found, chosen, wanted)
     for key in sorted(chosen):
         part = chosen[key]
         report(f"object {part.record.id}")
@@ -156,7 +157,7 @@ def _load_hand(name: str, cache: Cache, device: Device, report: Callable[[str], 
 
 def _check(
     config: SceneConfig,
-    hand: HandRecord,
+    hand: HandSource,
     found: dict[tuple[str, str], _Part],
     chosen: dict[tuple[str, str], _Part],
     wanted: list[str] | None,
@@ -166,11 +167,12 @@ def _check(
         if source not in there:
             names = ", ".join(sorted(key[0] for key in found))
             raise ConfigError(f"{config.grasps} has no grasps of object '{name}'; it has {names}")
+    digest = hand_digest(hand.urdf, hand.spec)
     for part in chosen.values():
-        if part.hand[1] != hand.sha256:
+        if part.hand[1] != digest:
             raise ConfigError(
                 f"the grasps of '{part.record.id}' are of hand '{part.hand[0]}' (hash {part.hand[1][:12]}), "
-                f"not of '{hand.name}' (hash {hand.sha256[:12]}); generate them with this hand"
+                f"not of '{hand.name}' (hash {digest[:12]}); generate them with this hand"
             )
 
 

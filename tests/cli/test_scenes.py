@@ -1,0 +1,91 @@
+"""``lgrasp scenes``: what it prints, its exit codes, one line for bad input."""
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+import yaml
+
+SMALL = {"objects": 2, "grasps": 5, "colliding": 5, "tested": 20, "camera": {"width": 80, "height": 60, "views": 2}}
+
+
+@pytest.fixture
+def config(tmp_path, quick):
+    """config(**changes): file of a small config of scenes."""
+
+    def write(**changes) -> Path:
+        path = tmp_path / "small.yaml"
+        data = {"hand": "allegro", "objects": ["tiny", "sphere"], "pipeline": quick, "stock": 20, "scenes": 2}
+        data |= {"out": "out", "device": "cpu", "workers": 1, "scene": SMALL}
+        path.write_text(yaml.safe_dump(data | changes))
+        return path
+
+    return write
+
+
+def test_make_check_info(cli, config):
+    made = cli("scenes", "make", config(), "--json", "report.json")
+    assert made.code == 0, made
+    assert "2 of 2 asked" in made.out
+    data = json.loads(Path("report.json").read_text())
+    assert data["made"] == 2
+    assert set(data["objects"]) == {"sphere", "tiny"}
+    again = cli("scenes", "make", config(), "-n", 3, "--json", "-")
+    assert json.loads(again.out)["present"] == 2
+    checked = cli("scenes", "check", "out")
+    assert checked.code == 0
+    assert checked.out == "3 scenes valid\n"
+    assert "collision-free" in cli("scenes", "info", "out").out
+    path = next(Path("out").glob("*.h5"))
+    path.write_bytes(path.read_bytes()[:-50])
+    broken = cli("scenes", "check", "out")
+    assert broken.code == 2
+    assert str(path) in broken.err
+
+
+def test_options_replace_the_config(cli, config):
+    result = cli("scenes", "make", config(), "--on-table", 1, "--views", 1, "-n", 1, "--out", "other", "--json", "-")
+    data = json.loads(result.out)
+    assert data["out"] == "other"
+    assert sum(found["scenes"] for found in data["objects"].values()) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"sceens": 3}, "unknown key 'sceens'; did you mean 'scenes'?"),
+        ({"scene": {"camera": {"elevation": [80, 20]}}}, "elevation [80, 20] is empty"),
+        ({"scenes": 0}, "key 'scenes' = 0"),
+        ({"hand": "nohand"}, "nohand"),
+    ],
+)
+def test_bad_configs(cli, config, changes, words):
+    assert words in cli("scenes", "make", config(**changes)).error()
+
+
+def test_bad_options(cli, config):
+    assert "no objects" in cli("scenes", "make").error()
+    assert "unknown config of scenes" in cli("scenes", "make", "absent.yaml").error()
+    assert "need 0 <= index < number" in cli("scenes", "make", config(), "--shard-index", 3, "--num-shards", 2).error()
+    assert "no such file" in cli("scenes", "check", "absent").error()
+    Path("file").write_text("")
+    assert "is a file" in cli("scenes", "make", config(), "--out", "file/out").error()
+
+
+def test_ctrl_c_leaves_whole_scenes(process, config, cli, tmp_path):
+    running = process("scenes", "make", config(scenes=500))
+    for _ in range(2400):
+        if len(list((tmp_path / "out").glob("*.h5"))) >= 2:
+            break
+        try:
+            running.wait(0.1)
+            break
+        except Exception:
+            continue
+    running.send_signal(signal.SIGINT)
+    _, err = running.communicate(timeout=60)
+    assert running.returncode == 130, err
+    assert "the same command goes on" in err
+    assert cli("scenes", "check", "out").code == 0
+    assert not list((tmp_path / "out").glob("*.tmp"))
