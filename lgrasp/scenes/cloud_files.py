@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from lgrasp.errors import CloudError
+from lgrasp.errors import CloudError, ShardError
+from lgrasp.scenes.reader import SceneReader
 
-__all__ = ["CLOUD_SUFFIXES", "read_arrays", "read_mask"]
+__all__ = ["CLOUD_SUFFIXES", "check_labels", "read_arrays", "read_mask"]
 
-CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz")
+CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz", ".h5")
 
 _MASK_SUFFIXES = (".npy", ".npz")
 _LABELS = ("label", "labels")  # names that a file may give to the label of a point
@@ -24,13 +25,15 @@ _LABELS = ("label", "labels")  # names that a file may give to the label of a po
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """What a cloud's file says of n points: ``points`` (n, 3), and perhaps ``normals`` (n, 3) and ``labels`` (n,).
 
-    An image of points, (h, w, 3), is read row by row.
+    An image of points, (h, w, 3), is read row by row. A scene (.h5) gives its merged cloud.
 
     Raises:
         CloudError: no such file, an unknown suffix, or not the form of that suffix.
     """
     data = _read_bytes(path, CLOUD_SUFFIXES, "a point cloud")
     kind = path.suffix.lower()
+    if kind == ".h5":
+        return _read_scene(path)
     try:
         with _silence():
             found = _parse_ply(data) if kind == ".ply" else _parse_xyz(data) if kind == ".xyz" else _parse_numpy(data)
@@ -105,6 +108,15 @@ def _read_bytes(path: Path, suffixes: tuple[str, ...], what: str) -> bytes:
     if not data:
         raise CloudError(f"{path}: 0 bytes; {what} ({accepted}) is accepted")
     return data
+
+
+def _read_scene(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with SceneReader(path) as reader:
+            cloud = reader.cloud()
+    except ShardError as error:
+        raise CloudError(str(error)) from None
+    return {"points": cloud.points.astype(np.float64), "normals": cloud.normals, "labels": cloud.labels}
 
 
 @contextlib.contextmanager
