@@ -24,7 +24,7 @@ from lgrasp.hand.urdf import Urdf, read_urdf
 
 __all__ = ["HAND_VERSION", "HandModel", "build_hand", "hand_digest"]
 
-HAND_VERSION = 12
+HAND_VERSION = 13
 """Raised whenever the arrays of a HandModel change meaning."""
 
 _SPHERES_PER_PIECE = 12

@@ -16,7 +16,7 @@ from lgrasp.hand.geometry import geometry_mesh
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition import side_links
 from lgrasp.hand.spec import Cone, HandSpec, Surface
-from lgrasp.hand.surface import ContactLink, contact_arrays
+from lgrasp.hand.surface import ContactLink, contact_arrays, with_bare_links
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 
@@ -159,6 +159,7 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
     links = [link for side in space_sides(urdf, spec, tree, name, device) for link in side.links]
     meshes = _body_meshes(urdf, tree, {int(tree.link_body[tree.link_names.index(link.link)]) for link in links})
     arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device)
+    arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
     described = spec.opposition_spaces[name].model_dump(mode="json")
     digest = hashlib.sha256(json.dumps([model.sha256, name, described]).encode()).hexdigest()
     return replace(model, sha256=digest, contacts=(), **arrays)

@@ -9,7 +9,7 @@ import trimesh
 from lgrasp.hand.contacts import LinkGrid, cover_patches, link_grid
 from lgrasp.hand.tree import Tree
 
-__all__ = ["ContactLink", "contact_arrays", "csr", "stack_rows"]
+__all__ = ["ContactLink", "contact_arrays", "csr", "stack_rows", "with_bare_links"]
 
 
 def csr(counts: list[int]) -> np.ndarray:
@@ -89,6 +89,28 @@ def contact_arrays(
         "mesh_face_first": csr([len(m.faces) for m in joined]),
         "mesh_faces": stack_rows([m.faces for m in joined], 3, np.int32),
     }
+
+
+def with_bare_links(arrays: Mapping[str, np.ndarray], others: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays with the grids and meshes of further links, which get no contact point.
+
+    Args:
+        arrays, others: as of :func:`contact_arrays`; links of ``others`` that ``arrays`` has already are left out.
+    """
+    out = dict(arrays)
+    for i in np.flatnonzero(~np.isin(others["grid_link"], arrays["grid_link"])):
+        for name in ("grid_shape", "grid_origin", "grid_cell", "grid_link"):
+            out[name] = np.concatenate([out[name], others[name][i : i + 1]])
+        for first, name in (
+            ("grid_first", "grid_values"),
+            ("rule_first", "rules"),
+            ("mesh_vertex_first", "mesh_vertices"),
+            ("mesh_face_first", "mesh_faces"),
+        ):
+            part = others[name][others[first][i] : others[first][i + 1]]
+            out[name] = np.concatenate([out[name], part])
+            out[first] = np.append(out[first], out[first][-1] + len(part)).astype(np.int32)
+    return out
 
 
 def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:

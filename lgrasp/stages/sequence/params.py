@@ -23,9 +23,9 @@ class SequenceParams(BaseModel):
     )
     width: int = Field(320, ge=1, le=65_536, description="Sequences begun in a round.")
     wave: int = Field(
-        128, ge=1, le=65_536, description="Candidates tried with one space before the next is tried (field)."
+        256, ge=1, le=65_536, description="Candidates tried with one space before the next is tried (field)."
     )
-    waves: int = Field(8, ge=1, le=256, description="Waves of a step before a sequence is given up (field).")
+    waves: int = Field(4, ge=1, le=256, description="Waves of a step before a sequence is given up (field).")
     branch: int = Field(1, ge=1, le=1024, description="Most sequences that go on from one.")
     optimiser: OptimiserParams = Field(OptimiserParams(), description="Numbers of the methods anneal and mala.")
     rounds: int = Field(64, ge=1, le=65_536, description="Rounds per width of sequences asked, before giving up.")

@@ -28,12 +28,22 @@ def space_orders(table: SequenceTable, spaces: Sequence[Space], policy: str, lef
     drawn = rng.random((len(table), len(spaces)))
     used = table.used
     order = np.full((len(table), len(spaces)), -1)
+    able_of: dict[tuple[tuple[int, ...], bytes], list[int]] = {}
     for i in range(len(table)):
-        taken = frozenset(table.space[i].tolist())
-        able = sorted(available(spaces, taken, used[i]), key=lambda s, i=i: drawn[i, s])
-        if policy == "lookahead" and able:
-            later = [min(longest(spaces, taken | {s}, used[i] | spaces[s].joints), left) for s in able]
-            able = [s for s, n in zip(able, later, strict=True) if n == max(later)]
+        taken = tuple(sorted(table.space[i].tolist()))
+        state = taken, used[i].tobytes()
+        if state not in able_of:
+            able_of[state] = _able(spaces, taken, used[i], policy, left)
+        able = sorted(able_of[state], key=lambda s, i=i: drawn[i, s])
         able = able if policy == "lookahead" else able[:1]
         order[i, : len(able)] = able
     return order
+
+
+def _able(spaces: Sequence[Space], taken: tuple[int, ...], used: np.ndarray, policy: str, left: int) -> list[int]:
+    """Spaces that a sequence may go on with."""
+    able = available(spaces, taken, used)
+    if policy == "uniform" or not able:
+        return able
+    later = [min(longest(spaces, (*taken, s), used | spaces[s].joints), left) for s in able]
+    return [s for s, n in zip(able, later, strict=True) if n == max(later)]
