@@ -1,0 +1,187 @@
+"""Sequences of grasps: same rows whatever the threads; frozen joints and held objects stay; files go on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lgrasp.dataset import read_shard, validate_shard
+from lgrasp.device.runtime import resolve_device
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.generate import Listener
+from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.sequence import round as round_module
+from lgrasp.engine.sequence.inputs import load_sequence_inputs, sequence_keys
+from lgrasp.engine.sequence.job import SequenceJob, generate_sequences
+from lgrasp.engine.sequence.round import run_round
+from lgrasp.engine.sequence.shard import make_sequences
+from lgrasp.engine.sequence.size import Size
+from lgrasp.errors import OutputError
+from lgrasp.grasp.sequences import SequenceTable
+
+OBJECTS = ("sphere", "mug")
+SIZE = Size(0.06, 0.08)
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    found = load_pipeline("sequence")
+    small = found.model_copy(update={"field": found.field.model_copy(update={"records": 20_000})})
+    return small.with_params("sequence", width=24, wave=64, waves=3)
+
+
+@pytest.fixture(scope="module")
+def inputs(pipeline, cache_root):
+    keys = sequence_keys("allegro", OBJECTS, SIZE, pipeline.seed, pipeline.object, pipeline.field)
+    cache = Cache(cache_root, pytest.fail)
+    return load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, resolve_device("cpu"))
+
+
+@pytest.fixture(scope="module")
+def found(pipeline, inputs):
+    return run_round(pipeline, inputs, 0, 0, 2)
+
+
+def assert_same(a: SequenceTable, b: SequenceTable) -> None:
+    for name in ("parent", "candidate", "space", "free", "q", "q_pregrasp", "q_squeeze", "pose", "contact_points"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+@pytest.mark.parametrize(("workers", "chunk"), [(1, 1024), (3, 100)])
+def test_threads_and_chunks_change_nothing(pipeline, inputs, found, monkeypatch, workers, chunk):
+    monkeypatch.setattr(round_module, "_CPU_CHUNK", chunk)
+    again = run_round(pipeline, inputs, 0, 0, workers)
+    for a, b in zip(found.levels, again.levels, strict=True):
+        assert_same(a, b)
+
+
+def test_other_rounds_and_shards_differ(pipeline, inputs, found):
+    for shard, number in ((0, 1), (1, 0)):
+        other = run_round(pipeline, inputs, shard, number, 2)
+        assert not np.array_equal(other.levels[0].q, found.levels[0].q)
+
+
+def test_frozen_joints_and_objects_stay_exactly(found):
+    first, second = found.levels
+    assert len(second) >= 8
+    before = {name: getattr(first, name)[second.parent] for name in ("q", "q_squeeze", "pose", "space", "free")}
+    for name, values in before.items():
+        np.testing.assert_array_equal(getattr(second, name)[:, :1], values, err_msg=name)
+    frozen = ~second.free[:, 1]
+    np.testing.assert_array_equal(second.q[:, 1][frozen], second.q[:, 0][frozen])
+    np.testing.assert_array_equal(second.q_pregrasp[:, 1][frozen], second.q[:, 0][frozen])
+    np.testing.assert_array_equal(second.q_squeeze[:, 1][frozen], second.q_squeeze[:, 0][frozen])
+    assert not (second.free[:, 0] & second.free[:, 1]).any()
+    assert (np.abs(second.q[:, 1] - second.q[:, 0]).max(1) > 0).all()
+
+
+def test_spaces_move_their_joints_only(inputs, found):
+    for table in found.levels:
+        for space, free in zip(table.space[:, -1], table.free[:, -1], strict=True):
+            assert not (free & ~inputs.spaces[space].joints).any()
+
+
+def test_contacts_are_on_both_sides_of_the_space(inputs, found):
+    """Each grasp touches with two links, one of each side; the palm's link does not move."""
+    tree = inputs.hand.tree
+    group = tree.body_group[tree.link_body]
+    for table in found.levels:
+        for space, links in zip(table.space[:, -1], table.contact_links[:, -1], strict=True):
+            touching = sorted(group[links[links >= 0]])
+            assert touching == sorted(inputs.spaces[space].groups)
+
+
+def test_objects_are_apart(inputs, found):
+    """No surface point of either object is inside the other (the meshes themselves, another library)."""
+    trimesh = pytest.importorskip("trimesh")
+    table = found.levels[1]
+    models = [obj.model for obj in inputs.objects]
+    meshes = [trimesh.Trimesh(m.vertices - m.center, m.faces) for m in models]
+    for row in range(min(len(table), 6)):
+        moved = []
+        for mesh, (x, y, z, i, j, k, w) in zip(meshes, table.pose[row].astype(float), strict=True):
+            T = trimesh.transformations.quaternion_matrix([w, i, j, k])
+            T[:3, 3] = x, y, z
+            moved.append(mesh.copy().apply_transform(T))
+        for a, b in (moved, moved[::-1]):
+            points = np.vstack([a.vertices, trimesh.sample.sample_surface(a, 500, seed=0)[0]])
+            assert trimesh.proximity.signed_distance(b, points).max() < 0
+
+
+def test_lookahead_goes_farther(pipeline, inputs):
+    """Rows that take spaces at will are consumed early; those that look ahead leave room for three objects."""
+    three = replace(inputs, objects=(inputs.objects[0],) * 3)
+    reached = {}
+    for policy in ("uniform", "lookahead"):
+        chosen = pipeline.with_params("sequence", policy=policy)
+        levels = run_round(chosen, three, 0, 0, 2).levels
+        reached[policy] = len(levels[2]) if len(levels) == 3 else 0
+    assert reached["lookahead"] > reached["uniform"]
+
+
+def test_first_rows_of_a_longer_run(pipeline, inputs):
+    few, many = (make_sequences(pipeline, inputs, 0, rows, 2) for rows in (5, 30))
+    assert len(few) == 5
+    assert len(many) == 30
+    assert many.rounds > 1
+    np.testing.assert_array_equal(few.levels[-1].q, many.levels[-1].q[:5])
+    for result in (few, many):
+        first, second = result.levels
+        assert second.parent.max() < len(first)
+        np.testing.assert_array_equal(first.q[second.parent], second.q[:, :1])
+
+
+@pytest.fixture
+def job(pipeline, cache_root, tmp_path):
+    cache = Cache(cache_root, pytest.fail)
+    own = SequenceJob("allegro", OBJECTS, 8, pipeline, tmp_path / "out", SIZE, device="cpu", shard_rows=4, cache=cache)
+    return lambda **changes: replace(own, **changes)
+
+
+def test_files(job):
+    outcome = generate_sequences(job())
+    assert [path.name for path in outcome.paths] == [f"allegro-sphere-mug-0000{s}.h5" for s in (0, 1)]
+    for path in outcome.paths:
+        assert validate_shard(path) == []
+        shard = read_shard(path)
+        rows = shard.grasps
+        assert rows.sequence is not None
+        assert (rows.object_index[:, 1] >= 0).sum() == 4
+        assert [record.id for record in shard.objects] == ["mug", "sphere"]
+        sides = [np.ptp(record.vertices, axis=0).max() for record in shard.objects]
+        assert all(0.06 <= side <= 0.08 for side in sides)
+
+
+def test_array_tasks_and_resume_give_the_same_files(job, tmp_path):
+    whole = {p.name: read_shard(p).grasps for p in generate_sequences(job()).paths}
+    parts = tmp_path / "parts"
+    for task in (0, 1):
+        generate_sequences(job(out=parts, shard_index=task, num_shards=2))
+    assert generate_sequences(job(out=parts)).made == 0
+    for path in parts.glob("*.h5"):
+        np.testing.assert_array_equal(read_shard(path).grasps.q, whole[path.name].q)
+
+
+def test_other_run_is_not_overwritten(job):
+    generate_sequences(job(rows=4))
+    with pytest.raises(OutputError, match="another run"):
+        generate_sequences(job(rows=4, objects=("sphere", "mug"), size=Size(0.06, 0.07)))
+
+
+def test_stop(job):
+    class Stop(Listener):
+        def cancelled(self):
+            return True
+
+    outcome = generate_sequences(job(), Stop())
+    assert outcome.cancelled
+    assert not outcome.paths
+
+
+def test_physics_between_steps(pipeline, inputs, job):
+    """Rows that do not hold are not gone on from: every row of the file holds, and so do those before it."""
+    pytest.importorskip("mujoco")
+    outcome = generate_sequences(job(rows=4, physics="seq6"))
+    rows = read_shard(outcome.paths[0]).grasps
+    assert rows.physics["seq6_holds"].all()
+    assert rows.physics["seq6_object_touches"].shape == rows.object_index.shape
