@@ -103,10 +103,14 @@ class Refiner(nn.Module):
         x = (R[0, self._block] @ self._points.mT).mT + t[0, self._block, None]
         self._middle = x.reshape(-1, 3)[self._palmar].mean(0)  # of the palmar side, base frame
 
-    def forward(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, outer: int | None = None) -> Refined:
-        """Refine hands: ``outer`` (default: the parameters') times match, then ``inner`` gradient steps.
+    def forward(
+        self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, outer: int | None = None, first: int = 0
+    ) -> Refined:
+        """Refine hands: match, then ``inner`` gradient steps, for outer steps ``first`` to ``outer``.
 
         Args:
+            outer: default: the parameters'. Sizes and reach fall along the parameters' outer steps or these, whichever
+                are more.
             R: rotations of the hand's base in the object's internal frame, (N, 3, 3). t: its origin [m], (N, 3).
             q: joint positions [rad or m], (N, K); outside the limits they are clamped first.
         """
@@ -114,12 +118,11 @@ class Refiner(nn.Module):
         outer = p.outer if outer is None else outer
         pose = Pose(R.detach(), t.detach(), self._clamped(q.detach()))
         moments = _Moments(pose)
-        steps = max(outer * p.inner - 1, 1)
-        for i in range(outer):
-            share = i / max(outer - 1, 1)
-            matches = self.match(*pose, reach=p.reach * (p.reach_end / p.reach) ** share)
+        whole = max(outer, p.outer)
+        for i in range(first, outer):
+            matches = self.match(*pose, reach=p.reach * (p.reach_end / p.reach) ** (i / whole))
             for j in range(p.inner):
-                size = p.decay ** ((i * p.inner + j) / steps)
+                size = p.decay ** ((i + j / p.inner) / whole)
                 pose = self._moved(pose, moments.step(self._gradient(pose, matches), p, size))
         with torch.no_grad():
             return Refined(pose, self.energy(*pose))
@@ -192,6 +195,16 @@ class Refiner(nn.Module):
             d, _ = self.target.nearest_obstacle(at, d, n)
             gone = (gone + (d.amin((1, 2)) - clearance).clamp_min(0)).minimum(travel)
         return pose._replace(t=pose.t + gone[:, None] * direction)
+
+    @torch.no_grad()
+    def inside(self, pose: Pose, depth: float) -> torch.Tensor:
+        """Is a point of the hand deeper than ``depth`` [m] in anything, or one of that in the hand? (N,) bool."""
+        R, t, q = pose
+        bodies = self._bodies(q)
+        x, _ = self._placed(R, t, bodies)
+        d, _ = self.target.nearest_obstacle(x, *self.target.nearest(x))
+        into, _ = self._links.distances(self._links.match(R, t, *bodies), R, t, *bodies)
+        return (d.amin((1, 2)) < -depth) | (into.amin((1, 2)) < -depth)
 
     def _contacts(self, x: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
         """Farthest points among the nearest of the palmar ones, (N, C); the nearest of all first."""

@@ -5,14 +5,14 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import HandError
 from lgrasp.hand.model import HandModel
-from lgrasp.refine.surface import farthest_points
 
-__all__ = ["STAND_OFF", "palm_axis", "start_poses"]
+__all__ = ["GOLDEN_ANGLE", "STAND_OFF", "palm_axis", "start_poses"]
 
 STAND_OFF = 0.12
 """Distance of a hand's base from the surface where hand.yaml has no ``stand_off`` [m]."""
 
-_TURN = np.pi * (3 - np.sqrt(5))  # golden angle: rolls of consecutive starts are spread evenly
+GOLDEN_ANGLE = float(np.pi * (3 - np.sqrt(5)))
+"""Multiples of it are spread evenly over the circle [rad]."""
 
 
 def palm_axis(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
@@ -29,28 +29,24 @@ def palm_axis(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def start_poses(
-    model: HandModel, points: np.ndarray, normals: np.ndarray, count: int, stand_off: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotations (N, 3, 3), positions (N, 3) [m] of open hands in the frame of the points, and the chosen points (N,).
+    model: HandModel, points: np.ndarray, normals: np.ndarray, turn: np.ndarray, stand_off: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (N, 3, 3) and positions (N, 3) [m] of hands in the frame of the points.
 
-    The points are the farthest from each other; the palm faces along minus the normal, the line from its centre meets
-    the point, and the base stands ``stand_off`` from it along that line. The roll about it turns by the golden angle
-    from start to start.
+    The palm faces along minus the normal, the line from its centre meets the point, and the base stands ``stand_off``
+    from it along that line.
 
     Args:
-        points: (n, 3) [m]. normals: outward, (n, 3). count: N, with repeats (at other rolls) when there are fewer.
+        points: (N, 3) [m]. normals: outward, (N, 3). turn: roll about the line [rad], (N,).
     """
-    chosen = farthest_points(points, count)
     centre, facing = palm_axis(model)
-    before = -normals[chosen]
-    side = np.cross(before, np.eye(3)[np.abs(before).argmin(1)])
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    to = np.stack([side, np.cross(before, side), before], -1)  # columns
-    own = np.cross(facing, np.eye(3)[np.abs(facing).argmin()])
-    own /= np.linalg.norm(own)
-    of = np.stack([own, np.cross(facing, own), facing], -1)
-    roll = Rotation.from_rotvec(np.arange(count)[:, None] * _TURN * np.array([0, 0, 1.0])).as_matrix()
-    R = to @ roll @ of.T
+    R = _frames(-normals) @ Rotation.from_rotvec(turn[:, None] * np.array([0, 0, 1.0])).as_matrix() @ _frames(facing).T
     lateral = centre - (centre @ facing) * facing
-    t = points[chosen] - stand_off * before - np.einsum("nij,j->ni", R, lateral)
-    return R, t, chosen
+    return R, points + stand_off * normals - np.einsum("nij,j->ni", R, lateral)
+
+
+def _frames(z: np.ndarray) -> np.ndarray:
+    """Right-handed frames (..., 3, 3) whose third column is z (..., 3)."""
+    x = np.cross(z, np.eye(3)[np.abs(z).argmin(-1)])
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], -1)

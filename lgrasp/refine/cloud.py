@@ -1,0 +1,138 @@
+"""Point clouds as objects: normals, a distance grid near what was seen, and a model that all else takes for an object."""
+
+import hashlib
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
+from lgrasp.errors import ObjectError
+from lgrasp.object.model import ObjectModel
+
+__all__ = ["TRUST", "cloud_object", "estimate_normals"]
+
+TRUST = 0.02
+"""Behind what was seen, the sign of distances is known to this depth [m]; what lies deeper counts as neither."""
+
+_LEAST_POINTS, _MOST_POINTS = 32, 8192
+_EXTENT = (0.005, 2.0)  # [m]
+_NEIGHBOURS = 24
+_PAD = 0.016
+_MOST_NODES, _LEAST_CELL = 250_000, 0.0015
+_CONTACTS = 4096
+
+
+def estimate_normals(points: np.ndarray, viewpoint: np.ndarray, neighbours: int = _NEIGHBOURS) -> np.ndarray:
+    """Unit normals (n, 3) of planes through the nearest points, towards where they were seen from.
+
+    Args:
+        points: (n, 3) [m]. viewpoint: (3,), or one of each point (n, 3) [m].
+    """
+    near = points[cKDTree(points).query(points, min(neighbours, len(points)), workers=-1)[1]]  # (n, k, 3)
+    centred = near - near.mean(1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0]
+    return np.where(((viewpoint - points) * normals).sum(1, keepdims=True) < 0, -normals, normals)
+
+
+def cloud_object(
+    points: np.ndarray, normals: np.ndarray | None = None, *, viewpoint: np.ndarray | None = None, name: str = "cloud"
+) -> ObjectModel:
+    """An ObjectModel without faces from points of a surface, perhaps of one side only.
+
+    Distances are those to planes through the nearest points, so that noise averages out; inside they are negative to
+    the depth TRUST, and positive beyond: what nobody saw is no obstacle, and nothing to touch either. The centre of
+    mass is the mean of the points.
+
+    Args:
+        points: (n, 3) [m]. normals: outward, (n, 3); default: estimated.
+        viewpoint: where the points were seen from [m], (3,), or one of each point (n, 3); needed without normals.
+
+    Raises:
+        ObjectError: too few points, not finite, a size that no hand grasps, normals that do not match.
+    """
+    points = np.asarray(points, float)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ObjectError(f"cloud '{name}': points of shape {list(points.shape)}; need [n, 3]")
+    bad = int((~np.isfinite(points).all(1)).sum())
+    if bad:
+        raise ObjectError(f"cloud '{name}': {bad} of {len(points)} points are NaN or infinite; drop them first")
+    if len(points) < _LEAST_POINTS:
+        raise ObjectError(f"cloud '{name}' has {len(points)} points; at least {_LEAST_POINTS} are needed")
+    size = float(np.ptp(points, axis=0).max())
+    if not _EXTENT[0] <= size <= _EXTENT[1]:
+        raise ObjectError(
+            f"cloud '{name}' is {size:.3g} m long; accepted: {_EXTENT[0]:g} to {_EXTENT[1]:g} m (are its units metres?)"
+        )
+    digest = hashlib.sha256(np.ascontiguousarray(points).tobytes())
+    keep = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
+    if normals is None:
+        if viewpoint is None:
+            raise ObjectError(f"cloud '{name}' has no normals; say where it was seen from (viewpoint), or add normals")
+        viewpoint = np.broadcast_to(np.asarray(viewpoint, float), points.shape)[keep]
+        points = points[keep]
+        normals = estimate_normals(points, viewpoint)
+    else:
+        normals = np.asarray(normals, float)
+        length = np.linalg.norm(normals, axis=-1, keepdims=True)
+        if normals.shape != points.shape or not (np.isfinite(length) & (length > 1e-6)).all():
+            raise ObjectError(f"cloud '{name}': normals must be {len(points)} finite vectors that are not zero")
+        digest.update(np.ascontiguousarray(normals).tobytes())
+        points, normals = points[keep], (normals / length)[keep]
+    center = 0.5 * (points.min(0) + points.max(0))
+    points = points - center
+    points, normals = _smoothed(points, normals)
+    sdf, origin, cell = _distances(points, normals)
+    order = cluster_order(np.resize(points, (-(-len(points) // CLUSTER_SIZE) * CLUSTER_SIZE, 3))) % len(points)
+    obstacles = points[order].astype(np.float32)
+    balls = bounding_spheres(obstacles)
+    return ObjectModel(
+        name=name,
+        sha256=digest.hexdigest(),
+        scale=1.0,
+        center=center.astype(np.float32),
+        vertices=(points + center).astype(np.float32),
+        faces=np.zeros((0, 3), np.int32),
+        watertight=False,
+        com=points.mean(0).astype(np.float32),
+        extents=np.ptp(points, axis=0).astype(np.float32),
+        notes=["a point cloud: what was not seen of the object is unknown"],
+        contact_points=points[:_CONTACTS].astype(np.float32),
+        contact_normals=normals[:_CONTACTS].astype(np.float32),
+        contact_opposite=np.full(len(points[:_CONTACTS]), -1, np.int32),
+        obstacle_points=obstacles,
+        obstacle_normals=normals[order].astype(np.float32),
+        cluster_center=balls[0],
+        cluster_radius=balls[1],
+        sdf=sdf,
+        sdf_origin=origin,
+        sdf_cell=cell,
+    )
+
+
+def _smoothed(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points moved along their mean normals onto the mean of their neighbours that face the same way."""
+    near = cKDTree(points).query(points, min(_NEIGHBOURS, len(points)), workers=-1)[1]
+    same = (np.einsum("nki,ni->nk", normals[near], normals) > 0.5)[..., None]
+    mean_normal = (same * normals[near]).sum(1)
+    mean_normal /= np.linalg.norm(mean_normal, axis=1, keepdims=True)
+    mean = (same * points[near]).sum(1) / same.sum(1)
+    return points + ((mean - points) * mean_normal).sum(1, keepdims=True) * mean_normal, mean_normal
+
+
+def _distances(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Signed distance grid [m] of planes through points, its origin and its cell."""
+    low, high = points.min(0) - _PAD, points.max(0) + _PAD
+    cell = max(_LEAST_CELL, float(np.prod(high - low) / _MOST_NODES) ** (1 / 3))
+    shape = np.ceil((high - low) / cell).astype(int) + 1
+    nodes = low + cell * np.indices(shape).reshape(3, -1).T
+    tree = cKDTree(points)
+    gap, near = tree.query(nodes, min(8, len(points)), workers=-1)
+    weight = np.exp(-0.5 * (gap / (gap[:, :1] + cell)) ** 2)
+    height = ((nodes[:, None] - points[near]) * normals[near]).sum(-1)
+    plane = (weight * height).sum(1) / weight.sum(1)
+    # close to the surface the planes tell the distance, farther off the nearest point does
+    spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
+    share = np.clip(gap[:, 0] / max(4 * spacing, 2 * cell) - 0.5, 0, 1)
+    value = (1 - share) * plane + share * np.sign(plane) * gap[:, 0]
+    value = np.where((plane < 0) & (gap[:, 0] > TRUST), gap[:, 0], value)
+    return value.reshape(shape).astype(np.float32), low.astype(np.float32), cell
