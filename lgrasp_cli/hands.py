@@ -1,11 +1,14 @@
 """``lgrasp hands``: the hands there are."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lgrasp_cli.options import CacheDir, Device, PipelineName, Quiet, choose_pipeline, open_cache
+
+if TYPE_CHECKING:
+    from lgrasp.engine.check import HandCheck
 
 __all__ = ["app"]
 
@@ -27,8 +30,8 @@ def list_hands(as_json: _AsJson = False) -> None:
     if as_json:
         print_json(hands)
         return
-    columns = ("name", "description", "licence", "folder")
-    print_table(columns, [[hand[c] for c in columns] for hand in hands])
+    columns = ("name", "description", "spaces", "licence", "folder")
+    print_table(columns, [[str(hand[c]) for c in columns] for hand in hands], right=("spaces",))
 
 
 @app.command("show")
@@ -57,6 +60,7 @@ def show_hand(
         ("palm", ", ".join(hand["palm_links"]) or "none"),
         *(("shared joint", f"{n}: {', '.join(f'{x:g}' for x in v)}") for n, v in hand["shared"].items()),
         ("canonical box", f"{box} mm"),
+        ("opposition spaces", _spaces_line(hand["opposition_spaces"])),
         ("licence", hand["licence"] or "not stated"),
         ("source", hand["source"] or "not stated"),
         *(("note", note) for note in hand["notes"]),
@@ -68,6 +72,10 @@ def show_hand(
         for j in hand["joints"]
     ]
     print_table(("finger", "joint", "lower", "upper"), rows, right=("lower", "upper"))
+
+
+def _spaces_line(spaces: dict[str, list[str]]) -> str:
+    return f"{len(spaces)}: {', '.join(spaces)}" if spaces else "none"
 
 
 @app.command("add")
@@ -150,5 +158,30 @@ def check_hand(
             typer.echo(f"{o.name}: {line}")
     for line in found.hints:
         typer.echo(f"could be better: {line}")
+    _print_spaces(found)
     for picture in found.pictures:
         typer.echo(f"wrote {picture}")
+
+
+def _print_spaces(found: "HandCheck") -> None:
+    """Opposition spaces: fingers, joints, area of both sides, distances at which these face each other."""
+    from lgrasp_cli.tables import print_table
+
+    if not found.spaces:
+        typer.echo("no opposition spaces: 'lgrasp sequence' cannot use this hand")
+        return
+    rows = []
+    for space in found.spaces:
+        sides = [
+            text for side, area in zip(space.sides, space.areas, strict=True) for text in (side, f"{1e4 * area:.1f}")
+        ]
+        apart = "-" if space.low is None or space.high is None else f"{1e3 * space.low:.0f}-{1e3 * space.high:.0f}"
+        rows.append([space.name, str(len(space.joints)), *sides, apart])
+    print_table(
+        ("space", "joints", "side", "cm2", "other", "cm2", "apart, mm"), rows, right=("joints", "cm2", "apart, mm")
+    )
+    for space in found.spaces:
+        if space.problem:
+            typer.echo(f"{space.name} can hold nothing: {space.problem}")
+    count = found.longest_sequence
+    typer.echo(f"a sequence holds {count} object{'s' if count != 1 else ''} at most")

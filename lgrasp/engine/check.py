@@ -13,9 +13,10 @@ from lgrasp.dataset.records import Shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.diagnose import diagnose, hand_findings
 from lgrasp.engine.generate import Job, generate
-from lgrasp.engine.pictures import draw_grasps, draw_hand, draw_workspace
+from lgrasp.engine.pictures import draw_grasps, draw_hand, draw_spaces, draw_workspace
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.report import survivors
+from lgrasp.engine.space_check import SpaceCheck, check_spaces, longest_sequence
 from lgrasp.engine.workspace import Inputs
 from lgrasp.errors import OutputError
 
@@ -46,6 +47,8 @@ class HandCheck:
     notes: list[str]  # of the collision model
     hints: list[str] = field(default_factory=list)  # what the rules leave unused, though enough came out
     objects: list[ObjectCheck] = field(default_factory=list)
+    spaces: list[SpaceCheck] = field(default_factory=list)
+    longest_sequence: int = 0  # objects
     pictures: list[Path] = field(default_factory=list)
 
 
@@ -118,6 +121,9 @@ def check_hand(
     if not any(o.reasons for o in result.objects):
         found = hand_findings(inputs.hand.model, inputs.field.model, dict(inputs.keys.source.spec.fingers))
         result.hints = [line for stage in ("domain", "place", "ik", "search") for line in found[stage]]
+    say("opposition spaces")
+    result.spaces = check_spaces(inputs)
+    result.longest_sequence = longest_sequence(inputs, result.spaces)
     say("pictures")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -125,6 +131,9 @@ def check_hand(
             draw_hand(inputs, out / "hand.png"),
             draw_workspace(inputs, out / "workspace.png"),
         ]
+        able = [space.name for space in result.spaces if all(space.areas)]
+        if able:
+            result.pictures.append(draw_spaces(inputs, able, out / "spaces.png"))
         if shards:
             result.pictures.append(draw_grasps(inputs, _samples(shards), out / "grasps.png"))
     except OSError as error:

@@ -8,6 +8,7 @@ from lgrasp.config import read_yaml
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.errors import ConfigError
 from lgrasp.hand.find import find_hand, known_hands
+from lgrasp.hand.opposition import check_spaces
 from lgrasp.hand.spec import load_spec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
@@ -19,15 +20,21 @@ from lgrasp.paths import data_dirs
 __all__ = ["describe_hand", "describe_object", "describe_pipeline", "list_hands", "list_objects", "list_pipelines"]
 
 
-def list_hands() -> list[dict[str, str]]:
-    """Name, description, licence and folder of every known hand.
+def list_hands() -> list[dict[str, Any]]:
+    """Name, description, number of opposition spaces, licence and folder of every known hand.
 
     Raises:
         HandError: a hand.yaml is wrong.
     """
     specs = {name: (load_spec(folder / "hand.yaml"), folder) for name, folder in known_hands().items()}
     return [
-        {"name": name, "description": spec.description, "licence": spec.licence, "folder": str(folder)}
+        {
+            "name": name,
+            "description": spec.description,
+            "spaces": len(spec.opposition_spaces),
+            "licence": spec.licence,
+            "folder": str(folder),
+        }
         for name, (spec, folder) in specs.items()
     ]
 
@@ -40,7 +47,9 @@ def describe_hand(name: str) -> dict[str, Any]:
     """
     source = find_hand(name)
     spec = source.spec
-    tree = build_tree(read_urdf(source.urdf), spec)
+    urdf = read_urdf(source.urdf)
+    tree = build_tree(urdf, spec)
+    check_spaces(spec, tree, dict(urdf.links))
     group = np.repeat(np.arange(tree.groups), np.diff(tree.dof_first))
     finger = {int(k): int(g) for k, g in zip(tree.dof_index, group, strict=True)}
     return {
@@ -54,6 +63,7 @@ def describe_hand(name: str) -> dict[str, Any]:
         "contact_links": [link for rule in spec.contact for link in rule.links],
         "palm_links": list(spec.palm.links),
         "canonical_box": spec.canonical_box.model_dump(),
+        "opposition_spaces": {name: list(space.joints) for name, space in spec.opposition_spaces.items()},
         "licence": spec.licence,
         "source": spec.source,
         "notes": [spec.notes] if isinstance(spec.notes, str) and spec.notes else list(spec.notes),

@@ -9,36 +9,37 @@ from scipy.spatial import cKDTree
 
 from lgrasp.dataset.records import Shard
 from lgrasp.engine.diagnose import field_vectors, finger_label
+from lgrasp.engine.plotting import add_box, add_triangles, frame_points, new_figure, save_figure, shade
 from lgrasp.engine.workspace import Inputs
 from lgrasp.hand.geometry import thin_mesh
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.palmar import Skin, link_skins, sample_bodies
+from lgrasp.hand.spaces import space_sides
 from lgrasp.hand.urdf import read_urdf
 
-__all__ = ["draw_grasps", "draw_hand", "draw_workspace"]
+__all__ = ["draw_grasps", "draw_hand", "draw_spaces", "draw_workspace"]
 
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#e377c2", "#17becf")
 _PALM = "#e8a400"
 _LINK = "#c4c8cc"
 _OBJECT = "#ff9a3c"
 _FACES = 2500  # of a link
-_LIGHT = np.array([0.35, 0.25, 0.9]) / np.linalg.norm([0.35, 0.25, 0.9])
 
 
 def draw_hand(inputs: Inputs, path: Path) -> Path:
     """The open hand from two sides: surface that may touch in colours, the palm's in gold, canonical box."""
     model = inputs.hand.model
     triangles, colours = _hand_triangles(inputs, model.tree.joint_open, patches=True)
-    figure = _figure(13, 7.2)
+    figure = new_figure(13, 7.2)
     towards = _palmar_direction(inputs)
     for i, turn in enumerate((20.0, 115.0)):
         axes = figure.add_subplot(1, 2, i + 1, projection="3d")
-        _add_triangles(axes, triangles, colours)
-        _add_box(axes, model.canonical_box)
-        _frame(axes, np.vstack([_hand_points(model, model.tree.joint_open), model.canonical_box]), towards, turn)
+        add_triangles(axes, triangles, colours)
+        add_box(axes, model.canonical_box)
+        frame_points(axes, np.vstack([_hand_points(model, model.tree.joint_open), model.canonical_box]), towards, turn)
     _legend(figure, inputs, box=True)
     figure.suptitle(f"{model.name}: open posture, surface that may touch, canonical box")
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def draw_workspace(inputs: Inputs, path: Path) -> Path:
@@ -47,26 +48,26 @@ def draw_workspace(inputs: Inputs, path: Path) -> Path:
     triangles, colours = _hand_triangles(inputs, model.tree.joint_open, patches=False)
     clouds = [field_vectors(inputs.field.model, g, model.groups)[0] for g in range(model.groups)]
     clouds = [c[:: max(1, len(c) // 1500)] for c in clouds]
-    figure = _figure(13, 7.2)
+    figure = new_figure(13, 7.2)
     towards = _palmar_direction(inputs)
     for i, turn in enumerate((20.0, 115.0)):
         axes = figure.add_subplot(1, 2, i + 1, projection="3d")
-        _add_triangles(axes, triangles, colours)
+        add_triangles(axes, triangles, colours)
         for g, cloud in enumerate(clouds):
             axes.scatter(*cloud.T, s=5.0, color=_COLOURS[g % len(_COLOURS)], alpha=0.5, linewidths=0, zorder=5)
-        _add_box(axes, model.canonical_box)
-        _frame(
+        add_box(axes, model.canonical_box)
+        frame_points(
             axes, np.vstack([_hand_points(model, model.tree.joint_open), model.canonical_box, *clouds]), towards, turn
         )
     _legend(figure, inputs, box=True)
     figure.suptitle(f"{model.name}: reach of every finger's contact surface")
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def draw_grasps(inputs: Inputs, samples: list[tuple[str, Shard, int]], path: Path) -> Path:
     """Sample grasps with their objects and contact points."""
     model = inputs.hand.model
-    figure = _figure(15, 6.0)
+    figure = new_figure(15, 6.0)
     for i, (name, shard, row) in enumerate(samples):
         axes = figure.add_subplot(1, len(samples), i + 1, projection="3d")
         triangles, colours = _hand_triangles(inputs, shard.grasps.q[row], patches=True)
@@ -75,11 +76,11 @@ def draw_grasps(inputs: Inputs, samples: list[tuple[str, Shard, int]], path: Pat
         mesh = thin_mesh(trimesh.Trimesh(np.asarray(obj.vertices), np.asarray(obj.faces), process=False), _FACES)
         vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
         solid = vertices[mesh.faces]
-        _add_triangles(axes, np.vstack([triangles, solid]), np.vstack([colours, _shade(solid, _OBJECT)]))
+        add_triangles(axes, np.vstack([triangles, solid]), np.vstack([colours, shade(solid, _OBJECT)]))
         points = shard.grasps.contact_points[row, 0]
         points = points[np.isfinite(points).all(1)] @ pose[:3, :3].T + pose[:3, 3]
         axes.scatter(*points.T, s=45, c="black", depthshade=False, zorder=10)
-        _frame(
+        frame_points(
             axes,
             np.vstack([_hand_points(model, shard.grasps.q[row]), vertices]),
             _away(points, vertices.mean(0), inputs),
@@ -87,25 +88,32 @@ def draw_grasps(inputs: Inputs, samples: list[tuple[str, Shard, int]], path: Pat
         )
         axes.set_title(f"{name}: {len(points)} contacts, epsilon {shard.grasps.metrics['epsilon'][row]:.2f}")
     figure.suptitle(f"{model.name}: sample grasps (black: contacts)")
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
-def _figure(width: float, height: float) -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg", force=False)
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=100, layout=None)
-    FigureCanvasAgg(figure)
-    figure.subplots_adjust(left=0.0, right=0.98, bottom=0.09, top=0.9, wspace=0.04)
-    return figure
-
-
-def _save(figure: Any, path: Path) -> Path:
-    figure.savefig(path)
-    return path
+def draw_spaces(inputs: Inputs, names: list[str], path: Path) -> Path:
+    """The open hand once for each opposition space, its two sides in colours."""
+    source, model = inputs.keys.source, inputs.hand.model
+    urdf, q = read_urdf(source.urdf), model.tree.joint_open
+    meshes = _hand_meshes(inputs, q)
+    columns = min(4, len(names))
+    rows = -(-len(names) // columns)
+    figure = new_figure(3.6 * columns, 4.0 * rows + 0.6)
+    towards = _palmar_direction(inputs)
+    for i, name in enumerate(names):
+        tints = [shade(placed, _LINK) for _, _, placed in meshes]
+        for side, colour in zip(space_sides(urdf, source.spec, model.tree, name), _COLOURS, strict=False):
+            for link in side.links:
+                for (skin, mesh, placed), tint in zip(meshes, tints, strict=True):
+                    if skin.link == link.link:
+                        near = _near_faces(mesh, link.points, link.normals)
+                        tint[near] = shade(placed[near], colour)
+        axes = figure.add_subplot(rows, columns, i + 1, projection="3d")
+        add_triangles(axes, np.concatenate([placed for _, _, placed in meshes]), np.concatenate(tints))
+        frame_points(axes, _hand_points(model, q), towards, 35.0)
+        axes.set_title(name)
+    figure.suptitle(f"{model.name}: opposition spaces, one side red, the other blue")
+    return save_figure(figure, path)
 
 
 def _matrix(pose: np.ndarray) -> np.ndarray:
@@ -120,9 +128,24 @@ def _matrix(pose: np.ndarray) -> np.ndarray:
 def _hand_triangles(inputs: Inputs, q: np.ndarray, *, patches: bool) -> tuple[np.ndarray, np.ndarray]:
     """Triangles (n, 3, 3) of a hand in the base frame and their colours (n, 4)."""
     model = inputs.hand.model
+    triangles, colours = [], []
+    for skin, mesh, placed in _hand_meshes(inputs, q):
+        tint = shade(placed, _LINK)
+        if patches:
+            for group, chosen in _patch_faces(model, skin, mesh):
+                colour = _PALM if group == model.groups else _COLOURS[group % len(_COLOURS)]
+                tint[chosen] = shade(placed[chosen], colour)
+        triangles.append(placed)
+        colours.append(tint)
+    return np.concatenate(triangles), np.concatenate(colours)
+
+
+def _hand_meshes(inputs: Inputs, q: np.ndarray) -> list[tuple[Skin, trimesh.Trimesh, np.ndarray]]:
+    """Every link with its mesh (body frame) in about even triangles, and these (n, 3, 3) in the base frame."""
+    model = inputs.hand.model
     postures = sample_bodies(model, np.asarray(q, float)[None])
     R, t = postures.R[0], postures.t[0]
-    triangles, colours = [], []
+    out = []
     for skin in link_skins(read_urdf(inputs.keys.source.urdf), model):
         mesh = thin_mesh(skin.mesh, _FACES)
         if len(mesh.faces) < _FACES:
@@ -130,15 +153,8 @@ def _hand_triangles(inputs: Inputs, q: np.ndarray, *, patches: bool) -> tuple[np
             mesh = trimesh.Trimesh(
                 *trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge)[:2], process=False
             )
-        placed = (mesh.vertices @ R[skin.body].T + t[skin.body])[mesh.faces]
-        tint = _shade(placed, _LINK)
-        if patches:
-            for group, chosen in _patch_faces(model, skin, mesh):
-                colour = _PALM if group == model.groups else _COLOURS[group % len(_COLOURS)]
-                tint[chosen] = _shade(placed[chosen], colour)
-        triangles.append(placed)
-        colours.append(tint)
-    return np.concatenate(triangles), np.concatenate(colours)
+        out.append((skin, mesh, (mesh.vertices @ R[skin.body].T + t[skin.body])[mesh.faces]))
+    return out
 
 
 def _hand_points(model: HandModel, q: np.ndarray) -> np.ndarray:
@@ -156,34 +172,13 @@ def _patch_faces(model: HandModel, skin: Skin, mesh: trimesh.Trimesh) -> list[tu
     if not len(rows):
         return []
     group = int(np.searchsorted(model.contact_first, rows[0], "right")) - 1
-    far, near = cKDTree(model.contact_points[rows]).query(mesh.triangles_center)
-    agree = (mesh.face_normals * model.contact_normals[rows][near]).sum(1) > 0.6
-    return [(group, np.flatnonzero((far < 0.006) & agree))]
+    return [(group, _near_faces(mesh, model.contact_points[rows], model.contact_normals[rows]))]
 
 
-def _shade(triangles: np.ndarray, colour: str) -> np.ndarray:
-    from matplotlib.colors import to_rgb
-
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    light = 0.55 + 0.45 * np.clip(normals @ _LIGHT, -0.6, 1)
-    return np.column_stack([np.clip(light[:, None] * np.array(to_rgb(colour)), 0, 1), np.ones(len(light))])
-
-
-def _add_triangles(axes: Any, triangles: np.ndarray, colours: np.ndarray) -> None:
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    axes.add_collection3d(Poly3DCollection(triangles, facecolors=colours, edgecolors=colours, linewidths=0.2, zorder=1))
-
-
-def _add_box(axes: Any, box: np.ndarray) -> None:
-    """Edges of a box (2, 3)."""
-    corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    points = box[0] + corner * (box[1] - box[0])
-    for a in range(8):
-        for b in range(a):
-            if np.abs(corner[a] - corner[b]).sum() == 1:
-                axes.plot(*points[[a, b]].T, color="black", linewidth=1.6, zorder=9)
+def _near_faces(mesh: trimesh.Trimesh, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Faces of a mesh that lie at contact points (n, 3) and look their way."""
+    far, near = cKDTree(points).query(mesh.triangles_center)
+    return np.flatnonzero((far < 0.006) & ((mesh.face_normals * normals[near]).sum(1) > 0.6))
 
 
 def _palmar_direction(inputs: Inputs) -> np.ndarray:
@@ -206,20 +201,6 @@ def _away(points: np.ndarray, centre: np.ndarray, inputs: Inputs) -> np.ndarray:
     way = centre - points.mean(0) + 0.02 * _palmar_direction(inputs)
     size = float(np.linalg.norm(way))
     return way / size if size > 1e-6 else _palmar_direction(inputs)
-
-
-def _frame(axes: Any, points: np.ndarray, towards: np.ndarray, turn: float) -> None:
-    """Equal scales around points, camera on the side ``towards``, turned about z by ``turn`` degrees."""
-    middle = (points.min(0) + points.max(0)) / 2
-    half = float(np.ptp(points, axis=0).max()) / 2 * 0.95
-    for axis, c in zip("xyz", middle, strict=True):
-        getattr(axes, f"set_{axis}lim")(c - half, c + half)
-        getattr(axes, f"set_{axis}label")(f"{axis} (m)", fontsize=8)
-        axes.tick_params(axis=axis, labelsize=6)
-    axes.set_box_aspect((1, 1, 1), zoom=1.1)
-    axes.computed_zorder = False  # dots and lines are drawn over solids
-    elevation = float(np.clip(np.degrees(np.arcsin(np.clip(towards[2], -1, 1))), -20, 55)) + 12
-    axes.view_init(elev=elevation, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) + turn)
 
 
 def _legend(figure: Any, inputs: Inputs, *, box: bool) -> None:

@@ -1,5 +1,6 @@
 """URDF -> hand.yaml without a human: fingers, palmar surface, canonical box, open posture, and why."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,8 @@ def draft_spec(
     spec = HandSpec.model_validate(data)
     if jaws is None:
         spec, said = _with_shared(urdf, survey, spec, said)
-    model = build_hand(urdf.path, spec) if spec.shared else survey.model
+    # without shared joints the hand is that of the survey in another open posture
+    model = build_hand(urdf.path, spec) if spec.shared else replace(survey.model, tree=build_tree(urdf, spec))
     spaces, told = propose_spaces(urdf, spec, survey, names, model)
     return spec.model_copy(update={"opposition_spaces": spaces}), [*said, *told]
 

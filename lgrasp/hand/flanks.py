@@ -10,7 +10,6 @@ from lgrasp.hand.opposition import moving_joints
 from lgrasp.hand.palmar import Postures, Skin, sample_bodies
 from lgrasp.hand.spec import Surface
 from lgrasp.hand.survey import Survey, pad_axis
-from lgrasp.hand.tree import Tree
 
 __all__ = ["Beside", "Finger", "find_fingers", "finger_rows", "neighbours", "rounded_axis"]
 
@@ -72,7 +71,7 @@ def _finger(survey: Survey, model: HandModel, standing: Postures, group: int, na
         along = R @ _middle(skins)
         axis = pad_axis(survey.model, skins, tip)
         if not tree.joint_prismatic[tip - 1] and abs(hinge @ along) < _ALONG * np.linalg.norm(along):
-            axis = R.T @ _flexed(tree, tip, hinge, along, standing.t[0, 1:].mean(0) - t)
+            axis = _flexed(survey, model, tip, R.T @ np.cross(hinge, along), axis)
             hinges.append(hinge)
         pads += [(s, axis) for s in skins if axis is not None]
         moved |= moving_joints(model.tree, int(model.tree.link_body[model.tree.link_names.index(skins[0].link)]))
@@ -116,17 +115,20 @@ class _Place:
         return T[:3, :3], T[:3, 3]
 
 
-def _flexed(tree: Tree, tip: int, hinge: np.ndarray, along: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Direction in which a fingertip bends, (3,) unit: where its joint has most room, else ``towards`` the others."""
-    k = tip - 1
-    column = int(tree.dof_index[tree.dof_first[tree.body_group[tip]] + tree.joint_dof[k]])
-    limits = np.array([tree.joint_lower[column], tree.joint_upper[column]])
-    room = tree.joint_mult[k] * (limits - tree.joint_open[column])
+def _flexed(survey: Survey, model: HandModel, tip: int, way: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
+    """Direction in which a fingertip closes, (3,) unit, body frame: ``way`` or against it.
+
+    The open posture leaves a joint most of its room to close; where it does not tell, the side that is ``seen`` does.
+    """
+    tree, k = survey.model.tree, tip - 1
+    name = tree.joint_names[tree.dof_index[tree.dof_first[tree.body_group[tip]] + tree.joint_dof[k]]]
+    column = model.tree.joint_names.index(name)
+    limits = np.array([model.tree.joint_lower[column], model.tree.joint_upper[column]])
+    room = tree.joint_mult[k] * (limits - model.tree.joint_open[column])
     down, up = -min(room), max(room)
-    way = np.cross(hinge, along)
-    way /= np.linalg.norm(way)
-    if max(up, down) < _ONE_SIDED * min(up, down):
-        return way * np.sign(way @ towards)
+    way = way / np.linalg.norm(way)
+    if seen is not None and max(up, down) < _ONE_SIDED * min(up, down):
+        return way if way @ seen > 0 else -way
     return way if up > down else -way
 
 

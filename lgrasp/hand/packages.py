@@ -11,7 +11,7 @@ from lgrasp.paths import cache_dir, package_files
 
 __all__ = ["PACKAGE_HANDS", "drafted_folder", "package_urdf"]
 
-_DRAFT_VERSION = 2
+_DRAFT_VERSION = 3
 
 PACKAGE_HANDS = {
     "allegro_right": ("example-robot-data", "allegro_right_hand"),

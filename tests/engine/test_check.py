@@ -42,8 +42,10 @@ def test_drafted_gripper_holds_all_three(jaws, tmp_path, swift: Pipeline, cache_
     assert [o.rows for o in found.objects] == [20, 20, 20]
     assert all(o.reasons == [] for o in found.objects)
     assert found.hints == []
+    assert [(s.name, s.problem) for s in found.spaces] == [("finger_1-finger_2", "")]
+    assert found.longest_sequence == 1
     assert all(list(o.survivors) == list(swift.order) for o in found.objects)
-    assert [p.name for p in found.pictures] == ["hand.png", "workspace.png", "grasps.png"]
+    assert [p.name for p in found.pictures] == ["hand.png", "workspace.png", "spaces.png", "grasps.png"]
     for picture in found.pictures:
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert picture.stat().st_size > 20_000
