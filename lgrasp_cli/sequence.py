@@ -10,7 +10,7 @@ from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Quiet, Seed, ch
 if TYPE_CHECKING:
     from lgrasp.engine.sequence.job import SequenceJob, SequenceOutcome
 
-__all__ = ["register", "sequence"]
+__all__ = ["conclude", "register", "run_sequences", "sequence"]
 
 
 def register(app: typer.Typer) -> None:
@@ -99,7 +99,7 @@ def sequence(
     )
     check_report(json_path)
     data, outcome = run_sequences(job, quiet=quiet)
-    _show(data, json_path, quiet)
+    _show(data, json_path, quiet or not data["sequences"])
     conclude(data, outcome)
 
 
