@@ -1,0 +1,158 @@
+"""Optimised grasps of whole rows: what stays, what the indices mean, independence of the batch."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from lgrasp.differentiable.streams import uniforms
+from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
+from lgrasp.hand.find import find_hand
+from lgrasp.hand.model import build_hand
+from lgrasp.hand.spaces import hand_spaces, space_view
+from lgrasp.object.model import preprocess_object
+from lgrasp.object.params import ObjectParams
+from lgrasp.stages.sequence.anneal_optimise import Optimised, optimise
+from lgrasp.stages.sequence.anneal_params import OptimiserParams
+from lgrasp.stages.sequence.anneal_start import start_poses
+
+SPACES = ["thumb-palm", "index-middle", "ring-palm"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Busy machines: threads that wait for one another cost more than they gain on arrays so small."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def case() -> SimpleNamespace:
+    """Allegro with three of its spaces, a ball and a bar."""
+    source = find_hand("allegro")
+    model = build_hand(source.urdf, source.spec)
+    known = {s.name: s for s in hand_spaces(source.spec, model.tree)}
+    params = ObjectParams(sdf_cells=40**3, obstacle_count=1024, contact_count=512)
+    shapes = [trimesh.creation.icosphere(3, 0.03), trimesh.creation.box((0.03, 0.02, 0.07))]
+    return SimpleNamespace(
+        hand=model,
+        views=[space_view(source.urdf, source.spec, model, name) for name in SPACES],
+        spaces=[known[name] for name in SPACES],
+        objects=[preprocess_object(mesh, params=params) for mesh in shapes],
+    )
+
+
+@pytest.fixture(scope="module")
+def first(case) -> Optimised:
+    """Balls grasped by the first two spaces."""
+    return run(case, 1, np.arange(6) % 2, method="anneal")
+
+
+def rows_of(case, number: int, space: np.ndarray, before: Optimised | None = None) -> dict[str, np.ndarray]:
+    n = len(space)
+    free = np.array([case.spaces[s].joints for s in space])
+    opened = np.tile(case.hand.tree.joint_open, (n, 1))
+    held = np.zeros((n, 0, 7), np.float32)
+    q, held = (opened, held) if before is None else (before.q, before.pose[:, None])
+    return {"space": space, "free": free, "q": q, "held": held, "seed": 100 * number + np.arange(n)}
+
+
+def run(case, number: int, space: np.ndarray, before: Optimised | None = None, only=slice(None), **more) -> Optimised:
+    """Grasp object ``number`` in rows of these spaces that hold what ``before`` grasped."""
+    params = OptimiserParams(iterations=40, step_period=8, temperature_period=3, hand_points=512, object_points=256)
+    inputs = {name: values[only] for name, values in rows_of(case, number, space, before).items()}
+    return optimise(case.hand, case.views, case.spaces, case.objects[:number], **inputs, **{"params": params} | more)
+
+
+def columns(result: Optimised) -> list[np.ndarray]:
+    return [result.pose, result.q, result.hand_point, result.object_point, result.energies]
+
+
+@pytest.mark.parametrize("method", ["anneal", "mala"])
+@pytest.mark.parametrize("number", [1, 2])
+def test_rows_do_not_depend_on_the_batch(case, first, method, number):
+    """Bit by bit: all together, in blocks, alone."""
+    space = np.array([0, 1, 0, 1, 0, 1]) if number == 1 else np.full(6, 2)
+    before = None if number == 1 else first
+    together = run(case, number, space, before, method=method)
+    blocks = run(case, number, space, before, method=method, rows=4)
+    assert all(np.array_equal(a, b) for a, b in zip(columns(together), columns(blocks), strict=True))
+    alone = run(case, number, space, before, slice(2, 3), method=method)
+    assert all(np.array_equal(a[0], b[2]) for a, b in zip(columns(alone), columns(together), strict=True))
+
+
+def test_joints_that_may_not_move_stay_bit_by_bit(case, first):
+    space = np.full(6, 2)
+    second = run(case, 2, space, first)
+    free = case.spaces[2].joints
+    assert np.array_equal(second.q[:, ~free], first.q[:, ~free])
+    assert (second.q[:, free] != first.q[:, free]).any(1).all()
+    assert (second.q >= case.hand.tree.joint_lower).all()
+    assert (second.q <= case.hand.tree.joint_upper).all()
+
+
+def test_indices_name_points_of_the_two_sides_and_the_nearest_of_the_object(case, first):
+    T_body = pose_matrices(body_poses(upload_hand(case.hand, "cpu"), first.q).astype(float).reshape(-1, 7))
+    T_body = T_body.reshape(len(first.q), -1, 4, 4)
+    surface = case.objects[0].contact_points
+    for row, space in enumerate(np.arange(6) % 2):
+        view = case.views[space]
+        for side, group in enumerate(case.spaces[space].groups):
+            index = first.hand_point[row, side]
+            group = group if group >= 0 else view.groups
+            assert view.contact_first[group] <= index < view.contact_first[group + 1]
+            T = T_body[row, view.contact_body[index]]
+            p = T[:3, :3] @ view.contact_points[index] + T[:3, 3]
+            local = Rotation.from_quat(first.pose[row, 3:]).inv().apply(p - first.pose[row, :3])
+            distance = np.linalg.norm(surface - local, axis=1)
+            assert distance[first.object_point[row, side]] == pytest.approx(distance.min(), abs=1e-6)
+
+
+def test_distances_are_those_of_the_contact_points(case, first):
+    """dis from the pose, the posture and the indices alone, on a true ball."""
+    T_body = pose_matrices(body_poses(upload_hand(case.hand, "cpu"), first.q).astype(float).reshape(-1, 7))
+    T_body = T_body.reshape(len(first.q), -1, 4, 4)
+    for row, space in enumerate(np.arange(6) % 2):
+        view = case.views[space]
+        gaps = []
+        for index in first.hand_point[row]:
+            T = T_body[row, view.contact_body[index]]
+            p = T[:3, :3] @ view.contact_points[index] + T[:3, 3]
+            gaps.append(abs(np.linalg.norm(p - first.pose[row, :3]) - 0.03))
+        assert first.energies[row, 1] <= sum(gaps) + 1e-3  # far from a grid its distance is a lower bound
+
+
+def test_more_steps_lower_the_energy(case):
+    """The published weights, a short schedule: contacts come near, penetration goes."""
+    schedule = {"iterations": 300, "step": 0.01, "step_period": 25, "temperature": 8, "temperature_period": 6}
+    params = OptimiserParams(**schedule, hand_points=512, object_points=256)
+    space, told = np.zeros(8, int), []
+    result = run(case, 1, space, params=params, progress=lambda done, total: told.append((done, total)))
+    brief = run(case, 1, space, params=params.model_copy(update={"iterations": 1}))
+    assert told[-1] == (300, 300)
+    assert [done for done, _ in told] == list(range(1, 301))
+    assert np.median(result.energies[:, 1]) < 0.5 * np.median(brief.energies[:, 1])
+    assert np.median(result.energies[:, 0]) < 0.2
+
+
+def test_starts_face_the_hand_and_clear_what_is_held(case):
+    u = uniforms(torch.arange(300), 0, 7)
+    none = torch.zeros(300, 0, 3, 3), torch.zeros(300, 0, 3)
+    R, t = (x.numpy() for x in start_poses(case.hand, case.objects[1:], none, u))
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-9)
+    # some point of the bar is in the canonical box, and none is much nearer to the palm, which faces about +x
+    bar = case.objects[1]
+    low, high = case.hand.canonical_box
+    hull = np.array([(bar.vertices - bar.center) @ r.T + x for r, x in zip(R, t, strict=True)])  # (300, v, 3)
+    assert (hull[..., 0].min(1) >= low[0] - 0.006).all()
+    assert (hull[..., 0].min(1) <= high[0] + 0.006).all()
+    held = torch.eye(3).expand(300, 1, 3, 3), torch.tensor([[0.1, 0.0, 0.02]]).expand(300, 1, 3)
+    R, t = (x.numpy() for x in start_poses(case.hand, case.objects, held, u))
+    hull = np.array([(bar.vertices - bar.center) @ r.T + x for r, x in zip(R, t, strict=True)])
+    assert (hull[..., 0].min(1) >= 0.1 + 0.024).all()
