@@ -47,6 +47,7 @@ def bench_sequence(
     cache = open_cache(cache_dir)
     from pathlib import Path
 
+    from lgrasp.config import parse_model
     from lgrasp.engine.sequence.bench import PUBLISHED, measure_sequences
     from lgrasp.engine.sequence.job import SequenceJob
     from lgrasp.engine.sequence.sets import SequenceSets, object_sequences
@@ -55,7 +56,8 @@ def bench_sequence(
     from lgrasp_cli.tables import print_json
 
     pool = objects or ["mug", "sphere", "box", "capsule", "bottle", "bowl"]
-    drawn = object_sequences(pool, SequenceSets(sets=sequences, length=length, permutations=1), seed)
+    sets = parse_model(SequenceSets, {"sets": sequences, "length": length, "permutations": 1}, "bench sequence")
+    drawn = object_sequences(pool, sets, seed)
     results: dict[str, Any] = {"published": PUBLISHED, "sequences": drawn, "physics": physics, "methods": {}}
     for place, method in enumerate(name.strip() for name in methods.split(",")):
         chosen = choose_pipeline("sequence", seed)
