@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.errors import HandError
-from lgrasp.hand.contacts import body_cones, side_points
+from lgrasp.hand.contacts import LinkGrid, body_cones, side_points
 from lgrasp.hand.geometry import geometry_mesh
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition import side_links
@@ -147,7 +147,8 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
     """The same hand with the two sides of an opposition space as its only contact surface.
 
     Fingers' sides are contact rules: all that is outside the side's cone is forbidden. A static side is the palm. A box
-    bounds the contact points; a contact that slides on a finger may leave it.
+    bounds the contact points; a contact that slides on a finger may leave it. The hand's other contact links keep their
+    distance grids and have no contact point.
 
     Args:
         urdf_path, spec: what ``model`` was built from. device: answers the geometric queries.
@@ -158,11 +159,27 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
     urdf, tree = read_urdf(urdf_path), model.tree
     links = [link for side in space_sides(urdf, spec, tree, name, device) for link in side.links]
     meshes = _body_meshes(urdf, tree, {int(tree.link_body[tree.link_names.index(link.link)]) for link in links})
-    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device)
+    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=_grids(model))
     arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
     described = spec.opposition_spaces[name].model_dump(mode="json")
     digest = hashlib.sha256(json.dumps([model.sha256, name, described]).encode()).hexdigest()
     return replace(model, sha256=digest, contacts=(), **arrays)
+
+
+def _grids(model: HandModel) -> dict[str, LinkGrid]:
+    """Distance grids of the hand's own contact links."""
+    return {
+        model.tree.link_names[link]: LinkGrid(model.grid_values[a:b].reshape(shape), origin, float(cell))
+        for link, a, b, shape, origin, cell in zip(
+            model.grid_link,
+            model.grid_first[:-1],
+            model.grid_first[1:],
+            model.grid_shape,
+            model.grid_origin,
+            model.grid_cell,
+            strict=True,
+        )
+    }
 
 
 def _outside(surface: Surface) -> tuple[Cone, ...]:

@@ -39,15 +39,19 @@ def contact_arrays(
     meshes: Mapping[str, list[trimesh.Trimesh]],
     rng: np.random.Generator,
     device: str,
+    *,
+    known: Mapping[str, LinkGrid] | None = None,
 ) -> dict[str, np.ndarray]:
     """Arrays ``contact_*``, ``grid_*``, ``rule*`` and ``mesh_*`` of a HandModel.
 
     Args:
-        meshes: solids of each link, body frame.
+        meshes: solids of each link, body frame. known: distance grids that need not be made.
     """
     made: dict[bytes, LinkGrid] = {}
 
     def grid(link: str) -> LinkGrid:
+        if known and link in known:
+            return known[link]
         # fingertips of one shape share one grid's work
         key = b"".join(np.round(m.vertices, 9).tobytes() for m in meshes[link])
         if key not in made:

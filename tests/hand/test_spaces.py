@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.hands import hand_model, hand_source
+from scipy.ndimage import map_coordinates
 
 from lgrasp.errors import HandError
 from lgrasp.hand.find import find_hand
@@ -154,7 +155,8 @@ def test_view_holds_the_surface_of_the_sides_and_no_other(hand, name):
     assert model.sha256 != whole.sha256
     side = {link: part for sides in hand_source(hand)[1].opposition_spaces[name].sides for part in sides
             for link in part.links}  # fmt: skip
-    assert {links[i] for i in model.grid_link} == set(side)
+    assert {links[i] for i in np.unique(model.contact_link)} == set(side)
+    assert set(model.grid_link) == set(model.contact_link) | set(whole.grid_link)
     for index in np.unique(model.contact_link):
         own, part = model.contact_link == index, side[links[index]]
         R, t = tree.T_body_link[index][:3, :3], tree.T_body_link[index][:3, 3]
@@ -171,6 +173,18 @@ def test_view_holds_the_surface_of_the_sides_and_no_other(hand, name):
     for key in ("pairs", "vertices", "spheres", "samples", "overlap_points", "canonical_box"):
         np.testing.assert_array_equal(getattr(model, key), getattr(whole, key))
     assert model.tree is whole.tree
+
+
+def test_grids_of_a_view_are_those_of_its_links():
+    """Those that the hand has, and those that it has not, by the same rule: zero at the link's own contact points."""
+    model = view("shipped", "index-middle")
+    for i in np.unique(model.contact_grid):
+        own = model.contact_grid == i
+        grid = model.grid_values[model.grid_first[i] : model.grid_first[i + 1]].reshape(model.grid_shape[i])
+        place = (model.contact_points[own] - model.grid_origin[i]) / model.grid_cell[i]
+        assert abs(map_coordinates(grid, place.T, order=1)).max() < 4e-4
+        out = place + 3e-3 * model.contact_normals[own] / model.grid_cell[i]
+        assert abs(map_coordinates(grid, out.T, order=1) - 3e-3).max() < 1e-3
 
 
 def test_thirds_of_the_palm_lie_under_their_fingers():
