@@ -13,6 +13,7 @@ from lgrasp_cli import (
     export,
     generate,
     hands,
+    learn,
     objects,
     pipelines,
     prepare,
@@ -34,7 +35,7 @@ app = typer.Typer(
 )
 for module in (prepare, generate, sequence, run, validate, stages, export):
     module.register(app)
-for group in (bench, hands, objects, pipelines, cache, dataset, scenes):
+for group in (bench, hands, objects, pipelines, cache, dataset, scenes, learn):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])
 
 

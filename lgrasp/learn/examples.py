@@ -1,0 +1,108 @@
+"""What the predictor learns from: partial clouds of objects by simulated cameras, and grasps with their palm points."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from lgrasp.dataset import pose_matrix
+from lgrasp.differentiable.kinematics import BodyKinematics
+from lgrasp.hand.model import HandModel
+from lgrasp.learn.params import LearnParams
+from lgrasp.object.model import ObjectModel
+from lgrasp.scenes.camera import intrinsics_of, look_at
+from lgrasp.scenes.params import CameraParams
+from lgrasp.scenes.render import Surface, render
+from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
+
+__all__ = ["Examples", "make_examples", "palm_point", "partial_clouds"]
+
+_CAMERA = CameraParams.model_validate(
+    {"views": 2, "width": 96, "height": 96, "angle": 40.0, "calibration": 0.003, "voxel": 0.0, "window": 2}
+)
+_DISTANCE = 4.0  # of a camera, in radii of the object
+
+
+@dataclass(frozen=True)
+class Examples:
+    """One object with G grasps and V clouds of n points, all in its internal frame."""
+
+    model: ObjectModel
+    points: torch.Tensor
+    """[m], (V, n, 3)."""
+    normals: torch.Tensor
+    """(V, n, 3)."""
+    R: torch.Tensor
+    """Rotation of the hand's base, (G, 3, 3)."""
+    t: torch.Tensor
+    """Its origin [m], (G, 3)."""
+    q: torch.Tensor
+    """Actuated joints [rad or m], (G, K)."""
+    anchor: torch.Tensor
+    """Palm point of each grasp: where the surface is nearest to the palm [m], (G, 3)."""
+
+
+def make_examples(
+    hand: HandModel,
+    model: ObjectModel,
+    T_hand_object: np.ndarray,
+    q: np.ndarray,
+    params: LearnParams,
+    rng: np.random.Generator,
+    clouds: int,
+    device: str = "cpu",
+) -> Examples:
+    """Clouds and labels of one object.
+
+    Args:
+        T_hand_object: of each grasp as in a shard, x y z [m] qw qx qy qz, (G, 7).
+        q: actuated joints [rad or m], (G, K).
+        clouds: how many clouds.
+        device: Warp device of the cameras.
+    """
+    T = np.linalg.inv(pose_matrix(T_hand_object.astype(float)))
+    R, t = T[:, :3, :3], T[:, :3, 3] - model.center
+    palm = t + R @ palm_point(hand)
+    away = np.linalg.norm(palm[:, None] - model.contact_points[None], axis=2)
+    points, normals = partial_clouds(model, clouds, params.points, rng, device)
+
+    def put(a: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32)
+
+    anchor = model.contact_points[away.argmin(1)] if len(q) else np.zeros((0, 3))
+    return Examples(model, put(points), put(normals), put(R), put(t), put(q), put(anchor))
+
+
+def palm_point(hand: HandModel) -> np.ndarray:
+    """Mean of the contact surface of the open hand in its base frame [m], (3,): a point before the palm."""
+    R, t = BodyKinematics(hand.tree, dtype=torch.float64)(torch.as_tensor(hand.tree.joint_open[None].astype(float)))
+    body = hand.contact_body
+    points = np.einsum("nab,nb->na", R[0].numpy()[body], hand.contact_points) + t[0].numpy()[body]
+    return points.mean(0)
+
+
+def partial_clouds(
+    model: ObjectModel, clouds: int, count: int, rng: np.random.Generator, device: str = "cpu"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy clouds of an object alone in space, each from two random sides.
+
+    Returns:
+        Points [m] in the internal frame and unit normals, (clouds, count, 3) each.
+    """
+    vertices = model.vertices - model.center
+    radius = float(np.linalg.norm(vertices, axis=1).max())
+    surface = Surface(vertices, model.faces, np.zeros(len(model.faces)))
+    points, normals = np.zeros((clouds, count, 3)), np.zeros((clouds, count, 3))
+    made = 0
+    while made < clouds:
+        way = rng.standard_normal((_CAMERA.views, 3))
+        way /= np.linalg.norm(way, axis=1)[:, None]
+        if np.abs(way[:, 2]).max() > 0.98:  # no upright image
+            continue
+        images = render(surface, intrinsics_of(_CAMERA), look_at(_DISTANCE * radius * way, np.zeros(3)), device)
+        merged = merge_views(add_noise(images, _CAMERA, rng), draw_offsets(_CAMERA, rng), _CAMERA, device)
+        if len(merged.points):
+            kept = np.resize(rng.permutation(len(merged.points)), count)
+            points[made], normals[made] = merged.points[kept], merged.normals[kept]
+            made += 1
+    return points, normals

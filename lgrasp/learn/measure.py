@@ -1,0 +1,44 @@
+"""How good coarse answers are, and what the refiner makes of them: energies against steps."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from lgrasp.learn.examples import Examples
+from lgrasp.learn.training import Trainer, whole_energy
+from lgrasp.refine import Pose
+
+__all__ = ["Measured", "measure"]
+
+
+class Measured(NamedTuple):
+    """Means over all clouds and seeds that were measured on."""
+
+    poses: int
+    coarse: float
+    """E* of the answers."""
+    unrolled: float
+    """E* after the K unrolled steps of joint training."""
+    refined: tuple[float, ...]
+    """E* after each number of outer steps that was asked for."""
+
+
+def measure(trainer: Trainer, examples: Sequence[Examples], *, seeds: int = 4, outer: Sequence[int] = ()) -> Measured:
+    """Energies of the answers at the same seeds of the same clouds, every time.
+
+    Args:
+        seeds: points of each cloud that are asked.
+        outer: numbers of outer steps of the refiner.
+    """
+    parts: list[torch.Tensor] = []
+    for e in examples:
+        coarse, refiner = trainer.predict(e, seeds), trainer.refiner(e)
+        start = Pose(coarse.R, coarse.t, coarse.q)
+        poses = [start, Pose(*(x.detach() for x in refiner.unrolled(*start, steps=trainer.params.unrolled)))]
+        poses += [refiner(*start, outer=steps).pose for steps in outer]
+        with torch.no_grad():
+            parts.append(torch.stack([whole_energy(refiner, pose) for pose in poses]))
+    every = torch.cat(parts, 1)  # (2 + outer, N)
+    coarse, unrolled, *refined = every.mean(1).tolist()
+    return Measured(every.shape[1], coarse, unrolled, tuple(refined))

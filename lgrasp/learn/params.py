@@ -1,0 +1,27 @@
+"""Parameters of the coarse predictor and its training; lengths in metres."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["LearnParams"]
+
+
+class LearnParams(BaseModel):
+    """What the network sees, its size, and how long it is trained."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    points: int = Field(96, ge=16, le=8192, description="Points of a cloud that the network sees.")
+    width: int = Field(64, ge=8, le=4096, description="Channels of a point; the whole has twice as many.")
+    scale: float = Field(0.05, gt=0, le=1.0, description="Length that the network counts in.")
+    near: float = Field(0.02, gt=0, le=0.2, description="A grasp belongs to seeds at most so far from its palm point.")
+    choices: int = Field(16, ge=1, le=1024, description="Grasps nearest to a seed; the closest to the answer pulls.")
+    clouds: int = Field(24, ge=1, le=10_000, description="Partial clouds of each object to train on.")
+    held_out: int = Field(8, ge=1, le=10_000, description="Others of each object, to measure on.")
+    batch: int = Field(64, ge=1, le=65_536, description="Seeds of a step.")
+    steps: int = Field(1500, ge=0, le=10_000_000, description="Steps on poses alone.")
+    rate: float = Field(1.0e-3, gt=0, le=1.0, description="Learning rate of Adam, falling to a tenth.")
+    joint_steps: int = Field(80, ge=0, le=10_000_000, description="Steps through the refiner afterwards.")
+    joint_rate: float = Field(3.0e-4, gt=0, le=1.0)
+    unrolled: int = Field(5, ge=0, le=100, description="Steps K of the refiner that gradients go through.")
+    pose_weight: float = Field(0.1, ge=0, le=1.0e6, description="Weight of the loss on poses in joint training.")
+    seed: int = Field(0, ge=0, lt=2**31)

@@ -1,0 +1,152 @@
+"""Training of the coarse predictor: on poses alone, then jointly through unrolled steps of the refiner."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch.nn import functional
+
+from lgrasp.hand.model import HandModel
+from lgrasp.learn.examples import Examples
+from lgrasp.learn.network import Coarse, CoarseNet
+from lgrasp.learn.params import LearnParams
+from lgrasp.refine import LocalSearch, Pose, Refiner
+
+__all__ = ["Trainer", "pose_loss", "whole_energy"]
+
+_ANY_REACH = 10.0  # [m]
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Seeds on clouds of one object."""
+
+    points: torch.Tensor  # (N, n, 3)
+    normals: torch.Tensor  # (N, n, 3)
+    seeds: torch.Tensor  # (N,)
+
+
+def pose_loss(coarse: Coarse, points: torch.Tensor, examples: Examples, params: LearnParams) -> torch.Tensor:
+    """How far answers are from the grasps of their seeds, and scores from whether there are any; a number.
+
+    Of the ``choices`` grasps whose palm points are nearest to a seed the one that is closest to the answer counts:
+    where a place can be grasped in several ways, one of them is learnt and not their mean.
+
+    Args:
+        points: the seeds themselves [m], (N, 3).
+    """
+    away = torch.cdist(points, examples.anchor)  # (N, G)
+    gap, near = away.topk(min(params.choices, away.shape[1]), largest=False)
+    turn = ((coarse.R[:, None] - examples.R[near]) ** 2).sum((-1, -2))
+    shift = ((coarse.t[:, None] - examples.t[near]) ** 2).sum(-1) / params.scale**2
+    bend = ((coarse.q[:, None] - examples.q[near]) ** 2).mean(-1)
+    apart = torch.where(gap <= params.near, turn + shift + bend, torch.inf).amin(1)
+    there = torch.isfinite(apart)
+    score = functional.binary_cross_entropy_with_logits(coarse.score, there.to(coarse.score))
+    return torch.where(there, apart, 0.0).sum() / there.sum().clamp_min(1) + 0.1 * score
+
+
+def whole_energy(refiner: Refiner, pose: Pose) -> torch.Tensor:
+    """E* of hands with palmar points pulling however far off they are, (N,): far hands have no low energy."""
+    return refiner.energy(*pose, matches=refiner.match(*pose, reach=_ANY_REACH)).total
+
+
+class Trainer:
+    """A predictor, a refiner for each object, and the random numbers of one training."""
+
+    def __init__(
+        self,
+        hand: HandModel,
+        train: Sequence[Examples],
+        params: LearnParams,
+        *,
+        search: LocalSearch | None = None,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self.params, self.device = params, torch.device(device)
+        self._hand, self._search, self._train = hand, search, [_moved(e, self.device) for e in train]
+        self._random = torch.Generator().manual_seed(params.seed)
+        self._refiners: dict[int, Refiner] = {}
+        state = torch.random.get_rng_state()
+        torch.manual_seed(params.seed)
+        lower, upper = (torch.as_tensor(x, dtype=torch.float32) for x in (hand.tree.joint_lower, hand.tree.joint_upper))
+        self.net = CoarseNet(lower, upper, params).to(self.device)
+        torch.random.set_rng_state(state)
+
+    def fit_poses(self, steps: int, rate: float, told: Callable[[int, float], None] | None = None) -> None:
+        """Steps on poses alone, the learning rate falling to a tenth.
+
+        Args:
+            told: called with (step, loss).
+        """
+        optimiser = torch.optim.Adam(self.net.parameters(), lr=rate)
+        fall = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(steps, 1), 0.1 * rate)
+        for step in range(steps):
+            examples = self._train[step % len(self._train)]
+            batch = self._draw(examples)
+            loss = self._pose_loss(batch, examples)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            fall.step()
+            if told:
+                told(step + 1, loss.item())
+
+    def fit_jointly(self, told: Callable[[int, float], None] | None = None) -> None:
+        """``joint_steps`` steps on the energy after K unrolled steps of the refiner.
+
+        The loss is the mean of log(1 + E*), so that a few hopeless answers do not drown the others, and
+        ``pose_weight`` times the loss on poses.
+
+        Args:
+            told: called with (step, mean energy after the unrolled steps).
+        """
+        p = self.params
+        optimiser = torch.optim.Adam(self.net.parameters(), lr=p.joint_rate)
+        for step in range(p.joint_steps):
+            examples = self._train[step % len(self._train)]
+            batch = self._draw(examples)
+            coarse = self.net(batch.points, batch.normals, batch.seeds)
+            refiner = self.refiner(examples)
+            pose = refiner.unrolled(coarse.R, coarse.t, coarse.q, steps=p.unrolled)
+            total = whole_energy(refiner, pose)
+            loss = total.clamp_min(0).log1p().mean()
+            if p.pose_weight:
+                loss = loss + p.pose_weight * self._pose_loss(batch, examples)
+            optimiser.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
+            optimiser.step()
+            if told:
+                told(step + 1, total.mean().item())
+
+    def refiner(self, examples: Examples) -> Refiner:
+        """The refiner of an object."""
+        key = id(examples.model)
+        if key not in self._refiners:
+            self._refiners[key] = Refiner(self._hand, examples.model, self._search, device=self.device)
+        return self._refiners[key]
+
+    @torch.no_grad()
+    def predict(self, examples: Examples, seeds: int = 4) -> Coarse:
+        """Answers on the first ``seeds`` points of every cloud: fixed ones, for comparisons."""
+        examples = _moved(examples, self.device)
+        clouds, n = examples.points.shape[:2]
+        which = torch.arange(clouds, device=self.device).repeat_interleave(min(seeds, n))
+        seed = torch.arange(min(seeds, n), device=self.device).repeat(clouds)
+        return self.net(examples.points[which], examples.normals[which], seed)
+
+    def _pose_loss(self, batch: _Batch, examples: Examples) -> torch.Tensor:
+        coarse = self.net(batch.points, batch.normals, batch.seeds)
+        rows = torch.arange(len(batch.seeds), device=self.device)
+        return pose_loss(coarse, batch.points[rows, batch.seeds], examples, self.params)
+
+    def _draw(self, examples: Examples) -> _Batch:
+        clouds, n = examples.points.shape[:2]
+        which = torch.randint(clouds, (self.params.batch,), generator=self._random).to(self.device)
+        seeds = torch.randint(n, (self.params.batch,), generator=self._random).to(self.device)
+        return _Batch(examples.points[which], examples.normals[which], seeds)
+
+
+def _moved(e: Examples, device: torch.device) -> Examples:
+    return Examples(e.model, *(x.to(device) for x in (e.points, e.normals, e.R, e.t, e.q, e.anchor)))

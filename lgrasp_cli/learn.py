@@ -1,0 +1,129 @@
+"""``lgrasp learn``: a small network that guesses grasps from partial clouds, trained through the refiner."""
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lgrasp_cli.options import CacheDir, Device, JsonPath, Quiet, check_report, open_cache
+
+__all__ = ["app"]
+
+app = typer.Typer(help="Coarse grasps from partial clouds by a small network.", no_args_is_help=True)
+
+_INTERVAL = 10.0  # [s] between lines of progress
+
+_Shards = Annotated[list[Path], typer.Argument(help="Shard files, or folders of them.", show_default=False)]
+
+
+@app.command()
+def fit(
+    shards: _Shards,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File of the predictor.")] = Path("coarse.pt"),
+    steps: Annotated[int | None, typer.Option(help="Steps on poses alone; default: 1500.", show_default=False)] = None,
+    joint_steps: Annotated[
+        int | None, typer.Option(help="Steps through the refiner afterwards; default: 80.", show_default=False)
+    ] = None,
+    unrolled: Annotated[
+        int | None, typer.Option(help="Unrolled steps of the refiner; default: 5.", show_default=False)
+    ] = None,
+    batch: Annotated[int | None, typer.Option(help="Seeds of a step; default: 64.", show_default=False)] = None,
+    seed: Annotated[int, typer.Option(help="Of clouds, weights and batches.")] = 0,
+    device: Device = "auto",
+    json_path: JsonPath = None,
+    cache_dir: CacheDir = None,
+    quiet: Quiet = False,
+) -> None:
+    """Train a predictor on the grasps of shards, first on poses, then through unrolled steps of the refiner.
+
+    The report compares energies on clouds that were not trained on.
+
+    Example: lgrasp learn fit grasps --out coarse.pt
+    """
+    check_report(json_path)
+    cache = open_cache(cache_dir)
+    from lgrasp.config import parse_model
+    from lgrasp.engine.learn.job import Fit
+    from lgrasp.engine.learn.job import fit as run
+    from lgrasp.learn.params import LearnParams
+
+    given = {"steps": steps, "joint_steps": joint_steps, "unrolled": unrolled, "batch": batch, "seed": seed}
+    params = parse_model(LearnParams, {k: v for k, v in given.items() if v is not None}, "learn fit")
+    said = time.monotonic()
+
+    def told(phase: str, step: int, of: int, value: float) -> None:
+        nonlocal said
+        if not quiet and time.monotonic() - said >= _INTERVAL:
+            said = time.monotonic()
+            typer.echo(f"{phase} {step:,}/{of:,}  {'loss' if phase == 'poses' else 'energy'} {value:.3f}", err=True)
+
+    data = run(Fit(shards, out, params, device=device, cache=cache), told)
+    _report(data, json_path, quiet, _fit_pairs(data))
+
+
+@app.command(name="eval")
+def evaluate(
+    predictor: Annotated[Path, typer.Argument(help="File that lgrasp learn fit wrote.", show_default=False)],
+    shards: _Shards,
+    clouds: Annotated[int, typer.Option(min=1, help="New clouds of each object.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Of the clouds.")] = 1,
+    device: Device = "auto",
+    json_path: JsonPath = None,
+    cache_dir: CacheDir = None,
+    quiet: Quiet = False,
+) -> None:
+    """Energies of a predictor's answers on new clouds, and after 3, 6, 10 and 13 outer steps of the refiner.
+
+    Example: lgrasp learn eval coarse.pt grasps
+    """
+    check_report(json_path)
+    cache = open_cache(cache_dir)
+    from lgrasp.engine.learn.job import evaluate as run
+
+    data = run(predictor, shards, cache, clouds=clouds, seed=seed, device=device)
+    pairs = [
+        ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
+        ("poses", f"{data['poses']:,}"),
+        ("coarse", f"{data['coarse']:.4f}"),
+    ]
+    pairs += [
+        (f"{steps}-step", f"{energy:.4f}  ({data['coarse'] / energy:.1f}x lower)")
+        for steps, energy in zip(data["outer"], data["refined"], strict=True)
+    ]
+    _report(data, json_path, quiet, pairs)
+
+
+def _fit_pairs(data: dict[str, Any]) -> list[tuple[str, str]]:
+    seconds = data["seconds"]
+    pairs = [
+        ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
+        ("where", data["out"]),
+        ("seconds", "  ".join(f"{name} {value:.1f}" for name, value in seconds.items())),
+    ]
+    words = {
+        "frozen": "trained on poses",
+        "longer": "on poses as many steps more",
+        "joint": "jointly through the refiner",
+    }
+    for name, what in words.items():
+        if name in data:
+            found = data[name]
+            pairs.append((what, f"energy {found['coarse']:.4f}, after the unrolled steps {found['unrolled']:.4f}"))
+    if "lowered" in data:
+        lowered = data["lowered"]
+        pairs.append(("lowered by", f"{lowered['coarse']:.1%}, after the unrolled steps {lowered['unrolled']:.1%}"))
+    return pairs
+
+
+def _report(data: dict[str, Any], json_path: str | None, quiet: bool, pairs: list[tuple[str, str]]) -> None:
+    from lgrasp_cli.tables import print_json, print_pairs
+
+    if json_path == "-":
+        print_json(data)
+    elif not quiet:
+        print_pairs(pairs)
+    if json_path and json_path != "-":
+        from lgrasp.engine.report import write_json
+
+        write_json(json_path, data)
