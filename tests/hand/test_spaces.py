@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.hands import hand_model, hand_source
+from reference.hands import ROOT, hand_model, hand_source
 from scipy.ndimage import map_coordinates
 
 from lgrasp.errors import HandError
@@ -198,6 +198,21 @@ def test_thirds_of_the_palm_lie_under_their_fingers():
             y = model.contact_points[model.contact_first[4] :, 1]
             assert np.argmin([abs(r - y.mean()) for r in root]) == g
             assert np.ptp(y) > 0.03
+
+
+@pytest.mark.parametrize("name", sorted(p.name for p in (ROOT / "hands").iterdir()))
+def test_pads_are_no_surface_that_the_contact_rules_forbid(name):
+    """A wrong sign in either is seen here: a pad would look where no contact may be."""
+    spec = find_hand(name).spec
+    forbidden = {link: rule.forbidden for rule in spec.contact for link in rule.links}
+    sides = [part for space in spec.opposition_spaces.values() for side in space.sides for part in side]
+    pads = [(link, part.axis) for part in sides if part.angle == 60 for link in part.links if link in forbidden]
+    assert {link for link, _ in pads} & set(forbidden)
+    for link, axis in pads:
+        for cone in forbidden[link]:
+            turned = np.degrees(np.arccos(np.dot(axis, cone.axis) / np.linalg.norm(axis) / np.linalg.norm(cone.axis)))
+            # a fingertip may be used beyond its side only: then the pad is just at the edge of what is allowed
+            assert turned > cone.angle - 2, link
 
 
 # refusals
