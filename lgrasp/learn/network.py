@@ -8,7 +8,7 @@ from torch import nn
 from lgrasp.differentiable.rotations import matrix_from_sixd
 from lgrasp.learn.params import LearnParams
 
-__all__ = ["Coarse", "CoarseNet", "seed_frames"]
+__all__ = ["Coarse", "CoarseNet", "best_answers", "seed_frames"]
 
 
 class Coarse(NamedTuple):
@@ -39,7 +39,7 @@ class CoarseNet(nn.Module):
 
     def __init__(self, lower: torch.Tensor, upper: torch.Tensor, params: LearnParams) -> None:
         super().__init__()
-        self.scale = params.scale
+        self.scale, self.points = params.scale, params.points
         w, joints = params.width, len(lower)
         self.point = nn.Sequential(
             nn.Linear(6, w // 2), nn.ReLU(), nn.Linear(w // 2, w), nn.ReLU(), nn.Linear(w, 2 * w)
@@ -65,6 +65,22 @@ class CoarseNet(nn.Module):
         t = p + (F @ (2 * self.scale * out[:, 6:9])[..., None])[..., 0]
         q = self.lower + out[:, 10:].sigmoid() * (self.upper - self.lower)
         return Coarse(F @ matrix_from_sixd(turn), t, q, out[:, 9])
+
+
+@torch.no_grad()
+def best_answers(net: CoarseNet, points: torch.Tensor, normals: torch.Tensor, count: int, seed: int = 0) -> Coarse:
+    """The ``count`` answers with the highest score for one cloud, best first, in its frame.
+
+    Args:
+        points: any number of points [m], (n, 3); some are drawn. normals: unit, outward, (n, 3).
+    """
+    draw = torch.Generator().manual_seed(seed)
+    kept = torch.randperm(len(points), generator=draw)[: net.points]
+    kept = kept.repeat(-(-net.points // len(kept)))[: net.points].to(points.device)
+    n = len(kept)
+    every = net(points[kept].expand(n, n, 3), normals[kept].expand(n, n, 3), torch.arange(n, device=points.device))
+    best = every.score.topk(min(count, n)).indices
+    return Coarse(*(x[best] for x in every))
 
 
 def seed_frames(points: torch.Tensor, normals: torch.Tensor, seeds: torch.Tensor) -> torch.Tensor:

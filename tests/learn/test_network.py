@@ -11,7 +11,7 @@ from lgrasp.differentiable.rotations import so3_exp
 from lgrasp.engine.workspace import Inputs
 from lgrasp.learn.examples import Examples, make_examples, palm_point, partial_clouds
 from lgrasp.learn.measure import measure
-from lgrasp.learn.network import Coarse, CoarseNet, seed_frames
+from lgrasp.learn.network import Coarse, CoarseNet, best_answers, seed_frames
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import Trainer, pose_loss, whole_energy
 from lgrasp.object.sdf import SdfGrid, sample_sdf
@@ -81,6 +81,16 @@ def test_answers_turn_and_move_with_the_cloud():
     torch.testing.assert_close(a.t @ T.mT + shift, b.t, atol=1e-4, rtol=0)
     torch.testing.assert_close(a.q, b.q, atol=1e-4, rtol=0)
     assert (a.q.abs() <= 1).all()
+
+
+def test_best_answers_of_a_cloud_of_any_size():
+    torch.manual_seed(0)
+    net = CoarseNet(-torch.ones(7), torch.ones(7), PARAMS)
+    for n in (20, 500):
+        points, normals = 0.05 * torch.randn(n, 3), torch.nn.functional.normalize(torch.randn(n, 3), dim=-1)
+        found = best_answers(net, points, normals, 5)
+        assert found.q.shape == (5, 7)
+        assert (found.score.diff() <= 0).all()
 
 
 def test_the_loss_is_nothing_at_a_label(examples: Examples):

@@ -24,10 +24,11 @@ from lgrasp.errors import ConfigError
 from lgrasp.hand.model import HandModel
 from lgrasp.learn.examples import Examples, make_examples
 from lgrasp.learn.measure import Measured, measure
+from lgrasp.learn.network import CoarseNet
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import Trainer
 
-__all__ = ["OUTER", "Fit", "evaluate", "fit"]
+__all__ = ["OUTER", "Fit", "evaluate", "fit", "load_predictor"]
 
 OUTER = (3, 6, 10, 13)
 """Outer steps of the refiner that the published table has."""
@@ -96,7 +97,7 @@ def evaluate(
         LgraspError: shards cannot be used.
     """
     alias = resolve_device(device).alias
-    saved = _load(path)
+    net, saved = load_predictor(path)
     params = LearnParams.model_validate(saved["params"]).model_copy(update={"clouds": clouds, "seed": seed})
     hand, examples, _ = _examples(shards, None, params.model_copy(update={"held_out": 1}), cache, alias)
     if hand.sha256 != saved["hand_sha256"]:
@@ -104,11 +105,24 @@ def evaluate(
             f"{path} is of hand '{saved['hand']}', the shards are of '{hand.name}' (or another model of it)"
         )
     trainer = Trainer(hand, examples, params, device=alias)
-    trainer.net.load_state_dict(saved["state"])
+    trainer.net.load_state_dict(net.state_dict())
     start = time.perf_counter()
     found = measure(trainer, examples, outer=OUTER)
     names = {"hand": hand.name, "objects": [e.model.name for e in examples], "outer": list(OUTER)}
     return names | _numbers(found) | {"refined": list(found.refined), "seconds": time.perf_counter() - start}
+
+
+def load_predictor(path: Path) -> tuple[CoarseNet, dict[str, Any]]:
+    """A predictor on the CPU, and what its file says: ``hand``, ``hand_sha256``, ``params``.
+
+    Raises:
+        ConfigError: no such file, or no predictor.
+    """
+    saved = _load(path)
+    state = saved.pop("state")
+    net = CoarseNet(state["lower"], state["upper"], LearnParams.model_validate(saved["params"]))
+    net.load_state_dict(state)
+    return net, saved
 
 
 def _numbers(found: Measured) -> dict[str, Any]:
