@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lxml import etree
 from reference.hands import ROOT, hand_model, hand_source
 from scipy.ndimage import map_coordinates
 
@@ -253,6 +254,18 @@ def test_locked_joints_and_unknown_spaces():
     )
     with pytest.raises(HandError, match=r"'mine': side 2 \(link_3.0_tip\) has no surface within 10 degrees"):
         space_view(urdf, empty, hand_model("shipped"), "mine")
+
+
+def test_a_variant_of_a_known_hand_keeps_the_spaces_that_fit(tmp_path):
+    """A URDF with the known names takes the known rules; a link that has lost its solid takes its spaces with it."""
+    urdf = etree.parse(str(hand_source("shipped")[0]))
+    for collision in urdf.xpath("//link[@name='link_5.0']/collision"):
+        collision.getparent().remove(collision)
+    path = tmp_path / "variant.urdf"
+    urdf.write(str(path))
+    source = find_hand(str(path))
+    assert list(source.spec.opposition_spaces) == [n for n in ALLEGRO if n not in ("index-middle", "middle-ring")]
+    assert "without the opposition spaces index-middle, middle-ring, which do not fit: link 'link_5.0'" in source.note
 
 
 def test_a_hand_without_spaces_is_legal():
