@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 from lgrasp.dataset import pose_matrix
+from lgrasp.device.runtime import start
 from lgrasp.scenes.camera import Intrinsics, intrinsics_of, look_at, place_cameras
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.render import NOTHING, TABLE, Surface, image_normals, join_surfaces, render, table_surface
@@ -13,6 +15,14 @@ from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
 SIZE = 0.8
 RADIUS = 0.08
 CENTRE = np.array([0.05, -0.03, 0.2])
+
+
+@pytest.fixture(scope="module", params=["cpu", "cuda:0"])
+def device(request):
+    start()
+    if request.param != "cpu" and wp.get_cuda_device_count() == 0:
+        pytest.skip("no GPU here")
+    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +64,8 @@ def expected(camera: Intrinsics, pose: np.ndarray):
     return np.where(np.isinf(depth), 0, depth), label, normal, sure
 
 
-def test_depths_and_labels_are_exact(camera, pose, surface):
-    images = render(surface, camera, pose)
+def test_depths_and_labels_are_exact(camera, pose, surface, device):
+    images = render(surface, camera, pose, device)
     depth, label, _, sure = expected(camera, pose)
     assert sure.mean() > 0.9
     np.testing.assert_array_equal(images.labels[sure], label[sure])
@@ -85,9 +95,9 @@ def test_cameras_stand_where_they_may():
     np.testing.assert_allclose(turn, np.pi / 2, atol=1e-9)
 
 
-def test_normals_of_exact_depths(camera, pose, surface):
-    images = render(surface, camera, pose)
-    normals = image_normals(images, 2)
+def test_normals_of_exact_depths(camera, pose, surface, device):
+    images = render(surface, camera, pose, device)
+    normals = image_normals(images, 2, device)
     _, label, true, sure = expected(camera, pose)
     found = np.abs(normals).sum(-1) > 0
     cosine = np.einsum("vhwc,vhwc->vhw", normals, true)
