@@ -10,7 +10,7 @@ import typer
 import lgrasp
 from lgrasp_cli.main import app
 
-GROUPS = ("hands", "objects", "pipelines", "cache", "dataset")
+GROUPS = ("hands", "objects", "pipelines", "cache", "dataset", "scenes", "learn")
 
 
 def names():
