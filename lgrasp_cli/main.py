@@ -16,7 +16,9 @@ from lgrasp_cli import (
     learn,
     objects,
     pipelines,
+    plan,
     prepare,
+    refine,
     run,
     scenes,
     sequence,
@@ -33,7 +35,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (prepare, generate, sequence, run, validate, stages, export):
+for module in (prepare, generate, sequence, plan, refine, run, validate, stages, export):
     module.register(app)
 for group in (bench, hands, objects, pipelines, cache, dataset, scenes, learn):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])

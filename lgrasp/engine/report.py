@@ -36,6 +36,7 @@ _SURVIVORS = {
     "filter": "kept",
     "sequence": "kept",
     "validate": "held",
+    "refine": "tried",
 }
 
 

@@ -15,6 +15,8 @@ from lgrasp.stages.ik import stage as ik
 from lgrasp.stages.ik.params import IkParams
 from lgrasp.stages.place import stage as place
 from lgrasp.stages.place.params import PlaceParams
+from lgrasp.stages.refine import stage as refine
+from lgrasp.stages.refine.params import RefineParams
 from lgrasp.stages.search import stage as search
 from lgrasp.stages.search.params import SearchParams
 from lgrasp.stages.sequence import stage as sequence
@@ -41,6 +43,7 @@ STAGES: dict[str, Stage] = {
     "ik": Stage("ik", IkParams, ik.VERSION, ik.run),
     "search": Stage("search", SearchParams, search.VERSION, search.run),
     "filter": Stage("filter", FilterParams, filter_.VERSION, filter_.run),
+    "refine": Stage("refine", RefineParams, refine.VERSION, refine.run),
     "sequence": Stage("sequence", SequenceParams, sequence.VERSION, sequence.run),
     "validate": Stage("validate", ValidateParams, validate.VERSION, validate.run),
 }
@@ -48,15 +51,15 @@ STAGES: dict[str, Stage] = {
 ORDERS = (("place", "domain", "ik", "search", "filter"), ("place", "domain", "search", "ik", "filter"))
 """Accepted orders: contacts realised before they are combined, or (the published order) after."""
 
-OPTIONAL = ("sequence", "validate")
-"""Stages of which one may follow: sequences go on with the next object, other grasps are simulated."""
+OPTIONAL = ("refine", "sequence", "validate")
+"""Stages that may follow: grasps are refined, sequences go on with the next object, other grasps are simulated."""
+
+_ENDS = ((), ("refine",), ("sequence",), ("validate",), ("refine", "validate"))
 
 
 def check_order(names: tuple[str, ...], where: str) -> None:
-    """Raises ConfigError unless ``names`` is one of ORDERS, perhaps with one of OPTIONAL after it."""
-    if names not in ORDERS and names not in [(*order, last) for order in ORDERS for last in OPTIONAL]:
+    """Raises ConfigError unless ``names`` is one of ORDERS, perhaps with some of OPTIONAL after it."""
+    if names not in [(*order, *end) for order in ORDERS for end in _ENDS]:
         choices = " or ".join(", ".join(order) for order in ORDERS)
-        raise ConfigError(
-            f"{where}: stages {', '.join(names)}; accepted: {choices}, each with {' or '.join(OPTIONAL)} after it "
-            "or not"
-        )
+        ends = " or ".join(", ".join(end) for end in _ENDS if end)
+        raise ConfigError(f"{where}: stages {', '.join(names)}; accepted: {choices}, each with {ends} after it or not")

@@ -19,6 +19,7 @@ __all__ = [
     "candidate_arrays",
     "candidate_table",
     "grasp_arrays",
+    "grasps_from_arrays",
     "join_grasps",
     "pose_arrays",
     "pose_table",
@@ -180,7 +181,8 @@ def grasp_arrays(table: GraspTable) -> dict[str, np.ndarray]:
     return out
 
 
-def _grasps(arrays: dict[str, np.ndarray]) -> GraspTable:
+def grasps_from_arrays(arrays: dict[str, np.ndarray]) -> GraspTable:
+    """Inverse of :func:`grasp_arrays`."""
     own: dict[str, np.ndarray] = {}
     families: dict[str, dict[str, np.ndarray]] = {family: {} for family in _FAMILIES}
     for name, values in arrays.items():
@@ -192,14 +194,14 @@ def _grasps(arrays: dict[str, np.ndarray]) -> GraspTable:
 def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:
     """Some rows of a GraspTable, by rising index (n,): views when these are its first, else copies."""
     if len(rows) and rows[-1] == len(rows) - 1:
-        return _grasps({name: values[: len(rows)] for name, values in grasp_arrays(table).items()})
-    return _grasps({name: values[rows] for name, values in grasp_arrays(table).items()})
+        return grasps_from_arrays({name: values[: len(rows)] for name, values in grasp_arrays(table).items()})
+    return grasps_from_arrays({name: values[rows] for name, values in grasp_arrays(table).items()})
 
 
 def sort_grasps(table: GraspTable) -> GraspTable:
     """The rows in candidate order."""
     order = np.argsort(table.index, kind="stable")
-    return _grasps({name: values[order] for name, values in grasp_arrays(table).items()})
+    return grasps_from_arrays({name: values[order] for name, values in grasp_arrays(table).items()})
 
 
 def user_poses(pose: np.ndarray, center: np.ndarray) -> np.ndarray:
@@ -228,4 +230,4 @@ def join_grasps(tables: list[GraspTable]) -> GraspTable:
     if len(tables) == 1:
         return tables[0]
     parts = [grasp_arrays(t) for t in tables]
-    return _grasps({name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+    return grasps_from_arrays({name: np.concatenate([p[name] for p in parts]) for name in parts[0]})

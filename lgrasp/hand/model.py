@@ -150,8 +150,8 @@ def _digest(urdf: Urdf, spec: HandSpec) -> str:
     for name in sorted(urdf.mesh_files):
         h.update(name.encode())
         h.update(urdf.mesh_files[name].read_bytes())
-    # opposition spaces change nothing in a HandModel; their views have digests of their own
-    h.update(spec.model_dump_json(exclude={"opposition_spaces"}).encode())
+    # neither changes a HandModel; views of opposition spaces have digests of their own
+    h.update(spec.model_dump_json(exclude={"opposition_spaces", "stand_off"}).encode())
     return h.hexdigest()
 
 

@@ -126,6 +126,7 @@ class HandSpec(_Strict):
     contact: tuple[ContactRule, ...] = Field(min_length=1)
     palm: PalmRule = PalmRule()
     canonical_box: Box
+    stand_off: float | None = Field(default=None, gt=0, le=1)
     contacts: tuple[int, ...] = ()
     open_posture: dict[str, float] = Field(default_factory=dict)
     fingers: dict[str, tuple[str, ...]] = Field(default_factory=dict)

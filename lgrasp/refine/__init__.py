@@ -1,10 +1,14 @@
 """Differentiable local search of grasps."""
 
-from lgrasp.refine.energy import Energies, Matches
+from typing import TYPE_CHECKING, Any
+
 from lgrasp.refine.params import LocalSearch
-from lgrasp.refine.refiner import Pose, Refined, Refiner
 from lgrasp.refine.surface import HandSurface, hand_surface
-from lgrasp.refine.target import Target
+
+if TYPE_CHECKING:
+    from lgrasp.refine.energy import Energies, Matches
+    from lgrasp.refine.refiner import Pose, Refined, Refiner
+    from lgrasp.refine.target import Target
 
 __all__ = [
     "Energies",
@@ -17,3 +21,14 @@ __all__ = [
     "Target",
     "hand_surface",
 ]
+
+_MODULES = {"energy": ("Energies", "Matches"), "refiner": ("Pose", "Refined", "Refiner"), "target": ("Target",)}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():  # they import torch, so only when asked for
+        if name in names:
+            import importlib
+
+            return getattr(importlib.import_module(f"lgrasp.refine.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -18,8 +18,9 @@ from lgrasp.refine.check_kernels import (
     link_contacts,
 )
 from lgrasp.refine.params import Bounds
+from lgrasp.refine.surface import Palmar, ruled_palmar
 
-__all__ = ["OUTCOMES", "check_grasps"]
+__all__ = ["OUTCOMES", "check_grasps", "contact_width"]
 
 OUTCOMES = ("kept", "contact", "self-collision", "object collision", "balance", "disturbance")
 """Outcome codes of a row: the first check that it failed."""
@@ -34,6 +35,7 @@ def check_grasps(
     q: np.ndarray,
     bounds: Bounds,
     *,
+    palmar: Palmar | None = None,
     around: ObjectArrays | None = None,
     index: np.ndarray | None = None,
 ) -> tuple[GraspTable, np.ndarray]:
@@ -42,12 +44,15 @@ def check_grasps(
     Args:
         pose: T_hand_object of the object's internal frame, x y z [m] qx qy qz qw, (N, 7).
         q: joint positions within their limits [rad or m], (N, K).
+        palmar: where the hand may touch; default: where hand.yaml lets it.
         around: what else the hand must not penetrate, in the object's internal frame.
         index: candidate index of each row; default: the row.
     """
     d, n = hand.device, len(q)
-    runs = _link_runs(hand.model.contact_link)
-    links, width = len(runs) - 1, min(MAX_CONTACTS, len(runs) - 1)
+    side = palmar or ruled_palmar(hand.model)
+    runs = _link_runs(side.link)
+    links, width = len(runs) - 1, contact_width(side.link)
+    run_body = wp.array(side.body[runs[:-1]].astype(np.int32), dtype=wp.int32, device=d)
     poses = wp.array(np.ascontiguousarray(pose, np.float32), dtype=wp.transform, device=d)
     joints = wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=d)
     contact = wp.empty((n, links), dtype=wp.int32, device=d)
@@ -59,7 +64,10 @@ def check_grasps(
         inputs=[
             hand.struct,
             obj.struct,
+            wp.array(side.points.astype(np.float32), dtype=wp.vec3, device=d),
+            wp.array(side.normals.astype(np.float32), dtype=wp.vec3, device=d),
             wp.array(runs, dtype=wp.int32, device=d),
+            run_body,
             bounds.gap,
             math.cos(math.radians(bounds.angle)),
             poses,
@@ -70,12 +78,15 @@ def check_grasps(
     )
     chosen = wp.empty((n, width), dtype=wp.int32, device=d)
     groups, clear = (wp.empty(n, dtype=wp.int32, device=d) for _ in range(2))
-    wp.launch(
-        choose_contacts, dim=n, inputs=[hand.struct, contact, gap], outputs=[chosen, groups], device=d
-    )
+    overlap = wp.empty(n, dtype=wp.float32, device=d)
+    wp.launch(choose_contacts, dim=n, inputs=[hand.struct, run_body, contact, gap], outputs=[chosen, groups], device=d)
     body = wp.empty((n, len(hand.model.piece_first) - 2), dtype=wp.transform, device=d)
     wp.launch(
-        clear_of_itself, dim=n, inputs=[hand.struct, bounds.self_margin, joints], outputs=[body, clear], device=d
+        clear_of_itself,
+        dim=n,
+        inputs=[hand.struct, bounds.self_margin, joints],
+        outputs=[body, clear, overlap],
+        device=d,
     )
     depth = wp.zeros(n, dtype=wp.float32, device=d)
     for solid in (obj, around):
@@ -112,7 +123,7 @@ def check_grasps(
             joints,
             body,
             chosen,
-            contact,
+            run_body,
             point,
             normal,
             force,
@@ -149,7 +160,7 @@ def check_grasps(
         "disturbance": disturbance,
         "epsilon": epsilon,
         "penetration": deep,
-        "self_penetration": np.zeros(n, np.float32),
+        "self_penetration": overlap.numpy(),
         "gap": column(gap, 0).max(1, initial=0),
         "normal_error": np.arccos(np.clip(column(dot, 1).min(1, initial=1), -1, 1)),
     }
@@ -162,11 +173,16 @@ def check_grasps(
         pose=np.ascontiguousarray(pose, np.float32),
         contact_points=column(point, np.nan),
         contact_normals=column(normal, np.nan),
-        contact_links=np.where(filled, hand.model.contact_link[hit], -1).astype(np.int32),
+        contact_links=np.where(filled, side.link[hit], -1).astype(np.int32),
         contact_forces=np.where(filled[..., None], force.numpy(), np.nan),
         metrics={name: values.astype(np.float32) for name, values in metrics.items()},
     )
     return table, outcome
+
+
+def contact_width(contact_link: np.ndarray) -> int:
+    """Most contacts of a row of :func:`check_grasps`, by the links of a hand's contact points."""
+    return min(MAX_CONTACTS, len(_link_runs(contact_link)) - 1)
 
 
 def _link_runs(contact_link: np.ndarray) -> np.ndarray:

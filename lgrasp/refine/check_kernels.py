@@ -10,7 +10,7 @@ from lgrasp.device.sdf import sdf_gradient, sdf_value
 from lgrasp.grasp.clearance import body_apart, body_depth
 from lgrasp.grasp.control import press_contact, shift_contact
 from lgrasp.hand.arrays import Hand, group_dofs
-from lgrasp.hand.clearance import group_pairs_clear
+from lgrasp.hand.clearance import group_pairs_clear, overlap_depth
 from lgrasp.object.arrays import Object
 
 __all__ = ["balance_rows", "choose_contacts", "clear_of_itself", "control_rows", "deepen_rows", "link_contacts"]
@@ -45,17 +45,21 @@ def _pairs_clear(hand: Hand, X: wp.array(dtype=wp.transform), margin: wp.float32
 @wp.func
 def _all_apart(hand: Hand, obj: Object, T_object: wp.transform, X: wp.array(dtype=wp.transform), margin: wp.float32):
     """Are all moving bodies farther than the margin from the object? T_object = T_object_base."""
+    apart = int(1)
     for j in range(hand.body_group.shape[0] - 1):
-        if not body_apart(hand, obj, 1 + j, T_object * X[j], margin):
-            return False
-    return True
+        if apart == 1 and not body_apart(hand, obj, 1 + j, T_object * X[j], margin):
+            apart = int(0)
+    return apart == 1
 
 
 @wp.kernel
 def link_contacts(
     hand: Hand,
     obj: Object,
+    palmar: wp.array(dtype=wp.vec3),
+    palmar_normal: wp.array(dtype=wp.vec3),
     run_first: wp.array(dtype=wp.int32),
+    run_body: wp.array(dtype=wp.int32),
     gap: wp.float32,
     cosine: wp.float32,
     pose: wp.array(dtype=wp.transform),
@@ -66,33 +70,33 @@ def link_contacts(
     point_out: wp.array2d(dtype=wp.vec3),
     normal_out: wp.array2d(dtype=wp.vec3),
 ):
-    """One thread per (run of contact points of one link, row): the nearest that faces the object, -1 if none does.
+    """One thread per (run of palmar points of one link, row): the nearest that faces the object, -1 if none does.
 
     The contact on the object is the foot of the perpendicular; its normal is that of the contact point beside it.
     """
-    l, i = wp.tid()
-    contact_out[i, l] = -1
+    s, i = wp.tid()
+    contact_out[i, s] = -1
     T_object = wp.transform_inverse(pose[i])
-    g = hand.body_group[hand.contacts.body[run_first[l]]]
+    g = hand.body_group[run_body[s]]
     T = T_object
     if g >= 0:
         X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
         first = group_forward(hand.kin, g, group_dofs(hand.kin, g, q, i), X, 0)
-        T = T_object * X[hand.contacts.body[run_first[l]] - 1 - first]
+        T = T_object * X[run_body[s] - 1 - first]
     best = gap
-    for c in range(run_first[l], run_first[l + 1]):
-        p = wp.transform_point(T, hand.contacts.points[c])
+    for c in range(run_first[s], run_first[s + 1]):
+        p = wp.transform_point(T, palmar[c])
         d = wp.abs(sdf_value(obj.sdf, p))
         if d < best:
             e = sdf_gradient(obj.sdf, p)
             n = wp.vec3(e[0], e[1], e[2])
-            if wp.dot(n, wp.transform_vector(T, hand.contacts.normals[c])) < -cosine:
+            if wp.dot(n, wp.transform_vector(T, palmar_normal[c])) < -cosine:
                 best = d
-                contact_out[i, l] = c
-    c = contact_out[i, l]
+                contact_out[i, s] = c
+    c = contact_out[i, s]
     if c < 0:
         return
-    p = wp.transform_point(T, hand.contacts.points[c])
+    p = wp.transform_point(T, palmar[c])
     e = sdf_gradient(obj.sdf, p)
     n = wp.vec3(e[0], e[1], e[2])
     foot = p - n * e[3]
@@ -103,21 +107,22 @@ def link_contacts(
         if far < near:
             near = far
             beside = k
-    contact_out[i, l] = -1
+    contact_out[i, s] = -1
     if beside >= 0:
         m = obj.contact_normals[beside]
-        facing = -wp.dot(m, wp.transform_vector(T, hand.contacts.normals[c]))
+        facing = -wp.dot(m, wp.transform_vector(T, palmar_normal[c]))
         if wp.dot(m, n) > _SMOOTH and facing > cosine:
-            contact_out[i, l] = c
-            gap_out[i, l] = best
-            dot_out[i, l] = facing
-            point_out[i, l] = foot
-            normal_out[i, l] = m
+            contact_out[i, s] = c
+            gap_out[i, s] = best
+            dot_out[i, s] = facing
+            point_out[i, s] = foot
+            normal_out[i, s] = m
 
 
 @wp.kernel
 def choose_contacts(
     hand: Hand,
+    run_body: wp.array(dtype=wp.int32),
     link_contact: wp.array2d(dtype=wp.int32),
     link_gap: wp.array2d(dtype=wp.float32),
     link_out: wp.array2d(dtype=wp.int32),
@@ -132,18 +137,17 @@ def choose_contacts(
     for k in range(link_out.shape[1]):
         best = int(-1)
         least = float(1.0e30)
-        for l in range(runs):
-            c = link_contact[i, l]
-            if c >= 0 and taken[l] == 0:
+        for s in range(runs):
+            if link_contact[i, s] >= 0 and taken[s] == 0:
                 # a group without contact goes before all others
-                worth = link_gap[i, l] + 1.0e3 * float(has[hand.body_group[hand.contacts.body[c]] + 1])
+                worth = link_gap[i, s] + 1.0e3 * float(has[hand.body_group[run_body[s]] + 1])
                 if worth < least:
                     least = worth
-                    best = l
+                    best = s
         link_out[i, k] = best
         if best >= 0:
             taken[best] = 1
-            g = hand.body_group[hand.contacts.body[link_contact[i, best]]] + 1
+            g = hand.body_group[run_body[best]] + 1
             groups += 1 - has[g]
             has[g] = 1
     groups_out[i] = groups
@@ -181,14 +185,17 @@ def clear_of_itself(
     q: wp.array2d(dtype=wp.float32),
     body_out: wp.array2d(dtype=wp.transform),
     clear_out: wp.array(dtype=wp.int32),
+    overlap_out: wp.array(dtype=wp.float32),
 ):
-    """Is the hand clear of itself by the margin [m]? Also the poses of its bodies."""
+    """Is the hand clear of itself by the margin [m]? Also the poses of its bodies, and the overlap of pairs that nearly
+    always touch."""
     i = wp.tid()
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     _whole(hand, q, i, X)
     clear_out[i] = wp.where(_pairs_clear(hand, X, margin), 1, 0)
     for j in range(body_out.shape[1]):
         body_out[i, j] = X[j]
+    overlap_out[i] = overlap_depth(hand, body_out, i)
 
 
 @wp.kernel
@@ -214,10 +221,10 @@ def balance_rows(
     k = int(0)
     centroid = wp.vec3(0.0)
     for c in range(link.shape[1]):
-        l = link[i, c]
-        if l >= 0:
-            points[k] = link_point[i, l] - obj.com
-            normals[k] = -link_normal[i, l]
+        s = link[i, c]
+        if s >= 0:
+            points[k] = link_point[i, s] - obj.com
+            normals[k] = -link_normal[i, s]
             centroid = centroid + points[k]
             k += 1
     if k < 2:
@@ -252,14 +259,14 @@ def control_rows(
     q: wp.array2d(dtype=wp.float32),
     body: wp.array2d(dtype=wp.transform),
     link: wp.array2d(dtype=wp.int32),
-    link_contact: wp.array2d(dtype=wp.int32),
+    run_body: wp.array(dtype=wp.int32),
     link_point: wp.array2d(dtype=wp.vec3),
     link_normal: wp.array2d(dtype=wp.vec3),
     force: wp.array2d(dtype=wp.vec3),
     pregrasp_out: wp.array2d(dtype=wp.float32),
     squeeze_out: wp.array2d(dtype=wp.float32),
 ):
-    """Targets that press with the balancing forces, and the fingers backed off their first contacts as far as is clear."""
+    """Targets that press with the balancing forces; fingers backed off their first contacts as far as is clear."""
     i = wp.tid()
     T = pose[i]
     for g in range(hand.kin.groups):
@@ -269,12 +276,12 @@ def control_rows(
         first = hand.kin.joint_first[g]
         moved = int(0)
         for k in range(link.shape[1]):
-            l = link[i, k]
-            if l >= 0:
-                b = hand.contacts.body[link_contact[i, l]]
+            s = link[i, k]
+            if s >= 0:
+                b = run_body[s]
                 if hand.body_group[b] == g:
-                    p = wp.transform_point(T, link_point[i, l])
-                    n = wp.transform_vector(T, link_normal[i, l])
+                    p = wp.transform_point(T, link_point[i, s])
+                    n = wp.transform_vector(T, link_normal[i, s])
                     f = wp.transform_vector(T, force[i, k]) * squeeze_force
                     if moved == 0:
                         local = wp.transform_point(wp.transform_inverse(body[i, b - 1]), p)

@@ -1,4 +1,4 @@
-"""Point clouds as objects: normals, a distance grid near what was seen, and a model that all else takes for an object."""
+"""Point clouds as objects: a distance grid near what was seen, and a model that all else takes for an object."""
 
 import hashlib
 
@@ -9,7 +9,7 @@ from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.errors import ObjectError
 from lgrasp.object.model import ObjectModel
 
-__all__ = ["TRUST", "cloud_object", "estimate_normals"]
+__all__ = ["TRUST", "cloud_object"]
 
 TRUST = 0.02
 """Behind what was seen, the sign of distances is known to this depth [m]; what lies deeper counts as neither."""
@@ -22,21 +22,7 @@ _MOST_NODES, _LEAST_CELL = 250_000, 0.0015
 _CONTACTS = 4096
 
 
-def estimate_normals(points: np.ndarray, viewpoint: np.ndarray, neighbours: int = _NEIGHBOURS) -> np.ndarray:
-    """Unit normals (n, 3) of planes through the nearest points, towards where they were seen from.
-
-    Args:
-        points: (n, 3) [m]. viewpoint: (3,), or one of each point (n, 3) [m].
-    """
-    near = points[cKDTree(points).query(points, min(neighbours, len(points)), workers=-1)[1]]  # (n, k, 3)
-    centred = near - near.mean(1, keepdims=True)
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0]
-    return np.where(((viewpoint - points) * normals).sum(1, keepdims=True) < 0, -normals, normals)
-
-
-def cloud_object(
-    points: np.ndarray, normals: np.ndarray | None = None, *, viewpoint: np.ndarray | None = None, name: str = "cloud"
-) -> ObjectModel:
+def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud", centred: bool = True) -> ObjectModel:
     """An ObjectModel without faces from points of a surface, perhaps of one side only.
 
     Distances are those to planes through the nearest points, so that noise averages out; inside they are negative to
@@ -44,8 +30,8 @@ def cloud_object(
     mass is the mean of the points.
 
     Args:
-        points: (n, 3) [m]. normals: outward, (n, 3); default: estimated.
-        viewpoint: where the points were seen from [m], (3,), or one of each point (n, 3); needed without normals.
+        points: (n, 3) [m]. normals: outward, (n, 3).
+        centred: else the internal frame is that of the points.
 
     Raises:
         ObjectError: too few points, not finite, a size that no hand grasps, normals that do not match.
@@ -65,20 +51,13 @@ def cloud_object(
         )
     digest = hashlib.sha256(np.ascontiguousarray(points).tobytes())
     keep = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
-    if normals is None:
-        if viewpoint is None:
-            raise ObjectError(f"cloud '{name}' has no normals; say where it was seen from (viewpoint), or add normals")
-        viewpoint = np.broadcast_to(np.asarray(viewpoint, float), points.shape)[keep]
-        points = points[keep]
-        normals = estimate_normals(points, viewpoint)
-    else:
-        normals = np.asarray(normals, float)
-        length = np.linalg.norm(normals, axis=-1, keepdims=True)
-        if normals.shape != points.shape or not (np.isfinite(length) & (length > 1e-6)).all():
-            raise ObjectError(f"cloud '{name}': normals must be {len(points)} finite vectors that are not zero")
-        digest.update(np.ascontiguousarray(normals).tobytes())
-        points, normals = points[keep], (normals / length)[keep]
-    center = 0.5 * (points.min(0) + points.max(0))
+    normals = np.asarray(normals, float)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    if normals.shape != points.shape or not (np.isfinite(length) & (length > 1e-6)).all():
+        raise ObjectError(f"cloud '{name}': normals must be {len(points)} finite vectors that are not zero")
+    digest.update(np.ascontiguousarray(normals).tobytes())
+    points, normals = points[keep], (normals / length)[keep]
+    center = 0.5 * (points.min(0) + points.max(0)) if centred else np.zeros(3)
     points = points - center
     points, normals = _smoothed(points, normals)
     sdf, origin, cell = _distances(points, normals)

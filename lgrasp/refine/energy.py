@@ -8,7 +8,16 @@ import torch
 from lgrasp.refine.links import Intrusions
 from lgrasp.refine.params import LocalSearch
 
-__all__ = ["LENGTH", "Energies", "Matches", "barrier", "intrusion_energies", "limit_energy", "matching_energies", "wrench_energy"]
+__all__ = [
+    "LENGTH",
+    "Energies",
+    "Matches",
+    "barrier",
+    "intrusion_energies",
+    "limit_energy",
+    "matching_energies",
+    "wrench_energy",
+]
 
 LENGTH = 0.01
 """Distances are counted in this unit [m]."""
@@ -56,8 +65,8 @@ class Energies(NamedTuple):
 def barrier(u: torch.Tensor) -> torch.Tensor:
     """-(u - 1)^2 ln u of distances u (...) in units of the margin: 0 from u = 1 on, rising as u falls.
 
-    Below a tenth it goes on as the parabola of the same value, slope and curvature, so that points inside are pushed out
-    the harder the deeper they are.
+    Below a tenth it goes on as the parabola of the same value, slope and curvature, so that points inside are pushed
+    out the harder the deeper they are.
     """
     a = _STEEPEST
     log = math.log(a)

@@ -61,9 +61,7 @@ class LinkSolids:
         self._pairs = torch.as_tensor(np.ascontiguousarray(pairs), dtype=torch.int64, device=device)
 
     @torch.no_grad()
-    def match(
-        self, R: torch.Tensor, t: torch.Tensor, body_R: torch.Tensor, body_t: torch.Tensor
-    ) -> Intrusions:
+    def match(self, R: torch.Tensor, t: torch.Tensor, body_R: torch.Tensor, body_t: torch.Tensor) -> Intrusions:
         """Planes at the deepest points of hands; rotations R (N, 3, 3) and positions t (N, 3) of bases in the object's
         frame, body_R (N, B, 3, 3) and body_t (N, B, 3) of bodies in the base frame."""
         link_R, link_t = body_R[:, self._body], body_t[:, self._body]  # (N, S, 3, 3)

@@ -12,27 +12,35 @@ class LocalSearch(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    outer: int = Field(20, ge=0, le=1000, description="Outer steps: correspondences are matched anew.")
-    inner: int = Field(10, ge=1, le=1000, description="Gradient steps per outer step.")
-    optimizer: Literal["adam", "sgd"] = Field("adam", description="adam, or sgd with momentum.")
-    momentum: float = Field(0.9, ge=0, lt=1, description="Of sgd; the decay of adam's first moment.")
-    shift: float = Field(0.0015, gt=0, le=0.1, description="Largest translation of the hand in one step.")
-    turn: float = Field(0.015, gt=0, le=1, description="Largest rotation of the hand in one step.")
-    bend: float = Field(0.02, gt=0, le=1, description="Largest motion of a joint in one step.")
-    decay: float = Field(0.05, gt=0, le=1, description="Size of the last step over that of the first.")
-    reach: float = Field(0.02, gt=0, le=1, description="Points farther from the object do not pull, first outer step.")
-    reach_end: float = Field(0.01, gt=0, le=1, description="The same in the last outer step.")
-    soft: float = Field(0.004, gt=0, le=1, description="Distance about which pulls stop growing.")
-    touching: int = Field(4, ge=1, le=16, description="Palmar points of a link, nearest first, that pull.")
-    points: float = Field(1.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared.")
-    normals: float = Field(0.02, ge=0, le=1e6, description="Weight of normals that do not oppose.")
-    force: float = Field(0.05, ge=0, le=1e6, description="Weight of the net wrench of four contacts.")
-    barrier: float = Field(0.002, ge=0, le=1e6, description="Weight of the barriers against penetration, per point.")
-    limits: float = Field(0.01, ge=0, le=1e6, description="Weight of the barrier at the joint limits.")
-    margin: float = Field(0.003, gt=0, le=0.05, description="Distance below which the barrier acts.")
-    self_margin: float = Field(0.001, gt=0, le=0.05, description="The same between links.")
-    contacts: int = Field(4, ge=2, le=16, description="Contacts that the net wrench is made of.")
-    nearest: float = Field(0.2, gt=0, le=1, description="Share of the palmar points, nearest first, they come from.")
+    outer: int = Field(default=20, ge=0, le=1000, description="Outer steps: correspondences are matched anew.")
+    inner: int = Field(default=10, ge=1, le=1000, description="Gradient steps per outer step.")
+    optimizer: Literal["adam", "sgd"] = Field(default="adam", description="adam, or sgd with momentum.")
+    momentum: float = Field(default=0.9, ge=0, lt=1, description="Of sgd; the decay of adam's first moment.")
+    shift: float = Field(default=0.0015, gt=0, le=0.1, description="Largest translation of the hand in one step.")
+    turn: float = Field(default=0.015, gt=0, le=1, description="Largest rotation of the hand in one step.")
+    bend: float = Field(default=0.02, gt=0, le=1, description="Largest motion of a joint in one step.")
+    decay: float = Field(default=0.05, gt=0, le=1, description="Size of the last step over that of the first.")
+    reach: float = Field(
+        default=0.02, gt=0, le=1, description="Points farther from the object do not pull, first outer step."
+    )
+    reach_end: float = Field(default=0.01, gt=0, le=1, description="The same in the last outer step.")
+    soft: float = Field(default=0.004, gt=0, le=1, description="Distance about which pulls stop growing.")
+    touching: int = Field(default=4, ge=1, le=16, description="Palmar points of a link, nearest first, that pull.")
+    points: float = Field(
+        default=1.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared."
+    )
+    normals: float = Field(default=0.02, ge=0, le=1e6, description="Weight of normals that do not oppose.")
+    force: float = Field(default=0.05, ge=0, le=1e6, description="Weight of the net wrench of four contacts.")
+    barrier: float = Field(
+        default=0.002, ge=0, le=1e6, description="Weight of the barriers against penetration, per point."
+    )
+    limits: float = Field(default=0.01, ge=0, le=1e6, description="Weight of the barrier at the joint limits.")
+    margin: float = Field(default=0.003, gt=0, le=0.05, description="Distance below which the barrier acts.")
+    self_margin: float = Field(default=0.001, gt=0, le=0.05, description="The same between links.")
+    contacts: int = Field(default=4, ge=2, le=16, description="Contacts that the net wrench is made of.")
+    nearest: float = Field(
+        default=0.2, gt=0, le=1, description="Share of the palmar points, nearest first, they come from."
+    )
 
 
 class Bounds(BaseModel):
@@ -40,17 +48,23 @@ class Bounds(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    penetration: float = Field(0.0008, ge=0, le=0.01, description="Largest hand-object penetration.")
-    self_margin: float = Field(0.0003, ge=0, le=0.01, description="Least distance of non-adjacent links.")
-    gap: float = Field(0.0013, gt=0, le=0.02, description="Largest distance of link and object at a contact.")
-    angle: float = Field(17.0, gt=0, le=90, description="Largest angle of the normals at a contact [deg].")
-    friction: float = Field(0.5, gt=0, le=2, description="Friction coefficient of gswo and epsilon.")
-    balance: float = Field(0.035, gt=0, le=10, description="Largest gswo residual (norm).")
-    torque_scale: float = Field(10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")
+    penetration: float = Field(default=0.0008, ge=0, le=0.01, description="Largest hand-object penetration.")
+    self_margin: float = Field(default=0.0003, ge=0, le=0.01, description="Least distance of non-adjacent links.")
+    gap: float = Field(default=0.0013, gt=0, le=0.02, description="Largest distance of link and object at a contact.")
+    angle: float = Field(default=17.0, gt=0, le=90, description="Largest angle of the normals at a contact [deg].")
+    friction: float = Field(default=0.5, gt=0, le=2, description="Friction coefficient of gswo and epsilon.")
+    balance: float = Field(default=0.035, gt=0, le=10, description="Largest gswo residual (norm).")
+    torque_scale: float = Field(default=10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")
     disturbance: float = Field(
-        1.0, gt=0, le=1, description="Largest disturbance residual: unresisted part of a unit force."
+        default=1.0, gt=0, le=1, description="Largest disturbance residual: unresisted part of a unit force."
     )
-    open_distance: float = Field(0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the normals.")
-    open_margin: float = Field(0.001, ge=0, le=0.05, description="Least distance of hand and object in q_pregrasp.")
-    squeeze_force: float = Field(15.0, ge=0, le=1000, description="Normal forces that q_squeeze presses with [N].")
-    stiffness: float = Field(5.0, gt=0, le=1e6, description="Stiffness that q_squeeze is meant for [N m/rad].")
+    open_distance: float = Field(
+        default=0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the normals."
+    )
+    open_margin: float = Field(
+        default=0.001, ge=0, le=0.05, description="Least distance of hand and object in q_pregrasp."
+    )
+    squeeze_force: float = Field(
+        default=15.0, ge=0, le=1000, description="Normal forces that q_squeeze presses with [N]."
+    )
+    stiffness: float = Field(default=5.0, gt=0, le=1e6, description="Stiffness that q_squeeze is meant for [N m/rad].")

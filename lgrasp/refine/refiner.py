@@ -157,15 +157,15 @@ class Refiner(nn.Module):
         points, normals, kept_out = matching_energies(x, m, matches, self._sum, self.params)
         at = matches.contacts[..., None].expand(-1, -1, 3)
         contacts = x.flatten(1, 2).gather(1, at)
-        force = wrench_energy(contacts, -self.target.normals(contacts), self.target.com, self.target.radius, self.params)
+        force = wrench_energy(
+            contacts, -self.target.normals(contacts), self.target.com, self.target.radius, self.params
+        )
         into, overlap = intrusion_energies(*self._links.distances(matches.intrusions, R, t, *bodies), self.params)
         limits = limit_energy(q, self.lower, self.upper, self.params)
         return Energies(points, normals, force, kept_out + into, overlap, limits)
 
     @torch.no_grad()
-    def match(
-        self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, reach: float | None = None
-    ) -> Matches:
+    def match(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, reach: float | None = None) -> Matches:
         """Nearest points of the object for every point of the hands, and the contacts that make the net wrench."""
         reach = self.params.reach if reach is None else reach
         bodies = self._bodies(q)
@@ -239,16 +239,17 @@ class Refiner(nn.Module):
                 R, t, q = (x.requires_grad_() for x in (R, t, q))
             total = self.energy(R, t, q, matches=matches).total.sum()
             by_R, by_t, by_q = torch.autograd.grad(total, [R, t, q], create_graph=graph)
-            arm = t - self._centre(R, t)
+            arm = t - self.middle(R, t)
             turn = torch.linalg.cross(R, by_R, dim=1).sum(2) + torch.linalg.cross(arm, by_t)
         return _Gradient(by_t, turn, by_q) if graph else _Gradient(by_t, turn.detach(), by_q)
 
-    def _centre(self, R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    def middle(self, R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        """Middle of the palmar side of open hands [m], (N, 3): what they are turned about."""
         return t + R @ self._middle
 
     def _moved(self, pose: Pose, by: _Gradient) -> Pose:
         """The poses after a translation, a rotation about the hand's middle, and a motion of the joints."""
-        centre = self._centre(pose.R, pose.t)
+        centre = self.middle(pose.R, pose.t)
         T = so3_exp(by.turn)
         t = centre + by.shift + (T @ (pose.t - centre)[..., None])[..., 0]
         return Pose(T @ pose.R, t, self._clamped(pose.q + by.bend))

@@ -1,13 +1,24 @@
 """Points of a hand's surface for the local search, with weights: palmar points pull, all of them are kept out."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from lgrasp.clusters import CLUSTER_SIZE
 from lgrasp.hand.model import HandModel
 
-__all__ = ["BLOCK", "DISTAL", "OTHER", "HandSurface", "farthest_points", "hand_surface", "weighted_surface"]
+__all__ = [
+    "BLOCK",
+    "DISTAL",
+    "OTHER",
+    "HandSurface",
+    "Palmar",
+    "farthest_points",
+    "hand_surface",
+    "last_bodies",
+    "ruled_palmar",
+]
 
 BLOCK = 24
 """Points are in blocks of this many, each on one body."""
@@ -33,6 +44,24 @@ class HandSurface:
     """How strongly each point is drawn to the object, 0 for points that are only kept out, (L, BLOCK)."""
 
 
+class Palmar(NamedTuple):
+    """Where a hand may touch: n points of its palmar side, those of one link together."""
+
+    link: np.ndarray
+    """Index in ``link_names``, (n,)."""
+    body: np.ndarray
+    """Body that the link rides on, (n,)."""
+    points: np.ndarray
+    """In the body's frame [m], (n, 3)."""
+    normals: np.ndarray
+    """Outward, (n, 3)."""
+
+
+def ruled_palmar(model: HandModel) -> Palmar:
+    """The palmar side where hand.yaml lets a hand touch."""
+    return Palmar(model.contact_link, model.contact_body, model.contact_points, model.contact_normals)
+
+
 def farthest_points(points: np.ndarray, count: int, *, first: int = 0) -> np.ndarray:
     """Indices of ``count`` points, each the farthest from those before (all and repeats when there are fewer).
 
@@ -47,47 +76,32 @@ def farthest_points(points: np.ndarray, count: int, *, first: int = 0) -> np.nda
     return np.resize(chosen, count)
 
 
-def hand_surface(model: HandModel, *, distal: float = DISTAL, other: float = OTHER) -> HandSurface:
-    """Surface of a hand whose palmar side is where hand.yaml lets it touch.
+def hand_surface(
+    model: HandModel, palmar: Palmar | None = None, *, distal: float = DISTAL, other: float = OTHER
+) -> HandSurface:
+    """Surface of a hand for the local search.
 
     Args:
+        palmar: default: :func:`ruled_palmar`.
         distal, other: weight of palmar points on the last links of fingers, and elsewhere.
     """
-    return weighted_surface(
-        model, model.contact_body, model.contact_points, model.contact_normals, distal=distal, other=other
-    )
-
-
-def weighted_surface(
-    model: HandModel,
-    body: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    *,
-    distal: float = DISTAL,
-    other: float = OTHER,
-) -> HandSurface:
-    """Surface of a hand whose palmar side is given by points.
-
-    Args:
-        body: body of each palmar point, (n,). points, normals: in its frame, (n, 3).
-    """
-    last = _last_bodies(model)
+    side = palmar or ruled_palmar(model)
+    last = last_bodies(model)
     bodies, blocks = [], []
     for b in range(len(model.piece_first) - 1):
         first, end = (model.cluster_first[b : b + 2] * CLUSTER_SIZE).tolist()
-        samples, own = model.samples[first:end], np.flatnonzero(body == b)
+        samples, own = model.samples[first:end], np.flatnonzero(side.body == b)
         if len(samples) == 0:
             continue
         count = int(np.clip(len(samples) // _PER_BLOCK, 1, _AREA_BLOCKS))
-        palmar = min(_PALMAR, BLOCK) * count if len(own) else 0
-        rest = samples[farthest_points(samples, BLOCK * count - palmar)]
+        drawn = _PALMAR * count if len(own) else 0
+        rest = samples[farthest_points(samples, BLOCK * count - drawn)]
         weight = np.zeros((count, BLOCK))
         p, n = np.zeros((count, BLOCK, 3)), np.zeros((count, BLOCK, 3))
-        if palmar:
-            chosen = own[farthest_points(points[own], palmar)]
-            p[:, :_PALMAR] = points[chosen].reshape(count, -1, 3)
-            n[:, :_PALMAR] = normals[chosen].reshape(count, -1, 3)
+        if drawn:
+            chosen = own[farthest_points(side.points[own], drawn)]
+            p[:, :_PALMAR] = side.points[chosen].reshape(count, -1, 3)
+            n[:, :_PALMAR] = side.normals[chosen].reshape(count, -1, 3)
             weight[:, :_PALMAR] = distal if b in last else other
             p[:, _PALMAR:] = rest.reshape(count, -1, 3)
         else:
@@ -98,7 +112,7 @@ def weighted_surface(
     return HandSurface(np.array(bodies), p, n, weight)
 
 
-def _last_bodies(model: HandModel) -> set[int]:
+def last_bodies(model: HandModel) -> set[int]:
     """Bodies with geometry that no body with geometry rides on: the last links of fingers."""
     tree = model.tree
     group = np.repeat(np.arange(tree.groups), np.diff(tree.joint_first))

@@ -1,0 +1,1 @@
+"""Refining grasps and planning them by local search."""

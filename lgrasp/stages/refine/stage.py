@@ -1,0 +1,100 @@
+"""refine: finished grasps -> the same, moved by a local search wherever that makes them better."""
+
+import threading
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
+from lgrasp.refine.check import check_grasps, contact_width
+from lgrasp.refine.params import LocalSearch
+from lgrasp.stages.context import Context
+from lgrasp.stages.refine.params import RefineParams
+
+if TYPE_CHECKING:
+    from lgrasp.refine.refiner import Pose, Refiner
+
+__all__ = ["VERSION", "run"]
+
+VERSION = 1
+
+_making = threading.Lock()
+_made: dict[tuple[object, ...], "Refiner"] = {}  # the latest
+
+
+def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
+    """Refine grasps; a refined grasp takes its row's place where it passes every check and resists pulls better.
+
+    Every check is made anew on the refined posture, by the measures of filter. Rows stay where they are: none is lost.
+
+    Returns:
+        The grasps in the order given; how many there were, passed the checks once refined, and were replaced.
+    """
+    width = max(inputs.contact_links.shape[1], contact_width(context.hand.model.contact_link))
+    if len(inputs) == 0:
+        return _widened(inputs, width), {"tried": 0, "passed": 0, "replaced": 0}
+    # torch is heavy to load
+    from lgrasp.refine.planning import object_pose
+
+    refined = _refiner(params.search, context)(*_hands(inputs, context.device)).pose
+    q = refined.q.cpu().numpy()
+    table, outcome = check_grasps(
+        context.hand, context.object, object_pose(refined), q, params.bounds, index=inputs.index
+    )
+    passed = outcome == 0
+    better = passed & (table.metrics["disturbance"] < inputs.metrics["disturbance"])
+    counts = {"tried": len(inputs), "passed": int(passed.sum()), "replaced": int(better.sum())}
+    return _replaced(_widened(inputs, width), _widened(table, width), better), counts
+
+
+def _refiner(search: LocalSearch, context: Context) -> "Refiner":
+    """The refiner of a job: made by the first batch, used by all."""
+    import torch
+
+    from lgrasp.refine.refiner import Refiner
+
+    key = (context.hand.model.sha256, context.object.model.sha256, context.object.model.scale, search, context.device)
+    with _making:
+        if key not in _made:
+            if context.device == "cpu":
+                torch.set_num_threads(1)  # batches run side by side
+            _made.clear()
+            _made[key] = Refiner(context.hand.model, context.object.model, search, device=context.device)
+        return _made[key]
+
+
+def _hands(table: GraspTable, device: str) -> "Pose":
+    """The hands of grasps in the object's internal frame."""
+    import torch
+
+    from lgrasp.differentiable.rotations import matrix_from_quaternion
+    from lgrasp.refine.refiner import Pose
+
+    pose = torch.as_tensor(table.pose, device=device)
+    R = matrix_from_quaternion(pose[:, 3:]).mT
+    t = -(R @ pose[:, :3, None])[..., 0]
+    return Pose(R, t, torch.as_tensor(table.q, device=device))
+
+
+def _replaced(old: GraspTable, new: GraspTable, rows: np.ndarray) -> GraspTable:
+    """``old`` with some rows (N,) bool of ``new``; slots stay."""
+    a, b = grasp_arrays(old), grasp_arrays(new)
+    b["slot"] = a["slot"]
+    return grasps_from_arrays({name: np.where(_over(rows, x), b[name], x).astype(x.dtype) for name, x in a.items()})
+
+
+def _over(rows: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return rows.reshape(-1, *(1,) * (x.ndim - 1))
+
+
+def _widened(table: GraspTable, width: int) -> GraspTable:
+    """The table with room for ``width`` contacts at least."""
+    missing = width - table.contact_links.shape[1]
+    if missing <= 0:
+        return table
+    out = grasp_arrays(table)
+    for name in ("contact_points", "contact_normals", "contact_links", "contact_forces"):
+        x = out[name]
+        none = -1 if name == "contact_links" else np.nan
+        out[name] = np.pad(x, [(0, 0), (0, missing)] + [(0, 0)] * (x.ndim - 2), constant_values=none)
+    return grasps_from_arrays(out)

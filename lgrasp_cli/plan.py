@@ -1,0 +1,169 @@
+"""``lgrasp plan``: grasps of an object, or of what is seen of it, from starts all over its surface."""
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Quiet, Scale, check_report, open_cache, warn
+
+if TYPE_CHECKING:
+    from lgrasp.engine.refine.plan import PlanOutcome
+
+__all__ = ["plan", "register"]
+
+_INTERVAL = 5.0  # [s] between lines of progress
+
+
+def register(app: typer.Typer) -> None:
+    """Mount the commands of this file."""
+    app.command()(plan)
+
+
+def plan(
+    mesh: Annotated[
+        str | None, typer.Option("--object", "-o", help="Mesh file, or the name of an object.", show_default=False)
+    ] = None,
+    cloud: Annotated[
+        Path | None, typer.Option(help="Point cloud (.ply .xyz .npy .npz .h5), perhaps a scene.", show_default=False)
+    ] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="Labels of the cloud's points (.npy, .npz).", show_default=False)
+    ] = None,
+    label: Annotated[int | None, typer.Option(help="Which points are to be grasped.", show_default=False)] = None,
+    viewpoint: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Where the cloud was seen from [m]; turns its normals.", show_default=False),
+    ] = None,
+    scale: Scale = 1.0,
+    hand: Hand = "barrett",
+    starts: Annotated[int, typer.Option("--starts", "-n", help="Points of the surface that are tried.")] = 80,
+    stand_off: Annotated[
+        float | None,
+        typer.Option(help="Distance of the hand's base from a start [m]; default: the hand's.", show_default=False),
+    ] = None,
+    distal: Annotated[float, typer.Option(help="Weight of the palmar side of the last links.")] = 1.0,
+    other: Annotated[float, typer.Option(help="Weight of the rest of the palmar side; small: a pinch.")] = 0.2,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder; default: plans/HAND-OBJECT.", show_default=False)
+    ] = None,
+    device: Device = "auto",
+    force: Annotated[bool, typer.Option("--force", help="Replace plans that are there.")] = False,
+    json_path: JsonPath = None,
+    cache_dir: CacheDir = None,
+    quiet: Quiet = False,
+) -> None:
+    """Plan grasps by a local search from open hands before the surface; a point cloud will do.
+
+    The palm faces each of the starts, the farthest from each other; the best hand of a start that passes all checks
+    becomes a row. Exit code 3 when no start gave one.
+
+    Example: lgrasp plan --cloud scene.ply --mask labels.npy --label 3 --hand barrett --starts 80
+    """
+    check_report(json_path)
+    cache = open_cache(cache_dir)
+    from lgrasp.config import parse_model
+    from lgrasp.engine.refine.plan import PlanJob, plan_grasps
+    from lgrasp.errors import ConfigError, StarvedError
+    from lgrasp.hand.find import find_hand
+    from lgrasp.refine.planning import PlanParams
+    from lgrasp.scenes.cloud import read_cloud
+
+    if (mesh is None) == (cloud is None):
+        raise ConfigError("give --object (a mesh or a name) or --cloud (a file of points), one of the two")
+    given = None
+    if cloud is not None:
+        given = read_cloud(cloud, mask, label, scale, None if viewpoint is None else _numbers(viewpoint))
+        for note in given.notes:
+            warn(note)
+    elif mask is not None or label is not None or viewpoint is not None:
+        raise ConfigError("--mask, --label and --viewpoint belong to --cloud")
+    name = Path(mesh).stem if mesh else f"{Path(str(cloud)).stem}{'' if label is None else f'-{label}'}"
+    params = parse_model(PlanParams, {"distal": distal, "other": other}, "plan")
+    job = PlanJob(
+        hand=hand,
+        out=out or Path("plans") / f"{find_hand(hand).name}-{name}",
+        starts=starts,
+        object=mesh,
+        scale=scale,
+        cloud=given,
+        cloud_name=name,
+        stand_off=stand_off,
+        params=params,
+        device=device,
+        force=force,
+        cache=cache,
+    )
+    done = plan_grasps(job, None if quiet else _Progress(starts))
+    data = _report(done, starts)
+    _show(data, json_path, quiet)
+    if done.path is None:
+        counts = ", ".join(f"{count} {what}" for what, count in done.counts.items() if what != "kept")
+        raise StarvedError(f"no grasp planned: {counts}")
+
+
+def _numbers(text: str) -> list[float]:
+    from lgrasp.errors import ConfigError
+
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 3:
+        raise ConfigError(f"--viewpoint '{text}': three numbers separated by commas, such as 0,0,0.7")
+    return numbers
+
+
+def _report(done: "PlanOutcome", starts: int) -> dict[str, Any]:
+    import numpy as np
+
+    metrics = done.grasps.metrics
+    return {
+        "hand": done.hand,
+        "object": done.object.name,
+        "starts": starts,
+        "grasps": len(done.grasps),
+        "counts": done.counts,
+        "seconds": done.seconds,
+        "epsilon": float(np.median(metrics["epsilon"])) if len(done.grasps) else None,
+        "disturbance": float(np.median(metrics["disturbance"])) if len(done.grasps) else None,
+        "out": None if done.path is None else str(done.path),
+    }
+
+
+def _show(data: dict[str, Any], json_path: str | None, quiet: bool) -> None:
+    from lgrasp_cli.tables import print_json, print_pairs
+
+    if json_path == "-":
+        print_json(data)
+    elif not quiet and data["grasps"]:
+        lost = [f"{n} {what}" for what, n in data["counts"].items() if what not in ("starts", "kept") and n]
+        each = data["seconds"] / data["grasps"]
+        print_pairs(
+            [
+                ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({', '.join(lost) or 'none lost'})"),
+                ("where", data["out"]),
+                ("hand, object", f"{data['hand']}, {data['object']}"),
+                ("quality", f"median epsilon {data['epsilon']:.3f}, disturbance {data['disturbance']:.2f}"),
+                ("wall", f"{data['seconds']:.1f} s, {each:.3f} s a plan"),
+            ]
+        )
+    if json_path and json_path != "-":
+        from lgrasp.engine.report import write_json
+
+        write_json(json_path, data)
+
+
+class _Progress:
+    """A line on standard error every few seconds."""
+
+    def __init__(self, starts: int) -> None:
+        self._starts, self._said = starts, time.monotonic()
+
+    def __call__(self, done: int, plans: int) -> None:
+        if done < self._starts and time.monotonic() - self._said > _INTERVAL:
+            self._said = time.monotonic()
+            sys.stderr.write(f"{done:,}/{self._starts:,} starts  {plans:,} plans\n")
+            sys.stderr.flush()
