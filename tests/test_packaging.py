@@ -25,8 +25,24 @@ MAY_IMPORT = {
     "grasp": {"device", "hand", "object"},
     "dataset": {"device", "hand", "object", "field", "grasp"},
     "physics": {"device", "hand", "object", "dataset"},
-    "stages": {"device", "hand", "object", "field", "grasp", "differentiable", "dataset", "physics"},
-    "engine": {"device", "hand", "object", "field", "grasp", "differentiable", "stages", "dataset", "physics"},
+    "refine": {"device", "hand", "object", "differentiable", "grasp"},
+    "scenes": {"device", "hand", "object", "grasp", "dataset", "physics"},
+    "learn": {"device", "hand", "object", "differentiable", "dataset", "refine", "scenes"},
+    "stages": {"device", "hand", "object", "field", "grasp", "differentiable", "dataset", "physics", "refine"},
+    "engine": {
+        "device",
+        "hand",
+        "object",
+        "field",
+        "grasp",
+        "differentiable",
+        "stages",
+        "dataset",
+        "physics",
+        "refine",
+        "scenes",
+        "learn",
+    },
 }
 """The packages of lgrasp, each with those it may import besides itself and the shared modules."""
 

@@ -12,7 +12,7 @@ from lgrasp.learn.params import LearnParams
 from lgrasp.object.model import ObjectModel
 from lgrasp.scenes.camera import intrinsics_of, look_at
 from lgrasp.scenes.params import CameraParams
-from lgrasp.scenes.render import Surface, render
+from lgrasp.scenes.render import LabelledMesh, render
 from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
 
 __all__ = ["Examples", "make_examples", "palm_point", "partial_clouds"]
@@ -91,7 +91,7 @@ def partial_clouds(
     """
     vertices = model.vertices - model.center
     radius = float(np.linalg.norm(vertices, axis=1).max())
-    surface = Surface(vertices, model.faces, np.zeros(len(model.faces)))
+    surface = LabelledMesh(vertices, model.faces, np.zeros(len(model.faces)))
     points, normals = np.zeros((clouds, count, 3)), np.zeros((clouds, count, 3))
     made = 0
     while made < clouds:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from lgrasp.errors import CloudError
-from lgrasp.scenes.cloud_files import CLOUD_SUFFIXES, check_labels, read_arrays, read_mask
+from lgrasp.scenes.cloud_files import check_labels, read_arrays, read_mask
 from lgrasp.scenes.normals import estimate_normals, face_viewpoint
 
-__all__ = ["CLOUD_SUFFIXES", "MIN_POINTS", "Cloud", "read_cloud"]
+__all__ = ["MIN_POINTS", "Cloud", "read_cloud"]
 
 MIN_POINTS = 50
 """Fewer points do not show a surface."""
@@ -58,7 +58,7 @@ def read_cloud(
     """Read a whole cloud; with a label, its ``target`` are the points of that label.
 
     Args:
-        path: File (see ``CLOUD_SUFFIXES``) with points and perhaps normals and labels.
+        path: File (see ``cloud_files.CLOUD_SUFFIXES``) with points and perhaps normals and labels.
         mask: File with a label for each point (.npy, .npz); default: the labels in the cloud's own file.
         label: Which points are the target; 1 where a mask of flags is given and no label.
         scale: Factor from the file's unit to metres.

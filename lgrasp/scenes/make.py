@@ -13,7 +13,7 @@ from lgrasp.scenes.camera import intrinsics_of, place_cameras
 from lgrasp.scenes.drop import drop
 from lgrasp.scenes.params import CameraParams, SceneParams
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord
-from lgrasp.scenes.render import Surface, join_surfaces, render, table_surface
+from lgrasp.scenes.render import LabelledMesh, join_surfaces, render, table_surface
 from lgrasp.scenes.schema import DEPTH_UNIT
 from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
 from lgrasp.scenes.transfer import find_collisions, hand_poses
@@ -85,7 +85,7 @@ def make_scene(
 
 
 def observe(
-    surface: Surface, params: CameraParams, rng: np.random.Generator, device: str = "cpu"
+    surface: LabelledMesh, params: CameraParams, rng: np.random.Generator, device: str = "cpu"
 ) -> tuple[ViewsRecord, CloudRecord]:
     """What cameras around the table see of a surface, and the cloud that is made of it."""
     camera, pose = intrinsics_of(params), place_cameras(params, rng).astype(np.float32)
@@ -103,12 +103,12 @@ def observe(
     return views, CloudRecord(points=merged.points, normals=merged.normals, labels=labels, view=view)
 
 
-def _surfaces(chosen: Sequence[Item], pose: np.ndarray) -> list[Surface]:
+def _surfaces(chosen: Sequence[Item], pose: np.ndarray) -> list[LabelledMesh]:
     """The objects' meshes where they lie, labelled from 1 on."""
     found = []
     for label, (item, T) in enumerate(zip(chosen, pose_matrix(pose), strict=True), 1):
         vertices = np.asarray(item.record.vertices, float) @ T[:3, :3].T + T[:3, 3]
-        found.append(Surface(vertices, np.asarray(item.record.faces), np.full(len(item.record.faces), label)))
+        found.append(LabelledMesh(vertices, np.asarray(item.record.faces), np.full(len(item.record.faces), label)))
     return found
 
 

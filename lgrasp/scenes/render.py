@@ -11,7 +11,7 @@ from lgrasp.device.runtime import start
 from lgrasp.scenes import render_kernels as kernels
 from lgrasp.scenes.camera import Intrinsics
 
-__all__ = ["NOTHING", "TABLE", "Images", "Surface", "image_normals", "join_surfaces", "render", "table_surface"]
+__all__ = ["NOTHING", "TABLE", "Images", "LabelledMesh", "image_normals", "join_surfaces", "render", "table_surface"]
 
 NOTHING, TABLE = -1, 0
 """Labels of pixels that see nothing, and of the table; object k is k + 1."""
@@ -21,7 +21,7 @@ _SLOPE = 6.0  # tangent of the steepest angle to the image plane at which neighb
 
 
 @dataclass(frozen=True)
-class Surface:
+class LabelledMesh:
     """A triangle mesh in the scene frame, every face with a label."""
 
     vertices: np.ndarray
@@ -45,24 +45,24 @@ class Images:
     """Shape (v, h, w), int32; ``NOTHING`` where nothing is seen."""
 
 
-def table_surface(side: float) -> Surface:
+def table_surface(side: float) -> LabelledMesh:
     """A square table about the origin, its top in the plane z = 0, seen from above."""
     x = 0.5 * side
     corners = np.array([[-x, -x, 0.0], [x, -x, 0.0], [x, x, 0.0], [-x, x, 0.0]])
-    return Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.full(2, TABLE))
+    return LabelledMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.full(2, TABLE))
 
 
-def join_surfaces(surfaces: Sequence[Surface]) -> Surface:
+def join_surfaces(surfaces: Sequence[LabelledMesh]) -> LabelledMesh:
     """Several surfaces as one."""
     first = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
-    return Surface(
+    return LabelledMesh(
         np.concatenate([s.vertices for s in surfaces]),
         np.concatenate([s.faces + at for s, at in zip(surfaces, first, strict=False)]),
         np.concatenate([s.labels for s in surfaces]),
     )
 
 
-def render(surface: Surface, intrinsics: Intrinsics, pose: np.ndarray, device: str = "cpu") -> Images:
+def render(surface: LabelledMesh, intrinsics: Intrinsics, pose: np.ndarray, device: str = "cpu") -> Images:
     """Exact depths and labels from v cameras.
 
     Args:

@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 
 from lgrasp.engine.scenes.config import SceneConfig
-from lgrasp.scenes.cloud import CLOUD_SUFFIXES
+from lgrasp.scenes.cloud_files import CLOUD_SUFFIXES
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")

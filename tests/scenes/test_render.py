@@ -9,7 +9,7 @@ from lgrasp.dataset import pose_matrix
 from lgrasp.device.runtime import start
 from lgrasp.scenes.camera import Intrinsics, intrinsics_of, look_at, place_cameras
 from lgrasp.scenes.params import CameraParams
-from lgrasp.scenes.render import NOTHING, TABLE, Surface, image_normals, join_surfaces, render, table_surface
+from lgrasp.scenes.render import NOTHING, TABLE, LabelledMesh, image_normals, join_surfaces, render, table_surface
 from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
 
 SIZE = 0.8
@@ -39,7 +39,7 @@ def pose():
 def surface():
     ball = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
     return join_surfaces(
-        [table_surface(SIZE), Surface(ball.vertices + CENTRE, ball.faces, np.full(len(ball.faces), 7))]
+        [table_surface(SIZE), LabelledMesh(ball.vertices + CENTRE, ball.faces, np.full(len(ball.faces), 7))]
     )
 
 
