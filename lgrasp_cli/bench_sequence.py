@@ -109,9 +109,19 @@ def _show(results: dict[str, Any]) -> None:
             )
             for name, counts in found["spaces"].items()
         ]
-        columns = ("space", "tried", "valid", "hold", "hold/valid", "hold/tried", "published")
+        columns = ("space", "tried", "found", "hold", "hold/found", "hold/tried", "published")
         print_table(columns, rows, right=columns[1:])
-        columns = ("objects", "simulated", "hold", "cumulative", "consumed", "penetration mm", "s per 256", "diversity")
+        columns = (
+            "objects",
+            "simulated",
+            "strict",
+            "hold",
+            "cumulative",
+            "consumed",
+            "penetration mm",
+            "s per 256",
+            "diversity",
+        )
         print_table(columns, _by_number(found["objects"], published), right=columns[1:])
         typer.echo(f"strict-valid rows of two objects per second: {found['strict_per_s']:,.2f}\n")
     typer.echo(f"physics {results['physics']}; hold is conditional on the row before; penetration: median of the rows")
@@ -131,6 +141,7 @@ def _by_number(entries: list[dict[str, Any]], published: dict[str, Any]) -> list
             (
                 str(number),
                 f"{entry['simulated']:,}",
+                f"{entry['strict']:,}",
                 beside(entry["success"], "success", ".1f", " %"),
                 f"{100 * cumulative:.1f} %",
                 beside(entry["consumed"], "consumed", ".1f", " %"),

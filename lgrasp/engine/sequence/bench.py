@@ -9,12 +9,14 @@ import numpy as np
 
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.kernels import kernel_modules, load_kernels
+from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.sequence.inputs import SequenceInputs, load_sequence_inputs, sequence_keys
 from lgrasp.engine.sequence.job import SequenceJob, make_sequence_scene, simulated
 from lgrasp.engine.sequence.round import Round, Verdicts, run_round
 from lgrasp.engine.shard import add_counts
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.spaces import consumed
+from lgrasp.stages.filter.params import FilterParams
 
 __all__ = ["PUBLISHED", "measure_sequences"]
 
@@ -43,23 +45,27 @@ def measure_sequences(
 ) -> dict[str, Any]:
     """Run rounds of each job, simulate every row and go on from those that hold; nothing is written.
 
+    Grasps of an optimiser are simulated as published: only a penetration of 1 cm, contacts farther away than that, and
+    links in links are left out before.
+
     Args:
         jobs: the same method on several sequences of objects; each names a physics protocol.
         rounds: of each job.
         progress: called with one line before each round.
 
     Returns:
-        ``spaces`` (name -> sequences tried with it, strict-valid rows found, rows that held), ``objects`` (for each
-        number of objects: rows simulated and held, consumed, ``seconds`` of the step, penetration of all rows [mm],
-        diversity [rad]), ``strict_per_s`` (whole rows of two objects, simulation not counted).
+        ``spaces`` (name -> sequences tried with it, rows found, rows that held), ``objects`` (for each number of
+        objects: rows simulated, strict-valid and held, consumed, ``seconds`` of the step, penetration of all rows [mm],
+        diversity [rad]), ``strict_per_s`` (strict-valid rows of two objects, simulation not counted).
     """
     device = resolve_device(jobs[0].device)
+    bounds = jobs[0].pipeline.params("filter")
     length = max(len(job.objects) for job in jobs)
     spaces: dict[str, dict[str, int]] = {}
     objects = [_Objects() for _ in range(length)]
     two, seconds = 0, 0.0
     for job in jobs:
-        pipeline, cache = job.pipeline, job.cache
+        pipeline, cache = _as_published(job.pipeline), job.cache
         keys = sequence_keys(job.hand, job.objects, job.size, pipeline.seed, pipeline.object, pipeline.field)
         inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device)
         inputs = replace(inputs, scene=make_sequence_scene(cache, inputs))
@@ -76,14 +82,29 @@ def measure_sequences(
             found = run_round(pipeline, inputs, 0, number, job.workers or os.cpu_count() or 1, verdicts=watched)
             _count_spaces(spaces, found)
             for step, table in enumerate(seen):
-                objects[step].add(table, found.levels[step], inputs, found.walls[step])
-            two += len(seen[1]) if len(seen) > 1 else 0
+                strict = int(_strict(table, bounds).sum())
+                objects[step].add(table, found.levels[step], inputs, found.walls[step], strict)
+            two += int(_strict(seen[1], bounds).sum()) if len(seen) > 1 else 0
             seconds += sum(found.walls[:2])
     return {
         "spaces": spaces,
         "objects": [entry.summary() for entry in objects],
         "strict_per_s": two / seconds if seconds else 0.0,
     }
+
+
+def _as_published(pipeline: Pipeline) -> Pipeline:
+    """The pipeline; for an optimiser with the published bounds in place of those of strict validity."""
+    if pipeline.params("sequence").method == "field":
+        return pipeline
+    return pipeline.with_params("filter", penetration=0.01, self_margin=0.0, gap=0.01, angle=60.0, balance=1.0)
+
+
+def _strict(table: SequenceTable, bounds: FilterParams) -> np.ndarray:
+    """Rows within the bounds of the filter in every step, (N,) bool."""
+    m = table.metrics
+    near = (m["gap"] <= bounds.gap) & (m["normal_error"] <= np.radians(bounds.angle))
+    return near & (m["penetration"] <= bounds.penetration) & (m["gswo"] <= bounds.balance)
 
 
 def _watched(simulate: Verdicts, seen: list[SequenceTable]) -> Verdicts:
@@ -112,12 +133,15 @@ class _Objects:
     """Rows of one number of objects, over rounds and sequences."""
 
     def __init__(self) -> None:
-        self._simulated = self._held = self._consumed = 0
+        self._simulated = self._held = self._consumed = self._strict = 0
         self._seconds = 0.0
         self._depth: list[np.ndarray] = []
         self._q: list[np.ndarray] = []
 
-    def add(self, tried: SequenceTable, held: SequenceTable, inputs: SequenceInputs, seconds: float) -> None:
+    def add(
+        self, tried: SequenceTable, held: SequenceTable, inputs: SequenceInputs, seconds: float, strict: int
+    ) -> None:
+        self._strict += strict
         self._simulated += len(tried)
         self._held += len(held)
         used = held.used
@@ -133,6 +157,7 @@ class _Objects:
         q = np.concatenate(self._q) if self._q else np.zeros((0, 1))
         return {
             "simulated": self._simulated,
+            "strict": self._strict,
             "held": self._held,
             "success": _percent(self._held, self._simulated),
             "consumed": _percent(self._consumed, self._held),
