@@ -70,6 +70,7 @@ def check_grasps(
             run_body,
             bounds.gap,
             math.cos(math.radians(bounds.angle)),
+            math.cos(math.radians(bounds.fold)),
             poses,
             joints,
         ],

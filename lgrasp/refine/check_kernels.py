@@ -18,7 +18,6 @@ __all__ = ["balance_rows", "choose_contacts", "clear_of_itself", "control_rows",
 wp.set_module_options(KERNEL_OPTIONS)
 
 _NEAR = wp.constant(0.006)  # [m] to a contact point of the object
-_SMOOTH = wp.constant(0.94)  # cosine of the normals of the distance grid and of that point
 _SHARES = wp.constant(5)  # of the way open that are tried
 
 
@@ -62,6 +61,7 @@ def link_contacts(
     run_body: wp.array(dtype=wp.int32),
     gap: wp.float32,
     cosine: wp.float32,
+    smooth: wp.float32,
     pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),
     contact_out: wp.array2d(dtype=wp.int32),
@@ -111,7 +111,7 @@ def link_contacts(
     if beside >= 0:
         m = obj.contact_normals[beside]
         facing = -wp.dot(m, wp.transform_vector(T, palmar_normal[c]))
-        if wp.dot(m, n) > _SMOOTH and facing > cosine:
+        if wp.dot(m, n) > smooth and facing > cosine:
             contact_out[i, s] = c
             gap_out[i, s] = best
             dot_out[i, s] = facing

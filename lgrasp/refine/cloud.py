@@ -16,7 +16,11 @@ TRUST = 0.02
 
 _LEAST_POINTS, _MOST_POINTS = 32, 8192
 _EXTENT = (0.005, 2.0)  # [m]
-_NEIGHBOURS = 24
+_NEIGHBOURS, _WIDE = 24, 128
+_CLEAN = 0.001  # [m]
+_PLANES, _EDGE = 12, 0.5  # points that tell a distance; cosine of faces that meet in an edge
+_PASSES, _KEPT = 4, 0.95  # over noisy clouds
+_SAME_SIDE = 0.7  # cosine
 _PAD = 0.016
 _MOST_NODES, _LEAST_CELL = 250_000, 0.0015
 _CONTACTS = 4096
@@ -89,13 +93,47 @@ def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud"
 
 
 def _smoothed(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points moved along their mean normals onto the mean of their neighbours that face the same way."""
-    near = cKDTree(points).query(points, min(_NEIGHBOURS, len(points)), workers=-1)[1]
-    same = (np.einsum("nki,ni->nk", normals[near], normals) > 0.5)[..., None]
-    mean_normal = (same * normals[near]).sum(1)
-    mean_normal /= np.linalg.norm(mean_normal, axis=1, keepdims=True)
-    mean = (same * points[near]).sum(1) / same.sum(1)
-    return points + ((mean - points) * mean_normal).sum(1, keepdims=True) * mean_normal, mean_normal
+    """Points moved along mean normals onto the surface through their neighbours that face the same way, and its normals.
+
+    A cloud whose points lie more than a millimetre off the surface through a wide neighbourhood is taken for noisy: it is
+    smoothed over such neighbourhoods again and again, and what stays apart, or is sparse, is dropped.
+    """
+    wide = min(_WIDE, len(points))
+    near = cKDTree(points).query(points, wide, workers=-1)[1]
+    height, normal = _fit(points, normals, near)
+    if float(np.median(np.abs(height))) < _CLEAN:
+        height, normal = _fit(points, normals, near[:, :_NEIGHBOURS])
+        return points + height[:, None] * normal, normal
+    for _ in range(_PASSES):
+        points, normals = points + height[:, None] * normal, normal
+        near = cKDTree(points).query(points, wide, workers=-1)[1]
+        height, normal = _fit(points, normals, near)
+    # noise along the surface carries points past its edges, where they are half as dense
+    gap = np.linalg.norm(points[near] - points[:, None], axis=2)
+    same = np.cumsum(np.einsum("nki,ni->nk", normals[near], normals) > _SAME_SIDE, axis=1)
+    reach = np.where(same >= wide // 2, gap, np.inf).min(1)
+    keep = (np.abs(height) <= np.quantile(np.abs(height), _KEPT)) & (reach <= np.sqrt(2) * np.median(reach))
+    return points[keep], normals[keep]
+
+
+def _fit(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far above each point the surface through its neighbours (n, k) of the same side runs [m], (n,), and its
+    normals: a quadratic function over the plane of the mean normal."""
+    same = (np.einsum("nki,ni->nk", normals[near], normals) > _SAME_SIDE).astype(float)
+    normal = np.einsum("nk,nki->ni", same, normals[near])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    u = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(normal, u)
+    way = points[near] - points[:, None]
+    x, y, z = (np.einsum("nki,ni->nk", way, axis) for axis in (u, v, normal))
+    reach = np.sqrt((same * (x * x + y * y)).sum(1) / same.sum(1))[:, None] + 1e-9
+    x, y = x / reach, y / reach
+    A = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)  # (n, k, 6)
+    lhs = np.einsum("nk,nki,nkj->nij", same, A, A) + 1e-3 * same.sum(1)[:, None, None] * np.eye(6)
+    c = np.linalg.solve(lhs, np.einsum("nk,nki,nk->ni", same, A, z)[..., None])[..., 0]
+    tilted = normal - (c[:, 1:2] * u + c[:, 2:3] * v) / reach
+    return c[:, 0], tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
 
 
 def _distances(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -105,10 +143,13 @@ def _distances(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.
     shape = np.ceil((high - low) / cell).astype(int) + 1
     nodes = low + cell * np.indices(shape).reshape(3, -1).T
     tree = cKDTree(points)
-    gap, near = tree.query(nodes, min(8, len(points)), workers=-1)
+    gap, near = tree.query(nodes, min(_PLANES, len(points)), workers=-1)
     weight = np.exp(-0.5 * (gap / (gap[:, :1] + cell)) ** 2)
     height = ((nodes[:, None] - points[near]) * normals[near]).sum(-1)
     plane = (weight * height).sum(1) / weight.sum(1)
+    # about an edge what is outside one of its faces is outside
+    edge = np.einsum("nki,ni->nk", normals[near], normals[near[:, 0]]).min(1) < _EDGE
+    plane = np.where(edge, height.max(1), plane)
     # close to the surface the planes tell the distance, farther off the nearest point does
     spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
     share = np.clip(gap[:, 0] / max(4 * spacing, 2 * cell) - 0.5, 0, 1)

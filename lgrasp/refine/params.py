@@ -52,6 +52,9 @@ class Bounds(BaseModel):
     self_margin: float = Field(default=0.0003, ge=0, le=0.01, description="Least distance of non-adjacent links.")
     gap: float = Field(default=0.0013, gt=0, le=0.02, description="Largest distance of link and object at a contact.")
     angle: float = Field(default=17.0, gt=0, le=90, description="Largest angle of the normals at a contact [deg].")
+    fold: float = Field(
+        default=20.0, gt=0, le=180, description="Largest angle of the object's normals about a contact [deg]."
+    )
     friction: float = Field(default=0.5, gt=0, le=2, description="Friction coefficient of gswo and epsilon.")
     balance: float = Field(default=0.035, gt=0, le=10, description="Largest gswo residual (norm).")
     torque_scale: float = Field(default=10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")

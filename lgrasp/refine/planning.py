@@ -24,8 +24,10 @@ __all__ = ["PlanParams", "Planned", "Planner", "object_pose"]
 
 _CPU_STARTS, _GPU_STARTS = 40, 1000  # planned at a time
 _COLLIDES = 1.0e-3  # [m]
-_PLAN_BOUNDS = Bounds(penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, balance=10.0, squeeze_force=20.0)
-_COARSE = Bounds(penetration=0.01, self_margin=0.0, gap=0.012, angle=60.0, balance=10.0)
+_PLAN_BOUNDS = Bounds(
+    penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=20.0
+)
+_COARSE = Bounds(penetration=0.01, self_margin=0.0, gap=0.012, angle=60.0, fold=90.0, balance=10.0)
 
 
 class PlanParams(BaseModel):

@@ -29,6 +29,7 @@ __all__ = ["PlanJob", "PlanOutcome", "plan_grasps"]
 
 _REACH = 0.3  # [m] what is farther from the target than this is no hand's business
 _LEAST_AROUND = 50
+_CLOUD_DEPTH = 0.004  # [m] points of a cloud lie so far off
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,11 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
         raise OutputError(f"{path} exists; choose another folder with --out, or --force to replace it")
     clean_folder(path)
     palmar = seen_palmar(source, hand)
-    planner = Planner(upload_hand(hand, device.alias), model, stand_off, job.params, palmar, around)
+    params = job.params
+    if job.cloud is not None:
+        loose = params.bounds.model_copy(update={"penetration": max(params.bounds.penetration, _CLOUD_DEPTH)})
+        params = params.model_copy(update={"bounds": loose})
+    planner = Planner(upload_hand(hand, device.alias), model, stand_off, params, palmar, around)
     begin = time.perf_counter()
     grasps, counts = planner.run(job.starts, progress)
     seconds = time.perf_counter() - begin
@@ -101,7 +106,7 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
             pipeline="plan",
             seed=0,
             shard_index=0,
-            config={"plan": job.params.model_dump(mode="json"), "starts": job.starts, "stand_off": stand_off},
+            config={"plan": params.model_dump(mode="json"), "starts": job.starts, "stand_off": stand_off},
         )
         record = hand_record(hand, mesh_blobs(source.urdf))
         statistics = {"device": device.name, "seconds_wall": seconds}
