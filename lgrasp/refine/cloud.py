@@ -93,10 +93,10 @@ def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud"
 
 
 def _smoothed(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points moved along mean normals onto the surface through their neighbours that face the same way, and its normals.
+    """Points moved onto the surface through their neighbours that face the same way, and its normals.
 
-    A cloud whose points lie more than a millimetre off the surface through a wide neighbourhood is taken for noisy: it is
-    smoothed over such neighbourhoods again and again, and what stays apart, or is sparse, is dropped.
+    A cloud whose points lie more than a millimetre off the surface through a wide neighbourhood is taken for noisy: it
+    is smoothed over such neighbourhoods again and again, and what stays apart, or is sparse, is dropped.
     """
     wide = min(_WIDE, len(points))
     near = cKDTree(points).query(points, wide, workers=-1)[1]

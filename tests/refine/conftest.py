@@ -1,0 +1,49 @@
+"""A refiner of the shared hand and object, and hands at valid grasps."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from lgrasp.differentiable.rotations import matrix_from_quaternion
+from lgrasp.engine.batch import run_stages
+from lgrasp.refine import LocalSearch, Pose, Refiner
+
+
+@pytest.fixture(scope="session")
+def filtered(swift, context):
+    """Valid grasps of the shared hand and object."""
+    return run_stages(swift, context, 0, 2000, "filter")
+
+
+@pytest.fixture(scope="session")
+def valid(filtered) -> Pose:
+    """Their hands, in the object's internal frame."""
+    pose = torch.as_tensor(np.asarray(filtered.pose))
+    R = matrix_from_quaternion(pose[:, 3:]).mT
+    return Pose(R, -(R @ pose[:, :3, None])[..., 0], torch.as_tensor(np.asarray(filtered.q)))
+
+
+@pytest.fixture(scope="session")
+def make(inputs) -> Callable[..., Refiner]:
+    """make(**parameters): a refiner; keyword dtype too."""
+
+    def make(dtype: torch.dtype = torch.float32, **params) -> Refiner:
+        return Refiner(inputs.hand.model, inputs.object.model, LocalSearch(**params), dtype=dtype)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def coarse() -> Callable[..., Pose]:
+    """coarse(pose): the poses with noise of 1.5 cm, 15 degrees and 0.15 rad."""
+    from lgrasp.differentiable.rotations import so3_exp
+
+    def coarse(pose: Pose, seed: int = 0) -> Pose:
+        g = torch.Generator().manual_seed(seed)
+        n = len(pose.t)
+        turn, shift = torch.randn(n, 3, generator=g) * 0.15, torch.randn(n, 3, generator=g) * 0.009
+        return Pose(so3_exp(turn) @ pose.R, pose.t + shift, pose.q + torch.randn(pose.q.shape, generator=g) * 0.15)
+
+    return coarse

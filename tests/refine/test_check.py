@@ -1,0 +1,49 @@
+"""The checks of refined hands agree with those of the filter stage."""
+
+import numpy as np
+import pytest
+
+from lgrasp.refine.check import OUTCOMES, check_grasps
+from lgrasp.refine.params import Bounds
+from lgrasp.refine.planning import object_pose
+
+
+@pytest.fixture(scope="module")
+def checked(inputs, filtered):
+    return check_grasps(inputs.hand, inputs.object, filtered.pose, filtered.q, Bounds())
+
+
+def test_rows_of_filter_are_clear(checked, filtered):
+    table, outcome = checked
+    codes = {name: int((outcome == k).sum()) for k, name in enumerate(OUTCOMES)}
+    assert codes["self-collision"] == codes["object collision"] == 0
+    assert codes["kept"] > 0.6 * len(filtered)
+    np.testing.assert_allclose(table.metrics["penetration"], filtered.metrics["penetration"], atol=1e-5)
+
+
+def test_contacts_lie_on_the_object(checked, inputs):
+    table, outcome = checked
+    obj = inputs.object.model
+    points = table.contact_points[outcome == 0].reshape(-1, 3)
+    points = points[np.isfinite(points).all(1)]
+    gap = np.linalg.norm(points[:, None] - obj.obstacle_points[None], axis=2).min(1)
+    assert np.quantile(gap, 0.99) < 0.004  # of points that are some 2 mm apart
+
+
+def test_forces_balance(checked):
+    """Normal parts sum to one, and the net force is below the residual allowed."""
+    table, outcome = checked
+    force, normal = (np.nan_to_num(a[outcome == 0]) for a in (table.contact_forces, table.contact_normals))
+    np.testing.assert_allclose(-(force * normal).sum((1, 2)), 1, atol=1e-3)
+    assert np.linalg.norm(force.sum(1), axis=1).max() < Bounds().balance + 1e-3
+
+
+def test_a_hand_in_the_object_is_told(inputs, filtered, make, valid):
+    refiner = make()
+    _, n = refiner.target.nearest(refiner.middle(valid.R, valid.t))
+    pose = object_pose(valid._replace(t=valid.t - 0.006 * n))
+    table, outcome = check_grasps(inputs.hand, inputs.object, pose, filtered.q, Bounds())
+    deep = table.metrics["penetration"] > 0.002
+    assert deep.mean() > 0.6
+    assert (outcome[deep] != 0).all()
+    np.testing.assert_array_equal(deep[refiner.inside(valid._replace(t=valid.t - 0.006 * n), 0.0025).numpy()], True)

@@ -1,0 +1,73 @@
+"""Point clouds as objects."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from lgrasp.errors import ObjectError
+from lgrasp.object.sdf import SdfGrid, sample_sdf
+from lgrasp.refine.cloud import TRUST, cloud_object
+
+RADIUS = 0.05
+
+
+def sphere(count: int = 3000) -> np.ndarray:
+    """Unit vectors, evenly spread."""
+    return trimesh.creation.icosphere(subdivisions=4).vertices[:count]
+
+
+def distance(model, points: np.ndarray) -> np.ndarray:
+    return sample_sdf(SdfGrid(model.sdf, model.sdf_origin, model.sdf_cell), points - model.center)
+
+
+def test_distances_of_a_sphere():
+    n = sphere()
+    model = cloud_object(RADIUS * n + 0.3, n)
+    rng = np.random.default_rng(0)
+    way = rng.normal(size=(500, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    d = rng.uniform(-0.8 * TRUST, 0.012, 500)
+    np.testing.assert_allclose(distance(model, (RADIUS + d)[:, None] * way + 0.3), d, atol=1.2e-3)
+
+
+def test_what_is_behind_a_seen_side_is_no_obstacle():
+    n = sphere()
+    n = n[n[:, 2] > 0]
+    model = cloud_object(RADIUS * n, n)
+    deep = np.array([[0, 0, 0.01], [0, 0.01, 0.005]])
+    assert (distance(model, deep) > 0).all()
+    assert distance(model, np.array([[0, 0, 0.04]]))[0] == pytest.approx(-0.01, abs=2e-3)
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.005])
+def test_noise_averages_out(noise):
+    n = sphere()
+    points = RADIUS * n + np.random.default_rng(0).normal(size=n.shape) * noise
+    model = cloud_object(points, n)
+    off = np.linalg.norm(model.contact_points + model.center, axis=1) - RADIUS
+    assert np.median(np.abs(off)) < 0.35 * noise
+    assert (model.contact_normals * (model.contact_points + model.center)).sum(1).min() > 0
+
+
+def test_the_same_points_give_the_same_object():
+    n = sphere(1000)
+    a, b = (cloud_object(RADIUS * n, n) for _ in range(2))
+    assert a.sha256 == b.sha256
+    np.testing.assert_array_equal(a.sdf, b.sdf)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda p, n: (p[:10], n[:10]), "at least 32"),
+        (lambda p, n: (p * 1000, n), "units metres"),
+        (lambda p, n: (np.where(np.arange(len(p))[:, None] == 3, np.nan, p), n), "NaN"),
+        (lambda p, n: (p, n * 0), "normals"),
+        (lambda p, n: (p, n[:-1]), "normals"),
+        (lambda p, n: (p[:, :2], n), "shape"),
+    ],
+)
+def test_bad_clouds(change, said):
+    n = sphere(1000)
+    with pytest.raises(ObjectError, match=said):
+        cloud_object(*change(RADIUS * n, n))

@@ -1,0 +1,46 @@
+"""Plans: the best hand of each start."""
+
+import numpy as np
+import pytest
+
+from lgrasp.refine import LocalSearch
+from lgrasp.refine.check import OUTCOMES
+from lgrasp.refine.planning import Planner, PlanParams
+
+QUICK = PlanParams(rolls=3, finalists=1, opening=2, search=PlanParams().search.model_copy(update={"outer": 6}))
+
+
+@pytest.fixture(scope="module")
+def planner(inputs) -> Planner:
+    return Planner(inputs.hand, inputs.object.model, 0.12, QUICK)
+
+
+@pytest.fixture(scope="module")
+def planned(planner):
+    return planner.run(8)
+
+
+def test_every_start_is_accounted_for(planned):
+    counts = planned.counts
+    assert counts["starts"] == 8 == counts["colliding"] + sum(counts[name] for name in OUTCOMES)
+    assert counts["kept"] == len(planned.grasps) == len(set(planned.grasps.index)) > 0
+
+
+def test_plans_satisfy_their_bounds(planned):
+    metrics, bounds = planned.grasps.metrics, QUICK.bounds
+    assert metrics["penetration"].max() <= bounds.penetration
+    assert metrics["gap"].max() <= bounds.gap
+    assert ((planned.grasps.contact_links >= 0).sum(1) >= 2).all()
+
+
+def test_a_start_does_not_depend_on_the_others(planner, planned):
+    few = planner.run(4)
+    same = planned.grasps.index < 4
+    np.testing.assert_array_equal(few.grasps.index, planned.grasps.index[same])
+    np.testing.assert_array_equal(few.grasps.q, planned.grasps.q[same])
+    np.testing.assert_array_equal(few.grasps.pose, planned.grasps.pose[same])
+
+
+def test_parameters_are_bounded():
+    with pytest.raises(ValueError, match="greater than"):
+        LocalSearch(shift=0)

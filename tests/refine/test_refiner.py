@@ -1,0 +1,91 @@
+"""What the refiner promises: true gradients, samples by themselves, hands that leave the object and fit it."""
+
+import pytest
+import torch
+
+from lgrasp.differentiable.rotations import so3_exp
+from lgrasp.refine import Pose
+
+
+def some(pose: Pose, rows: slice, dtype: torch.dtype = torch.float32) -> Pose:
+    return Pose(*(x[rows].to(dtype) for x in pose))
+
+
+@pytest.fixture(scope="module")
+def exact(make, valid, coarse):
+    """A refiner in float64 with two coarse hands: rotation vector, position, joints, and the rotations they turn."""
+    refiner = make(torch.float64)
+    pose = some(coarse(valid), slice(2), torch.float64)
+    q = pose.q.maximum(refiner.lower + 0.01).minimum(refiner.upper - 0.01)
+    turn = torch.zeros(2, 3, dtype=torch.float64)
+    return refiner, pose.R, [x.detach().requires_grad_() for x in (turn, pose.t, q)]
+
+
+def test_gradient_of_every_term(exact):
+    refiner, R, inputs = exact
+    matches = refiner.match(R, inputs[1], inputs[2])
+
+    def energy(turn, t, q):
+        return torch.stack(list(refiner.energy(so3_exp(turn) @ R, t, q, matches=matches)))
+
+    assert torch.autograd.gradcheck(energy, inputs)
+
+
+def test_gradient_through_unrolled_steps(exact):
+    refiner, R, inputs = exact
+    matches = refiner.match(R, inputs[1], inputs[2])
+
+    def moved(turn, t, q):
+        pose = refiner.unrolled(so3_exp(turn) @ R, t, q, steps=2, matches=matches)
+        return torch.cat([x.flatten() for x in pose])
+
+    assert torch.autograd.gradcheck(moved, inputs)
+
+
+def test_a_sample_does_not_depend_on_the_others(make, valid, coarse):
+    refiner, pose = make(outer=3), coarse(valid)
+    whole, part = refiner(*some(pose, slice(9))).pose, refiner(*some(pose, slice(4, 6))).pose
+    for a, b in zip(whole, part, strict=True):
+        torch.testing.assert_close(a[4:6], b, rtol=0, atol=0)
+
+
+def test_energy_of_coarse_poses_falls(make, valid, coarse):
+    refiner, pose = make(outer=13, reach=0.05, reach_end=0.03), some(coarse(valid), slice(48))
+    before = refiner.energy(*pose).total.mean()
+    found = refiner(*pose)
+    after = found.energies.total.mean()
+    assert after < before / 3
+    torch.testing.assert_close(found.energies.total, refiner.energy(*found.pose).total)
+
+
+def test_penetration_is_left(make, valid):
+    """Hands pushed 6 mm into the object come out to less than 2 mm."""
+    refiner = make()
+    pose = some(valid, slice(96))
+    _, n = refiner.target.nearest(refiner.middle(pose.R, pose.t))
+    into = pose._replace(t=pose.t - 0.006 * n)
+    deep = refiner.inside(into, 0.004)
+    assert deep.sum() > 16
+    assert refiner.inside(refiner(*(x[deep] for x in into)).pose, 0.002).float().mean() < 0.1
+
+
+def test_unrolled_steps_stay_rotations_and_lower_the_energy(make, valid, coarse):
+    refiner, pose = make(), some(coarse(valid), slice(16))
+    matches = refiner.match(*pose)
+    moved = refiner.unrolled(*pose, steps=5, matches=matches)
+    eye = torch.eye(3).expand(16, 3, 3)
+    torch.testing.assert_close(moved.R @ moved.R.mT, eye, rtol=0, atol=1e-5)
+    assert refiner.energy(*moved, matches=matches).total.mean() < refiner.energy(*pose, matches=matches).total.mean()
+
+
+def test_joints_stay_in_their_limits(make, valid):
+    refiner = make(outer=2)
+    pose = some(valid, slice(4))
+    found = refiner(pose.R, pose.t, pose.q + 5).pose.q
+    assert (found <= refiner.upper).all()
+    assert (found >= refiner.lower).all()
+
+
+def test_sgd_refines_too(make, valid, coarse):
+    refiner, pose = make(outer=8, optimizer="sgd", reach=0.05), some(coarse(valid), slice(24))
+    assert refiner(*pose).energies.total.mean() < 0.7 * refiner.energy(*pose).total.mean()

@@ -1,0 +1,38 @@
+"""Starts of a plan: palms that face the surface, weights, farthest points."""
+
+import numpy as np
+
+from lgrasp.refine.starts import palm_axis, start_poses
+from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface, ruled_palmar
+
+
+def test_palm_faces_the_point_from_the_stand_off(inputs):
+    model, obj = inputs.hand.model, inputs.object.model
+    points, normals = obj.contact_points[:40].astype(float), obj.contact_normals[:40].astype(float)
+    R, t = start_poses(model, points, normals, np.linspace(0, 6, 40), 0.13)
+    centre, facing = palm_axis(model)
+    np.testing.assert_allclose(R @ facing, -normals, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(R), 1)
+    palm = np.einsum("nij,j->ni", R, centre) + t
+    np.testing.assert_allclose(np.cross(palm - points, normals), 0, atol=1e-6)  # the line meets the point
+    np.testing.assert_allclose(((t - points) * normals).sum(1), 0.13, atol=1e-6)
+
+
+def test_farthest_points_begin_alike_and_spread():
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    few, many = farthest_points(points, 10), farthest_points(points, 40)
+    assert list(few) == list(many[:10])
+    assert len(set(many)) == 40
+    gaps = np.linalg.norm(points[few][:, None] - points[few][None], axis=2) + 9 * np.eye(10)
+    assert gaps.min() > 1.0
+
+
+def test_palmar_points_weigh_as_told(inputs):
+    model = inputs.hand.model
+    surface = hand_surface(model)
+    assert set(np.unique(surface.weight)) == {0.0, OTHER, DISTAL}
+    tips = {int(b) for b in surface.body[(surface.weight == DISTAL).any(1)]}
+    assert len(tips) == model.groups  # one last link a finger
+    pulled = surface.points[surface.weight > 0]
+    gap = np.linalg.norm(pulled[:, None] - ruled_palmar(model).points[None], axis=2).min(1)
+    assert gap.max() < 1e-6
