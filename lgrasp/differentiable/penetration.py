@@ -44,6 +44,14 @@ def _turned(R: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
     return R[..., 0] * v[..., :1] + R[..., 1] * v[..., 1:2] + R[..., 2] * v[..., 2:]
 
 
+def _placed(
+    M: Sequence[torch.Tensor], m: Sequence[torch.Tensor], x: Sequence[torch.Tensor]
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """M x + m by components: M in rows."""
+    a, b, c = (M[k] * x[0] + M[k + 1] * x[1] + M[k + 2] * x[2] + m[k // 3] for k in (0, 3, 6))
+    return a, b, c
+
+
 class PenetrationSums:
     """Sums of depths [m] over surface points, by term, of pairs of solids that ride on frames.
 
@@ -132,7 +140,7 @@ class PenetrationSums:
 
     def slopes(self, R: torch.Tensor, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The sums (N, terms) and their derivatives by [R | t] of each frame, (N, terms, F, 3, 4)."""
-        rows, frames = t.shape[:2]
+        batch, frames = t.shape[:2]
         e = self.near(R, t)
         at_a, at_b = e.row * frames + self._frame[e.points], e.row * frames + self._frame[e.grid]
         flat = R.reshape(-1, 3, 3), t.reshape(-1, 3)
@@ -140,30 +148,29 @@ class PenetrationSums:
         back = Rb.transpose(1, 2)
         R_ba, t_ba = _product(back, Ra), _turned(back, flat[1][at_a] - flat[1][at_b])
         x = self._points[e.run].reshape(-1, RUN, 3).unbind(2)  # each (E, RUN)
-        M, m = R_ba.reshape(-1, 9, 1).unbind(1), t_ba[..., None].unbind(1)
-        z = [M[3 * k] * x[0] + M[3 * k + 1] * x[1] + M[3 * k + 2] * x[2] + m[k] for k in range(3)]
-        value, gradient = self._grids.value_and_gradient((z[0], z[1], z[2]), e.grid[:, None])
-        inside = value < 0
-        depth = torch.where(inside, -value, 0)
-        h = [torch.where(inside, -g, 0) for g in gradient]  # of the depth, frame of the grid
-
-        def total(y: torch.Tensor) -> torch.Tensor:
-            return _counted(y).sum(1).to(R.dtype) * _QUANTUM
-
-        pull = torch.stack([total(g) for g in h], 1)  # (E, 3)
-        lever = torch.stack([total(g * p) for g in h for p in x], 1).reshape(-1, 3, 3)  # sum of h x^T
+        z = _placed(R_ba.reshape(-1, 9, 1).unbind(1), t_ba[..., None].unbind(1), x)
+        inside = (self._grids.value_within(z, e.grid[:, None]) < 0).reshape(-1).nonzero()[:, 0]
+        entry = inside // RUN
+        x, (a, b, c) = ([y.reshape(-1).index_select(0, inside) for y in v] for v in (x, z))  # each (points inside,)
+        value, gradient = self._grids.value_and_gradient((a, b, c), e.grid[entry])
+        # of the depth, frame of the grid: its gradient h, and h x^T
+        rows = torch.stack([-value, *(-g for g in gradient), *(-g * y for g in gradient for y in x)], 1)
+        summed = torch.zeros(len(e.row), 13, dtype=torch.int64, device=R.device)
+        summed.index_add_(0, entry, _counted(rows))
+        pull, lever = (summed[:, 1:].to(R.dtype) * _QUANTUM).split([3, 9], 1)
+        lever = lever.reshape(-1, 3, 3)
         force = _turned(Rb, pull)
         by_a = torch.cat([_product(Rb, lever), force[..., None]], 2)
         moment = _product(R_ba, lever.transpose(1, 2)) + t_ba[..., None] * pull[:, None]  # sum of z h^T
         by_b = torch.cat([_product(Rb, moment), -force[..., None]], 2)
         slot = e.row * self.terms + e.term
-        sums = torch.zeros(rows * self.terms, dtype=torch.int64, device=R.device)
-        sums.index_add_(0, slot, _counted(depth).sum(1))
+        sums = torch.zeros(batch * self.terms, dtype=torch.int64, device=R.device)
+        sums.index_add_(0, slot, summed[:, 0])
         place = torch.cat([slot * frames + self._frame[e.points], slot * frames + self._frame[e.grid]])
-        slopes = torch.zeros(rows * self.terms * frames, 12, dtype=torch.int64, device=R.device)
+        slopes = torch.zeros(batch * self.terms * frames, 12, dtype=torch.int64, device=R.device)
         slopes.index_add_(0, place, _counted(torch.cat([by_a, by_b])).reshape(-1, 12))
         slopes = slopes.to(R.dtype) * _QUANTUM
-        return (sums.to(R.dtype) * _QUANTUM).reshape(rows, -1), slopes.reshape(rows, self.terms, frames, 3, 4)
+        return (sums.to(R.dtype) * _QUANTUM).reshape(batch, -1), slopes.reshape(batch, self.terms, frames, 3, 4)
 
 
 class _Sums(torch.autograd.Function):

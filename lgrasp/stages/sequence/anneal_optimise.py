@@ -18,6 +18,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.spaces import Space
 from lgrasp.object.model import ObjectModel
 from lgrasp.stages.sequence.anneal import Annealing, Proposals, run_chain, step_length, temperature
+from lgrasp.stages.sequence.anneal_contacts import touching_points
 from lgrasp.stages.sequence.anneal_params import OptimiserParams
 from lgrasp.stages.sequence.anneal_start import start_poses
 from lgrasp.stages.sequence.energy import TERMS, GraspEnergy
@@ -36,11 +37,11 @@ class Optimised:
     q: np.ndarray
     """Joints, those that may not move bit by bit as given, (H, K) f32."""
     hand_point: np.ndarray
-    """Contact point on each side, index in ``contact_points`` of the view of the row's space, (H, 2)."""
+    """The point of each side that touches, index in ``contact_points`` of the view of the row's space, (H, 2)."""
     object_point: np.ndarray
     """The object's contact point nearest to each, index in ``contact_points`` of the object, (H, 2)."""
     energies: np.ndarray
-    """In the order of TERMS, without weights, (H, 6)."""
+    """In the order of TERMS, with these contact points, without weights, (H, 6)."""
 
 
 def optimise(
@@ -57,7 +58,7 @@ def optimise(
     params: OptimiserParams,
     method: Literal["anneal", "mala"] = "anneal",
     device: str = "cpu",
-    rows: int = 256,
+    rows: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Optimised:
     """Grasp the last object in H rows that hold the objects before it.
@@ -71,7 +72,7 @@ def optimise(
         q: posture to start from, (H, K) [rad or m]. free: joints that may move, (H, K) bool.
         held: poses of the objects held, internal frames: x y z [m], qx qy qz qw, (H, n - 1, 7).
         seed: of each row, (H,) integers.
-        rows: how many are worked on at once.
+        rows: how many are worked on at once; default: 256, and 512 on a GPU, which so few leave half idle.
         progress: called with steps done and steps in all.
     """
     energy = GraspEnergy(
@@ -83,6 +84,7 @@ def optimise(
         device=device,
     )
     sides = Sides(views, spaces, device=device)
+    rows = rows or (256 if device == "cpu" else 512)
     blocks = [np.arange(first, min(first + rows, len(q))) for first in range(0, len(q), rows)]
     parts = []
     for number, block in enumerate(blocks):
@@ -143,12 +145,13 @@ def _optimise_block(
     )
     q = torch.where(free, chain.x[:, 9:].clamp(problem.energy.lower, problem.energy.upper), q)
     R, t = matrix_from_sixd(chain.x[:, 3:9]), chain.x[:, :3]
-    contacts = problem.sides.contacts(problem.space, chain.contact)
+    chosen = touching_points(problem, torch.cat([chain.x[:, :9], q], 1))
+    contacts = problem.sides.contacts(problem.space, chosen)
     terms = problem.energy(R, t, q, contacts, problem.held)
     at = problem.energy.contact_points(R, t, problem.energy.kinematics(q), contacts)
     surface = torch.as_tensor(objects[-1].contact_points, device=q.device)
     nearest = torch.cdist(at.reshape(-1, 3), surface).argmin(1).reshape(-1, 2)
-    index = problem.sides.index(problem.space, chain.contact)
+    index = problem.sides.index(problem.space, chosen)
     return [torch.cat([t, quaternion_from_matrix(R)], 1), q, index, nearest, terms]
 
 

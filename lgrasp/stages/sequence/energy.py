@@ -74,7 +74,7 @@ class GraspEnergy:
         )
         grid = SdfGrid(new.sdf, new.sdf_origin, new.sdf_cell)
         self._grid = DistanceGrids([grid], dtype=dtype, device=device)
-        self._normals = SurfaceNormals(grid, dtype=dtype, device=device)
+        self.normals = SurfaceNormals(grid, dtype=dtype, device=device)
         self._com = put(new.com)
         self._radius = float(np.linalg.norm(new.obstacle_points - new.com, axis=1).max())
         self._by_hand = point_unit / sum(len(s.points) for s in links.solids)
@@ -108,7 +108,8 @@ class GraspEnergy:
         hsp = self._by_hand * sums[:, _HAND_IN_HAND]
         oop = self._by_object * (sums[:, _NEW_IN_HELD] + sums[:, _HELD_IN_NEW])
         joint = ((q - self.upper).clamp_min(0) + (self.lower - q).clamp_min(0)).sum(1)
-        fc, dis = self._contact_terms(self.contact_points(R, t, (R_body, t_body), contacts))
+        x = self.contact_points(R, t, (R_body, t_body), contacts)
+        fc, dis = self.balance(x, self.normals(x)), self.distance(x).abs().sum(1)
         return torch.stack([fc, dis, hop, hsp, joint, oop], 1)
 
     def contact_points(
@@ -124,10 +125,12 @@ class GraspEnergy:
         p = (R_body * contacts.point[..., None, :]).sum(-1) + t_body - t[:, None]
         return (R[:, None] * p[..., None]).sum(-2)
 
-    def _contact_terms(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """fc and dis of contact points (N, 2, 3) in the object's frame."""
-        n = self._normals(x)
-        arm = (x - self._com) / self._radius
+    def distance(self, x: torch.Tensor) -> torch.Tensor:
+        """Signed distance [m] of points (..., 3) of its frame to the object to grasp, negative inside."""
+        return self._grid.value(x)
+
+    def balance(self, x: torch.Tensor, n: torch.Tensor) -> torch.Tensor:
+        """fc (N,) of contacts at x (N, 2, 3) with the object's outward normals n (N, 2, 3), frame of the object."""
         force = n.sum(1)
-        torque = torch.linalg.cross(arm, n).sum(1)
-        return (force * force).sum(1) + (torque * torque).sum(1), self._grid.value(x).abs().sum(1)
+        torque = torch.linalg.cross((x - self._com) / self._radius, n).sum(1)
+        return (force * force).sum(1) + (torque * torque).sum(1)

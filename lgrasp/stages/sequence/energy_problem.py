@@ -42,6 +42,7 @@ class Sides:
         self._count = torch.as_tensor(end - first, dtype=torch.int64, device=device)
         self._offset = torch.as_tensor(offsets[:-1], dtype=torch.int64, device=device)
         self._point = put([v.contact_points for v in views], dtype)
+        self._normal = put([v.contact_normals for v in views], dtype)
         self._body = put([v.contact_body for v in views], torch.int64)
 
     def counts(self, space: torch.Tensor) -> torch.Tensor:
@@ -56,6 +57,27 @@ class Sides:
         """Bodies and places of points of sides."""
         at = self.index(space, chosen) + self._offset[space][:, None]
         return HandContacts(self._body[at], self._point[at])
+
+    def points(self, space: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """All points of the sides of spaces (N,), (N, 2, P), and which of them are there: sides differ in size."""
+        number = torch.arange(int(self._count.max()), device=space.device)
+        listed = number < self._count[space][..., None]
+        at = self._first[space][..., None] + torch.where(listed, number, 0)
+        return at + self._offset[space][:, None, None], listed
+
+    def placed(
+        self, points: torch.Tensor, bodies: tuple[torch.Tensor, torch.Tensor]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Places [m] and outward normals, base frame, (N, 2, P, 3), of points that :meth:`points` lists.
+
+        Args:
+            bodies: R (N, B, 3, 3) and t (N, B, 3) of the hand's bodies.
+        """
+        body = self._body[points]
+        row = torch.arange(len(points), device=points.device)[:, None, None]
+        R, t = bodies[0][row, body], bodies[1][row, body]
+        place = (R * self._point[points][..., None, :]).sum(-1) + t
+        return place, (R * self._normal[points][..., None, :]).sum(-1)
 
 
 class GraspProblem:
