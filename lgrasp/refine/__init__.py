@@ -22,11 +22,10 @@ __all__ = [
     "hand_surface",
 ]
 
-_MODULES = {"energy": ("Energies", "Matches"), "refiner": ("Pose", "Refined", "Refiner"), "target": ("Target",)}
-
 
 def __getattr__(name: str) -> Any:
-    for module, names in _MODULES.items():  # they import torch, so only when asked for
+    modules = {"energy": ("Energies", "Matches"), "refiner": ("Pose", "Refined", "Refiner"), "target": ("Target",)}
+    for module, names in modules.items():  # they import torch, so only when asked for
         if name in names:
             import importlib
 

@@ -17,7 +17,7 @@ from lgrasp.refine.check_kernels import (
     deepen_rows,
     link_contacts,
 )
-from lgrasp.refine.params import Bounds
+from lgrasp.refine.params import GraspBounds
 from lgrasp.refine.surface import Palmar, ruled_palmar
 
 __all__ = ["OUTCOMES", "check_grasps", "contact_width"]
@@ -33,7 +33,7 @@ def check_grasps(
     obj: ObjectArrays,
     pose: np.ndarray,
     q: np.ndarray,
-    bounds: Bounds,
+    bounds: GraspBounds,
     *,
     palmar: Palmar | None = None,
     around: ObjectArrays | None = None,

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["Bounds", "LocalSearch"]
+__all__ = ["GraspBounds", "LocalSearch"]
 
 
 class LocalSearch(BaseModel):
@@ -43,7 +43,7 @@ class LocalSearch(BaseModel):
     )
 
 
-class Bounds(BaseModel):
+class GraspBounds(BaseModel):
     """What a finished grasp must satisfy, and its control poses; tighter than strict validity. Angles in degrees."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -14,7 +14,7 @@ from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.check import OUTCOMES, check_grasps
-from lgrasp.refine.params import Bounds, LocalSearch
+from lgrasp.refine.params import GraspBounds, LocalSearch
 from lgrasp.refine.refiner import Pose, Refiner
 from lgrasp.refine.starts import GOLDEN_ANGLE, palm_axis, start_poses
 from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface
@@ -24,10 +24,10 @@ __all__ = ["PlanParams", "Planned", "Planner", "object_pose"]
 
 _CPU_STARTS, _GPU_STARTS = 40, 1000  # planned at a time
 _COLLIDES = 1.0e-3  # [m]
-_PLAN_BOUNDS = Bounds(
+_PLAN_BOUNDS = GraspBounds(
     penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=20.0
 )
-_COARSE = Bounds(penetration=0.01, self_margin=0.0, gap=0.012, angle=60.0, fold=90.0, balance=10.0)
+_COARSE = GraspBounds(penetration=0.01, self_margin=0.0, gap=0.012, angle=60.0, fold=90.0, balance=10.0)
 
 
 class PlanParams(BaseModel):
@@ -51,7 +51,7 @@ class PlanParams(BaseModel):
         default=LocalSearch(shift=0.002, turn=0.02, bend=0.04, reach=0.15, reach_end=0.1, soft=0.01),
         description="The local search.",
     )
-    bounds: Bounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
+    bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
     def weights(self) -> dict[str, float]:
         """Arguments of :func:`hand_surface`."""
@@ -149,7 +149,7 @@ class Planner:
         # shared joints take their values in turn
         return start, (R, t, settings[number % len(settings)]), -normals
 
-    def _checked(self, pose: Pose, start: np.ndarray, bounds: Bounds) -> tuple[GraspTable, np.ndarray]:
+    def _checked(self, pose: Pose, start: np.ndarray, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray]:
         around = None if self.around is None else upload_object(self.around, self.hand.device)
         obj = upload_object(self.model, self.hand.device)
         q = pose.q.cpu().numpy()

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from lgrasp.refine.check import OUTCOMES, check_grasps
-from lgrasp.refine.params import Bounds
+from lgrasp.refine.params import GraspBounds
 from lgrasp.refine.planning import object_pose
 
 
 @pytest.fixture(scope="module")
 def checked(inputs, filtered):
-    return check_grasps(inputs.hand, inputs.object, filtered.pose, filtered.q, Bounds())
+    return check_grasps(inputs.hand, inputs.object, filtered.pose, filtered.q, GraspBounds())
 
 
 def test_rows_of_filter_are_clear(checked, filtered):
@@ -35,14 +35,14 @@ def test_forces_balance(checked):
     table, outcome = checked
     force, normal = (np.nan_to_num(a[outcome == 0]) for a in (table.contact_forces, table.contact_normals))
     np.testing.assert_allclose(-(force * normal).sum((1, 2)), 1, atol=1e-3)
-    assert np.linalg.norm(force.sum(1), axis=1).max() < Bounds().balance + 1e-3
+    assert np.linalg.norm(force.sum(1), axis=1).max() < GraspBounds().balance + 1e-3
 
 
 def test_a_hand_in_the_object_is_told(inputs, filtered, make, valid):
     refiner = make()
     _, n = refiner.target.nearest(refiner.middle(valid.R, valid.t))
     pose = object_pose(valid._replace(t=valid.t - 0.006 * n))
-    table, outcome = check_grasps(inputs.hand, inputs.object, pose, filtered.q, Bounds())
+    table, outcome = check_grasps(inputs.hand, inputs.object, pose, filtered.q, GraspBounds())
     deep = table.metrics["penetration"] > 0.002
     assert deep.mean() > 0.6
     assert (outcome[deep] != 0).all()

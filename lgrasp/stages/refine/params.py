@@ -2,7 +2,7 @@
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lgrasp.refine.params import Bounds, LocalSearch
+from lgrasp.refine.params import GraspBounds, LocalSearch
 
 __all__ = ["RefineParams"]
 
@@ -16,6 +16,6 @@ class RefineParams(BaseModel):
         default=LocalSearch(outer=8, shift=0.0005, turn=0.005, bend=0.01, reach=0.02, reach_end=0.02, force=0.3),
         description="The local search.",
     )
-    bounds: Bounds = Field(
-        default=Bounds(), description="What a refined grasp must satisfy to take the place of its row."
+    bounds: GraspBounds = Field(
+        default=GraspBounds(), description="What a refined grasp must satisfy to take the place of its row."
     )
