@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lgrasp_cli.bench_refine import bench_refine
 from lgrasp_cli.bench_sequence import bench_sequence
 from lgrasp_cli.interrupt import before_end
 from lgrasp_cli.options import Device, Hand, JsonPath, check_report, open_cache, warn
@@ -12,9 +13,10 @@ from lgrasp_cli.table1 import table1
 
 __all__ = ["app"]
 
-app = typer.Typer(invoke_without_command=True, subcommand_metavar="[table1|sequence [OPTIONS]]")
+app = typer.Typer(invoke_without_command=True, subcommand_metavar="[table1|sequence|refine [OPTIONS]]")
 app.command()(table1)
 app.command("sequence")(bench_sequence)
+app.command("refine")(bench_refine)
 
 
 @app.callback()

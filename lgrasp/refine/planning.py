@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 
-from lgrasp.differentiable.rotations import quaternion_from_matrix
+from lgrasp.differentiable.rotations import matrix_from_quaternion, quaternion_from_matrix
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import upload_object
@@ -20,7 +20,7 @@ from lgrasp.refine.starts import GOLDEN_ANGLE, palm_axis, start_poses
 from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface
 from lgrasp.refine.target import Target
 
-__all__ = ["PlanParams", "Planned", "Planner", "object_pose"]
+__all__ = ["PlanParams", "Planned", "Planner", "object_pose", "table_pose"]
 
 _CPU_STARTS, _GPU_STARTS = 40, 1000  # planned at a time
 _COLLIDES = 1.0e-3  # [m]
@@ -163,6 +163,13 @@ def object_pose(pose: Pose) -> np.ndarray:
     R = pose.R.mT
     t = -(R @ pose.t[..., None])[..., 0]
     return torch.cat([t, quaternion_from_matrix(R)], 1).cpu().numpy()
+
+
+def table_pose(table: GraspTable, device: str) -> Pose:
+    """Hands of grasps in the object's internal frame: inverse of :func:`object_pose`."""
+    pose = torch.as_tensor(table.pose, device=device)
+    R = matrix_from_quaternion(pose[:, 3:]).mT
+    return Pose(R, -(R @ pose[:, :3, None])[..., 0], torch.as_tensor(table.q, device=device))
 
 
 def _rows(pose: Pose, rows: np.ndarray) -> Pose:

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 
-from lgrasp.differentiable.rotations import matrix_from_quaternion
 from lgrasp.engine.batch import run_stages
 from lgrasp.refine import LocalSearch, Pose, Refiner
+from lgrasp.refine.planning import table_pose
 
 
 @pytest.fixture(scope="session")
@@ -20,9 +19,7 @@ def filtered(swift, context):
 @pytest.fixture(scope="session")
 def valid(filtered) -> Pose:
     """Their hands, in the object's internal frame."""
-    pose = torch.as_tensor(np.asarray(filtered.pose))
-    R = matrix_from_quaternion(pose[:, 3:]).mT
-    return Pose(R, -(R @ pose[:, :3, None])[..., 0], torch.as_tensor(np.asarray(filtered.q)))
+    return table_pose(filtered, "cpu")
 
 
 @pytest.fixture(scope="session")

@@ -51,7 +51,7 @@ def test_wrench_of_any_contacts():
     x, c = rng.normal(size=(5, 4, 3)) * 0.04, rng.normal(size=(5, 4, 3))
     com, radius = rng.normal(size=3) * 0.01, 0.06
     wrench = np.concatenate([c, np.cross((x - com) / radius, c)], -1).sum(1)
-    found = wrench_energy(*(torch.as_tensor(a) for a in (x, c, com)), radius, P)
+    found = wrench_energy(torch.as_tensor(x), torch.as_tensor(c), torch.as_tensor(com), radius, P)
     np.testing.assert_allclose(found.numpy(), P.force * (wrench**2).sum(1) / 16, rtol=1e-12)
 
 

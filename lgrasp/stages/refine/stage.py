@@ -12,7 +12,7 @@ from lgrasp.stages.context import Context
 from lgrasp.stages.refine.params import RefineParams
 
 if TYPE_CHECKING:
-    from lgrasp.refine.refiner import Pose, Refiner
+    from lgrasp.refine.refiner import Refiner
 
 __all__ = ["VERSION", "run"]
 
@@ -34,9 +34,9 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
     if len(inputs) == 0:
         return _widened(inputs, width), {"tried": 0, "passed": 0, "replaced": 0}
     # torch is heavy to load
-    from lgrasp.refine.planning import object_pose
+    from lgrasp.refine.planning import object_pose, table_pose
 
-    refined = _refiner(params.search, context)(*_hands(inputs, context.device)).pose
+    refined = _refiner(params.search, context)(*table_pose(inputs, context.device)).pose
     q = refined.q.cpu().numpy()
     table, outcome = check_grasps(
         context.hand, context.object, object_pose(refined), q, params.bounds, index=inputs.index
@@ -61,19 +61,6 @@ def _refiner(search: LocalSearch, context: Context) -> "Refiner":
             _made.clear()
             _made[key] = Refiner(context.hand.model, context.object.model, search, device=context.device)
         return _made[key]
-
-
-def _hands(table: GraspTable, device: str) -> "Pose":
-    """The hands of grasps in the object's internal frame."""
-    import torch
-
-    from lgrasp.differentiable.rotations import matrix_from_quaternion
-    from lgrasp.refine.refiner import Pose
-
-    pose = torch.as_tensor(table.pose, device=device)
-    R = matrix_from_quaternion(pose[:, 3:]).mT
-    t = -(R @ pose[:, :3, None])[..., 0]
-    return Pose(R, t, torch.as_tensor(table.q, device=device))
 
 
 def _replaced(old: GraspTable, new: GraspTable, rows: np.ndarray) -> GraspTable:
