@@ -107,7 +107,9 @@ def extend(
         "pose": grasps.pose,
         **{name: getattr(grasps, name) for name in _CONTACTS},
     }
-    longer = {n: np.concatenate([getattr(before, n)[row], values[:, None]], 1) for n, values in step.items()}
+    longer: dict[str, Any] = {
+        n: np.concatenate([getattr(before, n)[row], values[:, None]], 1) for n, values in step.items()
+    }
     metrics = dict(grasps.metrics)
     for name, values in before.metrics.items():
         metrics[name] = _WORST.get(name, np.fmax)(values[row], metrics[name])

@@ -28,7 +28,8 @@ class SequenceParams(BaseModel):
     waves: int = Field(4, ge=1, le=256, description="Waves of a step before a sequence is given up (field).")
     branch: int = Field(1, ge=1, le=1024, description="Most sequences that go on from one.")
     optimiser: OptimiserParams = Field(
-        default_factory=OptimiserParams, description="Numbers of the methods anneal and mala."
+        default_factory=lambda: OptimiserParams.model_validate({}),
+        description="Numbers of the methods anneal and mala.",
     )
     rounds: int = Field(64, ge=1, le=65_536, description="Rounds per width of sequences asked, before giving up.")
 
