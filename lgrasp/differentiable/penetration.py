@@ -6,14 +6,20 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from lgrasp.differentiable.culling import Culling, Kept
 from lgrasp.differentiable.distance import DistanceGrids
-from lgrasp.differentiable.solids import RUN, Solid
+from lgrasp.differentiable.solids import RUN, PointSolid
 
 __all__ = ["PenetrationSums"]
 
 _QUANTUM = 2.0**-48
 """Sums are made in integers of this unit: exact in any order, so no result depends on batch, threads or atomics. Their
 range is 32,768: metres, or points that pull."""
+
+
+_ROOMS = (128, 32, 1024, 256, 128, 384)
+"""Entries per row: pairs with balls that meet, pairs that may touch, their runs, those with balls that meet, those that
+may touch, points inside."""
 
 
 class _Entries(NamedTuple):
@@ -25,9 +31,8 @@ class _Entries(NamedTuple):
     term: torch.Tensor
     run: torch.Tensor
 
-    def where(self, mask: torch.Tensor) -> "_Entries":
-        at = mask.nonzero()[:, 0]
-        return _Entries(*(column.index_select(0, at) for column in self))
+    def at(self, index: torch.Tensor) -> "_Entries":
+        return _Entries(*(column.index_select(0, index) for column in self))
 
 
 def _counted(x: torch.Tensor) -> torch.Tensor:
@@ -67,7 +72,7 @@ class PenetrationSums:
 
     def __init__(
         self,
-        solids: Sequence[Solid],
+        solids: Sequence[PointSolid],
         frame: Sequence[int] | np.ndarray,
         pairs: np.ndarray,
         counts: np.ndarray,
@@ -90,6 +95,7 @@ class PenetrationSums:
         self._run_ball = put(np.concatenate([s.run_ball for s in solids]))
         self._run_frame = index(np.repeat(np.asarray(frame), runs))
         self._run_first, self._run_count = index(np.cumsum([0, *runs[:-1]])), index(runs)
+        self.culling = Culling(_ROOMS, device)
         points = np.concatenate([s.points for s in solids])
         self._points = put(points.reshape(-1, RUN * 3))
 
@@ -99,15 +105,17 @@ class PenetrationSums:
         assert isinstance(out, torch.Tensor)
         return out
 
-    def near(self, R: torch.Tensor, t: torch.Tensor) -> _Entries:
+    def near(self, R: torch.Tensor, t: torch.Tensor) -> tuple[_Entries, Kept]:
         """Runs of points that may be inside the other solid of their pair."""
         flat = R.reshape(-1, 3, 3), t.reshape(-1, 3)
-        frames = t.shape[1]
+        frames, keep = t.shape[1], self.culling.keep
         centre = self._centres(R, t, self._frame, self._ball)  # (N, P, 3)
         a, b = self._pairs.unbind(1)
         gap = [x.index_select(1, a) - x.index_select(1, b) for x in centre.unbind(2)]
         reach = self._ball[a, 3] + self._ball[b, 3]
-        row, pair = (gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2] < reach * reach).nonzero().unbind(1)
+        close = gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2] < reach * reach  # (N, Q)
+        kept = keep(0, close.reshape(-1))
+        row, pair = kept.index // len(a), kept.index % len(a)
 
         def distance(row: torch.Tensor, centre: torch.Tensor, grid: torch.Tensor) -> torch.Tensor:
             """Of points (E, 3) of the common frame, in the grids of solids."""
@@ -117,23 +125,24 @@ class PenetrationSums:
             return self._grids.value_and_gradient((local[0], local[1], local[2]), grid)[0] - self._grids.cell[grid]
 
         a, b = a[pair], b[pair]
-        keep = (distance(row, centre[row, a], b) < self._ball[a, 3]).nonzero()[:, 0]
-        row, a, b, pair = row[keep], a[keep], b[keep], pair[keep]
+        kept = keep(1, kept.allowed(distance(row, centre[row, a], b) < self._ball[a, 3]))
+        row, a, b, pair = row[kept.index], a[kept.index], b[kept.index], pair[kept.index]
         # both ways, and every run of the points' solid
         row, points, grid = torch.cat([row, row]), torch.cat([a, b]), torch.cat([b, a])
-        term = self._pair_terms[pair].t().reshape(-1)
-        count = self._run_count[points]
-        entry = torch.repeat_interleave(count)
-        ends = count.cumsum(0)
-        run = torch.arange(len(entry), device=R.device) - (ends - count - self._run_first[points])[entry]
-        entries = _Entries(row[entry], points[entry], grid[entry], term[entry], run)
+        term, count = self._pair_terms[pair].t().reshape(-1), self._run_count[points]
+        if kept.used is not None:
+            count = torch.where(torch.cat([kept.used, kept.used]), count, 0)
+        kept, number = self.culling.repeat(2, count)
+        run = self._run_first[points][kept.index] + number
+        e = _Entries(row[kept.index], points[kept.index], grid[kept.index], term[kept.index], run)
         run_centre = self._centres(R, t, self._run_frame, self._run_ball)  # (N, runs, 3)
-        gap = run_centre[entries.row, entries.run] - centre[entries.row, entries.grid]
-        x, y, z = gap.unbind(1)
-        reach = self._run_ball[entries.run, 3] + self._ball[entries.grid, 3]
-        entries = entries.where(x * x + y * y + z * z < reach * reach)
-        apart = distance(entries.row, run_centre[entries.row, entries.run], entries.grid)
-        return entries.where(apart < self._run_ball[entries.run, 3])
+        x, y, z = (run_centre[e.row, e.run] - centre[e.row, e.grid]).unbind(1)
+        reach = self._run_ball[e.run, 3] + self._ball[e.grid, 3]
+        kept = keep(3, kept.allowed(x * x + y * y + z * z < reach * reach))
+        e = e.at(kept.index)
+        apart = distance(e.row, run_centre[e.row, e.run], e.grid)
+        kept = keep(4, kept.allowed(apart < self._run_ball[e.run, 3]))
+        return e.at(kept.index), kept
 
     def _centres(self, R: torch.Tensor, t: torch.Tensor, frame: torch.Tensor, ball: torch.Tensor) -> torch.Tensor:
         return _turned(R.index_select(1, frame), ball[:, :3]) + t.index_select(1, frame)
@@ -141,7 +150,7 @@ class PenetrationSums:
     def slopes(self, R: torch.Tensor, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The sums (N, terms) and their derivatives by [R | t] of each frame, (N, terms, F, 3, 4)."""
         batch, frames = t.shape[:2]
-        e = self.near(R, t)
+        e, kept = self.near(R, t)
         at_a, at_b = e.row * frames + self._frame[e.points], e.row * frames + self._frame[e.grid]
         flat = R.reshape(-1, 3, 3), t.reshape(-1, 3)
         Ra, Rb = flat[0][at_a], flat[0][at_b]
@@ -149,12 +158,15 @@ class PenetrationSums:
         R_ba, t_ba = _product(back, Ra), _turned(back, flat[1][at_a] - flat[1][at_b])
         x = self._points[e.run].reshape(-1, RUN, 3).unbind(2)  # each (E, RUN)
         z = _placed(R_ba.reshape(-1, 9, 1).unbind(1), t_ba[..., None].unbind(1), x)
-        inside = (self._grids.value_within(z, e.grid[:, None]) < 0).reshape(-1).nonzero()[:, 0]
-        entry = inside // RUN
-        x, (a, b, c) = ([y.reshape(-1).index_select(0, inside) for y in v] for v in (x, z))  # each (points inside,)
+        inside = kept.allowed(self._grids.value_within(z, e.grid[:, None]) < 0)
+        kept = self.culling.keep(5, inside.reshape(-1))
+        entry = kept.index // RUN
+        x, (a, b, c) = ([y.reshape(-1).index_select(0, kept.index) for y in v] for v in (x, z))  # (points inside,)
         value, gradient = self._grids.value_and_gradient((a, b, c), e.grid[entry])
         # of the depth, frame of the grid: its gradient h, and h x^T
         rows = torch.stack([-value, *(-g for g in gradient), *(-g * y for g in gradient for y in x)], 1)
+        if kept.used is not None:
+            rows = torch.where(kept.used[:, None], rows, 0)
         summed = torch.zeros(len(e.row), 13, dtype=torch.int64, device=R.device)
         summed.index_add_(0, entry, _counted(rows))
         pull, lever = (summed[:, 1:].to(R.dtype) * _QUANTUM).split([3, 9], 1)

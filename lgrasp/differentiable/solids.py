@@ -10,7 +10,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.sdf import SdfGrid
 
-__all__ = ["RUN", "HandSolids", "Solid", "hand_solids", "object_solid"]
+__all__ = ["RUN", "HandPoints", "PointSolid", "hand_solids", "object_solid"]
 
 RUN = 16
 """Surface points are in compact runs of this many."""
@@ -24,7 +24,7 @@ _CHUNK = 1 << 22  # most point-plane distances held at once
 
 
 @dataclass(frozen=True)
-class Solid:
+class PointSolid:
     """A rigid solid in its own frame; lengths in metres."""
 
     points: np.ndarray
@@ -37,19 +37,19 @@ class Solid:
 
 
 @dataclass(frozen=True)
-class HandSolids:
+class HandPoints:
     """Links of a hand that have collision geometry, each in the frame of the body that it rides on."""
 
     links: np.ndarray
     """Index in ``link_names``, (L,)."""
     body: np.ndarray
     """Body of each, (L,)."""
-    solids: tuple[Solid, ...]
+    solids: tuple[PointSolid, ...]
     pairs: np.ndarray
     """Pairs of them that must stay apart: not joined by a joint, not touching always, (P, 2)."""
 
 
-def hand_solids(model: HandModel, count: int) -> HandSolids:
+def hand_solids(model: HandModel, count: int) -> HandPoints:
     """The links of a hand as solids, with about ``count`` surface points together (more on small links).
 
     A link is the union of its convex pieces, which stand for its collision geometry in all of lgrasp.
@@ -68,7 +68,7 @@ def hand_solids(model: HandModel, count: int) -> HandSolids:
     links = np.array(list(members))
     place = {link: i for i, link in enumerate(members)}
     pairs = np.unique(np.sort(model.piece_link[model.pairs], axis=1), axis=0)
-    return HandSolids(
+    return HandPoints(
         links=links,
         body=model.tree.link_body[links],
         solids=tuple(solids),
@@ -76,7 +76,7 @@ def hand_solids(model: HandModel, count: int) -> HandSolids:
     )
 
 
-def object_solid(model: ObjectModel, count: int) -> Solid:
+def object_solid(model: ObjectModel, count: int) -> PointSolid:
     """An object in its internal frame, with ``count`` surface points (rounded up to whole runs)."""
     points = model.obstacle_points
     ball = np.array([0.0, 0.0, 0.0, np.linalg.norm(points, axis=1).max()])  # the centre of the bounding box
@@ -89,11 +89,11 @@ def _thinned(points: np.ndarray, count: int) -> np.ndarray:
     return points[((np.arange(count) + 0.5) * len(points) / count).astype(int)]
 
 
-def _solid(points: np.ndarray, ball: np.ndarray, grid: SdfGrid) -> Solid:
+def _solid(points: np.ndarray, ball: np.ndarray, grid: SdfGrid) -> PointSolid:
     points = np.resize(points, (-(-len(points) // RUN) * RUN, 3))  # the last run is filled with repeats
     points = points[cluster_order(points, size=RUN)].astype(np.float32)
     centre, radius = bounding_spheres(points, size=RUN)
-    return Solid(points, np.column_stack([centre, radius]), ball.astype(np.float32), grid)
+    return PointSolid(points, np.column_stack([centre, radius]), ball.astype(np.float32), grid)
 
 
 def _piece(model: HandModel, i: int) -> Piece:

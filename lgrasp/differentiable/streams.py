@@ -16,11 +16,11 @@ def _mixed(z: torch.Tensor) -> torch.Tensor:
     return z ^ ((z >> 31) & 0x1FFFFFFFF)
 
 
-def uniforms(seed: torch.Tensor, step: int, count: int) -> torch.Tensor:
+def uniforms(seed: torch.Tensor, step: int | torch.Tensor, count: int) -> torch.Tensor:
     """Uniform numbers in (0, 1), (N, count) f64.
 
     Args:
-        seed: of each row, (N,) int64. step: any number below 2^32; each has numbers of its own.
+        seed: of each row, (N,) int64. step: any number below 2^32, or (); each has numbers of its own.
     """
     place = torch.arange(count, device=seed.device) + (step << 20)
     key = _mixed(seed * _GAMMA + 1)[:, None] + place * _GAMMA
@@ -28,7 +28,7 @@ def uniforms(seed: torch.Tensor, step: int, count: int) -> torch.Tensor:
     return (bits.to(torch.float64) + 0.5) * 2.0**-53
 
 
-def normals(seed: torch.Tensor, step: int, count: int) -> torch.Tensor:
+def normals(seed: torch.Tensor, step: int | torch.Tensor, count: int) -> torch.Tensor:
     """Standard normal numbers, (N, count) f64; see :func:`uniforms`, whose numbers of that step they use."""
     half = -(-count // 2)
     u = uniforms(seed, step, 2 * half)

@@ -6,17 +6,18 @@ import torch
 from reference.hands import hand_model
 from scipy.spatial.transform import Rotation
 
+from lgrasp.differentiable.culling import Culling
 from lgrasp.differentiable.distance import DistanceGrids
 from lgrasp.differentiable.kinematics import BodyKinematics
 from lgrasp.differentiable.penetration import PenetrationSums
-from lgrasp.differentiable.solids import RUN, HandSolids, Solid, hand_solids, object_solid
+from lgrasp.differentiable.solids import RUN, HandPoints, PointSolid, hand_solids, object_solid
 from lgrasp.object.find import find_object
 from lgrasp.object.model import preprocess_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.sdf import SdfGrid
 
 
-def ball(radius: float, points: int, cell: float = 0.001) -> Solid:
+def ball(radius: float, points: int, cell: float = 0.001) -> PointSolid:
     """A ball about the origin."""
     nodes = int(np.ceil(radius / cell)) + 3
     at = cell * (np.indices((2 * nodes + 1,) * 3) - nodes)
@@ -27,22 +28,22 @@ def ball(radius: float, points: int, cell: float = 0.001) -> Solid:
     d = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
     p = (radius * d).astype(np.float32)
     whole = np.array([0, 0, 0, radius], np.float32)
-    return Solid(p, np.tile(whole, (points // RUN, 1)), whole, grid)
+    return PointSolid(p, np.tile(whole, (points // RUN, 1)), whole, grid)
 
 
 @pytest.fixture(scope="module")
-def hand() -> HandSolids:
+def hand() -> HandPoints:
     return hand_solids(hand_model("shipped"), 1024)
 
 
 @pytest.fixture(scope="module")
-def mug() -> Solid:
+def mug() -> PointSolid:
     params = ObjectParams(sdf_cells=32**3, obstacle_count=1024, contact_count=256)
     return object_solid(preprocess_object(find_object("mug"), params=params), 512)
 
 
 @pytest.fixture(scope="module")
-def scene(hand, mug) -> tuple[list[Solid], np.ndarray, np.ndarray, np.ndarray]:
+def scene(hand, mug) -> tuple[list[PointSolid], np.ndarray, np.ndarray, np.ndarray]:
     """The hand and a mug: solids, frames, pairs, terms (hand in mug, mug in hand, hand in itself)."""
     links = len(hand.solids)
     frame = np.append(hand.body, 17)
@@ -125,6 +126,27 @@ def test_rows_do_not_depend_on_their_neighbours(scene):
         alone, own = sums.slopes(R[row : row + 1], t[row : row + 1])
         assert torch.equal(alone[0], together[row])
         assert torch.equal(own[0], slopes[row])
+
+
+def test_fixed_room_gives_the_same_and_tells_when_it_lacks(scene):
+    """Shapes that do not depend on the data: bit by bit the same; too little room is told and made good."""
+    sums = PenetrationSums(*scene, 3)
+    R, t = poses(10, 3, torch.float32)
+    expected = sums.slopes(R, t)
+    sums.culling = Culling((40, 2, 100, 20, 2, 1), "cpu")
+    sums.culling.fix(10)
+    rounds = 1
+    found = sums.slopes(R, t)
+    assert sums.culling.lacking(10)
+    while True:
+        found = sums.slopes(R, t)
+        if not sums.culling.lacking(10):
+            break
+        rounds += 1
+    assert rounds <= 6  # at most one for each stage
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+    sums.culling.free()
+    assert all(torch.equal(a, b) for a, b in zip(sums.slopes(R, t), expected, strict=True))
 
 
 def test_solids_that_are_apart_add_nothing(scene):

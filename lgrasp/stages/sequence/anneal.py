@@ -5,10 +5,12 @@ from typing import NamedTuple, Protocol
 
 import torch
 
+from lgrasp.differentiable.culling import Culling
 from lgrasp.differentiable.streams import uniforms
 from lgrasp.stages.sequence.anneal_params import OptimiserParams
+from lgrasp.stages.sequence.anneal_replay import replayed
 
-__all__ = ["Annealing", "Chain", "Proposals", "accepted", "run_chain", "step_length", "temperature"]
+__all__ = ["Annealing", "Chain", "Proposals", "accepted", "run_chain", "step_lengths", "temperatures"]
 
 _DRAWS = 5  # uniform numbers of a row and step: acceptance, two switches, two contact points
 
@@ -20,10 +22,11 @@ class Chain(NamedTuple):
     contact: torch.Tensor  # (N, 2) int64 contact point on each side
     terms: torch.Tensor  # (N, T) energies
     gradient: torch.Tensor  # (N, G) of the weighted sum of energies
+    memory: torch.Tensor  # (N, G) what the last proposal left behind, accepted or not
 
 
 class Proposals(Protocol):
-    """How a chain goes on."""
+    """How a chain goes on. Steps are tensors, so that one can be recorded and replayed: () int64."""
 
     def evaluate(
         self, x: torch.Tensor, contact: torch.Tensor, weights: torch.Tensor, /
@@ -31,26 +34,28 @@ class Proposals(Protocol):
         """Energies (N, T) and the gradient (N, G) of their weighted sum at x (N, D)."""
         ...
 
-    def propose(self, step: int, chain: Chain) -> torch.Tensor:
-        """Coordinates (N, D) to go to."""
+    def propose(self, step: torch.Tensor, chain: Chain) -> tuple[torch.Tensor, torch.Tensor]:
+        """Coordinates (N, D) to go to, and the memory (N, G) that this leaves."""
         ...
 
-    def log_ratio(self, step: int, chain: Chain, proposed: Chain) -> torch.Tensor | float:
+    def log_ratio(self, step: torch.Tensor, chain: Chain, proposed: Chain) -> torch.Tensor | float:
         """Logarithm of the density of proposing the way back over that of proposing this way, (N,)."""
         ...
 
-    def temperature(self, step: int, /) -> float:
-        """Temperature of a step."""
+    def temperature(self, step: torch.Tensor, /) -> torch.Tensor | float:
+        """Temperature of a step, ()."""
         ...
 
 
-def step_length(params: OptimiserParams, step: int) -> float:
-    """Length of a step of each coordinate [m, rad or 1]."""
+def step_lengths(params: OptimiserParams, device: str | torch.device) -> torch.Tensor:
+    """Length of each step of a coordinate [m, rad or 1], (S,) f64."""
+    step = torch.arange(params.iterations, dtype=torch.float64, device=device)
     return params.step * params.step_decay ** (step / params.step_period)
 
 
-def temperature(params: OptimiserParams, step: int) -> float:
-    """Temperature of a step."""
+def temperatures(params: OptimiserParams, device: str | torch.device) -> torch.Tensor:
+    """Temperature of each step, (S,) f64."""
+    step = torch.arange(params.iterations, dtype=torch.float64, device=device)
     return params.temperature * params.temperature_decay ** (step / params.temperature_period)
 
 
@@ -67,6 +72,7 @@ def run_chain(
     weights: torch.Tensor,
     *,
     switch: float,
+    culling: Culling | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Chain:
     """Run N chains; every row depends on its own start, seed and energies alone.
@@ -75,18 +81,29 @@ def run_chain(
         x: (N, D) starts. counts: (N, 2) contact points of each side; one of each is drawn, and drawn anew with
             probability ``switch`` in each step. seed: (N,) int64.
         weights: (S, T) of the energies in each of S steps. Energies of the state are weighed anew in each step.
-        progress: called with the number of the step that is done.
+        culling: of the energies; with it steps on a GPU are recorded once and replayed.
+        progress: called with the number of steps done.
     """
-    first = uniforms(seed, len(weights), 2)
-    chain = Chain(x, (first * counts).to(torch.int64), *proposals.evaluate(x, (first * counts).long(), weights[0]))
-    for k, w in enumerate(weights.unbind(0)):
-        u = uniforms(seed, k, _DRAWS)
+
+    def advance(step: torch.Tensor, chain: Chain) -> Chain:
+        w = weights.index_select(0, step[None])[0]
+        u = uniforms(seed, step, _DRAWS)
         contact = torch.where(u[:, 1:3] < switch, (u[:, 3:] * counts).to(torch.int64), chain.contact)
-        x = proposals.propose(k, chain)
-        proposed = Chain(x, contact, *proposals.evaluate(x, contact, w))
-        fall = ((chain.terms - proposed.terms) * w).sum(1) / proposals.temperature(k)
-        go = accepted(fall + proposals.log_ratio(k, chain, proposed), u[:, 0])[:, None]
-        chain = Chain(*(torch.where(go, new, old) for new, old in zip(proposed, chain, strict=True)))
+        there, memory = proposals.propose(step, chain)
+        terms, gradient = proposals.evaluate(there, contact, w)
+        proposed = Chain(there, contact, terms, gradient, memory)
+        fall = ((chain.terms - proposed.terms) * w).sum(1) / proposals.temperature(step)
+        go = accepted(fall + proposals.log_ratio(step, chain, proposed), u[:, 0])[:, None]
+        kept = Chain._make(torch.where(go, new, old) for new, old in zip(proposed, chain, strict=True))
+        return kept._replace(memory=memory)
+
+    contact = (uniforms(seed, len(weights), 2) * counts).to(torch.int64)
+    terms, gradient = proposals.evaluate(x, contact, weights[0])
+    chain = Chain(x, contact, terms, gradient, torch.zeros_like(gradient))
+    if x.is_cuda and culling is not None:
+        return Chain._make(replayed(lambda k, s: advance(k, Chain._make(s)), chain, len(weights), culling, progress))
+    for k in range(len(weights)):
+        chain = advance(torch.tensor(k, device=x.device), chain)
         if progress is not None:
             progress(k + 1)
     return chain
@@ -110,18 +127,19 @@ class Annealing:
         free: torch.Tensor,
         params: OptimiserParams,
     ) -> None:
-        self.evaluate, self._retract, self._free, self._params = evaluate, retract, free, params
-        self._square: torch.Tensor | None = None
+        self.evaluate, self._retract, self._free = evaluate, retract, free
+        self._memory = params.smoothing
+        self._lengths, self._temperatures = step_lengths(params, free.device), temperatures(params, free.device)
 
-    def propose(self, step: int, chain: Chain) -> torch.Tensor:
-        p, g = self._params, chain.gradient
-        old = torch.zeros_like(g) if self._square is None else self._square
-        self._square = p.smoothing * old + (1 - p.smoothing) * g * g
-        root = (self._square / (1 - p.smoothing ** (step + 1))).sqrt() + 1e-8
-        return self._retract(torch.where(self._free, chain.x - step_length(p, step) * g / root, chain.x))
+    def propose(self, step: torch.Tensor, chain: Chain) -> tuple[torch.Tensor, torch.Tensor]:
+        g, share = chain.gradient, self._memory
+        square = share * chain.memory + (1 - share) * g * g
+        root = (square / (1 - share ** (step + 1))).sqrt() + 1e-8
+        there = chain.x - self._lengths.take(step) * g / root
+        return self._retract(torch.where(self._free, there, chain.x)), square
 
-    def log_ratio(self, step: int, chain: Chain, proposed: Chain) -> float:
+    def log_ratio(self, step: torch.Tensor, chain: Chain, proposed: Chain) -> float:
         return 0.0  # the published rule leaves it out
 
-    def temperature(self, step: int) -> float:
-        return temperature(self._params, step)
+    def temperature(self, step: torch.Tensor) -> torch.Tensor:
+        return self._temperatures.take(step)

@@ -17,7 +17,7 @@ from lgrasp.differentiable.streams import uniforms
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.spaces import Space
 from lgrasp.object.model import ObjectModel
-from lgrasp.stages.sequence.anneal import Annealing, Proposals, run_chain, step_length, temperature
+from lgrasp.stages.sequence.anneal import Annealing, Proposals, run_chain, step_lengths, temperatures
 from lgrasp.stages.sequence.anneal_contacts import touching_points
 from lgrasp.stages.sequence.anneal_params import OptimiserParams
 from lgrasp.stages.sequence.anneal_start import start_poses
@@ -26,6 +26,8 @@ from lgrasp.stages.sequence.energy_problem import GraspProblem, Sides
 from lgrasp.stages.sequence.mala import Langevin
 
 __all__ = ["Optimised", "optimise"]
+
+_CPU_ROWS, _GPU_ROWS = 256, 512  # worked on at once; fewer leave a GPU half idle
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def optimise(
         q: posture to start from, (H, K) [rad or m]. free: joints that may move, (H, K) bool.
         held: poses of the objects held, internal frames: x y z [m], qx qy qz qw, (H, n - 1, 7).
         seed: of each row, (H,) integers.
-        rows: how many are worked on at once; default: 256, and 512 on a GPU, which so few leave half idle.
+        rows: how many are worked on at once; no result on a CPU depends on it.
         progress: called with steps done and steps in all.
     """
     energy = GraspEnergy(
@@ -84,26 +86,27 @@ def optimise(
         device=device,
     )
     sides = Sides(views, spaces, device=device)
-    rows = rows or (256 if device == "cpu" else 512)
+    rows = rows or (_CPU_ROWS if device == "cpu" else _GPU_ROWS)
     blocks = [np.arange(first, min(first + rows, len(q))) for first in range(0, len(q), rows)]
     parts = []
     for number, block in enumerate(blocks):
         # on a GPU sums depend on the number of rows, so it is always the same there
-        filled = np.resize(block, rows) if device != "cpu" else block
+        filled = block if device == "cpu" else np.resize(block, rows)
+        problem = GraspProblem(
+            energy,
+            sides,
+            torch.as_tensor(space[filled], dtype=torch.int64, device=device),
+            _frames(torch.as_tensor(held[filled], dtype=torch.float32, device=device)),
+        )
 
-        def told(step: int, number: int = number) -> None:
+        def told(step: int, before: int = number * params.iterations) -> None:
             if progress is not None:
-                progress(number * params.iterations + step, len(blocks) * params.iterations)
+                progress(before + step, len(blocks) * params.iterations)
 
-        part = _optimise_block(
+        columns = _optimise_block(
             hand,
             objects,
-            GraspProblem(
-                energy,
-                sides,
-                torch.as_tensor(space[filled], dtype=torch.int64, device=device),
-                _frames(torch.as_tensor(held[filled], dtype=torch.float32, device=device)),
-            ),
+            problem,
             torch.as_tensor(q[filled], dtype=torch.float32, device=device),
             torch.as_tensor(free[filled], device=device),
             torch.as_tensor(seed[filled].astype(np.int64), device=device),
@@ -111,7 +114,7 @@ def optimise(
             method,
             told,
         )
-        parts.append([column[: len(block)].cpu().numpy() for column in part])
+        parts.append([column[: len(block)].cpu().numpy() for column in columns])
     pose, joints, hand_point, object_point, energies = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Optimised(pose, np.where(free, joints, q).astype(np.float32), hand_point, object_point, energies)
 
@@ -141,6 +144,7 @@ def _optimise_block(
         seed,
         torch.as_tensor(_weights(params), dtype=q.dtype, device=q.device),
         switch=params.switch,
+        culling=problem.energy.culling,
         progress=progress,
     )
     q = torch.where(free, chain.x[:, 9:].clamp(problem.energy.lower, problem.energy.upper), q)
@@ -175,12 +179,10 @@ def _proposals(
     # noise as long as the published step; angles are turned by more
     length = with_pose(free.to(problem.energy.lower.dtype) * params.mala_turn, 6)
     length[:, 3:6] *= params.mala_turn
-    cooler = params.mala_temperature / params.temperature
+    lengths = step_lengths(params, seed.device)
+    warmth = temperatures(params, seed.device) * (params.mala_temperature / params.temperature)
 
-    def warmth(step: int) -> float:
-        return temperature(params, step) * cooler
+    def scale(step: torch.Tensor) -> torch.Tensor:
+        return (lengths.take(step) * length) ** 2 / (2 * warmth.take(step))
 
-    def scale(step: int) -> torch.Tensor:
-        return (step_length(params, step) * length) ** 2 / (2 * warmth(step))
-
-    return Langevin(problem.by_motion, problem.moved, seed, scale, warmth)
+    return Langevin(problem.by_motion, problem.moved, seed, scale, warmth.take)

@@ -72,6 +72,7 @@ class GraspEnergy:
             dtype=dtype,
             device=device,
         )
+        self.culling = self._sums.culling
         grid = SdfGrid(new.sdf, new.sdf_origin, new.sdf_cell)
         self._grid = DistanceGrids([grid], dtype=dtype, device=device)
         self.normals = SurfaceNormals(grid, dtype=dtype, device=device)

@@ -32,22 +32,20 @@ class Langevin:
         evaluate: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
         moved: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
         seed: torch.Tensor,
-        scale: Callable[[int], torch.Tensor],
-        temperature: Callable[[int], float],
+        scale: Callable[[torch.Tensor], torch.Tensor],
+        temperature: Callable[[torch.Tensor], torch.Tensor | float],
     ) -> None:
         self.evaluate, self.temperature = evaluate, temperature
         self._moved, self._seed, self._scale = moved, seed, scale
-        self._motion: torch.Tensor | None = None
 
-    def propose(self, step: int, chain: Chain) -> torch.Tensor:
+    def propose(self, step: torch.Tensor, chain: Chain) -> tuple[torch.Tensor, torch.Tensor]:
         g, scale = chain.gradient, self._scale(step)
         noise = normals(self._seed, step + _NOISE, g.shape[1]).to(g.dtype)
-        self._motion = -scale * g + (2 * self.temperature(step) * scale).sqrt() * noise
-        return self._moved(chain.x, self._motion)
+        motion = -scale * g + (2 * self.temperature(step) * scale).sqrt() * noise
+        return self._moved(chain.x, motion), motion
 
-    def log_ratio(self, step: int, chain: Chain, proposed: Chain) -> torch.Tensor:
-        assert self._motion is not None
-        scale, d = self._scale(step), self._motion
+    def log_ratio(self, step: torch.Tensor, chain: Chain, proposed: Chain) -> torch.Tensor:
+        scale, d = self._scale(step), proposed.memory
         there, back = d + scale * chain.gradient, -d + scale * proposed.gradient
         free = scale > 0
         difference = torch.where(free, (there * there - back * back) / torch.where(free, scale, 1), 0)

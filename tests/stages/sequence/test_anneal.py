@@ -23,14 +23,14 @@ class Levels:
     def evaluate(self, x, contact, weights, /):
         return LEVELS[contact[:, :1]], torch.zeros(len(x), 1)
 
-    def propose(self, step: int, chain: Chain) -> torch.Tensor:
-        return chain.x + 1
+    def propose(self, step, chain: Chain) -> tuple[torch.Tensor, torch.Tensor]:
+        return chain.x + 1, chain.memory
 
-    def log_ratio(self, step: int, chain: Chain, proposed: Chain) -> float:
+    def log_ratio(self, step, chain: Chain, proposed: Chain) -> float:
         self.seen.append((chain.contact[:, 0], proposed.contact[:, 0]))
         return 0.0
 
-    def temperature(self, step: int) -> float:
+    def temperature(self, step) -> float:
         return self._temperature
 
 
@@ -91,31 +91,33 @@ def test_old_energy_is_weighed_with_the_new_weights():
     assert (halves[1] == 1).all()
 
 
-def chain_at(x: torch.Tensor, gradient: torch.Tensor) -> Chain:
-    return Chain(x, torch.zeros(len(x), 2, dtype=torch.int64), torch.zeros(len(x), 6), gradient)
+def chain_at(x: torch.Tensor, gradient: torch.Tensor, memory: torch.Tensor | None = None) -> Chain:
+    memory = torch.zeros_like(gradient) if memory is None else memory
+    return Chain(x, torch.zeros(len(x), 2, dtype=torch.int64), torch.zeros(len(x), 6), gradient, memory)
+
+
+def annealing(free: torch.Tensor) -> Annealing:
+    return Annealing(lambda *_: (torch.zeros(0), torch.zeros(0)), lambda x: x, free, OptimiserParams())
 
 
 def test_steps_are_as_long_as_the_schedule_and_leave_the_rest_alone():
-    params = OptimiserParams()
-    free = torch.tensor([[True, True, True, False]])
-    annealing = Annealing(lambda *_: (torch.zeros(0), torch.zeros(0)), lambda x: x, free, params)
+    chain = annealing(torch.tensor([[True, True, True, False]]))
     x, g = torch.zeros(1, 4), torch.tensor([[1e3, -2e-3, 7.0, 5.0]])
-    moved = annealing.propose(0, chain_at(x, g))
+    moved, memory = chain.propose(torch.tensor(0), chain_at(x, g))
     torch.testing.assert_close(moved, torch.tensor([[-0.005, 0.005, -0.005, 0.0]]), rtol=1e-4, atol=0)
     for k in range(1, 100):  # the gradient stays as it is, so its mean square does
-        moved = annealing.propose(k, chain_at(x, g))
+        moved, memory = chain.propose(torch.tensor(k), chain_at(x, g, memory))
     torch.testing.assert_close(moved[0, 0].item(), -0.005 * 0.95 ** (99 / 50), rtol=1e-4, atol=0)
-    assert annealing.temperature(0) == 32
-    assert annealing.temperature(60) == pytest.approx(32 * 0.95**2)
+    assert chain.temperature(torch.tensor(0)).item() == 32
+    assert chain.temperature(torch.tensor(60)).item() == pytest.approx(32 * 0.95**2)
 
 
 def test_running_mean_square_is_that_of_the_row():
     """Gradients 3 then 4 with memory 0.98: the root of (0.98 * 0.02 * 9 + 0.02 * 16) / (1 - 0.98^2)."""
-    annealing = Annealing(
-        lambda *_: (torch.zeros(0), torch.zeros(0)), lambda x: x, torch.ones(2, 1, dtype=torch.bool), OptimiserParams()
-    )
-    annealing.propose(0, chain_at(torch.zeros(2, 1), torch.tensor([[3.0], [100.0]])))
-    moved = annealing.propose(1, chain_at(torch.zeros(2, 1), torch.tensor([[4.0], [100.0]])))
+    chain = annealing(torch.ones(2, 1, dtype=torch.bool))
+    _, memory = chain.propose(torch.tensor(0), chain_at(torch.zeros(2, 1), torch.tensor([[3.0], [100.0]])))
+    last = chain_at(torch.zeros(2, 1), torch.tensor([[4.0], [100.0]]), memory)
+    moved, _ = chain.propose(torch.tensor(1), last)
     root = np.sqrt((0.98 * 0.02 * 9 + 0.02 * 16) / (1 - 0.98**2))
     length = 0.005 * 0.95 ** (1 / 50)
     np.testing.assert_allclose(moved[:, 0], [-length * 4 / root, -length], rtol=1e-5)
