@@ -16,7 +16,7 @@ TRUST = 0.02
 
 _LEAST_POINTS, _MOST_POINTS = 32, 8192
 _EXTENT = (0.005, 2.0)  # [m]
-_NEIGHBOURS, _WIDE = 24, 128
+_NEIGHBOURS, _LEAST_WIDE, _WIDE = 24, 48, 128
 _CLEAN = 0.001  # [m]
 _PLANES, _EDGE = 12, 0.5  # points that tell a distance; cosine of faces that meet in an edge
 _PASSES, _KEPT = 4, 0.95  # over noisy clouds
@@ -95,15 +95,19 @@ def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud"
 def _smoothed(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points moved onto the surface through their neighbours that face the same way, and its normals.
 
-    A cloud whose points lie more than a millimetre off the surface through a wide neighbourhood is taken for noisy: it
+    A cloud whose points lie a millimetre or more off the surface through a wide neighbourhood is taken for noisy: it
     is smoothed over such neighbourhoods again and again, and what stays apart, or is sparse, is dropped.
     """
     wide = min(_WIDE, len(points))
-    near = cKDTree(points).query(points, wide, workers=-1)[1]
-    height, normal = _fit(points, normals, near)
-    if float(np.median(np.abs(height))) < _CLEAN:
+    gap, near = cKDTree(points).query(points, wide, workers=-1)
+    noise = 1.5 * float(np.median(np.abs(_fit(points, normals, near)[0])))
+    if noise < _CLEAN:
         height, normal = _fit(points, normals, near[:, :_NEIGHBOURS])
         return points + height[:, None] * normal, normal
+    # neighbourhoods that reach four times the noise
+    wide = int(np.clip((np.median(gap, axis=0) < 4 * noise).sum(), min(_LEAST_WIDE, wide), wide))
+    near = near[:, :wide]
+    height, normal = _fit(points, normals, near)
     for _ in range(_PASSES):
         points, normals = points + height[:, None] * normal, normal
         near = cKDTree(points).query(points, wide, workers=-1)[1]

@@ -20,12 +20,12 @@ from lgrasp.refine.starts import GOLDEN_ANGLE, palm_axis, start_poses
 from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface
 from lgrasp.refine.target import Target
 
-__all__ = ["PlanParams", "Planned", "Planner", "object_pose", "table_pose"]
+__all__ = ["PlanParams", "Planned", "Planner", "cloud_params", "object_pose", "table_pose"]
 
 _CPU_STARTS, _GPU_STARTS = 40, 1000  # planned at a time
-_COLLIDES = 1.0e-3  # [m]
+_COLLIDES, _CLOUD_DEPTH = 1.0e-3, 4.0e-3  # [m]
 _PLAN_BOUNDS = GraspBounds(
-    penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=20.0
+    penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=40.0
 )
 _COARSE = GraspBounds(penetration=0.01, self_margin=0.0, gap=0.012, angle=60.0, fold=90.0, balance=10.0)
 
@@ -36,9 +36,9 @@ class PlanParams(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     rolls: int = Field(
-        default=8, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
+        default=12, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
     )
-    finalists: int = Field(default=2, ge=1, le=64, description="Of these go on after the first outer steps.")
+    finalists: int = Field(default=4, ge=1, le=64, description="Of these go on after the first outer steps.")
     opening: int = Field(default=5, ge=1, le=100, description="Outer steps of all of them.")
     clearance: float = Field(
         default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
@@ -48,7 +48,7 @@ class PlanParams(BaseModel):
     )
     other: float = Field(default=OTHER, ge=0, le=100, description="Weight of the other palmar points.")
     search: LocalSearch = Field(
-        default=LocalSearch(shift=0.002, turn=0.02, bend=0.04, reach=0.15, reach_end=0.1, soft=0.01),
+        default=LocalSearch(shift=0.002, turn=0.02, bend=0.04, reach=0.15, reach_end=0.1, soft=0.01, force=0.3),
         description="The local search.",
     )
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
@@ -56,6 +56,12 @@ class PlanParams(BaseModel):
     def weights(self) -> dict[str, float]:
         """Arguments of :func:`hand_surface`."""
         return {"distal": self.distal, "other": self.other}
+
+
+def cloud_params(params: PlanParams) -> PlanParams:
+    """The parameters for an object that is a point cloud, whose points lie off its surface by their noise."""
+    bounds = params.bounds.model_copy(update={"penetration": max(params.bounds.penetration, _CLOUD_DEPTH)})
+    return params.model_copy(update={"bounds": bounds})
 
 
 class Planned(NamedTuple):

@@ -28,7 +28,7 @@ from lgrasp.object.params import ObjectParams
 from lgrasp.physics import Scene, find_protocol, scene_of, verdicts
 from lgrasp.refine.cloud import cloud_object
 from lgrasp.refine.palmar import seen_palmar
-from lgrasp.refine.planning import Planner, PlanParams, table_pose
+from lgrasp.refine.planning import Planner, PlanParams, cloud_params, table_pose
 from lgrasp.refine.refiner import Pose, Refiner
 from lgrasp.refine.starts import STAND_OFF
 from lgrasp.refine.surface import hand_surface
@@ -158,7 +158,8 @@ def bench_hand(
         for noise, total in totals.items():
             target = case.model if noise is None else _cloud(case.model, noise)
             what = "mesh" if noise is None else f"cloud, {1e3 * noise:g} mm"
-            planner = Planner(arrays, target, stand_off, PlanParams(), palmar)
+            params = PlanParams() if noise is None else cloud_params(PlanParams())
+            planner = Planner(arrays, target, stand_off, params, palmar)
             begin = time.perf_counter()
             grasps, counts = planner.run(starts)
             seconds = time.perf_counter() - begin

@@ -20,7 +20,7 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.refine.cloud import cloud_object
 from lgrasp.refine.palmar import seen_palmar
-from lgrasp.refine.planning import Planner, PlanParams
+from lgrasp.refine.planning import Planner, PlanParams, cloud_params
 from lgrasp.refine.starts import STAND_OFF
 from lgrasp.scenes.cloud import Cloud
 
@@ -29,7 +29,6 @@ __all__ = ["PlanJob", "PlanOutcome", "plan_grasps"]
 
 _REACH = 0.3  # [m] what is farther from the target than this is no hand's business
 _LEAST_AROUND = 50
-_CLOUD_DEPTH = 0.004  # [m] points of a cloud lie so far off
 
 
 @dataclass(frozen=True)
@@ -93,10 +92,7 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
         raise OutputError(f"{path} exists; choose another folder with --out, or --force to replace it")
     clean_folder(path)
     palmar = seen_palmar(source, hand)
-    params = job.params
-    if job.cloud is not None:
-        loose = params.bounds.model_copy(update={"penetration": max(params.bounds.penetration, _CLOUD_DEPTH)})
-        params = params.model_copy(update={"bounds": loose})
+    params = job.params if job.cloud is None else cloud_params(job.params)
     planner = Planner(upload_hand(hand, device.alias), model, stand_off, params, palmar, around)
     begin = time.perf_counter()
     grasps, counts = planner.run(job.starts, progress)
