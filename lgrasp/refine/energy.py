@@ -106,7 +106,7 @@ def intrusion_energies(
         object_distance: (N, S, k) [m]. link_distance: (N, Q, k) [m].
     """
     of_object = barrier(object_distance / params.margin).sum((1, 2))
-    of_links = barrier(link_distance / params.self_margin).sum((1, 2))
+    of_links = barrier(link_distance / params.link_margin).sum((1, 2))
     return params.barrier * of_object, params.barrier * of_links
 
 

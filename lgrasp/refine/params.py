@@ -36,7 +36,7 @@ class LocalSearch(BaseModel):
     )
     limits: float = Field(default=0.01, ge=0, le=1e6, description="Weight of the barrier at the joint limits.")
     margin: float = Field(default=0.003, gt=0, le=0.05, description="Distance below which the barrier acts.")
-    self_margin: float = Field(default=0.001, gt=0, le=0.05, description="The same between links.")
+    link_margin: float = Field(default=0.001, gt=0, le=0.05, description="The same between links.")
     contacts: int = Field(default=4, ge=2, le=16, description="Contacts that the net wrench is made of.")
     nearest: float = Field(
         default=0.2, gt=0, le=1, description="Share of the palmar points, nearest first, they come from."

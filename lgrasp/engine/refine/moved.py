@@ -60,7 +60,7 @@ def move_rows(
         stored: rows that are not replaced stay as they are, metrics and contacts included; else all is computed.
         progress: called with rows done.
     """
-    refiner = Refiner(hand.model, obj, params.search, device=hand.device)
+    refiner = Refiner(hand.model, obj, params, device=hand.device)
     arrays = upload_object(obj, hand.device)
     tree = hand.model.tree
     limits = np.asarray(rows.q)[:, : hand.model.dofs]
@@ -73,9 +73,9 @@ def move_rows(
         refined = refiner(*given)
         index = np.arange(len(rows))[part]
         q = given.q.maximum(refiner.lower).minimum(refiner.upper).cpu().numpy()
-        old, old_outcome = check_grasps(hand, arrays, object_pose(given), q, params.bounds, index=index)
+        old, old_outcome = check_grasps(hand, arrays, object_pose(given), q, params, index=index)
         new, new_outcome = check_grasps(
-            hand, arrays, object_pose(refined.pose), refined.pose.q.cpu().numpy(), params.bounds, index=index
+            hand, arrays, object_pose(refined.pose), refined.pose.q.cpu().numpy(), params, index=index
         )
         good, was = new_outcome == 0, old_outcome == 0
         lower = new.metrics["disturbance"] < old.metrics["disturbance"]

@@ -16,8 +16,6 @@ def refine_params(*, outer: int | None = None, inner: int | None = None, coarse:
     Raises:
         ConfigError: a value out of range.
     """
-    base = RefineParams()
-    search = COARSE if coarse else base.search
     changes = {name: value for name, value in (("outer", outer), ("inner", inner)) if value is not None}
-    checked = parse_model(LocalSearch, search.model_dump() | changes, "refine")
-    return base.model_copy(update={"search": checked})
+    search = COARSE.model_dump() if coarse else {}
+    return parse_model(RefineParams, search | changes, "refine")

@@ -1,21 +1,18 @@
 """Parameters of the refine stage."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from lgrasp.refine.params import GraspBounds, LocalSearch
 
 __all__ = ["RefineParams"]
 
 
-class RefineParams(BaseModel):
-    """How finished grasps are moved, and what the moved ones must satisfy: the bounds of filter."""
+class RefineParams(LocalSearch, GraspBounds):
+    """How finished grasps are moved, in small steps and drawn to balance, and the bounds of filter for moved ones."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    search: LocalSearch = Field(
-        default=LocalSearch(outer=8, shift=0.0005, turn=0.005, bend=0.01, reach=0.02, reach_end=0.02, force=0.3),
-        description="The local search.",
-    )
-    bounds: GraspBounds = Field(
-        default=GraspBounds(), description="What a refined grasp must satisfy to take the place of its row."
-    )
+    outer: int = Field(default=8, ge=0, le=1000, description="Outer steps: correspondences are matched anew.")
+    shift: float = Field(default=0.0005, gt=0, le=0.1, description="Largest translation of the hand in one step.")
+    turn: float = Field(default=0.005, gt=0, le=1, description="Largest rotation of the hand in one step.")
+    bend: float = Field(default=0.01, gt=0, le=1, description="Largest motion of a joint in one step.")
+    reach_end: float = Field(default=0.02, gt=0, le=1, description="As reach, in the last outer step.")
+    force: float = Field(default=0.3, ge=0, le=1e6, description="Weight of the net wrench of four contacts.")

@@ -36,11 +36,9 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
     # torch is heavy to load
     from lgrasp.refine.planning import object_pose, table_pose
 
-    refined = _refiner(params.search, context)(*table_pose(inputs, context.device)).pose
+    refined = _refiner(params, context)(*table_pose(inputs, context.device)).pose
     q = refined.q.cpu().numpy()
-    table, outcome = check_grasps(
-        context.hand, context.object, object_pose(refined), q, params.bounds, index=inputs.index
-    )
+    table, outcome = check_grasps(context.hand, context.object, object_pose(refined), q, params, index=inputs.index)
     passed = outcome == 0
     better = passed & (table.metrics["disturbance"] < inputs.metrics["disturbance"])
     counts = {"tried": len(inputs), "passed": int(passed.sum()), "replaced": int(better.sum())}

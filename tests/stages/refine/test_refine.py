@@ -27,7 +27,7 @@ def test_no_row_is_lost_and_some_are_replaced(refined):
 
 
 def test_replaced_rows_resist_better_within_the_bounds(refined):
-    before, after, bounds = refined.before.metrics, refined.after.metrics, RefineParams().bounds
+    before, after, bounds = refined.before.metrics, refined.after.metrics, RefineParams()
     assert (after["disturbance"][refined.changed] < before["disturbance"][refined.changed]).all()
     for name, most in (("penetration", bounds.penetration), ("gap", bounds.gap), ("gswo", bounds.balance)):
         assert after[name].max() <= most + 1e-6, name
