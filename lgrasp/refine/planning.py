@@ -22,7 +22,7 @@ from lgrasp.refine.target import Target
 
 __all__ = ["PlanParams", "Planned", "Planner", "cloud_params", "object_pose", "table_pose"]
 
-_CPU_STARTS, _GPU_STARTS = 40, 1000  # planned at a time
+_CPU_STARTS, _GPU_STARTS = 40, 800  # planned at a time
 _COLLIDES, _CLOUD_DEPTH = 1.0e-3, 4.0e-3  # [m]
 _PLAN_BOUNDS = GraspBounds(
     penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=40.0

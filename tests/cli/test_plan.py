@@ -1,6 +1,7 @@
 """``lgrasp plan``."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -73,3 +74,13 @@ def test_bad_input(cli, arguments, said):
 def test_bad_viewpoint_and_label(cli, cloud):
     assert "three numbers" in cli("plan", "--cloud", cloud, "--viewpoint", "1,2").error()
     assert "its labels are 0" in cli("plan", "--cloud", cloud, "--label", 7).error()
+
+
+def test_interrupted(process, tmp_path):
+    """Ctrl-C ends with 130 and leaves no half file."""
+    out = tmp_path / "out"
+    with process("plan", "--object", "sphere", "--starts", 2000, "--device", "cpu", "--out", out) as run:
+        assert "starts" in run.stderr.readline()
+        run.send_signal(signal.SIGINT)
+        assert run.wait(20) == 130
+    assert not list(out.glob("*"))
