@@ -31,6 +31,9 @@ def bench_sequence(
     policy: Annotated[str, typer.Option(help="uniform, as published, or lookahead.")] = "uniform",
     physics: Annotated[str, typer.Option(help="Protocol: seq6 (friction 2.0, as published) or seq6_mu06.")] = "seq6",
     scale: Annotated[str, typer.Option(help="Factor to metres, or range of the longest side [m].")] = "0.06:0.10",
+    pipeline: Annotated[
+        str, typer.Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.")
+    ] = "sequence",
     seed: Annotated[int, typer.Option(min=0, help="Draws the sequences and the grasps.")] = 0,
     device: Device = "auto",
     workers: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
@@ -60,10 +63,10 @@ def bench_sequence(
     drawn = object_sequences(pool, sets, seed)
     results: dict[str, Any] = {"published": PUBLISHED, "sequences": drawn, "physics": physics, "methods": {}}
     for place, method in enumerate(name.strip() for name in methods.split(",")):
-        chosen = choose_pipeline("sequence", seed)
+        chosen = choose_pipeline(pipeline, seed)
         changes: dict[str, Any] = {"method": method, "policy": policy, "width": baseline_width if place else width}
         if iterations:
-            changes["optimiser"] = {"iterations": iterations}
+            changes["optimiser"] = chosen.params("sequence").optimiser.model_dump() | {"iterations": iterations}
         jobs = [
             SequenceJob(
                 hand=hand,

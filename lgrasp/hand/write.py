@@ -61,6 +61,8 @@ def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
         lines += ["palm: {}"]
     lines += ["", "# Numbers of fingers that touch, drawn evenly; [] leaves it to the pipeline (3, 4)."]
     lines += [f"contacts: {_plain(list(spec.contacts))}"]
+    lines += ["", "# Distance from base to surface at which lgrasp plan begins [m]; null: as far as for most hands."]
+    lines += [f"stand_off: {_plain(spec.stand_off)}"]
     box = spec.canonical_box
     lines += [
         "",
