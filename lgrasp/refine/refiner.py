@@ -19,14 +19,13 @@ from lgrasp.refine.energy import (
 )
 from lgrasp.refine.links import LinkSolids
 from lgrasp.refine.params import LocalSearch
+from lgrasp.refine.steps import Gradient, Moments, clipped
 from lgrasp.refine.surface import HandSurface, hand_surface
 from lgrasp.refine.target import Target
 
 __all__ = ["Pose", "Refined", "Refiner"]
 
-_TINY = 1e-12
 _ADVANCES = 30
-_SECOND = 0.99  # decay of adam's second moment
 
 
 class Pose(NamedTuple):
@@ -46,14 +45,6 @@ class Refined(NamedTuple):
     pose: Pose
     energies: Energies
     """At ``pose``, matched anew, every point within the first reach pulling."""
-
-
-class _Gradient(NamedTuple):
-    """Of the total energy by motions of the base about the hand's middle and by the joints."""
-
-    shift: torch.Tensor  # (N, 3)
-    turn: torch.Tensor  # (N, 3)
-    bend: torch.Tensor  # (N, K)
 
 
 class Refiner(nn.Module):
@@ -117,7 +108,7 @@ class Refiner(nn.Module):
         p = self.params
         outer = p.outer if outer is None else outer
         pose = Pose(R.detach(), t.detach(), self._clamped(q.detach()))
-        moments = _Moments(pose)
+        moments = Moments(pose.t, pose.q)
         whole = max(outer, p.outer)
         for i in range(first, outer):
             matches = self.match(*pose, reach=p.reach * (p.reach_end / p.reach) ** (i / whole))
@@ -142,7 +133,7 @@ class Refiner(nn.Module):
         pose = Pose(R, t, q)
         for _ in range(steps):
             g = self._gradient(pose, matches, graph=True)
-            pose = self._moved(pose, _clipped(g, self.params))
+            pose = self._moved(pose, clipped(g, self.params))
         return pose
 
     def energy(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, matches: Matches | None = None) -> Energies:
@@ -230,7 +221,7 @@ class Refiner(nn.Module):
         turned = R_block.mT
         return self._points @ turned + t_block[:, :, None], self._normals @ turned
 
-    def _gradient(self, pose: Pose, matches: Matches, *, graph: bool = False) -> _Gradient:
+    def _gradient(self, pose: Pose, matches: Matches, *, graph: bool = False) -> Gradient:
         R, t, q = pose if graph else (x.detach() for x in pose)
         with torch.enable_grad():
             if graph:
@@ -241,13 +232,13 @@ class Refiner(nn.Module):
             by_R, by_t, by_q = torch.autograd.grad(total, [R, t, q], create_graph=graph)
             arm = t - self.middle(R, t)
             turn = torch.linalg.cross(R, by_R, dim=1).sum(2) + torch.linalg.cross(arm, by_t)
-        return _Gradient(by_t, turn, by_q) if graph else _Gradient(by_t, turn.detach(), by_q)
+        return Gradient(by_t, turn, by_q) if graph else Gradient(by_t, turn.detach(), by_q)
 
     def middle(self, R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
         """Middle of the palmar side of open hands [m], (N, 3): what they are turned about."""
         return t + R @ self._middle
 
-    def _moved(self, pose: Pose, by: _Gradient) -> Pose:
+    def _moved(self, pose: Pose, by: Gradient) -> Pose:
         """The poses after a translation, a rotation about the hand's middle, and a motion of the joints."""
         centre = self.middle(pose.R, pose.t)
         T = so3_exp(by.turn)
@@ -256,42 +247,3 @@ class Refiner(nn.Module):
 
     def _clamped(self, q: torch.Tensor) -> torch.Tensor:
         return q.maximum(self.lower).minimum(self.upper)
-
-
-def _clipped(g: _Gradient, p: LocalSearch) -> _Gradient:
-    """A step down, at most the parameters' sizes, per sample."""
-
-    def down(x: torch.Tensor, size: float) -> torch.Tensor:
-        scaled = x * size
-        return -size * scaled / (1 + (scaled * scaled).sum(-1, keepdim=True)).sqrt()
-
-    return _Gradient(down(g.shift, p.shift), down(g.turn, p.turn), down(g.bend, p.bend))
-
-
-class _Moments:
-    """Running means of gradients, per sample and coordinate."""
-
-    def __init__(self, pose: Pose) -> None:
-        zeros = (torch.zeros_like(pose.t), torch.zeros_like(pose.t), torch.zeros_like(pose.q))
-        self._first, self._second, self._steps = list(zeros), list(zeros), 0
-
-    def step(self, g: _Gradient, p: LocalSearch, size: float) -> _Gradient:
-        """The step down that adam, or sgd with momentum, takes; ``size``: share of the parameters' sizes."""
-        self._steps += 1
-        out = []
-        for i, (x, most) in enumerate(zip(g, (p.shift, p.turn, p.bend), strict=True)):
-            if p.optimizer == "sgd":
-                # clipped per sample, then averaged
-                x = x / x.norm(dim=-1, keepdim=True).clamp_min(1.0)
-                self._first[i] = p.momentum * self._first[i] + (1 - p.momentum) * x
-                out.append(-most * size * self._first[i])
-                continue
-            self._first[i] = p.momentum * self._first[i] + (1 - p.momentum) * x
-            # one scale for the three axes: steps do not depend on the frame
-            square = x * x if i == 2 else (x * x).mean(-1, keepdim=True).expand_as(x)
-            self._second[i] = _SECOND * self._second[i] + (1 - _SECOND) * square
-            mean = self._first[i] / (1 - p.momentum**self._steps)
-            root = (self._second[i] / (1 - _SECOND**self._steps)).sqrt()
-            move = mean / (root + _TINY)
-            out.append(-most * size * move.clamp(-1, 1))
-        return _Gradient(*out)
