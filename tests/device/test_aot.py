@@ -10,7 +10,7 @@ import warp as wp
 from lgrasp.device.runtime import start
 from lgrasp.engine.kernels import import_all, kernel_modules
 
-ARCHS = (75, 80, 90, 100)  # T4 and RTX 20, A100, H100 and H200, B200; the driver compiles the rest from the one below
+ARCHS = (75, 90)  # the oldest, and H100 and H200; the driver compiles the rest from the one below
 
 import_all()
 
