@@ -22,7 +22,7 @@ class _Found(NamedTuple):
 
     key: str | None
     rows: int
-    tried: int  # candidates, when they were all that the shard may try; else 0
+    tried: int  # candidates (or rounds), when they were all that the shard may try; else 0
 
 
 def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
@@ -111,8 +111,9 @@ def _read(path: Path) -> _Found | None:
         with ShardReader(path) as reader:
             config, statistics = reader.header.config, reader.statistics
             key = config.get("run_key") if isinstance(config, dict) else None
-            tried = int(statistics.get("candidates", 0)) if statistics.get("exhausted") else 0
-            # of a file with sequences only the whole ones count
-            return _Found(key, int(statistics.get("sequences", len(reader))), tried)
+            # of a file with sequences only the whole ones count, and rounds are tried
+            rows = int(statistics.get("sequences", len(reader)))
+            effort = statistics.get("rounds" if "sequences" in statistics else "candidates", 0)
+            return _Found(key, rows, int(effort) if statistics.get("exhausted") else 0)
     except (ShardError, ValueError):
         return None

@@ -18,7 +18,7 @@ from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.recording import Recorder
 from lgrasp.engine.records import hand_record, make_scene, mesh_blobs, object_record
-from lgrasp.engine.shard import Execution, Found, ShardResult, make_shard, shard_effort
+from lgrasp.engine.shard import Execution, Found, ShardResult, flat_statistics, make_shard, shard_effort, split_rows
 from lgrasp.engine.workspace import Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.writing import BackgroundWriter
 from lgrasp.errors import ConfigError
@@ -106,12 +106,7 @@ def job_shards(job: Job) -> list[tuple[int, int]]:
         raise ConfigError(f"rate {job.rate}: the rows expected per candidate must be positive and finite")
     if "sequence" in job.pipeline.order:
         raise ConfigError(f"pipeline '{job.pipeline.name}' is for several objects: lgrasp sequence OBJECT OBJECT ...")
-    if job.num_shards <= 0 or not 0 <= job.shard_index < job.num_shards:
-        raise ConfigError(f"--shard-index {job.shard_index} --num-shards {job.num_shards}: need 0 <= index < number")
-    total = -(-job.rows // job.shard_rows)
-    return [
-        (s, min(job.shard_rows, job.rows - s * job.shard_rows)) for s in range(job.shard_index, total, job.num_shards)
-    ]
+    return split_rows(job.rows, job.shard_rows, job.shard_index, job.num_shards)
 
 
 def find_present(job: Job, files: dict[int, Path], key: str) -> dict[int, int]:
@@ -151,7 +146,8 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     if len(present) < len(shards):
         if "validate" in pipeline.order:
             listener.loading("scene", 0.0)
-            inputs = replace(inputs, scene=make_scene(job.cache, inputs, meshes))
+            objects = [object_record(inputs.object.model)]
+            inputs = replace(inputs, scene=make_scene(job.cache, inputs.hand.model, objects, meshes, device.alias))
         begin = time.perf_counter()
         load_kernels(device.alias, kernel_modules("lgrasp.stages."), listener.loading)
         inputs.seconds["kernels"] = time.perf_counter() - begin
@@ -238,9 +234,7 @@ def _statistics(inputs: Inputs, result: ShardResult) -> dict[str, Any]:
         "exhausted": int(result.exhausted),
         "seconds_wall": result.wall,
     }
-    for stage, counts in result.counts.items():
-        flat |= {f"{stage}_{name.replace(' ', '_')}": value for name, value in counts.items()}
-    return flat | {f"seconds_{stage}": seconds for stage, seconds in result.seconds.items()}
+    return flat | flat_statistics(result.counts, result.seconds)
 
 
 def _rows(table: GraspTable, pipeline: Pipeline, inputs: Inputs, shard: int) -> GraspRows:

@@ -1,12 +1,12 @@
 """Hand and object of a job as the records of a shard, and as the scene of a simulator."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 from lgrasp.dataset import HandRecord, ObjectRecord
 from lgrasp.decompose import decompose
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.workspace import Inputs
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.object.model import ObjectModel
@@ -49,7 +49,8 @@ def object_record(obj: ObjectModel, id: str | None = None) -> ObjectRecord:
     )
 
 
-def make_scene(cache: Cache, inputs: Inputs, meshes: dict[str, bytes]) -> Scene:
-    """What the simulator is given: the scene of the job's shards."""
-    cut, device = partial(decompose, store=cache), inputs.device.alias
-    return scene_of(hand_record(inputs.hand.model, meshes), [object_record(inputs.object.model)], cut, device)
+def make_scene(
+    cache: Cache, hand: HandModel, objects: Sequence[ObjectRecord], meshes: dict[str, bytes], device: str
+) -> Scene:
+    """What the simulator is given: the scene of the job's shards; ``meshes`` are the hand's :func:`mesh_blobs`."""
+    return scene_of(hand_record(hand, meshes), objects, partial(decompose, store=cache), device)

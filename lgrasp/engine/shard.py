@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
@@ -16,11 +16,22 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.recording import Recorder
 from lgrasp.engine.workspace import Inputs
+from lgrasp.errors import ConfigError
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps, user_poses
 from lgrasp.stages.context import Context
 
-__all__ = ["Execution", "Found", "ShardResult", "add_counts", "make_shard", "shard_effort"]
+__all__ = [
+    "Execution",
+    "Found",
+    "ShardResult",
+    "add_counts",
+    "add_seconds",
+    "flat_statistics",
+    "make_shard",
+    "shard_effort",
+    "split_rows",
+]
 
 _LEAST_EFFORT = 65_536
 _CPU_BATCH, _PHYSICS_BATCH = 256, 32  # rows of a simulation are dear
@@ -72,6 +83,32 @@ def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]
         into = total.setdefault(stage, {})
         for name, value in counts.items():
             into[name] = into.get(name, 0) + value
+
+
+def add_seconds(total: dict[str, float], more: Mapping[str, float]) -> None:
+    """Add seconds per stage to a running total."""
+    for stage, value in more.items():
+        total[stage] = total.get(stage, 0.0) + value
+
+
+def flat_statistics(counts: dict[str, dict[str, int]], seconds: Mapping[str, float]) -> dict[str, int | float]:
+    """Survivors and seconds per stage as the statistics of a shard: STAGE_NAME and seconds_STAGE."""
+    flat: dict[str, int | float] = {}
+    for stage, found in counts.items():
+        flat |= {f"{stage}_{name.replace(' ', '_')}": value for name, value in found.items()}
+    return flat | {f"seconds_{stage}": value for stage, value in seconds.items()}
+
+
+def split_rows(rows: int, shard_rows: int, shard_index: int, num_shards: int) -> list[tuple[int, int]]:
+    """(shard, rows) of every shard that task ``shard_index`` of ``num_shards`` makes.
+
+    Raises:
+        ConfigError: array numbers out of range.
+    """
+    if num_shards <= 0 or not 0 <= shard_index < num_shards:
+        raise ConfigError(f"--shard-index {shard_index} --num-shards {num_shards}: need 0 <= index < number")
+    total = -(-rows // shard_rows)
+    return [(s, min(shard_rows, rows - s * shard_rows)) for s in range(shard_index, total, num_shards)]
 
 
 def _batches(
@@ -185,8 +222,7 @@ def make_shard(
                 result = ShardResult(batch.grasps)
             result.candidates += count
             add_counts(result.counts, batch.counts)
-            for stage, seconds in batch.seconds.items():
-                result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
+            add_seconds(result.seconds, batch.seconds)
             # near-duplicates are defined on poses as they are written
             pose = user_poses(batch.grasps.pose, inputs.object.model.center)
             with recorder.recording if recorder else nullcontext():

@@ -40,10 +40,9 @@ class Held:
 
 @dataclass(frozen=True)
 class HeldArrays:
-    """The held of H rows on one device; keeps the objects alive."""
+    """What is held on one device; keeps the objects alive."""
 
     struct: "Held"
-    rows: int
     objects: tuple[ObjectArrays, ...] = ()
 
 
@@ -92,7 +91,7 @@ def hold(
     held.object = wp.array([o.struct for o in objects], dtype=Object, device=d)
     flat = np.ascontiguousarray(pose, np.float32).reshape(-1, 7)
     held.pose = wp.array(flat, dtype=wp.transform, device=d).reshape((rows, len(objects)))
-    return HeldArrays(held, rows, objects)
+    return HeldArrays(held, objects)
 
 
 def _settings(q: np.ndarray, settings: np.ndarray) -> np.ndarray:

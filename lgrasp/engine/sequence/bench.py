@@ -10,8 +10,10 @@ import numpy as np
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.records import make_scene, mesh_blobs
 from lgrasp.engine.sequence.inputs import SequenceInputs, load_sequence_inputs, sequence_keys
-from lgrasp.engine.sequence.job import SequenceJob, make_sequence_scene, simulated
+from lgrasp.engine.sequence.job import SequenceJob, simulated
+from lgrasp.engine.sequence.records import object_records
 from lgrasp.engine.sequence.round import Round, Verdicts, run_round
 from lgrasp.engine.shard import add_counts
 from lgrasp.grasp.sequences import SequenceTable
@@ -68,7 +70,9 @@ def measure_sequences(
         pipeline, cache = _as_published(job.pipeline), job.cache
         keys = sequence_keys(job.hand, job.objects, job.size, pipeline.seed, pipeline.object, pipeline.field)
         inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device)
-        inputs = replace(inputs, scene=make_sequence_scene(cache, inputs))
+        meshes = mesh_blobs(keys.source.urdf)
+        scene = make_scene(cache, inputs.hand, object_records(inputs), meshes, device.alias)
+        inputs = replace(inputs, scene=scene)
         load_kernels(device.alias, kernel_modules("lgrasp.stages."))
         assert job.physics
         simulate = simulated(inputs, job.physics)
@@ -77,9 +81,8 @@ def measure_sequences(
                 names = " ".join(inputs.object_ids)
                 progress(f"{pipeline.params('sequence').method}, {names}: round {number + 1} of {rounds}")
             seen: list[SequenceTable] = []
-
-            watched = _watched(simulate, seen)
-            found = run_round(pipeline, inputs, 0, number, job.workers or os.cpu_count() or 1, verdicts=watched)
+            workers = job.workers or os.cpu_count() or 1
+            found = run_round(pipeline, inputs, 0, number, workers, verdicts=_watched(simulate, seen))
             _count_spaces(spaces, found)
             for step, table in enumerate(seen):
                 strict = int(_strict(table, bounds).sum())

@@ -10,31 +10,29 @@ from typing import Any
 import numpy as np
 
 from lgrasp.dataset import Shard, ShardHeader
-from lgrasp.decompose import decompose
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder, clean_folder, present_shards, shard_path
 from lgrasp.engine.generate import Listener
 from lgrasp.engine.kernels import kernel_modules, load_kernels
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.records import hand_record, mesh_blobs
+from lgrasp.engine.records import hand_record, make_scene, mesh_blobs
 from lgrasp.engine.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, sequence_keys
 from lgrasp.engine.sequence.records import object_records, sequence_rows
 from lgrasp.engine.sequence.round import Verdicts
 from lgrasp.engine.sequence.shard import SequenceResult, make_sequences, most_rounds
 from lgrasp.engine.sequence.size import Size
+from lgrasp.engine.shard import flat_statistics, split_rows
 from lgrasp.engine.writing import BackgroundWriter
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.physics import find_protocol, protocol_text, verdicts
 from lgrasp.physics.model import import_mujoco
-from lgrasp.physics.scene import Scene, scene_of
 
 __all__ = [
     "SequenceJob",
     "SequenceOutcome",
     "generate_sequences",
-    "make_sequence_scene",
     "sequence_name",
     "sequence_shards",
     "simulated",
@@ -92,14 +90,9 @@ def sequence_shards(job: SequenceJob) -> list[tuple[int, int]]:
         raise ConfigError(f"-n {job.rows} --shard-rows {job.shard_rows}: both must be at least 1")
     if job.workers < 0:
         raise ConfigError(f"--workers {job.workers}: must be at least 0 (0: by device)")
-    if job.num_shards <= 0 or not 0 <= job.shard_index < job.num_shards:
-        raise ConfigError(f"--shard-index {job.shard_index} --num-shards {job.num_shards}: need 0 <= index < number")
     if "sequence" not in job.pipeline.order:
         raise ConfigError(f"pipeline '{job.pipeline.name}' has no stage sequence; use pipeline sequence, or add it")
-    total = -(-job.rows // job.shard_rows)
-    return [
-        (s, min(job.shard_rows, job.rows - s * job.shard_rows)) for s in range(job.shard_index, total, job.num_shards)
-    ]
+    return split_rows(job.rows, job.shard_rows, job.shard_index, job.num_shards)
 
 
 def generate_sequences(job: SequenceJob, listener: Listener | None = None) -> SequenceOutcome:
@@ -131,7 +124,8 @@ def generate_sequences(job: SequenceJob, listener: Listener | None = None) -> Se
     if len(present) < len(shards):
         if job.physics:
             listener.loading("scene", 0.0)
-            inputs = replace(inputs, scene=make_sequence_scene(job.cache, inputs))
+            scene = make_scene(job.cache, inputs.hand, object_records(inputs), meshes, device.alias)
+            inputs = replace(inputs, scene=scene)
         begin = time.perf_counter()
         load_kernels(device.alias, kernel_modules("lgrasp.stages."), listener.loading)
         inputs.seconds["kernels"] = time.perf_counter() - begin
@@ -177,13 +171,6 @@ def generate_sequences(job: SequenceJob, listener: Listener | None = None) -> Se
     outcome.paths = [files[s] for s, _ in shards if s in present or files[s] in outcome.written]
     outcome.wall = time.perf_counter() - start
     return outcome
-
-
-def make_sequence_scene(cache: Cache, inputs: SequenceInputs) -> Scene:
-    """What the simulator is given: hand and objects of the job's shards."""
-    cut = partial(decompose, store=cache)
-    record = hand_record(inputs.hand, mesh_blobs(inputs.keys.source.urdf))
-    return scene_of(record, object_records(inputs), cut, inputs.device.alias)
 
 
 def simulated(inputs: SequenceInputs, physics: str) -> Verdicts:
@@ -237,7 +224,6 @@ def _statistics(inputs: SequenceInputs, result: SequenceResult) -> dict[str, Any
     flat: dict[str, Any] = {
         "device": inputs.device.name,
         "sequences": len(result),
-        "candidates": result.rounds,
         "rounds": result.rounds,
         "duplicates_dropped": result.duplicates,
         "exhausted": int(result.exhausted),
@@ -245,6 +231,4 @@ def _statistics(inputs: SequenceInputs, result: SequenceResult) -> dict[str, Any
     }
     for step, found in enumerate(result.reached, 1):
         flat[f"found_{step}"] = found
-    for stage, counts in result.counts.items():
-        flat |= {f"{stage}_{name.replace(' ', '_')}": value for name, value in counts.items()}
-    return flat | {f"seconds_{stage}": seconds for stage, seconds in result.seconds.items()}
+    return flat | flat_statistics(result.counts, result.seconds)

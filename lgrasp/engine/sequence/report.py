@@ -7,7 +7,8 @@ import numpy as np
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.report import peak_device_mb, peak_rss_mb
 from lgrasp.engine.sequence.job import SequenceJob, SequenceOutcome, sequence_shards
-from lgrasp.engine.shard import add_counts
+from lgrasp.engine.sequence.shard import add_spaces
+from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.engine.starving import starving_stage
 
 __all__ = ["report", "unheld"]
@@ -23,18 +24,14 @@ def report(job: SequenceJob, outcome: SequenceOutcome) -> dict[str, Any]:
     """
     inputs, params = outcome.inputs, job.pipeline.params("sequence")
     steps = len(inputs.objects)
-    reached, spaces = [0] * steps, [{} for _ in range(steps)]
+    reached, spaces = [0] * steps, _spaces(outcome)
     counts: dict[str, dict[str, int]] = {}
     seconds: dict[str, float] = {}
     for result in outcome.results:
         add_counts(counts, result.counts)
-        for stage, value in result.seconds.items():
-            seconds[stage] = seconds.get(stage, 0.0) + value
+        add_seconds(seconds, result.seconds)
         for step, found in enumerate(result.reached):
             reached[step] += found
-        for step, found in enumerate(result.spaces):
-            for space, survivors in found.items():
-                add_counts(spaces[step].setdefault(space, {}), survivors)
     depth = [np.zeros(1)]
     for path in outcome.paths:
         with ShardReader(path) as reader:
@@ -80,11 +77,8 @@ def unheld(outcome: SequenceOutcome) -> str:
     step = min(step, len(inputs.objects) - 1)
     model, path = inputs.objects[step].model, inputs.keys.meshes[step]
     sides = " x ".join(f"{1e3 * side:.0f}" for side in model.extents)
-    spaces: dict[str, dict[str, dict[str, int]]] = {}
-    for result in outcome.results:
-        for space, counts in (result.spaces[step] if step < len(result.spaces) else {}).items():
-            add_counts(spaces.setdefault(space, {}), counts)
-    why = "; ".join(f"{space}: stage {stage}, {words}" for space, (stage, words) in _reasons(spaces).items())
+    reasons = {space: starving_stage(counts) for space, counts in _spaces(outcome)[step].items()}
+    why = "; ".join(f"{space}: stage {stage}, {words}" for space, (stage, words) in reasons.items())
     return (
         f"object {step + 1} ({path}, {sides} mm) is held by no opposition space of hand '{inputs.hand.name}'"
         + (f" after {step} other object{'s' if step > 1 else ''}" if step else "")
@@ -92,5 +86,9 @@ def unheld(outcome: SequenceOutcome) -> str:
     )
 
 
-def _reasons(spaces: dict[str, dict[str, dict[str, int]]]) -> dict[str, tuple[str, str]]:
-    return {space: starving_stage(counts) for space, counts in spaces.items()}
+def _spaces(outcome: SequenceOutcome) -> list[dict[str, dict[str, dict[str, int]]]]:
+    """Survivors by step, space and stage over all shards made."""
+    total: list[dict[str, dict[str, dict[str, int]]]] = [{} for _ in outcome.inputs.objects]
+    for result in outcome.results:
+        add_spaces(total, result.spaces)
+    return total

@@ -11,7 +11,7 @@ from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.meter import Meter
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.sequence.inputs import SequenceInputs
-from lgrasp.engine.shard import add_counts
+from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.grasp.held import hold
 from lgrasp.grasp.sequences import SequenceTable, empty_sequences, join_sequences, take_sequences
 from lgrasp.grasp.tables import GraspTable, join_grasps, sort_grasps
@@ -45,8 +45,7 @@ class Round:
         """Count survivors of the step that is being made, and thread-seconds."""
         add_counts(self.counts, counts)
         add_counts(self.spaces[-1].setdefault(space, {}), counts)
-        for stage, more in (seconds or {}).items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + more
+        add_seconds(self.seconds, seconds or {})
 
 
 def run_round(
@@ -167,8 +166,7 @@ class _Search:
             method=params.method,
             device=inputs.device.alias,
         )
-        spent = self._result.seconds
-        spent[params.method] = spent.get(params.method, 0.0) + time.perf_counter() - start
+        add_seconds(self._result.seconds, {params.method: time.perf_counter() - start})
         for number in np.unique(space[able]):
             own = np.flatnonzero(space[able] == number)
             part = replace(grasps, **{f.name: getattr(grasps, f.name)[own] for f in fields(grasps)})

@@ -2,19 +2,19 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.sequence.inputs import SequenceInputs
 from lgrasp.engine.sequence.round import Round, Verdicts, run_round
-from lgrasp.engine.shard import add_counts
+from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.sequences import SequenceTable, join_sequences, take_sequences
 from lgrasp.grasp.tables import user_poses
 
-__all__ = ["SequenceResult", "make_sequences", "most_rounds"]
+__all__ = ["SequenceResult", "add_spaces", "make_sequences", "most_rounds"]
 
 _EMPTY_ROUNDS = 4  # without any row of some length, before nothing more is expected
 
@@ -42,16 +42,22 @@ class SequenceResult:
         """Count a further round."""
         self.rounds += 1
         add_counts(self.counts, round_.counts)
-        for stage, seconds in round_.seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
-        for step, found in enumerate(round_.spaces):
-            if step == len(self.spaces):
-                self.spaces.append({})
-            for space, counts in found.items():
-                add_counts(self.spaces[step].setdefault(space, {}), counts)
+        add_seconds(self.seconds, round_.seconds)
+        add_spaces(self.spaces, round_.spaces)
         for step, table in enumerate(round_.levels):
             self.reached += [0] * (step + 1 - len(self.reached))
             self.reached[step] += len(table)
+
+
+def add_spaces(
+    total: list[dict[str, dict[str, dict[str, int]]]], more: list[dict[str, dict[str, dict[str, int]]]]
+) -> None:
+    """Add survivors by step, space and stage to a running total."""
+    for step, found in enumerate(more):
+        if step == len(total):
+            total.append({})
+        for space, counts in found.items():
+            add_counts(total[step].setdefault(space, {}), counts)
 
 
 def most_rounds(pipeline: Pipeline, rows: int) -> int:
@@ -112,12 +118,11 @@ def _missing(result: SequenceResult, objects: int) -> bool:
 
 def _lineage(levels: list[SequenceTable], rows: np.ndarray) -> list[SequenceTable]:
     """Some rows of the last level and those that they go on from; parents are counted anew."""
-    out = []
+    out: list[SequenceTable] = []
     for table in reversed(levels):
-        out.append(take_sequences(table, rows))
-        rows, place = np.unique(out[-1].parent, return_inverse=True)
-        out[-1] = take_sequences(out[-1], np.arange(len(place)), parent=place.astype(np.int64))
-    out[-1] = take_sequences(out[-1], np.arange(len(out[-1])), parent=np.full(len(out[-1]), -1))
+        taken = take_sequences(table, rows)
+        rows, parent = np.unique(taken.parent, return_inverse=True)
+        out.append(replace(taken, parent=parent if table.steps > 1 else np.full(len(parent), -1)))
     return out[::-1]
 
 
@@ -127,10 +132,7 @@ def _joined(parts: list[list[SequenceTable]]) -> list[SequenceTable]:
         return []
     joined = []
     for step in range(len(parts[0])):
-        before = np.cumsum([0, *(len(levels[step - 1]) for levels in parts)]) if step else [0] * len(parts)
-        moved = [
-            take_sequences(levels[step], np.arange(len(levels[step])), parent=levels[step].parent + shift)
-            for levels, shift in zip(parts, before, strict=False)
-        ]
-        joined.append(join_sequences(moved))
+        shifts = np.cumsum([0, *(len(levels[step - 1]) for levels in parts)]) if step else [0] * len(parts)
+        parents = zip(parts, shifts, strict=False)
+        joined.append(join_sequences([replace(p[step], parent=p[step].parent + shift) for p, shift in parents]))
     return joined

@@ -9,7 +9,7 @@ from lgrasp.dataset import read_shard
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.generate import generate
-from lgrasp.engine.records import make_scene, mesh_blobs
+from lgrasp.engine.records import make_scene, mesh_blobs, object_record
 from lgrasp.errors import ConfigError, OutputError, PhysicsError
 from lgrasp.grasp.tables import GraspTable, grasp_arrays
 from lgrasp.physics import COLUMNS, PROTOCOLS, scene_of_shard, verdicts
@@ -23,7 +23,8 @@ pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 @pytest.fixture(scope="module")
 def context(load, cache_root) -> Context:
     inputs = load("sphere")
-    scene = make_scene(Cache(cache_root, pytest.fail), inputs, mesh_blobs(inputs.keys.source.urdf))
+    objects, meshes = [object_record(inputs.object.model)], mesh_blobs(inputs.keys.source.urdf)
+    scene = make_scene(Cache(cache_root, pytest.fail), inputs.hand.model, objects, meshes, "cpu")
     return Context(inputs.hand, inputs.object, inputs.field, "cpu", 0, 0, scene)
 
 
