@@ -49,7 +49,7 @@ def bench(
     from lgrasp.engine.bench import Bench
     from lgrasp.engine.jobs import JobConfig, plan_jobs
     from lgrasp.engine.pipeline import pipeline_files
-    from lgrasp_cli.tables import print_json
+    from lgrasp_cli.tables import print_report
 
     names = [name.strip() for name in pipelines.split(",")]
     if "lightning" in names and "lightning" not in pipeline_files():
@@ -69,14 +69,7 @@ def bench(
     check_report(json_path)
     with Bench() as runs, before_end(runs.discard):
         results = runs.measure(jobs, repeat, lambda line: typer.echo(line, err=True))
-    if json_path == "-":
-        print_json(results)
-        return
-    _show(results, rows, repeat)
-    if json_path:
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, results)
+    print_report(results, json_path, lambda: _show(results, rows, repeat))
 
 
 def _refuse_options(context: typer.Context) -> None:

@@ -32,7 +32,7 @@ def bench_refine(
     check_report(json_path)
     cache = open_cache(cache_dir)
     from lgrasp.engine.refine.bench import NOISES, bench_hand
-    from lgrasp_cli.tables import print_json
+    from lgrasp_cli.tables import print_report
 
     names = [name.strip() for name in objects.split(",")]
     results = [
@@ -49,14 +49,7 @@ def bench_refine(
         for hand in hands.split(",")
     ]
     data = [_plain(one) for one in results]
-    if json_path == "-":
-        print_json(data)
-        return
-    _show(results, names, starts)
-    if json_path:
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, data)
+    print_report(data, json_path, lambda: _show(results, names, starts))
 
 
 def _plain(one: "HandBench") -> dict[str, Any]:

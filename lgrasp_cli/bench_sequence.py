@@ -56,7 +56,7 @@ def bench_sequence(
     from lgrasp.engine.sequence.sets import SequenceSets, object_sequences
     from lgrasp.engine.sequence.size import parse_size
     from lgrasp_cli.options import choose_pipeline
-    from lgrasp_cli.tables import print_json
+    from lgrasp_cli.tables import print_report
 
     pool = objects or ["mug", "sphere", "box", "capsule", "bottle", "bowl"]
     sets = parse_model(SequenceSets, {"sets": sequences, "length": length, "permutations": 1}, "bench sequence")
@@ -84,14 +84,7 @@ def bench_sequence(
         ]
         results["methods"][method] = measure_sequences(jobs, 1, lambda line: typer.echo(line, err=True))
         results["methods"][method]["width"] = changes["width"]
-    if json_path == "-":
-        print_json(results)
-        return
-    _show(results)
-    if json_path:
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, results)
+    print_report(results, json_path, lambda: _show(results))
 
 
 def _show(results: dict[str, Any]) -> None:

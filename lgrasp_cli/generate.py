@@ -106,7 +106,9 @@ def generate(
         return
     check_report(json_path)
     data, outcome = run_job(job, quiet=quiet)
-    _show(data, json_path, quiet)
+    from lgrasp_cli.tables import job_report, print_pairs, print_report
+
+    print_report(data, json_path, None if quiet else lambda: print_pairs(job_report(data)))
     conclude(data, outcome)
 
 
@@ -139,19 +141,6 @@ def conclude(data: dict[str, Any], outcome: "Outcome") -> None:
     if outcome.starved:
         stage, words = starving_stage(data["counts"])
         raise StarvedError(f"{data['grasps']:,} of {data['asked']:,} grasps found; stage {stage} starves: {words}")
-
-
-def _show(data: dict[str, Any], json_path: str | None, quiet: bool) -> None:
-    from lgrasp_cli.tables import job_report, print_json, print_pairs
-
-    if json_path == "-":
-        print_json(data)
-    elif not quiet:
-        print_pairs(job_report(data))
-    if json_path and json_path != "-":
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, data)
 
 
 def _show_plan(job: "Job", json_path: str | None) -> None:

@@ -117,13 +117,6 @@ def _fit_pairs(data: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _report(data: dict[str, Any], json_path: str | None, quiet: bool, pairs: list[tuple[str, str]]) -> None:
-    from lgrasp_cli.tables import print_json, print_pairs
+    from lgrasp_cli.tables import print_pairs, print_report
 
-    if json_path == "-":
-        print_json(data)
-    elif not quiet:
-        print_pairs(pairs)
-    if json_path and json_path != "-":
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, data)
+    print_report(data, json_path, None if quiet else lambda: print_pairs(pairs))

@@ -98,7 +98,9 @@ def plan(
     )
     done = plan_grasps(job, None if quiet else _Progress(starts))
     data = _report(done, starts)
-    _show(data, json_path, quiet)
+    from lgrasp_cli.tables import print_report
+
+    print_report(data, json_path, None if quiet or not data["grasps"] else lambda: _show(data))
     if done.path is None:
         counts = ", ".join(f"{count} {what}" for what, count in done.counts.items() if what != "kept")
         raise StarvedError(f"no grasp planned: {counts}")
@@ -133,27 +135,20 @@ def _report(done: "PlanOutcome", starts: int) -> dict[str, Any]:
     }
 
 
-def _show(data: dict[str, Any], json_path: str | None, quiet: bool) -> None:
-    from lgrasp_cli.tables import print_json, print_pairs
+def _show(data: dict[str, Any]) -> None:
+    from lgrasp_cli.tables import print_pairs
 
-    if json_path == "-":
-        print_json(data)
-    elif not quiet and data["grasps"]:
-        lost = [f"{n} {what}" for what, n in data["counts"].items() if what not in ("starts", "kept") and n]
-        each = data["seconds"] / data["grasps"]
-        print_pairs(
-            [
-                ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({', '.join(lost) or 'none lost'})"),
-                ("where", data["out"]),
-                ("hand, object", f"{data['hand']}, {data['object']}"),
-                ("quality", f"median epsilon {data['epsilon']:.3f}, disturbance {data['disturbance']:.2f}"),
-                ("wall", f"{data['seconds']:.1f} s, {each:.3f} s a plan"),
-            ]
-        )
-    if json_path and json_path != "-":
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, data)
+    lost = [f"{n} {what}" for what, n in data["counts"].items() if what not in ("starts", "kept") and n]
+    each = data["seconds"] / data["grasps"]
+    print_pairs(
+        [
+            ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({', '.join(lost) or 'none lost'})"),
+            ("where", data["out"]),
+            ("hand, object", f"{data['hand']}, {data['object']}"),
+            ("quality", f"median epsilon {data['epsilon']:.3f}, disturbance {data['disturbance']:.2f}"),
+            ("wall", f"{data['seconds']:.1f} s, {each:.3f} s a plan"),
+        ]
+    )
 
 
 class _Progress:

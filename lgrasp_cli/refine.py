@@ -84,7 +84,9 @@ def refine(
     if far:
         warn(f"the hands of {far:,} rows are more than half a metre from their object; nothing draws them to it")
     data = [_report(one) for one in done]
-    _show(data, json_path, quiet)
+    from lgrasp_cli.tables import print_report
+
+    print_report(data, json_path, None if quiet else lambda: _show(data))
 
 
 def _report(one: "RefinedShard") -> dict[str, Any]:
@@ -103,33 +105,26 @@ def _report(one: "RefinedShard") -> dict[str, Any]:
     }
 
 
-def _show(data: list[dict[str, Any]], json_path: str | None, quiet: bool) -> None:
-    from lgrasp_cli.tables import print_json, print_table
+def _show(data: list[dict[str, Any]]) -> None:
+    from lgrasp_cli.tables import print_table
 
-    if json_path == "-":
-        print_json(data)
-    elif not quiet:
-        names = ("hand", "object", "rows", "refined", "valid before", "valid", "energy before", "energy", "s")
-        rows = [
-            (
-                one["hand"],
-                one["object"],
-                f"{one['rows']:,}",
-                f"{one['refined']:,}",
-                f"{one['valid_before']:,}",
-                f"{one['valid']:,}",
-                f"{one['energy_before']:.4f}",
-                f"{one['energy']:.4f}",
-                f"{one['seconds']:.1f}",
-            )
-            for one in data
-        ]
-        print_table(names, rows, right=names[2:])
-        typer.echo(str(Path(data[0]["shard"]).parent) if data else "")
-    if json_path and json_path != "-":
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, data)
+    names = ("hand", "object", "rows", "refined", "valid before", "valid", "energy before", "energy", "s")
+    rows = [
+        (
+            one["hand"],
+            one["object"],
+            f"{one['rows']:,}",
+            f"{one['refined']:,}",
+            f"{one['valid_before']:,}",
+            f"{one['valid']:,}",
+            f"{one['energy_before']:.4f}",
+            f"{one['energy']:.4f}",
+            f"{one['seconds']:.1f}",
+        )
+        for one in data
+    ]
+    print_table(names, rows, right=names[2:])
+    typer.echo(str(Path(data[0]["shard"]).parent) if data else "")
 
 
 class _Progress:

@@ -69,7 +69,9 @@ def run(
         if results[-1]["exit_code"] == 130:
             break
     code = max(result["exit_code"] for result in results)
-    _show(results, json_path, quiet)
+    from lgrasp_cli.tables import print_report
+
+    print_report({"jobs": results, "exit_code": code}, json_path, None if quiet else lambda: _show(results))
     if code:
         raise typer.Exit(code)
 
@@ -97,30 +99,11 @@ def _run_one(job: Any, quiet: bool) -> dict[str, Any]:
     return base | data | {"status": "done", "error": "", "exit_code": 0}
 
 
-def _show(results: list[dict[str, Any]], json_path: str | None, quiet: bool) -> None:
-    from lgrasp_cli.tables import print_json, print_table
+def _show(results: list[dict[str, Any]]) -> None:
+    from lgrasp_cli.tables import print_table
 
-    whole = {"jobs": results, "exit_code": max(result["exit_code"] for result in results)}
-    if json_path == "-":
-        print_json(whole)
-    elif not quiet:
-        columns = (
-            "hand",
-            "object",
-            "pipeline",
-            "grasps",
-            "strict/s",
-            "seed/s",
-            "wall s",
-            "near-dup",
-            "poses",
-            "status",
-        )
-        print_table(columns, [_row(result) for result in results], right=columns[3:9])
-    if json_path and json_path != "-":
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, whole)
+    columns = ("hand", "object", "pipeline", "grasps", "strict/s", "seed/s", "wall s", "near-dup", "poses", "status")
+    print_table(columns, [_row(result) for result in results], right=columns[3:9])
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:

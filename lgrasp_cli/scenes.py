@@ -96,7 +96,9 @@ def make(
     from lgrasp.engine.scenes.report import report
 
     data = report(outcome, len(scene_numbers(job)), config.out)
-    _show(data, json_path, quiet)
+    from lgrasp_cli.tables import print_report
+
+    print_report(data, json_path, None if quiet else lambda: _show(data))
     if outcome.cancelled:
         typer.echo(f"interrupted: {len(outcome.paths)} scenes in {config.out}; the same command goes on", err=True)
         raise typer.Exit(130)
@@ -204,25 +206,16 @@ def _run(job: Any, asked: int, *, quiet: bool) -> "SceneOutcome":
         return make_scenes(job, listener)
 
 
-def _show(data: dict[str, Any], json_path: str | None, quiet: bool) -> None:
-    from lgrasp_cli.tables import print_json
-
-    if json_path == "-":
-        print_json(data)
-    elif not quiet:
-        extra = f" ({data['present']:,} were there)" if data["present"] else ""
-        speed = f", {data['scenes_per_minute']:.1f} scenes/min" if data["made"] else ""
-        head = [
-            ("scenes", f"{data['scenes']:,} of {data['asked']:,} asked{extra}"),
-            ("where", data["out"]),
-            ("hand", data["hand"]),
-            ("wall", f"{data['seconds']:.2f} s{speed}"),
-        ]
-        _print(data, head)
-    if json_path and json_path != "-":
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, data)
+def _show(data: dict[str, Any]) -> None:
+    extra = f" ({data['present']:,} were there)" if data["present"] else ""
+    speed = f", {data['scenes_per_minute']:.1f} scenes/min" if data["made"] else ""
+    head = [
+        ("scenes", f"{data['scenes']:,} of {data['asked']:,} asked{extra}"),
+        ("where", data["out"]),
+        ("hand", data["hand"]),
+        ("wall", f"{data['seconds']:.2f} s{speed}"),
+    ]
+    _print(data, head)
 
 
 def _print(data: dict[str, Any], head: list[tuple[str, str]]) -> None:

@@ -19,7 +19,7 @@ def run_sets(jobs: "list[SequenceJob]", json_path: str | None, *, dry_run: bool,
     Raises:
         Exit: with the worst exit code, if it is not 0.
     """
-    from lgrasp_cli.tables import print_table
+    from lgrasp_cli.tables import print_report, print_table
 
     if dry_run:
         print_table(("objects", "sequences", "folder"), [(_names(j), f"{j.rows:,}", str(j.out)) for j in jobs])
@@ -33,7 +33,7 @@ def run_sets(jobs: "list[SequenceJob]", json_path: str | None, *, dry_run: bool,
         if results[-1]["exit_code"] == 130:
             break
     code = max((result["exit_code"] for result in results), default=0)
-    _show(results, code, json_path, quiet)
+    print_report({"jobs": results, "exit_code": code}, json_path, None if quiet else lambda: _show(results))
     if code:
         raise typer.Exit(code)
 
@@ -62,19 +62,11 @@ def _run_one(job: "SequenceJob", quiet: bool) -> dict[str, Any]:
     return data | {"status": "done", "error": "", "exit_code": 0}
 
 
-def _show(results: list[dict[str, Any]], code: int, json_path: str | None, quiet: bool) -> None:
-    from lgrasp_cli.tables import print_json, print_table
+def _show(results: list[dict[str, Any]]) -> None:
+    from lgrasp_cli.tables import print_table
 
-    whole = {"jobs": results, "exit_code": code}
-    if json_path == "-":
-        print_json(whole)
-    elif not quiet:
-        columns = ("hand", "objects", "sequences", "reached", "wall s", "status")
-        print_table(columns, [_row(result) for result in results], right=("sequences", "wall s"))
-    if json_path and json_path != "-":
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, whole)
+    columns = ("hand", "objects", "sequences", "reached", "wall s", "status")
+    print_table(columns, [_row(result) for result in results], right=("sequences", "wall s"))
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:

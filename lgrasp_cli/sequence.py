@@ -99,7 +99,9 @@ def sequence(
     )
     check_report(json_path)
     data, outcome = run_sequences(job, quiet=quiet)
-    _show(data, json_path, quiet or not data["sequences"])
+    from lgrasp_cli.tables import print_report
+
+    print_report(data, json_path, None if quiet or not data["sequences"] else lambda: _show(data))
     conclude(data, outcome)
 
 
@@ -138,32 +140,25 @@ def conclude(data: dict[str, Any], outcome: "SequenceOutcome") -> None:
         )
 
 
-def _show(data: dict[str, Any], json_path: str | None, quiet: bool) -> None:
-    from lgrasp_cli.tables import print_json, print_pairs, print_table
+def _show(data: dict[str, Any]) -> None:
+    from lgrasp_cli.tables import print_pairs, print_table
 
-    if json_path == "-":
-        print_json(data)
-    elif not quiet:
-        extra = f" ({data['present']:,} were there)" if data["present"] else ""
-        print_pairs(
-            [
-                ("sequences", f"{data['sequences']:,} of {data['asked']:,} asked{extra}"),
-                ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
-                ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
-                ("how", f"pipeline {data['pipeline']}, method {data['method']}, policy {data['policy']}"),
-                ("wall", f"{data['seconds']['total']:.2f} s, {data['seconds']['wall']:.2f} s of it the sequences"),
-                ("penetration", f"median {data['penetration'][0]:.2f} mm, largest {data['penetration'][1]:.2f} mm"),
-                ("device", data["device"]),
-            ]
+    extra = f" ({data['present']:,} were there)" if data["present"] else ""
+    print_pairs(
+        [
+            ("sequences", f"{data['sequences']:,} of {data['asked']:,} asked{extra}"),
+            ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
+            ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
+            ("how", f"pipeline {data['pipeline']}, method {data['method']}, policy {data['policy']}"),
+            ("wall", f"{data['seconds']['total']:.2f} s, {data['seconds']['wall']:.2f} s of it the sequences"),
+            ("penetration", f"median {data['penetration'][0]:.2f} mm, largest {data['penetration'][1]:.2f} mm"),
+            ("device", data["device"]),
+        ]
+    )
+    if data["spaces"]:
+        print_table(
+            ("object", "space", "sequences", "go on", "share"), _shares(data), right=("sequences", "go on", "share")
         )
-        if data["spaces"]:
-            print_table(
-                ("object", "space", "sequences", "go on", "share"), _shares(data), right=("sequences", "go on", "share")
-            )
-    if json_path and json_path != "-":
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, data)
 
 
 def _shares(data: dict[str, Any]) -> list[tuple[str, ...]]:

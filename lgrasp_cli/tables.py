@@ -1,17 +1,34 @@
 """Tables on standard output: aligned columns, the same on a terminal and in a file."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import typer
 
-__all__ = ["job_report", "print_json", "print_pairs", "print_table"]
+__all__ = ["job_report", "print_json", "print_pairs", "print_report", "print_table"]
 
 
 def print_json(data: Any) -> None:
     """JSON on standard output."""
     typer.echo(json.dumps(data, indent=2))
+
+
+def print_report(data: Any, json_path: str | None, show: Callable[[], None] | None) -> None:
+    """A report as --json says: to standard output for -, else shown, and written to the path if there is one.
+
+    Args:
+        show: prints the tables; None: nothing is to be shown.
+    """
+    if json_path == "-":
+        print_json(data)
+        return
+    if show:
+        show()
+    if json_path:
+        from lgrasp.engine.report import write_json
+
+        write_json(json_path, data)
 
 
 def print_pairs(pairs: Iterable[tuple[str, str]]) -> None:

@@ -58,7 +58,7 @@ def validate(
     check_report(json_path)
     from lgrasp.engine.validate import Validation, summary, validate_shards
     from lgrasp.physics import find_protocol
-    from lgrasp_cli.tables import print_json
+    from lgrasp_cli.tables import print_report
 
     chosen = find_protocol(protocol)
     cache = open_cache(cache_dir)
@@ -70,14 +70,7 @@ def validate(
     for note in dict.fromkeys(note for entry in entries for note in entry["notes"]):
         warn(note)
     data = {"protocol": chosen.model_dump(mode="json"), "results": entries}
-    if json_path == "-":
-        print_json(data)
-    elif not quiet:
-        _show(entries, done, chosen)
-    if json_path and json_path != "-":
-        from lgrasp.engine.report import write_json
-
-        write_json(json_path, data)
+    print_report(data, json_path, None if quiet else lambda: _show(entries, done, chosen))
 
 
 def _show(entries: list[dict[str, Any]], done: "list[Validated]", protocol: "Protocol") -> None:
