@@ -10,6 +10,8 @@ PYTHON := $(shell for p in python3 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in [(3, 11), (3, 12)])' >/dev/null 2>&1 && echo $$p && break; done)
 endif
 
+WORKERS ?= 2
+
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test check lint format type pytest bench wheel clean
 
@@ -47,8 +49,9 @@ format: setup
 type: setup
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# WORKERS test files run side by side, each on one thread.
 pytest: setup
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 bench: setup
 	$(BIN)/lgrasp bench
