@@ -36,7 +36,7 @@ def draw_hand(inputs: Inputs, path: Path) -> Path:
         axes = figure.add_subplot(1, 2, i + 1, projection="3d")
         add_triangles(axes, triangles, colours)
         add_box(axes, model.canonical_box)
-        frame_points(axes, np.vstack([_hand_points(model, model.tree.joint_open), model.canonical_box]), towards, turn)
+        frame_points(axes, np.vstack([_hand_points(inputs, model.tree.joint_open), model.canonical_box]), towards, turn)
     _legend(figure, inputs, box=True)
     figure.suptitle(f"{model.name}: open posture, surface that may touch, canonical box")
     return save_figure(figure, path)
@@ -57,7 +57,7 @@ def draw_workspace(inputs: Inputs, path: Path) -> Path:
             axes.scatter(*cloud.T, s=5.0, color=_COLOURS[g % len(_COLOURS)], alpha=0.5, linewidths=0, zorder=5)
         add_box(axes, model.canonical_box)
         frame_points(
-            axes, np.vstack([_hand_points(model, model.tree.joint_open), model.canonical_box, *clouds]), towards, turn
+            axes, np.vstack([_hand_points(inputs, model.tree.joint_open), model.canonical_box, *clouds]), towards, turn
         )
     _legend(figure, inputs, box=True)
     figure.suptitle(f"{model.name}: reach of every finger's contact surface")
@@ -82,7 +82,7 @@ def draw_grasps(inputs: Inputs, samples: list[tuple[str, Shard, int]], path: Pat
         axes.scatter(*points.T, s=45, c="black", depthshade=False, zorder=10)
         frame_points(
             axes,
-            np.vstack([_hand_points(model, shard.grasps.q[row]), vertices]),
+            np.vstack([_hand_points(inputs, shard.grasps.q[row]), vertices]),
             _away(points, vertices.mean(0), inputs),
             0.0,
         )
@@ -102,7 +102,9 @@ def draw_spaces(inputs: Inputs, names: list[str], path: Path) -> Path:
     towards = _palmar_direction(inputs)
     for i, name in enumerate(names):
         tints = [shade(placed, _LINK) for _, _, placed in meshes]
-        for side, colour in zip(space_sides(urdf, source.spec, model.tree, name), _COLOURS, strict=False):
+        for side, colour in zip(
+            space_sides(urdf, source.spec, model.tree, name, inputs.hand.device), _COLOURS, strict=False
+        ):
             for link in side.links:
                 for (skin, mesh, placed), tint in zip(meshes, tints, strict=True):
                     if skin.link == link.link:
@@ -110,7 +112,7 @@ def draw_spaces(inputs: Inputs, names: list[str], path: Path) -> Path:
                         tint[near] = shade(placed[near], colour)
         axes = figure.add_subplot(rows, columns, i + 1, projection="3d")
         add_triangles(axes, np.concatenate([placed for _, _, placed in meshes]), np.concatenate(tints))
-        frame_points(axes, _hand_points(model, q), towards, 35.0)
+        frame_points(axes, _hand_points(inputs, q), towards, 35.0)
         axes.set_title(name)
     figure.suptitle(f"{model.name}: opposition spaces, one side red, the other blue")
     return save_figure(figure, path)
@@ -143,7 +145,7 @@ def _hand_triangles(inputs: Inputs, q: np.ndarray, *, patches: bool) -> tuple[np
 def _hand_meshes(inputs: Inputs, q: np.ndarray) -> list[tuple[Skin, trimesh.Trimesh, np.ndarray]]:
     """Every link with its mesh (body frame) in about even triangles, and these (n, 3, 3) in the base frame."""
     model = inputs.hand.model
-    postures = sample_bodies(model, np.asarray(q, float)[None])
+    postures = sample_bodies(model, np.asarray(q, float)[None], inputs.hand.device)
     R, t = postures.R[0], postures.t[0]
     out = []
     for skin in link_skins(read_urdf(inputs.keys.source.urdf), model):
@@ -157,9 +159,10 @@ def _hand_meshes(inputs: Inputs, q: np.ndarray) -> list[tuple[Skin, trimesh.Trim
     return out
 
 
-def _hand_points(model: HandModel, q: np.ndarray) -> np.ndarray:
+def _hand_points(inputs: Inputs, q: np.ndarray) -> np.ndarray:
     """Contact points (n, 3) and body origins at a posture: what a picture must show of a hand, without its arm."""
-    postures = sample_bodies(model, np.asarray(q, float)[None])
+    model = inputs.hand.model
+    postures = sample_bodies(model, np.asarray(q, float)[None], inputs.hand.device)
     body = model.contact_body
     placed = np.einsum("nij,nj->ni", postures.R[0][body], model.contact_points) + postures.t[0][body]
     return np.vstack([placed, postures.t[0][1:]])
@@ -184,7 +187,7 @@ def _near_faces(mesh: trimesh.Trimesh, points: np.ndarray, normals: np.ndarray) 
 def _palmar_direction(inputs: Inputs) -> np.ndarray:
     """Direction from which the contact surface of the open hand is seen best."""
     model = inputs.hand.model
-    postures = sample_bodies(model, model.tree.joint_open[None])
+    postures = sample_bodies(model, model.tree.joint_open[None], inputs.hand.device)
     last = int(model.contact_first[model.groups + 1])
     body = model.contact_body[:last]
     weight = np.where(body == 0, 2.0, 1.0)

@@ -33,13 +33,14 @@ def check_spaces(inputs: Inputs) -> list[SpaceCheck]:
     spaces = hand_spaces(spec, model.tree)
     if not spaces:
         return []
-    urdf, postures = read_urdf(inputs.keys.source.urdf), space_postures(model)
+    device = inputs.hand.device
+    urdf, postures = read_urdf(inputs.keys.source.urdf), space_postures(model, device)
     out = []
     for space in spaces:
         labels = [finger_label(model, dict(spec.fingers), g) if g >= 0 else "palm" for g in space.groups]
         joints = list(spec.opposition_spaces[space.name].joints)
         try:
-            sides = space_sides(urdf, spec, model.tree, space.name)
+            sides = space_sides(urdf, spec, model.tree, space.name, device)
         except HandError as error:
             out.append(SpaceCheck(space.name, joints, labels, [0.0, 0.0], None, None, str(error).split(": ", 2)[-1]))
             continue

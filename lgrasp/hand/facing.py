@@ -55,13 +55,13 @@ def opposed(
     return good, width
 
 
-def space_postures(model: HandModel) -> Postures:
+def space_postures(model: HandModel, device: str = "cpu") -> Postures:
     """Random postures of a hand; row r has the shared joints at setting r modulo the number of settings."""
     tree = model.tree
     q = np.random.default_rng(0).uniform(tree.joint_lower, tree.joint_upper, (_POSTURES, model.dofs))
     shared = np.isin(tree.joint_names, tree.shared_names)
     q[:, shared] = np.resize(tree.settings[:, shared], (_POSTURES, int(shared.sum())))
-    return sample_bodies(model, q)
+    return sample_bodies(model, q, device)
 
 
 def space_opening(model: HandModel, postures: Postures, space: Space, sides: tuple[SpaceSide, SpaceSide]) -> Opening:

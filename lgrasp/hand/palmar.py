@@ -51,17 +51,17 @@ class Postures:
     touching: np.ndarray  # (N,) do any two parts touch?
 
 
-def sample_bodies(model: HandModel, q: np.ndarray) -> Postures:
+def sample_bodies(model: HandModel, q: np.ndarray, device: str = "cpu") -> Postures:
     """Body poses at postures q (N, K) and what is clear there."""
     from scipy.spatial.transform import Rotation
 
     start()
-    poses = body_poses(upload_hand(model, "cpu"), q)
+    poses = body_poses(upload_hand(model, device), q)
     R = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix().reshape(*poses.shape[:2], 3, 3)
     clear = np.ones((len(q), model.groups), bool)
     touching: np.ndarray = np.zeros(len(q), bool)
     if len(model.pairs):
-        touch = pieces_touch(model, q, model.pairs)
+        touch = pieces_touch(model, q, model.pairs, device=device)
         group = model.tree.body_group[model.piece_body[model.pairs]]  # (Q, 2), the base is -1
         for g in range(model.groups):
             own = (group[:, 1] == g) & ((group[:, 0] == -1) | (group[:, 0] == g))
@@ -111,7 +111,7 @@ def _first_hits(
     free_out[i] = wp.where(hit.result, 0, 1)
 
 
-def see_skins(skins: list[Skin], postures: Postures, tips: dict[int, np.ndarray]) -> list[Skin]:
+def see_skins(skins: list[Skin], postures: Postures, tips: dict[int, np.ndarray], device: str = "cpu") -> list[Skin]:
     """The skins with the share of postures at which the mean fingertip sees each point.
 
     Args:
@@ -133,18 +133,20 @@ def see_skins(skins: list[Skin], postures: Postures, tips: dict[int, np.ndarray]
         def place(p: np.ndarray, b: np.ndarray, R: np.ndarray = R, t: np.ndarray = t) -> np.ndarray:
             return np.einsum("nij,nj->ni", R[b], p) + t[b]
 
-        world = wp.array(place(vertices, body).astype(np.float32), dtype=wp.vec3, device="cpu")
+        world = wp.array(place(vertices, body).astype(np.float32), dtype=wp.vec3, device=device)
         if handle is None:
-            handle = wp.Mesh(world, wp.array(faces.ravel().astype(np.int32), dtype=wp.int32, device="cpu"))
+            handle = wp.Mesh(world, wp.array(faces.ravel().astype(np.int32), dtype=wp.int32, device=device))
         else:
             wp.copy(handle.points, world)
             handle.refit()
         eye = np.mean([R[b] @ p + t[b] for b, p in tips.items()], 0)
         target = place(points, point_body)
         facing = np.einsum("ni,ni->n", np.einsum("nij,nj->ni", R[point_body], normals), eye - target) > 0
-        free = wp.empty(len(target), dtype=wp.int32, device="cpu")
-        targets = wp.array(target.astype(np.float32), dtype=wp.vec3, device="cpu")
-        wp.launch(_first_hits, len(target), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device="cpu")
+        free = wp.empty(len(target), dtype=wp.int32, device=device)
+        targets = wp.array(target.astype(np.float32), dtype=wp.vec3, device=device)
+        wp.launch(
+            _first_hits, len(target), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device
+        )
         seen += facing & (free.numpy() == 1)
     parts = np.split(seen / len(chosen), np.cumsum([len(s.points) for s in skins])[:-1])
     return [

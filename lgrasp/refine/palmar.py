@@ -14,14 +14,14 @@ _POSTURES = 64
 _SEEN = 0.3  # share of postures
 
 
-def seen_palmar(source: HandSource, model: HandModel) -> Palmar:
+def seen_palmar(source: HandSource, model: HandModel, device: str = "cpu") -> Palmar:
     """The palmar side of a hand: what the mean fingertip sees. A ray from there meets it first, in three of ten random
     postures or more."""
     tree = model.tree
     q = np.random.default_rng(0).uniform(tree.joint_lower, tree.joint_upper, (_POSTURES, model.dofs))
     skins = link_skins(read_urdf(source.urdf), model)
     tips = {b: _tip([s for s in skins if s.body == b]) for b in last_bodies(model)}
-    seen = see_skins(skins, sample_bodies(model, q), tips)
+    seen = see_skins(skins, sample_bodies(model, q, device), tips, device)
     chosen = [s.seen >= _SEEN for s in seen]
     parts = [
         (np.full(int(c.sum()), tree.link_names.index(s.link)), s.points[c], s.normals[c])

@@ -91,7 +91,7 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
     if path.exists() and not job.force:
         raise OutputError(f"{path} exists; choose another folder with --out, or --force to replace it")
     clean_folder(path)
-    palmar = seen_palmar(source, hand)
+    palmar = seen_palmar(source, hand, device.alias)
     params = job.params if job.cloud is None else cloud_params(job.params)
     planner = Planner(upload_hand(hand, device.alias), model, stand_off, params, palmar, around)
     begin = time.perf_counter()
