@@ -13,7 +13,7 @@ from lgrasp.dataset.records import Shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.diagnose import diagnose, hand_findings
 from lgrasp.engine.generate import Job, generate
-from lgrasp.engine.pictures import draw_grasps, draw_hand, draw_spaces, draw_workspace
+from lgrasp.engine.pictures import draw_grasps, draw_hand, draw_palmar, draw_spaces, draw_workspace
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.report import survivors
 from lgrasp.engine.space_check import SpaceCheck, check_spaces, longest_sequence
@@ -129,6 +129,7 @@ def check_hand(
         out.mkdir(parents=True, exist_ok=True)
         result.pictures = [
             draw_hand(inputs, out / "hand.png"),
+            draw_palmar(inputs, out / "palmar.png"),
             draw_workspace(inputs, out / "workspace.png"),
         ]
         able = [space.name for space in result.spaces if all(space.areas)]

@@ -1,4 +1,4 @@
-"""Pictures of a hand without a display: contact patches, canonical box, workspace clouds, sample grasps."""
+"""Pictures of a hand without a display: contact patches, canonical box, palmar side, workspace, sample grasps."""
 
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,15 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.palmar import Skin, link_skins, sample_bodies
 from lgrasp.hand.spaces import space_sides
 from lgrasp.hand.urdf import read_urdf
+from lgrasp.refine.palmar import seen_palmar
+from lgrasp.refine.surface import DISTAL, OTHER, last_bodies
 
-__all__ = ["draw_grasps", "draw_hand", "draw_spaces", "draw_workspace"]
+__all__ = ["draw_grasps", "draw_hand", "draw_palmar", "draw_spaces", "draw_workspace"]
 
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#e377c2", "#17becf")
 _PALM = "#e8a400"
 _LINK = "#c4c8cc"
+_PULLS = {DISTAL: "#d62728", OTHER: "#f2b134"}  # palmar points by their weight
 _OBJECT = "#ff9a3c"
 _FACES = 2500  # of a link
 
@@ -61,6 +64,33 @@ def draw_workspace(inputs: Inputs, path: Path) -> Path:
         )
     _legend(figure, inputs, box=True)
     figure.suptitle(f"{model.name}: reach of every finger's contact surface")
+    return save_figure(figure, path)
+
+
+def draw_palmar(inputs: Inputs, path: Path) -> Path:
+    """The open hand from four sides, its palmar side in colours: what it pulls to an object, by weight."""
+    from matplotlib.patches import Patch
+
+    source, model = inputs.keys.source, inputs.hand.model
+    q, last = model.tree.joint_open, last_bodies(model)
+    side = seen_palmar(source, model, inputs.hand.device)
+    triangles, colours = [], []
+    for skin, mesh, placed in _hand_meshes(inputs, q):
+        own, tint = side.link == model.tree.link_names.index(skin.link), shade(placed, _LINK)
+        if own.any():
+            pulled = _seen_faces(mesh, skin, side.points[own])
+            tint[pulled] = shade(placed[pulled], _PULLS[DISTAL if skin.body in last else OTHER])
+        triangles.append(placed)
+        colours.append(tint)
+    figure = new_figure(16, 5.6)
+    for i, turn in enumerate((0.0, 75.0, 180.0, -75.0)):
+        axes = figure.add_subplot(1, 4, i + 1, projection="3d")
+        add_triangles(axes, np.concatenate(triangles), np.concatenate(colours))
+        frame_points(axes, _hand_points(inputs, q), _palmar_direction(inputs), turn)
+    words = {DISTAL: "last links", OTHER: "other links"}
+    marks = [Patch(color=colour, label=f"{words[w]}, weight {w:g}") for w, colour in _PULLS.items()]
+    figure.legend(handles=[*marks, Patch(color=_LINK, label="not palmar")], loc="lower center", ncols=3, frameon=False)
+    figure.suptitle(f"{model.name}: palmar side, from the front, both sides and the back")
     return save_figure(figure, path)
 
 
@@ -182,6 +212,15 @@ def _near_faces(mesh: trimesh.Trimesh, points: np.ndarray, normals: np.ndarray) 
     """Faces of a mesh that lie at contact points (n, 3) and look their way."""
     far, near = cKDTree(points).query(mesh.triangles_center)
     return np.flatnonzero((far < 0.006) & ((mesh.face_normals * normals[near]).sum(1) > 0.6))
+
+
+def _seen_faces(mesh: trimesh.Trimesh, skin: Skin, palmar: np.ndarray) -> np.ndarray:
+    """Faces of a mesh whose nearest sample of the skin that looks their way is one of the palmar ones (n, 3)."""
+    seen = cKDTree(palmar).query(skin.points)[0] < 1e-9
+    near = cKDTree(skin.points).query(mesh.triangles_center, 8)[1]  # (m, 8)
+    alike = np.einsum("mki,mi->mk", skin.normals[near], mesh.face_normals) > 0.6
+    chosen = near[np.arange(len(near)), alike.argmax(1)]
+    return np.flatnonzero(seen[chosen] & alike.any(1))
 
 
 def _palmar_direction(inputs: Inputs) -> np.ndarray:

@@ -55,7 +55,9 @@ def test_check_measures_the_spaces(cli, jaws, tmp_path):
     assert "side 1" in nothing
     assert "has no surface" in nothing
     assert "a sequence holds 1 object at most" in lines
-    assert (folder / "spaces.png").stat().st_size > 20_000
+    for name in ("spaces.png", "palmar.png"):
+        assert (folder / name).stat().st_size > 20_000
+        assert f"wrote {folder / name}" in lines
 
 
 def test_spaces_that_do_not_fit_are_refused(cli, jaws):

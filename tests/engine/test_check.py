@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from matplotlib import image
 from reference.urdfs import gripper
 
 from lgrasp.device.runtime import resolve_device
@@ -45,11 +46,24 @@ def test_drafted_gripper_holds_all_three(jaws, tmp_path, swift: Pipeline, cache_
     assert [(s.name, s.problem) for s in found.spaces] == [("finger_1-finger_2", "")]
     assert found.longest_sequence == 1
     assert all(list(o.survivors) == list(swift.order) for o in found.objects)
-    assert [p.name for p in found.pictures] == ["hand.png", "workspace.png", "spaces.png", "grasps.png"]
+    assert [p.name for p in found.pictures] == ["hand.png", "palmar.png", "workspace.png", "spaces.png", "grasps.png"]
     for picture in found.pictures:
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert picture.stat().st_size > 20_000
     assert said[-1] == "pictures"
+    red, amber, grey = share_of_colours(tmp_path / "palmar.png")
+    assert 0.001 < red < 0.1  # the jaw, a last link
+    assert 0.001 < amber < 0.1  # the static one
+    assert grey > 0.005  # their backs
+
+
+def share_of_colours(picture: Path) -> tuple[float, ...]:
+    """Share of a picture's pixels that are red, amber and grey, of any brightness but white and black."""
+    rgb = image.imread(picture)[..., :3]
+    r, g, b = np.moveaxis(rgb, -1, 0)
+    lit = (rgb.max(-1) > 0.3) & (rgb.max(-1) < 0.93)
+    colours = (g < 0.4 * r) & (b < 0.4 * r), (g > 0.6 * r) & (b < 0.4 * r), np.ptp(rgb, axis=-1) < 0.05
+    return tuple(float((lit & colour).mean()) for colour in colours)
 
 
 def load_hand(hand: str, swift: Pipeline, cache_root: Path) -> Inputs:
