@@ -8,13 +8,11 @@ import torch
 from lgrasp.differentiable.distance import DistanceGrids
 from lgrasp.differentiable.solids import hand_solids
 from lgrasp.hand.model import HandModel
-from lgrasp.refine.surface import farthest_points
+from lgrasp.refine.match_kernels import DEEPEST, LINK_DEEPEST
+from lgrasp.refine.surface import LINK_POINTS, link_probes
 
 __all__ = ["Intrusions", "LinkSolids"]
 
-_POINTS = 32  # of each link, that other links are probed with
-_OBJECT_DEEPEST, _LINK_DEEPEST = 4, 2  # points that are kept of each link, and of each pair of links
-_COUNT = 1024
 _NOTHING = -1.0  # [m] offset of a plane that nothing is near
 
 
@@ -45,7 +43,7 @@ class LinkSolids:
     def __init__(
         self, model: HandModel, cloud: np.ndarray, margin: float, *, dtype: torch.dtype, device: str | torch.device
     ) -> None:
-        solids = hand_solids(model, _COUNT)
+        solids = hand_solids(model, LINK_POINTS)
 
         def put(a: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device)
@@ -56,7 +54,7 @@ class LinkSolids:
         balls = np.stack([s.ball for s in solids.solids])
         self._centre, self._radius = put(balls[:, :3]), put(balls[:, 3])
         self._cloud = put(cloud)
-        self._points = put(np.stack([s.points[farthest_points(s.points, _POINTS)] for s in solids.solids]))
+        self._points = put(np.stack([link_probes(s.points) for s in solids.solids]))
         pairs = np.concatenate([solids.pairs, solids.pairs[:, ::-1]])
         self._pairs = torch.as_tensor(np.ascontiguousarray(pairs), dtype=torch.int64, device=device)
 
@@ -80,7 +78,7 @@ class LinkSolids:
         d, _ = self._distance(p, link)
         depth = torch.full_like(apart, torch.inf)
         depth[row, link, point] = d
-        best = depth.topk(_OBJECT_DEEPEST, dim=2, largest=False)
+        best = depth.topk(DEEPEST, dim=2, largest=False)
         rows = torch.arange(len(cloud), device=cloud.device)[:, None, None]
         p = _into(link_R[:, :, None], link_t[:, :, None], cloud[rows, best.indices])  # (N, S, k, 3)
         normal, offset = self._planes(p, torch.arange(len(self._body), device=p.device)[:, None])
@@ -94,11 +92,11 @@ class LinkSolids:
         row, pair = near.nonzero().unbind(1)
         first, second = a[pair], b[pair]
         p = (link_R[row, first, None] @ self._points[first][..., None])[..., 0] + link_t[row, first, None]
-        p = _into(link_R[row, second, None], link_t[row, second, None], p)  # (E, _POINTS, 3)
+        p = _into(link_R[row, second, None], link_t[row, second, None], p)  # (E, probes, 3)
         d, _ = self._distance(p, second[:, None])
-        best = d.topk(_LINK_DEEPEST, dim=1, largest=False).indices
+        best = d.topk(LINK_DEEPEST, dim=1, largest=False).indices
         normal, offset = self._planes(p.gather(1, best[..., None].expand(-1, -1, 3)), second[:, None])
-        shape = (len(centre), len(a), _LINK_DEEPEST)
+        shape = (len(centre), len(a), LINK_DEEPEST)
         points = centre.new_zeros((*shape, 3))
         normals, offsets = torch.zeros_like(points), centre.new_full(shape, _NOTHING)
         points[row, pair] = self._points[first[:, None], best]

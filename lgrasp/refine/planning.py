@@ -1,31 +1,31 @@
 """Grasp planning: many starts before a surface, a parallel local search, the best of each start."""
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from pydantic import BaseModel, ConfigDict, Field
 
-from lgrasp.differentiable.rotations import matrix_from_quaternion, quaternion_from_matrix
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.object.arrays import upload_object
+from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.check import OUTCOMES, check_grasps
+from lgrasp.refine.descent import Descent, Hands, inverse_poses
 from lgrasp.refine.params import GraspBounds, LocalSearch
-from lgrasp.refine.refiner import Pose, Refiner
-from lgrasp.refine.starts import GOLDEN_ANGLE, palm_axis, start_poses
+from lgrasp.refine.starts import GOLDEN_ANGLE, palm_axis, start_poses, tilted
 from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface
-from lgrasp.refine.target import Target
+from lgrasp.refine.volume import upload_target
 
-__all__ = ["PlanParams", "Planned", "Planner", "cloud_params", "object_pose", "table_pose"]
+__all__ = ["PlanParams", "Planned", "Planner", "cloud_params"]
 
-_CPU_STARTS, _GPU_STARTS = 40, 800  # planned at a time
+_CPU_STARTS, _GPU_STARTS = 10, 2000  # planned at a time
 _COLLIDES, _CLOUD_DEPTH = 1.0e-3, 4.0e-3  # [m]
 _PLAN_BOUNDS = GraspBounds(
-    penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=40.0
+    penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=60.0
 )
 _COARSE = GraspBounds(penetration=0.01, self_margin=0.0, gap=0.012, angle=60.0, fold=90.0, balance=10.0)
 
@@ -36,9 +36,14 @@ class PlanParams(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     rolls: int = Field(
-        default=12, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
+        default=24, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
     )
-    finalists: int = Field(default=4, ge=1, le=64, description="Of these go on after the first outer steps.")
+    tilts: tuple[float, ...] = Field(
+        default=(0.0, 45.0, 90.0),
+        min_length=1,
+        description="Angles between the surface's normal and the way back from it [deg], in turn.",
+    )
+    finalists: int = Field(default=8, ge=1, le=64, description="Of these go on after the first outer steps.")
     opening: int = Field(default=5, ge=1, le=100, description="Outer steps of all of them.")
     clearance: float = Field(
         default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
@@ -48,8 +53,13 @@ class PlanParams(BaseModel):
     )
     other: float = Field(default=OTHER, ge=0, le=100, description="Weight of the other palmar points.")
     search: LocalSearch = Field(
-        default=LocalSearch(shift=0.002, turn=0.02, bend=0.04, reach=0.15, reach_end=0.1, soft=0.01, force=0.3),
+        default=LocalSearch(
+            shift=0.002, turn=0.02, bend=0.04, reach=0.15, reach_end=0.1, soft=0.01, force=0.3, margin=0.005
+        ),
         description="The local search.",
+    )
+    rank_friction: float = Field(
+        default=0.3, gt=0, le=2, description="Friction coefficient at which the hands of a start are compared."
     )
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
@@ -99,92 +109,104 @@ class Planner:
         Raises:
             HandError: the hand has no palm.
         """
-        p, hand, device = self.params, self.hand.model, self.hand.device
-        target = Target(self.model, self.around, device=device)
-        search = Refiner(hand, target, p.search, surface=hand_surface(hand, self.palmar, **p.weights()), device=device)
+        p, device = self.params, self.hand.device
+        surface = hand_surface(self.hand.model, self.palmar, **p.weights())
+        around = None if self.around is None else upload_object(self.around, device)
+        scene = _Scene(
+            Descent(self.hand, upload_target(self.model, self.around, device), p.search, surface),
+            upload_object(self.model, device),
+            around,
+        )
         points = farthest_points(self.model.contact_points.astype(float), count)
+        some, workers = (_CPU_STARTS, os.cpu_count() or 1) if device == "cpu" else (_GPU_STARTS, 1)
         counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *OUTCOMES], 0)
         tables = []
-        some = _CPU_STARTS if device == "cpu" else _GPU_STARTS
-        for first in range(0, count, some):
-            table, outcome = self._plan(search, points[first : first + some], first)
-            counts["starts"] += len(points[first : first + some])
-            counts["colliding"] += len(points[first : first + some]) - len(outcome)
-            for code, name in enumerate(OUTCOMES):
-                counts[name] += int((outcome == code).sum())
-            tables.append(take_grasps(table, np.flatnonzero(outcome == 0)))
-            if progress:
-                progress(counts["starts"], counts["kept"])
+        with ThreadPoolExecutor(workers) as pool:
+            firsts = range(0, count, some)
+            parts = [pool.submit(self._plan, scene, points[first : first + some], first) for first in firsts]
+            try:
+                for first, part in zip(firsts, parts, strict=True):
+                    table, outcome = part.result()
+                    tried = len(points[first : first + some])
+                    counts["starts"] += tried
+                    counts["colliding"] += tried - len(outcome)
+                    for code, name in enumerate(OUTCOMES):
+                        counts[name] += int((outcome == code).sum())
+                    tables.append(take_grasps(table, np.flatnonzero(outcome == 0)))
+                    if progress:
+                        progress(counts["starts"], counts["kept"])
+            finally:
+                pool.shutdown(cancel_futures=True)
         return Planned(join_grasps(tables), counts)
 
-    def _plan(self, search: Refiner, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
+    def _plan(self, scene: "_Scene", points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
-        p, hand = self.params, self.hand.model
-        start, pose, facing = self._starts(points, first)
-
-        def put(a: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(a, dtype=torch.float32, device=self.hand.device)
-
-        centre, axis = palm_axis(hand)
-        travel = put(np.full(len(start), max(self.stand_off - float(centre @ axis) - p.clearance, 0.0)))
-        at = Pose(*map(put, pose))
-        free = ~search.inside(at, _COLLIDES).cpu().numpy()
-        at, start = _rows(at, free), start[free]
-        at = search.advanced(at, put(facing[free]), travel[: len(start)], p.clearance)
+        p, hand, search = self.params, self.hand.model, scene.search
+        start, pose, q, facing = self._starts(points, first)
+        free = search.depth(self._put(pose, q)) <= _COLLIDES
+        start, at = start[free], self._put(pose[free], q[free])
         if len(start):
-            at = search(*at, outer=p.opening).pose
-            table, outcome = self._checked(at, start, _COARSE)
-            best = _best(start, table, outcome, p.finalists)
-            at, start = _rows(at, best), start[best]
-            at = search(*at, first=p.opening).pose
-        table, outcome = self._checked(at, start, p.bounds)
-        best = _best(start, table, outcome, 1)
-        return take_grasps(table, best), outcome[best]
+            centre, axis = palm_axis(hand)
+            travel = np.full(len(start), max(self.stand_off - float(centre @ axis) - p.clearance, 0.0))
+            search.advanced(at, facing[free], travel, p.clearance)
+            search.run(at, outer=p.opening)
+            start, at = self._best(scene, at, start, _COARSE, p.finalists)
+            search.run(at, first=p.opening)
+            start, at = self._best(scene, at, start, p.bounds, 1)
+        return self._checked(scene, at, start, p.bounds)
 
-    def _starts(
-        self, points: np.ndarray, first: int
-    ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-        """Start of each hand (M,), the hands (R, t, q), and the directions they face (M, 3); starts count from
-        ``first``, ``points`` are theirs among the contact points."""
+    def _best(
+        self, scene: "_Scene", at: Hands, start: np.ndarray, bounds: GraspBounds, count: int
+    ) -> tuple[np.ndarray, Hands]:
+        """The ``count`` best hands of each start: those that pass the checks first, then those that resist most."""
+        bounds = bounds.model_copy(update={"friction": self.params.rank_friction})
+        table, outcome = self._checked(scene, at, start, bounds)
+        keys = [np.arange(len(start)), -table.metrics["epsilon"], table.metrics["disturbance"], outcome != 0, start]
+        order = np.lexsort(keys)
+        place = np.arange(len(start)) - np.searchsorted(start[order], start[order])
+        rows = np.sort(order[place < count])
+        pose, q = at.numpy()
+        return start[rows], self._put(pose[rows], q[rows])
+
+    def _starts(self, points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Start of each hand (M,), the hands' bases (M, 7) and joints (M, K), and the directions they face (M, 3).
+
+        Starts count from ``first``, ``points`` are theirs among the contact points.
+        """
         model, settings, rolls = self.model, self.hand.model.tree.settings, self.params.rolls
         start = np.repeat(first + np.arange(len(points)), rolls)
         at, normals = (a[points].repeat(rolls, 0).astype(float) for a in (model.contact_points, model.contact_normals))
         number = start * rolls + np.tile(np.arange(rolls), len(points))
         turn = (start * GOLDEN_ANGLE + 2 * np.pi * number / rolls) % (2 * np.pi)
-        R, t = start_poses(self.hand.model, at, normals, turn, self.stand_off)
+        tilt = np.deg2rad(np.array(self.params.tilts))[number // len(settings) % len(self.params.tilts)]
+        back = tilted(normals, tilt, number * GOLDEN_ANGLE)
+        pose = start_poses(self.hand.model, at, back, turn, self.stand_off)
         # shared joints take their values in turn
-        return start, (R, t, settings[number % len(settings)]), -normals
+        return start, pose, settings[number % len(settings)], -back
 
-    def _checked(self, pose: Pose, start: np.ndarray, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray]:
-        around = None if self.around is None else upload_object(self.around, self.hand.device)
-        obj = upload_object(self.model, self.hand.device)
-        q = pose.q.cpu().numpy()
+    def _put(self, pose: np.ndarray, q: np.ndarray) -> Hands:
+        return Hands.put(pose, q, self.hand.device)
+
+    def _checked(
+        self, scene: "_Scene", at: Hands, start: np.ndarray, bounds: GraspBounds
+    ) -> tuple[GraspTable, np.ndarray]:
+        pose, q = at.numpy()
         return check_grasps(
-            self.hand, obj, object_pose(pose), q, bounds, palmar=self.palmar, around=around, index=start
+            self.hand,
+            scene.object,
+            inverse_poses(pose),
+            q,
+            bounds,
+            palmar=self.palmar,
+            around=scene.around,
+            index=start,
         )
 
 
-def object_pose(pose: Pose) -> np.ndarray:
-    """T_hand_object of the object's internal frame, x y z [m] qx qy qz qw, (N, 7), of hands in that frame."""
-    R = pose.R.mT
-    t = -(R @ pose.t[..., None])[..., 0]
-    return torch.cat([t, quaternion_from_matrix(R)], 1).cpu().numpy()
+@dataclass(frozen=True)
+class _Scene:
+    """What a planning uploads once."""
 
-
-def table_pose(table: GraspTable, device: str) -> Pose:
-    """Hands of grasps in the object's internal frame: inverse of :func:`object_pose`."""
-    pose = torch.as_tensor(table.pose, device=device)
-    R = matrix_from_quaternion(pose[:, 3:]).mT
-    return Pose(R, -(R @ pose[:, :3, None])[..., 0], torch.as_tensor(table.q, device=device))
-
-
-def _rows(pose: Pose, rows: np.ndarray) -> Pose:
-    at = torch.as_tensor(rows, device=pose.q.device)
-    return Pose(*(x[at] for x in pose))
-
-
-def _best(start: np.ndarray, table: GraspTable, outcome: np.ndarray, count: int) -> np.ndarray:
-    """Rows of the ``count`` best of each start: those that pass first, then those that resist most; rising."""
-    order = np.lexsort([np.arange(len(start)), table.metrics["disturbance"], outcome != 0, start])
-    place = np.arange(len(start)) - np.searchsorted(start[order], start[order])
-    return np.sort(order[place < count])
+    search: Descent
+    object: ObjectArrays
+    around: ObjectArrays | None

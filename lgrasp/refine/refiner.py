@@ -2,13 +2,17 @@
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import nn
 
 from lgrasp.differentiable.kinematics import BodyKinematics
-from lgrasp.differentiable.rotations import so3_exp
+from lgrasp.differentiable.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
+from lgrasp.grasp.tables import GraspTable
+from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.object.model import ObjectModel
+from lgrasp.refine.descent import Descent, Hands
 from lgrasp.refine.energy import (
     Energies,
     Matches,
@@ -19,13 +23,12 @@ from lgrasp.refine.energy import (
 )
 from lgrasp.refine.links import LinkSolids
 from lgrasp.refine.params import LocalSearch
-from lgrasp.refine.steps import Gradient, Moments, clipped
+from lgrasp.refine.steps import Gradient, clipped
 from lgrasp.refine.surface import HandSurface, hand_surface
 from lgrasp.refine.target import Target
+from lgrasp.refine.volume import upload_target
 
-__all__ = ["Pose", "Refined", "Refiner"]
-
-_ADVANCES = 30
+__all__ = ["Pose", "Refined", "Refiner", "object_pose", "table_pose"]
 
 
 class Pose(NamedTuple):
@@ -50,8 +53,9 @@ class Refined(NamedTuple):
 class Refiner(nn.Module):
     """Moves hands by the gradient of E* (:mod:`lgrasp.refine.energy`) until their surface fits the object's.
 
-    Three modes: :meth:`forward` is fast and keeps no graph; :meth:`unrolled` can be differentiated by the poses that
-    it is given; :meth:`energy` is E* itself, as a loss. What becomes of a sample does not depend on the others.
+    Three modes: :meth:`forward` is fast, keeps no graph and computes in float32 (:mod:`lgrasp.refine.descent`);
+    :meth:`unrolled` can be differentiated by the poses that it is given; :meth:`energy` is E* itself, as a loss. What
+    becomes of a sample does not depend on the others.
 
     Args:
         hand: any hand; coupled joints move with their drive.
@@ -74,6 +78,8 @@ class Refiner(nn.Module):
     ) -> None:
         super().__init__()
         surface = surface or hand_surface(hand)
+        self._hand, self._surface, self._device = hand, surface, torch.device(device)
+        self._descent: Descent | None = None  # made when first used
         self.params = params or LocalSearch()
         self.target = target if isinstance(target, Target) else Target(target, dtype=dtype, device=device)
         self._bodies = BodyKinematics(hand.tree, dtype=dtype, device=device)
@@ -105,18 +111,31 @@ class Refiner(nn.Module):
             R: rotations of the hand's base in the object's internal frame, (N, 3, 3). t: its origin [m], (N, 3).
             q: joint positions [rad or m], (N, K); outside the limits they are clamped first.
         """
-        p = self.params
-        outer = p.outer if outer is None else outer
-        pose = Pose(R.detach(), t.detach(), self._clamped(q.detach()))
-        moments = Moments(pose.t, pose.q)
-        whole = max(outer, p.outer)
-        for i in range(first, outer):
-            matches = self.match(*pose, reach=p.reach * (p.reach_end / p.reach) ** (i / whole))
-            for j in range(p.inner):
-                size = p.decay ** ((i + j / p.inner) / whole)
-                pose = self._moved(pose, moments.step(self._gradient(pose, matches), p, size))
         with torch.no_grad():
+            at = self._put(Pose(R.detach(), t.detach(), self._clamped(q.detach())))
+            self._fast().run(at, outer=outer, first=first)
+            pose = self._taken(at, t.dtype)
             return Refined(pose, self.energy(*pose))
+
+    def depth(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+        """Depth of the deepest point of hands in anything, or of that in them [m], negative apart, (N,)."""
+        with torch.no_grad():
+            return torch.as_tensor(self._fast().depth(self._put(Pose(R, t, q))), device=self._device)
+
+    def _fast(self) -> Descent:
+        if self._descent is None:
+            name = "cpu" if self._device.type == "cpu" else f"cuda:{self._device.index or 0}"
+            target = upload_target(self.target.model, self.target.around, name)
+            self._descent = Descent(upload_hand(self._hand, name), target, self.params, self._surface)
+        return self._descent
+
+    def _put(self, pose: Pose) -> Hands:
+        base = torch.cat([pose.t, quaternion_from_matrix(pose.R)], 1)
+        return Hands.put(base.cpu().numpy(), pose.q.cpu().numpy(), self._fast().device)
+
+    def _taken(self, at: Hands, dtype: torch.dtype) -> Pose:
+        base, q = (torch.as_tensor(x, dtype=dtype, device=self._device) for x in at.numpy())
+        return Pose(matrix_from_quaternion(base[:, 3:]), base[:, :3], q)
 
     def unrolled(
         self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, steps: int = 5, matches: Matches | None = None
@@ -132,8 +151,7 @@ class Refiner(nn.Module):
         matches = matches or self.match(R, t, q)
         pose = Pose(R, t, q)
         for _ in range(steps):
-            g = self._gradient(pose, matches, graph=True)
-            pose = self._moved(pose, clipped(g, self.params))
+            pose = self._moved(pose, clipped(self._gradient(pose, matches), self.params))
         return pose
 
     def energy(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, matches: Matches | None = None) -> Energies:
@@ -171,32 +189,6 @@ class Refiner(nn.Module):
         block_offset = (x * block_n).sum(-1) - block_d
         return Matches(offset, n, pull, block_offset, block_n, self._contacts(x, d), self._links.match(R, t, *bodies))
 
-    @torch.no_grad()
-    def advanced(self, pose: Pose, direction: torch.Tensor, travel: torch.Tensor, clearance: float) -> Pose:
-        """Hands moved straight until a point of theirs is ``clearance`` [m] from anything, or by ``travel`` (N,) [m].
-
-        Args:
-            direction: unit vectors in the object's frame, (N, 3).
-        """
-        x, _ = self._placed(pose.R, pose.t, self._bodies(pose.q))
-        gone = torch.zeros_like(travel)
-        for _ in range(_ADVANCES):
-            at = x + (gone[:, None] * direction)[:, None, None]
-            d, n = self.target.nearest(at)
-            d, _ = self.target.nearest_obstacle(at, d, n)
-            gone = (gone + (d.amin((1, 2)) - clearance).clamp_min(0)).minimum(travel)
-        return pose._replace(t=pose.t + gone[:, None] * direction)
-
-    @torch.no_grad()
-    def inside(self, pose: Pose, depth: float) -> torch.Tensor:
-        """Is a point of the hand deeper than ``depth`` [m] in anything, or one of that in the hand? (N,) bool."""
-        R, t, q = pose
-        bodies = self._bodies(q)
-        x, _ = self._placed(R, t, bodies)
-        d, _ = self.target.nearest_obstacle(x, *self.target.nearest(x))
-        into, _ = self._links.distances(self._links.match(R, t, *bodies), R, t, *bodies)
-        return (d.amin((1, 2)) < -depth) | (into.amin((1, 2)) < -depth)
-
     def _contacts(self, x: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
         """Farthest points among the nearest of the palmar ones, (N, C); the nearest of all first."""
         p = self.params
@@ -221,18 +213,14 @@ class Refiner(nn.Module):
         turned = R_block.mT
         return self._points @ turned + t_block[:, :, None], self._normals @ turned
 
-    def _gradient(self, pose: Pose, matches: Matches, *, graph: bool = False) -> Gradient:
-        R, t, q = pose if graph else (x.detach() for x in pose)
+    def _gradient(self, pose: Pose, matches: Matches) -> Gradient:
         with torch.enable_grad():
-            if graph:
-                R, t, q = (x if x.requires_grad else x.detach().requires_grad_() for x in (R, t, q))
-            else:
-                R, t, q = (x.requires_grad_() for x in (R, t, q))
+            R, t, q = (x if x.requires_grad else x.detach().requires_grad_() for x in pose)
             total = self.energy(R, t, q, matches=matches).total.sum()
-            by_R, by_t, by_q = torch.autograd.grad(total, [R, t, q], create_graph=graph)
+            by_R, by_t, by_q = torch.autograd.grad(total, [R, t, q], create_graph=True)
             arm = t - self.middle(R, t)
             turn = torch.linalg.cross(R, by_R, dim=1).sum(2) + torch.linalg.cross(arm, by_t)
-        return Gradient(by_t, turn, by_q) if graph else Gradient(by_t, turn.detach(), by_q)
+        return Gradient(by_t, turn, by_q)
 
     def middle(self, R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
         """Middle of the palmar side of open hands [m], (N, 3): what they are turned about."""
@@ -247,3 +235,17 @@ class Refiner(nn.Module):
 
     def _clamped(self, q: torch.Tensor) -> torch.Tensor:
         return q.maximum(self.lower).minimum(self.upper)
+
+
+def object_pose(pose: Pose) -> np.ndarray:
+    """T_hand_object of the object's internal frame, x y z [m] qx qy qz qw, (N, 7), of hands in that frame."""
+    R = pose.R.mT
+    t = -(R @ pose.t[..., None])[..., 0]
+    return torch.cat([t, quaternion_from_matrix(R)], 1).cpu().numpy()
+
+
+def table_pose(table: GraspTable, device: str) -> Pose:
+    """Hands of grasps in the object's internal frame: inverse of :func:`object_pose`."""
+    pose = torch.as_tensor(table.pose, device=device)
+    R = matrix_from_quaternion(pose[:, 3:]).mT
+    return Pose(R, -(R @ pose[:, :3, None])[..., 0], torch.as_tensor(table.q, device=device))

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from lgrasp.errors import HandError
 from lgrasp.hand.model import HandModel
 
-__all__ = ["GOLDEN_ANGLE", "STAND_OFF", "palm_axis", "start_poses"]
+__all__ = ["GOLDEN_ANGLE", "STAND_OFF", "palm_axis", "start_poses", "tilted"]
 
 STAND_OFF = 0.12
 """Distance of a hand's base from the surface where hand.yaml has no ``stand_off`` [m]."""
@@ -30,8 +30,8 @@ def palm_axis(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
 
 def start_poses(
     model: HandModel, points: np.ndarray, normals: np.ndarray, turn: np.ndarray, stand_off: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (N, 3, 3) and positions (N, 3) [m] of hands in the frame of the points.
+) -> np.ndarray:
+    """Bases of hands in the frame of the points, x y z [m] qx qy qz qw, (N, 7).
 
     The palm faces along minus the normal, the line from its centre meets the point, and the base stands ``stand_off``
     from it along that line.
@@ -42,7 +42,15 @@ def start_poses(
     centre, facing = palm_axis(model)
     R = _frames(-normals) @ Rotation.from_rotvec(turn[:, None] * np.array([0, 0, 1.0])).as_matrix() @ _frames(facing).T
     lateral = centre - (centre @ facing) * facing
-    return R, points + stand_off * normals - np.einsum("nij,j->ni", R, lateral)
+    t = points + stand_off * normals - np.einsum("nij,j->ni", R, lateral)
+    return np.concatenate([t, Rotation.from_matrix(R).as_quat()], 1)
+
+
+def tilted(normals: np.ndarray, angle: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Unit vectors (N, 3) turned away by angle (N,) [rad], towards the side at azimuth (N,) [rad]."""
+    F = _frames(normals)
+    side = F[..., 0] * np.cos(azimuth)[:, None] + F[..., 1] * np.sin(azimuth)[:, None]
+    return normals * np.cos(angle)[:, None] + side * np.sin(angle)[:, None]
 
 
 def _frames(z: np.ndarray) -> np.ndarray:

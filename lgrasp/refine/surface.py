@@ -11,12 +11,14 @@ from lgrasp.hand.model import HandModel
 __all__ = [
     "BLOCK",
     "DISTAL",
+    "LINK_POINTS",
     "OTHER",
     "HandSurface",
     "Palmar",
     "farthest_points",
     "hand_surface",
     "last_bodies",
+    "link_probes",
     "ruled_palmar",
 ]
 
@@ -25,6 +27,10 @@ BLOCK = 24
 DISTAL, OTHER = 1.0, 0.2
 """Weight of palmar points on the last link of a finger, and of the others."""
 
+LINK_POINTS = 1024
+"""Points of the surfaces of all links together, where links are solids (:func:`hand_solids`)."""
+
+_PROBES = 32
 _PALMAR = 16  # of a block
 _AREA_BLOCKS = 4  # most blocks of one body
 _PER_BLOCK = 500  # surface samples of a body to a block
@@ -74,6 +80,11 @@ def farthest_points(points: np.ndarray, count: int, *, first: int = 0) -> np.nda
         chosen.append(int(gap.argmax()))
         gap = np.minimum(gap, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.resize(chosen, count)
+
+
+def link_probes(points: np.ndarray) -> np.ndarray:
+    """Those of a link's surface points that other links are probed with, (32, 3) [m]."""
+    return points[farthest_points(points, _PROBES)]
 
 
 def hand_surface(

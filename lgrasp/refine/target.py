@@ -7,11 +7,9 @@ from torch.nn.functional import grid_sample
 from lgrasp.differentiable.distance import SurfaceNormals
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.sdf import SdfGrid
+from lgrasp.refine.volume import solid_cloud, surface_radius
 
 __all__ = ["Target"]
-
-
-_CLOUD = 512
 
 
 class Target:
@@ -31,16 +29,16 @@ class Target:
         device: str | torch.device = "cpu",
     ) -> None:
         self._own = _Volume(model, dtype, device)
-        self._around = None if around is None else _Volume(around, dtype, device)
+        self._other = None if around is None else _Volume(around, dtype, device)
         self.normals = SurfaceNormals(_grid(model), dtype=dtype, device=device)
         """Outward unit normals (..., 3) at points (..., 3) [m]: smooth, differentiable."""
         solids = [model] if around is None else [model, around]
-        clouds = [m.obstacle_points[_evenly(len(m.obstacle_points), _CLOUD)] for m in solids]
-        self.cloud = np.concatenate(clouds)
+        self.model, self.around = model, around
+        self.cloud = np.concatenate([solid_cloud(m) for m in solids])
         """Points of the surface of all that the hand is kept out of [m], (n, 3)."""
         self.com = torch.as_tensor(model.com, dtype=dtype, device=device)
         """Centre of mass [m], (3,)."""
-        self.radius = float(np.linalg.norm(model.obstacle_points - model.com, axis=1).max())
+        self.radius = surface_radius(model)
         """Largest distance of the surface from there [m]."""
 
     def nearest(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -52,9 +50,9 @@ class Target:
 
     def nearest_obstacle(self, x: torch.Tensor, d: torch.Tensor, n: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """As :meth:`nearest`, of whatever is nearest to x, given what :meth:`nearest` says of the object itself."""
-        if self._around is None:
+        if self._other is None:
             return d, n
-        other_d, other_n = self._around.nearest(x)
+        other_d, other_n = self._other.nearest(x)
         closer = other_d < d
         return torch.where(closer, other_d, d), torch.where(closer[..., None], other_n, n)
 
@@ -83,11 +81,6 @@ class _Volume:
         far = way.norm(dim=-1)
         out = (beyond != 0).any(-1)
         return torch.where(out, far, d), torch.where(out[..., None], way / far.clamp_min(1e-9)[..., None], n)
-
-
-def _evenly(length: int, count: int) -> np.ndarray:
-    count = min(count, length)
-    return ((np.arange(count) + 0.5) * length / count).astype(int)
 
 
 def _grid(model: ObjectModel) -> SdfGrid:

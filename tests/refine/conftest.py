@@ -7,7 +7,7 @@ import torch
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.refine import LocalSearch, Pose, Refiner
-from lgrasp.refine.planning import table_pose
+from lgrasp.refine.refiner import table_pose
 
 
 @pytest.fixture(scope="session")

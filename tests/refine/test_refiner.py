@@ -64,9 +64,9 @@ def test_penetration_is_left(make, valid):
     pose = some(valid, slice(96))
     _, n = refiner.target.nearest(refiner.middle(pose.R, pose.t))
     into = pose._replace(t=pose.t - 0.006 * n)
-    deep = refiner.inside(into, 0.004)
+    deep = refiner.depth(*into) > 0.004
     assert deep.sum() > 16
-    assert refiner.inside(refiner(*(x[deep] for x in into)).pose, 0.002).float().mean() < 0.1
+    assert (refiner.depth(*refiner(*(x[deep] for x in into)).pose) > 0.002).float().mean() < 0.1
 
 
 def test_unrolled_steps_stay_rotations_and_lower_the_energy(make, valid, coarse):

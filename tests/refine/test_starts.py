@@ -1,18 +1,19 @@
 """Starts of a plan: palms that face the surface, weights, farthest points."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from lgrasp.refine.starts import palm_axis, start_poses
+from lgrasp.refine.starts import palm_axis, start_poses, tilted
 from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface, ruled_palmar
 
 
 def test_palm_faces_the_point_from_the_stand_off(inputs):
     model, obj = inputs.hand.model, inputs.object.model
     points, normals = obj.contact_points[:40].astype(float), obj.contact_normals[:40].astype(float)
-    R, t = start_poses(model, points, normals, np.linspace(0, 6, 40), 0.13)
+    pose = start_poses(model, points, normals, np.linspace(0, 6, 40), 0.13)
+    R, t = Rotation.from_quat(pose[:, 3:]).as_matrix(), pose[:, :3]
     centre, facing = palm_axis(model)
     np.testing.assert_allclose(R @ facing, -normals, atol=1e-6)
-    np.testing.assert_allclose(np.linalg.det(R), 1)
     palm = np.einsum("nij,j->ni", R, centre) + t
     np.testing.assert_allclose(np.cross(palm - points, normals), 0, atol=1e-6)  # the line meets the point
     np.testing.assert_allclose(((t - points) * normals).sum(1), 0.13, atol=1e-6)
@@ -36,3 +37,14 @@ def test_palmar_points_weigh_as_told(inputs):
     pulled = surface.points[surface.weight > 0]
     gap = np.linalg.norm(pulled[:, None] - ruled_palmar(model).points[None], axis=2).min(1)
     assert gap.max() < 1e-6
+
+
+def test_tilted_directions_lean_by_their_angle_to_all_sides():
+    normals = np.random.default_rng(0).normal(size=(400, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    angle, azimuth = np.linspace(0, np.pi / 2, 400), np.arange(400) * 2.4
+    back = tilted(normals, angle, azimuth)
+    np.testing.assert_allclose(np.linalg.norm(back, axis=1), 1)
+    np.testing.assert_allclose(np.arccos(np.clip((back * normals).sum(1), -1, 1)), angle, atol=1e-6)
+    around = tilted(np.tile([0.0, 0, 1], (8, 1)), np.full(8, np.pi / 2), np.arange(8) * np.pi / 4)
+    np.testing.assert_allclose(around.sum(0), 0, atol=1e-12)

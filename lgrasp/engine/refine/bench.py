@@ -28,8 +28,8 @@ from lgrasp.object.params import ObjectParams
 from lgrasp.physics import Scene, find_protocol, scene_of, verdicts
 from lgrasp.refine.cloud import cloud_object
 from lgrasp.refine.palmar import seen_palmar
-from lgrasp.refine.planning import Planner, PlanParams, cloud_params, table_pose
-from lgrasp.refine.refiner import Pose, Refiner
+from lgrasp.refine.planning import Planner, PlanParams, cloud_params
+from lgrasp.refine.refiner import Pose, Refiner, table_pose
 from lgrasp.refine.starts import STAND_OFF
 from lgrasp.refine.surface import hand_surface
 
@@ -142,7 +142,7 @@ def bench_hand(
     """
     cache, at = cache or Cache(), resolve_device(device)
     source, model = named_hand(cache, hand, at)
-    arrays, palmar = upload_hand(model, at.alias), seen_palmar(source, model)
+    arrays, palmar = upload_hand(model, at.alias), seen_palmar(source, model, at.alias)
     record = hand_record(model, mesh_blobs(source.urdf))
     judge = partial(_holds, find_protocol(protocol).name)
     cases = []

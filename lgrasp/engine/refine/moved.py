@@ -15,14 +15,14 @@ from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.check import check_grasps
 from lgrasp.refine.energy import Energies
-from lgrasp.refine.planning import object_pose
-from lgrasp.refine.refiner import Pose, Refiner
+from lgrasp.refine.refiner import Pose, Refiner, object_pose
 from lgrasp.stages.refine.params import RefineParams
 
 __all__ = ["Moved", "move_rows"]
 
 _ROWS = 256  # at a time
 _FAR = 0.5  # [m] from the object: nothing pulls there
+_LIMIT = 1e-4  # [rad or m] that a joint may be outside its limits
 
 
 class Moved(NamedTuple):
@@ -36,7 +36,7 @@ class Moved(NamedTuple):
     valid: tuple[int, int]
     """Rows that pass every check, before and as stored."""
     clamped: int
-    """Rows whose joints were outside their limits."""
+    """Rows whose joints were outside their limits; they are moved, and kept where they stay, from within."""
     far: int
     """Rows whose hand is too far from the object to be drawn to it."""
 
@@ -62,9 +62,7 @@ def move_rows(
     """
     refiner = Refiner(hand.model, obj, params, device=hand.device)
     arrays = upload_object(obj, hand.device)
-    tree = hand.model.tree
-    limits = np.asarray(rows.q)[:, : hand.model.dofs]
-    clamped = int(((limits < tree.joint_lower - 1e-4) | (limits > tree.joint_upper + 1e-4)).any(1).sum())
+    outside = _outside(rows, hand)
     parts, before, after, oks = [], [], [], []
     far = 0
     for first in range(0, len(rows), _ROWS):
@@ -72,8 +70,7 @@ def move_rows(
         given = _hands(rows, part, hand, obj)
         refined = refiner(*given)
         index = np.arange(len(rows))[part]
-        q = given.q.maximum(refiner.lower).minimum(refiner.upper).cpu().numpy()
-        old, old_outcome = check_grasps(hand, arrays, object_pose(given), q, params, index=index)
+        old, old_outcome = check_grasps(hand, arrays, object_pose(given), given.q.cpu().numpy(), params, index=index)
         new, new_outcome = check_grasps(
             hand, arrays, object_pose(refined.pose), refined.pose.q.cpu().numpy(), params, index=index
         )
@@ -96,18 +93,25 @@ def move_rows(
     made = shard_rows(table, hand.model, obj, {name: np.asarray(v, np.float32) for name, v in extra.items()})
     made = replace(made, candidate=rows.candidate)
     if stored:
-        made = _kept(rows, made, take)
+        made = _kept(rows, made, take | outside)
     was = np.concatenate([ok[0] for ok in oks])
     means = float(first_energy.sum(0).mean()), float(last_energy.sum(0).mean())
-    return Moved(made, means, (int(was.sum()), int(valid.sum())), clamped, far)
+    return Moved(made, means, (int(was.sum()), int(valid.sum())), int(outside.sum()), far)
+
+
+def _outside(rows: GraspRows, hand: HandArrays) -> np.ndarray:
+    """Rows with joints outside their limits, (N,) bool."""
+    tree, q = hand.model.tree, np.asarray(rows.q)[:, : hand.model.dofs]
+    return ((q < tree.joint_lower - _LIMIT) | (q > tree.joint_upper + _LIMIT)).any(1)
 
 
 def _hands(rows: GraspRows, part: slice, hand: HandArrays, obj: ObjectModel) -> Pose:
-    """The hands of rows in the object's internal frame."""
+    """The hands of rows in the object's internal frame, joints within their limits."""
     T = pose_matrix(np.asarray(rows.object_pose, float)[part, 0])  # base from the user's frame
     R = T[:, :3, :3].transpose(0, 2, 1)
     t = -(R @ T[:, :3, 3:])[..., 0] - obj.center
-    q = np.asarray(rows.q)[part, : hand.model.dofs]
+    tree = hand.model.tree
+    q = np.clip(np.asarray(rows.q)[part, : hand.model.dofs], tree.joint_lower, tree.joint_upper)
     return Pose(*(torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32, device=hand.device) for a in (R, t, q)))
 
 
@@ -129,8 +133,8 @@ def _mixed(old: GraspTable, new: GraspTable, take: np.ndarray) -> GraspTable:
 
 
 def _kept(old: GraspRows, new: GraspRows, take: np.ndarray) -> GraspRows:
-    """``new`` with the stored rows of ``old`` where they stay. Verdicts of a simulator are dropped: they are of the old
-    rows."""
+    """``new`` with the stored rows of ``old`` but those to ``take``. Verdicts of a simulator are dropped: they are of
+    the old rows."""
     changes = {}
     for name in ("q", "q_pregrasp", "q_squeeze", "object_pose"):
         keep = (~take).reshape(-1, *(1,) * (np.ndim(getattr(old, name)) - 1))

@@ -1,25 +1,24 @@
 """refine: finished grasps -> the same, moved by a local search wherever that makes them better."""
 
 import threading
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
 from lgrasp.refine.check import check_grasps, contact_width
+from lgrasp.refine.descent import Descent, Hands, inverse_poses
 from lgrasp.refine.params import LocalSearch
+from lgrasp.refine.surface import hand_surface
+from lgrasp.refine.volume import upload_target
 from lgrasp.stages.context import Context
 from lgrasp.stages.refine.params import RefineParams
 
-if TYPE_CHECKING:
-    from lgrasp.refine.refiner import Refiner
-
 __all__ = ["VERSION", "run"]
 
-VERSION = 1
+VERSION = 2
 
 _making = threading.Lock()
-_made: dict[tuple[object, ...], "Refiner"] = {}  # the latest
+_made: dict[tuple[object, ...], Descent] = {}  # the latest
 
 
 def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
@@ -33,31 +32,25 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
     width = max(inputs.contact_links.shape[1], contact_width(context.hand.model.contact_link))
     if len(inputs) == 0:
         return _widened(inputs, width), {"tried": 0, "passed": 0, "replaced": 0}
-    # torch is heavy to load
-    from lgrasp.refine.planning import object_pose, table_pose
-
-    refined = _refiner(params, context)(*table_pose(inputs, context.device)).pose
-    q = refined.q.cpu().numpy()
-    table, outcome = check_grasps(context.hand, context.object, object_pose(refined), q, params, index=inputs.index)
+    tree = context.hand.model.tree
+    at = Hands.put(inverse_poses(inputs.pose), np.clip(inputs.q, tree.joint_lower, tree.joint_upper), context.device)
+    _descent(params, context).run(at)
+    pose, q = at.numpy()
+    table, outcome = check_grasps(context.hand, context.object, inverse_poses(pose), q, params, index=inputs.index)
     passed = outcome == 0
     better = passed & (table.metrics["disturbance"] < inputs.metrics["disturbance"])
     counts = {"tried": len(inputs), "passed": int(passed.sum()), "replaced": int(better.sum())}
     return _replaced(_widened(inputs, width), _widened(table, width), better), counts
 
 
-def _refiner(search: LocalSearch, context: Context) -> "Refiner":
-    """The refiner of a job: made by the first batch, used by all."""
-    import torch
-
-    from lgrasp.refine.refiner import Refiner
-
+def _descent(search: LocalSearch, context: Context) -> Descent:
+    """The local search of a job: made by the first batch, used by all."""
     key = (context.hand.model.sha256, context.object.model.sha256, context.object.model.scale, search, context.device)
     with _making:
         if key not in _made:
-            if context.device == "cpu":
-                torch.set_num_threads(1)  # batches run side by side
             _made.clear()
-            _made[key] = Refiner(context.hand.model, context.object.model, search, device=context.device)
+            target = upload_target(context.object.model, None, context.device)
+            _made[key] = Descent(context.hand, target, search, hand_surface(context.hand.model))
         return _made[key]
 
 

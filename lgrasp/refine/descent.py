@@ -1,0 +1,249 @@
+"""The local search on a device: matches and gradient steps of many hands, without a graph."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.differentiable.solids import hand_solids
+from lgrasp.errors import HandError
+from lgrasp.hand.arrays import HandArrays, body_poses, pose_matrices
+from lgrasp.refine.descent_kernels import MAX_COLUMNS, Search, advance, deepest, descend
+from lgrasp.refine.match_kernels import (
+    DEEPEST,
+    LINK_DEEPEST,
+    Matches,
+    Points,
+    Solids,
+    choose_contacts,
+    match_links,
+    match_points,
+    match_solids,
+    place_bodies,
+)
+from lgrasp.refine.params import LocalSearch
+from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
+from lgrasp.refine.volume import TargetArrays
+
+__all__ = ["Descent", "Hands", "inverse_poses"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_LIMIT_SHARE = 0.15
+_ADVANCES = 30
+_ROWS = 32  # hands of a block of threads: few hands spread over many processors
+
+
+@dataclass(frozen=True)
+class Hands:
+    """Hands on a device."""
+
+    pose: wp.array
+    """Base in the object's internal frame, (N,) transform."""
+    q: wp.array
+    """Joint positions [rad or m], (N, K) float32."""
+
+    @classmethod
+    def put(cls, pose: np.ndarray, q: np.ndarray, device: str) -> "Hands":
+        """Of x y z [m] qx qy qz qw (N, 7), and joint positions (N, K)."""
+        poses = wp.array(np.ascontiguousarray(pose, np.float32), dtype=wp.transform, device=device)
+        return cls(poses, wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=device))
+
+    def numpy(self) -> tuple[np.ndarray, np.ndarray]:
+        """Base (N, 7) and joint positions (N, K)."""
+        return self.pose.numpy().reshape(-1, 7), self.q.numpy()
+
+
+class Descent:
+    """Moves hands by the gradient of E* (:mod:`lgrasp.refine.energy`), without a graph; any number at a time.
+
+    What becomes of a hand does not depend on the others.
+
+    Args:
+        surface: the hand's points.
+
+    Raises:
+        HandError: the hand has too many joints.
+    """
+
+    def __init__(self, hand: HandArrays, target: TargetArrays, params: LocalSearch, surface: HandSurface) -> None:
+        model = hand.model
+        if model.dofs > MAX_COLUMNS:
+            raise HandError(
+                f"hand '{model.name}' has {model.dofs} joints; the local search takes {MAX_COLUMNS} at most"
+            )
+        self.params, self._hand, self._target, self.device = params, hand, target, hand.device
+        self._points, self._solids = _points(surface, self.device), _solids(hand)
+        self._bodies = len(model.tree.joint_dof) + 1
+        self._search = self._settings(surface)
+
+    def run(self, at: Hands, *, outer: int | None = None, first: int = 0) -> None:
+        """Move hands: match, then ``inner`` gradient steps, for outer steps ``first`` to ``outer``, in place.
+
+        Args:
+            outer: default: the parameters'. Sizes and reach fall along the parameters' outer steps or these, whichever
+                are more.
+        """
+        p = self.params
+        outer = p.outer if outer is None else outer
+        whole, rows = max(outer, p.outer), at.pose.shape[0]
+        if rows == 0:
+            return
+        first_moment, second_moment = self._moments(rows), self._moments(rows)
+        m, body = self._matches(rows), self._body(rows)
+        for i in range(first, outer):
+            self._match(at, m, body, p.reach * (p.reach_end / p.reach) ** (i / whole))
+            self._descend(at, m, (i - first) * p.inner, first, whole, False, first_moment, second_moment)
+
+    def gradient(self, at: Hands) -> np.ndarray:
+        """Derivatives of E* by a shift [1/m], a turn about the hand's middle and the joints, (N, 6 + K)."""
+        rows = at.pose.shape[0]
+        m, body, out = self._matches(rows), self._body(rows), self._moments(rows)
+        self._match(at, m, body, self.params.reach)
+        self._descend(at, m, 0, 0, 1, True, out, self._moments(rows))
+        return out.numpy()
+
+    def advanced(self, at: Hands, direction: np.ndarray, travel: np.ndarray, clearance: float) -> None:
+        """Move hands straight until a point of theirs is ``clearance`` [m] from anything, or by ``travel`` (N,) [m].
+
+        Args:
+            direction: unit vectors in the object's frame, (N, 3).
+        """
+        d, t, rows = self.device, self._target, at.pose.shape[0]
+        body = self._body(rows)
+        self._place(at, body)
+        ways = wp.array(np.ascontiguousarray(direction, np.float32), dtype=wp.vec3, device=d)
+        most = wp.array(np.ascontiguousarray(travel, np.float32), dtype=wp.float32, device=d)
+        inputs = [self._points, t.own, t.around, int(t.has_around), _ADVANCES, clearance, ways, most, body]
+        wp.launch(advance, dim=rows, inputs=inputs, outputs=[at.pose], device=d)
+
+    def depth(self, at: Hands) -> np.ndarray:
+        """Depth of the deepest point of hands in anything, or of that in them [m], negative apart, (N,)."""
+        rows = at.pose.shape[0]
+        m, body = self._matches(rows), self._body(rows)
+        self._match(at, m, body, self.params.reach)
+        out = wp.empty(rows, dtype=wp.float32, device=self.device)
+        inputs = [m, self._points, self._solids, body]
+        wp.launch(deepest, dim=rows, inputs=inputs, outputs=[out], device=self.device)
+        return out.numpy()
+
+    def _settings(self, surface: HandSurface) -> "Search":
+        p, tree, t = self.params, self._hand.model.tree, self._target
+        total = float(surface.weight.sum())
+        s = Search()
+        s.points, s.normals = p.points / total, p.normals / total
+        s.force, s.barrier, s.limits = p.force / p.contacts**2, p.barrier, p.limits / len(tree.joint_lower)
+        s.margin, s.link_margin, s.contacts, s.inner = p.margin, p.link_margin, p.contacts, p.inner
+        s.sgd, s.momentum, s.decay = int(p.optimizer == "sgd"), p.momentum, p.decay
+        s.shift, s.turn, s.bend = p.shift, p.turn, p.bend
+        s.middle = wp.vec3(*map(float, _middle(self._hand, surface)))
+        s.com, s.radius = t.com, t.radius
+
+        def put(a: np.ndarray) -> wp.array:
+            return wp.array(np.ascontiguousarray(a, np.float32), dtype=wp.float32, device=self.device)
+
+        s.lower, s.upper = put(tree.joint_lower), put(tree.joint_upper)
+        s.near = put(_LIMIT_SHARE * np.maximum(tree.joint_upper - tree.joint_lower, 1e-6))
+        return s
+
+    def _matches(self, rows: int) -> "Matches":
+        def room(n: int, dtype: type) -> wp.array:
+            return wp.empty((rows, n), dtype=dtype, device=self.device)
+
+        n = self._points.points.shape[0]
+        links, pairs = self._solids.body.shape[0], self._solids.pairs.shape[0]
+        m = Matches()
+        m.plane, m.pull, m.distance = room(n, wp.vec4), room(n, wp.float32), room(n, wp.float32)
+        m.block = room(n, wp.vec4) if self._target.has_around else m.plane
+        m.contacts = room(self.params.contacts, wp.int32)
+        m.deep, m.deep_plane = room(links * DEEPEST, wp.vec3), room(links * DEEPEST, wp.vec4)
+        m.link_deep, m.link_plane = room(pairs * LINK_DEEPEST, wp.vec3), room(pairs * LINK_DEEPEST, wp.vec4)
+        return m
+
+    def _moments(self, rows: int) -> wp.array:
+        return wp.zeros((rows, 6 + self._hand.model.dofs), dtype=wp.float32, device=self.device)
+
+    def _body(self, rows: int) -> wp.array:
+        return wp.empty((rows, self._bodies), dtype=wp.transform, device=self.device)
+
+    def _place(self, at: Hands, body: wp.array) -> None:
+        inputs = [self._hand.struct.kin, at.pose, at.q]
+        wp.launch(place_bodies, dim=at.pose.shape[0], inputs=inputs, outputs=[body], device=self.device)
+
+    def _match(self, at: Hands, m: "Matches", body: wp.array, reach: float) -> None:
+        p, t, d, rows = self.params, self._target, self.device, at.pose.shape[0]
+        points, solids = self._points, self._solids
+        self._place(at, body)
+        blocks, links, pairs = points.body.shape[0], solids.body.shape[0], solids.pairs.shape[0]
+        shapes = [points, t.own, t.around, int(t.has_around), p.touching, reach, p.soft, body, m]
+        wp.launch(match_points, dim=(blocks, rows), inputs=shapes, device=d)
+        near = max(p.contacts, int(p.nearest * points.palmar.shape[0]))
+        wp.launch(choose_contacts, dim=rows, inputs=[points, near, p.contacts, body, m], device=d, block_dim=_ROWS)
+        wp.launch(match_solids, dim=(links, rows), inputs=[solids, t.cloud, p.margin, body, m], device=d)
+        wp.launch(match_links, dim=(pairs, rows), inputs=[solids, p.margin, body, m], device=d)
+
+    def _descend(
+        self, at: Hands, m: "Matches", taken: int, first: int, whole: int, gradient: bool, *moments: wp.array
+    ) -> None:
+        inputs = [self._hand.struct.kin, self._points, self._solids, self._target.own, self._search, m]
+        inputs += [taken, first * self.params.inner, float(whole), int(gradient), *moments]
+        wp.launch(
+            descend,
+            dim=at.pose.shape[0],
+            inputs=inputs,
+            outputs=[at.pose, at.q],
+            device=self.device,
+            block_dim=_ROWS,
+        )
+
+
+def inverse_poses(pose: np.ndarray) -> np.ndarray:
+    """Inverses of poses x y z [m] qx qy qz qw, (N, 7)."""
+    from scipy.spatial.transform import Rotation
+
+    back = Rotation.from_quat(pose[:, 3:]).inv()
+    return np.concatenate([-back.apply(pose[:, :3]), back.as_quat()], 1).astype(np.float32)
+
+
+def _middle(hand: HandArrays, surface: HandSurface) -> np.ndarray:
+    """Middle of the palmar points of the open hand, base frame [m], (3,)."""
+    T = pose_matrices(body_poses(hand, hand.model.tree.joint_open[None])[0])[surface.body]
+    x = np.einsum("lij,lpj->lpi", T[:, :3, :3], surface.points) + T[:, None, :3, 3]
+    return x[surface.weight > 0].mean(0)
+
+
+def _points(surface: HandSurface, device: str) -> "Points":
+    def put(a: np.ndarray, dtype: type) -> wp.array:
+        return wp.array(np.ascontiguousarray(a), dtype=dtype, device=device)
+
+    p = Points()
+    p.block = BLOCK
+    p.body = put(surface.body.astype(np.int32), wp.int32)
+    p.points = put(surface.points.reshape(-1, 3).astype(np.float32), wp.vec3)
+    p.normals = put(surface.normals.reshape(-1, 3).astype(np.float32), wp.vec3)
+    p.weight = put(surface.weight.ravel().astype(np.float32), wp.float32)
+    p.palmar = put(np.flatnonzero(surface.weight.ravel() > 0).astype(np.int32), wp.int32)
+    return p
+
+
+def _solids(hand: HandArrays) -> "Solids":
+    found = hand_solids(hand.model, LINK_POINTS)
+    solids, device = found.solids, hand.device
+
+    def put(a: np.ndarray, dtype: type, kind: type = np.float32) -> wp.array:
+        return wp.array(np.ascontiguousarray(a, kind), dtype=dtype, device=device)
+
+    grids = [x.grid for x in solids]
+    sizes = [g.values.size for g in grids]
+    s = Solids()
+    s.body = put(found.body, wp.int32, np.int32)
+    s.ball = put(np.stack([x.ball for x in solids]), wp.vec4)
+    s.grid_first = put(np.cumsum([0, *sizes[:-1]]), wp.int32, np.int32)
+    s.grid_shape = put(np.array([g.values.shape for g in grids]), wp.vec3i, np.int32)
+    s.grid_origin = put(np.array([g.origin for g in grids]), wp.vec3)
+    s.grid_inv_cell = put(1.0 / np.array([g.cell for g in grids]), wp.float32)
+    s.grid_values = put(np.concatenate([g.values.ravel() for g in grids]), wp.float32)
+    s.points = put(np.stack([link_probes(x.points) for x in solids]), wp.vec3)
+    s.pairs = put(np.concatenate([found.pairs, found.pairs[:, ::-1]]).reshape(-1, 2), wp.vec2i, np.int32)
+    return s

@@ -1,0 +1,274 @@
+"""Correspondences of hands: planes at the object's surface and at links, and the contacts of the net wrench.
+
+Rows are hands; everything is frozen until it is matched anew (:mod:`lgrasp.refine.descent_kernels` moves the hands).
+"""
+
+import warp as wp
+
+from lgrasp.device.kinematics import MAX_JOINTS, Kinematics, group_forward
+from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.device.sdf import Sdf, sdf_gradient, sdf_part, sdf_value
+from lgrasp.hand.arrays import group_dofs
+from lgrasp.refine.volume import Volume, volume_at
+
+__all__ = [
+    "DEEPEST",
+    "LINK_DEEPEST",
+    "Matches",
+    "Points",
+    "Solids",
+    "choose_contacts",
+    "match_links",
+    "match_points",
+    "match_solids",
+    "place_bodies",
+]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+DEEPEST, LINK_DEEPEST = 4, 2
+"""Points that are kept of each link in the object, and of each ordered pair of links."""
+
+_NOTHING = -1.0  # [m] offset of a plane that nothing is near
+_FAR = 1.0e9
+_HALVINGS = 40
+
+_vec_block = wp.types.vector(32, wp.float32)
+_vec_deep = wp.types.vector(DEEPEST, wp.float32)
+_veci_deep = wp.types.vector(DEEPEST, wp.int32)
+
+
+@wp.struct
+class Points:
+    """Points of a hand's surface, in blocks that ride on one body (:class:`lgrasp.refine.surface.HandSurface`)."""
+
+    body: wp.array(dtype=wp.int32)  # of each block
+    points: wp.array(dtype=wp.vec3)  # body's frame [m]
+    normals: wp.array(dtype=wp.vec3)
+    weight: wp.array(dtype=wp.float32)
+    palmar: wp.array(dtype=wp.int32)  # points with weight
+    block: wp.int32  # points of a block
+
+
+@wp.struct
+class Solids:
+    """Links with their distance grids, and the pairs of them that must stay apart, both ways."""
+
+    body: wp.array(dtype=wp.int32)
+    ball: wp.array(dtype=wp.vec4)  # body's frame [m]
+    grid_first: wp.array(dtype=wp.int32)
+    grid_shape: wp.array(dtype=wp.vec3i)
+    grid_origin: wp.array(dtype=wp.vec3)
+    grid_inv_cell: wp.array(dtype=wp.float32)
+    grid_values: wp.array(dtype=wp.float32)
+    points: wp.array2d(dtype=wp.vec3)  # that other links are probed with, body's frame [m]
+    pairs: wp.array(dtype=wp.vec2i)
+
+
+@wp.struct
+class Matches:
+    """What hands are matched to; a plane (n, o) has the signed distance n . x - o [m]."""
+
+    plane: wp.array2d(dtype=wp.vec4)  # of each point, object's frame
+    pull: wp.array2d(dtype=wp.float32)  # weight of each point, 0 where it does not pull
+    block: wp.array2d(dtype=wp.vec4)  # plane that each point is kept beyond
+    distance: wp.array2d(dtype=wp.float32)  # of each point from the object [m]
+    contacts: wp.array2d(dtype=wp.int32)  # points that make the net wrench
+    deep: wp.array2d(dtype=wp.vec3)  # points of the object, its frame [m]
+    deep_plane: wp.array2d(dtype=wp.vec4)  # of the link, body's frame
+    link_deep: wp.array2d(dtype=wp.vec3)  # points of links, their bodies' frames [m]
+    link_plane: wp.array2d(dtype=wp.vec4)  # of the other link, its body's frame
+
+
+@wp.kernel
+def place_bodies(
+    h: Kinematics,
+    pose: wp.array(dtype=wp.transform),
+    q: wp.array2d(dtype=wp.float32),
+    body_out: wp.array2d(dtype=wp.transform),
+):
+    """Bodies of hands in the object's frame; launched over hands."""
+    row = wp.tid()
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    T = pose[row]
+    body_out[row, 0] = T
+    for g in range(h.groups):
+        first = group_forward(h, g, group_dofs(h, g, q, row), X, 0)
+        for j in range(h.joint_first[g + 1] - first):
+            body_out[row, 1 + first + j] = T * X[j]
+
+
+@wp.func
+def _plane(at: wp.vec4, x: wp.vec3):
+    """Plane through the match of x."""
+    return wp.vec4(at[0], at[1], at[2], at[0] * x[0] + at[1] * x[1] + at[2] * x[2] - at[3])
+
+
+@wp.kernel
+def match_points(
+    points: Points,
+    own: Volume,
+    around: Volume,
+    has_around: wp.int32,
+    touching: wp.int32,
+    reach: wp.float32,
+    soft: wp.float32,
+    body: wp.array2d(dtype=wp.transform),
+    m: Matches,
+):
+    """Planes, pulls and distances of points; launched over (block, hand)."""
+    block, row = wp.tid()
+    T = body[row, points.body[block]]
+    first = block * points.block
+    apart = _vec_block()
+    for k in range(points.block):
+        i = first + k
+        x = wp.transform_point(T, points.points[i])
+        at = volume_at(own, x)
+        m.plane[row, i] = _plane(at, x)
+        m.distance[row, i] = at[3]
+        apart[k] = wp.where(points.weight[i] > 0.0, wp.abs(at[3]), _FAR)
+        if has_around == 1:
+            other = volume_at(around, x)
+            if other[3] < at[3]:
+                at = other
+            m.block[row, i] = _plane(at, x)
+    # the part of each link that is nearest to the object: a surface that fits nowhere else is no error
+    least = float(-1.0)
+    for _ in range(touching):
+        following = float(_FAR)
+        for k in range(points.block):
+            if apart[k] > least:
+                following = wp.min(following, apart[k])
+        least = following
+    for k in range(points.block):
+        i = first + k
+        pull = float(0.0)
+        if apart[k] <= least and apart[k] < reach:
+            pull = points.weight[i] / (1.0 + apart[k] / soft)
+        m.pull[row, i] = pull
+
+
+@wp.kernel
+def choose_contacts(
+    points: Points, nearest: wp.int32, count: wp.int32, body: wp.array2d(dtype=wp.transform), m: Matches
+):
+    """Farthest points among the ``nearest`` nearest palmar ones, the nearest first; launched over hands."""
+    row = wp.tid()
+    best = int(0)
+    low = float(_FAR)
+    high = float(-_FAR)
+    for k in range(points.palmar.shape[0]):
+        d = m.distance[row, points.palmar[k]]
+        if d < low:
+            low = d
+            best = points.palmar[k]
+        high = wp.max(high, d)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        within = int(0)
+        for k in range(points.palmar.shape[0]):
+            if m.distance[row, points.palmar[k]] <= middle:
+                within += 1
+        if within >= nearest:
+            high = middle
+        else:
+            low = middle
+    m.contacts[row, 0] = best
+    for c in range(1, count):
+        farthest = float(-1.0)
+        chosen = best
+        for k in range(points.palmar.shape[0]):
+            i = points.palmar[k]
+            if m.distance[row, i] <= high:
+                x = wp.transform_point(body[row, points.body[i // points.block]], points.points[i])
+                gap = float(_FAR)
+                for e in range(c):
+                    o = m.contacts[row, e]
+                    y = wp.transform_point(body[row, points.body[o // points.block]], points.points[o])
+                    gap = wp.min(gap, wp.length_sq(x - y))
+                if gap > farthest:
+                    farthest = gap
+                    chosen = i
+        m.contacts[row, c] = chosen
+
+
+@wp.func
+def _grid(s: Solids, i: wp.int32):
+    return sdf_part(s.grid_values, s.grid_first[i], s.grid_shape[i], s.grid_origin[i], s.grid_inv_cell[i])
+
+
+@wp.func
+def _link_plane(grid: Sdf, p: wp.vec3):
+    return _plane(sdf_gradient(grid, p), p)
+
+
+@wp.func
+def _centre(s: Solids, i: wp.int32, T: wp.transform):
+    b = s.ball[i]
+    return wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))
+
+
+@wp.kernel
+def match_solids(
+    s: Solids, cloud: wp.array(dtype=wp.vec3), margin: wp.float32, body: wp.array2d(dtype=wp.transform), m: Matches
+):
+    """The deepest points of the object in each link; launched over (link, hand)."""
+    i, row = wp.tid()
+    T = body[row, s.body[i]]
+    back = wp.transform_inverse(T)
+    centre = _centre(s, i, T)
+    radius = s.ball[i][3] + margin
+    grid = _grid(s, i)
+    depth = _vec_deep(_FAR)
+    which = _veci_deep(0)
+    for k in range(cloud.shape[0]):
+        if wp.length_sq(cloud[k] - centre) < radius * radius:
+            d = sdf_value(grid, wp.transform_point(back, cloud[k]))
+            at = k
+            for e in range(DEEPEST):
+                if d < depth[e]:
+                    later = depth[e]
+                    later_at = which[e]
+                    depth[e] = d
+                    which[e] = at
+                    d = later
+                    at = later_at
+    for e in range(DEEPEST):
+        plane = wp.vec4(0.0, 0.0, 0.0, _NOTHING)
+        if depth[e] < _FAR:
+            plane = _link_plane(grid, wp.transform_point(back, cloud[which[e]]))
+        m.deep[row, i * DEEPEST + e] = cloud[which[e]]
+        m.deep_plane[row, i * DEEPEST + e] = plane
+
+
+@wp.kernel
+def match_links(s: Solids, margin: wp.float32, body: wp.array2d(dtype=wp.transform), m: Matches):
+    """The deepest points of the first link of each pair in the second; launched over (pair, hand)."""
+    pair, row = wp.tid()
+    a = s.pairs[pair][0]
+    b = s.pairs[pair][1]
+    A = body[row, s.body[a]]
+    B = body[row, s.body[b]]
+    first = pair * LINK_DEEPEST
+    for e in range(LINK_DEEPEST):
+        m.link_plane[row, first + e] = wp.vec4(0.0, 0.0, 0.0, _NOTHING)
+    reach = s.ball[a][3] + s.ball[b][3] + margin
+    if wp.length_sq(_centre(s, a, A) - _centre(s, b, B)) >= reach * reach:
+        return
+    T = wp.transform_inverse(B) * A
+    grid = _grid(s, b)
+    depth = wp.vec2(_FAR, _FAR)
+    which = wp.vec2i(0, 0)
+    for k in range(s.points.shape[1]):
+        d = sdf_value(grid, wp.transform_point(T, s.points[a, k]))
+        if d < depth[0]:
+            depth = wp.vec2(d, depth[0])
+            which = wp.vec2i(k, which[0])
+        elif d < depth[1]:
+            depth[1] = d
+            which[1] = k
+    for e in range(LINK_DEEPEST):
+        p = s.points[a, which[e]]
+        m.link_deep[row, first + e] = p
+        m.link_plane[row, first + e] = _link_plane(grid, wp.transform_point(T, p))
