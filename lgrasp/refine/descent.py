@@ -227,7 +227,20 @@ def _points(surface: HandSurface, device: str) -> "Points":
     return p
 
 
+_latest: dict[tuple[str, str], "Solids"] = {}  # of the latest hand: objects come and go
+
+
 def _solids(hand: HandArrays) -> "Solids":
+    key = (hand.model.sha256, hand.device)
+    made = _latest.get(key)
+    if made is None:
+        made = _made_solids(hand)
+        _latest.clear()
+        _latest[key] = made
+    return made
+
+
+def _made_solids(hand: HandArrays) -> "Solids":
     found = hand_solids(hand.model, LINK_POINTS)
     solids, device = found.solids, hand.device
 

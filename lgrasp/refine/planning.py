@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from lgrasp.refine.volume import upload_target
 
 __all__ = ["PlanParams", "Planned", "Planner", "cloud_params"]
 
-_CPU_STARTS, _GPU_STARTS = 10, 2000  # planned at a time
+_CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
 _COLLIDES, _CLOUD_DEPTH = 1.0e-3, 4.0e-3  # [m]
 _PLAN_BOUNDS = GraspBounds(
     penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=60.0
@@ -109,21 +110,15 @@ class Planner:
         Raises:
             HandError: the hand has no palm.
         """
-        p, device = self.params, self.hand.device
-        surface = hand_surface(self.hand.model, self.palmar, **p.weights())
-        around = None if self.around is None else upload_object(self.around, device)
-        scene = _Scene(
-            Descent(self.hand, upload_target(self.model, self.around, device), p.search, surface),
-            upload_object(self.model, device),
-            around,
-        )
+        device = self.hand.device
         points = farthest_points(self.model.contact_points.astype(float), count)
         some, workers = (_CPU_STARTS, os.cpu_count() or 1) if device == "cpu" else (_GPU_STARTS, 1)
         counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *OUTCOMES], 0)
         tables = []
+        assert self._scene  # made before threads ask for it
         with ThreadPoolExecutor(workers) as pool:
             firsts = range(0, count, some)
-            parts = [pool.submit(self._plan, scene, points[first : first + some], first) for first in firsts]
+            parts = [pool.submit(self._plan, points[first : first + some], first) for first in firsts]
             try:
                 for first, part in zip(firsts, parts, strict=True):
                     table, outcome = part.result()
@@ -139,9 +134,18 @@ class Planner:
                 pool.shutdown(cancel_futures=True)
         return Planned(join_grasps(tables), counts)
 
-    def _plan(self, scene: "_Scene", points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
+    @cached_property
+    def _scene(self) -> "_Scene":
+        device, surface = self.hand.device, hand_surface(self.hand.model, self.palmar, **self.params.weights())
+        around = None if self.around is None else upload_object(self.around, device)
+        target = upload_target(self.model, self.around, device)
+        return _Scene(
+            Descent(self.hand, target, self.params.search, surface), upload_object(self.model, device), around
+        )
+
+    def _plan(self, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
-        p, hand, search = self.params, self.hand.model, scene.search
+        p, hand, search = self.params, self.hand.model, self._scene.search
         start, pose, q, facing = self._starts(points, first)
         free = search.depth(self._put(pose, q)) <= _COLLIDES
         start, at = start[free], self._put(pose[free], q[free])
@@ -150,17 +154,15 @@ class Planner:
             travel = np.full(len(start), max(self.stand_off - float(centre @ axis) - p.clearance, 0.0))
             search.advanced(at, facing[free], travel, p.clearance)
             search.run(at, outer=p.opening)
-            start, at = self._best(scene, at, start, _COARSE, p.finalists)
+            start, at = self._best(at, start, _COARSE, p.finalists)
             search.run(at, first=p.opening)
-            start, at = self._best(scene, at, start, p.bounds, 1)
-        return self._checked(scene, at, start, p.bounds)
+            start, at = self._best(at, start, p.bounds, 1)
+        return self._checked(at, start, p.bounds)
 
-    def _best(
-        self, scene: "_Scene", at: Hands, start: np.ndarray, bounds: GraspBounds, count: int
-    ) -> tuple[np.ndarray, Hands]:
+    def _best(self, at: Hands, start: np.ndarray, bounds: GraspBounds, count: int) -> tuple[np.ndarray, Hands]:
         """The ``count`` best hands of each start: those that pass the checks first, then those that resist most."""
         bounds = bounds.model_copy(update={"friction": self.params.rank_friction})
-        table, outcome = self._checked(scene, at, start, bounds)
+        table, outcome = self._checked(at, start, bounds)
         keys = [np.arange(len(start)), -table.metrics["epsilon"], table.metrics["disturbance"], outcome != 0, start]
         order = np.lexsort(keys)
         place = np.arange(len(start)) - np.searchsorted(start[order], start[order])
@@ -187,18 +189,16 @@ class Planner:
     def _put(self, pose: np.ndarray, q: np.ndarray) -> Hands:
         return Hands.put(pose, q, self.hand.device)
 
-    def _checked(
-        self, scene: "_Scene", at: Hands, start: np.ndarray, bounds: GraspBounds
-    ) -> tuple[GraspTable, np.ndarray]:
+    def _checked(self, at: Hands, start: np.ndarray, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray]:
         pose, q = at.numpy()
         return check_grasps(
             self.hand,
-            scene.object,
+            self._scene.object,
             inverse_poses(pose),
             q,
             bounds,
             palmar=self.palmar,
-            around=scene.around,
+            around=self._scene.around,
             index=start,
         )
 

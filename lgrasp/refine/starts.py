@@ -40,21 +40,20 @@ def start_poses(
         points: (N, 3) [m]. normals: outward, (N, 3). turn: roll about the line [rad], (N,).
     """
     centre, facing = palm_axis(model)
-    R = _frames(-normals) @ Rotation.from_rotvec(turn[:, None] * np.array([0, 0, 1.0])).as_matrix() @ _frames(facing).T
+    roll = Rotation.from_rotvec(turn[:, None] * np.array([0, 0, 1.0]))
+    R = _towards(-normals) * roll * _towards(facing[None]).inv()
     lateral = centre - (centre @ facing) * facing
-    t = points + stand_off * normals - np.einsum("nij,j->ni", R, lateral)
-    return np.concatenate([t, Rotation.from_matrix(R).as_quat()], 1)
+    return np.concatenate([points + stand_off * normals - R.apply(lateral), R.as_quat()], 1)
 
 
 def tilted(normals: np.ndarray, angle: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
     """Unit vectors (N, 3) turned away by angle (N,) [rad], towards the side at azimuth (N,) [rad]."""
-    F = _frames(normals)
-    side = F[..., 0] * np.cos(azimuth)[:, None] + F[..., 1] * np.sin(azimuth)[:, None]
-    return normals * np.cos(angle)[:, None] + side * np.sin(angle)[:, None]
+    side = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], 1)
+    return _towards(normals).apply(side)
 
 
-def _frames(z: np.ndarray) -> np.ndarray:
-    """Right-handed frames (..., 3, 3) whose third column is z (..., 3)."""
-    x = np.cross(z, np.eye(3)[np.abs(z).argmin(-1)])
-    x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], -1)
+def _towards(z: np.ndarray) -> Rotation:
+    """The shortest rotations that turn the third axis to unit vectors z (N, 3)."""
+    q = np.stack([-z[:, 1], z[:, 0], np.zeros(len(z)), 1 + z[:, 2]], 1)
+    q[q[:, 3] < 1e-9] = [1.0, 0, 0, 0]
+    return Rotation.from_quat(q)

@@ -74,11 +74,11 @@ def farthest_points(points: np.ndarray, count: int, *, first: int = 0) -> np.nda
     Args:
         points: (n, 3), n >= 1. first: where to begin.
     """
-    chosen = [first]
-    gap = np.linalg.norm(points - points[first], axis=1)
+    chosen, gap = [first], np.full(len(points), np.inf)
     while len(chosen) < min(count, len(points)):
+        away = points - points[chosen[-1]]
+        np.minimum(gap, np.einsum("ij,ij->i", away, away), out=gap)
         chosen.append(int(gap.argmax()))
-        gap = np.minimum(gap, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.resize(chosen, count)
 
 
