@@ -75,7 +75,7 @@ def plan(
         raise ConfigError("give --object (a mesh or a name) or --cloud (a file of points), one of the two")
     given = None
     if cloud is not None:
-        given = read_cloud(cloud, mask, label, scale, None if viewpoint is None else _numbers(viewpoint))
+        given = read_cloud(cloud, mask, label, scale, _numbers(viewpoint), scene=False)
         for note in given.notes:
             warn(note)
     elif mask is not None or label is not None or viewpoint is not None:
@@ -102,13 +102,15 @@ def plan(
 
     print_report(data, json_path, None if quiet or not data["grasps"] else lambda: _show(data))
     if done.path is None:
-        counts = ", ".join(f"{count} {what}" for what, count in done.counts.items() if what != "kept")
-        raise StarvedError(f"no grasp planned: {counts}")
+        hint = "; do its normals point out of it (--viewpoint), are there views of all sides?" if cloud else ""
+        raise StarvedError(f"no grasp planned from {starts} starts: {_lost(done.counts)}{hint}")
 
 
-def _numbers(text: str) -> list[float]:
+def _numbers(text: str | None) -> list[float] | None:
     from lgrasp.errors import ConfigError
 
+    if text is None:
+        return None
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
@@ -138,17 +140,20 @@ def _report(done: "PlanOutcome", starts: int) -> dict[str, Any]:
 def _show(data: dict[str, Any]) -> None:
     from lgrasp_cli.tables import print_pairs
 
-    lost = [f"{n} {what}" for what, n in data["counts"].items() if what not in ("starts", "kept") and n]
     each = data["seconds"] / data["grasps"]
     print_pairs(
         [
-            ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({', '.join(lost) or 'none lost'})"),
+            ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({_lost(data['counts']) or 'none lost'})"),
             ("where", data["out"]),
             ("hand, object", f"{data['hand']}, {data['object']}"),
             ("quality", f"median epsilon {data['epsilon']:.3f}, disturbance {data['disturbance']:.2f}"),
             ("wall", f"{data['seconds']:.1f} s, {each:.3f} s a plan"),
         ]
     )
+
+
+def _lost(counts: dict[str, int]) -> str:
+    return ", ".join(f"{n} {what}" for what, n in counts.items() if what not in ("starts", "kept") and n)
 
 
 class _Progress:

@@ -29,7 +29,7 @@ def hand_problems(hand: HandRecord) -> list[str]:
 
 
 def object_problems(record: ObjectRecord) -> list[str]:
-    """What is wrong with an object's values: vertices not finite, faces out of range, scale not positive."""
+    """What is wrong with an object's values: vertices not finite, faces out of range, normals, scale not positive."""
     where, problems = f"objects/{record.id}", []
     if not np.isfinite(record.vertices).all():
         problems.append(f"{where}/vertices: not finite")
@@ -37,6 +37,11 @@ def object_problems(record: ObjectRecord) -> list[str]:
     if faces.size and (faces.min() < 0 or faces.max() >= len(record.vertices)):
         bad = int(faces.min() if faces.min() < 0 else faces.max())
         problems.append(f"{where}/faces: index {bad}, there are {len(record.vertices)} vertices")
+    if record.normals is not None:
+        if np.shape(record.normals) != np.shape(record.vertices):
+            problems.append(f"{where}/normals: {len(record.normals)} for {len(record.vertices)} vertices")
+        elif not (np.abs(np.linalg.norm(record.normals, axis=-1) - 1) <= _UNIT_TOLERANCE).all():  # NaN fails too
+            problems.append(f"{where}/normals: not of unit length")
     if not 0 < record.scale < np.inf:
         problems.append(f"{where}: scale is {record.scale}, must be positive")
     return problems

@@ -218,6 +218,7 @@ def read_object(file: h5py.File, object_id: str) -> ObjectRecord:
         watertight=bool(group.attrs["watertight"]),
         vertices=group["vertices"][()],
         faces=group["faces"][()],
+        normals=group["normals"][()] if "normals" in group else None,
     )
 
 

@@ -56,7 +56,9 @@ class ObjectRecord:
     vertices: np.ndarray
     """Vertex positions in the object's user frame [m], scale applied, shape [V, 3], float32."""
     faces: np.ndarray
-    """Vertex indices of triangles, shape [F, 3], int32."""
+    """Vertex indices of triangles, shape [F, 3], int32; none of a point cloud, whose points are the vertices."""
+    normals: np.ndarray | None = None
+    """Outward unit normals of the vertices, shape [V, 3], float32, where they are known, as of a point cloud."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,6 +40,7 @@ class DatasetSpec:
     unit: str = ""
     fill: float | int | None = None
     """Padding value; None where padding is not allowed."""
+    required: bool = True
 
     @property
     def numpy(self) -> np.dtype:
@@ -98,10 +99,11 @@ DATASETS: tuple[DatasetSpec, ...] = (
     DatasetSpec("hand/link_names", "text", ("L",)),
     DatasetSpec("objects/*/vertices", "f4", ("v", 3), "m"),
     DatasetSpec("objects/*/faces", "i4", ("f", 3)),
+    DatasetSpec("objects/*/normals", "f4", ("v", 3), required=False),
     *GRASP_FIELDS.values(),
     *ROW_GROUPS.values(),
 )
-"""Every dataset; a family may be empty (except ``objects``), all others are required."""
+"""Every dataset; a family may be empty (except ``objects``), all others are required unless they say otherwise."""
 
 SEQUENCE_DATASETS: tuple[DatasetSpec, ...] = (
     DatasetSpec("sequence/space_names", "text", ("S",)),

@@ -54,6 +54,8 @@ def schema_problems(file: h5py.File, datasets: Sequence[DatasetSpec], attributes
     dims: dict[str, int] = {}
     for spec in datasets:
         for path in expand(file, spec.path):
+            if not spec.required and path not in file:
+                continue
             problems += _dataset_problems(file, path, spec, dims)
     for attribute in attributes:
         for path in expand(file, attribute.path):

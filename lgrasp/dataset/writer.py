@@ -117,6 +117,8 @@ def write_object(group: h5py.Group, record: ObjectRecord) -> None:
     )
     create_array(group, "vertices", np.asarray(record.vertices, dtype="f4"))
     create_array(group, "faces", np.asarray(record.faces, dtype="i4"))
+    if record.normals is not None:
+        create_array(group, "normals", np.asarray(record.normals, dtype="f4"))
 
 
 def create_rows(file: h5py.File, name: str, shape, dtype, *, unit: str = "", protocol: str = "") -> h5py.Dataset:

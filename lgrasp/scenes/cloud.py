@@ -18,7 +18,8 @@ MIN_POINTS = 50
 
 _LARGEST = 20.0  # [m] side of a whole cloud
 _LARGEST_TARGET, _LEAST_TARGET = 2.0, 0.005  # [m] side of what is to be grasped
-_CENTIMETRES = 40.0  # a file whose coordinates span more is taken to be in millimetres
+_UNITS = ((0.01, "centimetres"), (0.001, "millimetres"), (1e-6, "micrometres"))
+_CENTIMETRES = 40.0  # a file whose coordinates span more is not taken to be in centimetres
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ def read_cloud(
     label: int | None = None,
     scale: float = 1.0,
     viewpoint: Sequence[float] | np.ndarray | None = None,
+    *,
+    scene: bool = True,
 ) -> Cloud:
     """Read a whole cloud; with a label, its ``target`` are the points of that label.
 
@@ -64,6 +67,7 @@ def read_cloud(
         scale: Factor from the file's unit to metres.
         viewpoint: Where the points were seen from, x y z in the file's frame [m] after scaling. Normals are turned to
             it. Without one, normals that the file lacks are turned to the origin, which must lie outside the cloud.
+        scene: Without a label it may be a scene, larger than anything that a hand grasps.
 
     Raises:
         CloudError: no usable points, a mask of another length or that selects next to nothing, an unlikely size, or
@@ -79,16 +83,22 @@ def read_cloud(
     if mask is not None:
         labels = read_mask(Path(mask), len(points))
         label = 1 if label is None and set(np.unique(labels)) <= {0, 1} else label
-    keep = _seen(path, points, notes)
+    mesh = "faces" in found
+    keep = _seen(path, points, notes, hint="; it is a mesh, which --object takes" if mesh else "")
+    if mesh:
+        notes.append(f"{path} is a mesh: its vertices are the points; --object takes all of its surface")
     points, labels = points[keep], None if labels is None else labels[keep]
     normals = None if normals is None else normals[keep]
     target = _target(mask or path, labels, label, masked=mask is not None, count=len(points))
-    _check_size(path, points, target, scale, chosen=label is not None)
+    chosen = label is not None
+    if chosen or not scene:
+        target = _without_strays(points, target, notes)
+    _check_size(path, points, target, scale, chosen=chosen, scene=scene)
     normals = _normals(path, points, normals, viewpoint, notes)
     return Cloud(points.astype(np.float32), normals.astype(np.float32), labels, target, tuple(notes))
 
 
-def _seen(path: Path, points: np.ndarray, notes: list[str]) -> np.ndarray:
+def _seen(path: Path, points: np.ndarray, notes: list[str], hint: str) -> np.ndarray:
     """Flags of the points that are there: finite, and not the zeros that cameras write where they see nothing."""
     finite = np.isfinite(points).all(axis=1)
     zero = (points == 0.0).all(axis=1)
@@ -101,7 +111,9 @@ def _seen(path: Path, points: np.ndarray, notes: list[str]) -> np.ndarray:
         notes.append(f"dropped {int(zero.sum()):,} of {len(points):,} points at 0 0 0: no depth")
     keep = finite & ~zero
     if keep.sum() < MIN_POINTS:
-        raise CloudError(f"{path}: {int(keep.sum())} usable points; at least {MIN_POINTS} are needed to show a surface")
+        raise CloudError(
+            f"{path}: {int(keep.sum())} usable points; at least {MIN_POINTS} are needed to show a surface{hint}"
+        )
     return keep
 
 
@@ -130,19 +142,45 @@ def _histogram(labels: np.ndarray | None) -> str:
     return f"its labels are {shown}{', ...' if len(values) > 12 else ''}"
 
 
-def _check_size(path: Path, points: np.ndarray, target: np.ndarray, scale: float, *, chosen: bool) -> None:
+def _without_strays(points: np.ndarray, target: np.ndarray, notes: list[str]) -> np.ndarray:
+    """The target without points that are farther from the box of the others than it is long, such as a mask's edge that
+    reaches the background; at most one in a hundred."""
+    low, high = np.percentile(points[target], [1.0, 99.0], axis=0)
+    reach = float((high - low).max())
+    stray = target & ((points < low - reach) | (points > high + reach)).any(axis=1)
+    if stray.any():
+        notes.append(
+            f"{int(stray.sum()):,} of {int(target.sum()):,} points lie far from the rest; they are not grasped"
+        )
+    return target & ~stray
+
+
+def _check_size(path: Path, points: np.ndarray, target: np.ndarray, scale: float, *, chosen: bool, scene: bool) -> None:
     """Refuse extents that a unit mistake explains; a hundredth of the points may be stray."""
     whole = float(np.ptp(np.percentile(points, [1.0, 99.0], axis=0), axis=0).max())
     part = float(np.ptp(np.percentile(points[target], [1.0, 99.0], axis=0), axis=0).max())
     at = "" if scale == 1.0 else f" at scale {scale:g}"
-    if whole > _LARGEST or (chosen and part > _LARGEST_TARGET):
-        what, extent, most = ("target", part, _LARGEST_TARGET) if chosen else ("cloud", whole, _LARGEST)
-        factor, unit = (0.01, "centimetres") if extent / scale <= _CENTIMETRES else (0.001, "millimetres")
-        hint = f"if the file is in {unit} use --scale {factor:g}"
+    long = [("cloud", whole, _LARGEST)] if whole > _LARGEST else []
+    if part > _LARGEST_TARGET and (chosen or not scene):
+        what = "target" if chosen else "cloud, all of which is to be grasped without --label,"
+        long = [(what, part, _LARGEST_TARGET)]
+    for what, extent, most in long:
+        hint = _unit(extent / scale, most)
         raise CloudError(f"{path}: the {what} is {extent:.4g} m long{at}; at most {most:g} m is accepted; {hint}")
     if part < _LEAST_TARGET:
-        hint = "; it is in metres already: use --scale 1" if part / scale >= _LEAST_TARGET else ""
-        raise CloudError(f"{path}: what is to be grasped is {part:.2g} m long{at}; {_LEAST_TARGET:g} m at least{hint}")
+        metres = "it is in metres already: use --scale 1"
+        hint = metres if part / scale >= _LEAST_TARGET else "--scale turns other units into metres"
+        raise CloudError(
+            f"{path}: what is to be grasped is {part:.2g} m long{at}; at least {_LEAST_TARGET:g} m is accepted; {hint}"
+        )
+
+
+def _unit(extent: float, most: float) -> str:
+    """The unit that a file with coordinates so far apart is probably in."""
+    for factor, unit in _UNITS:
+        if extent * factor <= most and (factor != _UNITS[0][0] or extent <= _CENTIMETRES):
+            return f"if the file is in {unit} use --scale {factor:g}"
+    return "--scale turns other units into metres"
 
 
 def _normals(

@@ -4,7 +4,6 @@ import contextlib
 import io
 import logging
 import warnings
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,8 @@ _LABELS = ("label", "labels")  # names that a file may give to the label of a po
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """What a cloud's file says of n points: ``points`` (n, 3), and perhaps ``normals`` (n, 3) and ``labels`` (n,).
 
-    An image of points, (h, w, 3), is read row by row. A scene (.h5) gives its merged cloud.
+    An image of points, (h, w, 3), is read row by row. A scene (.h5) gives its merged cloud. Of a mesh (.ply) the
+    vertices are the points, and their normals those of the faces around; it has ``faces`` (f, 3) too.
 
     Raises:
         CloudError: no such file, an unknown suffix, or not the form of that suffix.
@@ -38,10 +38,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         with _silence():
             found = _parse_ply(data) if kind == ".ply" else _parse_xyz(data) if kind == ".xyz" else _parse_numpy(data)
     except Exception as error:  # the parsers raise anything on garbage
-        why = " ".join(str(error).split())[:120] or type(error).__name__
-        raise CloudError(f"{path}: not a readable {kind} cloud ({why})") from None
-    if "points" not in found:
-        raise CloudError(f"{path}: has {', '.join(found) or 'nothing'}; an array 'points' of shape (n, 3) is needed")
+        raise CloudError(f"{path}: not a readable {kind} cloud ({_reason(error)})") from None
     points = found["points"]
     if points.ndim not in (2, 3) or points.shape[-1] not in (3, 6) or points.dtype.kind not in "fiu":
         raise CloudError(
@@ -49,7 +46,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             "(n, 6) with normals, or (h, w, 3) are accepted"
         )
     flat = points.reshape(-1, points.shape[-1]).astype(np.float64)
-    out = {"points": flat[:, :3]}
+    out = {"points": flat[:, :3]} | {name: found[name] for name in found if name == "faces"}
     if flat.shape[1] == 6:
         out["normals"] = flat[:, 3:]
     for name, width in (("normals", 3), ("labels", 1)):
@@ -57,7 +54,9 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             continue
         values = np.asarray(found[name])
         if values.size != len(flat) * width:
-            raise CloudError(f"{path}: {name} have shape {values.shape}, the points {points.shape}")
+            raise CloudError(
+                f"{path}: {name} have shape {values.shape}, the points {points.shape}; one for each is accepted"
+            )
         out[name] = values.reshape(len(flat), 3).astype(np.float64) if width == 3 else values.ravel()
     return out
 
@@ -70,13 +69,11 @@ def read_mask(path: Path, count: int) -> np.ndarray:
     """
     data = _read_bytes(path, _MASK_SUFFIXES, "a mask")
     try:
-        values = np.load(io.BytesIO(data), allow_pickle=False)
+        values = _load_numpy(data)
         if not isinstance(values, np.ndarray):
-            values = next((values[name] for name in (*_LABELS, "mask") if name in values), None)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise CloudError(f"{path}: not a readable mask ({' '.join(str(error).split())[:120]})") from None
-    if values is None:
-        raise CloudError(f"{path}: has no array 'labels'")
+            values = values[_named(values, (*_LABELS, "mask"), "labels")]
+    except Exception as error:  # the parsers raise anything on garbage
+        raise CloudError(f"{path}: not a readable mask ({_reason(error)})") from None
     return check_labels(np.asarray(values), count, str(path))
 
 
@@ -132,15 +129,32 @@ def _silence():
         log.disabled = before
 
 
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
 def _parse_ply(data: bytes) -> dict[str, np.ndarray]:
+    header, ends, _ = data.partition(b"end_header")
+    if header.startswith(b"ply") and not ends:
+        raise ValueError("its header has no end; is the file truncated?")
+    if header.startswith(b"ply") and not {b"x", b"y", b"z"} <= set(header.split()):
+        raise ValueError("its vertices have no x, y and z")
     loaded = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
-    columns = loaded.metadata["_ply_raw"]["vertex"]["data"]  # a record array, or a dict for text
-    names = columns.dtype.names if isinstance(columns, np.ndarray) else columns
+    element = loaded.metadata["_ply_raw"].get("vertex", {})
+    columns = element.get("data", {})  # a record array, or a dict for text
+    names = (columns.dtype.names or ()) if isinstance(columns, np.ndarray) else tuple(columns)
+    if not names:
+        raise ValueError("it has no vertices")
+    found, told = len(columns["x"]), int(element["length"])
+    if found != told:
+        raise ValueError(f"{found:,} of the {told:,} vertices that its header tells; is the file truncated?")
 
     def stack(wanted: tuple[str, ...]) -> np.ndarray:
         return np.stack([np.ravel(columns[name]) for name in wanted], axis=-1)
 
     out = {"points": stack(("x", "y", "z"))}
+    if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces) and len(loaded.vertices) == found:
+        out |= {"faces": np.asarray(loaded.faces), "normals": np.asarray(loaded.vertex_normals)}
     if {"nx", "ny", "nz"} <= set(names):
         out["normals"] = stack(("nx", "ny", "nz"))
     label = next((name for name in _LABELS if name in names), None)
@@ -152,9 +166,25 @@ def _parse_xyz(data: bytes) -> dict[str, np.ndarray]:
 
 
 def _parse_numpy(data: bytes) -> dict[str, np.ndarray]:
-    loaded: Any = np.load(io.BytesIO(data), allow_pickle=False)
+    loaded = _load_numpy(data)
     if isinstance(loaded, np.ndarray):
         return {"points": loaded}
+    _named(loaded, ("points",), "points")
     found = {name: loaded[name] for name in ("points", "normals") if name in loaded}
     label = next((name for name in _LABELS if name in loaded), None)
     return found if label is None else found | {"labels": loaded[label]}
+
+
+def _load_numpy(data: bytes) -> Any:
+    """An array, or a mapping of arrays."""
+    if not data.startswith((b"\x93NUMPY", b"PK")):
+        raise ValueError("it is no NumPy file")
+    return np.load(io.BytesIO(data), allow_pickle=False)
+
+
+def _named(arrays: Any, wanted: tuple[str, ...], what: str) -> str:
+    """The first of the names that an .npz file has."""
+    name = next((name for name in wanted if name in arrays), None)
+    if name is None:
+        raise ValueError(f"it has {', '.join(arrays) or 'nothing'}; an array '{what}' is needed")
+    return name

@@ -51,6 +51,7 @@ def test_cloud_is_stored(cli, cloud, tmp_path):
     assert len(record.faces) == 0
     radius = np.linalg.norm(record.vertices - [0, 0, 0.2], axis=1)
     np.testing.assert_allclose(radius, 0.035, atol=1e-3)
+    np.testing.assert_allclose(record.normals, (record.vertices - [0, 0, 0.2]) / radius[:, None], atol=1e-3)
     # contacts lie on the ball
     points = shard.grasps.contact_points.reshape(-1, 3)
     points = points[np.isfinite(points).all(1)]
@@ -63,18 +64,32 @@ def test_cloud_is_stored(cli, cloud, tmp_path):
         ([], "--object"),
         (["--object", "sphere", "--cloud", "a.ply"], "one of the two"),
         (["--object", "sphere", "--label", 1], "belong to --cloud"),
-        (["--object", "sphere", "--starts", 0], "at least 1"),
-        (["--cloud", "none.ply"], "does not exist"),
-        (["--object", "sphere", "--distal", -1], "distal"),
+        (["--object", "sphere", "--starts", 0], "--starts 0: at least 1"),
+        (["--object", "sphere", "--starts", -3], "--starts -3: at least 1"),
+        (["--cloud", "none.ply"], "none.ply: does not exist"),
+        (["--cloud", "."], "is a folder"),
+        (["--object", "sphere", "--distal", -1], "'distal' = -1"),
+        (["--object", "sphere", "--distal", "nan"], "'distal' = nan"),
+        (["--object", "sphere", "--distal", 0, "--other", 0], "give one of them a weight"),
+        (["--object", "sphere", "--stand-off", "nan"], "--stand-off nan: more than 0 and at most 1 m"),
+        (["--object", "sphere", "--stand-off", 0], "--stand-off 0: more than 0"),
+        (["--object", "sphere", "--stand-off", 50], "at most 1 m"),
+        (["--object", "sphere", "--hand", "dclaw"], "hand 'dclaw' has no palm (hand.yaml: palm)"),
+        (["--object", "sphere", "--hand", "baret"], "did you mean 'barrett'"),
+        (["--object", "spere"], "did you mean sphere"),
+        (["--object", "sphere", "--scale", 1000], "is accepted"),
+        (["--object", "sphere", "--out", "/proc/nothing"], "cannot be written"),
+        (["--object", "sphere", "--json", "/proc/nothing.json"], "cannot be written"),
     ],
 )
-def test_bad_input(cli, arguments, said):
+def test_bad_input(cli, tmp_path, arguments, said):
     assert said in cli("plan", *arguments, "--device", "cpu").error()
+    assert not list(tmp_path.iterdir())
 
 
-def test_bad_viewpoint_and_label(cli, cloud):
+def test_bad_viewpoint(cli, cloud):
     assert "three numbers" in cli("plan", "--cloud", cloud, "--viewpoint", "1,2").error()
-    assert "its labels are 0" in cli("plan", "--cloud", cloud, "--label", 7).error()
+    assert "viewpoint [nan, 0.0, 0.0]" in cli("plan", "--cloud", cloud, "--viewpoint", "nan,0,0").error()
 
 
 def test_interrupted(process, tmp_path):

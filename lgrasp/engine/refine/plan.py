@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from lgrasp.dataset import Shard, ShardHeader, write_shard
+import numpy as np
+
+from lgrasp.dataset import ObjectRecord, Shard, ShardHeader, write_shard
 from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder, clean_folder, shard_path
@@ -29,6 +31,7 @@ __all__ = ["PlanJob", "PlanOutcome", "plan_grasps"]
 
 _REACH = 0.3  # [m] what is farther from the target than this is no hand's business
 _LEAST_AROUND = 50
+_FARTHEST = 1.0  # [m] of a base from a start
 
 
 @dataclass(frozen=True)
@@ -64,11 +67,13 @@ class PlanOutcome:
 def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None) -> PlanOutcome:
     """Plan grasps and write those that passed every check, a row a start, as one shard.
 
+    Of a cloud the shard has the target's points as they were given, with their normals, as an object without faces.
+
     Args:
         progress: called with (starts done, plans); what it raises ends the job, and no file is written.
 
     Raises:
-        ConfigError: neither or both of object and cloud, or no start.
+        ConfigError: neither or both of object and cloud, no start, a distance or weights out of range.
         OutputError: the shard exists already, or its folder cannot be written.
         LgraspError: hand, object or cloud cannot be used.
     """
@@ -76,6 +81,10 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
         raise ConfigError("plan needs an object or a cloud, one of the two")
     if job.starts < 1:
         raise ConfigError(f"--starts {job.starts}: at least 1")
+    if job.stand_off is not None and not 0 < job.stand_off <= _FARTHEST:
+        raise ConfigError(f"--stand-off {job.stand_off:g}: more than 0 and at most {_FARTHEST:g} m is accepted")
+    if not job.params.distal + job.params.other > 0:
+        raise ConfigError("--distal 0 --other 0: nothing pulls the hand to the object; give one of them a weight")
     device = resolve_device(job.device)
     source, hand = named_hand(job.cache, job.hand, device)
     stand_off = job.stand_off or source.spec.stand_off or STAND_OFF
@@ -110,9 +119,18 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
         rows = shard_rows(grasps, hand, model)
         write_shard(
             path,
-            Shard(header=header, hand=record, objects=[object_record(model)], grasps=rows, statistics=statistics),
+            Shard(header=header, hand=record, objects=[_record(model, job.cloud)], grasps=rows, statistics=statistics),
         )
     return PlanOutcome(path if len(grasps) else None, hand.name, model, grasps, counts, seconds)
+
+
+def _record(model: ObjectModel, cloud: Cloud | None) -> ObjectRecord:
+    record = object_record(model)
+    if cloud is None:
+        return record
+    target = cloud.only(cloud.target)
+    normals = target.normals / np.linalg.norm(target.normals, axis=1, keepdims=True)
+    return replace(record, vertices=target.points, normals=normals)
 
 
 def _cloud_models(cloud: Cloud, name: str) -> tuple[ObjectModel, ObjectModel | None]:
