@@ -24,7 +24,7 @@ def register(app: typer.Typer) -> None:
 
 def refine(
     shards: Annotated[
-        list[Path], typer.Argument(help="Shard files, or folders of *.h5 files; or one export.", show_default=False)
+        list[Path], typer.Argument(help="Shard files, or folders of them; or one export.", show_default=False)
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder of the refined shards.", show_default=False)],
     form: Annotated[

@@ -13,7 +13,7 @@ from lxml import etree
 from lgrasp.dataset.records import HandRecord, ObjectRecord, Shard
 from lgrasp.decompose import Decompose
 from lgrasp.decompose import decompose as cut_mesh
-from lgrasp.errors import ShardError
+from lgrasp.errors import PhysicsError, ShardError
 from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh
 from lgrasp.hand.urdf import parse_robot, read_urdf
 from lgrasp.physics.solid import Solid, solid_of_mesh
@@ -114,7 +114,13 @@ def _write_meshes(tree: etree._Element, record: HandRecord, folder: Path) -> Non
 
 
 def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> Solid:
-    """The object of a shard as a solid, in the frame of its vertices."""
+    """The object of a shard as a solid, in the frame of its vertices.
+
+    Raises:
+        PhysicsError: a point cloud.
+    """
+    if not len(record.faces):
+        raise PhysicsError(f"object '{record.name}' is a point cloud; a simulator needs a mesh, as of a complete scan")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         mesh = trimesh.Trimesh(np.asarray(record.vertices, float), np.asarray(record.faces), process=True)

@@ -1,9 +1,14 @@
 """``lgrasp refine``."""
 
 import json
+import shutil
+import signal
+import time
 
+import h5py
 import numpy as np
 import pytest
+import trimesh
 
 from lgrasp.dataset import read_shard, validate_shard
 
@@ -55,7 +60,165 @@ def test_exports_of_other_programs(cli, shards, tmp_path):
     assert "--hand" in cli("refine", folder, "--from", "dexgraspnet", "--out", tmp_path / "x").error()
 
 
+def spoilt(shards, folder, **changes):
+    """A folder with a copy of the shard, row 3 of datasets changed behind the writer's back."""
+    folder.mkdir()
+    (source,) = shards.glob("*.h5")
+    shutil.copy(source, folder)
+    with h5py.File(folder / source.name, "r+") as file:
+        for name, change in changes.items():
+            file[f"grasps/{name}"][3] = change(file[f"grasps/{name}"][3])
+    return folder
+
+
+def put(value, *columns):
+    """A change of some columns of a row."""
+    return lambda row: np.where(np.isin(np.arange(row.shape[-1]), columns), value, row)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("q", put(np.nan, 2), "grasps/q: not finite (row 3, 1 rows)"),
+        ("q", put(np.inf, 2), "grasps/q: not finite (row 3, 1 rows)"),
+        ("q_squeeze", put(np.nan, 2), "grasps/q_squeeze: not finite (row 3"),
+        ("object_pose", put(np.nan, 0), "grasps/object_pose: NaN"),
+        ("object_pose", put(0.0, 3, 4, 5, 6), "quaternion is not of unit length (row 3"),
+    ],
+)
+def test_rows_that_cannot_be_repaired(cli, shards, tmp_path, name, change, words):
+    folder = spoilt(shards, tmp_path / "spoilt", **{name: change})
+    line = cli("refine", folder, "--out", tmp_path / "x", "--device", "cpu").error()
+    assert words in line
+    assert str(folder / "allegro-tiny-00000.h5") in line
+    assert not (tmp_path / "x").exists()
+
+
+def test_joints_outside_their_limits_are_clamped(cli, shards, tmp_path):
+    folder, out = spoilt(shards, tmp_path / "spoilt", q=put(9.0, 2)), tmp_path / "refined"
+    found = cli("refine", folder, "--out", out, "--outer", 1, "--device", "cpu", "--json", "-")
+    assert found.code == 0, found
+    assert found.err.startswith("warning: joints of 1 rows were outside their limits")
+    (data,) = json.loads(found.out)
+    assert data["energy_before"] < 1.0  # that of the joints within
+    (path,) = out.glob("*.h5")
+    assert validate_shard(path) == []
+    shard = read_shard(path)
+    assert shard.grasps.q[3, 2] == pytest.approx(shard.hand.joint_upper[2], abs=0.05)
+
+
+def test_hands_that_are_far_off_are_told(cli, shards, tmp_path):
+    folder, out = spoilt(shards, tmp_path / "spoilt", object_pose=put(3.0, 0)), tmp_path / "refined"
+    found = cli("refine", folder, "--out", out, "--outer", 1, "--device", "cpu", "-q")
+    assert found.code == 0, found
+    assert "the hands of 1 rows are more than half a metre from their object" in found.err
+    (path,) = out.glob("*.h5")
+    assert read_shard(path).grasps.metrics["refined"][3] == 0
+
+
+@pytest.fixture
+def export(cli, shards, tmp_path):
+    """export(change): the grasps in format dexgraspnet, their entries changed."""
+    assert cli("export", shards, "--to", "dexgraspnet", "--out", tmp_path / "export").code == 0
+
+    def export(change=lambda entries: entries):
+        path = tmp_path / "export" / "grasps" / "tiny.npy"
+        entries = change(list(np.load(path, allow_pickle=True)))
+        out = np.empty(len(entries), object)
+        out[:] = entries
+        np.save(path, out, allow_pickle=True)
+        return tmp_path / "export"
+
+    return export
+
+
+def with_values(**values):
+    """Entry 2 with other values of its posture."""
+
+    def change(entries):
+        entries[2]["qpos"] |= values
+        return entries
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (with_values(**{"joint_1.0": np.nan}), "entry 2: qpos is not finite"),
+        (with_values(WRJTx=np.inf), "entry 2: qpos is not finite"),
+        (with_values(extra=0.0), "entry 2: has joint 'extra'; expected joint_0.0"),
+        (lambda entries: [e | {"scale": np.nan} for e in entries], "object 'tiny' has scale nan"),
+        (lambda entries: [e | {"scale": 1000.0} for e in entries], "90 m at scale 1000; 0.005 to 1 m is accepted"),
+        (lambda entries: [], "holds no grasps"),
+    ],
+)
+def test_bad_exports(cli, export, tmp_path, change, words):
+    base = ["--from", "dexgraspnet", "--hand", "allegro", "--device", "cpu", "--out", tmp_path / "x"]
+    assert words in cli("refine", export(change), *base).error()
+    assert not (tmp_path / "x").exists()
+
+
+def test_exports_of_another_hand_or_without_a_mesh(cli, export, tmp_path):
+    base = [export(), "--from", "dexgraspnet", "--device", "cpu", "--out", tmp_path / "x", "--hand"]
+    assert "entry 0: lacks joint 'finger_1_med_joint'" in cli("refine", *base, "barrett").error()
+    (tmp_path / "export/objects/tiny.obj").unlink()
+    assert "objects/tiny.obj: does not exist" in cli("refine", *base, "allegro").error()
+    assert "choose one of dexgraspnet" in cli("refine", "export", "--from", "x", *base[3:], "allegro").error()
+    assert not (tmp_path / "x").exists()
+
+
 def test_bad_input(cli, shards, tmp_path):
-    assert "nothing" in cli("refine", "nothing", "--out", tmp_path / "x").error()
-    assert "inner" in cli("refine", shards, "--out", tmp_path / "x", "--inner", 0).error()
-    assert "another version" in cli("refine", shards, "--out", tmp_path / "x", "--hand", "barrett").error()
+    out = ("--out", tmp_path / "x")
+    assert "nothing: no such file" in cli("refine", "nothing", *out).error()
+    assert "'inner' = 0" in cli("refine", shards, *out, "--inner", 0).error()
+    line = cli("refine", shards, *out, "--hand", "barrett").error()
+    assert "allegro-tiny-00000.h5: its grasps are of hand 'allegro'" in line
+    assert "not of 'barrett'" in line
+    (path,) = shards.glob("*.h5")
+    other = tmp_path / "other" / path.name
+    other.parent.mkdir()
+    other.write_bytes(path.read_bytes()[:9000])
+    assert f"{other}: " in cli("refine", other, *out).error()
+    shutil.copy(path, other)
+    assert "name one folder above both" in cli("refine", shards, other.parent, *out).error()
+    assert "is a file" in cli("refine", shards, "--out", path).error()
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_tree_of_shards_stays_a_tree(cli, shards, tmp_path):
+    (path,) = shards.glob("*.h5")
+    for name in ("a", "b"):
+        (tmp_path / "tree" / name).mkdir(parents=True)
+        shutil.copy(path, tmp_path / "tree" / name)
+    quick = ("--device", "cpu", "--outer", 1, "--inner", 1, "-q")
+    assert cli("refine", tmp_path / "tree", "--out", tmp_path / "x", *quick).code == 0
+    assert sorted(p.parent.name for p in (tmp_path / "x").rglob("*.h5")) == ["a", "b"]
+    (tmp_path / "x" / "a" / path.name).unlink()
+    # what is there already is told before anything is made
+    assert "--force" in cli("refine", tmp_path / "tree", "--out", tmp_path / "x", *quick).error()
+    assert not list((tmp_path / "x" / "a").iterdir())
+
+
+def test_plans_of_a_cloud_can_be_refined(cli, tmp_path):
+    n = np.asarray(trimesh.creation.icosphere(subdivisions=4).vertices)
+    np.savez(tmp_path / "ball.npz", points=0.035 * n, normals=n)
+    planned, out = tmp_path / "planned", tmp_path / "refined"
+    cloud = ("plan", "--cloud", tmp_path / "ball.npz", "--starts", 2, "--device", "cpu", "-q")
+    assert cli(*cloud, "--out", planned).code == 0
+    assert cli("refine", planned, "--out", out, "--always", "--outer", 2, "--device", "cpu", "-q").code == 0
+    before, after = (read_shard(next(folder.glob("*.h5"))) for folder in (planned, out))
+    np.testing.assert_array_equal(after.objects[0].normals, before.objects[0].normals)
+    assert (after.grasps.metrics["energy"] > 0).all()
+    assert "is a point cloud" in cli("validate", planned, "--out", tmp_path / "x").error()
+
+
+def test_interrupted(process, shards, tmp_path):
+    """Ctrl-C ends with 130 and leaves no half file."""
+    out = tmp_path / "refined"
+    with process("refine", shards, "--outer", 1000, "--inner", 50, "--device", "cpu", "--out", out) as run:
+        time.sleep(5)
+        run.send_signal(signal.SIGINT)
+        assert run.wait(20) == 130
+        assert run.stderr.read() == "interrupted\n"
+    assert not list(out.glob("*"))

@@ -93,6 +93,8 @@ def read_dexgraspbench(path: Path | str, *, joint_names: Sequence[str] | None = 
         root.append(postures[0][:7])
         q.append([values[7:][order] for values in postures])
         world.append(_numbers(entry, "obj_pose", 7, file))
+        if not (world[-1][3:].any() and root[-1][3:].any()):
+            raise ShardError(f"{file}: a quaternion is 0 0 0 0; one of unit length is accepted")
         known = folder.object(_code(entry, file), float(_numbers(entry, "obj_scale", 1, file)[0]))
         if known not in objects:
             objects.append(known)

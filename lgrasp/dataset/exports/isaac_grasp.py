@@ -110,6 +110,8 @@ def read_isaac_grasp(path: Path | str, *, joint_names: Sequence[str] | None = No
                 raise ShardError(f"{where}: not as isaac_grasp 1.0 has it: {error}") from None
             if len(poses[-1]) != 7 or not np.isfinite(poses[-1]).all() or not np.isfinite(q[-1]).all():
                 raise ShardError(f"{where}: expected 3 numbers of position, 4 of orientation, all finite")
+            if not any(poses[-1][3:]):
+                raise ShardError(f"{where}: orientation is 0 0 0 0; a quaternion of unit length is accepted")
             index.append([place])
     joints = np.array(q, np.float64).reshape(-1, 3, len(names))
     pose = inverse(np.array(poses, np.float64).reshape(-1, 7))

@@ -101,8 +101,8 @@ def move_rows(
 
 def _outside(rows: GraspRows, hand: HandArrays) -> np.ndarray:
     """Rows with joints outside their limits, (N,) bool."""
-    tree, q = hand.model.tree, np.asarray(rows.q)[:, : hand.model.dofs]
-    return ((q < tree.joint_lower - _LIMIT) | (q > tree.joint_upper + _LIMIT)).any(1)
+    limits, q = hand.model.tree.listed_limits, np.asarray(rows.q)
+    return np.asarray(((q < limits[:, 0] - _LIMIT) | (q > limits[:, 1] + _LIMIT)).any(1))
 
 
 def _hands(rows: GraspRows, part: slice, hand: HandArrays, obj: ObjectModel) -> Pose:

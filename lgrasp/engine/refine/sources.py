@@ -18,19 +18,25 @@ from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.object.load import load_mesh
 from lgrasp.object.model import ObjectModel, preprocess_object
+from lgrasp.refine.cloud import cloud_object
 
 __all__ = ["grasp_shards", "object_of_record"]
 
 
 def object_of_record(cache: Cache, record: ObjectRecord, device: str) -> ObjectModel:
-    """The object of a shard, preprocessed, in its user frame; from the cache if it was there before.
+    """The object of a shard, preprocessed, in its user frame; a mesh from the cache if it was there before.
 
     Raises:
         ObjectError: it cannot be used.
+        ShardError: a point cloud without normals.
     """
     vertices, faces = np.asarray(record.vertices, float), np.asarray(record.faces)
     if len(faces) == 0:
-        raise ShardError(f"object '{record.id}' is a point cloud; rows of meshes can be refined")
+        if record.normals is None:
+            raise ShardError(
+                f"object '{record.id}' is a point cloud without normals; meshes and clouds with normals can"
+            )
+        return cloud_object(vertices, record.normals, name=record.name)
     key = content_key(
         "object",
         OBJECT_VERSION,
@@ -47,18 +53,22 @@ def grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) -> 
 
     Raises:
         ConfigError: an unknown format.
-        ShardError: a file is damaged, names other joints, or the mesh of an object is missing.
+        ShardError: a file is damaged, names other joints, has no grasps, or the mesh of an object is missing.
         ObjectError: a mesh cannot be read.
     """
     found = read_grasps(path, form, joint_names=hand.tree.listed_names)
     rows = found.grasps
     if rows.object_index.shape[1] != 1:
         raise ShardError(f"{path}: grasps of several objects cannot be refined")
+    if not len(rows):
+        raise ShardError(f"{path}: holds no grasps")
     record = hand_record(hand, mesh_blobs(source.urdf))
     for number, item in enumerate(found.objects):
         chosen = np.flatnonzero(rows.object_index[:, 0] == number)
         if item.mesh is None:
             raise ShardError(f"{path}: no mesh of object '{item.code}' is known; an export folder with its meshes is")
+        if not (np.isfinite(item.scale) and item.scale > 0):
+            raise ShardError(f"{path}: object '{item.code}' has scale {item.scale:g}; a positive number is accepted")
         mesh = load_mesh(item.mesh, scale=item.scale)
         solid = ObjectRecord(
             id=item.code,
