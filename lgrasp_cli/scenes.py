@@ -153,7 +153,11 @@ def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, v
     """The config that is named, or one of the objects, with what the command line replaces."""
     from lgrasp.config import parse_model
     from lgrasp.engine.scenes.config import SceneConfig, load_scene_config, scene_configs
+    from lgrasp.errors import ConfigError
 
+    config = next((name for name in objects if name.endswith((".yaml", ".yml"))), None)
+    if config and len(objects) > 1:
+        raise ConfigError(f"{', '.join(objects)}: the config {config} is named alone, or objects without it")
     data: dict[str, Any] = {"objects": objects}
     if len(objects) == 1 and (objects[0].endswith((".yaml", ".yml")) or objects[0] in scene_configs()):
         data = load_scene_config(objects[0]).model_dump()

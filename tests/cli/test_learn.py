@@ -3,6 +3,13 @@
 import json
 from pathlib import Path
 
+import h5py
+import numpy as np
+import torch
+
+from lgrasp.learn.network import CoarseNet
+from lgrasp.learn.params import LearnParams
+
 
 def test_fit_and_eval(generate, cli):
     assert generate().code == 0
@@ -23,6 +30,51 @@ def test_fit_and_eval(generate, cli):
     assert "no such file" in cli("learn", "eval", "absent.pt", "out").error()
 
 
-def test_bad_input(cli):
+def test_bad_options(cli):
     assert "no such file or folder" in cli("learn", "fit", "absent").error()
-    assert "key 'batch' = 0" in cli("learn", "fit", "absent", "--batch", 0).error()
+    for option, value in (("batch", 0), ("steps", -1), ("unrolled", 101), ("seed", -1)):
+        assert f"key '{option}' = {value}" in cli("learn", "fit", "absent", f"--{option}", value).error()
+
+
+def test_shards_that_cannot_be_learned_from(generate, cli, tmp_path):
+    def refused(*shards):
+        line = cli("learn", "fit", *shards, "--out", "net.pt", "--device", "cpu").error()
+        assert not Path("net.pt").exists()
+        return line
+
+    assert generate(rows=3).code == 0
+    (path,) = Path("out").glob("*.h5")
+    assert "out: 3 grasps; at least 16 are needed" in refused("out")
+    with h5py.File(path, "r+") as file:
+        file["grasps/q"][1, 2] = np.nan
+    assert f"{path}: q is not finite (row 1, 1 rows)" in refused("out")
+    assert generate("--hand", "barrett", rows=2, out=tmp_path / "other").code == 0
+    assert generate("--force", rows=3).code == 0
+    line = refused("out", "other")
+    assert "barrett-tiny-00000.h5: its grasps are of hand 'barrett'" in line
+    assert f"those of {path} of 'allegro'" in line
+    assert "out is a folder; name a file" in cli("learn", "fit", "out", "--out", "out", "--device", "cpu").error()
+
+
+def test_files_that_are_no_predictors(cli):
+    params = LearnParams.model_validate({"width": 8})
+    net = CoarseNet(torch.zeros(2), torch.ones(2), params)
+    good = {"format": "lgrasp-coarse", "version": 1, "hand": "h", "hand_sha256": "0" * 64}
+    good |= {"params": params.model_dump_json(), "state": net.state_dict()}
+    weights = {name: values * float("nan") for name, values in net.state_dict().items()}
+    for change, words in (
+        ({"version": 9}, "version 9"),
+        ({"params": "{}"}, "size mismatch"),
+        ({"params": "?"}, "net.pt"),
+        ({"state": {}}, "'lower'"),
+        ({"state": weights}, "weights that are not finite"),
+    ):
+        torch.save(good | change, "net.pt")
+        line = cli("learn", "eval", "net.pt", "absent").error()
+        assert "net.pt: not a predictor of lgrasp" in line
+        assert words in line
+    torch.save(good, "net.pt")
+    data = Path("net.pt").read_bytes()
+    assert "absent: no such file" in cli("learn", "eval", "net.pt", "absent").error()
+    Path("net.pt").write_bytes(data[: len(data) // 2])
+    assert "not a predictor" in cli("learn", "eval", "net.pt", "absent").error()

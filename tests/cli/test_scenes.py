@@ -4,8 +4,12 @@ import json
 import signal
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 import yaml
+
+from lgrasp.object import find_object
 
 SMALL = {"objects": 2, "grasps": 5, "colliding": 5, "tested": 20, "camera": {"width": 80, "height": 60, "views": 2}}
 
@@ -71,6 +75,31 @@ def test_bad_options(cli, config):
     assert "no such file" in cli("scenes", "check", "absent").error()
     Path("file").write_text("")
     assert "is a file" in cli("scenes", "make", config(), "--out", "file/out").error()
+
+
+def test_bad_objects(cli, generate, quick):
+    """Said before grasps of the first object are made."""
+    base = ("--pipeline", quick, "--stock", 5, "--device", "cpu", "--out", "scenes", "-n", 1, "--on-table", 1)
+
+    def refused(*more):
+        line = cli("scenes", "make", *more, *base).error()
+        assert not Path("scenes").exists()
+        return line
+
+    assert "object 'nomug'" in refused("tiny", "nomug")
+    Path("empty.obj").write_text("")
+    assert "empty.obj: 0 bytes" in refused("tiny", "empty.obj")
+    Path("tiny.obj").write_bytes(find_object("sphere").read_bytes())
+    assert "have one name, 'tiny'" in refused("tiny", "./tiny.obj")
+    Path("a.yaml").write_text("scenes: 1")
+    assert "the config a.yaml is named alone" in refused("a.yaml", "tiny")
+    assert generate(rows=3).code == 0
+    assert "out has no grasps of object 'sphere'; it has tiny" in refused("sphere", "--grasps", "out")
+    assert "(hash " in refused("--grasps", "out", "--hand", "barrett")
+    (path,) = Path("out").glob("*.h5")
+    with h5py.File(path, "r+") as file:
+        file["grasps/q"][1, 2] = np.nan
+    assert f"{path}: q is not finite (row 1, 1 rows)" in refused("--grasps", "out")
 
 
 def test_ctrl_c_leaves_whole_scenes(process, config, cli, tmp_path):

@@ -20,7 +20,7 @@ from lgrasp.engine.folder import check_folder
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.scenes.shards import check_hand, object_model, read_parts
 from lgrasp.engine.workspace import input_keys, load_hand
-from lgrasp.errors import ConfigError
+from lgrasp.errors import ConfigError, OutputError
 from lgrasp.hand.model import HandModel
 from lgrasp.learn.examples import Examples, make_examples
 from lgrasp.learn.measure import Measured, measure
@@ -34,6 +34,7 @@ OUTER = (3, 6, 10, 13)
 """Outer steps of the refiner that the published table has."""
 
 _FORMAT, _VERSION = "lgrasp-coarse", 1
+_LEAST = 16  # grasps to learn from
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,15 @@ def fit(job: Fit, told: Callable[[str, int, int, float], None] | None = None) ->
     """
     p, say = job.params, told or (lambda phase, step, steps, value: None)
     check_folder(job.out.parent)
+    if job.out.is_dir():
+        raise OutputError(f"{job.out} is a folder; name a file with --out, such as coarse.pt")
     device = resolve_device(job.device).alias
     hand, train, held_out = _examples(job.shards, job.hand, p, job.cache, device)
+    grasps = sum(len(e.q) for e in train)
+    if grasps < _LEAST:
+        raise ConfigError(
+            f"{', '.join(map(str, job.shards))}: {grasps} grasps; at least {_LEAST} are needed to learn from"
+        )
     trainer = Trainer(hand, train, p, device=device)
     start = time.perf_counter()
     trainer.fit_poses(p.steps, p.rate, lambda step, loss: say("poses", step, p.steps, loss))
@@ -118,11 +126,21 @@ def load_predictor(path: Path) -> tuple[CoarseNet, dict[str, Any]]:
     Raises:
         ConfigError: no such file, or no predictor.
     """
-    saved = _load(path)
-    state = saved.pop("state")
-    net = CoarseNet(state["lower"], state["upper"], LearnParams.model_validate(saved["params"]))
-    net.load_state_dict(state)
-    return net, saved
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        if saved["format"] != _FORMAT or saved["version"] != _VERSION:
+            raise ValueError(f"format {saved['format']!r}, version {saved['version']!r}")
+        about = {name: saved[name] for name in ("format", "version", "hand", "hand_sha256")}
+        about["params"], state = json.loads(saved["params"]), saved["state"]
+        net = CoarseNet(state["lower"], state["upper"], LearnParams.model_validate(about["params"]))
+        net.load_state_dict(state)
+        if not all(bool(values.isfinite().all()) for values in state.values()):
+            raise ValueError("weights that are not finite")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; lgrasp learn fit writes predictors") from None
+    except Exception as error:  # damaged files make the unpickler raise almost anything
+        raise ConfigError(f"{path}: not a predictor of lgrasp ({' '.join(str(error).split())[:120]})") from None
+    return net, about
 
 
 def _numbers(found: Measured) -> dict[str, Any]:
@@ -161,15 +179,3 @@ def _save(path: Path, trainer: Trainer, hand: HandModel) -> None:
     torch.save(about | {"params": trainer.params.model_dump_json(), "state": state}, data)
     with new_file(path) as file:
         file.write(data.getvalue())
-
-
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-        if saved["format"] != _FORMAT or saved["version"] != _VERSION:
-            raise ValueError(f"format {saved['format']!r}, version {saved['version']!r}")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; lgrasp learn fit writes predictors") from None
-    except Exception as error:  # damaged files make the unpickler raise almost anything
-        raise ConfigError(f"{path}: not a predictor of lgrasp ({' '.join(str(error).split())[:120]})") from None
-    return saved | {"params": json.loads(saved["params"])}

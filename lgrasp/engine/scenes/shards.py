@@ -38,12 +38,14 @@ class Part:
 
 
 def read_parts(paths: Sequence[Path]) -> dict[tuple[str, str], Part]:
-    """Objects by id and hash of their mesh as grasped.
+    """Objects by id and hash of their mesh as grasped, all with grasps of one hand.
 
     Raises:
-        ShardError: a file is no shard of single objects, or two objects have one id.
+        ShardError: a file is no shard of single objects, of point clouds, has a row that is not finite, or is of
+            another hand than the others; two objects have one id.
     """
     found: dict[tuple[str, str], Part] = {}
+    first: tuple[tuple[str, str], Path] | None = None
     for path in paths:
         with ShardReader(path) as reader:
             if reader.space_names is not None or len(reader.object_ids) != 1:
@@ -51,8 +53,18 @@ def read_parts(paths: Sequence[Path]) -> dict[tuple[str, str], Part]:
             (record,), attributes = reader.objects(), reader.attributes
             columns = {name: reader.column(name) for name in _COLUMNS}
             columns["T_hand_object"] = reader.column("object_pose")[:, 0]
+        if not len(record.faces):
+            raise ShardError(f"{path}: object '{record.id}' is a point cloud; objects with a mesh are accepted")
+        _check_finite(path, columns)
         key = (record.id, record_hash(record))
         hand = (str(attributes["hand"]), str(attributes["hand_sha256"]))
+        first = first or (hand, path)
+        if hand != first[0]:
+            (a, b), (c, d) = hand, first[0]
+            raise ShardError(
+                f"{path}: its grasps are of hand '{a}' (hash {b[:12]}), those of {first[1]} of '{c}' (hash {d[:12]}); "
+                "name shards of one hand"
+            )
         part = found.setdefault(key, Part(record, hand, []))
         part.columns.append(columns)
     ids = [key[0] for key in found]
@@ -62,6 +74,15 @@ def read_parts(paths: Sequence[Path]) -> dict[tuple[str, str], Part]:
             f"the shards hold several objects of the name '{twice}' (other mesh or scale); use one of them"
         )
     return found
+
+
+def _check_finite(path: Path, columns: dict[str, np.ndarray]) -> None:
+    for name, values in columns.items():
+        bad = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
+        if len(bad):
+            raise ShardError(
+                f"{path}: {name} is not finite (row {bad[0]}, {len(bad)} rows); finite grasps are accepted"
+            )
 
 
 def record_hash(record: ObjectRecord) -> str:

@@ -24,6 +24,7 @@ from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.find import HandSource, find_hand
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.find import find_object
+from lgrasp.object.load import load_mesh
 from lgrasp.physics.scene import object_of_record
 from lgrasp.scenes.make import Item
 
@@ -83,6 +84,7 @@ def _generated(config: SceneConfig, cache: Cache, device: Device, report: Callab
     if not config.objects:
         raise ConfigError("no objects: name some (lgrasp objects list), or give a folder of shards with --grasps")
     hand, shards = config.hand or "allegro", []
+    _check_meshes(config)
     for name in config.objects:
         report(f"grasps of {Path(name).stem}")
         job = Job(
@@ -98,6 +100,18 @@ def _generated(config: SceneConfig, cache: Cache, device: Device, report: Callab
         )
         shards += generate(job).paths
     return shards
+
+
+def _check_meshes(config: SceneConfig) -> None:
+    """Can all meshes be used, and do they have names of their own? Better said before grasps of the first are made."""
+    found: dict[str, Path] = {}
+    for name in config.objects:
+        path = find_object(name)
+        load_mesh(path, scale=config.scale)
+        if not path.samefile(found.setdefault(path.stem, path)):
+            raise ConfigError(
+                f"objects {found[path.stem]} and {path} have one name, '{path.stem}'; rename one of the files"
+            )
 
 
 def _source_hash(name: str) -> str:
