@@ -121,3 +121,20 @@ def test_import_needs_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True)
     code = "import sys, lgrasp_cli.dataset; assert not {'h5py', 'numpy'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_point_clouds_have_normals(tmp_path, make_shard):
+    shard = make_shard(3)
+    (mesh,) = shard.objects
+    n = np.random.default_rng(0).normal(size=mesh.vertices.shape).astype(np.float32)
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    cloud = replace(mesh, faces=np.zeros((0, 3), np.int32), normals=n)
+    write_shard(tmp_path / "cloud.h5", replace(shard, objects=[cloud]))
+    assert validate_shard(tmp_path / "cloud.h5") == []
+    np.testing.assert_array_equal(read_shard(tmp_path / "cloud.h5").objects[0].normals, n)
+    write_shard(tmp_path / "mesh.h5", shard)
+    assert read_shard(tmp_path / "mesh.h5").objects[0].normals is None
+    for bad, words in ((2 * n, "not of unit length"), (np.nan * n, "not of unit length"), (n[1:], "vertices")):
+        with pytest.raises(ShardError, match=words):
+            write_shard(tmp_path / "bad.h5", replace(shard, objects=[replace(cloud, normals=bad)]))
+    assert not (tmp_path / "bad.h5").exists()

@@ -126,6 +126,46 @@ def test_scale(ball):
     np.testing.assert_allclose(cloud.points, points, atol=1e-6)
 
 
+def test_a_scene_may_be_larger_than_what_is_grasped(ball):
+    """A room with a ball in it: fine with the ball's label, and without any as a scene, but nothing to grasp."""
+    write, points, _ = ball
+    room = np.random.default_rng(1).uniform(-6, 6, (2000, 3))
+    path = write("room.npz", lambda p: np.concatenate([p, room]), labels=np.repeat([4, 0], 2000))
+    cloud = read_cloud(path, label=4, viewpoint=[0, 0, 0])
+    np.testing.assert_allclose(cloud.only(cloud.target).points, points, atol=1e-6)
+    assert read_cloud(path, viewpoint=[0, 0, 0]).target.all()
+    with pytest.raises(CloudError, match=r"without --label, is 1[12].* m long; at most 2 m"):
+        read_cloud(path, viewpoint=[0, 0, 0], scene=False)
+    with pytest.raises(CloudError, match=r"the cloud is 1.*e.* m long; at most 20 m is accepted"):
+        read_cloud(
+            write("room.npz", lambda p: np.concatenate([p, 1e3 * room]), labels=np.repeat([4, 0], 2000)), label=4
+        )
+
+
+def test_strays_of_a_mask_are_surroundings(ball, tmp_path):
+    """The edge of a mask on what lies behind: those points stay in the cloud, but are not the target."""
+    write, _, normals = ball
+    behind = np.array([0.0, 0.0, 1.5])
+    path = write("ball.npz", lambda p: np.concatenate([p[:-8], p[-8:] + behind]), normals=normals)
+    np.save(tmp_path / "mask.npy", np.ones(2000, bool))
+    cloud = read_cloud(path, tmp_path / "mask.npy")
+    np.testing.assert_array_equal(cloud.target, np.arange(2000) < 1992)
+    assert len(cloud) == 2000
+    assert any("8 of 2,000 points lie far from the rest" in note for note in cloud.notes)
+
+
+def test_a_mesh_is_a_cloud_with_the_normals_of_its_faces(tmp_path):
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    mesh.export(tmp_path / "a.ply")
+    cloud = read_cloud(tmp_path / "a.ply")
+    np.testing.assert_allclose(cloud.points, mesh.vertices, atol=1e-6)
+    assert (cloud.normals * mesh.vertices / RADIUS).sum(1).min() > 0.999
+    assert any("is a mesh" in note for note in cloud.notes)
+    trimesh.creation.box((0.1,) * 3).export(tmp_path / "box.ply")
+    with pytest.raises(CloudError, match=r"8 usable points.*it is a mesh, which --object takes"):
+        read_cloud(tmp_path / "box.ply")
+
+
 def fill(value):
     return lambda p: np.full_like(p, value)
 
