@@ -32,6 +32,10 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 _LIMIT_SHARE = 0.15
 _ADVANCES = 30
+_DEEP, _FREE = 0.002, 0.0005  # [m] hands deeper than this are taken out; those less deep are out
+_STEP = 0.002  # [m]
+_WAYS = np.array([w for w in np.ndindex(3, 3, 3) if w != (1, 1, 1)]) - 1.0
+_WAYS /= np.linalg.norm(_WAYS, axis=1, keepdims=True)
 _ROWS = 32  # hands of a block of threads: few hands spread over many processors
 
 
@@ -81,6 +85,9 @@ class Descent:
     def run(self, at: Hands, *, outer: int | None = None, first: int = 0) -> None:
         """Move hands: match, then ``inner`` gradient steps, for outer steps ``first`` to ``outer``, in place.
 
+        Hands deep in the object are first taken out, straight along the shortest of some ways (``withdraw``): through a
+        thin wall the gradient leads to either side.
+
         Args:
             outer: default: the parameters'. Sizes and reach fall along the parameters' outer steps or these, whichever
                 are more.
@@ -90,6 +97,8 @@ class Descent:
         whole, rows = max(outer, p.outer), at.pose.shape[0]
         if rows == 0:
             return
+        if first == 0 and p.withdraw > 0:
+            self._withdraw(at)
         first_moment, second_moment = self._moments(rows), self._moments(rows)
         m, body = self._matches(rows), self._body(rows)
         for i in range(first, outer):
@@ -122,7 +131,8 @@ class Descent:
         """Depth of the deepest point of hands in anything, or of that in them [m], negative apart, (N,)."""
         rows = at.pose.shape[0]
         m, body = self._matches(rows), self._body(rows)
-        self._match(at, m, body, self.params.reach)
+        self._place(at, body)
+        self._match_object(m, body, self.params.reach)
         out = wp.empty(rows, dtype=wp.float32, device=self.device)
         inputs = [m, self._points, self._solids, body]
         wp.launch(deepest, dim=rows, inputs=inputs, outputs=[out], device=self.device)
@@ -172,16 +182,39 @@ class Descent:
         wp.launch(place_bodies, dim=at.pose.shape[0], inputs=inputs, outputs=[body], device=self.device)
 
     def _match(self, at: Hands, m: "Matches", body: wp.array, reach: float) -> None:
-        p, t, d, rows = self.params, self._target, self.device, at.pose.shape[0]
+        p, d, rows = self.params, self.device, at.pose.shape[0]
         points, solids = self._points, self._solids
         self._place(at, body)
-        blocks, links, pairs = points.body.shape[0], solids.body.shape[0], solids.pairs.shape[0]
-        shapes = [points, t.own, t.around, int(t.has_around), p.touching, reach, p.soft, body, m]
-        wp.launch(match_points, dim=(blocks, rows), inputs=shapes, device=d)
+        self._match_object(m, body, reach)
         near = max(p.contacts, int(p.nearest * points.palmar.shape[0]))
         wp.launch(choose_contacts, dim=rows, inputs=[points, near, p.contacts, body, m], device=d, block_dim=_ROWS)
-        wp.launch(match_solids, dim=(links, rows), inputs=[solids, t.cloud, p.margin, body, m], device=d)
-        wp.launch(match_links, dim=(pairs, rows), inputs=[solids, p.margin, body, m], device=d)
+        wp.launch(match_links, dim=(solids.pairs.shape[0], rows), inputs=[solids, p.margin, body, m], device=d)
+
+    def _match_object(self, m: "Matches", body: wp.array, reach: float) -> None:
+        p, t, d, rows = self.params, self._target, self.device, body.shape[0]
+        points, solids = self._points, self._solids
+        shapes = [points, t.own, t.around, int(t.has_around), p.touching, reach, p.soft, body, m]
+        wp.launch(match_points, dim=(points.body.shape[0], rows), inputs=shapes, device=d)
+        inputs = [solids, t.cloud, p.margin, body, m]
+        wp.launch(match_solids, dim=(solids.body.shape[0], rows), inputs=inputs, device=d)
+
+    def _withdraw(self, at: Hands) -> None:
+        pose, q = at.numpy()
+        least = self.depth(at)
+        moved, left = pose.copy(), np.flatnonzero(least > _DEEP)
+        for step in np.arange(_STEP, self.params.withdraw + 1e-9, _STEP):
+            if len(left) == 0:
+                break
+            tried = pose[left].repeat(len(_WAYS), 0)
+            tried[:, :3] += np.tile(step * _WAYS, (len(left), 1))
+            depth = self.depth(Hands.put(tried, q[left].repeat(len(_WAYS), 0), self.device)).reshape(len(left), -1)
+            best = depth.argmin(1)
+            lowest = depth[np.arange(len(left)), best]
+            better = lowest < least[left]
+            moved[left[better]] = tried.reshape(len(left), len(_WAYS), 7)[better, best[better]]
+            least[left] = np.minimum(least[left], lowest)
+            left = left[least[left] > _FREE]
+        at.pose.assign(moved)
 
     def _descend(
         self, at: Hands, m: "Matches", taken: int, first: int, whole: int, gradient: bool, *moments: wp.array

@@ -26,6 +26,12 @@ class LocalSearch(BaseModel):
     reach_end: float = Field(default=0.01, gt=0, le=1, description="The same in the last outer step.")
     soft: float = Field(default=0.004, gt=0, le=1, description="Distance about which pulls stop growing.")
     touching: int = Field(default=4, ge=1, le=16, description="Palmar points of a link, nearest first, that pull.")
+    withdraw: float = Field(
+        default=0.012,
+        ge=0,
+        le=0.1,
+        description="How far a hand that begins deep in the object may be taken straight out first.",
+    )
     points: float = Field(
         default=1.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared."
     )

@@ -55,7 +55,15 @@ class PlanParams(BaseModel):
     other: float = Field(default=OTHER, ge=0, le=100, description="Weight of the other palmar points.")
     search: LocalSearch = Field(
         default=LocalSearch(
-            shift=0.002, turn=0.02, bend=0.04, reach=0.15, reach_end=0.1, soft=0.01, force=0.3, margin=0.005
+            withdraw=0.0,
+            shift=0.002,
+            turn=0.02,
+            bend=0.04,
+            reach=0.15,
+            reach_end=0.1,
+            soft=0.01,
+            force=0.3,
+            margin=0.005,
         ),
         description="The local search.",
     )

@@ -13,7 +13,7 @@ from lgrasp.refine.surface import hand_surface
 from lgrasp.refine.target import Target
 from lgrasp.refine.volume import upload_target
 
-SEARCH = LocalSearch(reach=0.05, reach_end=0.03, contacts=5, inner=1, force=0.3)
+SEARCH = LocalSearch(withdraw=0.0, reach=0.05, reach_end=0.03, contacts=5, inner=1, force=0.3)
 
 
 @pytest.fixture(scope="module")

@@ -17,5 +17,5 @@ class RefineParams(LocalSearch, GraspBounds):
     reach_end: float = Field(default=0.02, gt=0, le=1, description="As reach, in the last outer step.")
     force: float = Field(default=0.3, ge=0, le=1e6, description="Weight of the net wrench of four contacts.")
     points: float = Field(default=3.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per cm squared.")
-    barrier: float = Field(default=0.001, ge=0, le=1e6, description="Weight of the barriers, per point.")
+    barrier: float = Field(default=0.002, ge=0, le=1e6, description="Weight of the barriers, per point.")
     margin: float = Field(default=0.0015, gt=0, le=0.05, description="Distance below which the barrier acts.")
