@@ -22,7 +22,7 @@ from lgrasp.refine.match_kernels import (
     match_solids,
     place_bodies,
 )
-from lgrasp.refine.params import LocalSearch
+from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
 
@@ -30,7 +30,6 @@ __all__ = ["Descent", "Hands", "inverse_poses"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_LIMIT_SHARE = 0.15
 _ADVANCES = 30
 _DEEP, _FREE = 0.002, 0.0005  # [m] hands deeper than this are taken out; those less deep are out
 _STEP = 0.002  # [m]
@@ -154,7 +153,7 @@ class Descent:
             return wp.array(np.ascontiguousarray(a, np.float32), dtype=wp.float32, device=self.device)
 
         s.lower, s.upper = put(tree.joint_lower), put(tree.joint_upper)
-        s.near = put(_LIMIT_SHARE * np.maximum(tree.joint_upper - tree.joint_lower, 1e-6))
+        s.near = put(LIMIT_SHARE * np.maximum(tree.joint_upper - tree.joint_lower, 1e-6))
         return s
 
     def _matches(self, rows: int) -> "Matches":

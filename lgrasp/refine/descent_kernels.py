@@ -4,12 +4,15 @@ The gradient is that of E* (:mod:`lgrasp.refine.energy`), by hand: every term pu
 make a force and a moment about the origin of the object's frame, and these go down the joints.
 """
 
+import math
+
 import warp as wp
 
 from lgrasp.device.kinematics import MAX_BODIES, Kinematics, group_forward
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import group_dofs
 from lgrasp.refine.match_kernels import Matches, Points, Solids
+from lgrasp.refine.params import LENGTH, STEEPEST
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
 
 __all__ = ["MAX_COLUMNS", "Search", "advance", "deepest", "descend"]
@@ -19,10 +22,11 @@ wp.set_module_options(KERNEL_OPTIONS)
 MAX_COLUMNS = 32
 """Most joints that a hand's postures name."""
 
-_LENGTH = wp.constant(0.01)  # [m] unit of distances
-_STEEPEST = wp.constant(0.1)
-_SLOPE = wp.constant(-2.0 * (0.1 - 1.0) * -2.302585092994046 - (0.1 - 1.0) ** 2 / 0.1)
-_BEND = wp.constant(2.0 * 2.302585092994046 - 4.0 * (0.1 - 1.0) / 0.1 + (0.1 - 1.0) ** 2 / 0.01)
+_LENGTH = wp.constant(LENGTH)
+_STEEPEST = wp.constant(STEEPEST)
+_LOG = math.log(STEEPEST)
+_SLOPE = wp.constant(-2 * (STEEPEST - 1) * _LOG - (STEEPEST - 1) ** 2 / STEEPEST)
+_BEND = wp.constant(-2 * _LOG - 4 * (STEEPEST - 1) / STEEPEST + (STEEPEST - 1) ** 2 / STEEPEST**2)
 _TINY = wp.constant(1.0e-12)
 _SECOND = wp.constant(0.99)  # decay of adam's second moment
 _BODIES = MAX_BODIES + 1

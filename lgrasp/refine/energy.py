@@ -6,10 +6,9 @@ from typing import NamedTuple
 import torch
 
 from lgrasp.refine.links import Intrusions
-from lgrasp.refine.params import LocalSearch
+from lgrasp.refine.params import LENGTH, LIMIT_SHARE, STEEPEST, LocalSearch
 
 __all__ = [
-    "LENGTH",
     "Energies",
     "Matches",
     "barrier",
@@ -18,13 +17,6 @@ __all__ = [
     "matching_energies",
     "wrench_energy",
 ]
-
-LENGTH = 0.01
-"""Distances are counted in this unit [m]."""
-
-_STEEPEST = 0.1
-"""Share of the margin below which the barrier goes on as a parabola."""
-_LIMIT_SHARE = 0.15
 
 
 class Matches(NamedTuple):
@@ -68,7 +60,7 @@ def barrier(u: torch.Tensor) -> torch.Tensor:
     Below a tenth it goes on as the parabola of the same value, slope and curvature, so that points inside are pushed
     out the harder the deeper they are.
     """
-    a = _STEEPEST
+    a = STEEPEST
     log = math.log(a)
     slope = -2 * (a - 1) * log - (a - 1) ** 2 / a
     bend = -2 * log - 4 * (a - 1) / a + (a - 1) ** 2 / a**2
@@ -130,5 +122,5 @@ def limit_energy(q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor, para
     Args:
         q: (N, K) [rad or m]. lower, upper: limits, (K,).
     """
-    near = _LIMIT_SHARE * (upper - lower).clamp_min(1e-6)
+    near = LIMIT_SHARE * (upper - lower).clamp_min(1e-6)
     return (barrier((q - lower) / near) + barrier((upper - q) / near)).sum(-1) * (params.limits / q.shape[1])

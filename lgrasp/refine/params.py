@@ -4,7 +4,14 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["GraspBounds", "LocalSearch"]
+__all__ = ["LENGTH", "LIMIT_SHARE", "STEEPEST", "GraspBounds", "LocalSearch"]
+
+LENGTH = 0.01
+"""The energy counts distances in this unit [m]."""
+STEEPEST = 0.1
+"""Share of the margin below which a barrier goes on as a parabola."""
+LIMIT_SHARE = 0.15
+"""Joint limits repel within this share of the range."""
 
 
 class LocalSearch(BaseModel):
