@@ -22,6 +22,7 @@ __all__ = ["Moved", "move_rows"]
 
 _ROWS = 256  # at a time
 _FAR = 0.5  # [m] from the object: nothing pulls there
+_BETTER = 1e-3  # of a unit pull that must be resisted more to replace a valid row
 _LIMIT = 1e-4  # [rad or m] that a joint may be outside its limits
 
 
@@ -53,7 +54,8 @@ def move_rows(
 ) -> Moved:
     """Refine rows of one object.
 
-    A refined row takes the place of the one given where it passes every check, and that does not or resists pulls less.
+    A refined row takes the place of the one given where it passes every check, and that does not or resists pulls less,
+    by what is stored of it too.
 
     Args:
         always: every row takes the refined posture.
@@ -63,6 +65,7 @@ def move_rows(
     refiner = Refiner(hand.model, obj, params, device=hand.device)
     arrays = upload_object(obj, hand.device)
     outside = _outside(rows, hand)
+    known = np.asarray(rows.metrics.get("disturbance", np.full(len(rows), np.nan))) if stored else None
     parts, before, after, oks = [], [], [], []
     far = 0
     for first in range(0, len(rows), _ROWS):
@@ -75,7 +78,8 @@ def move_rows(
             hand, arrays, object_pose(refined.pose), refined.pose.q.cpu().numpy(), params, index=index
         )
         good, was = new_outcome == 0, old_outcome == 0
-        lower = new.metrics["disturbance"] < old.metrics["disturbance"]
+        least = old.metrics["disturbance"] if known is None else np.fmin(old.metrics["disturbance"], known[part])
+        lower = new.metrics["disturbance"] < least - _BETTER
         take = np.ones_like(good) if always else good & (~was | lower)
         energies = _numbers(refiner.energy(*given)), _numbers(refined.energies)
         before.append(energies[0])
