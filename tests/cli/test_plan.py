@@ -51,6 +51,7 @@ def test_cloud_is_stored(cli, cloud, tmp_path):
     assert len(record.faces) == 0
     radius = np.linalg.norm(record.vertices - [0, 0, 0.2], axis=1)
     np.testing.assert_allclose(radius, 0.035, atol=1e-3)
+    assert record.normals is not None
     np.testing.assert_allclose(record.normals, (record.vertices - [0, 0, 0.2]) / radius[:, None], atol=1e-3)
     # contacts lie on the ball
     points = shard.grasps.contact_points.reshape(-1, 3)

@@ -95,7 +95,7 @@ def test_rows_say_where_they_come_from(mug):
     assert shard.header.pipeline == "plan"
     assert (np.diff(shard.grasps.candidate.astype(int)) > 0).all()
     assert shard.grasps.candidate.max() < STARTS
-    counts = {name: n for name, n in shard.statistics.items() if name.startswith("plan_")}
+    counts = {name: int(n) for name, n in shard.statistics.items() if name.startswith("plan_")}
     assert counts.pop("plan_starts") == sum(counts.values()) == STARTS
     assert counts["plan_kept"] == rows
     assert PlanParams.model_validate(shard.header.config["plan"]) == PlanParams()
@@ -120,6 +120,7 @@ def test_the_cloud_is_stored_with_its_normals(ball):
     (record,) = read_shard(ball).objects
     cloud = ball_on_table()
     np.testing.assert_array_equal(record.vertices, cloud.points[cloud.target])
+    assert record.normals is not None
     np.testing.assert_allclose(record.normals, cloud.normals[cloud.target], atol=1e-6)
     assert len(record.faces) == 0
     assert not record.watertight

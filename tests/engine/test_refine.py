@@ -138,7 +138,7 @@ def test_a_valid_row_is_replaced_by_one_that_resists_pulls_better(source, done, 
     assert (after.metrics["disturbance"][improved] < before.metrics["disturbance"][improved]).all()
     mesh = read_shard(source).objects[0]
     centre = trimesh.Trimesh(mesh.vertices, mesh.faces).center_mass
-    for row in np.flatnonzero(improved):
+    for row in np.flatnonzero(improved).tolist():
         assert unheld(after, row, centre) < unheld(before, row, centre)
 
 
