@@ -1,7 +1,5 @@
 """The local search on a device: matches and gradient steps of many hands, without a graph."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import warp as wp
 
@@ -10,10 +8,11 @@ from lgrasp.differentiable.solids import hand_solids
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import HandArrays, body_poses, pose_matrices
 from lgrasp.refine.descent_kernels import MAX_COLUMNS, Search, advance, deepest, descend
+from lgrasp.refine.hands import Hands
 from lgrasp.refine.match_kernels import (
     DEEPEST,
     LINK_DEEPEST,
-    Matches,
+    Correspondences,
     Points,
     Solids,
     choose_contacts,
@@ -23,39 +22,17 @@ from lgrasp.refine.match_kernels import (
     place_bodies,
 )
 from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
+from lgrasp.refine.starts import has_palm, palm_axis
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
+from lgrasp.refine.withdraw import withdraw
 
-__all__ = ["Descent", "Hands", "inverse_poses"]
+__all__ = ["Descent"]
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _ADVANCES = 30
-_DEEP, _FREE = 0.002, 0.0005  # [m] hands deeper than this are taken out; those less deep are out
-_STEP = 0.002  # [m]
-_WAYS = np.array([w for w in np.ndindex(3, 3, 3) if w != (1, 1, 1)]) - 1.0
-_WAYS /= np.linalg.norm(_WAYS, axis=1, keepdims=True)
 _ROWS = 32  # hands of a block of threads: few hands spread over many processors
-
-
-@dataclass(frozen=True)
-class Hands:
-    """Hands on a device."""
-
-    pose: wp.array
-    """Base in the object's internal frame, (N,) transform."""
-    q: wp.array
-    """Joint positions [rad or m], (N, K) float32."""
-
-    @classmethod
-    def put(cls, pose: np.ndarray, q: np.ndarray, device: str) -> "Hands":
-        """Of x y z [m] qx qy qz qw (N, 7), and joint positions (N, K)."""
-        poses = wp.array(np.ascontiguousarray(pose, np.float32), dtype=wp.transform, device=device)
-        return cls(poses, wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=device))
-
-    def numpy(self) -> tuple[np.ndarray, np.ndarray]:
-        """Base (N, 7) and joint positions (N, K)."""
-        return self.pose.numpy().reshape(-1, 7), self.q.numpy()
 
 
 class Descent:
@@ -80,12 +57,13 @@ class Descent:
         self._points, self._solids = _points(surface, self.device), _solids(hand)
         self._bodies = len(model.tree.joint_dof) + 1
         self._search = self._settings(surface)
+        self._back = -palm_axis(model)[1] if has_palm(model) else np.zeros(3)
 
     def run(self, at: Hands, *, outer: int | None = None, first: int = 0) -> None:
         """Move hands: match, then ``inner`` gradient steps, for outer steps ``first`` to ``outer``, in place.
 
-        Hands deep in the object are first taken out, straight along the shortest of some ways (``withdraw``): through a
-        thin wall the gradient leads to either side.
+        Hands deep in the object are first taken out, straight along the shortest of some ways or by opening
+        (``withdraw``): through a thin wall the gradient leads to either side.
 
         Args:
             outer: default: the parameters'. Sizes and reach fall along the parameters' outer steps or these, whichever
@@ -97,7 +75,7 @@ class Descent:
         if rows == 0:
             return
         if first == 0 and p.withdraw > 0:
-            self._withdraw(at)
+            withdraw(self, self._hand.model.tree, self._back, at, p.withdraw)
         first_moment, second_moment = self._moments(rows), self._moments(rows)
         m, body = self._matches(rows), self._body(rows)
         for i in range(first, outer):
@@ -156,13 +134,13 @@ class Descent:
         s.near = put(LIMIT_SHARE * np.maximum(tree.joint_upper - tree.joint_lower, 1e-6))
         return s
 
-    def _matches(self, rows: int) -> "Matches":
+    def _matches(self, rows: int) -> "Correspondences":
         def room(n: int, dtype: type) -> wp.array:
             return wp.empty((rows, n), dtype=dtype, device=self.device)
 
         n = self._points.points.shape[0]
         links, pairs = self._solids.body.shape[0], self._solids.pairs.shape[0]
-        m = Matches()
+        m = Correspondences()
         m.plane, m.pull, m.distance = room(n, wp.vec4), room(n, wp.float32), room(n, wp.float32)
         m.block = room(n, wp.vec4) if self._target.has_around else m.plane
         m.contacts = room(self.params.contacts, wp.int32)
@@ -180,7 +158,7 @@ class Descent:
         inputs = [self._hand.struct.kin, at.pose, at.q]
         wp.launch(place_bodies, dim=at.pose.shape[0], inputs=inputs, outputs=[body], device=self.device)
 
-    def _match(self, at: Hands, m: "Matches", body: wp.array, reach: float) -> None:
+    def _match(self, at: Hands, m: "Correspondences", body: wp.array, reach: float) -> None:
         p, d, rows = self.params, self.device, at.pose.shape[0]
         points, solids = self._points, self._solids
         self._place(at, body)
@@ -189,7 +167,7 @@ class Descent:
         wp.launch(choose_contacts, dim=rows, inputs=[points, near, p.contacts, body, m], device=d, block_dim=_ROWS)
         wp.launch(match_links, dim=(solids.pairs.shape[0], rows), inputs=[solids, p.margin, body, m], device=d)
 
-    def _match_object(self, m: "Matches", body: wp.array, reach: float) -> None:
+    def _match_object(self, m: "Correspondences", body: wp.array, reach: float) -> None:
         p, t, d, rows = self.params, self._target, self.device, body.shape[0]
         points, solids = self._points, self._solids
         shapes = [points, t.own, t.around, int(t.has_around), p.touching, reach, p.soft, body, m]
@@ -197,26 +175,8 @@ class Descent:
         inputs = [solids, t.cloud, p.margin, body, m]
         wp.launch(match_solids, dim=(solids.body.shape[0], rows), inputs=inputs, device=d)
 
-    def _withdraw(self, at: Hands) -> None:
-        pose, q = at.numpy()
-        least = self.depth(at)
-        moved, left = pose.copy(), np.flatnonzero(least > _DEEP)
-        for step in np.arange(_STEP, self.params.withdraw + 1e-9, _STEP):
-            if len(left) == 0:
-                break
-            tried = pose[left].repeat(len(_WAYS), 0)
-            tried[:, :3] += np.tile(step * _WAYS, (len(left), 1))
-            depth = self.depth(Hands.put(tried, q[left].repeat(len(_WAYS), 0), self.device)).reshape(len(left), -1)
-            best = depth.argmin(1)
-            lowest = depth[np.arange(len(left)), best]
-            better = lowest < least[left]
-            moved[left[better]] = tried.reshape(len(left), len(_WAYS), 7)[better, best[better]]
-            least[left] = np.minimum(least[left], lowest)
-            left = left[least[left] > _FREE]
-        at.pose.assign(moved)
-
     def _descend(
-        self, at: Hands, m: "Matches", taken: int, first: int, whole: int, gradient: bool, *moments: wp.array
+        self, at: Hands, m: "Correspondences", taken: int, first: int, whole: int, gradient: bool, *moments: wp.array
     ) -> None:
         inputs = [self._hand.struct.kin, self._points, self._solids, self._target.own, self._search, m]
         inputs += [taken, first * self.params.inner, float(whole), int(gradient), *moments]
@@ -228,14 +188,6 @@ class Descent:
             device=self.device,
             block_dim=_ROWS,
         )
-
-
-def inverse_poses(pose: np.ndarray) -> np.ndarray:
-    """Inverses of poses x y z [m] qx qy qz qw, (N, 7)."""
-    from scipy.spatial.transform import Rotation
-
-    back = Rotation.from_quat(pose[:, 3:]).inv()
-    return np.concatenate([-back.apply(pose[:, :3]), back.as_quat()], 1).astype(np.float32)
 
 
 def _middle(hand: HandArrays, surface: HandSurface) -> np.ndarray:

@@ -11,7 +11,7 @@ import warp as wp
 from lgrasp.device.kinematics import MAX_BODIES, Kinematics, group_forward
 from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import group_dofs
-from lgrasp.refine.match_kernels import Matches, Points, Solids
+from lgrasp.refine.match_kernels import Correspondences, Points, Solids
 from lgrasp.refine.params import LENGTH, STEEPEST
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
 
@@ -88,7 +88,7 @@ def _wrench_pulls(
     points: Points,
     own: Volume,
     s: Search,
-    m: Matches,
+    m: Correspondences,
     row: wp.int32,
     X: wp.array(dtype=wp.transform),
     F: wp.array(dtype=wp.vec3),
@@ -119,7 +119,7 @@ def _wrench_pulls(
 def _point_pulls(
     points: Points,
     s: Search,
-    m: Matches,
+    m: Correspondences,
     row: wp.int32,
     X: wp.array(dtype=wp.transform),
     F: wp.array(dtype=wp.vec3),
@@ -156,7 +156,7 @@ def _point_pulls(
 def _solid_pulls(
     solids: Solids,
     s: Search,
-    m: Matches,
+    m: Correspondences,
     row: wp.int32,
     X: wp.array(dtype=wp.transform),
     F: wp.array(dtype=wp.vec3),
@@ -282,7 +282,7 @@ def descend(
     solids: Solids,
     own: Volume,
     s: Search,
-    m: Matches,
+    m: Correspondences,
     taken: wp.int32,
     skipped: wp.int32,
     whole: wp.float32,
@@ -387,7 +387,7 @@ def advance(
 
 @wp.kernel
 def deepest(
-    m: Matches,
+    m: Correspondences,
     points: Points,
     solids: Solids,
     body: wp.array2d(dtype=wp.transform),

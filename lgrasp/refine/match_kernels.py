@@ -14,7 +14,7 @@ from lgrasp.refine.volume import Volume, volume_at
 __all__ = [
     "DEEPEST",
     "LINK_DEEPEST",
-    "Matches",
+    "Correspondences",
     "Points",
     "Solids",
     "choose_contacts",
@@ -66,7 +66,7 @@ class Solids:
 
 
 @wp.struct
-class Matches:
+class Correspondences:
     """What hands are matched to; a plane (n, o) has the signed distance n . x - o [m]."""
 
     plane: wp.array2d(dtype=wp.vec4)  # of each point, object's frame
@@ -114,7 +114,7 @@ def match_points(
     reach: wp.float32,
     soft: wp.float32,
     body: wp.array2d(dtype=wp.transform),
-    m: Matches,
+    m: Correspondences,
 ):
     """Planes, pulls and distances of points; launched over (block, hand)."""
     block, row = wp.tid()
@@ -151,7 +151,7 @@ def match_points(
 
 @wp.kernel
 def choose_contacts(
-    points: Points, nearest: wp.int32, count: wp.int32, body: wp.array2d(dtype=wp.transform), m: Matches
+    points: Points, nearest: wp.int32, count: wp.int32, body: wp.array2d(dtype=wp.transform), m: Correspondences
 ):
     """Farthest points among the ``nearest`` nearest palmar ones, the nearest first; launched over hands."""
     row = wp.tid()
@@ -211,7 +211,11 @@ def _centre(s: Solids, i: wp.int32, T: wp.transform):
 
 @wp.kernel
 def match_solids(
-    s: Solids, cloud: wp.array(dtype=wp.vec3), margin: wp.float32, body: wp.array2d(dtype=wp.transform), m: Matches
+    s: Solids,
+    cloud: wp.array(dtype=wp.vec3),
+    margin: wp.float32,
+    body: wp.array2d(dtype=wp.transform),
+    m: Correspondences,
 ):
     """The deepest points of the object in each link; launched over (link, hand)."""
     i, row = wp.tid()
@@ -243,7 +247,7 @@ def match_solids(
 
 
 @wp.kernel
-def match_links(s: Solids, margin: wp.float32, body: wp.array2d(dtype=wp.transform), m: Matches):
+def match_links(s: Solids, margin: wp.float32, body: wp.array2d(dtype=wp.transform), m: Correspondences):
     """The deepest points of the first link of each pair in the second; launched over (pair, hand)."""
     pair, row = wp.tid()
     a = s.pairs[pair][0]

@@ -37,7 +37,7 @@ class LocalSearch(BaseModel):
         default=0.012,
         ge=0,
         le=0.1,
-        description="How far a hand that begins deep in the object may be taken straight out first.",
+        description="How far a hand that begins deep in the object may be taken straight out; four times, opened.",
     )
     points: float = Field(
         default=1.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared."

@@ -15,7 +15,8 @@ from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.check import OUTCOMES, check_grasps
-from lgrasp.refine.descent import Descent, Hands, inverse_poses
+from lgrasp.refine.descent import Descent
+from lgrasp.refine.hands import Hands, inverse_poses
 from lgrasp.refine.params import GraspBounds, LocalSearch
 from lgrasp.refine.starts import GOLDEN_ANGLE, palm_axis, start_poses, tilted
 from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface

@@ -12,7 +12,7 @@ from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.object.model import ObjectModel
-from lgrasp.refine.descent import Descent, Hands
+from lgrasp.refine.descent import Descent
 from lgrasp.refine.energy import (
     Energies,
     Matches,
@@ -21,6 +21,7 @@ from lgrasp.refine.energy import (
     matching_energies,
     wrench_energy,
 )
+from lgrasp.refine.hands import Hands
 from lgrasp.refine.links import LinkSolids
 from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.steps import Gradient, clipped

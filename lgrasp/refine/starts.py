@@ -6,13 +6,19 @@ from scipy.spatial.transform import Rotation
 from lgrasp.errors import HandError
 from lgrasp.hand.model import HandModel
 
-__all__ = ["GOLDEN_ANGLE", "STAND_OFF", "palm_axis", "start_poses", "tilted"]
+__all__ = ["GOLDEN_ANGLE", "STAND_OFF", "has_palm", "palm_axis", "start_poses", "tilted"]
 
 STAND_OFF = 0.12
 """Distance of a hand's base from the surface where hand.yaml has no ``stand_off`` [m]."""
 
 GOLDEN_ANGLE = float(np.pi * (3 - np.sqrt(5)))
 """Multiples of it are spread evenly over the circle [rad]."""
+
+
+def has_palm(model: HandModel) -> bool:
+    """Has the static base of the hand a contact surface?"""
+    first, end = model.contact_first[-2:]
+    return bool(first < end)
 
 
 def palm_axis(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
@@ -22,7 +28,7 @@ def palm_axis(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
         HandError: the hand has no palm.
     """
     first, end = model.contact_first[-2:]
-    if first == end:
+    if not has_palm(model):
         raise HandError(f"hand '{model.name}' has no palm (hand.yaml: palm), so no side of it can face an object")
     facing = model.contact_normals[first:end].mean(0)
     return model.contact_points[first:end].mean(0), facing / np.linalg.norm(facing)

@@ -8,7 +8,8 @@ from lgrasp.differentiable.rotations import matrix_from_quaternion, quaternion_f
 from lgrasp.errors import HandError
 from lgrasp.refine import LocalSearch, Pose, Refiner
 from lgrasp.refine.cloud import cloud_object
-from lgrasp.refine.descent import Descent, Hands, inverse_poses
+from lgrasp.refine.descent import Descent
+from lgrasp.refine.hands import Hands, inverse_poses
 from lgrasp.refine.surface import hand_surface
 from lgrasp.refine.target import Target
 from lgrasp.refine.volume import upload_target

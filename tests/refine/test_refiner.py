@@ -74,14 +74,21 @@ def test_penetration_is_left(make, valid, inputs):
     assert np.quantile(table.metrics["penetration"], 0.9) < 0.001
 
 
-def test_deep_hands_move_no_farther_than_told(make, valid):
-    refiner = make(outer=0, withdraw=0.004)
-    _, n = refiner.target.nearest(refiner.middle(valid.R, valid.t))
-    into = valid._replace(t=valid.t - 0.003 * n)
-    moved = (refiner(*into).pose.t - into.t).norm(dim=1)
-    assert moved.max() < 0.0041
-    # only what was deep has moved
-    torch.testing.assert_close(moved[refiner.depth(*into) < 0.0019].max(), torch.tensor(0.0), atol=1e-7, rtol=0)
+def test_hands_are_taken_out_before_the_search(make, valid, coarse):
+    """Coarse hands through the mug's walls come free, by opening where a straight way is not enough; others stay."""
+    refiner, pose = make(outer=0), coarse(valid)
+    before, moved = refiner.depth(*pose), refiner(*pose).pose
+    deep, q = before > 0.002, pose.q.maximum(refiner.lower).minimum(refiner.upper)
+    assert deep.float().mean() > 0.3
+    assert (refiner.depth(*moved)[deep] < 0.002).float().mean() > 0.95
+    shift = (moved.t - pose.t).norm(dim=1)
+    assert shift.max() < 4 * refiner.params.withdraw + 1e-5
+    straight = deep & (moved.q - q).abs().amax(1).lt(1e-6)
+    assert shift[straight].max() < refiner.params.withdraw + 1e-5
+    again = refiner.depth(pose.R, pose.t, q) < 0.0019
+    torch.testing.assert_close(moved.t[again], pose.t[again], rtol=0, atol=1e-6)
+    still = make(outer=0, withdraw=0.0)(*pose).pose
+    torch.testing.assert_close(still.t, pose.t, rtol=0, atol=1e-6)
 
 
 def test_unrolled_steps_stay_rotations_and_lower_the_energy(make, valid, coarse):

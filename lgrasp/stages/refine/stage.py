@@ -6,7 +6,8 @@ import numpy as np
 
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
 from lgrasp.refine.check import check_grasps, contact_width
-from lgrasp.refine.descent import Descent, Hands, inverse_poses
+from lgrasp.refine.descent import Descent
+from lgrasp.refine.hands import Hands, inverse_poses
 from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.surface import hand_surface
 from lgrasp.refine.volume import upload_target

@@ -1,0 +1,36 @@
+"""Hands on a device: bases in an object's frame and joint positions."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+__all__ = ["Hands", "inverse_poses"]
+
+
+@dataclass(frozen=True)
+class Hands:
+    """Hands on a device."""
+
+    pose: wp.array
+    """Base in the object's internal frame, (N,) transform."""
+    q: wp.array
+    """Joint positions [rad or m], (N, K) float32."""
+
+    @classmethod
+    def put(cls, pose: np.ndarray, q: np.ndarray, device: str) -> "Hands":
+        """Of x y z [m] qx qy qz qw (N, 7), and joint positions (N, K)."""
+        poses = wp.array(np.ascontiguousarray(pose, np.float32), dtype=wp.transform, device=device)
+        return cls(poses, wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=device))
+
+    def numpy(self) -> tuple[np.ndarray, np.ndarray]:
+        """Base (N, 7) and joint positions (N, K)."""
+        return self.pose.numpy().reshape(-1, 7), self.q.numpy()
+
+
+def inverse_poses(pose: np.ndarray) -> np.ndarray:
+    """Inverses of poses x y z [m] qx qy qz qw, (N, 7)."""
+    from scipy.spatial.transform import Rotation
+
+    back = Rotation.from_quat(pose[:, 3:]).inv()
+    return np.concatenate([-back.apply(pose[:, :3]), back.as_quat()], 1).astype(np.float32)
