@@ -25,7 +25,7 @@ from lgrasp.refine.volume import upload_target
 __all__ = ["PlanParams", "Planned", "Planner", "cloud_params"]
 
 _CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
-_COLLIDES, _CLOUD_DEPTH = 1.0e-3, 4.0e-3  # [m]
+_COLLIDES, _CLOUD_GAP = 1.0e-3, 6.0e-3  # [m]
 _PLAN_BOUNDS = GraspBounds(
     penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=60.0
 )
@@ -38,14 +38,14 @@ class PlanParams(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     rolls: int = Field(
-        default=24, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
+        default=30, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
     )
     tilts: tuple[float, ...] = Field(
         default=(0.0, 45.0, 90.0),
         min_length=1,
         description="Angles between the surface's normal and the way back from it [deg], in turn.",
     )
-    finalists: int = Field(default=8, ge=1, le=64, description="Of these go on after the first outer steps.")
+    finalists: int = Field(default=10, ge=1, le=64, description="Of these go on after the first outer steps.")
     opening: int = Field(default=5, ge=1, le=100, description="Outer steps of all of them.")
     clearance: float = Field(
         default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
@@ -80,7 +80,7 @@ class PlanParams(BaseModel):
 
 def cloud_params(params: PlanParams) -> PlanParams:
     """The parameters for an object that is a point cloud, whose points lie off its surface by their noise."""
-    bounds = params.bounds.model_copy(update={"penetration": max(params.bounds.penetration, _CLOUD_DEPTH)})
+    bounds = params.bounds.model_copy(update={"gap": max(params.bounds.gap, _CLOUD_GAP)})
     return params.model_copy(update={"bounds": bounds})
 
 
