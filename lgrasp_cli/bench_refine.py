@@ -79,10 +79,10 @@ def _show(results: "list[HandBench]", objects: list[str], starts: int) -> None:
     rows = []
     for one in results:
         paper = PUBLISHED.get(one.hand)
-        own = (f"{one.mesh.epsilon:.3f}", f"{one.mesh.share:.1%}", f"{one.mesh.seconds_each:.3f}")
+        own = (f"{one.mesh.epsilon:.3f}", f"{one.mesh.share:.1%}", f"{one.mesh.seconds_each:.2g}")
         says = ("-",) * 3
         if paper:
-            says = (f"{paper['epsilon']:.3f}", f"{paper['valid'][0]:.1%}", f"{paper['seconds'][0]:.3f}")
+            says = (f"{paper['epsilon']:.3f}", f"{paper['valid'][0]:.1%}", f"{paper['seconds'][0]:.2g}")
         pairs = [text for pair in zip(own, says, strict=True) for text in pair]
         rows.append((one.hand, *pairs, f"{one.mesh.planned / one.mesh.starts:.1%}"))
     print_table(columns, rows, right=columns[1:])
@@ -111,7 +111,7 @@ def _show(results: "list[HandBench]", objects: list[str], starts: int) -> None:
         for one in results:
             shares = [p.share for p in one.clouds.values()]
             rows.append((one.hand, "ours", *(f"{s:.1%}" for s in shares), _kept(shares)))
-            rows.append((one.hand, "ours, s each", *(f"{p.seconds_each:.3f}" for p in one.clouds.values()), ""))
+            rows.append((one.hand, "ours, s each", *(f"{p.seconds_each:.2g}" for p in one.clouds.values()), ""))
             if one.hand in PUBLISHED:
                 valid = PUBLISHED[one.hand]["valid"]
                 rows.append((one.hand, "paper", *(f"{s:.1%}" for s in valid), _kept(list(valid))))

@@ -72,7 +72,7 @@ class Descent:
         p = self.params
         outer = p.outer if outer is None else outer
         whole, rows = max(outer, p.outer), at.pose.shape[0]
-        if rows == 0:
+        if rows == 0 or outer <= first:
             return
         if first == 0 and p.withdraw > 0:
             withdraw(self, self._hand.model.tree, self._back, at, p.withdraw)

@@ -1,5 +1,6 @@
 """Refiner: gradient-based local search of grasps, fast, unrolled, or as a training loss."""
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -113,9 +114,18 @@ class Refiner(nn.Module):
             q: joint positions [rad or m], (N, K); outside the limits they are clamped first.
         """
         with torch.no_grad():
-            at = self._put(Pose(R.detach(), t.detach(), self._clamped(q.detach())))
-            self._fast().run(at, outer=outer, first=first)
-            pose = self._taken(at, t.dtype)
+            given, fast = Pose(R.detach(), t.detach(), self._clamped(q.detach())), self._fast()
+
+            def search(part: Pose) -> Pose:
+                at = self._put(part)
+                fast.run(at, outer=outer, first=first)
+                return self._taken(at, t.dtype)
+
+            workers = torch.get_num_threads() if self._device.type == "cpu" else 1
+            parts = zip(*(x.chunk(workers) for x in given), strict=True)
+            with ThreadPoolExecutor(workers) as pool:
+                found = list(pool.map(search, [Pose(*part) for part in parts]))
+            pose = Pose(*(torch.cat(x) for x in zip(*found, strict=True)))
             return Refined(pose, self.energy(*pose))
 
     def depth(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> torch.Tensor:

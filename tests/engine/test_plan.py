@@ -18,7 +18,7 @@ from lgrasp.object.find import find_object
 from lgrasp.refine.planning import PlanParams
 from lgrasp.scenes.cloud import Cloud
 
-PENETRATION, CLOUD_PENETRATION, GAP, ANGLE = 2.0, 4.0, 4.0, 45.0  # [mm, deg] that docs/refine.md promises
+PENETRATION, GAP, CLOUD_GAP, ANGLE = 2.0, 4.0, 6.0, 45.0  # [mm, deg] that docs/refine.md promises
 ROUNDING = 0.1  # [mm] of distance grids; the judge measures meshes
 RADIUS, STARTS = 0.035, 12
 
@@ -132,11 +132,11 @@ def test_plans_of_a_cloud_hold_what_was_seen(ball, tmp_path):
     assert len(shard.grasps) >= 3
     solid = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS).apply_translation([0, 0, RADIUS])
     report = judged(shard, tmp_path, solid)
-    assert report.values["penetration_mm"].max() <= CLOUD_PENETRATION
+    assert report.values["penetration_mm"].max() <= PENETRATION + 1.0
     assert report.values["contact_object_mm"].max() <= 2.0
-    assert report.values["contact_link_mm"].max() <= GAP + 1.0
+    assert report.values["contact_link_mm"].max() <= CLOUD_GAP + 1.0
     slab = trimesh.creation.box((0.4, 0.4, 0.05)).apply_translation([0, 0, -0.025])
-    assert judged(shard, tmp_path, slab).values["penetration_mm"].max() <= CLOUD_PENETRATION
+    assert judged(shard, tmp_path, slab).values["penetration_mm"].max() <= PENETRATION + 1.0
 
 
 def test_without_a_plan_there_is_no_file(plan, tmp_path):
