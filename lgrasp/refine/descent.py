@@ -7,7 +7,7 @@ from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.differentiable.solids import hand_solids
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import HandArrays, body_poses, pose_matrices
-from lgrasp.refine.descent_kernels import MAX_COLUMNS, Search, advance, deepest, descend
+from lgrasp.refine.descent_kernels import advance, deepest, descend
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.match_kernels import (
     DEEPEST,
@@ -22,6 +22,7 @@ from lgrasp.refine.match_kernels import (
     place_bodies,
 )
 from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
+from lgrasp.refine.pulls import MAX_COLUMNS, Search
 from lgrasp.refine.starts import has_palm, palm_axis
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
