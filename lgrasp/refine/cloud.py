@@ -1,4 +1,4 @@
-"""Point clouds as objects: a distance grid near what was seen, and a model that all else takes for an object."""
+"""Point clouds and distance grids as objects: models without faces that all else takes for an object."""
 
 import hashlib
 
@@ -9,7 +9,7 @@ from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.errors import ObjectError
 from lgrasp.object.model import ObjectModel
 
-__all__ = ["TRUST", "cloud_object"]
+__all__ = ["TRUST", "cloud_object", "sdf_object"]
 
 TRUST = 0.02
 """Behind what was seen, the sign of distances is known to this depth [m]; what lies deeper counts as neither."""
@@ -64,21 +64,75 @@ def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud"
     center = 0.5 * (points.min(0) + points.max(0)) if centred else np.zeros(3)
     points = points - center
     points, normals = _smoothed(points, normals)
-    sdf, origin, cell = _distances(points, normals)
+    note = "a point cloud: what was not seen of the object is unknown"
+    return _model(name, digest.hexdigest(), center, points, normals, _distances(points, normals), points.mean(0), note)
+
+
+def sdf_object(values: np.ndarray, origin: np.ndarray, cell: float, *, name: str = "sdf") -> ObjectModel:
+    """An ObjectModel without faces from a grid of signed distances, of a whole object.
+
+    The surface is where nodes next to it lead along the slope; the centre of mass is that of the volume.
+
+    Args:
+        values: signed distances [m], negative inside, (nx, ny, nz).
+        origin: node (0, 0, 0) [m], (3,). cell: spacing of nodes [m].
+
+    Raises:
+        ObjectError: not finite, no inside, an inside that reaches the border, a size that no hand grasps.
+    """
+    v = np.asarray(values, float)
+    if v.ndim != 3 or min(v.shape) < 4 or not np.isfinite(v).all() or not cell > 0:
+        raise ObjectError(
+            f"grid '{name}' of shape {list(v.shape)}: need [nx, ny, nz] finite values, 4 a side, cell > 0"
+        )
+    inner = v[1:-1, 1:-1, 1:-1]
+    if not (inner < 0).any() or (v < 0).sum() != (inner < 0).sum():
+        raise ObjectError(
+            f"grid '{name}': values are negative inside an object, which must lie within the grid's border"
+        )
+    near = np.abs(v) < cell
+    normals = np.stack([*np.gradient(v, cell)], -1)[near]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+    points = np.argwhere(near) * cell + np.asarray(origin, float) - v[near][:, None] * normals
+    size = float(np.ptp(points, axis=0).max())
+    if not _EXTENT[0] <= size <= _EXTENT[1]:
+        raise ObjectError(
+            f"grid '{name}' is {size:.3g} m long; accepted: {_EXTENT[0]:g} to {_EXTENT[1]:g} m (is its unit metres?)"
+        )
+    keep = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
+    center = 0.5 * (points.min(0) + points.max(0))
+    com = (np.argwhere(v < 0) * cell + origin).mean(0) - center
+    grid = v.astype(np.float32), (np.asarray(origin, float) - center).astype(np.float32), float(cell)
+    digest = hashlib.sha256(grid[0].tobytes() + np.asarray([*np.ravel(origin), cell], float).tobytes()).hexdigest()
+    return _model(name, digest, center, points[keep] - center, normals[keep], grid, com, "a grid of distances")
+
+
+def _model(
+    name: str,
+    digest: str,
+    center: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    grid: tuple[np.ndarray, np.ndarray, float],
+    com: np.ndarray,
+    note: str,
+) -> ObjectModel:
+    """Of points in the internal frame, without faces."""
     order = cluster_order(np.resize(points, (-(-len(points) // CLUSTER_SIZE) * CLUSTER_SIZE, 3))) % len(points)
     obstacles = points[order].astype(np.float32)
     balls = bounding_spheres(obstacles)
+    sdf, origin, cell = grid
     return ObjectModel(
         name=name,
-        sha256=digest.hexdigest(),
+        sha256=digest,
         scale=1.0,
         center=center.astype(np.float32),
         vertices=(points + center).astype(np.float32),
         faces=np.zeros((0, 3), np.int32),
         watertight=False,
-        com=points.mean(0).astype(np.float32),
+        com=com.astype(np.float32),
         extents=np.ptp(points, axis=0).astype(np.float32),
-        notes=["a point cloud: what was not seen of the object is unknown"],
+        notes=[note],
         contact_points=points[:_CONTACTS].astype(np.float32),
         contact_normals=normals[:_CONTACTS].astype(np.float32),
         contact_opposite=np.full(len(points[:_CONTACTS]), -1, np.int32),
