@@ -23,7 +23,7 @@ from lgrasp.refine.match_kernels import (
 )
 from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
 from lgrasp.refine.pulls import MAX_COLUMNS, Search
-from lgrasp.refine.starts import has_palm, palm_axis
+from lgrasp.refine.starts import palm_axis
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
 from lgrasp.refine.withdraw import withdraw
@@ -45,7 +45,7 @@ class Descent:
         surface: the hand's points.
 
     Raises:
-        HandError: the hand has too many joints.
+        HandError: the hand has too many joints, or no side of it can face an object.
     """
 
     def __init__(self, hand: HandArrays, target: TargetArrays, params: LocalSearch, surface: HandSurface) -> None:
@@ -58,7 +58,7 @@ class Descent:
         self._points, self._solids = _points(surface, self.device), _solids(hand)
         self._bodies = len(model.tree.joint_dof) + 1
         self._search = self._settings(surface)
-        self._back = -palm_axis(model)[1] if has_palm(model) else np.zeros(3)
+        self._back = -palm_axis(model)[1]
 
     def run(self, at: Hands, *, outer: int | None = None, first: int = 0) -> None:
         """Move hands: match, then ``inner`` gradient steps, for outer steps ``first`` to ``outer``, in place.

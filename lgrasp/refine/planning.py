@@ -117,7 +117,7 @@ class Planner:
             progress: called with (starts done, plans); what it raises ends the planning.
 
         Raises:
-            HandError: the hand has no palm.
+            HandError: no side of the hand can face an object.
         """
         device = self.hand.device
         points = farthest_points(self.model.contact_points.astype(float), count)

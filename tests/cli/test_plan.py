@@ -75,7 +75,6 @@ def test_cloud_is_stored(cli, cloud, tmp_path):
         (["--object", "sphere", "--stand-off", "nan"], "--stand-off nan: more than 0 and at most 1 m"),
         (["--object", "sphere", "--stand-off", 0], "--stand-off 0: more than 0"),
         (["--object", "sphere", "--stand-off", 50], "at most 1 m"),
-        (["--object", "sphere", "--hand", "dclaw"], "hand 'dclaw' has no palm (hand.yaml: palm)"),
         (["--object", "sphere", "--hand", "baret"], "did you mean 'barrett'"),
         (["--object", "spere"], "did you mean sphere"),
         (["--object", "sphere", "--scale", 1000], "is accepted"),

@@ -1,8 +1,19 @@
 """Starts of a plan: palms that face the surface, weights, farthest points."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
+from lgrasp.device.runtime import resolve_device
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.refine.inputs import named_hand
+from lgrasp.errors import HandError
+from lgrasp.hand.arrays import upload_hand
+from lgrasp.object.find import find_object
+from lgrasp.object.model import preprocess_object
+from lgrasp.refine.planning import Planner, PlanParams
 from lgrasp.refine.starts import palm_axis, start_poses, tilted
 from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface, ruled_palmar
 
@@ -48,3 +59,18 @@ def test_tilted_directions_lean_by_their_angle_to_all_sides():
     np.testing.assert_allclose(np.arccos(np.clip((back * normals).sum(1), -1, 1)), angle, atol=1e-6)
     around = tilted(np.tile([0.0, 0, 1], (8, 1)), np.full(8, np.pi / 2), np.arange(8) * np.pi / 4)
     np.testing.assert_allclose(around.sum(0), 0, atol=1e-12)
+
+
+def test_a_hand_without_a_palm_faces_its_box():
+    device = resolve_device("cpu")
+    source, dclaw = named_hand(Cache(), "dclaw", device)
+    centre, facing = palm_axis(dclaw)
+    np.testing.assert_allclose(facing, [1, 0, 0], atol=0.01)  # fingers along +x
+    assert np.linalg.norm(centre) < 0.02
+    ball = preprocess_object(find_object("sphere"))
+    assert source.spec.stand_off
+    planner = Planner(upload_hand(dclaw, "cpu"), ball, source.spec.stand_off, PlanParams(rolls=6, finalists=2))
+    assert len(planner.run(8).grasps) >= 4
+    nowhere = replace(dclaw, canonical_box=np.array([centre - 0.01, centre + 0.01]))
+    with pytest.raises(HandError, match="'dclaw' has no palm, and its canonical_box"):
+        palm_axis(nowhere)
