@@ -48,11 +48,7 @@ def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud"
         raise ObjectError(f"cloud '{name}': {bad} of {len(points)} points are NaN or infinite; drop them first")
     if len(points) < _LEAST_POINTS:
         raise ObjectError(f"cloud '{name}' has {len(points)} points; at least {_LEAST_POINTS} are needed")
-    size = float(np.ptp(points, axis=0).max())
-    if not _EXTENT[0] <= size <= _EXTENT[1]:
-        raise ObjectError(
-            f"cloud '{name}' is {size:.3g} m long; accepted: {_EXTENT[0]:g} to {_EXTENT[1]:g} m (are its units metres?)"
-        )
+    _check_size(f"cloud '{name}'", points)
     digest = hashlib.sha256(np.ascontiguousarray(points).tobytes())
     keep = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
     normals = np.asarray(normals, float)
@@ -94,17 +90,21 @@ def sdf_object(values: np.ndarray, origin: np.ndarray, cell: float, *, name: str
     normals = np.stack([*np.gradient(v, cell)], -1)[near]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
     points = np.argwhere(near) * cell + np.asarray(origin, float) - v[near][:, None] * normals
-    size = float(np.ptp(points, axis=0).max())
-    if not _EXTENT[0] <= size <= _EXTENT[1]:
-        raise ObjectError(
-            f"grid '{name}' is {size:.3g} m long; accepted: {_EXTENT[0]:g} to {_EXTENT[1]:g} m (is its unit metres?)"
-        )
+    _check_size(f"grid '{name}'", points)
     keep = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
     center = 0.5 * (points.min(0) + points.max(0))
     com = (np.argwhere(v < 0) * cell + origin).mean(0) - center
     grid = v.astype(np.float32), (np.asarray(origin, float) - center).astype(np.float32), float(cell)
     digest = hashlib.sha256(grid[0].tobytes() + np.asarray([*np.ravel(origin), cell], float).tobytes()).hexdigest()
     return _model(name, digest, center, points[keep] - center, normals[keep], grid, com, "a grid of distances")
+
+
+def _check_size(what: str, points: np.ndarray) -> None:
+    size = float(np.ptp(points, axis=0).max())
+    if not _EXTENT[0] <= size <= _EXTENT[1]:
+        raise ObjectError(
+            f"{what} is {size:.3g} m long; accepted: {_EXTENT[0]:g} to {_EXTENT[1]:g} m (are its units metres?)"
+        )
 
 
 def _model(

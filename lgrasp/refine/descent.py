@@ -3,7 +3,6 @@
 import numpy as np
 import warp as wp
 
-from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.differentiable.solids import hand_solids
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import HandArrays, body_poses, pose_matrices
@@ -29,8 +28,6 @@ from lgrasp.refine.volume import TargetArrays
 from lgrasp.refine.withdraw import withdraw
 
 __all__ = ["Descent"]
-
-wp.set_module_options(KERNEL_OPTIONS)
 
 _ADVANCES = 30
 _ROWS = 32  # hands of a block of threads: few hands spread over many processors

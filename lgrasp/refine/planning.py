@@ -124,10 +124,9 @@ class Planner:
         some, workers = (_CPU_STARTS, os.cpu_count() or 1) if device == "cpu" else (_GPU_STARTS, 1)
         counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *OUTCOMES], 0)
         tables = []
-        assert self._scene  # made before threads ask for it
         with ThreadPoolExecutor(workers) as pool:
-            firsts = range(0, count, some)
-            parts = [pool.submit(self._plan, points[first : first + some], first) for first in firsts]
+            firsts, search = range(0, count, some), self._scene.search
+            parts = [pool.submit(self._plan, search, points[first : first + some], first) for first in firsts]
             try:
                 for first, part in zip(firsts, parts, strict=True):
                     table, outcome = part.result()
@@ -152,9 +151,9 @@ class Planner:
             Descent(self.hand, target, self.params.search, surface), upload_object(self.model, device), around
         )
 
-    def _plan(self, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
+    def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
-        p, hand, search = self.params, self.hand.model, self._scene.search
+        p, hand = self.params, self.hand.model
         start, pose, q, facing = self._starts(points, first)
         free = search.depth(self._put(pose, q)) <= _COLLIDES
         start, at = start[free], self._put(pose[free], q[free])
