@@ -45,10 +45,10 @@ def bench(
         _refuse_options(context)
         return
     cache = open_cache(None)
+    from lgrasp.bench.rate import Bench
     from lgrasp.config import parse_model
-    from lgrasp.engine.bench import Bench
-    from lgrasp.engine.jobs import JobConfig, plan_jobs
     from lgrasp.engine.pipeline import pipeline_files
+    from lgrasp.jobs.config import JobConfig, plan_jobs
     from lgrasp_cli.tables import print_report
 
     names = [name.strip() for name in pipelines.split(",")]

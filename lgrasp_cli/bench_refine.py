@@ -7,7 +7,7 @@ import typer
 from lgrasp_cli.options import CacheDir, Device, JsonPath, check_report, open_cache
 
 if TYPE_CHECKING:
-    from lgrasp.engine.refine.bench import HandBench
+    from lgrasp.bench.refine import HandBench
 
 __all__ = ["bench_refine"]
 
@@ -31,7 +31,7 @@ def bench_refine(
     """
     check_report(json_path)
     cache = open_cache(cache_dir)
-    from lgrasp.engine.refine.bench import NOISES, bench_hand
+    from lgrasp.bench.refine import NOISES, bench_hand
     from lgrasp_cli.tables import print_report
 
     names = [name.strip() for name in objects.split(",")]
@@ -53,7 +53,7 @@ def bench_refine(
 
 
 def _plain(one: "HandBench") -> dict[str, Any]:
-    from lgrasp.engine.refine.bench import PUBLISHED, STEPS
+    from lgrasp.bench.refine import PUBLISHED, STEPS
 
     planning = {"mesh": one.mesh, **{f"cloud_{1e3 * noise:g}_mm": p for noise, p in one.clouds.items()}}
     return {
@@ -70,7 +70,7 @@ def _plain(one: "HandBench") -> dict[str, Any]:
 
 
 def _show(results: "list[HandBench]", objects: list[str], starts: int) -> None:
-    from lgrasp.engine.refine.bench import PUBLISHED, STEPS
+    from lgrasp.bench.refine import PUBLISHED, STEPS
     from lgrasp_cli.tables import print_table
 
     typer.echo(f"{starts} starts on each of {', '.join(objects)}")

@@ -50,11 +50,11 @@ def bench_sequence(
     cache = open_cache(cache_dir)
     from pathlib import Path
 
+    from lgrasp.bench.sequence import PUBLISHED, measure_sequences
     from lgrasp.config import parse_model
-    from lgrasp.engine.sequence.bench import PUBLISHED, measure_sequences
-    from lgrasp.engine.sequence.job import SequenceJob
-    from lgrasp.engine.sequence.sets import SequenceSets, object_sequences
-    from lgrasp.engine.sequence.size import parse_size
+    from lgrasp.jobs.sequence.job import SequenceJob
+    from lgrasp.jobs.sequence.sets import SequenceSets, object_sequences
+    from lgrasp.jobs.sequence.size import parse_size
     from lgrasp_cli.options import choose_pipeline
     from lgrasp_cli.tables import print_report
 

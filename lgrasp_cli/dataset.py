@@ -132,7 +132,7 @@ def report(
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """
     check_report(json_path)
-    from lgrasp.engine.dataset_report import report_dataset
+    from lgrasp.dataset.report import report_dataset
     from lgrasp.engine.report import check_json, write_json
     from lgrasp_cli.counting import counting
     from lgrasp_cli.tables import print_json, print_pairs

@@ -70,8 +70,8 @@ def _cutter(cache_dir: Path | None) -> "Cut":
     """Convex pieces of objects as ``lgrasp validate`` makes them, from the cache; what is approximated is said."""
     from functools import partial
 
-    from lgrasp.decompose import decompose
-    from lgrasp.physics.scene import object_of_record
+    from lgrasp.geometry.decompose import decompose
+    from lgrasp.simulate.scene import object_of_record
 
     cache = open_cache(cache_dir)
 

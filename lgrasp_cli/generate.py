@@ -22,7 +22,7 @@ from lgrasp_cli.options import (
 )
 
 if TYPE_CHECKING:
-    from lgrasp.engine.generate import Job, Outcome
+    from lgrasp.jobs.generate import Job, Outcome
 
 __all__ = ["conclude", "generate", "register", "run_job"]
 
@@ -79,8 +79,8 @@ def generate(
     Example: lgrasp generate --object mug.obj -n 10000
     """
     cache = open_cache(cache_dir, fresh=force)
-    from lgrasp.engine.generate import Job
-    from lgrasp.engine.jobs import array_task, default_out
+    from lgrasp.jobs.config import array_task, default_out
+    from lgrasp.jobs.generate import Job
 
     index, number = array_task(shard_index, num_shards)
     chosen = choose_pipeline(pipeline, seed, contacts)
@@ -114,9 +114,9 @@ def generate(
 
 def run_job(job: "Job", *, quiet: bool) -> tuple[dict[str, Any], "Outcome"]:
     """Run a job with progress; its report and outcome."""
-    from lgrasp.engine.generate import generate as run
-    from lgrasp.engine.generate import job_shards
     from lgrasp.engine.report import report
+    from lgrasp.jobs.generate import generate as run
+    from lgrasp.jobs.generate import job_shards
     from lgrasp_cli.progress import JobProgress, interruptible
 
     with JobProgress(dict(job_shards(job)), quiet=quiet) as progress, interruptible(progress):
@@ -130,8 +130,8 @@ def conclude(data: dict[str, Any], outcome: "Outcome") -> None:
     Raises:
         StarvedError: fewer grasps than asked.
     """
-    from lgrasp.engine.starving import starving_stage
     from lgrasp.errors import StarvedError
+    from lgrasp.jobs.bottleneck import starving_stage
 
     if outcome.cancelled:
         typer.echo(
@@ -144,7 +144,7 @@ def conclude(data: dict[str, Any], outcome: "Outcome") -> None:
 
 
 def _show_plan(job: "Job", json_path: str | None) -> None:
-    from lgrasp.engine.plan import plan
+    from lgrasp.jobs.preview import plan
     from lgrasp_cli.tables import print_json, print_table
 
     lines = plan(job)

@@ -8,7 +8,7 @@ import typer
 from lgrasp_cli.options import CacheDir, Device, PipelineName, Quiet, choose_pipeline, open_cache
 
 if TYPE_CHECKING:
-    from lgrasp.engine.check import HandCheck
+    from lgrasp.jobs.hand_check.check import HandCheck
 
 __all__ = ["app"]
 
@@ -23,7 +23,7 @@ def list_hands(as_json: _AsJson = False) -> None:
 
     Example: lgrasp hands list
     """
-    from lgrasp.engine.listing import list_hands as listed
+    from lgrasp.jobs.listing import list_hands as listed
     from lgrasp_cli.tables import print_json, print_table
 
     hands = listed()
@@ -43,7 +43,7 @@ def show_hand(
 
     Example: lgrasp hands show allegro
     """
-    from lgrasp.engine.listing import describe_hand
+    from lgrasp.jobs.listing import describe_hand
     from lgrasp_cli.tables import print_json, print_pairs, print_table
 
     hand = describe_hand(name)
@@ -92,7 +92,7 @@ def add_hand(
 
     Example: lgrasp hands add my_hand.urdf
     """
-    from lgrasp.hand.adopt import add_hand as add
+    from lgrasp.hand.drafting.import_urdf import add_hand as add
 
     made = add(urdf, name=name, out=out, force=force)
     for line in made.decisions:
@@ -122,8 +122,8 @@ def check_hand(
     """
     from dataclasses import asdict
 
-    from lgrasp.engine.check import check_hand as check
     from lgrasp.hand.find import find_hand
+    from lgrasp.jobs.hand_check.check import check_hand as check
     from lgrasp_cli.progress import say
     from lgrasp_cli.tables import print_json, print_table
 

@@ -44,8 +44,8 @@ def fit(
     check_report(json_path)
     cache = open_cache(cache_dir)
     from lgrasp.config import parse_model
-    from lgrasp.engine.learn.job import Fit
-    from lgrasp.engine.learn.job import fit as run
+    from lgrasp.jobs.learn.job import Fit
+    from lgrasp.jobs.learn.job import fit as run
     from lgrasp.learn.params import LearnParams
 
     given = {"steps": steps, "joint_steps": joint_steps, "unrolled": unrolled, "batch": batch, "seed": seed}
@@ -79,7 +79,7 @@ def evaluate(
     """
     check_report(json_path)
     cache = open_cache(cache_dir)
-    from lgrasp.engine.learn.job import evaluate as run
+    from lgrasp.jobs.learn.job import evaluate as run
 
     data = run(predictor, shards, cache, clouds=clouds, seed=seed, device=device)
     pairs = [

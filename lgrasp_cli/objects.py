@@ -19,7 +19,7 @@ def list_objects(as_json: _AsJson = False) -> None:
 
     Example: lgrasp objects list
     """
-    from lgrasp.engine.listing import list_objects as listed
+    from lgrasp.jobs.listing import list_objects as listed
     from lgrasp_cli.tables import print_json, print_table
 
     objects = listed()
@@ -40,7 +40,7 @@ def show_object(
 
     Example: lgrasp objects show mug
     """
-    from lgrasp.engine.listing import describe_object
+    from lgrasp.jobs.listing import describe_object
     from lgrasp_cli.tables import print_json, print_pairs
 
     data = describe_object(mesh, scale)

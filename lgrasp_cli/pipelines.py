@@ -17,7 +17,7 @@ def list_pipelines(as_json: _AsJson = False) -> None:
 
     Example: lgrasp pipelines list
     """
-    from lgrasp.engine.listing import list_pipelines as listed
+    from lgrasp.jobs.listing import list_pipelines as listed
     from lgrasp_cli.tables import print_json, print_table
 
     pipelines = listed()
@@ -37,7 +37,7 @@ def show_pipeline(
 
     Example: lgrasp pipelines show swift
     """
-    from lgrasp.engine.listing import describe_pipeline
+    from lgrasp.jobs.listing import describe_pipeline
     from lgrasp_cli.tables import print_json, print_table
 
     data = describe_pipeline(name)

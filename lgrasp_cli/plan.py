@@ -10,7 +10,7 @@ import typer
 from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Quiet, Scale, check_report, open_cache, warn
 
 if TYPE_CHECKING:
-    from lgrasp.engine.refine.plan import PlanOutcome
+    from lgrasp.jobs.refine.plan import PlanOutcome
 
 __all__ = ["plan", "register"]
 
@@ -64,12 +64,12 @@ def plan(
     """
     check_report(json_path)
     cache = open_cache(cache_dir)
+    from lgrasp.cloud.read import read_cloud
     from lgrasp.config import parse_model
-    from lgrasp.engine.refine.plan import PlanJob, plan_grasps
     from lgrasp.errors import ConfigError, StarvedError
     from lgrasp.hand.find import find_hand
-    from lgrasp.refine.planning import PlanParams
-    from lgrasp.scenes.cloud import read_cloud
+    from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
+    from lgrasp.planning.planner import PlanParams
 
     if (mesh is None) == (cloud is None):
         raise ConfigError("give --object (a mesh or a name) or --cloud (a file of points), one of the two")

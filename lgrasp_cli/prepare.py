@@ -45,7 +45,7 @@ def build_field(
     Example: lgrasp build-field allegro
     """
     cache = open_cache(cache_dir, fresh=force)
-    from lgrasp.engine.prepare import prepare_field
+    from lgrasp.jobs.prepare import prepare_field
     from lgrasp_cli.tables import print_json, print_pairs
 
     data = prepare_field(cache, hand, choose_pipeline(pipeline).field, index=index, device=device, report=_progress)
@@ -86,7 +86,7 @@ def preprocess(
     Example: lgrasp preprocess mug.obj --scale 0.001
     """
     cache = open_cache(cache_dir, fresh=force)
-    from lgrasp.engine.prepare import prepare_object
+    from lgrasp.jobs.prepare import prepare_object
     from lgrasp_cli.tables import print_json, print_pairs
 
     data = prepare_object(cache, mesh, choose_pipeline(pipeline).object, scale=scale)
@@ -118,8 +118,8 @@ def warm_up(
     Example: lgrasp warm-up --device cuda:0
     """
     open_cache(cache_dir)
-    from lgrasp.device.runtime import resolve_device
-    from lgrasp.engine.kernels import import_all, kernel_modules, load_kernels
+    from lgrasp.runtime.device import resolve_device
+    from lgrasp.runtime.kernels import import_all, kernel_modules, load_kernels
 
     start = time.monotonic()
     chosen = resolve_device(device)

@@ -9,8 +9,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from lgrasp.engine.generate import Listener
 from lgrasp.engine.report import survivors
+from lgrasp.jobs.generate import Listener
 from lgrasp_cli.interrupt import on_interrupt, stop_now
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import typer
 from lgrasp_cli.options import CacheDir, Device, JsonPath, Quiet, check_report, open_cache, warn
 
 if TYPE_CHECKING:
-    from lgrasp.engine.refine.shards import RefinedShard
+    from lgrasp.jobs.refine.shards import RefinedShard
 
 __all__ = ["refine", "register"]
 
@@ -63,8 +63,8 @@ def refine(
     """
     check_report(json_path)
     cache = open_cache(cache_dir)
-    from lgrasp.engine.refine.settings import refine_params
-    from lgrasp.engine.refine.shards import Refinement, refine_shards
+    from lgrasp.jobs.refine.settings import refine_params
+    from lgrasp.jobs.refine.shards import Refinement, refine_shards
 
     job = Refinement(
         sources=shards,

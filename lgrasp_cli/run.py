@@ -44,7 +44,7 @@ def run(
     """
     cache = open_cache(cache_dir, fresh=force)
     from lgrasp.config import parse_model
-    from lgrasp.engine.jobs import JobConfig, array_task, load_config, plan_jobs, plan_sequences
+    from lgrasp.jobs.config import JobConfig, array_task, load_config, plan_jobs, plan_sequences
     from lgrasp_cli.seqset import run_sets
 
     changes = {
@@ -123,7 +123,7 @@ def _row(result: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _show_plans(jobs: list[Any]) -> None:
-    from lgrasp.engine.plan import plan
+    from lgrasp.jobs.preview import plan
     from lgrasp_cli.tables import print_table
 
     lines = {line: None for job in jobs for line in plan(job)}

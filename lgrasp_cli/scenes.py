@@ -9,8 +9,8 @@ import typer
 from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache
 
 if TYPE_CHECKING:
-    from lgrasp.engine.scenes.config import SceneConfig
-    from lgrasp.engine.scenes.job import SceneOutcome
+    from lgrasp.jobs.scenes.config import SceneConfig
+    from lgrasp.jobs.scenes.job import SceneOutcome
 
 __all__ = ["app"]
 
@@ -73,8 +73,8 @@ def make(
     Example: lgrasp scenes make mug bowl bottle box sphere hammer --hand allegro -n 100 --out scenes
     """
     cache = open_cache(cache_dir)
-    from lgrasp.engine.jobs import array_task
-    from lgrasp.engine.scenes.job import SceneJob, scene_numbers
+    from lgrasp.jobs.config import array_task
+    from lgrasp.jobs.scenes.job import SceneJob, scene_numbers
 
     changes = {
         "hand": hand,
@@ -93,7 +93,7 @@ def make(
     check_report(json_path)
     job = SceneJob(config, shard_index=index, num_shards=number, resume=resume, cache=cache)
     outcome = _run(job, len(scene_numbers(job)), quiet=quiet)
-    from lgrasp.engine.scenes.report import report
+    from lgrasp.jobs.scenes.report import report
 
     data = report(outcome, len(scene_numbers(job)), config.out)
     from lgrasp_cli.tables import print_report
@@ -139,7 +139,7 @@ def info(
     Example: lgrasp scenes info scenes
     """
     from lgrasp.dataset import find_shards
-    from lgrasp.engine.scenes.report import describe_scenes
+    from lgrasp.jobs.scenes.report import describe_scenes
     from lgrasp_cli.tables import print_json
 
     data = describe_scenes(find_shards(paths))
@@ -152,8 +152,8 @@ def info(
 def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, views: int | None) -> "SceneConfig":
     """The config that is named, or one of the objects, with what the command line replaces."""
     from lgrasp.config import parse_model
-    from lgrasp.engine.scenes.config import SceneConfig, load_scene_config, scene_configs
     from lgrasp.errors import ConfigError
+    from lgrasp.jobs.scenes.config import SceneConfig, load_scene_config, scene_configs
 
     config = next((name for name in objects if name.endswith((".yaml", ".yml"))), None)
     if config and len(objects) > 1:
@@ -172,7 +172,7 @@ def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, v
 
 def _run(job: Any, asked: int, *, quiet: bool) -> "SceneOutcome":
     """Make the scenes with a line of progress every ten seconds; Ctrl-C ends the job after the running ones."""
-    from lgrasp.engine.scenes.job import SceneListener, make_scenes
+    from lgrasp.jobs.scenes.job import SceneListener, make_scenes
     from lgrasp_cli.interrupt import on_interrupt, stop_now
 
     class Progress(SceneListener):

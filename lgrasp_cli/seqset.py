@@ -8,7 +8,7 @@ from lgrasp_cli.interrupt import Interrupted
 from lgrasp_cli.options import check_report
 
 if TYPE_CHECKING:
-    from lgrasp.engine.sequence.job import SequenceJob
+    from lgrasp.jobs.sequence.job import SequenceJob
 
 __all__ = ["run_sets"]
 

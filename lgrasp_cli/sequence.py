@@ -8,7 +8,7 @@ import typer
 from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Quiet, Seed, check_report, choose_pipeline, open_cache
 
 if TYPE_CHECKING:
-    from lgrasp.engine.sequence.job import SequenceJob, SequenceOutcome
+    from lgrasp.jobs.sequence.job import SequenceJob, SequenceOutcome
 
 __all__ = ["conclude", "register", "run_sequences", "sequence"]
 
@@ -71,10 +71,10 @@ def sequence(
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10
     """
     cache = open_cache(cache_dir, fresh=force)
-    from lgrasp.engine.jobs import array_task
-    from lgrasp.engine.sequence.job import SequenceJob, sequence_name
-    from lgrasp.engine.sequence.size import parse_size
     from lgrasp.hand.find import find_hand
+    from lgrasp.jobs.config import array_task
+    from lgrasp.jobs.sequence.job import SequenceJob, sequence_name
+    from lgrasp.jobs.sequence.size import parse_size
 
     chosen = choose_pipeline(pipeline, seed)
     if "sequence" in chosen.order and (method or policy):
@@ -107,8 +107,8 @@ def sequence(
 
 def run_sequences(job: "SequenceJob", *, quiet: bool) -> tuple[dict[str, Any], "SequenceOutcome"]:
     """Run a job with progress; its report and outcome."""
-    from lgrasp.engine.sequence.job import generate_sequences, sequence_shards
-    from lgrasp.engine.sequence.report import report
+    from lgrasp.jobs.sequence.job import generate_sequences, sequence_shards
+    from lgrasp.jobs.sequence.report import report
     from lgrasp_cli.progress import JobProgress, interruptible
 
     with JobProgress(dict(sequence_shards(job)), quiet=quiet) as progress, interruptible(progress):
@@ -123,8 +123,8 @@ def conclude(data: dict[str, Any], outcome: "SequenceOutcome") -> None:
         ObjectError: no opposition space could hold an object.
         StarvedError: fewer sequences than asked.
     """
-    from lgrasp.engine.sequence.report import unheld
     from lgrasp.errors import ObjectError, StarvedError
+    from lgrasp.jobs.sequence.report import unheld
 
     if outcome.cancelled:
         typer.echo(

@@ -55,8 +55,8 @@ def _verb(stage: str):
         cache = open_cache(cache_dir, fresh=force)
         from pathlib import Path
 
-        from lgrasp.engine.generate import Job
-        from lgrasp.engine.onestage import run_stage
+        from lgrasp.jobs.generate import Job
+        from lgrasp.jobs.onestage import run_stage
         from lgrasp_cli.tables import print_json, print_table
 
         chosen = choose_pipeline(pipeline, seed, contacts)

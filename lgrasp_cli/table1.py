@@ -9,7 +9,7 @@ from lgrasp_cli.interrupt import before_end
 from lgrasp_cli.options import Device, JsonPath, check_report, open_cache, warn
 
 if TYPE_CHECKING:
-    from lgrasp.engine.jobs import JobConfig
+    from lgrasp.jobs.config import JobConfig
 
 __all__ = ["table1"]
 
@@ -57,13 +57,13 @@ def table1(
     Example: lgrasp bench table1 --hand-dir hands --object-dir meshes --json table1.json --plot table1.png
     """
     cache = open_cache(None)
+    from lgrasp.bench.charts import check_plot, draw_table
+    from lgrasp.bench.rate import Bench
+    from lgrasp.bench.table1 import measure_table, new_table, read_table
     from lgrasp.config import parse_model
-    from lgrasp.engine.bench import Bench
-    from lgrasp.engine.charts import check_plot, draw_table
-    from lgrasp.engine.jobs import JobConfig, load_config
     from lgrasp.engine.report import write_json
-    from lgrasp.engine.table1 import measure_table, new_table, read_table
     from lgrasp.errors import ConfigError
+    from lgrasp.jobs.config import JobConfig, load_config
     from lgrasp_cli.tables import print_json
 
     changes = {
@@ -112,7 +112,7 @@ def _split(names: str) -> list[str]:
 
 def _those_here(config: "JobConfig") -> "JobConfig":
     """The config without the objects that are not here, which is said."""
-    from lgrasp.engine.table1 import without_missing
+    from lgrasp.bench.table1 import without_missing
 
     config, missing = without_missing(config)
     if missing:

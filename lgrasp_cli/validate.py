@@ -11,8 +11,8 @@ import typer
 from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache, warn
 
 if TYPE_CHECKING:
-    from lgrasp.engine.validate import Validated
-    from lgrasp.physics import Protocol
+    from lgrasp.jobs.simulate import Validated
+    from lgrasp.simulate import Protocol
 
 __all__ = ["register", "validate"]
 
@@ -56,8 +56,8 @@ def validate(
     Example: lgrasp validate grasps/allegro-mug --out grasps/allegro-mug-fc --protocol fc
     """
     check_report(json_path)
-    from lgrasp.engine.validate import Validation, summary, validate_shards
-    from lgrasp.physics import find_protocol
+    from lgrasp.jobs.simulate import Validation, summary, validate_shards
+    from lgrasp.simulate import find_protocol
     from lgrasp_cli.tables import print_report
 
     chosen = find_protocol(protocol)
@@ -74,7 +74,7 @@ def validate(
 
 
 def _show(entries: list[dict[str, Any]], done: "list[Validated]", protocol: "Protocol") -> None:
-    from lgrasp.physics import DIRECTIONS
+    from lgrasp.simulate import DIRECTIONS
     from lgrasp_cli.tables import print_pairs, print_table
 
     stay = ("stay",) if any(entry["stay"] is not None for entry in entries) else ()

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from lgrasp.dataset import read_shard
-from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import Job, Outcome, generate
+from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
-from lgrasp.engine.workspace import Inputs, input_keys, load_inputs
 from lgrasp.field.params import FieldParams
+from lgrasp.jobs.generate import Job, Outcome, generate
+from lgrasp.runtime.device import resolve_device
 from lgrasp.stages.context import Context
 
 OBJECT = "mug"

@@ -5,10 +5,10 @@ import pytest
 from reference.solids import ELL, YOU, prism
 from scipy.spatial import ConvexHull
 
-from lgrasp import decompose as module
-from lgrasp.decompose import decompose
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import DecomposeError
+from lgrasp.geometry import decompose as module
+from lgrasp.geometry.decompose import decompose
 
 
 @pytest.fixture(autouse=True)

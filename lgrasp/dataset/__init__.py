@@ -7,10 +7,10 @@ from lgrasp.dataset.info import describe
 from lgrasp.dataset.manifest import write_manifest
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import ShardReader, iter_grasps, pose_matrix, read_shard
-from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
-from lgrasp.dataset.schema import FORMAT_VERSION
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
+from lgrasp.grasp.schema import FORMAT_VERSION
 
 if TYPE_CHECKING:
     from lgrasp.dataset.torch_dataset import GraspDataset

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lgrasp.dataset.lineage import Column, check_parents, check_steps
-from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 
 __all__ = ["hand_problems", "object_problems", "row_problems"]
 

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lgrasp.dataset.records import GraspRows, SequenceRows
-from lgrasp.dataset.schema import CHUNK_ROWS
+from lgrasp.grasp.records import GraspRows, SequenceRows
+from lgrasp.grasp.schema import CHUNK_ROWS
 
 __all__ = ["Column", "check_parents", "check_steps"]
 

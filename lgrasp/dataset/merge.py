@@ -15,10 +15,10 @@ from lgrasp.dataset.heap import check_heaps
 from lgrasp.dataset.manifest import MANIFEST_NAME, check_manifest
 from lgrasp.dataset.padding import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.records import GraspRows, HandRecord, ShardHeader
-from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 from lgrasp.dataset.writer import create_rows, finish, write_context, write_spaces
 from lgrasp.errors import ShardError
+from lgrasp.grasp.records import GraspRows, HandRecord, ShardHeader
+from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 
 __all__ = ["merge_shards", "sum_statistics"]
 

@@ -15,10 +15,10 @@ import trimesh
 
 from lgrasp.dataset.extend import check_shard, extend_shard
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.records import GraspRows, ObjectRecord
 from lgrasp.dataset.tree import shard_tree
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.errors import ConfigError, OutputError
+from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 
 __all__ = ["METRICS", "Added", "add_metrics", "mass_frame", "row_metrics"]

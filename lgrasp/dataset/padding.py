@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from lgrasp.dataset.schema import GRASP_FIELDS, SEQUENCE_FIELDS
+from lgrasp.grasp.schema import GRASP_FIELDS, SEQUENCE_FIELDS
 
 __all__ = ["pad_column", "widest"]
 

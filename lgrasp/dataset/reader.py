@@ -12,10 +12,10 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.heap import check_heaps
-from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
-from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 from lgrasp.dataset.structure import expand, format_problem, structure_problems
 from lgrasp.errors import ShardError
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
+from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 
 __all__ = [
     "ShardReader",

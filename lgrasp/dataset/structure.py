@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lgrasp.dataset.schema import (
+from lgrasp.grasp.schema import (
     ATTRIBUTES,
     DATASETS,
     FORMAT,

@@ -14,9 +14,9 @@ import torch
 from lgrasp.dataset.files import find_shards
 from lgrasp.dataset.padding import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.records import HandRecord, ObjectRecord
-from lgrasp.dataset.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 from lgrasp.errors import ShardError
+from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 
 __all__ = ["GraspDataset"]
 

@@ -7,9 +7,9 @@ import numpy as np
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.heap import check_heaps
 from lgrasp.dataset.reader import ShardReader, open_hdf5, reading
-from lgrasp.dataset.records import object_set_sha256
 from lgrasp.dataset.structure import format_problem, structure_problems, text_sha256
 from lgrasp.errors import ShardError
+from lgrasp.grasp.records import object_set_sha256
 
 __all__ = ["validate_shard"]
 

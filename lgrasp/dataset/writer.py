@@ -11,10 +11,10 @@ import numpy as np
 
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.files import new_shard_file
-from lgrasp.dataset.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, object_set_sha256
-from lgrasp.dataset.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, DatasetSpec
 from lgrasp.dataset.structure import structure_problems, text_sha256
 from lgrasp.errors import ShardError
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, object_set_sha256
+from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, DatasetSpec
 
 __all__ = [
     "create_array",

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
+from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.hand.geometry import Piece
 from lgrasp.hand.model import HandModel
 from lgrasp.object.model import ObjectModel

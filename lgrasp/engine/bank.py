@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.inputs import InputKeys
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.workspace import InputKeys
 from lgrasp.grasp.tables import CandidateTable, candidate_arrays, candidate_table
 
 __all__ = ["BANK_CANDIDATES", "BANK_VERSION", "Bank"]

@@ -8,10 +8,10 @@ import warp as wp
 
 from lgrasp.engine.bank import Bank
 from lgrasp.engine.fit import fit_params
-from lgrasp.engine.meter import Meter
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.stages import STAGES
+from lgrasp.engine.registry import STAGES
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, select_poses
+from lgrasp.runtime.meter import Meter
 from lgrasp.stages.context import Context
 
 __all__ = ["BatchResult", "finish_batch", "run_batch", "run_stage", "run_stages"]

@@ -7,13 +7,13 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny
 
 from lgrasp.config import parse_model, read_yaml
-from lgrasp.engine.stages import STAGES, check_order
+from lgrasp.engine.registry import STAGES, check_order
 from lgrasp.errors import ConfigError
 from lgrasp.field.params import FieldParams
 from lgrasp.object.params import ObjectParams
 from lgrasp.paths import data_dirs
-from lgrasp.physics import find_protocol
-from lgrasp.stages.validate.params import ValidateParams
+from lgrasp.simulate import find_protocol
+from lgrasp.stages.simulate.params import ValidateParams
 
 __all__ = ["Pipeline", "load_pipeline", "pipeline_files"]
 

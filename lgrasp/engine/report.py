@@ -16,11 +16,11 @@ import warp as wp
 from lgrasp.dataset.files import new_file
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.folder import check_folder
-from lgrasp.engine.generate import Job, Outcome
+from lgrasp.engine.registry import STAGES
 from lgrasp.engine.shard import add_counts
-from lgrasp.engine.stages import STAGES
 from lgrasp.errors import OutputError
 from lgrasp.grasp.duplicates import near_pairs
+from lgrasp.jobs.generate import Job, Outcome
 
 __all__ = ["SEED_FSWO", "check_json", "peak_device_mb", "peak_rss_mb", "report", "survivors", "write_json"]
 

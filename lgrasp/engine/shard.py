@@ -13,9 +13,9 @@ import warp as wp
 from lgrasp.engine.bank import BANK_CANDIDATES, Bank
 from lgrasp.engine.batch import BatchResult, finish_batch, run_batch
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.graphs import Recorder
+from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.recording import Recorder
-from lgrasp.engine.workspace import Inputs
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps, user_poses

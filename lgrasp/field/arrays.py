@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.device.kinematics import Kinematics, vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.transforms import decode_normal, normal_bin
 from lgrasp.field.model import ContactField
 from lgrasp.hand.model import HandModel
+from lgrasp.math.kinematics import Kinematics, vec_dof
+from lgrasp.math.transforms import decode_normal, normal_bin
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = [
     "Boxes",

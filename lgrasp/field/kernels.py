@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_JOINTS, group_forward, vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.transforms import encode_normal, normal_bin
 from lgrasp.hand.arrays import Hand
-from lgrasp.hand.clearance import group_pairs_clear
+from lgrasp.hand.self_collision import group_pairs_clear
+from lgrasp.math.kinematics import MAX_JOINTS, group_forward, vec_dof
+from lgrasp.math.transforms import encode_normal, normal_bin
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["contact_vectors", "sample_postures"]
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from lgrasp.device.transforms import NORMAL_BINS
 from lgrasp.errors import HandError
 from lgrasp.field.boxes import box_index
 from lgrasp.field.kernels import contact_vectors, sample_postures
@@ -15,6 +14,7 @@ from lgrasp.field.opposed import opposed_pairs
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.model import HandModel
+from lgrasp.math.transforms import NORMAL_BINS
 
 __all__ = ["FIELD_VERSION", "ContactField", "build_field"]
 

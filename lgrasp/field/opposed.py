@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lgrasp.hand.facing import opposed
+from lgrasp.hand.opposition.facing import opposed
 
 __all__ = ["opposed_pairs"]
 

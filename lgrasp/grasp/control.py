@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
+from lgrasp.math.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["press_contact", "shift_contact"]
 

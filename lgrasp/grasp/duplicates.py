@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
-from lgrasp.device.runtime import start
 from lgrasp.grasp.near_kernels import list_near
+from lgrasp.runtime.device import start
 
 __all__ = ["NEAR_ANGLE", "NEAR_DISTANCE", "NEAR_JOINT", "KeptRows", "near_pairs", "new_rows"]
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_DOFS, vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.grasp.clearance import body_apart, body_depth
+from lgrasp.grasp.collision import body_apart, body_depth
 from lgrasp.hand.arrays import Hand, HandArrays
+from lgrasp.math.kinematics import MAX_DOFS, vec_dof
 from lgrasp.object.arrays import Object, ObjectArrays
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = [
     "Held",

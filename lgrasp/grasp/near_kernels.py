@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["list_near"]
 

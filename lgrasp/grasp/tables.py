@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_DOFS, vec_dof
+from lgrasp.math.kinematics import MAX_DOFS, vec_dof
 
 __all__ = [
     "CandidateTable",

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.device.convex import Pieces
-from lgrasp.device.kinematics import MAX_JOINTS, Kinematics, group_forward, point_column, vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS, start
-from lgrasp.device.sdf import sdf_part
 from lgrasp.hand.model import HandModel
+from lgrasp.math.convex import Pieces
+from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_forward, point_column, vec_dof
+from lgrasp.math.sdf import sdf_part
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
 __all__ = [
     "Contacts",

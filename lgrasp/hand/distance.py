@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from lgrasp.device.runtime import KERNEL_OPTIONS, start
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
 __all__ = ["signed_distance"]
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lgrasp.errors import HandError
-from lgrasp.hand.opposition import space_problem
-from lgrasp.hand.packages import PACKAGE_HANDS, drafted_folder, package_urdf
+from lgrasp.hand.drafting.packages import PACKAGE_HANDS, drafted_folder, package_urdf
+from lgrasp.hand.opposition.check import space_problem
 from lgrasp.hand.spec import Coupling, HandSpec, load_spec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Joint, Urdf, read_urdf

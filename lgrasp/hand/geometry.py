@@ -8,8 +8,8 @@ import trimesh
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
-from lgrasp.decompose import Decompose
 from lgrasp.errors import DecomposeError, HandError
+from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.urdf import Geometry, Urdf
 
@@ -255,7 +255,7 @@ def _cut(body: trimesh.Trimesh, decompose: Decompose, most: int) -> list[Piece]:
     """Convex pieces of a dented body.
 
     Raises:
-        DecomposeError: see :func:`lgrasp.decompose.decompose`; also pieces that leave out some of the surface.
+        DecomposeError: see :func:`lgrasp.geometry.decompose.decompose`; also pieces that leave out some of the surface.
     """
     found = decompose(np.asarray(body.vertices), np.asarray(body.faces), threshold=_DENT, max_pieces=most)
     pieces = []

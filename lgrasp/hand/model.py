@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from lgrasp.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
-from lgrasp.decompose import Decompose
-from lgrasp.device.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 from lgrasp.errors import HandError
+from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
+from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.contacts import body_cones, check_contact_links, finger_points, palm_points
 from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh, inner_spheres, surface_samples
-from lgrasp.hand.opposition import check_spaces
+from lgrasp.hand.opposition.check import check_spaces
 from lgrasp.hand.overlap import overlap_arrays
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.surface import ContactLink, contact_arrays, csr, stack_rows
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
+from lgrasp.math.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 
 __all__ = ["HAND_VERSION", "HandModel", "build_hand", "hand_digest"]
 

@@ -7,11 +7,11 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from lgrasp.device.convex import Pieces, pieces_clear
-from lgrasp.device.runtime import KERNEL_OPTIONS, start
 from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.overlap import OVERLAP, OverlapSide, overlap_arrays, overlap_depth, overlap_sides
+from lgrasp.math.convex import Pieces, pieces_clear
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
 __all__ = ["pieces_touch", "with_pairs"]
 

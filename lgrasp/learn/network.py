@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from lgrasp.differentiable.rotations import matrix_from_sixd
+from lgrasp.geometry.rotations import matrix_from_sixd
 from lgrasp.learn.params import LearnParams
 
 __all__ = ["Coarse", "CoarseNet", "best_answers", "seed_frames"]

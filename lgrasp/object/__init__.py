@@ -1,6 +1,6 @@
 """Objects: mesh file to surface points, obstacle clusters and signed distance grid."""
 
-from lgrasp.clusters import CLUSTER_SIZE
+from lgrasp.geometry.clusters import CLUSTER_SIZE
 
 from .find import find_object, list_objects
 from .load import MESH_SUFFIXES

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.sdf import Sdf
+from lgrasp.math.sdf import Sdf
 from lgrasp.object.model import ObjectModel
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["Object", "ObjectArrays", "upload_object"]
 

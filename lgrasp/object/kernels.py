@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lgrasp.device.triangles import closest_on_triangle
+from lgrasp.math.triangles import closest_on_triangle
 
 __all__ = ["draw_opposite", "far_distance", "fold_spread", "lattice_crossings", "nearest_face_band", "winding_sign"]
 

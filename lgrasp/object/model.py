@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from lgrasp.clusters import bounding_spheres, cluster_order
+from lgrasp.geometry.clusters import bounding_spheres, cluster_order
 
 from .load import LoadedMesh, load_mesh
 from .params import ObjectParams

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import warp as wp
 
-from lgrasp.device.qp import MAX_CONTACTS
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import HandArrays
+from lgrasp.math.qp import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.refine.check_kernels import (
     balance_rows,

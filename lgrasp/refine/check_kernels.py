@@ -2,16 +2,16 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_BODIES, MAX_JOINTS, group_forward, vec_dof
-from lgrasp.device.qp import MAX_CONTACTS, balance, unresisted
-from lgrasp.device.quality import epsilon_bound
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.sdf import sdf_gradient, sdf_value
-from lgrasp.grasp.clearance import body_apart, body_depth
+from lgrasp.grasp.collision import body_apart, body_depth
 from lgrasp.grasp.control import press_contact, shift_contact
 from lgrasp.hand.arrays import Hand, group_dofs
-from lgrasp.hand.clearance import group_pairs_clear, overlap_depth
+from lgrasp.hand.self_collision import group_pairs_clear, overlap_depth
+from lgrasp.math.kinematics import MAX_BODIES, MAX_JOINTS, group_forward, vec_dof
+from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted
+from lgrasp.math.quality import epsilon_bound
+from lgrasp.math.sdf import sdf_gradient, sdf_value
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["balance_rows", "choose_contacts", "clear_of_itself", "control_rows", "deepen_rows", "link_contacts"]
 

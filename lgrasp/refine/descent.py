@@ -6,7 +6,9 @@ import warp as wp
 from lgrasp.differentiable.solids import hand_solids
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import HandArrays, body_poses, pose_matrices
+from lgrasp.planning.starts import palm_axis
 from lgrasp.refine.descent_kernels import advance, deepest, descend
+from lgrasp.refine.energy_gradient import MAX_COLUMNS, Search
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.match_kernels import (
     DEEPEST,
@@ -21,11 +23,9 @@ from lgrasp.refine.match_kernels import (
     place_bodies,
 )
 from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
-from lgrasp.refine.pulls import MAX_COLUMNS, Search
-from lgrasp.refine.starts import palm_axis
+from lgrasp.refine.resolve_penetration import withdraw
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
-from lgrasp.refine.withdraw import withdraw
 
 __all__ = ["Descent"]
 

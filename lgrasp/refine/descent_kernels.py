@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_BODIES, Kinematics, group_forward
-from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import group_dofs
+from lgrasp.math.kinematics import MAX_BODIES, Kinematics, group_forward
+from lgrasp.refine.energy_gradient import Search, beyond, joint_pulls, point_pulls, solid_pulls, wrench_pulls
 from lgrasp.refine.match_kernels import Correspondences, Points, Solids
-from lgrasp.refine.pulls import Search, beyond, joint_pulls, point_pulls, solid_pulls, wrench_pulls
 from lgrasp.refine.volume import Volume, volume_at
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["advance", "deepest", "descend"]
 

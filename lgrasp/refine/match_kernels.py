@@ -5,11 +5,11 @@ Rows are hands; everything is frozen until it is matched anew (:mod:`lgrasp.refi
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_JOINTS, Kinematics, group_forward
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.sdf import Sdf, sdf_gradient, sdf_part, sdf_value
 from lgrasp.hand.arrays import group_dofs
+from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_forward
+from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_part, sdf_value
 from lgrasp.refine.volume import Volume, volume_at
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = [
     "DEEPEST",

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from lgrasp.differentiable.kinematics import BodyKinematics
-from lgrasp.differentiable.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
+from lgrasp.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.model import HandModel

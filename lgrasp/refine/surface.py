@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lgrasp.clusters import CLUSTER_SIZE
+from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.model import HandModel
 
 __all__ = [

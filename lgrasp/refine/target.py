@@ -16,7 +16,7 @@ class Target:
     """An object, perhaps among others that are only kept out of, in the object's internal frame.
 
     Args:
-        model: the object (of a mesh, or of a cloud: :func:`lgrasp.refine.cloud.cloud_object`).
+        model: the object (of a mesh, or of a cloud: :func:`lgrasp.cloud.model.cloud_object`).
         around: what stands around it, in the same frame; None: nothing.
     """
 

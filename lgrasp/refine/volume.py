@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.device.runtime import KERNEL_OPTIONS, start
 from lgrasp.object.model import ObjectModel
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
 __all__ = [
     "Normal",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lgrasp.dataset.exports.poses import canonical
+from lgrasp.geometry.poses import canonical
 from lgrasp.scenes.params import CameraParams
 
 __all__ = ["Intrinsics", "intrinsics_of", "look_at", "place_cameras"]

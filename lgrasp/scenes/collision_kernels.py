@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from lgrasp.device.convex import Pieces
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.grasp.clearance import body_depth
+from lgrasp.grasp.collision import body_depth
 from lgrasp.hand.arrays import Hand
+from lgrasp.math.convex import Pieces
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["hand_depths"]
 

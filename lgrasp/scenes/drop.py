@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from lgrasp.dataset import pose_matrix
-from lgrasp.dataset.exports.poses import canonical
 from lgrasp.errors import PhysicsError
-from lgrasp.physics.assemble import add_hull
-from lgrasp.physics.model import import_mujoco
-from lgrasp.physics.solid import Solid
+from lgrasp.geometry.poses import canonical
 from lgrasp.scenes.params import DropParams
+from lgrasp.simulate.assemble import add_hull
+from lgrasp.simulate.model import import_mujoco
+from lgrasp.simulate.solid import Solid
 
 __all__ = ["Settled", "drop"]
 

@@ -8,7 +8,6 @@ import numpy as np
 from lgrasp.dataset import HandRecord, ObjectRecord, pose_matrix
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
-from lgrasp.physics.solid import Solid
 from lgrasp.scenes.camera import intrinsics_of, place_cameras
 from lgrasp.scenes.drop import drop
 from lgrasp.scenes.params import CameraParams, SceneParams
@@ -18,6 +17,7 @@ from lgrasp.scenes.schema import DEPTH_UNIT
 from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
 from lgrasp.scenes.transfer import find_collisions, hand_poses
 from lgrasp.seeding import stage_seed
+from lgrasp.simulate.solid import Solid
 
 __all__ = ["Item", "draw_items", "make_scene", "observe"]
 

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.dataset import pose_matrix
-from lgrasp.device.runtime import start
+from lgrasp.runtime.device import start
 from lgrasp.scenes import render_kernels as kernels
 from lgrasp.scenes.camera import Intrinsics
 

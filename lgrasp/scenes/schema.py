@@ -4,7 +4,7 @@ Capital letters in a shape hold across the file: ``M`` objects on the table, ``V
 ``P`` points, ``N`` grasps, ``K`` listed joints, ``L`` links.
 """
 
-from lgrasp.dataset.schema import AttributeSpec, DatasetSpec
+from lgrasp.grasp.schema import AttributeSpec, DatasetSpec
 
 __all__ = ["ATTRIBUTES", "DATASETS", "DEPTH_UNIT", "FORMAT", "FORMAT_VERSION"]
 

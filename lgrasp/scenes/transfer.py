@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.dataset.exports.poses import compose, inverse
+from lgrasp.geometry.poses import compose, inverse
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.scenes import collision_kernels as kernels

@@ -9,10 +9,10 @@ import warp as wp
 from lgrasp.field.arrays import FieldArrays
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.spaces import Space
+from lgrasp.hand.opposition.spaces import Space
 from lgrasp.object.arrays import ObjectArrays
-from lgrasp.physics.scene import Scene
 from lgrasp.seeding import stage_seed
+from lgrasp.simulate.scene import Scene
 
 __all__ = ["Context"]
 

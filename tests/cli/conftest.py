@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from lgrasp.device.runtime import start
+from lgrasp.runtime.device import start
 from lgrasp_cli.main import main
 
 QUICK = str(Path(__file__).parent / "quick.yaml")

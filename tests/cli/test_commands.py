@@ -135,7 +135,7 @@ def test_wrong_configs(cli, tmp_path, text, words):
 
 
 def test_shipped_configs(cli):
-    from lgrasp.engine.jobs import config_files, load_config
+    from lgrasp.jobs.config import config_files, load_config
 
     assert {"smoke", "table1"} <= set(config_files())
     assert all(load_config(name) for name in config_files())
@@ -193,7 +193,7 @@ def test_bench_table1(table1, tmp_path):
 
 
 def test_bench_table1_interrupted(table1, monkeypatch, tmp_path):
-    from lgrasp.engine.bench import Bench
+    from lgrasp.bench.rate import Bench
 
     measure = Bench.measure
 

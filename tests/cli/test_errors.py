@@ -150,7 +150,7 @@ def test_unexpected_failures_are_one_line(generate, monkeypatch):
         def fail(*_, error=error, **__):
             raise error
 
-        monkeypatch.setattr("lgrasp.engine.generate.load_inputs", fail)
+        monkeypatch.setattr("lgrasp.jobs.generate.load_inputs", fail)
         assert words in generate().error()
-    monkeypatch.setattr("lgrasp.engine.generate.load_inputs", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("lgrasp.jobs.generate.load_inputs", lambda *_, **__: 1 / 0)
     assert "unexpected ZeroDivisionError" in generate().error(1)

@@ -126,7 +126,7 @@ def test_too_many_sets(cli, tmp_path, sets, words):
 
 
 def test_sequences_are_drawn_with_a_seed():
-    from lgrasp.engine.sequence.sets import SequenceSets, object_sequences
+    from lgrasp.jobs.sequence.sets import SequenceSets, object_sequences
 
     pool = [f"o{i}" for i in range(12)]
     sets = SequenceSets(sets=20, length=4, permutations=3)

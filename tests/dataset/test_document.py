@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lgrasp.dataset import write_shard
-from lgrasp.dataset.schema import ATTRIBUTES, DATASETS, FORMAT_VERSION, SEQUENCE_DATASETS
+from lgrasp.grasp.schema import ATTRIBUTES, DATASETS, FORMAT_VERSION, SEQUENCE_DATASETS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "file-format.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)

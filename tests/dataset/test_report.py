@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from lgrasp.dataset import merge_shards, pose_matrix, read_shard, write_shard
-from lgrasp.engine.dataset_report import read_dataset, report_dataset
-from lgrasp.engine.dataset_report.coverage import Coverage
-from lgrasp.engine.dataset_report.posture import principal_postures
-from lgrasp.engine.dataset_report.quantity import QUANTITIES, Distribution
-from lgrasp.engine.dataset_report.sample import EvenSample
+from lgrasp.dataset.report import read_dataset, report_dataset
+from lgrasp.dataset.report.coverage import Coverage
+from lgrasp.dataset.report.posture import principal_postures
+from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
+from lgrasp.dataset.report.sample import EvenSample
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.duplicates import new_rows
 from lgrasp_cli.dataset import app

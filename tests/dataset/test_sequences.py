@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from lgrasp.dataset import GraspDataset, ShardReader, describe, merge_shards, read_shard, validate_shard, write_shard
 from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.metrics import METRICS, add_metrics
-from lgrasp.dataset.schema import SEQUENCE_DATASETS
 from lgrasp.errors import ShardError
+from lgrasp.grasp.schema import SEQUENCE_DATASETS
 from lgrasp_cli.dataset import app
 
 COUNTS = (4, 5, 3)

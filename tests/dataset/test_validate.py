@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 
 from lgrasp.dataset import read_shard, validate_shard, write_shard
-from lgrasp.dataset.schema import ATTRIBUTES, DATASETS
 from lgrasp.dataset.structure import expand
 from lgrasp.errors import ShardError
+from lgrasp.grasp.schema import ATTRIBUTES, DATASETS
 
 
 @pytest.fixture

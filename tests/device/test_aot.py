@@ -7,8 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import pytest
 import warp as wp
 
-from lgrasp.device.runtime import start
-from lgrasp.engine.kernels import import_all, kernel_modules
+from lgrasp.runtime.device import start
+from lgrasp.runtime.kernels import import_all, kernel_modules
 
 ARCHS = (75, 90)  # the oldest, and H100 and H200; the driver compiles the rest from the one below
 

@@ -7,9 +7,9 @@ from reference.convex import hull_distance, segment_distance
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from lgrasp.device.convex import Pieces, pieces_clear, point_depth
-from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.geometry import Piece
+from lgrasp.math.convex import Pieces, pieces_clear, point_depth
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from lgrasp.device.fetch import fetch
+from lgrasp.runtime.fetch import fetch
 
 
 @pytest.mark.parametrize("n", [0, 1, 1000])

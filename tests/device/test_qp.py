@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from reference.wrench import cone_forces, is_balanced, residual, unresisted
 from scipy.spatial.transform import Rotation
 
-from lgrasp.device.qp import MAX_CONTACTS, balance, disturbance, frictionless
-from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.math.qp import MAX_CONTACTS, balance, disturbance, frictionless
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 

@@ -4,9 +4,9 @@ import numpy as np
 import warp as wp
 from reference.wrench import epsilon
 
-from lgrasp.device.qp import MAX_CONTACTS
-from lgrasp.device.quality import epsilon_bound
-from lgrasp.device.runtime import KERNEL_OPTIONS
+from lgrasp.math.qp import MAX_CONTACTS
+from lgrasp.math.quality import epsilon_bound
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from lgrasp.device.runtime import resolve_device
 from lgrasp.errors import DeviceError
+from lgrasp.runtime.device import resolve_device
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:
@@ -14,7 +14,7 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_start_is_silent():
-    result = run("from lgrasp.device import resolve_device; print(resolve_device('cpu').alias)")
+    result = run("from lgrasp.runtime.device import resolve_device; print(resolve_device('cpu').alias)")
     assert result.stdout.strip() == "cpu"
     assert result.stderr == ""
 
@@ -22,7 +22,7 @@ def test_start_is_silent():
 def test_other_native_output_during_the_start_is_kept():
     code = """
 import os, warp as wp
-from lgrasp.device import runtime
+from lgrasp.runtime import device as runtime
 init = wp.init
 def noisy():
     os.write(2, b"disk is full\\n")
@@ -37,7 +37,7 @@ os.write(2, b"after\\n")
 def test_error_during_the_start_is_kept():
     code = """
 import os, warp as wp
-from lgrasp.device import runtime
+from lgrasp.runtime import device as runtime
 def broken():
     os.write(2, b"no native library\\n")
     raise RuntimeError("broken install")
@@ -51,7 +51,7 @@ runtime.start()
 
 
 def test_closed_stderr_does_not_stop_the_start():
-    code = "import os; os.close(2); from lgrasp.device import resolve_device; print(resolve_device('cpu').alias)"
+    code = "import os; os.close(2); from lgrasp.runtime.device import resolve_device; print(resolve_device('cpu').alias)"
     assert run(code).stdout.strip() == "cpu"
 
 

@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 from reference.sdf import trilinear, trilinear_gradient
 
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.sdf import Sdf, sdf_gradient, sdf_value
+from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_value
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 

@@ -8,8 +8,7 @@ from reference.directions import normal_bin as reference_bin
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.transforms import (
+from lgrasp.math.transforms import (
     NORMAL_BINS,
     decode_normal,
     encode_normal,
@@ -18,6 +17,7 @@ from lgrasp.device.transforms import (
     rotation_between,
     tangent,
 )
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 

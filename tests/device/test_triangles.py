@@ -5,7 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from lgrasp.device.triangles import least_facing
+from lgrasp.math.triangles import least_facing
 
 
 @wp.kernel

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lgrasp.differentiable.culling import Culling
+from lgrasp.sequence.optimiser.culling import Culling
 
 
 @settings(deadline=None, max_examples=60)

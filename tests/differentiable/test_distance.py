@@ -5,10 +5,10 @@ import pytest
 import torch
 import warp as wp
 
-from lgrasp.device.runtime import KERNEL_OPTIONS, start
-from lgrasp.device.sdf import Sdf, sdf_gradient, sdf_value
 from lgrasp.differentiable.distance import DistanceGrids, SurfaceNormals
+from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_value
 from lgrasp.object.sdf import SdfGrid
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
 wp.set_module_options(KERNEL_OPTIONS)
 

@@ -6,15 +6,15 @@ import torch
 from reference.hands import hand_model
 from scipy.spatial.transform import Rotation
 
-from lgrasp.differentiable.culling import Culling
 from lgrasp.differentiable.distance import DistanceGrids
 from lgrasp.differentiable.kinematics import BodyKinematics
-from lgrasp.differentiable.penetration import PenetrationSums
 from lgrasp.differentiable.solids import RUN, HandPoints, PointSolid, hand_solids, object_solid
 from lgrasp.object.find import find_object
 from lgrasp.object.model import preprocess_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.sdf import SdfGrid
+from lgrasp.sequence.optimiser.culling import Culling
+from lgrasp.sequence.optimiser.penetration import PenetrationSums
 
 
 def ball(radius: float, points: int, cell: float = 0.001) -> PointSolid:

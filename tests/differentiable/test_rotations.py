@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from lgrasp.differentiable.rotations import (
+from lgrasp.geometry.rotations import (
     matrix_from_quaternion,
     matrix_from_sixd,
     quaternion_from_matrix,

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scipy import stats
 
-from lgrasp.differentiable.streams import normals, uniforms
+from lgrasp.runtime.streams import normals, uniforms
 
 
 def test_uniform_normal_and_uncorrelated():

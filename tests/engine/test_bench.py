@@ -6,13 +6,13 @@ from statistics import median
 
 import pytest
 
-from lgrasp.engine import bench as bench_module
-from lgrasp.engine.bench import Bench
-from lgrasp.engine.charts import check_plot, draw_table
-from lgrasp.engine.generate import generate
-from lgrasp.engine.jobs import JobConfig, Published, in_folder, load_config, plan_jobs
-from lgrasp.engine.table1 import measure_table, new_table, read_table, trimmed_mean, with_ratios, without_missing
+from lgrasp.bench import rate as bench_module
+from lgrasp.bench.charts import check_plot, draw_table
+from lgrasp.bench.rate import Bench
+from lgrasp.bench.table1 import measure_table, new_table, read_table, trimmed_mean, with_ratios, without_missing
 from lgrasp.errors import ConfigError, OutputError
+from lgrasp.jobs.config import JobConfig, Published, in_folder, load_config, plan_jobs
+from lgrasp.jobs.generate import generate
 
 QUICK = str(Path(__file__).parents[1] / "cli" / "quick.yaml")
 

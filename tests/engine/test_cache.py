@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lgrasp.engine.cache import Cache, content_key
-from lgrasp.engine.generate import generate
 from lgrasp.errors import CacheError
+from lgrasp.jobs.generate import generate
 
 ARRAYS = {"a": np.arange(40, dtype=np.float32).reshape(8, 5), "text": np.asarray("word"), "none": np.zeros((0, 3))}
 

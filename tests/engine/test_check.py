@@ -8,15 +8,15 @@ import yaml
 from matplotlib import image
 from reference.urdfs import gripper
 
-from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.check import check_hand, check_objects
-from lgrasp.engine.diagnose import diagnose, field_vectors, hand_findings
+from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.workspace import Inputs, input_keys, load_inputs
-from lgrasp.hand.adopt import add_hand
+from lgrasp.hand.drafting.import_urdf import add_hand
+from lgrasp.jobs.hand_check.check import check_hand, check_objects
+from lgrasp.jobs.hand_check.diagnose import diagnose, field_vectors, hand_findings
 from lgrasp.object.find import find_object
 from lgrasp.object.load import load_mesh
+from lgrasp.runtime.device import resolve_device
 
 
 @pytest.fixture(scope="module")

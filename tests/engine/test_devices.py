@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from lgrasp.device.runtime import resolve_device, start
 from lgrasp.engine.batch import run_batch
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.inputs import input_keys, load_inputs
 from lgrasp.engine.pipeline import load_pipeline
-from lgrasp.engine.workspace import input_keys, load_inputs
+from lgrasp.runtime.device import resolve_device, start
 from lgrasp.stages.context import Context
 
 

@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from lgrasp.device.runtime import Device, start
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.pictures import draw_palmar
+from lgrasp.engine.inputs import input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.refine.plan import PlanJob, plan_grasps
-from lgrasp.engine.scenes.config import SceneConfig
-from lgrasp.engine.scenes.job import SceneJob, make_scenes
-from lgrasp.engine.space_check import check_spaces
-from lgrasp.engine.workspace import input_keys, load_inputs
+from lgrasp.hand.drafting.surface_visibility import sample_bodies
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.palmar import sample_bodies
+from lgrasp.jobs.hand_check.pictures import draw_palmar
+from lgrasp.jobs.hand_check.space_check import check_spaces
+from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
+from lgrasp.jobs.scenes.config import SceneConfig
+from lgrasp.jobs.scenes.job import SceneJob, make_scenes
+from lgrasp.runtime.device import Device, start
 
 OTHER = "other"
 JOBS = ("generate", "refine.plan", "scenes.job")

@@ -5,9 +5,9 @@ from reference.judge import judge
 
 from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import Job, generate
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.hand.find import find_hand
+from lgrasp.jobs.generate import Job, generate
 
 
 def test_locked_joints_are_in_the_shard(tmp_path):

@@ -7,8 +7,8 @@ import pytest
 
 from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import Job, generate
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.jobs.generate import Job, generate
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "hands" / "allegro"
 

@@ -8,9 +8,9 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
+from lgrasp.engine.inputs import input_keys, run_key
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
-from lgrasp.engine.stages import ORDERS, STAGES
-from lgrasp.engine.workspace import input_keys, run_key
+from lgrasp.engine.registry import ORDERS, STAGES
 from lgrasp.errors import ConfigError
 from lgrasp.object.find import find_object
 

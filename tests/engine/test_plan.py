@@ -10,13 +10,13 @@ import trimesh
 from reference.jaws import mesh_record
 from reference.judge import Report, judge
 
+from lgrasp.cloud.read import Cloud
 from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.refine.plan import PlanJob, PlanOutcome, plan_grasps
 from lgrasp.errors import ConfigError, ObjectError, OutputError
+from lgrasp.jobs.refine.plan import PlanJob, PlanOutcome, plan_grasps
 from lgrasp.object.find import find_object
-from lgrasp.refine.planning import PlanParams
-from lgrasp.scenes.cloud import Cloud
+from lgrasp.planning.planner import PlanParams
 
 PENETRATION, GAP, CLOUD_GAP, ANGLE = 2.0, 4.0, 6.0, 45.0  # [mm, deg] that docs/refine.md promises
 ROUNDING = 0.1  # [mm] of distance grids; the judge measures meshes

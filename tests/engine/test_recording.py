@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lgrasp.engine.recording import Recorder
+from lgrasp.engine.graphs import Recorder
 from lgrasp.engine.shard import Execution, make_shard
 from lgrasp.grasp.tables import grasp_arrays
 

@@ -12,12 +12,12 @@ from reference.wrench import unresisted
 from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset import GraspRows, Shard, read_shard, validate_shard, write_shard
-from lgrasp.dataset.schema import GRASP_FIELDS
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import Job, generate
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.refine.shards import RefinedShard, Refinement, refine_shards
 from lgrasp.errors import ShardError
+from lgrasp.grasp.schema import GRASP_FIELDS
+from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.refine.shards import RefinedShard, Refinement, refine_shards
 from lgrasp.stages.refine.params import RefineParams
 
 ROWS = 40

@@ -15,14 +15,14 @@ import pytest
 from lgrasp.dataset.files import hold_file
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import Job, Listener, generate
 from lgrasp.errors import ConfigError, OutputError
+from lgrasp.jobs.generate import Job, Listener, generate
 
 CHILD = """
 import os, signal, sys
 from pathlib import Path
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import Job, Listener, generate
+from lgrasp.jobs.generate import Job, Listener, generate
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.field.params import FieldParams
 

@@ -10,11 +10,11 @@ from lgrasp.engine import batch as batch_module
 from lgrasp.engine.bank import BANK_CANDIDATES, Bank
 from lgrasp.engine.batch import run_batch
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import generate
+from lgrasp.engine.registry import STAGES
 from lgrasp.engine.shard import Execution, make_shard
-from lgrasp.engine.stages import STAGES
 from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.tables import grasp_arrays, user_poses
+from lgrasp.jobs.generate import generate
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 
+from lgrasp.cloud.read import read_cloud
 from lgrasp.dataset import pose_matrix, read_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.scenes.config import SceneConfig, load_scene_config, scene_configs
-from lgrasp.engine.scenes.job import SceneJob, SceneListener, SceneOutcome, make_scenes
-from lgrasp.engine.scenes.report import describe_scenes
 from lgrasp.errors import CloudError, ConfigError, LgraspError, OutputError, ShardError
-from lgrasp.scenes.cloud import read_cloud
+from lgrasp.jobs.scenes.config import SceneConfig, load_scene_config, scene_configs
+from lgrasp.jobs.scenes.job import SceneJob, SceneListener, SceneOutcome, make_scenes
+from lgrasp.jobs.scenes.report import describe_scenes
 from lgrasp.scenes.reader import SceneReader, check_scene, read_scene
 from lgrasp.scenes.writer import write_scene
 

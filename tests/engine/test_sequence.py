@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from lgrasp.dataset import read_shard, validate_shard
-from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import Listener
 from lgrasp.engine.pipeline import load_pipeline
-from lgrasp.engine.sequence import round as round_module
-from lgrasp.engine.sequence.inputs import load_sequence_inputs, sequence_keys
-from lgrasp.engine.sequence.job import SequenceJob, generate_sequences
-from lgrasp.engine.sequence.round import run_round
-from lgrasp.engine.sequence.shard import make_sequences
-from lgrasp.engine.sequence.size import Size
 from lgrasp.errors import OutputError
 from lgrasp.grasp.sequences import SequenceTable
+from lgrasp.jobs.generate import Listener
+from lgrasp.jobs.sequence import round as round_module
+from lgrasp.jobs.sequence.inputs import load_sequence_inputs, sequence_keys
+from lgrasp.jobs.sequence.job import SequenceJob, generate_sequences
+from lgrasp.jobs.sequence.round import run_round
+from lgrasp.jobs.sequence.shard import make_sequences
+from lgrasp.jobs.sequence.size import Size
+from lgrasp.runtime.device import resolve_device
 
 OBJECTS = ("sphere", "mug")
 SIZE = Size(0.06, 0.08)

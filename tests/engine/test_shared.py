@@ -8,9 +8,9 @@ from reference.judge import judge
 
 from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import Job, generate
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.hand.find import find_hand
+from lgrasp.jobs.generate import Job, generate
 
 
 @pytest.fixture(scope="module")

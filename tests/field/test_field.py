@@ -7,16 +7,16 @@ from reference.directions import decode, normal_bin
 from reference.hands import hand_model, hand_source, minimal_spec
 from reference.kinematics import link_poses
 
-from lgrasp.device.runtime import KERNEL_OPTIONS, start
-from lgrasp.device.transforms import NORMAL_BINS
 from lgrasp.errors import HandError
 from lgrasp.field.arrays import Field, field_has, field_pick, field_seed, query_field, upload_field
 from lgrasp.field.model import ContactField, build_field
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import Hand, body_poses, upload_hand
 from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.opposition.spaces import space_view
 from lgrasp.hand.pairs import pieces_touch
-from lgrasp.hand.spaces import space_view
+from lgrasp.math.transforms import NORMAL_BINS
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
 wp.set_module_options(KERNEL_OPTIONS)
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lgrasp.device.runtime import start
+from lgrasp.runtime.device import start
 
 
 @pytest.fixture(scope="session", autouse=True)

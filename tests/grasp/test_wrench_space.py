@@ -11,10 +11,10 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from lgrasp.device.qp import MAX_CONTACTS
-from lgrasp.device.quality import epsilon_bound
-from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.grasp.wrench_space import WrenchSpace, primitive_wrenches, wrench_space, wrench_spaces
+from lgrasp.math.qp import MAX_CONTACTS
+from lgrasp.math.quality import epsilon_bound
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 

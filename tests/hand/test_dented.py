@@ -10,15 +10,15 @@ import warp as wp
 from reference.hands import hand_source, minimal_spec
 from reference.solids import ELL, YOU, prism
 
-from lgrasp.decompose import decompose
-from lgrasp.device.runtime import start
 from lgrasp.errors import DecomposeError
 from lgrasp.field.kernels import sample_postures
+from lgrasp.geometry.decompose import decompose
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.geometry import convex_pieces, is_dented
 from lgrasp.hand.model import HandModel, build_hand
 from lgrasp.hand.overlap import OVERLAP
 from lgrasp.hand.urdf import Geometry, Urdf, read_urdf
+from lgrasp.runtime.device import start
 from lgrasp.stages.filter.quality_kernels import self_overlap
 
 FINGER = """<robot name="slot">

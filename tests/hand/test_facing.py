@@ -7,10 +7,10 @@ import pytest
 from reference.hands import FILES, REAL, ROOT, hand_model, hand_source, minimal_spec
 from reference.urdfs import fingers, gripper, turned
 
-from lgrasp.hand.facing import Opening, opposed, space_opening, space_postures
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import build_hand
-from lgrasp.hand.spaces import hand_spaces, space_sides
+from lgrasp.hand.opposition.facing import Opening, opposed, space_opening, space_postures
+from lgrasp.hand.opposition.spaces import hand_spaces, space_sides
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf

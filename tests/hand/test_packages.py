@@ -8,9 +8,9 @@ from reference.hands import ROOT
 from reference.urdfs import gripper
 
 from lgrasp.errors import HandError, ObjectError
+from lgrasp.hand.drafting.packages import PACKAGE_HANDS
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import build_hand
-from lgrasp.hand.packages import PACKAGE_HANDS
 from lgrasp.object.find import find_object
 
 

@@ -7,14 +7,14 @@ import pytest
 from reference.hands import REAL, ROOT
 from reference.urdfs import fingers, gripper, turned
 
-from lgrasp.hand.adopt import add_hand
-from lgrasp.hand.draft import draft_spec
-from lgrasp.hand.flanks import Beside, finger_rows
-from lgrasp.hand.spaces import hand_spaces
+from lgrasp.hand.drafting.draft import draft_spec
+from lgrasp.hand.drafting.import_urdf import add_hand
+from lgrasp.hand.drafting.lateral_surfaces import Beside, finger_rows
+from lgrasp.hand.drafting.write import write_spec
+from lgrasp.hand.opposition.spaces import hand_spaces
 from lgrasp.hand.spec import HandSpec, OppositionSpace, load_spec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.hand.write import write_spec
 
 ALLEGRO = ROOT / "hands" / "allegro" / "hand.urdf"
 # its URDF does not say which finger is which

@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 from lgrasp.errors import HandError
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel, build_hand, hand_digest
-from lgrasp.hand.spaces import Space, available, consumed, free_joints, hand_spaces, longest, space_view
+from lgrasp.hand.opposition.spaces import Space, available, consumed, free_joints, hand_spaces, longest, space_view
 from lgrasp.hand.spec import HandSpec
 
 # index 0-3, middle 4-7, ring 8-11, thumb 12-15

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from lgrasp.dataset.exports.poses import pose_from_matrix
-from lgrasp.differentiable.rotations import so3_exp
-from lgrasp.engine.workspace import Inputs
+from lgrasp.engine.inputs import Inputs
+from lgrasp.geometry.poses import pose_from_matrix
+from lgrasp.geometry.rotations import so3_exp
 from lgrasp.learn.examples import Examples, make_examples, palm_point, partial_clouds
 from lgrasp.learn.measure import measure
 from lgrasp.learn.network import Coarse, CoarseNet, best_answers, seed_frames

@@ -3,7 +3,7 @@
 import pytest
 from reference.jaws import Jaws
 
-from lgrasp.device.runtime import start
+from lgrasp.runtime.device import start
 
 
 @pytest.fixture(scope="session", autouse=True)

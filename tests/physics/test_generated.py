@@ -8,8 +8,8 @@ import pytest
 
 from lgrasp.dataset import GraspRows, ShardReader, read_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import Job, generate
-from lgrasp.physics import PROTOCOLS, Scene, scene_of_shard, verdicts
+from lgrasp.jobs.generate import Job, generate
+from lgrasp.simulate import PROTOCOLS, Scene, scene_of_shard, verdicts
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

@@ -9,11 +9,11 @@ import warp as wp
 from reference.jaws import Jaws
 from reference.twins import in_one_gripper, twin_rows, twin_shard
 
-from lgrasp.device.runtime import start
-from lgrasp.physics import PROTOCOLS, scene_of_shard, verdicts
-from lgrasp.physics.columns import stack_verdicts
-from lgrasp.physics.groups import group_rows
-from lgrasp.physics.model import build_model
+from lgrasp.runtime.device import start
+from lgrasp.simulate import PROTOCOLS, scene_of_shard, verdicts
+from lgrasp.simulate.columns import stack_verdicts
+from lgrasp.simulate.groups import group_rows
+from lgrasp.simulate.model import build_model
 
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed (extra gpu-sim)")
 
@@ -35,7 +35,7 @@ def six(jaws: Jaws):
 
 
 def judge(scene, rows, worlds: int = 8, protocol=FC):
-    from lgrasp.physics.gpu import WorldTrials
+    from lgrasp.simulate.gpu import WorldTrials
 
     (group,) = group_rows(rows, len(scene.objects))
     model = build_model(scene, protocol, rows.q[0], group.objects)
@@ -57,7 +57,7 @@ def test_same_verdicts(six):
 
 def test_a_world_without_room_is_judged_by_mujoco(six, monkeypatch):
     """Rows that need more constraints than there is room for get MuJoCo's own verdict."""
-    from lgrasp.physics import worlds
+    from lgrasp.simulate import worlds
 
     monkeypatch.setattr(worlds, "_CONSTRAINTS", 8)
     here, there = verdicts(*six, FC, all_directions=True), judge(*six)

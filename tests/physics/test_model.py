@@ -9,12 +9,12 @@ from reference.jaws import Jaws, mesh_record, shipped_hand
 from reference.kinematics import link_poses
 from reference.solids import YOU, prism
 
-from lgrasp.decompose import decompose
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import DecomposeError
-from lgrasp.physics import PROTOCOLS, Scene, scene_of_shard, verdicts
-from lgrasp.physics.model import build_model
-from lgrasp.physics.scene import hand_of_record, object_of_record
+from lgrasp.geometry.decompose import decompose
+from lgrasp.simulate import PROTOCOLS, Scene, scene_of_shard, verdicts
+from lgrasp.simulate.model import build_model
+from lgrasp.simulate.scene import hand_of_record, object_of_record
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

@@ -8,7 +8,7 @@ from reference.jaws import EDGE
 from reference.twins import SIDE, in_one_gripper, twin_rows, twin_shard
 
 from lgrasp.dataset import GraspRows, Shard
-from lgrasp.physics import COLUMNS, OBJECT_COLUMNS, PROTOCOLS, scene_of, scene_of_shard, verdicts
+from lgrasp.simulate import COLUMNS, OBJECT_COLUMNS, PROTOCOLS, scene_of, scene_of_shard, verdicts
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

@@ -8,7 +8,7 @@ import pytest
 from reference.jaws import EDGE, Jaws
 
 from lgrasp.errors import ConfigError, PhysicsError
-from lgrasp.physics import COLUMNS, PROTOCOLS, find_protocol, protocol_text, scene_of_shard, verdicts
+from lgrasp.simulate import COLUMNS, PROTOCOLS, find_protocol, protocol_text, scene_of_shard, verdicts
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

@@ -35,7 +35,7 @@ def make(inputs) -> Callable[..., Refiner]:
 @pytest.fixture(scope="session")
 def coarse() -> Callable[..., Pose]:
     """coarse(pose): the poses with noise of 1.5 cm, 15 degrees and 0.15 rad."""
-    from lgrasp.differentiable.rotations import so3_exp
+    from lgrasp.geometry.rotations import so3_exp
 
     def coarse(pose: Pose, seed: int = 0) -> Pose:
         g = torch.Generator().manual_seed(seed)

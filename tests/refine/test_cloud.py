@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from lgrasp.cloud.model import TRUST, cloud_object, sdf_object
 from lgrasp.errors import ObjectError
 from lgrasp.object.sdf import SdfGrid, sample_sdf
-from lgrasp.refine.cloud import TRUST, cloud_object, sdf_object
-from lgrasp.refine.planning import Planner, PlanParams
+from lgrasp.planning.planner import Planner, PlanParams
 
 RADIUS = 0.05
 

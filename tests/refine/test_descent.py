@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from lgrasp.differentiable.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
+from lgrasp.cloud.model import cloud_object
 from lgrasp.errors import HandError
+from lgrasp.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
 from lgrasp.refine import LocalSearch, Pose, Refiner
-from lgrasp.refine.cloud import cloud_object
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands, inverse_poses
 from lgrasp.refine.surface import hand_surface

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from lgrasp.device.runtime import resolve_device, start
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.refine.inputs import named_hand
-from lgrasp.refine.palmar import seen_palmar
+from lgrasp.jobs.refine.inputs import named_hand
+from lgrasp.refine.visible_surface import seen_palmar
+from lgrasp.runtime.device import resolve_device, start
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from lgrasp.differentiable.rotations import so3_exp
+from lgrasp.geometry.rotations import so3_exp
 from lgrasp.refine import Pose
 from lgrasp.refine.check import check_grasps
 from lgrasp.refine.params import GraspBounds

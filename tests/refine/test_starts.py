@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lgrasp.device.runtime import resolve_device
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.refine.inputs import named_hand
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import upload_hand
+from lgrasp.jobs.refine.inputs import named_hand
 from lgrasp.object.find import find_object
 from lgrasp.object.model import preprocess_object
-from lgrasp.refine.planning import Planner, PlanParams
-from lgrasp.refine.starts import palm_axis, start_poses, tilted
+from lgrasp.planning.planner import Planner, PlanParams
+from lgrasp.planning.starts import palm_axis, start_poses, tilted
 from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface, ruled_palmar
+from lgrasp.runtime.device import resolve_device
 
 
 def test_palm_faces_the_point_from_the_stand_off(inputs):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from lgrasp.cloud.read import read_cloud
 from lgrasp.errors import CloudError
-from lgrasp.scenes.cloud import read_cloud
 
 CENTRE = np.array([0.1, -0.2, 0.7])
 RADIUS = 0.05

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import yaml
 
-from lgrasp.engine.scenes.config import SceneConfig
-from lgrasp.scenes.cloud_files import CLOUD_SUFFIXES
+from lgrasp.cloud.files import CLOUD_SUFFIXES
+from lgrasp.jobs.scenes.config import SceneConfig
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")

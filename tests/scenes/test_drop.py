@@ -6,9 +6,9 @@ import trimesh
 
 from lgrasp.dataset import pose_matrix
 from lgrasp.errors import PhysicsError
-from lgrasp.physics.solid import Solid
 from lgrasp.scenes.drop import drop
 from lgrasp.scenes.params import DropParams
+from lgrasp.simulate.solid import Solid
 
 SIDES = np.array([0.05, 0.07, 0.1])
 SHIFT = np.array([0.01, -0.02, 0.03])  # of the box in its own frame

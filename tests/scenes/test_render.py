@@ -6,7 +6,7 @@ import trimesh
 import warp as wp
 
 from lgrasp.dataset import pose_matrix
-from lgrasp.device.runtime import start
+from lgrasp.runtime.device import start
 from lgrasp.scenes.camera import Intrinsics, intrinsics_of, look_at, place_cameras
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.render import NOTHING, TABLE, LabelledMesh, image_normals, join_surfaces, render, table_surface

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from lgrasp.dataset import pose_matrix
-from lgrasp.engine.workspace import Inputs
+from lgrasp.engine.inputs import Inputs
 from lgrasp.hand.arrays import body_poses, pose_matrices
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import preprocess_object

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from lgrasp.engine.pipeline import pipeline_files
-from lgrasp.engine.stages import OPTIONAL, ORDERS, STAGES
+from lgrasp.engine.registry import OPTIONAL, ORDERS, STAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "pipeline.md"

@@ -10,9 +10,9 @@ from lgrasp.dataset.exports.folder import GRASPS, OBJECTS, open_folder
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_object
 from lgrasp.dataset.exports.plan import Plan
-from lgrasp.dataset.exports.poses import compose, inverse
 from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order_of
 from lgrasp.errors import ShardError
+from lgrasp.geometry.poses import compose, inverse
 
 __all__ = ["DEXGRASPBENCH_NOTES", "read_dexgraspbench", "write_dexgraspbench"]
 

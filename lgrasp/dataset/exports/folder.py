@@ -14,9 +14,9 @@ import lgrasp
 from lgrasp.dataset.exports.files import write_file
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.plan import ExportObject, Plan
-from lgrasp.dataset.exports.poses import inverse
 from lgrasp.dataset.exports.records import ReadObject
 from lgrasp.errors import ShardError
+from lgrasp.geometry.poses import inverse
 
 __all__ = ["GRASPS", "HAND", "OBJECTS", "ExportFolder", "object_text", "open_folder", "write_assets", "write_index"]
 

@@ -9,9 +9,9 @@ import numpy as np
 import yourdfpy
 from lxml import etree
 
-from lgrasp.dataset.exports.poses import compose, inverse, pose_from_matrix
-from lgrasp.dataset.records import HandRecord
 from lgrasp.errors import ShardError
+from lgrasp.geometry.poses import compose, inverse, pose_from_matrix
+from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.urdf import parse_robot
 
 __all__ = ["HandFrames", "hand_files"]

@@ -12,9 +12,9 @@ from lgrasp.dataset.exports.files import writing
 from lgrasp.dataset.exports.folder import GRASPS, open_folder
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.plan import Batch, Plan
-from lgrasp.dataset.exports.poses import inverse
 from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order_of
 from lgrasp.errors import ShardError
+from lgrasp.geometry.poses import inverse
 
 __all__ = ["ISAAC_GRASP_NOTES", "read_isaac_grasp", "write_isaac_grasp"]
 

@@ -14,10 +14,10 @@ from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, object_text, op
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.mjcf_scene import Keyframe, MjcfScene, SceneObject
 from lgrasp.dataset.exports.plan import Batch, Plan
-from lgrasp.dataset.exports.poses import inverse
 from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order_of
-from lgrasp.dataset.records import ObjectRecord
 from lgrasp.errors import ShardError
+from lgrasp.geometry.poses import inverse
+from lgrasp.grasp.records import ObjectRecord
 
 __all__ = ["MJCF_NOTES", "Cut", "MjcfWriter", "read_mjcf"]
 

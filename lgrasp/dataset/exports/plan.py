@@ -10,9 +10,9 @@ import numpy as np
 
 from lgrasp.dataset.exports.where import OBJECTS_HELD, Condition
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.records import HandRecord, ObjectRecord
-from lgrasp.dataset.schema import CHUNK_ROWS
 from lgrasp.errors import ShardError
+from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.grasp.schema import CHUNK_ROWS
 
 __all__ = ["HOLDS", "Batch", "ExportObject", "Plan", "make_plan"]
 

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lgrasp.dataset.exports.poses import canonical
-from lgrasp.dataset.records import GraspRows
 from lgrasp.errors import ShardError
+from lgrasp.geometry.poses import canonical
+from lgrasp.grasp.records import GraspRows
 
 __all__ = ["GraspSet", "ReadObject", "make_set", "order_of"]
 

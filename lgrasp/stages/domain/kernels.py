@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.field.arrays import Boxes, Field, boxes_pick, field_has, field_pick, field_seed
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.hand.arrays import Hand
+from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["draw_domains", "draw_domains_bvh", "drop_poor", "keep_frozen"]
 

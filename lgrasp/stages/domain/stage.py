@@ -4,9 +4,9 @@ import math
 
 import warp as wp
 
-from lgrasp.device.kinematics import vec_dof
 from lgrasp.grasp.tables import CandidateTable, PoseTable
-from lgrasp.grasp.tally import Tally, empty_tally
+from lgrasp.math.kinematics import vec_dof
+from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.domain.kernels import draw_domains, draw_domains_bvh, drop_poor, keep_frozen
 from lgrasp.stages.domain.params import DomainParams

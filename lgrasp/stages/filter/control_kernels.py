@@ -2,14 +2,14 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_BODIES, group_forward, vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.grasp.clearance import body_apart
+from lgrasp.grasp.collision import body_apart
 from lgrasp.grasp.control import press_contact, shift_contact
 from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.hand.arrays import Hand
-from lgrasp.hand.clearance import group_pairs_clear
+from lgrasp.hand.self_collision import group_pairs_clear
+from lgrasp.math.kinematics import MAX_BODIES, group_forward, vec_dof
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["control_poses", "open_poses"]
 

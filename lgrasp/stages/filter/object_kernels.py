@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.grasp.clearance import body_depth, objects_apart
+from lgrasp.grasp.collision import body_depth, objects_apart
 from lgrasp.grasp.held import Held, body_depth_in_held, group_fixed
 from lgrasp.hand.arrays import Hand
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["deepen", "deepen_held"]
 

@@ -2,15 +2,15 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import clamp_dofs, group_forward, vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.triangles import least_facing
 from lgrasp.field.arrays import Field, field_seed
-from lgrasp.grasp.clearance import body_clear
+from lgrasp.grasp.collision import body_clear
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.hand.arrays import Hand
-from lgrasp.hand.clearance import group_pairs_clear
+from lgrasp.hand.self_collision import group_pairs_clear
+from lgrasp.math.kinematics import clamp_dofs, group_forward, vec_dof
+from lgrasp.math.triangles import least_facing
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["fill_unused", "place_used"]
 

@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from lgrasp.device.qp import MAX_CONTACTS, balance, unresisted
-from lgrasp.device.quality import epsilon_bound
-from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
-from lgrasp.hand.clearance import overlap_depth
+from lgrasp.hand.self_collision import overlap_depth
+from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted
+from lgrasp.math.quality import epsilon_bound
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = [
     "balance_grasps",

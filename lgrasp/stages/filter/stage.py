@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.device.kinematics import vec_dof
-from lgrasp.device.scan import running_sums
 from lgrasp.grasp.tables import ContactSets, GraspTable, trim_sets
-from lgrasp.grasp.tally import Tally, empty_tally, read_tallies
+from lgrasp.math.kinematics import vec_dof
+from lgrasp.runtime.scan import running_sums
+from lgrasp.runtime.tally import Tally, empty_tally, read_tallies
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.control_kernels import control_poses, open_poses
 from lgrasp.stages.filter.object_kernels import deepen, deepen_held

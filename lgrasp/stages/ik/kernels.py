@@ -2,15 +2,15 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.sdf import sdf_gradient
 from lgrasp.field.arrays import Field
-from lgrasp.grasp.clearance import body_clear
+from lgrasp.grasp.collision import body_clear
 from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.hand.arrays import Hand, hand_grid
-from lgrasp.hand.clearance import group_pairs_clear
+from lgrasp.hand.self_collision import group_pairs_clear
+from lgrasp.math.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["avoid_held", "flag_realised", "mark_chosen", "realise_contacts", "take_realised"]
 

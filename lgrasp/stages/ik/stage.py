@@ -4,9 +4,9 @@ import math
 
 import warp as wp
 
-from lgrasp.device.scan import running_sums
 from lgrasp.grasp.tables import CandidateTable, ContactSets
-from lgrasp.grasp.tally import Tally, empty_tally
+from lgrasp.runtime.scan import running_sums
+from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.ik.kernels import avoid_held, flag_realised, mark_chosen, realise_contacts, take_realised
 from lgrasp.stages.ik.params import IkParams

@@ -3,13 +3,13 @@
 import numpy as np
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.transforms import random_rotation, rotation_between
 from lgrasp.field.arrays import Field, field_has, field_pair, field_seed
-from lgrasp.grasp.clearance import body_clear, body_depth
+from lgrasp.grasp.collision import body_clear, body_depth
 from lgrasp.hand.arrays import Hand
+from lgrasp.math.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward
+from lgrasp.math.transforms import random_rotation, rotation_between
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["choose_poses", "propose_poses", "take_poses"]
 

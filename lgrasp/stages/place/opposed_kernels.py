@@ -2,14 +2,14 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_JOINTS, group_forward
-from lgrasp.device.runtime import KERNEL_OPTIONS
-from lgrasp.device.transforms import rotation_between
 from lgrasp.field.arrays import Field, field_has, field_seed
-from lgrasp.grasp.clearance import body_clear, objects_apart
+from lgrasp.grasp.collision import body_clear, objects_apart
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.hand.arrays import Hand
+from lgrasp.math.kinematics import MAX_JOINTS, group_forward
+from lgrasp.math.transforms import rotation_between
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 __all__ = ["propose_opposed"]
 

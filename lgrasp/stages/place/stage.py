@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from lgrasp.device.scan import running_sums
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import PoseTable
-from lgrasp.grasp.tally import Tally, empty_tally
+from lgrasp.runtime.scan import running_sums
+from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
 from lgrasp.stages.place.opposed_kernels import propose_opposed

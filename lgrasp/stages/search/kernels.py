@@ -4,12 +4,12 @@ from typing import Any
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward, vec_dof
-from lgrasp.device.qp import MAX_CONTACTS, balance, disturbance, frictionless
-from lgrasp.device.runtime import KERNEL_OPTIONS
 from lgrasp.hand.arrays import Hand
-from lgrasp.hand.clearance import group_pairs_clear
+from lgrasp.hand.self_collision import group_pairs_clear
+from lgrasp.math.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward, vec_dof
+from lgrasp.math.qp import MAX_CONTACTS, balance, disturbance, frictionless
 from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.search.params import MAX_KINDS
 
 __all__ = [

@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from lgrasp.device.kinematics import MAX_GROUPS
-from lgrasp.device.scan import running_sums
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import CandidateTable, ContactSets
-from lgrasp.grasp.tally import Tally, empty_tally
+from lgrasp.math.kinematics import MAX_GROUPS
+from lgrasp.runtime.scan import running_sums
+from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.search.kernels import (
     MAX_KEEP,

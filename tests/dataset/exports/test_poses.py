@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset.exports.poses import (
+from lgrasp.geometry.poses import (
     canonical,
     compose,
     euler_from_quaternion,

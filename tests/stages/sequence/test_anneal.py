@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from lgrasp.differentiable.streams import uniforms
-from lgrasp.stages.sequence.anneal import Annealing, Chain, accepted, run_chain
-from lgrasp.stages.sequence.anneal_params import OptimiserParams
+from lgrasp.runtime.streams import uniforms
+from lgrasp.sequence.optimiser.anneal import Annealing, Chain, accepted, run_chain
+from lgrasp.sequence.optimiser.params import OptimiserParams
 
 LEVELS = torch.tensor([0.0, 0.3, 0.8, 1.0, 2.5])
 

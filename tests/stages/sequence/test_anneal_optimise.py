@@ -8,16 +8,16 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from lgrasp.differentiable.streams import uniforms
 from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import build_hand
-from lgrasp.hand.spaces import hand_spaces, space_view
+from lgrasp.hand.opposition.spaces import hand_spaces, space_view
 from lgrasp.object.model import preprocess_object
 from lgrasp.object.params import ObjectParams
-from lgrasp.stages.sequence.anneal_optimise import Optimised, optimise
-from lgrasp.stages.sequence.anneal_params import OptimiserParams
-from lgrasp.stages.sequence.anneal_start import start_poses
+from lgrasp.runtime.streams import uniforms
+from lgrasp.sequence.optimiser.optimise import Optimised, optimise
+from lgrasp.sequence.optimiser.params import OptimiserParams
+from lgrasp.sequence.optimiser.start import start_poses
 
 SHORT = OptimiserParams(
     iterations=300,

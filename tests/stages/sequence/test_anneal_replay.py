@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from lgrasp.differentiable.culling import Culling
-from lgrasp.stages.sequence.anneal_replay import replayed
+from lgrasp.sequence.optimiser.culling import Culling
+from lgrasp.sequence.optimiser.replay import replayed
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
 

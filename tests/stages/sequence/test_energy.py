@@ -7,11 +7,11 @@ import trimesh
 from reference.hands import hand_model
 from scipy.spatial.transform import Rotation
 
-from lgrasp.differentiable.rotations import se3_exp
+from lgrasp.geometry.rotations import se3_exp
 from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
 from lgrasp.object.model import ObjectModel, preprocess_object
 from lgrasp.object.params import ObjectParams
-from lgrasp.stages.sequence.energy import TERMS, GraspEnergy, HandContacts
+from lgrasp.sequence.optimiser.energy import TERMS, GraspEnergy, HandContacts
 
 PARAMS = ObjectParams(sdf_cells=48**3, obstacle_count=2048, contact_count=256)
 

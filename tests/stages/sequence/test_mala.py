@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from lgrasp.differentiable.rotations import so3_exp
-from lgrasp.stages.sequence.anneal import run_chain
-from lgrasp.stages.sequence.mala import Langevin
+from lgrasp.geometry.rotations import so3_exp
+from lgrasp.sequence.optimiser.anneal import run_chain
+from lgrasp.sequence.optimiser.mala import Langevin
 
 
 def sample(evaluate, moved, x: torch.Tensor, scale, T: float, steps: int) -> torch.Tensor:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lgrasp.grasp.sequences import empty_sequences
-from lgrasp.hand.spaces import Space, longest
-from lgrasp.stages.sequence.policy import space_orders
+from lgrasp.hand.opposition.spaces import Space, longest
+from lgrasp.sequence.policy import space_orders
 
 JOINTS = 16
 FINGERS = {"index": range(4), "middle": range(4, 8), "ring": range(8, 12), "thumb": range(12, 16)}

@@ -8,14 +8,14 @@ import pytest
 from lgrasp.dataset import read_shard
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.generate import generate
-from lgrasp.engine.records import make_scene, mesh_blobs, object_record
 from lgrasp.errors import ConfigError, OutputError, PhysicsError
 from lgrasp.grasp.tables import GraspTable, grasp_arrays
-from lgrasp.physics import COLUMNS, PROTOCOLS, scene_of_shard, verdicts
+from lgrasp.jobs.generate import generate
+from lgrasp.jobs.records import make_scene, mesh_blobs, object_record
+from lgrasp.simulate import COLUMNS, PROTOCOLS, scene_of_shard, verdicts
 from lgrasp.stages.context import Context
-from lgrasp.stages.validate.params import ValidateParams
-from lgrasp.stages.validate.stage import run
+from lgrasp.stages.simulate.params import ValidateParams
+from lgrasp.stages.simulate.stage import run
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

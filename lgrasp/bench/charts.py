@@ -1,0 +1,94 @@
+"""A benchmark table as bars, without a display."""
+
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+from lgrasp.dataset.files import new_file
+from lgrasp.engine.report import check_json
+from lgrasp.errors import OutputError
+
+__all__ = ["check_plot", "draw_table"]
+
+_COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#9467bd")
+_PUBLISHED = "#b0b0b0"
+_BARS = 0.84  # of the distance between two objects
+
+
+def check_plot(path: Path) -> None:
+    """Could a plot be written there? To be asked before a long job.
+
+    Raises:
+        OutputError: not a .png, a folder, or a place that cannot be written.
+    """
+    if path.suffix.lower() != ".png":
+        raise OutputError(f"--plot {path}: the plot is a PNG; name a file that ends in .png")
+    check_json(path)
+
+
+def draw_table(table: dict[str, Any], path: Path) -> None:
+    """One picture per hand in one PNG: strict-valid grasps per second of each object, on a log scale.
+
+    One bar per pipeline with whiskers from the lowest to the highest run, and the published figure beside them.
+
+    Args:
+        table: of :func:`lgrasp.bench.table1.measure_table`.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg", force=False)
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    hands = [mean["hand"] for mean in table["means"]]
+    across = min(2, max(1, len(hands)))
+    down = max(1, -(-len(hands) // across))
+    lowest = min(_lowest(cell) for cell in table["cells"])
+    figure = Figure(figsize=(1.6 + 6.4 * across, 1.2 + 3.6 * down), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    for i, hand in enumerate(hands):
+        axes = figure.add_subplot(down, across, i + 1)
+        _draw_hand(axes, table, [cell for cell in table["cells"] if cell["hand"] == hand and not cell["error"]])
+        axes.set_title(hand)
+        axes.set_ylim(bottom=10 ** math.floor(math.log10(lowest)))
+    settings = table["settings"]
+    figure.suptitle(f"strict-valid grasps per second, {settings['device']}, median of {settings['repeat']}")
+    if hands:
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    with new_file(path) as file:
+        file.write(data.getvalue())
+
+
+def _lowest(cell: dict[str, Any]) -> float:
+    """The lowest rate above zero in a cell, measured or published; 1 if there is none."""
+    rates = [run["strict_valid_per_s"]["min"] for run in cell["pipelines"].values()]
+    return min((rate for rate in [*rates, cell["published_per_s"]] if rate), default=1.0)
+
+
+def _draw_hand(axes: Any, table: dict[str, Any], cells: list[dict[str, Any]]) -> None:
+    names = table["settings"]["pipelines"]
+    published = table["published"]
+    width = _BARS / (len(names) + bool(published))
+    for k, name in enumerate(names):
+        rates = [c["pipelines"][name]["strict_valid_per_s"] for c in cells]
+        middle = [rate["median"] for rate in rates]
+        spread = [[r["median"] - r["min"] for r in rates], [r["max"] - r["median"] for r in rates]]
+        at = [i + (k + 0.5) * width - _BARS / 2 for i in range(len(cells))]
+        axes.bar(
+            at, middle, width, yerr=spread, color=_COLOURS[k % len(_COLOURS)], label=name, error_kw={"elinewidth": 0.8}
+        )
+    if published:
+        at = [i + _BARS / 2 - width / 2 for i in range(len(cells))]
+        figures = [c["published_per_s"] or 0.0 for c in cells]
+        axes.bar(at, figures, width, color=_PUBLISHED, label=f"published, {published['device']}")
+    axes.set_yscale("log")
+    axes.set_xticks(range(len(cells)), [c["object"] for c in cells], rotation=30, ha="right")
+    axes.grid(axis="y", which="major", alpha=0.4)
+    axes.set_axisbelow(True)

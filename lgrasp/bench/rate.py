@@ -1,0 +1,110 @@
+"""Pipelines side by side on several objects, in one run on one device."""
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.report import report
+from lgrasp.jobs.generate import Job, Outcome, generate
+
+__all__ = ["Bench"]
+
+_MEASURED = ("strict_valid_per_s", "seed_count_per_s")
+_INPUTS = ("object", "field")
+_PROBE_ROWS = 256  # and at most a tenth of the rows
+Progress = Callable[[str], None]
+
+
+class Bench:
+    """Runs jobs in a temporary folder and cache; nothing is left behind when the block ends.
+
+    Hands, objects and fields are made once, which gives their building time, and loaded from the temporary cache after.
+    """
+
+    def __init__(self) -> None:
+        self._built: dict[str, dict[str, float]] = {kind: {} for kind in _INPUTS}
+
+    def __enter__(self) -> "Bench":
+        self._folder = tempfile.TemporaryDirectory(prefix="lgrasp-bench-")
+        self._cache = Cache(Path(self._folder.name) / "cache")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.discard()
+
+    def discard(self) -> None:
+        """Remove the temporary folder, whatever still runs in it."""
+        shutil.rmtree(self._folder.name, ignore_errors=True)
+        self._folder.cleanup()
+
+    def measure(self, jobs: list[Job], repeat: int, progress: Progress | None = None) -> list[dict[str, Any]]:
+        """Run each job ``repeat`` times, in turns, and report the middle and the spread.
+
+        A small run comes first, untimed: it makes the inputs, loads the kernels and tells the rows to expect per
+        candidate, by which a GPU's first batch is sized; every run hands what it measured to the next run of its job,
+        as the shards of a long run do.
+
+        Args:
+            jobs: what is compared; their folders and caches are not used.
+            progress: called with one line before each run.
+
+        Returns:
+            For each job ``pipeline``, ``hand``, ``object``, ``grasps``, ``device``; each rate as ``median``, ``min``,
+            ``max``; ``seconds`` and ``survivors`` of the middle run; ``build_seconds`` and ``load_seconds`` of
+            object and field; ``near_duplicates``, ``distinct_poses``, ``starved``, ``peak_rss_mb``.
+
+        Raises:
+            LgraspError: bad input.
+        """
+        say = progress or (lambda line: None)
+        jobs = [self._probed(job, say) for job in jobs]
+        runs: list[list[dict[str, Any]]] = [[] for _ in jobs]
+        for turn in range(repeat):
+            for number, job in enumerate(jobs):
+                say(f"run {turn + 1}/{repeat}: {job.pipeline.name}, {Path(job.object).stem}, {job.rows:,} rows")
+                data, outcome = self._run(job)
+                jobs[number] = replace(job, rate=outcome.rate)
+                runs[number].append(data)
+        return [_summary(found, self._built) for found in runs]
+
+    def _probed(self, job: Job, say: Progress) -> Job:
+        """The job with the rows per candidate of a run of a few rows."""
+        rows = max(1, min(_PROBE_ROWS, job.rows // 10))
+        say(f"untimed: {job.pipeline.name}, {Path(job.object).stem}, {rows:,} rows")
+        _, outcome = self._run(replace(job, rows=rows))
+        return replace(job, rate=outcome.rate)
+
+    def _run(self, job: Job) -> tuple[dict[str, Any], Outcome]:
+        with tempfile.TemporaryDirectory(dir=self._folder.name) as out:
+            trial = replace(job, out=Path(out), cache=self._cache, resume=False)
+            outcome = generate(trial)
+            data = report(trial, outcome)
+        data["keys"] = {kind: getattr(outcome.inputs.keys, kind) for kind in _INPUTS}
+        for kind, key in data["keys"].items():
+            if not outcome.inputs.hits[kind]:
+                self._built[kind][key] = data["seconds"][kind]
+        return data, outcome
+
+
+def _summary(runs: list[dict[str, Any]], built: dict[str, dict[str, float]]) -> dict[str, Any]:
+    middle = sorted(runs, key=lambda data: data["strict_valid_per_s"])[len(runs) // 2]
+    same = ("pipeline", "hand", "object", "grasps", "device", "survivors", "counts")
+    last = ("near_duplicates", "distinct_poses", "starved", "peak_device_mb")
+    return {
+        **{name: middle[name] for name in same},
+        **{name: _spread([data[name] for data in runs]) for name in _MEASURED},
+        "seconds": middle["seconds"],
+        "build_seconds": {kind: built[kind].get(key, 0.0) for kind, key in middle["keys"].items()},
+        "load_seconds": {kind: min(data["seconds"][kind] for data in runs) for kind in built},
+        **{name: middle[name] for name in last},
+        "peak_rss_mb": max(data["peak_rss_mb"] for data in runs),
+    }
+
+
+def _spread(values: list[float]) -> dict[str, float]:
+    return {"median": median(values), "min": min(values), "max": max(values)}

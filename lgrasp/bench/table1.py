@@ -1,0 +1,201 @@
+"""The published comparison: hands x objects, pipelines in turn in one run on one device, beside published figures."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import lgrasp
+from lgrasp.bench.rate import Bench
+from lgrasp.engine.cache import Cache
+from lgrasp.errors import ConfigError, LgraspError, ObjectError
+from lgrasp.jobs.config import JobConfig, in_folder, plan_jobs
+from lgrasp.jobs.generate import Job
+from lgrasp.object.find import find_object
+from lgrasp.runtime.device import resolve_device
+
+__all__ = ["measure_table", "new_table", "read_table", "trimmed_mean", "with_ratios", "without_missing"]
+
+Table = dict[str, Any]
+Cell = dict[str, Any]
+
+
+def new_table(config: JobConfig, *, repeat: int, baseline_rows: int) -> Table:
+    """A table without cells: what is going to be measured, and how.
+
+    Returns:
+        ``settings`` (two tables can be joined if theirs agree), ``hands``, ``objects``, ``published``, ``complete``,
+        ``cells`` and ``means`` (both still empty).
+
+    Raises:
+        ConfigError: two hands, objects or pipelines of one name.
+        DeviceError: the device does not exist.
+    """
+    pipelines, hands, objects = (
+        _names(kind, given)
+        for kind, given in (("pipeline", config.pipelines), ("hand", config.hands), ("object", config.objects))
+    )
+    settings = {
+        "lgrasp": lgrasp.__version__,
+        "device": resolve_device(config.device).name,
+        "pipelines": pipelines,
+        "rows": config.rows,
+        "baseline_rows": baseline_rows,
+        "repeat": repeat,
+        "shard_rows": config.shard_rows,
+        "seed": config.seed,
+        "workers": config.workers,
+        "hand_dir": config.hand_dir and str(config.hand_dir),
+        "object_dir": config.object_dir and str(config.object_dir),
+    }
+    return {
+        "settings": settings,
+        "hands": hands,
+        "objects": objects,
+        "published": config.published and config.published.model_dump(mode="json"),
+        "cells": [],
+        "means": [],
+        "complete": False,
+    }
+
+
+def _names(kind: str, given: tuple[str, ...]) -> list[str]:
+    names = [Path(name).stem for name in given]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ConfigError(f"bench table1: {kind} '{twice[0]}' is named twice; each needs a name of its own")
+    return names
+
+
+def without_missing(config: JobConfig) -> tuple[JobConfig, list[str]]:
+    """The config with the objects that are here, and the names of those that are not."""
+    missing = []
+    for mesh in config.objects:
+        try:
+            find_object(in_folder(config.object_dir, mesh))
+        except ObjectError:
+            missing.append(mesh)
+    kept = tuple(mesh for mesh in config.objects if mesh not in missing)
+    return config.model_copy(update={"objects": kept}) if kept else config, missing
+
+
+def read_table(path: Path, wanted: Table) -> Table:
+    """The table that is wanted, with the cells that an earlier run of the same settings left in a file.
+
+    Raises:
+        ConfigError: the file is no such table, or one of other settings.
+    """
+    if not path.exists():
+        return wanted
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        was = found["settings"] | {"hands": found["hands"], "objects": found["objects"]}
+        cells = [cell for cell in found["cells"] if not cell["error"]]
+    except (OSError, ValueError, TypeError, KeyError):
+        raise ConfigError(f"--resume: {path} is no table of lgrasp bench table1; remove it or name another") from None
+    for name, value in (wanted["settings"] | {"hands": wanted["hands"], "objects": wanted["objects"]}).items():
+        if was.get(name) != value:
+            raise ConfigError(
+                f"--resume: {path} was measured with {name} {was.get(name)}, not {value}; name another file"
+            )
+    return with_ratios(wanted | {"cells": cells})
+
+
+def measure_table(
+    bench: Bench,
+    table: Table,
+    config: JobConfig,
+    cache: Cache,
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> Iterator[tuple[Table, Cell]]:
+    """Measure the cells that a table lacks; the table so far and its newest cell come back after each.
+
+    A cell is one hand and one object: all pipelines in turn, ``repeat`` times. Pipelines after the first are baselines
+    and run ``baseline_rows`` rows. A cell that cannot be measured says why in ``error`` and does not stop the others.
+
+    Raises:
+        ConfigError: see :func:`plan_jobs`.
+    """
+    settings = table["settings"]
+    count = len(config.pipelines)
+    jobs = plan_jobs(config, cache)
+    # plan_jobs: pipeline, hand, object; here all pipelines of a hand and object go together
+    pairs = [(hand, mesh) for hand in table["hands"] for mesh in table["objects"]]
+    done = {(cell["hand"], cell["object"]) for cell in table["cells"]}
+    for number, (hand, mesh) in enumerate(pairs):
+        if (hand, mesh) in done:
+            continue
+        cell_jobs = [
+            job if k == 0 else replace(job, rows=settings["baseline_rows"])
+            for k, job in enumerate(jobs[number + k * len(pairs)] for k in range(count))
+        ]
+        cell = _cell(bench, cell_jobs, settings, progress) | {"hand": hand, "object": mesh}
+        table = with_ratios(table | {"cells": [*table["cells"], cell]})
+        yield table, cell
+
+
+def _cell(bench: Bench, jobs: list[Job], settings: dict[str, Any], progress: Callable[[str], None] | None) -> Cell:
+    runs: list[dict[str, Any]] = []
+    error = ""
+    try:
+        runs = bench.measure(jobs, settings["repeat"], progress)
+    except LgraspError as problem:
+        error = str(problem)
+    source = {"hand_from": jobs[0].hand, "object_from": jobs[0].object}
+    asked = {name: job.rows for name, job in zip(settings["pipelines"], jobs, strict=True)}
+    by_name = dict(zip(settings["pipelines"], runs, strict=False))
+    return {"hand": "", "object": "", **source, "asked": asked, "error": error, "pipelines": by_name}
+
+
+def with_ratios(table: Table) -> Table:
+    """The table with the ratios of its cells, the means of its hands and whether it is complete, all counted anew."""
+    names = table["settings"]["pipelines"]
+    published = (table["published"] or {}).get("per_s", {})
+    cells = []
+    for cell in sorted(
+        table["cells"], key=lambda c: (table["hands"].index(c["hand"]), table["objects"].index(c["object"]))
+    ):
+        rates = {name: run["strict_valid_per_s"]["median"] for name, run in cell["pipelines"].items()}
+        figure = published.get(cell["hand"], {}).get(cell["object"])
+        cells.append(cell | {"published_per_s": figure} | _ratios(names, rates, figure))
+    means = [_means(hand, names, [c for c in cells if c["hand"] == hand and not c["error"]]) for hand in table["hands"]]
+    return table | {
+        "cells": cells,
+        "means": [mean for mean in means if mean],
+        "complete": len(cells) == len(table["hands"]) * len(table["objects"]),
+    }
+
+
+def _ratios(names: list[str], rates: dict[str, float], figure: float | None) -> dict[str, Any]:
+    """First pipeline over each other one, and each pipeline over the published figure; None where there is nothing."""
+    return {
+        "ratio": {name: _over(rates.get(names[0]), rates.get(name)) for name in names[1:]},
+        "published_ratio": {name: _over(rates.get(name), figure) for name in names},
+    }
+
+
+def _means(hand: str, names: list[str], cells: list[Cell]) -> dict[str, Any]:
+    """Trimmed means of a hand over its cells; the published ones over the same cells, if it has all of them."""
+    if not cells:
+        return {}
+    rates = {name: trimmed_mean([_rate(cell, name) for cell in cells]) for name in names}
+    figures = [cell["published_per_s"] for cell in cells]
+    figure = None if None in figures else trimmed_mean(figures)
+    whole = {"hand": hand, "cells": len(cells), "strict_valid_per_s": rates, "published_per_s": figure}
+    return whole | _ratios(names, rates, figure)
+
+
+def _rate(cell: Cell, name: str) -> float:
+    return cell["pipelines"][name]["strict_valid_per_s"]["median"]
+
+
+def _over(a: float | None, b: float | None) -> float | None:
+    return a / b if a is not None and b else None
+
+
+def trimmed_mean(values: list[float]) -> float:
+    """Mean without the highest and the lowest of three or more values; of fewer, the mean."""
+    return fmean(sorted(values)[1:-1] if len(values) > 2 else values)

@@ -1,0 +1,216 @@
+"""Point clouds and distance grids as objects: models without faces that all else takes for an object."""
+
+import hashlib
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lgrasp.errors import ObjectError
+from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
+from lgrasp.object.model import ObjectModel
+
+__all__ = ["TRUST", "cloud_object", "sdf_object"]
+
+TRUST = 0.02
+"""Behind what was seen, the sign of distances is known to this depth [m]; what lies deeper counts as neither."""
+
+_LEAST_POINTS, _MOST_POINTS = 32, 8192
+_EXTENT = (0.005, 2.0)  # [m]
+_NEIGHBOURS, _LEAST_WIDE, _WIDE = 24, 48, 128
+_CLEAN = 0.001  # [m]
+_PLANES, _EDGE = 12, 0.5  # points that tell a distance; cosine of faces that meet in an edge
+_PASSES, _KEPT = 4, 0.95  # over noisy clouds
+_SAME_SIDE = 0.7  # cosine
+_PAD = 0.016
+_MOST_NODES, _LEAST_CELL = 250_000, 0.0015
+_CONTACTS = 4096
+
+
+def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud", centred: bool = True) -> ObjectModel:
+    """An ObjectModel without faces from points of a surface, perhaps of one side only.
+
+    Distances are those to planes through the nearest points, so that noise averages out; inside they are negative to
+    the depth TRUST, and positive beyond: what nobody saw is no obstacle, and nothing to touch either. The centre of
+    mass is the mean of the points.
+
+    Args:
+        points: (n, 3) [m]. normals: outward, (n, 3).
+        centred: else the internal frame is that of the points.
+
+    Raises:
+        ObjectError: too few points, not finite, a size that no hand grasps, normals that do not match.
+    """
+    points = np.asarray(points, float)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ObjectError(f"cloud '{name}': points of shape {list(points.shape)}; need [n, 3]")
+    bad = int((~np.isfinite(points).all(1)).sum())
+    if bad:
+        raise ObjectError(f"cloud '{name}': {bad} of {len(points)} points are NaN or infinite; drop them first")
+    if len(points) < _LEAST_POINTS:
+        raise ObjectError(f"cloud '{name}' has {len(points)} points; at least {_LEAST_POINTS} are needed")
+    _check_size(f"cloud '{name}'", points)
+    digest = hashlib.sha256(np.ascontiguousarray(points).tobytes())
+    keep = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
+    normals = np.asarray(normals, float)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    if normals.shape != points.shape or not (np.isfinite(length) & (length > 1e-6)).all():
+        raise ObjectError(f"cloud '{name}': normals must be {len(points)} finite vectors that are not zero")
+    digest.update(np.ascontiguousarray(normals).tobytes())
+    points, normals = points[keep], (normals / length)[keep]
+    center = 0.5 * (points.min(0) + points.max(0)) if centred else np.zeros(3)
+    points = points - center
+    points, normals = _smoothed(points, normals)
+    note = "a point cloud: what was not seen of the object is unknown"
+    return _model(name, digest.hexdigest(), center, points, normals, _distances(points, normals), points.mean(0), note)
+
+
+def sdf_object(values: np.ndarray, origin: np.ndarray, cell: float, *, name: str = "sdf") -> ObjectModel:
+    """An ObjectModel without faces from a grid of signed distances, of a whole object.
+
+    The surface is where nodes next to it lead along the slope; the centre of mass is that of the volume.
+
+    Args:
+        values: signed distances [m], negative inside, (nx, ny, nz).
+        origin: node (0, 0, 0) [m], (3,). cell: spacing of nodes [m].
+
+    Raises:
+        ObjectError: not finite, no inside, an inside that reaches the border, a size that no hand grasps.
+    """
+    v = np.asarray(values, float)
+    if v.ndim != 3 or min(v.shape) < 4 or not np.isfinite(v).all() or not cell > 0:
+        raise ObjectError(
+            f"grid '{name}' of shape {list(v.shape)}: need [nx, ny, nz] finite values, 4 a side, cell > 0"
+        )
+    inner = v[1:-1, 1:-1, 1:-1]
+    if not (inner < 0).any() or (v < 0).sum() != (inner < 0).sum():
+        raise ObjectError(
+            f"grid '{name}': values are negative inside an object, which must lie within the grid's border"
+        )
+    near = np.abs(v) < cell
+    normals = np.stack([*np.gradient(v, cell)], -1)[near]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+    points = np.argwhere(near) * cell + np.asarray(origin, float) - v[near][:, None] * normals
+    _check_size(f"grid '{name}'", points)
+    keep = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
+    center = 0.5 * (points.min(0) + points.max(0))
+    com = (np.argwhere(v < 0) * cell + origin).mean(0) - center
+    grid = v.astype(np.float32), (np.asarray(origin, float) - center).astype(np.float32), float(cell)
+    digest = hashlib.sha256(grid[0].tobytes() + np.asarray([*np.ravel(origin), cell], float).tobytes()).hexdigest()
+    return _model(name, digest, center, points[keep] - center, normals[keep], grid, com, "a grid of distances")
+
+
+def _check_size(what: str, points: np.ndarray) -> None:
+    size = float(np.ptp(points, axis=0).max())
+    if not _EXTENT[0] <= size <= _EXTENT[1]:
+        raise ObjectError(
+            f"{what} is {size:.3g} m long; accepted: {_EXTENT[0]:g} to {_EXTENT[1]:g} m (are its units metres?)"
+        )
+
+
+def _model(
+    name: str,
+    digest: str,
+    center: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    grid: tuple[np.ndarray, np.ndarray, float],
+    com: np.ndarray,
+    note: str,
+) -> ObjectModel:
+    """Of points in the internal frame, without faces."""
+    order = cluster_order(np.resize(points, (-(-len(points) // CLUSTER_SIZE) * CLUSTER_SIZE, 3))) % len(points)
+    obstacles = points[order].astype(np.float32)
+    balls = bounding_spheres(obstacles)
+    sdf, origin, cell = grid
+    return ObjectModel(
+        name=name,
+        sha256=digest,
+        scale=1.0,
+        center=center.astype(np.float32),
+        vertices=(points + center).astype(np.float32),
+        faces=np.zeros((0, 3), np.int32),
+        watertight=False,
+        com=com.astype(np.float32),
+        extents=np.ptp(points, axis=0).astype(np.float32),
+        notes=[note],
+        contact_points=points[:_CONTACTS].astype(np.float32),
+        contact_normals=normals[:_CONTACTS].astype(np.float32),
+        contact_opposite=np.full(len(points[:_CONTACTS]), -1, np.int32),
+        obstacle_points=obstacles,
+        obstacle_normals=normals[order].astype(np.float32),
+        cluster_center=balls[0],
+        cluster_radius=balls[1],
+        sdf=sdf,
+        sdf_origin=origin,
+        sdf_cell=cell,
+    )
+
+
+def _smoothed(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points moved onto the surface through their neighbours that face the same way, and its normals.
+
+    A cloud whose points lie a millimetre or more off the surface through a wide neighbourhood is taken for noisy: it
+    is smoothed over such neighbourhoods again and again, and what stays apart, or is sparse, is dropped.
+    """
+    wide = min(_WIDE, len(points))
+    gap, near = cKDTree(points).query(points, wide, workers=-1)
+    noise = 1.5 * float(np.median(np.abs(_fit(points, normals, near)[0])))
+    if noise < _CLEAN:
+        height, normal = _fit(points, normals, near[:, :_NEIGHBOURS])
+        return points + height[:, None] * normal, normal
+    # neighbourhoods that reach four times the noise
+    wide = int(np.clip((np.median(gap, axis=0) < 4 * noise).sum(), min(_LEAST_WIDE, wide), wide))
+    near = near[:, :wide]
+    height, normal = _fit(points, normals, near)
+    for _ in range(_PASSES):
+        points, normals = points + height[:, None] * normal, normal
+        near = cKDTree(points).query(points, wide, workers=-1)[1]
+        height, normal = _fit(points, normals, near)
+    # noise along the surface carries points past its edges, where they are half as dense
+    gap = np.linalg.norm(points[near] - points[:, None], axis=2)
+    same = np.cumsum(np.einsum("nki,ni->nk", normals[near], normals) > _SAME_SIDE, axis=1)
+    reach = np.where(same >= wide // 2, gap, np.inf).min(1)
+    keep = (np.abs(height) <= np.quantile(np.abs(height), _KEPT)) & (reach <= np.sqrt(2) * np.median(reach))
+    return points[keep], normals[keep]
+
+
+def _fit(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far above each point the surface through its neighbours (n, k) of the same side runs [m], (n,), and its
+    normals: a quadratic function over the plane of the mean normal."""
+    same = (np.einsum("nki,ni->nk", normals[near], normals) > _SAME_SIDE).astype(float)
+    normal = np.einsum("nk,nki->ni", same, normals[near])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    u = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(normal, u)
+    way = points[near] - points[:, None]
+    x, y, z = (np.einsum("nki,ni->nk", way, axis) for axis in (u, v, normal))
+    reach = np.sqrt((same * (x * x + y * y)).sum(1) / same.sum(1))[:, None] + 1e-9
+    x, y = x / reach, y / reach
+    A = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)  # (n, k, 6)
+    lhs = np.einsum("nk,nki,nkj->nij", same, A, A) + 1e-3 * same.sum(1)[:, None, None] * np.eye(6)
+    c = np.linalg.solve(lhs, np.einsum("nk,nki,nk->ni", same, A, z)[..., None])[..., 0]
+    tilted = normal - (c[:, 1:2] * u + c[:, 2:3] * v) / reach
+    return c[:, 0], tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
+
+
+def _distances(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Signed distance grid [m] of planes through points, its origin and its cell."""
+    low, high = points.min(0) - _PAD, points.max(0) + _PAD
+    cell = max(_LEAST_CELL, float(np.prod(high - low) / _MOST_NODES) ** (1 / 3))
+    shape = np.ceil((high - low) / cell).astype(int) + 1
+    nodes = low + cell * np.indices(shape).reshape(3, -1).T
+    tree = cKDTree(points)
+    gap, near = tree.query(nodes, min(_PLANES, len(points)), workers=-1)
+    weight = np.exp(-0.5 * (gap / (gap[:, :1] + cell)) ** 2)
+    height = ((nodes[:, None] - points[near]) * normals[near]).sum(-1)
+    plane = (weight * height).sum(1) / weight.sum(1)
+    # about an edge what is outside one of its faces is outside
+    edge = np.einsum("nki,ni->nk", normals[near], normals[near[:, 0]]).min(1) < _EDGE
+    plane = np.where(edge, height.max(1), plane)
+    # close to the surface the planes tell the distance, farther off the nearest point does
+    spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
+    share = np.clip(gap[:, 0] / max(4 * spacing, 2 * cell) - 0.5, 0, 1)
+    value = (1 - share) * plane + share * np.sign(plane) * gap[:, 0]
+    value = np.where((plane < 0) & (gap[:, 0] > TRUST), gap[:, 0], value)
+    return value.reshape(shape).astype(np.float32), low.astype(np.float32), cell

@@ -1,0 +1,224 @@
+"""Point clouds of others as input: read, checked, given normals; every repair is put in words."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lgrasp.cloud.files import check_labels, read_arrays, read_mask
+from lgrasp.cloud.normals import estimate_normals, face_viewpoint
+from lgrasp.errors import CloudError
+
+__all__ = ["MIN_POINTS", "Cloud", "read_cloud"]
+
+MIN_POINTS = 50
+"""Fewer points do not show a surface."""
+
+_LARGEST = 20.0  # [m] side of a whole cloud
+_LARGEST_TARGET, _LEAST_TARGET = 2.0, 0.005  # [m] side of what is to be grasped
+_UNITS = ((0.01, "centimetres"), (0.001, "millimetres"), (1e-6, "micrometres"))
+_CENTIMETRES = 40.0  # a file whose coordinates span more is not taken to be in centimetres
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A point cloud; n points in the file's frame, scaled to metres.
+
+    Attributes:
+        points: [m], shape (n, 3), f32.
+        normals: Unit, out of the surface, shape (n, 3), f32.
+        labels: What each point belongs to, shape (n,), int64; None where nothing tells.
+        target: Which points are to be grasped, shape (n,), bool; all of them without a label.
+        notes: What was repaired or made up, one sentence each.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    labels: np.ndarray | None
+    target: np.ndarray
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def only(self, chosen: np.ndarray) -> "Cloud":
+        """The cloud of some points: flags, shape (n,), or indices; ``cloud.only(cloud.target)`` is the target."""
+        labels = None if self.labels is None else self.labels[chosen]
+        return Cloud(self.points[chosen], self.normals[chosen], labels, self.target[chosen], self.notes)
+
+
+def read_cloud(
+    path: str | os.PathLike[str],
+    mask: str | os.PathLike[str] | None = None,
+    label: int | None = None,
+    scale: float = 1.0,
+    viewpoint: Sequence[float] | np.ndarray | None = None,
+    *,
+    scene: bool = True,
+) -> Cloud:
+    """Read a whole cloud; with a label, its ``target`` are the points of that label.
+
+    Args:
+        path: File (see ``cloud_files.CLOUD_SUFFIXES``) with points and perhaps normals and labels.
+        mask: File with a label for each point (.npy, .npz); default: the labels in the cloud's own file.
+        label: Which points are the target; 1 where a mask of flags is given and no label.
+        scale: Factor from the file's unit to metres.
+        viewpoint: Where the points were seen from, x y z in the file's frame [m] after scaling. Normals are turned to
+            it. Without one, normals that the file lacks are turned to the origin, which must lie outside the cloud.
+        scene: Without a label it may be a scene, larger than anything that a hand grasps.
+
+    Raises:
+        CloudError: no usable points, a mask of another length or that selects next to nothing, an unlikely size, or
+            normals that cannot be oriented.
+    """
+    path, notes = Path(path), []
+    if not (np.isfinite(scale) and scale > 0.0):
+        raise CloudError(f"scale {scale} cannot be used; a positive number such as 0.001 (millimetres to metres) is")
+    found = read_arrays(path)
+    points, normals, labels = found["points"] * scale, found.get("normals"), found.get("labels")
+    if labels is not None:
+        labels = check_labels(labels, len(points), str(path))
+    if mask is not None:
+        labels = read_mask(Path(mask), len(points))
+        label = 1 if label is None and set(np.unique(labels)) <= {0, 1} else label
+    mesh = "faces" in found
+    keep = _seen(path, points, notes, hint="; it is a mesh, which --object takes" if mesh else "")
+    if mesh:
+        notes.append(f"{path} is a mesh: its vertices are the points; --object takes all of its surface")
+    points, labels = points[keep], None if labels is None else labels[keep]
+    normals = None if normals is None else normals[keep]
+    target = _target(mask or path, labels, label, masked=mask is not None, count=len(points))
+    chosen = label is not None
+    if chosen or not scene:
+        target = _without_strays(points, target, notes)
+    _check_size(path, points, target, scale, chosen=chosen, scene=scene)
+    normals = _normals(path, points, normals, viewpoint, notes)
+    return Cloud(points.astype(np.float32), normals.astype(np.float32), labels, target, tuple(notes))
+
+
+def _seen(path: Path, points: np.ndarray, notes: list[str], hint: str) -> np.ndarray:
+    """Flags of the points that are there: finite, and not the zeros that cameras write where they see nothing."""
+    finite = np.isfinite(points).all(axis=1)
+    zero = (points == 0.0).all(axis=1)
+    zero &= zero.sum() > 1
+    if not finite.any():
+        raise CloudError(f"{path}: all {len(points):,} points are NaN or infinite; finite coordinates are accepted")
+    if not finite.all():
+        notes.append(f"dropped {int((~finite).sum()):,} of {len(points):,} points that are NaN or infinite")
+    if zero.any():
+        notes.append(f"dropped {int(zero.sum()):,} of {len(points):,} points at 0 0 0: no depth")
+    keep = finite & ~zero
+    if keep.sum() < MIN_POINTS:
+        raise CloudError(
+            f"{path}: {int(keep.sum())} usable points; at least {MIN_POINTS} are needed to show a surface{hint}"
+        )
+    return keep
+
+
+def _target(
+    where: str | os.PathLike[str], labels: np.ndarray | None, label: int | None, *, masked: bool, count: int
+) -> np.ndarray:
+    """Flags of the points to be grasped, shape (count,)."""
+    if label is None:
+        if masked:
+            raise CloudError(f"{where}: give --label; {_histogram(labels)}")
+        return np.ones(count, bool)
+    if labels is None:
+        raise CloudError(f"{where}: has no labels; give --mask with one for each point, or leave out --label {label}")
+    target = labels == label
+    if target.sum() < MIN_POINTS:
+        raise CloudError(
+            f"{where}: label {label} selects {int(target.sum())} points, at least {MIN_POINTS} are needed; "
+            f"{_histogram(labels)}"
+        )
+    return target
+
+
+def _histogram(labels: np.ndarray | None) -> str:
+    values, counts = np.unique(np.zeros(0) if labels is None else labels, return_counts=True)
+    shown = ", ".join(f"{int(v)} ({c:,} points)" for v, c in list(zip(values, counts, strict=True))[:12])
+    return f"its labels are {shown}{', ...' if len(values) > 12 else ''}"
+
+
+def _without_strays(points: np.ndarray, target: np.ndarray, notes: list[str]) -> np.ndarray:
+    """The target without points that are farther from the box of the others than it is long, such as a mask's edge that
+    reaches the background; at most one in a hundred."""
+    low, high = np.percentile(points[target], [1.0, 99.0], axis=0)
+    reach = float((high - low).max())
+    stray = target & ((points < low - reach) | (points > high + reach)).any(axis=1)
+    if stray.any():
+        notes.append(
+            f"{int(stray.sum()):,} of {int(target.sum()):,} points lie far from the rest; they are not grasped"
+        )
+    return target & ~stray
+
+
+def _check_size(path: Path, points: np.ndarray, target: np.ndarray, scale: float, *, chosen: bool, scene: bool) -> None:
+    """Refuse extents that a unit mistake explains; a hundredth of the points may be stray."""
+    whole = float(np.ptp(np.percentile(points, [1.0, 99.0], axis=0), axis=0).max())
+    part = float(np.ptp(np.percentile(points[target], [1.0, 99.0], axis=0), axis=0).max())
+    at = "" if scale == 1.0 else f" at scale {scale:g}"
+    long = [("cloud", whole, _LARGEST)] if whole > _LARGEST else []
+    if part > _LARGEST_TARGET and (chosen or not scene):
+        what = "target" if chosen else "cloud, all of which is to be grasped without --label,"
+        long = [(what, part, _LARGEST_TARGET)]
+    for what, extent, most in long:
+        hint = _unit(extent / scale, most)
+        raise CloudError(f"{path}: the {what} is {extent:.4g} m long{at}; at most {most:g} m is accepted; {hint}")
+    if part < _LEAST_TARGET:
+        metres = "it is in metres already: use --scale 1"
+        hint = metres if part / scale >= _LEAST_TARGET else "--scale turns other units into metres"
+        raise CloudError(
+            f"{path}: what is to be grasped is {part:.2g} m long{at}; at least {_LEAST_TARGET:g} m is accepted; {hint}"
+        )
+
+
+def _unit(extent: float, most: float) -> str:
+    """The unit that a file with coordinates so far apart is probably in."""
+    for factor, unit in _UNITS:
+        if extent * factor <= most and (factor != _UNITS[0][0] or extent <= _CENTIMETRES):
+            return f"if the file is in {unit} use --scale {factor:g}"
+    return "--scale turns other units into metres"
+
+
+def _normals(
+    path: Path,
+    points: np.ndarray,
+    given: np.ndarray | None,
+    viewpoint: Sequence[float] | np.ndarray | None,
+    notes: list[str],
+) -> np.ndarray:
+    """Unit normals (n, 3), from the file or estimated, turned to the viewpoint."""
+    seen_from = None if viewpoint is None else np.asarray(viewpoint, np.float64)
+    if seen_from is not None and (seen_from.shape != (3,) or not np.isfinite(seen_from).all()):
+        raise CloudError(f"viewpoint {viewpoint} cannot be used; x y z of the camera in metres is accepted")
+    normals = np.zeros_like(points) if given is None else np.nan_to_num(given, nan=0.0, posinf=0.0, neginf=0.0)
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals / np.where(length > 1e-6, length, 1.0)[:, None]
+    missing = length <= 1e-6
+    if missing.any():
+        if seen_from is None:
+            low, high = points.min(axis=0), points.max(axis=0)
+            if (low <= 0.0).all() and (high >= 0.0).all():
+                raise CloudError(
+                    f"{path}: {_share(missing)} points have no normals, and the origin lies inside the cloud, so it is "
+                    "no camera; give --viewpoint X,Y,Z, where the points were seen from"
+                )
+        origin = np.zeros(3) if seen_from is None else seen_from
+        normals[missing] = estimate_normals(points)[missing]
+        normals[missing & face_viewpoint(points, normals, origin)] *= -1.0
+        told = "the origin, where a camera is supposed" if seen_from is None else "the viewpoint"
+        notes.append(f"normals of {_share(missing)} points estimated from neighbours and turned to {told}")
+    if seen_from is not None:
+        away = face_viewpoint(points, normals, seen_from)
+        normals[away] *= -1.0
+        if away.any():
+            notes.append(f"turned {int(away.sum()):,} normals that pointed away from the viewpoint")
+    return normals
+
+
+def _share(flags: np.ndarray) -> str:
+    count = int(flags.sum())
+    return f"all {count:,}" if flags.all() else f"{count:,} of {len(flags):,}"

@@ -1,0 +1,182 @@
+"""The report as one HTML page: charts inline, no script, no other file."""
+
+from collections.abc import Mapping
+from importlib.resources import files
+from typing import Any
+
+from lgrasp.dataset.report.gather import HandRows
+from lgrasp.dataset.report.parts import escape, figure, number, tiles
+from lgrasp.dataset.report.plots import (
+    MAPS,
+    contact_chart,
+    direction_maps,
+    failure_chart,
+    position_chart,
+    posture_chart,
+    quantity_chart,
+)
+from lgrasp.dataset.report.posture import principal_postures
+from lgrasp.dataset.report.tables import (
+    diversity_table,
+    held_tables,
+    physics_table,
+    protocol_list,
+    run_tables,
+    validity_table,
+)
+
+__all__ = ["page"]
+
+
+def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows]) -> str:
+    """The page.
+
+    Args:
+        numbers: Of :func:`lgrasp.dataset.report.summary.summary`.
+        hands: What it was made of, for the samples.
+    """
+    title = f"Grasps: {number(numbers['rows'])} of {_hands(numbers)}"
+    css = files("lgrasp.dataset.report").joinpath("page.css").read_text(encoding="utf-8")
+    sections = [_head(title, numbers)]
+    for data, rows in zip(numbers["hands"], hands.values(), strict=True):
+        sections.append(_hand(data, rows))
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n"
+        + "\n".join(sections)
+        + "\n</body>\n</html>\n"
+    )
+
+
+def _hands(numbers: dict[str, Any]) -> str:
+    names = [hand["hand"] for hand in numbers["hands"]]
+    objects = sum(len(hand["objects"]) for hand in numbers["hands"])
+    what = f"{names[0]} with " if len(names) == 1 else f"{len(names)} hands with "
+    if len(names) == 1 and objects == 1:
+        return what + " + ".join(numbers["hands"][0]["objects"][0]["objects"])
+    return what + f"{objects} object{'s' if objects != 1 else ''}"
+
+
+def _groups(groups: list[dict[str, Any]]) -> str:
+    if any(len(group["objects"]) > 1 for group in groups):
+        return "sets of objects in a hand"
+    return "pairs of hand and object" if len(groups) != 1 else "object"
+
+
+def _head(title: str, numbers: dict[str, Any]) -> str:
+    groups = [group for hand in numbers["hands"] for group in hand["objects"]]
+    compared = sum(group["near_duplicates"]["compared"] for group in groups)
+    near = sum(group["near_duplicates"]["duplicates"] for group in groups)
+    over = sum(m["over_bound"] or 0 for group in groups for m in group["metrics"].values())
+    shown = [
+        (number(numbers["rows"]), "grasps"),
+        (number(len(numbers["hands"])), "hands" if len(numbers["hands"]) != 1 else "hand"),
+        (number(len(groups)), _groups(groups)),
+        (number(numbers["shards"]), f"shards, {numbers['bytes'] / 1e6:,.1f} MB"),
+        (number(over), "values above a strict bound"),
+        (f"{near / compared:.2%}" if compared else "-", "near-duplicates"),
+        (number(sum(group["distinct_poses"] for group in groups)), "distinct object poses"),
+    ]
+    for name in sorted({name for group in groups for name in group["physics"]}):
+        found = [group["physics"][name] for group in groups if name in group["physics"]]
+        run = sum(f["run"] for f in found)
+        if run:
+            shown.append((f"{sum(f['held'] for f in found) / run:.1%}", f"hold in physics ({name})"))
+    remarks = "".join(f'<p class="note">{escape(line)}</p>' for line in numbers["remarks"])
+    lead = "Numbers are those stored in the shards; near-duplicates, poses and coverage are computed from the rows."
+    return f'<h1>{escape(title)}</h1>\n<p class="dim">{lead}</p>\n{remarks}{tiles(shown)}'
+
+
+def _hand(data: dict[str, Any], hand: HandRows) -> str:
+    parts = [f"<h2>{escape(data['hand'])}</h2>", run_tables(data)]
+    if not data["rows"]:
+        return "\n".join([*parts, "<p>No rows.</p>"])
+    sample = hand.sample.columns()
+    every = data["sample"]["every"]
+    dots = f"Dots: {number(data['sample']['rows'])} of {number(data['rows'])} grasps"
+    dots += f", one in {every}." if every > 1 else "."
+    parts += ["<h3>Validity</h3>", validity_table(data), *_histograms(hand), *_held(data), *_physics(data)]
+    parts += _contacts(data)
+    parts += ["<h3>Diversity</h3>", diversity_table(data), *_poses(hand, sample, dots)]
+    return "\n".join([*parts, *_postures(data, hand, sample, dots)])
+
+
+def _names(hand: HandRows) -> list[str]:
+    return [" + ".join(names) for names in hand.objects]
+
+
+def _histograms(hand: HandRows) -> list[str]:
+    together = [d for d in hand.together().values() if d.rows]
+    bounded = [d for d in together if d.quantity.bound is not None]
+    free = [d for d in together if d.quantity.bound is None]
+    out = []
+    if bounded:
+        text = "Orange: the strict bound. The last bar holds what lies beyond."
+        out.append(figure(quantity_chart(bounded), text))
+    if free:
+        text = (
+            "Epsilon and volume as docs/metrics.md defines them: friction 0.5, eight-edge cones, torque over the "
+            "object's radius. 0: the origin is not inside the hull, so some load cannot be held at this friction."
+        )
+        out += ["<h3>Quality</h3>", figure(quantity_chart(free), text)]
+    return out
+
+
+def _held(data: dict[str, Any]) -> list[str]:
+    tables = held_tables(data)
+    return ["<h3>Objects in the hand</h3>", tables] if tables else []
+
+
+def _contacts(data: dict[str, Any]) -> list[str]:
+    counts: dict[int, int] = {}
+    for group in data["objects"]:
+        for contacts, rows in group["contacts"].items():
+            counts[int(contacts)] = counts.get(int(contacts), 0) + rows
+    return ["<h3>Contacts</h3>", figure(contact_chart(counts, data["contact_links"]), "")]
+
+
+def _physics(data: dict[str, Any]) -> list[str]:
+    if not any(group["physics"] for group in data["objects"]):
+        return []
+    out = ["<h3>Physics</h3>", physics_table(data)]
+    total: dict[str, dict[str, dict[str, int]]] = {}
+    for group in data["objects"]:
+        for name, verdicts in group["physics"].items():
+            into = total.setdefault(name, {})
+            for way, counts in verdicts["directions"].items():
+                place = into.setdefault(way, {"run": 0, "failed": 0})
+                for key in place:
+                    place[key] += counts[key]
+    tried = [(name, ways) for name, ways in total.items() if any(way["run"] for way in ways.values())]
+    if tried:
+        text = "Of the grasps run in a direction; a grasp that failed in one may not have been run in the others."
+        out.append(figure(failure_chart(tried), text))
+    return [*out, protocol_list(data)]
+
+
+def _postures(data: dict[str, Any], hand: HandRows, sample: dict[str, Any], dots: str) -> list[str]:
+    posture, found = principal_postures(hand.rows, hand.sum_q, hand.sum_qq), data["posture"]
+    text = (
+        f"Principal components of the {len(data['joints'])} joint positions. Effective dimension "
+        f"{found['effective_dimension']:.1f} (squared sum of the variances over the sum of their squares); "
+        f"{found['components_for_95_percent']} components explain 95 %. {dots}"
+    )
+    chart = posture_chart(posture, posture.scores(sample["q"]), sample["group"], _names(hand))
+    return ["<h3>Postures</h3>", figure(chart, text)]
+
+
+def _poses(hand: HandRows, sample: dict[str, Any], dots: str) -> list[str]:
+    where = figure(
+        position_chart(sample["position"], sample["group"], _names(hand)),
+        f"Middle of the object's bounding box in the frame of the hand's base (+: its origin). {dots}",
+    )
+    maps = hand.directions()
+    text = (
+        "Direction from the object's middle to the origin of the hand's base, in the object's frame: where the hand "
+        "stands around the object. Equal-area map: +x in the middle, +y a quarter turn to the right, +z on top, -x at "
+        "both ends; bins without colour are empty."
+    )
+    if len(maps) > MAPS:
+        text += f" The first {MAPS} of {len(maps)} objects."
+    return ["<h3>Object positions</h3>", where, "<h3>Approach directions</h3>", figure(direction_maps(maps), text)]

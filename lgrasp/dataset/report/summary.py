@@ -1,0 +1,87 @@
+"""The numbers of the report, JSON-serialisable."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lgrasp.dataset.merge import sum_statistics
+from lgrasp.dataset.report.gather import HandRows, ObjectRows
+from lgrasp.dataset.report.held import held_numbers
+from lgrasp.dataset.report.posture import principal_postures
+from lgrasp.dataset.report.survey import Head
+from lgrasp.engine.registry import STAGES
+from lgrasp.engine.report import survivors
+
+__all__ = ["summary"]
+
+
+def summary(heads: Sequence[Head], remarks: list[str], hands: Mapping[tuple[str, str], HandRows]) -> dict[str, Any]:
+    """Everything that the page shows but the sampled dots."""
+    return {
+        "shards": len(heads),
+        "rows": sum(head.rows for head in heads),
+        "bytes": sum(head.bytes for head in heads),
+        "remarks": remarks,
+        "hands": [_hand(key, rows, [h for h in heads if h.hand == key]) for key, rows in hands.items()],
+    }
+
+
+def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, Any]:
+    posture = principal_postures(hand.rows, hand.sum_q, hand.sum_qq)
+    contacts = int(hand.links.sum())
+    shares = {name: int(n) / contacts for name, n in zip(hand.hand.link_names, hand.links, strict=True) if n}
+    return {
+        "hand": key[0],
+        "sha256": key[1],
+        "joints": list(hand.hand.joint_names),
+        "rows": hand.rows,
+        "shards": len(heads),
+        "created": [min(h.created for h in heads), max(h.created for h in heads)],
+        "lgrasp_versions": sorted({h.version for h in heads}),
+        "runs": [_run(name, [h for h in heads if h.pipeline == name]) for name in sorted({h.pipeline for h in heads})],
+        "metrics": {name: d.numbers() for name, d in hand.together().items() if d.rows},
+        "objects": [_objects(group) for group in hand.objects.values()],
+        "held": held_numbers(hand.held),
+        "contact_links": dict(sorted(shares.items(), key=lambda item: -item[1])),
+        "posture": posture.numbers(),
+        "sample": {"rows": len(hand.sample.columns().get("group", ())), "every": hand.sample.step},
+    }
+
+
+def _run(pipeline: str, heads: list[Head]) -> dict[str, Any]:
+    """What one pipeline counted on its way, over all shards."""
+    statistics = sum_statistics([head.statistics for head in heads])
+    counts: dict[str, dict[str, int]] = {}
+    seconds: dict[str, float] = {}
+    for name, value in statistics.items():
+        first, _, rest = name.partition("_")
+        if first == "seconds" and not isinstance(value, str):
+            seconds[rest] = float(value)
+        elif first in STAGES and isinstance(value, int):
+            counts.setdefault(first, {})[rest.replace("_", " ")] = value
+    return {
+        "pipeline": pipeline,
+        "rows": sum(head.rows for head in heads),
+        "seeds": sorted({head.seed for head in heads}),
+        "device": str(statistics.get("device", "")),
+        "survivors": survivors({stage: counts[stage] for stage in heads[0].stages or STAGES if stage in counts}),
+        "counts": counts,
+        "seconds": seconds,
+    }
+
+
+def _objects(group: ObjectRows) -> dict[str, Any]:
+    near = group.near
+    return {
+        "objects": list(group.names),
+        "rows": group.rows,
+        "metrics": {name: d.numbers() for name, d in group.quantities.items() if d.rows},
+        "contacts": {str(n): rows for n, rows in sorted(group.contacts.items())},
+        "distinct_poses": near.poses,
+        "near_duplicates": {
+            "compared": near.compared,
+            "duplicates": near.duplicates,
+            "share": near.duplicates / near.compared if near.compared else 0.0,
+        },
+        "coverage": {name: coverage.numbers(near.poses) for name, coverage in group.coverage.items()},
+        "physics": {name: verdicts.numbers() for name, verdicts in group.verdicts.items()},
+    }

@@ -1,0 +1,174 @@
+"""The report's tables."""
+
+import json
+from typing import Any
+
+from lgrasp.dataset.report.parts import escape, number, table
+
+__all__ = ["diversity_table", "held_tables", "physics_table", "protocol_list", "run_tables", "validity_table"]
+
+_SHOWN = (  # metric, head, format
+    ("penetration", "penetration [mm]", ".2f"),
+    ("self_penetration", "self-pen. [mm]", ".2f"),
+    ("gap", "gap [mm]", ".2f"),
+    ("normal_error", "normals [deg]", ".1f"),
+    ("gswo", "gswo", ".3f"),
+    ("epsilon", "epsilon", ".3f"),
+)
+
+_NEAR_SHARE = 0.01  # most near-duplicates of a good data set
+_VERDICTS = (  # column, head, factor, format
+    ("contact_at_q", "links at q", 1, ".1f"),
+    ("contact_at_grasp", "links at grasp", 1, ".1f"),
+    ("slip", "slip [mm]", 1e3, ".1f"),
+    ("settled", "settled [%]", 100, ".0f"),
+    ("diverged", "diverged [%]", 100, ".1f"),
+)
+
+
+def run_tables(data: dict[str, Any]) -> str:
+    """Where a hand's rows come from, and what survived each stage."""
+    about = [
+        ("hand", f"{data['hand']} ({data['sha256'][:12]}…), {len(data['joints'])} joints"),
+        ("rows", f"{number(data['rows'])} in {number(data['shards'])} shard{'s' if data['shards'] != 1 else ''}"),
+        ("made", " to ".join(dict.fromkeys(data["created"])) + f", lgrasp {', '.join(data['lgrasp_versions'])}"),
+    ]
+    out = []
+    for run in data["runs"]:
+        seeds = ", ".join(map(str, run["seeds"][:8])) + ("…" if len(run["seeds"]) > 8 else "")
+        wall = run["seconds"].get("wall")
+        about.append(
+            (
+                f"pipeline {run['pipeline']}",
+                f"{number(run['rows'])} rows, seed {seeds}"
+                + (f", on {run['device']}" if run["device"] else "")
+                + (f", {run['rows'] / wall:,.0f} rows/s" if wall else ""),
+            )
+        )
+        if run["survivors"]:
+            rows = [_stage(name, left, run) for name, left in run["survivors"].items()]
+            caption = f"Survivors per stage of {run['pipeline']}, all shards together"
+            out.append(table(("stage", "survivors", "seconds", "counts"), rows, caption=caption, text=(3,)))
+    return table(("", ""), about, text=(1,)) + "".join(out)
+
+
+def _stage(name: str, left: int, run: dict[str, Any]) -> list[str]:
+    seconds = run["seconds"].get(name)
+    counts = ", ".join(f"{what} {number(n)}" for what, n in sorted(run["counts"][name].items(), key=lambda c: -c[1]))
+    return [name, number(left), "-" if seconds is None else f"{seconds:,.1f}", counts]
+
+
+def validity_table(data: dict[str, Any]) -> str:
+    """Median and worst of each metric, a row per object (or set of objects held at once) and one for all."""
+    shown = [s for s in _SHOWN if s[0] in data["metrics"]]
+    columns = ["object", "rows", *(w for s in shown for w in ("median", "best" if s[0] == "epsilon" else "worst"))]
+    groups = [("", 2), *((head, 2) for _, head, _ in shown)]
+    rows = [[" + ".join(group["objects"]), *_metrics(group, shown)] for group in data["objects"]]
+    if len(rows) > 1:
+        rows.append(["all", *_metrics(data, shown)])
+    caption = "Metrics as stored, of each grasp its worst contact. Orange: above the bound of strict validity."
+    return table(columns, rows, groups=groups, caption=caption, total=len(rows) > 1)
+
+
+def _metrics(of: dict[str, Any], shown: list[tuple[str, str, str]]) -> list[str]:
+    cells = [number(of["rows"])]
+    for name, _, style in shown:
+        found = of["metrics"].get(name)
+        for what in ("median", "max"):
+            bad = "!" if found and what == "max" and found["over_bound"] else ""
+            cells.append(f"{bad}{found[what]:{style}}" if found else "-")
+    return cells
+
+
+def diversity_table(data: dict[str, Any]) -> str:
+    """Poses, near-duplicates and coverage, a row per object (or set of objects held at once)."""
+    columns = ["object", "rows", "poses", "near-dup.", "contacts", "approach", "if uniform", "rotation", "if uniform"]
+    rows = []
+    for group in data["objects"]:
+        near = group["near_duplicates"]
+        contacts = sum(int(n) * rows for n, rows in group["contacts"].items()) / max(group["rows"], 1)
+        cells = [" + ".join(group["objects"]), number(group["rows"]), number(group["distinct_poses"])]
+        cells += [f"{'!' * (near['share'] > _NEAR_SHARE)}{near['share']:.2%}", f"{contacts:.2f}"]
+        first = next(iter(group["coverage"].values()), None)
+        for what in ("directions", "rotations"):
+            cells += [f"{first[what][share]:.0%}" if first else "-" for share in ("share", "share_if_uniform")]
+        rows.append(cells)
+    caption = (
+        "Poses: distinct object poses. Near-dup.: object within 5 mm and 5 deg and every joint within 0.1 rad of a row "
+        "before; orange: over 1 %. Contacts: mean. Approach and rotation: share hit of equal-area bins of approach "
+        "directions and of equal-volume bins of rotations, and what as many uniform draws as there are poses would hit."
+    )
+    return table(columns, rows, caption=caption)
+
+
+def held_tables(data: dict[str, Any]) -> str:
+    """Rows by the number of objects in the hand, and by the opposition space of the last step; "" if all hold one."""
+    held, counts = data["held"], list(data["held"])
+    spaces = list(dict.fromkeys(name for group in held.values() for name in group["spaces"]))
+    if counts in ([], ["1"]) and not spaces:
+        return ""
+    protocols = sorted({name for group in held.values() for name in group["physics"]})
+    columns = ["objects", "rows", "penetration [mm]: median", "max", *(f"hold ({name})" for name in protocols)]
+    rows = []
+    for n, group in held.items():
+        deep = group["penetration"]
+        depth = [f"{deep['median']:.2f}", f"{'!' * bool(deep['over_bound'])}{deep['max']:.2f}"] if deep else ["-", "-"]
+        rows.append([n, number(group["rows"]), *depth, *(_share(group, name) for name in protocols)])
+    out = table(columns, rows, caption="By the number of objects in the hand. Orange: above the strict bound.")
+    if spaces:
+        heads = ["rows", *(f"hold ({name})" for name in protocols)]
+        rows = []
+        for name in spaces:
+            found = [held[n]["spaces"].get(name, {"rows": 0, "physics": {}}) for n in counts]
+            cells = [[number(part["rows"]), *(_share(part, p) for p in protocols)] for part in found]
+            rows.append([name, *(cell for part in cells for cell in part)])
+        groups = [("", 1), *((f"as object {n}", len(heads)) for n in counts)]
+        caption = "Rows by the opposition space that took their last object, by which object it is."
+        out += table(["space", *heads * len(counts)], rows, groups=groups, caption=caption)
+    return out
+
+
+def _share(group: dict[str, Any], protocol: str) -> str:
+    found = group["physics"].get(protocol, {"run": 0})
+    return f"{found['share']:.1%}" if found["run"] else "-"
+
+
+def physics_table(data: dict[str, Any]) -> str:
+    """What each protocol says of each object: share that holds, the object's mass, means of other verdicts."""
+    rows, columns = [], ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in _VERDICTS)]
+    for group in data["objects"]:
+        for name, found in sorted(group["physics"].items()):
+            share = f"{found['share']:.1%}" if found["run"] else "-"
+            cells = [" + ".join(group["objects"]), name, number(found["run"]), share, _mass(found["protocols"])]
+            for column, _, factor, style in _VERDICTS:
+                mean = found["means"].get(column)
+                cells.append("-" if mean is None else f"{factor * mean:{style}}")
+            rows.append(cells)
+    caption = "Means over the grasps that were run; links: of the hand, in contact with the object."
+    return table(columns, rows, caption=caption, text=(1,))
+
+
+def _mass(protocols: list[Any]) -> str:
+    """Mass of the object [g], if the protocols say one."""
+    masses = []
+    for protocol in protocols:
+        said = protocol if isinstance(protocol, dict) else {}
+        said = said | said["resolved"] if isinstance(said.get("resolved"), dict) else said
+        if isinstance(said.get("mass"), int | float):
+            masses.append(f"{1000 * said['mass']:.0f}")
+    return ", ".join(dict.fromkeys(masses)) or "-"
+
+
+def protocol_list(data: dict[str, Any]) -> str:
+    """What the protocols of the verdicts say, each text once, with its objects."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for group in data["objects"]:
+        for name, verdicts in group["physics"].items():
+            for text in verdicts["protocols"]:
+                shown = text if isinstance(text, str) else json.dumps(text, indent=1)
+                found.setdefault((name, shown), []).append(" + ".join(group["objects"]))
+    return "".join(
+        f"<details><summary>Protocol {escape(name)}: {escape(', '.join(objects))}</summary>"
+        f"<pre>{escape(shown)}</pre></details>"
+        for (name, shown), objects in found.items()
+    )

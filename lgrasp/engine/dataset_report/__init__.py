@@ -1,5 +1,0 @@
-"""``lgrasp dataset report``: what a data set holds, as one HTML page and as numbers."""
-
-from lgrasp.engine.dataset_report.report import read_dataset, report_dataset
-
-__all__ = ["read_dataset", "report_dataset"]

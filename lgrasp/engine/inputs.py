@@ -1,0 +1,169 @@
+"""Hand, object and field of a job: found, cached, loaded onto a device."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from dataclasses import field as with_default
+from functools import partial
+from pathlib import Path
+
+from lgrasp.engine.cache import Cache, content_key
+from lgrasp.errors import ObjectError
+from lgrasp.field.arrays import FieldArrays, upload_field
+from lgrasp.field.model import FIELD_VERSION, ContactField, build_field
+from lgrasp.field.params import FieldParams
+from lgrasp.geometry.decompose import decompose
+from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.hand.find import HandSource, find_hand
+from lgrasp.hand.model import HAND_VERSION, HandModel, build_hand, hand_digest
+from lgrasp.object.arrays import ObjectArrays, upload_object
+from lgrasp.object.find import find_object
+from lgrasp.object.model import ObjectModel, preprocess_object
+from lgrasp.object.params import ObjectParams
+from lgrasp.runtime.device import Device
+from lgrasp.simulate.scene import Scene
+
+__all__ = [
+    "OBJECT_VERSION",
+    "InputKeys",
+    "Inputs",
+    "input_keys",
+    "load_field",
+    "load_hand",
+    "load_inputs",
+    "load_object",
+    "object_key",
+    "run_key",
+]
+
+OBJECT_VERSION = 2
+"""Raised whenever preprocessing gives other arrays."""
+
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class InputKeys:
+    """Content keys of what a job starts from."""
+
+    source: HandSource
+    mesh: Path | None
+    hand: str
+    object: str
+    field: str
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a job starts from, on its device."""
+
+    hand: HandArrays
+    object: ObjectArrays
+    field: FieldArrays
+    keys: InputKeys
+    device: Device
+    seconds: dict[str, float] = with_default(default_factory=dict)
+    hits: dict[str, bool] = with_default(default_factory=dict)
+    scene: Scene | None = None  # for a physics simulation, if there is one
+
+
+def input_keys(hand: str, mesh: str | None, scale: float, objects: ObjectParams, fields: FieldParams) -> InputKeys:
+    """Find hand and object and compute the content keys of their artifacts.
+
+    Raises:
+        HandError, ObjectError: see :func:`find_hand`, :func:`find_object`.
+    """
+    source = find_hand(hand)
+    digest = hand_digest(source.urdf, source.spec)
+    hand_key = content_key("hand", HAND_VERSION, content=digest)
+    field_key = content_key("field", FIELD_VERSION, hand=hand_key, params=fields.model_dump(mode="json"))
+    path, key = (None, "") if mesh is None else object_key(mesh, scale, objects)
+    return InputKeys(source, path, hand_key, key, field_key)
+
+
+def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str]:
+    """File and content key of an object.
+
+    Raises:
+        ObjectError: see :func:`find_object`; also a file that cannot be read.
+    """
+    path = find_object(mesh)
+    try:
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ObjectError(f"object {path} cannot be read: {error.strerror}") from None
+    described = {"name": path.name, "scale": float(scale), "params": params.model_dump(mode="json")}
+    return path, content_key("object", OBJECT_VERSION, content=content, **described)
+
+
+def load_hand(cache: Cache, source: HandSource, key: str, device: Device) -> tuple[HandModel, bool]:
+    """The HandModel from the cache, or built and cached; and whether it was a hit."""
+
+    def make():
+        cut = partial(decompose, store=cache)
+        return build_hand(source.urdf, source.spec, device.alias, decompose=cut).to_arrays()
+
+    arrays, hit = cache.get("hand", key, make)
+    return HandModel.from_arrays(arrays), hit
+
+
+def load_object(
+    cache: Cache, mesh: Path, key: str, scale: float, params: ObjectParams, device: str = "cpu"
+) -> tuple[ObjectModel, bool]:
+    """The ObjectModel from the cache, or preprocessed and cached; and whether it was a hit."""
+
+    def make():
+        return preprocess_object(mesh, scale=scale, params=params, device=device).to_arrays()
+
+    arrays, hit = cache.get("object", key, make)
+    return ObjectModel.from_arrays(arrays), hit
+
+
+def load_field(
+    cache: Cache, keys: InputKeys, hand: HandArrays, params: FieldParams, report: Report | None = None
+) -> tuple[ContactField, bool]:
+    """The ContactField from the cache, or built and cached; and whether it was a hit."""
+    arrays, hit = cache.get("field", keys.field, lambda: build_field(hand, params, report).to_arrays())
+    return ContactField.from_arrays(arrays), hit
+
+
+def load_inputs(
+    cache: Cache,
+    keys: InputKeys,
+    scale: float,
+    objects: ObjectParams,
+    fields: FieldParams,
+    device: Device,
+    report: Report | None = None,
+) -> Inputs:
+    """Load or make hand, object and field, and put them on the device."""
+    report = report or (lambda what, share: None)
+    seconds, hits = {}, {}
+
+    def timed(name: str, load):
+        start = time.perf_counter()
+        report(name, 0.0)
+        model, hits[name] = load()
+        seconds[name] = time.perf_counter() - start
+        return model
+
+    assert keys.mesh is not None
+    mesh = keys.mesh
+    hand_model = timed("hand", lambda: load_hand(cache, keys.source, keys.hand, device))
+    object_model = timed("object", lambda: load_object(cache, mesh, keys.object, scale, objects, device.alias))
+    hand = upload_hand(hand_model, device.alias)
+    field_model = timed("field", lambda: load_field(cache, keys, hand, fields, report))
+    start = time.perf_counter()
+    obj = upload_object(object_model, device.alias)
+    field_arrays = upload_field(field_model, hand_model, device.alias)
+    seconds["upload"] = time.perf_counter() - start
+    return Inputs(hand, obj, field_arrays, keys, device, seconds, hits)
+
+
+def run_key(pipeline: dict, keys: InputKeys, shard_rows: int) -> str:
+    """Content key of a run: everything that decides its rows."""
+    return hashlib.sha256(
+        json.dumps([pipeline, keys.hand, keys.object, keys.field, shard_rows], sort_keys=True).encode()
+    ).hexdigest()

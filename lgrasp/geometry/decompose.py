@@ -1,0 +1,138 @@
+"""Triangle mesh -> convex pieces by CoACD, in a process of its own that may hang, crash or print what it likes."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from lgrasp.errors import DecomposeError
+
+__all__ = ["DECOMPOSE_VERSION", "Decompose", "decompose"]
+
+DECOMPOSE_VERSION = 1
+"""Raised whenever the same mesh and parameters give other pieces."""
+
+Decompose = Callable[..., list[np.ndarray]]
+""":func:`decompose`, perhaps with some parameters fixed."""
+
+_SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2, "resolution": 1000}
+"""CoACD's effort: a tenth of the default's time, pieces hardly worse."""
+
+
+_made: dict[str, dict[str, np.ndarray] | DecomposeError] = {}  # of this process: links often share a mesh
+
+
+class _Store(Protocol):
+    """Where results are kept: the engine's cache."""
+
+    def load(self, kind: str, key: str) -> dict[str, np.ndarray] | None: ...
+
+    def store(self, kind: str, key: str, arrays: dict[str, np.ndarray]) -> None: ...
+
+
+def decompose(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    threshold: float = 4.0e-3,
+    max_pieces: int = 8,
+    timeout: float = 60.0,
+    seed: int = 0,
+    store: _Store | None = None,
+) -> list[np.ndarray]:
+    """Convex pieces whose union holds a mesh and follows its dents, as vertices (W, 3) [m] each.
+
+    Args:
+        vertices: (V, 3) [m].
+        faces: (F, 3); a mesh that is not closed is closed first.
+        threshold: dents shallower than this [m] may stay filled.
+        max_pieces: pieces are merged down to this number, whatever dents that fills.
+        timeout: seconds after which the process is ended.
+        store: results are looked up and kept there; failures are not.
+
+    Raises:
+        DecomposeError: time-out, crash, or nothing usable came back.
+    """
+    vertices = np.ascontiguousarray(vertices, np.float64)
+    faces = np.ascontiguousarray(faces, np.int32)
+    parameters = {"threshold": threshold, "max_convex_hull": max_pieces, "seed": seed, **_SEARCH}
+    key = _key(vertices, faces, parameters)
+    found = store.load("convex", key) if store else None
+    if found is None:
+        if key not in _made:
+            try:
+                _made[key] = _run(vertices, faces, parameters, timeout)
+            except DecomposeError as error:
+                _made[key] = error
+        found = _made[key]
+        if isinstance(found, DecomposeError):
+            raise found
+        if store:
+            store.store("convex", key, found)
+    return np.split(found["vertices"], found["first"][1:-1])
+
+
+def _key(vertices: np.ndarray, faces: np.ndarray, parameters: dict[str, float]) -> str:
+    text = json.dumps([DECOMPOSE_VERSION, parameters, vertices.shape, faces.shape], sort_keys=True)
+    h = hashlib.sha256(text.encode())
+    h.update(vertices.tobytes())
+    h.update(faces.tobytes())
+    return h.hexdigest()
+
+
+def _run(
+    vertices: np.ndarray, faces: np.ndarray, parameters: dict[str, float], timeout: float
+) -> dict[str, np.ndarray]:
+    """Pieces as ``vertices`` (W, 3) and ``first`` (pieces + 1,), made by this module in another process."""
+    with tempfile.TemporaryDirectory(prefix="lgrasp-convex-") as folder:
+        task, result = Path(folder) / "task.npz", Path(folder) / "result.npz"
+        np.savez(task, vertices=vertices, faces=faces, parameters=np.asarray(json.dumps(parameters)))
+        # -P: no module of the folder that the user is in gets in the way
+        where = os.pathsep.join([str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])])
+        try:
+            done = subprocess.run(
+                [sys.executable, "-P", "-m", "lgrasp.geometry.decompose", str(task), str(result)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                timeout=timeout,
+                env={**os.environ, "PYTHONPATH": where, "OMP_NUM_THREADS": "1"},
+            )
+        except subprocess.TimeoutExpired:
+            raise DecomposeError(f"convex decomposition took longer than {timeout:g} s") from None
+        except OSError as error:
+            raise DecomposeError(f"convex decomposition cannot be started: {error.strerror}") from None
+        try:
+            with np.load(result, allow_pickle=False) as arrays:
+                found = {name: arrays[name] for name in ("vertices", "first")}
+        except Exception:  # no file, or half a file: the same to the caller
+            said = done.stderr.decode(errors="replace").strip().splitlines()
+            raise DecomposeError(
+                f"convex decomposition failed (exit code {done.returncode}){': ' + said[-1][:200] if said else ''}"
+            ) from None
+    if len(found["first"]) < 2 or not np.isfinite(found["vertices"]).all():
+        raise DecomposeError("convex decomposition gave no pieces")
+    return found
+
+
+def _main(task: str, result: str) -> None:
+    import coacd
+
+    with np.load(task, allow_pickle=False) as arrays:
+        mesh = coacd.Mesh(arrays["vertices"], arrays["faces"])
+        parameters = json.loads(str(arrays["parameters"]))
+    coacd.set_log_level("error")
+    pieces = [np.asarray(v, np.float64) for v, _ in coacd.run_coacd(mesh, real_metric=True, **parameters)]
+    first = np.cumsum([0, *map(len, pieces)])
+    np.savez(result, vertices=np.vstack(pieces) if pieces else np.zeros((0, 3)), first=first)
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

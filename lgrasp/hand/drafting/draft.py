@@ -1,0 +1,349 @@
+"""URDF -> hand.yaml without a human: fingers, palmar surface, canonical box, open posture, and why."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.errors import HandError
+from lgrasp.hand.drafting.contact_survey import Survey, survey_hand
+from lgrasp.hand.drafting.finger_structure import Anatomy, finger_names, held_value, probe_spec, study_anatomy, tip_link
+from lgrasp.hand.drafting.lateral_surfaces import rounded_axis
+from lgrasp.hand.drafting.propose import propose_spaces
+from lgrasp.hand.drafting.surface_visibility import sample_bodies
+from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.tree import build_tree
+from lgrasp.hand.urdf import Urdf, read_urdf
+from lgrasp.math.kinematics import MAX_JOINTS
+
+__all__ = ["draft_spec"]
+
+_LEAST_EXTENT, _MOST_EXTENT = 0.02, 3.0  # [m] of a hand, an arm included
+_OPEN_DRAWS = 800
+_ARM_TRIALS = 5
+_FEW_DRIVES = 2.0  # a finger, on average
+_SHARED_VALUES = {1: 4, 2: 3, 3: 2}  # values of each shared joint, by their number
+
+
+def draft_spec(
+    urdf_path: Path, name: str | None = None, *, jaws: tuple[str, str] | None = None
+) -> tuple[HandSpec, list[str]]:
+    """Rules for a hand from its URDF alone, and what was decided, in words.
+
+    Args:
+        jaws: (static link, moving link) of a gripper that :func:`lgrasp.hand.drafting.jaws.make_base` turned round.
+
+    Raises:
+        HandError: the URDF cannot be used (see :func:`read_urdf`, :func:`study_anatomy`), the hand is of impossible
+            size, or no two of its parts ever face each other.
+    """
+    urdf = read_urdf(urdf_path)
+    name = name or urdf.name
+    anatomy = study_anatomy(urdf, name, jaws[1] if jaws else None)
+    if jaws is None:
+        _check_coupled(urdf, anatomy)
+    survey = _best_survey(urdf, anatomy, name, jaws)
+    _check_size(urdf, survey)
+    _check_hold(urdf, survey)
+    said: list[str] = []
+    data: dict[str, Any] = {"name": name, "urdf": urdf_path.name, "base_link": survey.model.tree.base_link}
+    if anatomy.base_link:
+        said.append(f"base frame: '{anatomy.base_link}', which carries the fingers (base_link)")
+    else:
+        said.append(f"base frame: the root link '{urdf.root}' (base_link)")
+    data["locked"] = survey.locked
+    said += _say_locked(survey)
+    names = finger_names(anatomy)
+    data["static_links"] = [
+        n for n, b in zip(survey.model.tree.link_names, survey.model.tree.link_body, strict=True) if b == 0
+    ]
+    data["contact"] = _contact_rules(survey)
+    data["palm"] = _palm_rule(survey)
+    said += _say_contacts(survey, names)
+    assert survey.hold is not None
+    low, high = np.round(survey.hold.low, 3), np.round(survey.hold.high, 3)
+    data["canonical_box"] = {"min": low.tolist(), "max": high.tolist()}
+    said.append(_say_box(survey, names, low, high))
+    drives = [len(d) for tip, d in zip(anatomy.tips, anatomy.drives, strict=True) if tip in survey.sides]
+    if anatomy.tree.groups > 1 and np.mean(drives) <= _FEW_DRIVES:
+        data["contacts"] = (2, 3)
+        said.append(
+            "grasps touch with 2 or 3 fingers: fingers of one or two drives seldom meet an object more at "
+            "a time (contacts)"
+        )
+    opened, clear = _open_posture(survey)
+    data["open_posture"] = opened
+    said.append(
+        "open posture: "
+        + (
+            "free of self-collision, "
+            if clear
+            else "NO sampled posture is free of self-collision, this is the best one; "
+        )
+        + "fingers away from the canonical box (open_posture)"
+    )
+    data["fingers"] = {
+        finger: [n for b in np.flatnonzero(anatomy.tree.body_group == g) for n in anatomy.links(int(b))]
+        for g, finger in enumerate(names)
+    }
+    said += [f"note: {note}" for note in survey.model.notes]
+    spec = HandSpec.model_validate(data)
+    if jaws is None:
+        spec, said = _with_shared(urdf, survey, spec, said)
+    # without shared joints the hand is that of the survey in another open posture
+    model = build_hand(urdf.path, spec) if spec.shared else replace(survey.model, tree=build_tree(urdf, spec))
+    spaces, told = propose_spaces(urdf, spec, survey, names, model)
+    return spec.model_copy(update={"opposition_spaces": spaces}), [*said, *told]
+
+
+def _with_shared(urdf: Urdf, survey: Survey, spec: HandSpec, said: list[str]) -> tuple[HandSpec, list[str]]:
+    """Locked joints that move several fingers take a few values instead, those aside that the palm rides on."""
+    spread = [n for n in spec.locked if n not in survey.anatomy.carrying]
+    spread = [n for n in spread if _freed(urdf, spec, {n: (spec.locked[n],)}) is not None]
+    by_name = {j.name: j for j in urdf.joints}
+    count = _SHARED_VALUES.get(len(spread), 0)
+    shared = {n: _around(spec.locked[n], by_name[n].lower, by_name[n].upper, count) for n in spread}
+    free = _freed(urdf, spec, shared) if count else None
+    if free is None:
+        return spec, said
+    told = [line for line in said if not any(line.startswith(f"joint '{n}' is locked") for n in shared)]
+    told += [
+        f"joint '{n}' moves several fingers: poses take it at {', '.join(f'{v:g}' for v in values)} (shared)"
+        for n, values in shared.items()
+    ]
+    return free, told
+
+
+def _freed(urdf: Urdf, spec: HandSpec, shared: dict[str, tuple[float, ...]]) -> HandSpec | None:
+    """The rules with locked joints shared; None where the palm would move or a mimic joint does not reach as far."""
+    free = spec.model_copy(
+        update={"locked": {n: v for n, v in spec.locked.items() if n not in shared}, "shared": shared}
+    )
+    try:
+        tree = build_tree(urdf, free)
+    except HandError:
+        return None
+    static = {n for n, b in zip(tree.link_names, tree.link_body, strict=True) if b == 0}
+    if not static.issuperset(spec.palm.links) or max(np.diff(tree.joint_first)) > MAX_JOINTS:
+        return None
+    return free.model_copy(update={"static_links": tuple(n for n in spec.static_links if n in static)})
+
+
+def _around(best: float, lower: float, upper: float, count: int) -> tuple[float, ...]:
+    """Values spread over a range, the nearest of them moved to the best one."""
+    values = [round(lower + (i + 0.5) / count * (upper - lower), 4) for i in range(count)]
+    values[int(np.argmin(np.abs(np.array(values) - best)))] = best
+    return tuple(values)
+
+
+def _check_coupled(urdf: Urdf, anatomy: Anatomy) -> None:
+    if anatomy.tree.groups == 1 and len(anatomy.tips) > 1:
+        tips = ", ".join(anatomy.links(b)[0] for b in anatomy.tips)
+        raise HandError(
+            f"URDF {urdf.path}: one drive moves all fingers ({tips}) together; lgrasp places one contact per drive, so "
+            f"they cannot oppose each other: 'lgrasp hands add {urdf.path}' makes one of the two jaws the base"
+        )
+
+
+def _best_survey(urdf: Urdf, anatomy: Anatomy, name: str, jaws: tuple[str, str] | None) -> Survey:
+    """The survey of the lock values at which fingers oppose best: shared joints at 0, or at a share of their range.
+
+    An arm that is in the way of the fingers is held elsewhere. Values at which links overlap that other values part are
+    taken last: such grasps are invalid.
+    """
+    by_name = {j.name: j for j in urdf.joints}
+    base = {n: held_value(by_name[n]) for n in anatomy.locked}
+    carrying = anatomy.locked if jaws is not None else anatomy.carrying
+    spread = [n for n in anatomy.locked if n not in carrying]
+    best = survey_hand(urdf, anatomy, name, base, jaws)
+    rng = np.random.default_rng(0)
+    for _ in range(_ARM_TRIALS):
+        if not carrying or best.postures.clear.mean() > 0.6:
+            break
+        base = {**base, **{n: held_value(by_name[n], float(rng.uniform(0.2, 0.8))) for n in carrying}}
+        survey = survey_hand(urdf, anatomy, name, base, jaws)
+        best = max((best, survey), key=lambda s: (s.hold is not None, s.postures.clear.mean()))
+    apart = _kept_apart(_unlocked(urdf, name, anatomy, best.locked)) if spread else set()
+
+    def value(s: Survey) -> tuple[int, float]:
+        return -len(_stuck(s.model, apart)), s.hold.score if s.hold else 0.0
+
+    for share in (0.0, 0.5, 1.0):
+        locked = {**best.locked, **{n: held_value(by_name[n], share) for n in spread}}
+        if locked != best.locked:
+            best = max((best, survey_hand(urdf, anatomy, name, locked, jaws)), key=value)
+    return best
+
+
+def _unlocked(urdf: Urdf, name: str, anatomy: Anatomy, locked: dict[str, float]) -> HandModel | None:
+    """The hand with its locked spread joints at any value; None when that is too much for a group."""
+    held = {n: value for n, value in locked.items() if n in anatomy.carrying}
+    shared = {n: (value,) for n, value in locked.items() if n not in held}
+    spec = probe_spec(name, tip_link(urdf, anatomy), held, anatomy.base_link)
+    try:
+        return build_hand(urdf.path, spec.model_copy(update={"shared": shared}))
+    except HandError:
+        return None
+
+
+def _kept_apart(model: HandModel | None) -> set[tuple[str, str]]:
+    """Link pairs that must not touch, those decided on true surfaces aside."""
+    if model is None:
+        return set()
+    names = model.tree.link_names
+    return {(names[min(pair)], names[max(pair)]) for pair in model.piece_link[model.pairs].tolist()}
+
+
+def _stuck(model: HandModel, apart: set[tuple[str, str]]) -> set[tuple[str, str]]:
+    """Link pairs of ``apart`` on different bodies that the model does not keep apart: they touch in every posture."""
+    tree = model.tree
+    body = dict(zip(tree.link_names, tree.link_body, strict=True))
+    return {(a, b) for a, b in apart - _kept_apart(model) if body[a] != body[b]}
+
+
+def _check_size(urdf: Urdf, survey: Survey) -> None:
+    t = survey.postures.t.reshape(-1, 3)
+    reach = survey.model.body_sphere[survey.model.body_sphere[:, 3] > 0, 3].max()
+    extent = float(max(np.ptp(t, axis=0).max(), reach))
+    if extent < _LEAST_EXTENT:
+        raise HandError(
+            f"URDF {urdf.path}: the hand is {1000 * extent:.2g} mm large; lengths are in metres; is a scale applied "
+            "twice?"
+        )
+    if extent > _MOST_EXTENT:
+        raise HandError(
+            f"URDF {urdf.path}: the hand is {extent:.3g} m large; joint origins are probably in millimetres, "
+            "multiply them by 0.001"
+        )
+
+
+def _check_hold(urdf: Urdf, survey: Survey) -> None:
+    """Refuse what can hold nothing.
+
+    Raises:
+        HandError: with the reason and the remedy.
+    """
+    if survey.hold is not None:
+        return
+    anatomy = survey.anatomy
+    moved = int(anatomy.tree.groups)
+    tips = ", ".join(anatomy.links(b)[0] for b in anatomy.tips)
+    if moved == 1 and len(anatomy.tips) == 1:
+        raise HandError(
+            f"URDF {urdf.path} has one finger ({tips}) and no static surface opposite to it; a grasp needs two "
+            "contacts that face each other: add the missing fingers, or a fixed link that the finger closes against"
+        )
+    shares = ", ".join(f"{100 * s:.0f} %" for s in survey.postures.clear.mean(0))
+    raise HandError(
+        f"URDF {urdf.path}: no two of its {moved} fingers ({tips}) ever face each other across an object of 4 to 6 cm "
+        f"(postures clear of the palm, per finger: {shares}); check joint axes, limits (radians) and mesh scales"
+    )
+
+
+def _say_locked(survey: Survey) -> list[str]:
+    said = []
+    for joint, value in survey.locked.items():
+        why = "it carries the whole hand" if joint in survey.anatomy.carrying else "it moves several fingers"
+        if survey.model.groups == 1:
+            why = "it does not move the jaw"
+        said.append(f"joint '{joint}' is locked at {value:g}: {why} (locked)")
+    return said
+
+
+def _contact_rules(survey: Survey) -> list[dict[str, Any]]:
+    """One rule per set of links with the same forbidden cones."""
+    rules: dict[tuple[tuple[float, ...], ...], list[str]] = {}
+    named: set[str] = set()
+    for side in (s for sides in survey.sides.values() for s in sides):
+        if side.skin.link not in named:
+            key = tuple((*rounded_axis(axis), angle) for axis, angle in side.forbidden)
+            rules.setdefault(key, []).append(side.skin.link)
+            named.add(side.skin.link)
+    return [
+        {"links": links, "forbidden": [{"axis": list(cone[:3]), "angle": cone[3]} for cone in cones]}
+        for cones, links in rules.items()
+    ]
+
+
+def _palm_rule(survey: Survey) -> dict[str, Any]:
+    if not survey.palm:
+        return {}
+    links = [side.skin.link for side in survey.palm]
+    return {"links": links, "allowed": [{"axis": rounded_axis(survey.palm[0].axis), "angle": 45.0}]}
+
+
+def _say_contacts(survey: Survey, names: list[str]) -> list[str]:
+    said = []
+    group = survey.anatomy.tree.body_group
+    for g, finger in enumerate(names):
+        tips = [t for t in survey.anatomy.tips if group[t] == g]
+        sides = {s.skin.link: s for t in tips for s in survey.sides.get(t, [])}
+        joints = len(
+            set().union(*(d for t, d in zip(survey.anatomy.tips, survey.anatomy.drives, strict=True) if t in tips))
+        )
+        if sides:
+            area = 1e4 * sum(s.area for s in sides.values())
+            said.append(
+                f"finger '{finger}': {joints} drives, may touch with {', '.join(sides)} ({area:.1f} cm2; contact)"
+            )
+        else:
+            said.append(
+                f"finger '{finger}': {joints} drives, shows the others no surface, so it touches nothing (contact)"
+            )
+        if len(tips) > 1:
+            said.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
+    if survey.palm:
+        area = 1e4 * sum(s.area for s in survey.palm)
+        said.append(f"palm: {', '.join(s.skin.link for s in survey.palm)} ({area:.0f} cm2 face the fingertips; palm)")
+    else:
+        said.append("palm: none; no static link shows the fingertips 3 cm2 or more (palm)")
+    return said
+
+
+def _say_box(survey: Survey, names: list[str], low: np.ndarray, high: np.ndarray) -> str:
+    hold = survey.hold
+    assert hold is not None
+
+    def label(key: str) -> str:
+        return "palm" if key == "palm" else names[int(key)]
+
+    pairs = [f"{label(a)}-{label(b)}" for (a, b), v in sorted(hold.opposing.items(), key=lambda x: -x[1]) if v > 0.3]
+    place = " x ".join(f"[{a:.3f}, {b:.3f}]" for a, b in zip(low, high, strict=True))
+    able = [label(k) for k, v in hold.able.items() if v > 0.3]
+    who = (
+        f"{', '.join(pairs[:6])} face each other there"
+        if pairs
+        else f"{', '.join(able)} reach it, none straight opposite"
+    )
+    return f"canonical box: {place} m, where a 4-6 cm ball is held best: {who} (canonical_box)"
+
+
+def _open_posture(survey: Survey) -> tuple[dict[str, float], bool]:
+    """Joint values free of self-collision, fingers out of the canonical box, as near to 0 as that allows."""
+    model, tree = survey.model, survey.model.tree
+    assert survey.hold is not None
+    rng = np.random.default_rng(3)
+    lower, upper = tree.joint_lower.astype(float), tree.joint_upper.astype(float)
+    rest = np.clip(0.0, lower, upper)
+    span = upper - lower
+    draws = rng.uniform(lower, upper, (_OPEN_DRAWS, len(lower)))
+    # from the rest posture outwards, and the corners of the range
+    share = rng.uniform(0, 1, (_OPEN_DRAWS, 1)) ** 2
+    q = np.vstack([rest, rest + share * (draws - rest), np.where(rng.random(draws.shape) < 0.5, lower, upper)])
+    # a margin to the limits where there is room
+    q = np.clip(q, np.minimum(rest, lower + 0.01 * span), np.maximum(rest, upper - 0.01 * span))
+    postures = sample_bodies(model, q)
+    away = np.full(len(q), np.inf)
+    for side in (s for sides in survey.sides.values() for s in sides):
+        b = side.skin.body
+        p = np.einsum("nij,kj->nki", postures.R[:, b], side.skin.points[::8]) + postures.t[:, None, b]
+        outside = np.maximum(np.maximum(survey.hold.low - p, p - survey.hold.high), 0.0)
+        away = np.minimum(away, np.linalg.norm(outside, axis=2).min(1))
+    cost = np.abs((q - rest) / span).mean(1)
+    value = np.minimum(away, 0.03) / 0.03 - 0.5 * cost - 10.0 * postures.touching
+    best = int(np.argmax(value))
+    values = np.clip(np.round(q[best], 3), lower, upper)
+    opened = {n: float(v) for n, v in zip(tree.joint_names, values, strict=True)}
+    return opened, not bool(postures.touching[best])

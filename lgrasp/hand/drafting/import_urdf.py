@@ -1,0 +1,204 @@
+"""Any URDF -> a hand's folder: the URDF with its meshes beside it, and a drafted, commented hand.yaml."""
+
+import os
+import re
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import trimesh
+from lxml import etree
+
+from lgrasp.errors import HandError, LgraspError
+from lgrasp.hand.drafting.draft import draft_spec
+from lgrasp.hand.drafting.jaws import find_jaws, make_base
+from lgrasp.hand.drafting.write import write_spec
+from lgrasp.hand.geometry import MOST_FACES, thin_mesh
+from lgrasp.hand.model import build_hand
+from lgrasp.hand.spec import HandSpec, load_spec
+from lgrasp.hand.urdf import find_mesh, parse_robot, read_urdf
+from lgrasp.paths import user_dir
+
+__all__ = ["Adopted", "add_hand"]
+
+_DULL = {"hand", "robot", "model", "urdf", "gripper"}
+_LARGE = 5_000_000  # bytes of a mesh file that is worth looking into
+
+
+@dataclass(frozen=True)
+class Adopted:
+    """A hand that was added."""
+
+    folder: Path
+    spec: HandSpec
+    decisions: list[str]
+
+
+def add_hand(urdf: Path, *, name: str | None = None, out: Path | None = None, force: bool = False) -> Adopted:
+    """Make a hand's folder from a URDF; the folder appears whole or not at all.
+
+    Args:
+        name: default: the file's name, or the robot's when the file is called hand.urdf or the like.
+        out: default: the user's data folder, ``hands/NAME``.
+        force: replace what is there.
+
+    Raises:
+        HandError: the URDF cannot be used, or the folder exists.
+    """
+    source = read_urdf(urdf)
+    name = name or _slug(urdf.stem if urdf.stem.lower() not in _DULL else source.name)
+    if name != _slug(name):
+        raise HandError(f"hand name '{name}' may hold letters, digits, '.', '_' and '-' only, such as '{_slug(name)}'")
+    folder = Path(out).expanduser() if out is not None else user_dir("hands") / name
+    if os.path.lexists(folder) and not force:
+        raise HandError(f"hand folder {folder} exists; choose another --name or --out, or replace it with --force")
+    if folder.exists() and not (folder / "hand.yaml").is_file() and any(folder.iterdir() if folder.is_dir() else [1]):
+        raise HandError(f"{folder} holds something that is no hand (it has no hand.yaml); choose another --out")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
+    except OSError as error:
+        raise HandError(f"hand folder {folder} cannot be made: {error.strerror}; choose another with --out") from None
+    originals = {temporary / "hand.urdf": urdf}
+    try:
+        spec, said = _fill(urdf, name, temporary, originals)
+        temporary.chmod(0o755)
+        _swap(temporary, folder)
+    except LgraspError as error:
+        # messages name the user's files, not copies that are gone
+        text = str(error)
+        for copy, original in originals.items():
+            text = text.replace(str(copy.resolve()), str(original)).replace(str(copy), str(original))
+        raise type(error)(text) from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return Adopted(folder, spec, said)
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("._-") or "hand"
+
+
+def _swap(new: Path, folder: Path) -> None:
+    if not os.path.lexists(folder):
+        os.replace(new, folder)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
+    os.replace(folder, old / "old")
+    os.replace(new, folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> tuple[HandSpec, list[str]]:
+    """Write URDF, meshes and hand.yaml into a folder and build the hand once."""
+    robot, _ = parse_robot(urdf, urdf.read_bytes())
+    for note in [e for e in robot.iter() if not isinstance(e.tag, str)]:
+        if note.getparent() is not None:
+            note.getparent().remove(note)
+    said = _take_visuals(robot)
+    said += _take_meshes(robot, urdf, folder, originals)
+    target = folder / "hand.urdf"
+    _write(robot, target)
+    jaws = find_jaws(target)
+    if jaws is not None:
+        make_base(robot, jaws[0])
+        _write(robot, target)
+        said.append(
+            f"one drive moves both jaws: '{jaws[0]}' is made the base (the copy of the URDF is turned round; joint "
+            f"values mean the same), so that '{jaws[1]}' closes against it as against a palm"
+        )
+    spec, decided = draft_spec(target, name, jaws=jaws)
+    spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {urdf.name}"})
+    write_spec(spec, folder / "hand.yaml", [*said, *decided])
+    written = load_spec(folder / "hand.yaml")
+    build_hand(target, written)
+    return written, [*said, *decided]
+
+
+def _write(robot: etree._Element, path: Path) -> None:
+    path.write_bytes(etree.tostring(robot, xml_declaration=True, encoding="utf-8", pretty_print=True))
+
+
+def _take_visuals(robot: etree._Element) -> list[str]:
+    """Where no link has collision geometry, the visual geometry is it."""
+    if any(True for _ in robot.iter("collision")):
+        return []
+    count = 0
+    for visual in list(robot.iter("visual")):
+        collision = etree.SubElement(visual.getparent(), "collision")
+        for part in visual:
+            if part.tag in ("origin", "geometry"):
+                collision.append(etree.fromstring(etree.tostring(part)))
+        count += 1
+    return (
+        [f"no link has collision geometry: the visual geometry of {count} elements is used as collision"]
+        if count
+        else []
+    )
+
+
+def _take_meshes(robot: etree._Element, urdf: Path, folder: Path, originals: dict[Path, Path]) -> list[str]:
+    """Copy every mesh to meshes/collision or meshes/visual and name it there; huge collision meshes are thinned.
+
+    ``originals`` gets the file that each copy was made from.
+    """
+    said: list[str] = []
+    for kind in ("collision", "visual"):
+        copied: dict[Path, str] = {}
+        for element in list(robot.iter(kind)):
+            for mesh in list(element.iter("mesh")):
+                link = element.getparent().get("name")
+                try:
+                    file = find_mesh(urdf, link, mesh.get("filename", ""))
+                except HandError as error:
+                    if kind == "collision":
+                        raise
+                    element.getparent().remove(element)
+                    said.append(f"link '{link}': visual mesh left out ({str(error).split(': ', 1)[-1]})")
+                    break
+                if file not in copied:
+                    copied[file] = _copy_mesh(file, folder, kind, set(copied.values()), said)
+                    originals[folder / copied[file]] = file
+                mesh.set("filename", copied[file])
+    return said
+
+
+def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], said: list[str]) -> str:
+    """Path, relative to the folder, of the copy of a mesh."""
+    base = f"meshes/{kind}/{_slug(file.stem)}"
+    suffix = file.suffix.lower()
+    thin = _thinned(file) if kind == "collision" else None
+    if thin is not None:
+        suffix = ".stl"
+    name, number = f"{base}{suffix}", 1
+    while name in taken:
+        number += 1
+        name = f"{base}_{number}{suffix}"
+    target = folder / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if thin is not None:
+        mesh, before = thin
+        mesh.export(target)
+        said.append(f"collision mesh {file.name} has {before:,} faces: thinned to {len(mesh.faces):,}")
+        return name
+    shutil.copyfile(file, target)
+    if suffix == ".obj":
+        for library in re.findall(rb"^mtllib\s+(.+?)\s*$", file.read_bytes(), re.MULTILINE):
+            material = file.parent / Path(library.decode("utf-8", "replace")).name
+            if material.is_file():
+                shutil.copyfile(material, target.parent / material.name)
+    return name
+
+
+def _thinned(file: Path) -> tuple[trimesh.Trimesh, int] | None:
+    """A huge mesh, thinned, and its faces before; None for others, and for what cannot be read (said later)."""
+    if file.stat().st_size < _LARGE:
+        return None
+    try:
+        mesh = trimesh.load_mesh(file, process=True)
+    except Exception:
+        return None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) <= MOST_FACES:
+        return None
+    return thin_mesh(mesh, MOST_FACES), len(mesh.faces)

@@ -1,0 +1,176 @@
+"""Pads and lateral sides of fingers, and which fingers stand side by side."""
+
+from dataclasses import dataclass
+from itertools import combinations, groupby
+
+import numpy as np
+
+from lgrasp.hand.drafting.contact_survey import Survey, pad_axis
+from lgrasp.hand.drafting.surface_visibility import Postures, Skin, sample_bodies
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.opposition.check import moving_joints
+from lgrasp.hand.spec import Surface
+
+__all__ = ["Beside", "Finger", "find_fingers", "finger_rows", "neighbours", "rounded_axis"]
+
+_PAD, _FLANK = 60.0, 45.0  # degrees around the axis
+_FLANK_BODIES = 3  # the last of a finger
+_BESIDE = 0.5  # cosine of a finger's lateral axis to the way to its neighbour, at least
+_PARALLEL = 0.7  # cosine of neighbours' directions
+_ONE_SIDED = 2.0  # ratio of a joint's room to both sides of its open posture, for it to bend to one
+_ALONG = 0.6  # cosine of the last hinge to the finger's direction, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Finger:
+    """What a finger can press with, and where it is in a posture (base frame)."""
+
+    name: str
+    joints: tuple[str, ...]  # that move its tip, shared ones left out
+    pad: tuple[Surface, ...]
+    flanks: dict[int, tuple[Surface, ...]]  # both lateral sides, +1 and -1; empty for a thumb and what does not bend
+    base: np.ndarray  # (3,) [m] where its last bodies begin
+    along: np.ndarray  # (3,) unit, from there to the tip
+    lateral: np.ndarray  # (3,) unit, outward of side +1
+
+
+Beside = tuple[str, int, str, int]
+"""A finger, its lateral side, the other finger, its lateral side."""
+
+
+def rounded_axis(axis: np.ndarray) -> tuple[float, float, float]:
+    """An axis with two decimals, or a coordinate axis when it is within 8 degrees of one."""
+    main = int(np.argmax(np.abs(axis)))
+    if abs(axis[main]) > 0.99:
+        axis = np.sign(axis[main]) * np.eye(3)[main]
+    x, y, z = (np.round(axis, 2) + 0.0).tolist()
+    return x, y, z
+
+
+def find_fingers(survey: Survey, model: HandModel, names: list[str], q: np.ndarray) -> list[Finger]:
+    """The fingers that show the others some surface, as they stand in posture q (K,).
+
+    Args:
+        model: the hand with its shared joints free. names: of the survey's groups.
+    """
+    standing = sample_bodies(model, q[None])
+    shown = {int(survey.model.tree.body_group[tip]) for tip in survey.sides}
+    found = [_finger(survey, model, standing, group, name) for group, name in enumerate(names) if group in shown]
+    return [finger for finger in found if finger is not None]
+
+
+def _finger(survey: Survey, model: HandModel, standing: Postures, group: int, name: str) -> Finger | None:
+    tree = survey.model.tree
+    tips = [tip for tip in survey.sides if tree.body_group[tip] == group]
+    place = _Place(model, standing)
+    pads, hinges, moved = [], [], np.zeros(model.dofs, bool)
+    for tip in tips:
+        skins = [s for s in survey.skins if s.body == tip]
+        R, t = place(skins[0])
+        hinge = R @ tree.joint_axis[tip - 1].astype(float)
+        along = R @ _middle(skins)
+        axis = pad_axis(survey.model, skins, tip)
+        if not tree.joint_prismatic[tip - 1] and abs(hinge @ along) < _ALONG * np.linalg.norm(along):
+            axis = _flexed(survey, model, tip, R.T @ np.cross(hinge, along), axis)
+            hinges.append(hinge)
+        pads += [(s, axis) for s in skins if axis is not None]
+        moved |= moving_joints(model.tree, int(model.tree.link_body[model.tree.link_names.index(skins[0].link)]))
+    joints = [n for n, m in zip(model.tree.joint_names, moved, strict=True) if m and n not in model.tree.shared_names]
+    if not joints or not pads:
+        return None
+    last = [b for b in survey.anatomy.path(tips[0]) if any(s.body == b for s in survey.skins)][-_FLANK_BODIES:]
+    flank = [s for b in last for s in survey.skins if s.body == b]
+    base = place(flank[0])[1]
+    R, t = place(flank[-1])
+    along = R @ _middle([s for s in flank if s.body == last[-1]]) + t - base
+    along /= max(float(np.linalg.norm(along)), 1e-9)
+    flanks, lateral = {}, np.zeros(3)
+    if len(tips) == len(hinges) == 1 and name != "thumb":
+        lateral = hinges[0]
+        flanks = {sign: _surfaces([(s, place(s)[0].T @ (sign * lateral)) for s in flank], _FLANK) for sign in (1, -1)}
+    return Finger(name, tuple(joints), _surfaces(pads, _PAD), flanks, base, along, lateral)
+
+
+def _middle(skins: list[Skin]) -> np.ndarray:
+    """Mean point of the surface of links on one body, (3,) [m], body frame."""
+    return np.vstack([s.points for s in skins]).mean(0)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Called with a skin: rotation (3, 3) and position (3,) [m] of the frame of its points in a posture of the hand.
+
+    Bodies of the hand need not be those of the survey, which has the shared joints locked; links are the same.
+    """
+
+    model: HandModel
+    standing: Postures
+
+    def __call__(self, skin: Skin) -> tuple[np.ndarray, np.ndarray]:
+        tree = self.model.tree
+        index = tree.link_names.index(skin.link)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = self.standing.R[0, tree.link_body[index]], self.standing.t[0, tree.link_body[index]]
+        T = T @ tree.T_body_link[index] @ np.linalg.inv(skin.T_body_link)
+        return T[:3, :3], T[:3, 3]
+
+
+def _flexed(survey: Survey, model: HandModel, tip: int, way: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
+    """Direction in which a fingertip closes, (3,) unit, body frame: ``way`` or against it.
+
+    The open posture leaves a joint most of its room to close; where it does not tell, the side that is ``seen`` does.
+    """
+    tree, k = survey.model.tree, tip - 1
+    name = tree.joint_names[tree.dof_index[tree.dof_first[tree.body_group[tip]] + tree.joint_dof[k]]]
+    column = model.tree.joint_names.index(name)
+    limits = np.array([model.tree.joint_lower[column], model.tree.joint_upper[column]])
+    room = tree.joint_mult[k] * (limits - model.tree.joint_open[column])
+    down, up = -min(room), max(room)
+    way = way / np.linalg.norm(way)
+    if seen is not None and max(up, down) < _ONE_SIDED * min(up, down):
+        return way if way @ seen > 0 else -way
+    return way if up > down else -way
+
+
+def _surfaces(parts: list[tuple[Skin, np.ndarray]], angle: float) -> tuple[Surface, ...]:
+    """Surfaces around an axis (body frame) of each skin; neighbouring links with the same axis in one."""
+    axes = [(s.link, rounded_axis(s.T_body_link[:3, :3].T @ axis)) for s, axis in parts]
+    return tuple(
+        Surface(links=tuple(link for link, _ in same), axis=axis, angle=angle)
+        for axis, same in groupby(axes, key=lambda x: x[1])
+    )
+
+
+def neighbours(fingers: list[Finger]) -> set[Beside]:
+    """Fingers side by side with no other between them."""
+
+    def nearest(a: Finger, sign: int) -> str | None:
+        near = []
+        for b in fingers:
+            way = b.base - a.base
+            far = float(np.linalg.norm(way))
+            if b is not a and b.flanks and sign * (a.lateral @ way) > _BESIDE * far and a.along @ b.along > _PARALLEL:
+                near.append((far, b.name))
+        return min(near)[1] if near else None
+
+    side = {(a.name, sign): nearest(a, sign) for a in fingers for sign in a.flanks}
+    return {
+        (a, sign_a, b, sign_b)
+        for (a, sign_a), (b, sign_b) in combinations(side, 2)
+        if side[a, sign_a] == b and side[b, sign_b] == a
+    }
+
+
+def finger_rows(names: list[str], pairs: set[Beside]) -> list[list[str]]:
+    """Fingers that stand side by side, from end to end; rings have no ends and are left out."""
+    beside = {name: sorted({*(b for a, _, b, _ in pairs if a == name), *(a for a, _, b, _ in pairs if b == name)})
+              for name in names}  # fmt: skip
+    rows: list[list[str]] = []
+    for end in (name for name in names if len(beside[name]) == 1):
+        if any(end in row for row in rows):
+            continue
+        row = [end]
+        while following := [name for name in beside[row[-1]] if name not in row]:
+            row.append(following[0])
+        rows.append(row)
+    return rows

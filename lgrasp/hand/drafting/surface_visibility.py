@@ -1,0 +1,155 @@
+"""The palmar side of a hand: what the mean fingertip sees, by rays, over many postures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+import warp as wp
+
+from lgrasp.hand.arrays import body_poses, upload_hand
+from lgrasp.hand.geometry import geometry_mesh
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.pairs import pieces_touch
+from lgrasp.hand.urdf import Urdf
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
+
+__all__ = ["Postures", "Skin", "link_skins", "sample_bodies", "see_skins"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_POINTS = 400
+_VIEWS = 32
+
+
+@dataclass(frozen=True)
+class Skin:
+    """Surface of one link in its body frame, and how often the mean fingertip sees each of its points."""
+
+    link: str
+    body: int
+    area: float  # [m^2]
+    points: np.ndarray  # (n, 3) [m]
+    normals: np.ndarray  # (n, 3)
+    seen: np.ndarray  # (n,) share of postures
+    T_body_link: np.ndarray  # (4, 4)
+    mesh: trimesh.Trimesh  # body frame
+
+    @property
+    def seen_area(self) -> float:
+        """Area weighted by how often it is seen [m^2]."""
+        return self.area * float(self.seen.mean())
+
+
+@dataclass(frozen=True)
+class Postures:
+    """Random postures: body rotations (N, B, 3, 3), positions (N, B, 3) [m] and which fingers are clear (N, G)."""
+
+    q: np.ndarray  # (N, K)
+    R: np.ndarray
+    t: np.ndarray
+    clear: np.ndarray  # (N, G) of the static base and of itself
+    touching: np.ndarray  # (N,) do any two parts touch?
+
+
+def sample_bodies(model: HandModel, q: np.ndarray, device: str = "cpu") -> Postures:
+    """Body poses at postures q (N, K) and what is clear there."""
+    from scipy.spatial.transform import Rotation
+
+    start()
+    poses = body_poses(upload_hand(model, device), q)
+    R = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix().reshape(*poses.shape[:2], 3, 3)
+    clear = np.ones((len(q), model.groups), bool)
+    touching: np.ndarray = np.zeros(len(q), bool)
+    if len(model.pairs):
+        touch = pieces_touch(model, q, model.pairs, device=device)
+        group = model.tree.body_group[model.piece_body[model.pairs]]  # (Q, 2), the base is -1
+        for g in range(model.groups):
+            own = (group[:, 1] == g) & ((group[:, 0] == -1) | (group[:, 0] == g))
+            clear[:, g] = ~touch[:, own].any(1)
+        touching = np.asarray(touch.any(1))
+    return Postures(q, R, poses[..., :3].astype(float), clear, touching)
+
+
+def link_skins(urdf: Urdf, model: HandModel) -> list[Skin]:
+    """Surface samples of every link with collision geometry; nothing is seen yet."""
+    skins = []
+    tree = model.tree
+    for index, link in enumerate(tree.link_names):
+        if not urdf.links[link]:
+            continue
+        meshes = []
+        for geometry in urdf.links[link]:
+            mesh = geometry_mesh(urdf, geometry)
+            meshes.append(mesh.apply_transform(tree.T_body_link[index] @ geometry.T_link_geometry))
+        mesh = _join(meshes)
+        points, faces = trimesh.sample.sample_surface(mesh, _POINTS, seed=index)[:2]
+        normals = np.asarray(mesh.face_normals)[faces]
+        T, body = tree.T_body_link[index], int(tree.link_body[index])
+        skins.append(Skin(link, body, float(mesh.area), points, normals, np.zeros(len(points)), T, mesh))
+    return skins
+
+
+def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    joined = trimesh.util.concatenate(meshes)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
+
+
+@wp.kernel
+def _first_hits(
+    mesh: wp.uint64,
+    origin: wp.vec3,
+    target: wp.array(dtype=wp.vec3),
+    slack: wp.float32,
+    free_out: wp.array(dtype=wp.int32),
+):
+    """Is the way from the origin to each target free?"""
+    i = wp.tid()
+    way = target[i] - origin
+    length = wp.length(way)
+    hit = wp.mesh_query_ray(mesh, origin, way / length, length - slack)
+    free_out[i] = wp.where(hit.result, 0, 1)
+
+
+def see_skins(skins: list[Skin], postures: Postures, tips: dict[int, np.ndarray], device: str = "cpu") -> list[Skin]:
+    """The skins with the share of postures at which the mean fingertip sees each point.
+
+    Args:
+        tips: tip body -> fingertip in its body frame [m].
+    """
+    start()
+    body = np.concatenate([np.full(len(s.mesh.vertices), s.body) for s in skins])
+    vertices = np.concatenate([s.mesh.vertices for s in skins])
+    offsets = np.cumsum([0, *(len(s.mesh.vertices) for s in skins)])
+    faces = np.concatenate([s.mesh.faces + o for s, o in zip(skins, offsets, strict=False)])
+    point_body = np.concatenate([np.full(len(s.points), s.body) for s in skins])
+    points, normals = (np.concatenate([getattr(s, k) for s in skins]) for k in ("points", "normals"))
+    seen = np.zeros(len(points))
+    chosen = np.argsort(postures.touching, kind="stable")[:_VIEWS]  # postures that collide come last
+    handle = None
+    for row in chosen:
+        R, t = postures.R[row], postures.t[row]
+
+        def place(p: np.ndarray, b: np.ndarray, R: np.ndarray = R, t: np.ndarray = t) -> np.ndarray:
+            return np.einsum("nij,nj->ni", R[b], p) + t[b]
+
+        world = wp.array(place(vertices, body).astype(np.float32), dtype=wp.vec3, device=device)
+        if handle is None:
+            handle = wp.Mesh(world, wp.array(faces.ravel().astype(np.int32), dtype=wp.int32, device=device))
+        else:
+            wp.copy(handle.points, world)
+            handle.refit()
+        eye = np.mean([R[b] @ p + t[b] for b, p in tips.items()], 0)
+        target = place(points, point_body)
+        facing = np.einsum("ni,ni->n", np.einsum("nij,nj->ni", R[point_body], normals), eye - target) > 0
+        free = wp.empty(len(target), dtype=wp.int32, device=device)
+        targets = wp.array(target.astype(np.float32), dtype=wp.vec3, device=device)
+        wp.launch(
+            _first_hits, len(target), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device
+        )
+        seen += facing & (free.numpy() == 1)
+    parts = np.split(seen / len(chosen), np.cumsum([len(s.points) for s in skins])[:-1])
+    return [
+        Skin(s.link, s.body, s.area, s.points, s.normals, part, s.T_body_link, s.mesh)
+        for s, part in zip(skins, parts, strict=True)
+    ]

@@ -1,0 +1,197 @@
+"""Opposition spaces: the joints they move, what is left after some are used, the hand as one of them sees it."""
+
+import hashlib
+import json
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from lgrasp.errors import HandError
+from lgrasp.hand.contacts import LinkGrid, body_cones, side_points
+from lgrasp.hand.geometry import geometry_mesh
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.opposition.check import side_links
+from lgrasp.hand.spec import Cone, HandSpec, Surface
+from lgrasp.hand.surface import ContactLink, contact_arrays, with_bare_links
+from lgrasp.hand.tree import Tree
+from lgrasp.hand.urdf import Urdf, read_urdf
+
+__all__ = [
+    "Space",
+    "SpaceSide",
+    "available",
+    "consumed",
+    "free_joints",
+    "hand_spaces",
+    "longest",
+    "side_surface",
+    "space_sides",
+    "space_view",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """An opposition space of a hand."""
+
+    name: str
+    joints: np.ndarray  # (K,) bool, in the order of tree.joint_names: joints that move its sides
+    groups: tuple[int, int]  # finger of each side, -1 = static palm
+
+
+def hand_spaces(spec: HandSpec, tree: Tree) -> tuple[Space, ...]:
+    """The opposition spaces of a hand in the order of hand.yaml; none is legal."""
+    body = dict(zip(tree.link_names, tree.link_body, strict=True))
+    out = []
+    for name, space in spec.opposition_spaces.items():
+        first, second = (int(tree.body_group[body[links[0]]]) for links in side_links(space))
+        out.append(Space(name, np.isin(tree.joint_names, space.joints), (first, second)))
+    return tuple(out)
+
+
+def free_joints(space: Space, used: np.ndarray) -> np.ndarray:
+    """Joints that a step with a space moves: those of the space that no earlier step moved, (K,) bool.
+
+    Args:
+        used: joints that earlier steps moved, (K,) bool.
+    """
+    return space.joints & ~np.asarray(used, bool)
+
+
+def available(spaces: Sequence[Space], used_spaces: Collection[int], used_joints: np.ndarray) -> list[int]:
+    """Spaces that may come next: not used yet, and with a joint left to move.
+
+    Args:
+        used_spaces: indices in ``spaces``. used_joints: (K,) bool.
+    """
+    return [i for i, s in enumerate(spaces) if i not in used_spaces and free_joints(s, used_joints).any()]
+
+
+def consumed(spaces: Sequence[Space], used_spaces: Collection[int], used_joints: np.ndarray) -> bool:
+    """Is no space left for another object?"""
+    return not available(spaces, used_spaces, used_joints)
+
+
+def longest(spaces: Sequence[Space], used_spaces: Collection[int], used_joints: np.ndarray) -> int:
+    """The largest number of further objects that could follow, whatever the order; see :func:`available`."""
+    masks = {_bits(s.joints) for i, s in enumerate(spaces) if i not in used_spaces}
+    return _longest(tuple(sorted(masks)), _bits(np.asarray(used_joints, bool)))
+
+
+def _bits(mask: np.ndarray) -> int:
+    return sum(1 << int(i) for i in np.flatnonzero(mask))
+
+
+@lru_cache(maxsize=65_536)
+def _longest(masks: tuple[int, ...], joints: int) -> int:
+    """Most of the spaces that can be used one after another; sets of joints are bits of integers.
+
+    A space that was used has no joint left, so the joints alone say what comes next.
+    """
+    return max((1 + _longest(masks, joints | mask) for mask in masks if mask & ~joints), default=0)
+
+
+@dataclass(frozen=True)
+class SpaceSide:
+    """One side of an opposition space, body frame."""
+
+    links: tuple[ContactLink, ...]
+    area: float  # [m^2]
+
+
+def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface], device: str = "cpu") -> SpaceSide | None:
+    """The surface of one side of a space, links without any left out; None when there is none at all."""
+    rng = np.random.default_rng(0)
+    surfaces = [(tree.link_names.index(link), part) for part in side for link in part.links]
+    meshes = _body_meshes(urdf, tree, {int(tree.link_body[index]) for index, _ in surfaces})
+    found, total = [], 0.0
+    for index, surface in surfaces:
+        link, T, body = tree.link_names[index], tree.T_body_link[index], tree.link_body[index]
+        around = [m for n, b in zip(tree.link_names, tree.link_body, strict=True) if b == body for m in meshes[n]]
+        points, normals, area = side_points(meshes[link], around, T, surface, rng, device)
+        group = int(tree.body_group[body])
+        rules = body_cones(_outside(surface) if group >= 0 else (), T)
+        if len(points):
+            found.append(ContactLink(link, group if group >= 0 else tree.groups, points, normals, rules))
+            total += area
+    return SpaceSide(tuple(found), total) if found else None
+
+
+def space_sides(urdf: Urdf, spec: HandSpec, tree: Tree, name: str, device: str = "cpu") -> tuple[SpaceSide, SpaceSide]:
+    """The surface of both sides of a space.
+
+    Raises:
+        HandError: no space of that name, or a side without any surface.
+    """
+    space = spec.opposition_spaces.get(name)
+    if space is None:
+        known = ", ".join(spec.opposition_spaces) or "none"
+        raise HandError(f"hand '{spec.name}' has no opposition space '{name}'; its spaces: {known}")
+    found = []
+    for number, side in enumerate(space.sides, 1):
+        surface = side_surface(urdf, tree, side, device)
+        if surface is None:
+            raise HandError(
+                f"hand '{spec.name}': opposition space '{name}': side {number} ({', '.join(side[0].links)}) has no "
+                f"surface within {side[0].angle:g} degrees of {list(side[0].axis)}; change axis, angle or box"
+            )
+        found.append(surface)
+    return found[0], found[1]
+
+
+def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, device: str = "cpu") -> HandModel:
+    """The same hand with the two sides of an opposition space as its only contact surface.
+
+    Fingers' sides are contact rules: all that is outside the side's cone is forbidden. A static side is the palm. A box
+    bounds the contact points; a contact that slides on a finger may leave it. The hand's other contact links keep their
+    distance grids and have no contact point.
+
+    Args:
+        urdf_path, spec: what ``model`` was built from. device: answers the geometric queries.
+
+    Raises:
+        HandError: see :func:`space_sides`.
+    """
+    urdf, tree = read_urdf(urdf_path), model.tree
+    links = [link for side in space_sides(urdf, spec, tree, name, device) for link in side.links]
+    meshes = _body_meshes(urdf, tree, {int(tree.link_body[tree.link_names.index(link.link)]) for link in links})
+    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=_grids(model))
+    arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
+    described = spec.opposition_spaces[name].model_dump(mode="json")
+    digest = hashlib.sha256(json.dumps([model.sha256, name, described]).encode()).hexdigest()
+    return replace(model, sha256=digest, contacts=(), **arrays)
+
+
+def _grids(model: HandModel) -> dict[str, LinkGrid]:
+    """Distance grids of the hand's own contact links."""
+    return {
+        model.tree.link_names[link]: LinkGrid(model.grid_values[a:b].reshape(shape), origin, float(cell))
+        for link, a, b, shape, origin, cell in zip(
+            model.grid_link,
+            model.grid_first[:-1],
+            model.grid_first[1:],
+            model.grid_shape,
+            model.grid_origin,
+            model.grid_cell,
+            strict=True,
+        )
+    }
+
+
+def _outside(surface: Surface) -> tuple[Cone, ...]:
+    """Normals that a side's cone leaves out."""
+    x, y, z = surface.axis
+    return (Cone(axis=(-x, -y, -z), angle=180.0 - surface.angle),) if surface.angle < 180.0 else ()
+
+
+def _body_meshes(urdf: Urdf, tree: Tree, bodies: Collection[int]) -> dict[str, list[trimesh.Trimesh]]:
+    """Solids of every link that rides on one of the bodies, body frame."""
+    return {
+        link: [geometry_mesh(urdf, g).apply_transform(T @ g.T_link_geometry) for g in urdf.links[link]]
+        for link, body, T in zip(tree.link_names, tree.link_body, tree.T_body_link, strict=True)
+        if body in bodies
+    }

@@ -1,0 +1,181 @@
+"""Train a coarse predictor on shards, keep it in a file, measure it."""
+
+import copy
+import io
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lgrasp.dataset.files import new_file
+from lgrasp.dataset.tree import shard_tree
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.folder import check_folder
+from lgrasp.engine.inputs import input_keys, load_hand
+from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.errors import ConfigError, OutputError
+from lgrasp.hand.model import HandModel
+from lgrasp.jobs.scenes.shards import check_hand, object_model, read_parts
+from lgrasp.learn.examples import Examples, make_examples
+from lgrasp.learn.measure import Measured, measure
+from lgrasp.learn.network import CoarseNet
+from lgrasp.learn.params import LearnParams
+from lgrasp.learn.training import Trainer
+from lgrasp.runtime.device import resolve_device
+
+__all__ = ["OUTER", "Fit", "evaluate", "fit", "load_predictor"]
+
+OUTER = (3, 6, 10, 13)
+"""Outer steps of the refiner that the published table has."""
+
+_FORMAT, _VERSION = "lgrasp-coarse", 1
+_LEAST = 16  # grasps to learn from
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What is trained on what."""
+
+    shards: Sequence[Path]
+    out: Path
+    params: LearnParams
+    hand: str | None = None  # default: that of the shards
+    device: str = "auto"
+    cache: Cache = field(default_factory=Cache)
+
+
+def fit(job: Fit, told: Callable[[str, int, int, float], None] | None = None) -> dict[str, Any]:
+    """Train a predictor and write it; its report.
+
+    The report compares mean energies on clouds that were not trained on: of the predictor trained on poses alone
+    (``frozen``), of the same trained on poses as many steps more (``longer``), and of the jointly trained one
+    (``joint``).
+
+    Args:
+        told: called with (phase, step, steps, value): the loss on poses, then the energy of joint training.
+
+    Raises:
+        LgraspError: shards or hand cannot be used, or the file cannot be written.
+    """
+    p, say = job.params, told or (lambda phase, step, steps, value: None)
+    check_folder(job.out.parent)
+    if job.out.is_dir():
+        raise OutputError(f"{job.out} is a folder; name a file with --out, such as coarse.pt")
+    device = resolve_device(job.device).alias
+    hand, train, held_out = _examples(job.shards, job.hand, p, job.cache, device)
+    grasps = sum(len(e.q) for e in train)
+    if grasps < _LEAST:
+        raise ConfigError(
+            f"{', '.join(map(str, job.shards))}: {grasps} grasps; at least {_LEAST} are needed to learn from"
+        )
+    trainer = Trainer(hand, train, p, device=device)
+    start = time.perf_counter()
+    trainer.fit_poses(p.steps, p.rate, lambda step, loss: say("poses", step, p.steps, loss))
+    seconds = {"poses": time.perf_counter() - start}
+    report: dict[str, Any] = {"hand": hand.name, "objects": [e.model.name for e in train], "out": str(job.out)}
+    report["frozen"] = _numbers(measure(trainer, held_out))
+    if p.joint_steps:
+        before = copy.deepcopy(trainer.net.state_dict())
+        trainer.fit_poses(p.joint_steps, p.joint_rate)
+        report["longer"] = _numbers(measure(trainer, held_out))
+        trainer.net.load_state_dict(before)
+        start = time.perf_counter()
+        trainer.fit_jointly(lambda step, energy: say("jointly", step, p.joint_steps, energy))
+        seconds["joint"] = time.perf_counter() - start
+        report["joint"] = _numbers(measure(trainer, held_out))
+        report["lowered"] = {
+            name: 1.0 - report["joint"][name] / report["frozen"][name] for name in ("coarse", "unrolled")
+        }
+    _save(job.out, trainer, hand)
+    return report | {"seconds": seconds, "params": p.model_dump(mode="json")}
+
+
+def evaluate(
+    path: Path, shards: Sequence[Path], cache: Cache, *, clouds: int = 8, seed: int = 1, device: str = "auto"
+) -> dict[str, Any]:
+    """Energies of a predictor's answers on new clouds of the objects of shards, and of what the refiner makes of them.
+
+    Raises:
+        ConfigError: the file is no predictor, or of another hand than the shards.
+        LgraspError: shards cannot be used.
+    """
+    alias = resolve_device(device).alias
+    net, saved = load_predictor(path)
+    params = LearnParams.model_validate(saved["params"]).model_copy(update={"clouds": clouds, "seed": seed})
+    hand, examples, _ = _examples(shards, None, params.model_copy(update={"held_out": 1}), cache, alias)
+    if hand.sha256 != saved["hand_sha256"]:
+        raise ConfigError(
+            f"{path} is of hand '{saved['hand']}', the shards are of '{hand.name}' (or another model of it)"
+        )
+    trainer = Trainer(hand, examples, params, device=alias)
+    trainer.net.load_state_dict(net.state_dict())
+    start = time.perf_counter()
+    found = measure(trainer, examples, outer=OUTER)
+    names = {"hand": hand.name, "objects": [e.model.name for e in examples], "outer": list(OUTER)}
+    return names | _numbers(found) | {"refined": list(found.refined), "seconds": time.perf_counter() - start}
+
+
+def load_predictor(path: Path) -> tuple[CoarseNet, dict[str, Any]]:
+    """A predictor on the CPU, and what its file says: ``hand``, ``hand_sha256``, ``params``.
+
+    Raises:
+        ConfigError: no such file, or no predictor.
+    """
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        if saved["format"] != _FORMAT or saved["version"] != _VERSION:
+            raise ValueError(f"format {saved['format']!r}, version {saved['version']!r}")
+        about = {name: saved[name] for name in ("format", "version", "hand", "hand_sha256")}
+        about["params"], state = json.loads(saved["params"]), saved["state"]
+        net = CoarseNet(state["lower"], state["upper"], LearnParams.model_validate(about["params"]))
+        net.load_state_dict(state)
+        if not all(bool(values.isfinite().all()) for values in state.values()):
+            raise ValueError("weights that are not finite")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; lgrasp learn fit writes predictors") from None
+    except Exception as error:  # damaged files make the unpickler raise almost anything
+        raise ConfigError(f"{path}: not a predictor of lgrasp ({' '.join(str(error).split())[:120]})") from None
+    return net, about
+
+
+def _numbers(found: Measured) -> dict[str, Any]:
+    return {"poses": found.poses, "coarse": found.coarse, "unrolled": found.unrolled}
+
+
+def _examples(
+    shards: Sequence[Path], name: str | None, params: LearnParams, cache: Cache, device: str
+) -> tuple[HandModel, list[Examples], list[Examples]]:
+    """The hand; clouds to train on and others, with the grasps, object by object."""
+    parts = read_parts(list(shard_tree(shards).values()))
+    pipeline = load_pipeline("swift")
+    keys = input_keys(name or next(iter(parts.values())).hand[0], None, 1.0, pipeline.object, pipeline.field)
+    check_hand(keys.source, list(parts.values()))
+    found = resolve_device(device)
+    hand, _ = load_hand(cache, keys.source, keys.hand, found)
+    sets: tuple[list[Examples], list[Examples]] = ([], [])
+    for number, (_, part) in enumerate(sorted(parts.items())):
+        rows = part.joined()
+        if not len(rows["q"]):
+            continue
+        model = object_model(part.record, cache, found)
+        for which, (into, clouds) in enumerate(zip(sets, (params.clouds, params.held_out), strict=True)):
+            rng = np.random.default_rng([params.seed, number, which])
+            q = rows["q"][:, : hand.dofs]
+            into.append(make_examples(hand, model, rows["T_hand_object"], q, params, rng, clouds, device))
+    if not sets[0]:
+        raise ConfigError(f"{', '.join(map(str, shards))}: no grasps to learn from")
+    return hand, *sets
+
+
+def _save(path: Path, trainer: Trainer, hand: HandModel) -> None:
+    data = io.BytesIO()
+    state = {name: values.cpu() for name, values in trainer.net.state_dict().items()}
+    about = {"format": _FORMAT, "version": _VERSION, "hand": hand.name, "hand_sha256": hand.sha256}
+    torch.save(about | {"params": trainer.params.model_dump_json(), "state": state}, data)
+    with new_file(path) as file:
+        file.write(data.getvalue())

@@ -1,0 +1,128 @@
+"""One batch of candidates up to one stage, every table read from and written to the cache by content key."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.engine.cache import content_key
+from lgrasp.engine.fit import fit_params
+from lgrasp.engine.inputs import InputKeys, input_keys, load_inputs
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.registry import STAGES
+from lgrasp.errors import ConfigError
+from lgrasp.grasp.tables import (
+    CandidateTable,
+    ContactSets,
+    GraspTable,
+    PoseTable,
+    candidate_arrays,
+    candidate_table,
+    grasp_arrays,
+    pose_arrays,
+    pose_table,
+    set_arrays,
+    set_table,
+)
+from lgrasp.jobs.generate import Job
+from lgrasp.runtime.device import resolve_device
+from lgrasp.runtime.kernels import kernel_modules, load_kernels
+from lgrasp.stages.context import Context
+
+__all__ = ["StageRun", "run_stage"]
+
+
+@dataclass(frozen=True)
+class StageRun:
+    """What one stage gave."""
+
+    stage: str
+    hit: bool
+    counts: dict[str, int]  # survivors as the stage reports them
+    seconds: float  # 0 when the table was read from the cache
+    path: Path
+
+
+def run_stage(
+    job: Job,
+    last: str,
+    first: int,
+    count: int,
+    shard: int,
+    report: Callable[[str, float], None] | None = None,
+) -> list[StageRun]:
+    """Tables of the stages up to ``last`` for candidates ``first .. first + count - 1`` of a shard's stream.
+
+    Nothing is computed when the table of ``last`` is in the cache; else the latest one that is there is the start.
+
+    Args:
+        job: names hand, object, pipeline, device and cache; the rest of it is not used.
+        report: called with (what, share) while inputs are loaded.
+
+    Raises:
+        LgraspError: bad input.
+    """
+    if first < 0 or count < 1 or shard < 0:
+        raise ConfigError(f"--first {first} --candidates {count} --shard-index {shard}: need 0, 1 and 0 or more")
+    pipeline, cache = job.pipeline, job.cache
+    device = resolve_device(job.device)
+    keys = input_keys(job.hand, job.object, job.scale, pipeline.object, pipeline.field)
+    stages = pipeline.order[: pipeline.order.index(last) + 1]
+    files = _stage_keys(pipeline, keys, stages, first, count, shard)
+    found = {stage: arrays for stage in stages if (arrays := cache.load(stage, files[stage])) is not None}
+    runs = [
+        StageRun(stage, True, json.loads(str(found[stage]["counts"])), 0.0, cache.path(stage, files[stage]))
+        for stage in stages
+        if stage in found
+    ]
+    done = max((i for i, stage in enumerate(stages) if stage in found), default=-1) + 1
+    if done == len(stages):
+        return runs
+    inputs = load_inputs(cache, keys, job.scale, pipeline.object, pipeline.field, device, report)
+    context = Context(inputs.hand, inputs.object, inputs.field, device.alias, pipeline.seed, shard)
+    table: Any = _table(found[stages[done - 1]], device.alias) if done else (first, count)
+    load_kernels(device.alias, kernel_modules("lgrasp.stages."), report)
+    runs = [run for run in runs if run.stage in stages[:done]]
+    for stage in stages[done:]:
+        start = time.perf_counter()
+        options = {"realised": "ik" in stages[: stages.index(stage)]} if stage == "search" else {}
+        table, counts = STAGES[stage].run(
+            table, fit_params(stage, pipeline.params(stage), inputs.hand.model), context, **options
+        )
+        counted = dict(counts)
+        seconds = time.perf_counter() - start
+        cache.store(stage, files[stage], _arrays(table) | {"counts": np.asarray(json.dumps(counted))})
+        runs.append(StageRun(stage, False, counted, seconds, cache.path(stage, files[stage])))
+    return runs
+
+
+def _stage_keys(
+    pipeline: Pipeline, keys: InputKeys, stages: tuple[str, ...], first: int, count: int, shard: int
+) -> dict[str, str]:
+    """Content key of each stage's table; it holds the key of the table before."""
+    made: dict[str, str] = {}
+    before = content_key("start", 1, inputs=[keys.hand, keys.object, keys.field], candidates=[first, count])
+    for stage in stages:
+        params = pipeline.params(stage).model_dump(mode="json")
+        before = made[stage] = content_key(
+            stage, STAGES[stage].version, params=params, seed=pipeline.seed, shard=shard, input=before
+        )
+    return made
+
+
+def _arrays(table: PoseTable | CandidateTable | ContactSets | GraspTable) -> dict[str, np.ndarray]:
+    if isinstance(table, PoseTable):
+        return pose_arrays(table)
+    if isinstance(table, CandidateTable):
+        return candidate_arrays(table)
+    return set_arrays(table) if isinstance(table, ContactSets) else grasp_arrays(table)
+
+
+def _table(arrays: dict[str, np.ndarray], device: str) -> PoseTable | CandidateTable | ContactSets:
+    if "chosen" in arrays:
+        return set_table(arrays, device)
+    return candidate_table(arrays, device) if "surface" in arrays else pose_table(arrays, device)

@@ -1,0 +1,92 @@
+"""Make and describe the inputs of a job one by one: a contact field, a preprocessed object."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from lgrasp.config import parse_model
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.inputs import input_keys, load_field, load_hand, load_object, object_key
+from lgrasp.field.params import FieldParams
+from lgrasp.hand.arrays import upload_hand
+from lgrasp.object.params import ObjectParams
+from lgrasp.runtime.device import resolve_device
+from lgrasp.runtime.device import start as start_warp
+
+__all__ = ["prepare_field", "prepare_object"]
+
+
+def prepare_field(
+    cache: Cache,
+    hand: str,
+    params: FieldParams,
+    *,
+    index: str | None = None,
+    device: str = "auto",
+    report: Callable[[str, float], None] | None = None,
+) -> dict[str, Any]:
+    """Build the contact field of a hand (or find it in the cache) and describe it.
+
+    Args:
+        index: replaces the index structure of ``params``.
+        report: called with (what, share done).
+
+    Raises:
+        HandError, ConfigError, DeviceError: bad input.
+    """
+    if index is not None:
+        params = parse_model(FieldParams, params.model_dump() | {"index": index}, "--index")
+    where = resolve_device(device)
+    keys = input_keys(hand, None, 1.0, ObjectParams(), params)
+    start = time.perf_counter()
+    model, _ = load_hand(cache, keys.source, keys.hand, where)
+    field, hit = load_field(cache, keys, upload_hand(model, where.alias), params, report)
+    clear = field.clear_share.reshape(-1, model.groups).mean(0)
+    return {
+        "hand": model.name,
+        "note": keys.source.note,
+        "notes": list(model.notes),
+        "groups": model.groups,
+        "joints": model.dofs,
+        "patches": int(model.contact_patch.max(initial=-1)) + 1,
+        "vectors": field.vectors,
+        "index": params.index,
+        "voxels": int(field.cell_first[-1]),
+        "cell": field.cell,
+        "megabytes": field.megabytes,
+        "settings": len(model.tree.settings),
+        "clear_share": [None if np.isnan(share) else float(share) for share in clear],
+        "seconds": time.perf_counter() - start,
+        "cached": hit,
+        "device": where.name,
+        "file": str(cache.path("field", keys.field)),
+    }
+
+
+def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: float = 1.0) -> dict[str, Any]:
+    """Preprocess an object (or find it in the cache) and describe it.
+
+    Raises:
+        ObjectError: the mesh cannot be used.
+    """
+    start_warp()
+    path, key = object_key(mesh, scale, params)
+    start = time.perf_counter()
+    model, hit = load_object(cache, path, key, scale, params)
+    return {
+        "object": model.name,
+        "faces": len(model.faces),
+        "extents": [float(side) for side in model.extents],
+        "watertight": model.watertight,
+        "notes": list(model.notes),
+        "contact_points": len(model.contact_points),
+        "obstacle_points": len(model.obstacle_points),
+        "sdf_shape": list(model.sdf.shape),
+        "sdf_cells": int(np.prod(model.sdf.shape)),
+        "sdf_cell": model.sdf_cell,
+        "seconds": time.perf_counter() - start,
+        "cached": hit,
+        "file": str(cache.path("object", key)),
+    }

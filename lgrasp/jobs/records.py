@@ -1,0 +1,56 @@
+"""Hand and object of a job as the records of a shard, and as the scene of a simulator."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from lgrasp.dataset import HandRecord, ObjectRecord
+from lgrasp.engine.cache import Cache
+from lgrasp.geometry.decompose import decompose
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.urdf import read_urdf
+from lgrasp.object.model import ObjectModel
+from lgrasp.simulate.scene import Scene, scene_of
+
+__all__ = ["hand_record", "make_scene", "mesh_blobs", "object_record"]
+
+
+def mesh_blobs(urdf: Path) -> dict[str, bytes]:
+    """Collision meshes of a hand by the path its URDF names, read where the hand is now, not where it was cached."""
+    return {name: file.read_bytes() for name, file in read_urdf(urdf).mesh_files.items()}
+
+
+def hand_record(hand: HandModel, meshes: dict[str, bytes]) -> HandRecord:
+    """The hand; ``meshes`` are its :func:`mesh_blobs`."""
+    tree = hand.tree
+    return HandRecord(
+        name=hand.name,
+        base_link=tree.base_link,
+        urdf=hand.urdf_text,
+        joint_names=tree.listed_names,
+        joint_lower=tree.listed_limits[:, 0],
+        joint_upper=tree.listed_limits[:, 1],
+        link_names=tree.link_names,
+        sha256=hand.sha256,
+        meshes=meshes,
+    )
+
+
+def object_record(obj: ObjectModel, id: str | None = None) -> ObjectRecord:
+    """The object, in the user's frame; its name is its id where nothing else is said."""
+    return ObjectRecord(
+        id=id or obj.name,
+        name=obj.name,
+        scale=obj.scale,
+        sha256=obj.sha256,
+        watertight=obj.watertight,
+        vertices=obj.vertices,
+        faces=obj.faces,
+    )
+
+
+def make_scene(
+    cache: Cache, hand: HandModel, objects: Sequence[ObjectRecord], meshes: dict[str, bytes], device: str
+) -> Scene:
+    """What the simulator is given: the scene of the job's shards; ``meshes`` are the hand's :func:`mesh_blobs`."""
+    return scene_of(hand_record(hand, meshes), objects, partial(decompose, store=cache), device)

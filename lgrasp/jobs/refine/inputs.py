@@ -1,0 +1,20 @@
+"""The hand of a job that needs no contact field."""
+
+from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.inputs import load_hand
+from lgrasp.hand.find import HandSource, find_hand
+from lgrasp.hand.model import HAND_VERSION, HandModel, hand_digest
+from lgrasp.runtime.device import Device
+
+__all__ = ["named_hand"]
+
+
+def named_hand(cache: Cache, name: str, device: Device) -> tuple[HandSource, HandModel]:
+    """A hand by name, folder or URDF, from the cache if it was there before.
+
+    Raises:
+        HandError: see :func:`find_hand`.
+    """
+    source = find_hand(name)
+    key = content_key("hand", HAND_VERSION, content=hand_digest(source.urdf, source.spec))
+    return source, load_hand(cache, source, key, device)[0]

@@ -1,0 +1,165 @@
+"""The job of ``lgrasp refine``: shards, or grasps of other formats, moved by a local search and written again."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from lgrasp.dataset import GraspRows, ShardHeader, read_shard, write_shard
+from lgrasp.dataset.checks import row_problems
+from lgrasp.dataset.files import remove_leftovers
+from lgrasp.dataset.tree import shard_tree
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.folder import check_folder, shard_path
+from lgrasp.errors import ConfigError, HandError, OutputError, ShardError
+from lgrasp.grasp.records import Shard
+from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.jobs.refine.inputs import named_hand
+from lgrasp.jobs.refine.moved import Moved, move_rows
+from lgrasp.jobs.refine.sources import grasp_shards, object_of_record
+from lgrasp.runtime.device import Device, resolve_device
+from lgrasp.stages.refine.params import RefineParams
+
+__all__ = ["RefinedShard", "Refinement", "refine_shards"]
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What is refined and where it goes."""
+
+    sources: Sequence[Path]  # shards, folders of them at any depth; or one export, see ``form``
+    out: Path
+    form: str | None = None  # format of another program; none: shards
+    hand: str | None = None  # none: the one that the shards name
+    always: bool = False  # every row takes its refined posture, whatever the checks say
+    params: RefineParams = field(default_factory=RefineParams)
+    device: str = "auto"
+    force: bool = False
+    cache: Cache = field(default_factory=Cache)
+
+
+@dataclass(frozen=True)
+class RefinedShard:
+    """One file that was written."""
+
+    path: Path
+    hand: str
+    object: str
+    moved: Moved
+    seconds: float
+
+
+def refine_shards(job: Refinement, progress: Callable[[Path, int, int], None] | None = None) -> list[RefinedShard]:
+    """Refine the rows of shards; each shard is written under its place in the output folder. One without rows is left
+    out.
+
+    Args:
+        progress: called with (shard, its rows, rows done); what it raises ends the job, whole shards stay.
+
+    Raises:
+        ShardError: a source cannot be read, holds rows of several objects or that are not finite; no rows at all.
+        HandError: the hand is unknown, or another than the one of the shard.
+        OutputError: a file would be overwritten, or the folder cannot be written.
+    """
+    device = resolve_device(job.device)
+    hands: dict[str, HandArrays] = {}
+    check_folder(job.out)
+    remove_leftovers(job.out, "*.h5.tmp")
+    done = []
+    for source, target, shard in _shards(job, hands, device):
+        if not len(shard.grasps):
+            job.cache.warn(f"{source} holds no grasps; it is left out")
+            continue
+        _check_rows(source, shard)
+        hand = _hand(job, source, shard, hands, device)
+        model = object_of_record(job.cache, shard.objects[0], device.alias)
+        begin = time.perf_counter()
+        moved = move_rows(
+            hand,
+            model,
+            shard.grasps,
+            job.params,
+            always=job.always,
+            stored=job.form is None,
+            progress=partial(progress, target, len(shard.grasps)) if progress else None,
+        )
+        seconds = time.perf_counter() - begin
+        write_shard(target, _written(shard, moved.rows, job, seconds))
+        done.append(RefinedShard(target, shard.hand.name, shard.objects[0].name, moved, seconds))
+    if not done:
+        raise ShardError(f"{', '.join(map(str, job.sources))}: no grasps to refine")
+    return done
+
+
+def _shards(job: Refinement, hands: dict[str, HandArrays], device: Device) -> Iterator[tuple[Path, Path, Shard]]:
+    """Where each shard to refine comes from, the file to write, and the shard."""
+    if job.form is None:
+        found = shard_tree(job.sources)
+        for place in found:
+            _check_free(job, job.out / place)
+        for place, path in found.items():
+            yield path, job.out / place, read_shard(path)
+        return
+    if len(job.sources) != 1 or job.hand is None:
+        raise ConfigError(f"grasps in format {job.form}: give one folder or file, and their hand with --hand")
+    source, model = named_hand(job.cache, job.hand, device)
+    hands[model.sha256] = upload_hand(model, device.alias)
+    for shard in grasp_shards(job.sources[0], job.form, source, model):
+        target = shard_path(job.out, model.name, shard.objects[0].id, 0)
+        _check_free(job, target)
+        yield job.sources[0], target, shard
+
+
+def _check_free(job: Refinement, target: Path) -> None:
+    if target.exists() and not job.force:
+        raise OutputError(f"{target} exists; choose another folder with --out, or --force to replace it")
+
+
+def _check_rows(path: Path, shard: Shard) -> None:
+    """Refuse what cannot be repaired; joints outside their limits can."""
+    rows, hand = shard.grasps, shard.hand
+    if rows.sequence is not None or len(shard.objects) != 1 or np.shape(rows.object_index)[1] != 1:
+        raise ShardError(f"{path}: rows of several objects cannot be refined; one object to a shard is accepted")
+    q = np.where(np.isfinite(rows.q), np.clip(rows.q, hand.joint_lower, hand.joint_upper), rows.q)
+    columns = rows.columns()
+    problems = row_problems(
+        replace(rows, q=q), hand, [shard.objects[0].id], lambda name, first, end: columns[name][first:end]
+    )
+    if problems:
+        raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset validate' accepts them can be refined")
+
+
+def _hand(job: Refinement, path: Path, shard: Shard, hands: dict[str, HandArrays], device: Device) -> HandArrays:
+    name = job.hand or shard.hand.name
+    if shard.hand.sha256 not in hands:
+        _, model = named_hand(job.cache, name, device)
+        if model.sha256 != shard.hand.sha256:
+            other = (
+                f"hand '{shard.hand.name}'" if shard.hand.name != model.name else f"another version of hand '{name}'"
+            )
+            raise HandError(
+                f"{path}: its grasps are of {other} (hash {shard.hand.sha256[:12]}), not of '{name}' (hash "
+                f"{model.sha256[:12]}); name theirs with --hand"
+            )
+        hands[shard.hand.sha256] = upload_hand(model, device.alias)
+    return hands[shard.hand.sha256]
+
+
+def _written(shard: Shard, rows: GraspRows, job: Refinement, seconds: float) -> Shard:
+    config = {**shard.header.config, "refine": job.params.model_dump(mode="json"), "refine_always": job.always}
+    header = ShardHeader(
+        pipeline=shard.header.pipeline,
+        seed=shard.header.seed,
+        shard_index=shard.header.shard_index,
+        config=config,
+        merged_from=shard.header.merged_from,
+    )
+    counts = {
+        "refine_tried": len(rows),
+        "refine_replaced": int(rows.metrics["refined"].sum()),
+        "seconds_refine": seconds,
+    }
+    return replace(shard, header=header, grasps=rows, statistics={**shard.statistics, **counts})

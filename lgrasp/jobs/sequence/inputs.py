@@ -1,0 +1,180 @@
+"""What a job of sequences starts from: a hand, the views of its opposition spaces with their fields, the objects."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from dataclasses import field as with_default
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.inputs import load_hand, load_object, object_key
+from lgrasp.errors import ConfigError
+from lgrasp.field.arrays import FieldArrays, upload_field
+from lgrasp.field.model import FIELD_VERSION, ContactField, build_field
+from lgrasp.field.params import FieldParams
+from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.hand.find import HandSource, find_hand
+from lgrasp.hand.model import HAND_VERSION, HandModel, hand_digest
+from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, space_view
+from lgrasp.jobs.sequence.size import Size, object_scales
+from lgrasp.object.arrays import ObjectArrays, upload_object
+from lgrasp.object.find import find_object
+from lgrasp.object.params import ObjectParams
+from lgrasp.runtime.device import Device
+from lgrasp.simulate.scene import Scene
+
+__all__ = ["SequenceInputs", "SequenceKeys", "SpaceView", "load_sequence_inputs", "sequence_keys"]
+
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class SequenceKeys:
+    """Content keys of what a job starts from."""
+
+    source: HandSource
+    hand: str
+    views: dict[str, str]
+    fields: dict[str, str]
+    meshes: tuple[Path, ...]  # one per step
+    scales: tuple[float, ...]
+    objects: tuple[str, ...]
+
+    def run_key(self, pipeline: dict[str, Any], shard_rows: int, physics: str | None) -> str:
+        """Content key of a run: everything that decides its rows."""
+        parts = [pipeline, self.hand, self.fields, self.objects, shard_rows, physics]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class SpaceView:
+    """The hand and the contact field of one opposition space on a device."""
+
+    hand: HandArrays
+    field: FieldArrays
+
+
+@dataclass(frozen=True)
+class SequenceInputs:
+    """What a job starts from, on its device."""
+
+    hand: HandModel
+    spaces: tuple[Space, ...]
+    views: tuple[SpaceView, ...]
+    objects: tuple[ObjectArrays, ...]  # one per step
+    keys: SequenceKeys
+    device: Device
+    seconds: dict[str, float] = with_default(default_factory=dict)
+    hits: dict[str, bool] = with_default(default_factory=dict)
+    scene: Scene | None = None  # for a physics simulation, if there is one
+
+    @property
+    def object_ids(self) -> tuple[str, ...]:
+        """Name of each step's object, unique per mesh and scale."""
+        ids: dict[str, str] = {}
+        for path, key in zip(self.keys.meshes, self.keys.objects, strict=True):
+            if key not in ids:
+                name, number = path.stem, 1
+                while name in ids.values():
+                    number += 1
+                    name = f"{path.stem}-{number}"
+                ids[key] = name
+        return tuple(ids[key] for key in self.keys.objects)
+
+
+def sequence_keys(
+    hand: str, meshes: Sequence[str], size: Size, seed: int, objects: ObjectParams, fields: FieldParams
+) -> SequenceKeys:
+    """Find hand and objects and compute the content keys of their artifacts.
+
+    Raises:
+        HandError, ObjectError: see :func:`find_hand`, :func:`find_object`.
+        ConfigError: fewer than two objects, or a hand without opposition spaces.
+    """
+    if len(meshes) < 2:
+        named = meshes[0] if meshes else "no object"
+        raise ConfigError(
+            f"a sequence needs at least two objects, got {named}; for one object: lgrasp generate --object MESH"
+        )
+    source = find_hand(hand)
+    if not source.spec.opposition_spaces:
+        raise ConfigError(
+            f"hand '{source.name}' has no opposition spaces; add opposition_spaces to its hand.yaml "
+            "(lgrasp hands add proposes them)"
+        )
+    digest = hand_digest(source.urdf, source.spec)
+    hand_key = content_key("hand", HAND_VERSION, content=digest)
+    names = source.spec.opposition_spaces
+    views = {name: content_key("hand", HAND_VERSION, content=digest, space=name) for name in names}
+    described = fields.model_dump(mode="json")
+    field_keys = {n: content_key("field", FIELD_VERSION, hand=key, params=described) for n, key in views.items()}
+    paths = tuple(find_object(mesh) for mesh in meshes)
+    scales = object_scales(paths, size, seed, objects)
+    keys = tuple(object_key(str(p), s, objects)[1] for p, s in zip(paths, scales, strict=True))
+    return SequenceKeys(source, hand_key, views, field_keys, paths, scales, keys)
+
+
+def load_sequence_inputs(
+    cache: Cache,
+    keys: SequenceKeys,
+    objects: ObjectParams,
+    fields: FieldParams,
+    device: Device,
+    report: Report | None = None,
+) -> SequenceInputs:
+    """Load or make everything, and put it on the device.
+
+    Raises:
+        ConfigError: more objects than the hand's opposition spaces can take one after another.
+    """
+    report = report or (lambda what, share: None)
+    seconds: dict[str, float] = {}
+    hits: dict[str, bool] = {}
+
+    def timed(name: str, load: Callable[[], tuple[Any, bool]]) -> Any:
+        start = time.perf_counter()
+        report(name, 0.0)
+        model, hit = load()
+        hits[name] = hits.get(name, True) and hit
+        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
+        return model
+
+    source = keys.source
+    model = timed("hand", lambda: load_hand(cache, keys.source, keys.hand, device))
+    spaces = hand_spaces(source.spec, model.tree)
+    most = longest(spaces, (), np.zeros(model.dofs, bool))
+    if len(keys.meshes) > most:
+        raise ConfigError(
+            f"{len(keys.meshes)} objects are asked for, but the {len(spaces)} opposition spaces of hand "
+            f"'{source.name}' ({', '.join(s.name for s in spaces)}) take at most {most} one after another"
+        )
+    views = []
+    for space in spaces:
+
+        def make_view(name: str = space.name) -> dict[str, np.ndarray]:
+            return space_view(source.urdf, source.spec, model, name, device.alias).to_arrays()
+
+        arrays = timed("hand", lambda name=space.name, make=make_view: cache.get("hand", keys.views[name], make))
+        view = HandModel.from_arrays(arrays)
+        hand = upload_hand(view, device.alias)
+
+        def make_field(hand: HandArrays = hand) -> dict[str, np.ndarray]:
+            return build_field(hand, fields, report).to_arrays()
+
+        found = timed("field", lambda name=space.name, make=make_field: cache.get("field", keys.fields[name], make))
+        views.append(SpaceView(hand, upload_field(ContactField.from_arrays(found), view, device.alias)))
+    made: dict[str, ObjectArrays] = {}
+    for path, key, scale in zip(keys.meshes, keys.objects, keys.scales, strict=True):
+        if key not in made:
+            loaded = timed(
+                "object",
+                lambda path=path, key=key, scale=scale: load_object(cache, path, key, scale, objects, device.alias),
+            )
+            made[key] = upload_object(loaded, device.alias)
+    steps = tuple(made[key] for key in keys.objects)
+    return SequenceInputs(model, spaces, tuple(views), steps, keys, device, seconds, hits)

@@ -1,0 +1,94 @@
+"""What a job of sequences did, in numbers; and why an object was not held."""
+
+from typing import Any
+
+import numpy as np
+
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.engine.report import peak_device_mb, peak_rss_mb
+from lgrasp.engine.shard import add_counts, add_seconds
+from lgrasp.jobs.bottleneck import starving_stage
+from lgrasp.jobs.sequence.job import SequenceJob, SequenceOutcome, sequence_shards
+from lgrasp.jobs.sequence.shard import add_spaces
+
+__all__ = ["report", "unheld"]
+
+
+def report(job: SequenceJob, outcome: SequenceOutcome) -> dict[str, Any]:
+    """The report of a job, JSON-serialisable.
+
+    Returns:
+        ``sequences`` (whole ones on disk), ``asked``, ``reached`` (rows found by number of objects), ``spaces``
+        (survivors by step, space and stage), ``penetration`` (median and largest [mm], all rows), ``seconds`` (``wall``
+        of the sequences, thread-seconds per stage, loading, total), ``per_s`` and what was asked.
+    """
+    inputs, params = outcome.inputs, job.pipeline.params("sequence")
+    steps = len(inputs.objects)
+    reached, spaces = [0] * steps, _spaces(outcome)
+    counts: dict[str, dict[str, int]] = {}
+    seconds: dict[str, float] = {}
+    for result in outcome.results:
+        add_counts(counts, result.counts)
+        add_seconds(seconds, result.seconds)
+        for step, found in enumerate(result.reached):
+            reached[step] += found
+    depth = [np.zeros(1)]
+    for path in outcome.paths:
+        with ShardReader(path) as reader:
+            depth.append(reader.column("metrics/penetration"))
+    depth = np.concatenate(depth[1:] or depth)
+    wall = sum(result.wall for result in outcome.results)
+    loading = {name: inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field", "kernels")}
+    return {
+        "sequences": outcome.rows,
+        "asked": sum(rows for _, rows in sequence_shards(job)),
+        "made": outcome.made,
+        "present": outcome.present,
+        "reached": reached,
+        "spaces": spaces,
+        "counts": counts,
+        "penetration": [1e3 * float(np.median(depth)), 1e3 * float(depth.max())],
+        "seconds": seconds | loading | {"wall": wall, "total": outcome.wall},
+        "per_s": outcome.made / wall if wall else 0.0,
+        "hits": inputs.hits,
+        "hand": inputs.hand.name,
+        "objects": list(inputs.object_ids),
+        "scales": list(inputs.keys.scales),
+        "pipeline": job.pipeline.name,
+        "method": params.method,
+        "policy": params.policy,
+        "physics": job.physics,
+        "seed": job.pipeline.seed,
+        "out": str(job.out),
+        "shards": [path.name for path in outcome.paths],
+        "device": inputs.device.name,
+        "peak_rss_mb": peak_rss_mb(),
+        "peak_device_mb": peak_device_mb(inputs.device.alias),
+        "starved": outcome.starved,
+        "cancelled": outcome.cancelled,
+    }
+
+
+def unheld(outcome: SequenceOutcome) -> str:
+    """Which object no opposition space could hold, and why: one line."""
+    inputs = outcome.inputs
+    reached = next((r.reached for r in outcome.results), [])
+    step = next((s for s, found in enumerate(reached) if found == 0), len(reached))
+    step = min(step, len(inputs.objects) - 1)
+    model, path = inputs.objects[step].model, inputs.keys.meshes[step]
+    sides = " x ".join(f"{1e3 * side:.0f}" for side in model.extents)
+    reasons = {space: starving_stage(counts) for space, counts in _spaces(outcome)[step].items()}
+    why = "; ".join(f"{space}: stage {stage}, {words}" for space, (stage, words) in reasons.items())
+    return (
+        f"object {step + 1} ({path}, {sides} mm) is held by no opposition space of hand '{inputs.hand.name}'"
+        + (f" after {step} other object{'s' if step > 1 else ''}" if step else "")
+        + f": {why or 'none was left'}; --scale changes its size"
+    )
+
+
+def _spaces(outcome: SequenceOutcome) -> list[dict[str, dict[str, dict[str, int]]]]:
+    """Survivors by step, space and stage over all shards made."""
+    total: list[dict[str, dict[str, dict[str, int]]]] = [{} for _ in outcome.inputs.objects]
+    for result in outcome.results:
+        add_spaces(total, result.spaces)
+    return total

@@ -1,0 +1,236 @@
+"""One round: sequences begun together, object by object."""
+
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+
+from lgrasp.engine.batch import run_stage, run_stages
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.shard import add_counts, add_seconds
+from lgrasp.grasp.held import hold
+from lgrasp.grasp.sequences import SequenceTable, empty_sequences, join_sequences, take_sequences
+from lgrasp.grasp.tables import GraspTable, join_grasps, sort_grasps
+from lgrasp.jobs.sequence.inputs import SequenceInputs
+from lgrasp.runtime.meter import Meter
+from lgrasp.seeding import stage_seed
+from lgrasp.sequence.optimised_sets import optimised_sets
+from lgrasp.sequence.policy import space_orders
+from lgrasp.sequence.stage import go_on
+from lgrasp.sequence.stage import run as grow
+from lgrasp.stages.context import Context
+
+__all__ = ["Round", "Verdicts", "run_round"]
+
+_CPU_CHUNK = 1024  # candidates of a thread at a time
+_CHOICE = 4  # grasps among which policy lookahead chooses, for each that goes on
+
+Verdicts = Callable[[list[SequenceTable]], dict[str, np.ndarray]]
+"""Columns of a simulator for the rows of the last of some levels; the one whose name ends with ``_holds`` decides."""
+
+
+@dataclass
+class Round:
+    """What a round gave: level n holds the rows of n + 1 objects; their parents are rows of the level before."""
+
+    levels: list[SequenceTable] = field(default_factory=list)
+    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    spaces: list[dict[str, dict[str, dict[str, int]]]] = field(default_factory=list)  # step, space, stage: survivors
+    walls: list[float] = field(default_factory=list)  # of each step, simulation not counted [s]
+
+    def add(self, space: str, counts: dict[str, dict[str, int]], seconds: Mapping[str, float] | None = None) -> None:
+        """Count survivors of the step that is being made, and thread-seconds."""
+        add_counts(self.counts, counts)
+        add_counts(self.spaces[-1].setdefault(space, {}), counts)
+        add_seconds(self.seconds, seconds or {})
+
+
+def run_round(
+    pipeline: Pipeline,
+    inputs: SequenceInputs,
+    shard: int,
+    number: int,
+    workers: int,
+    cancelled: Callable[[], bool] = lambda: False,
+    verdicts: Verdicts | None = None,
+) -> Round:
+    """Sequences of round ``number`` of a shard: a pure function of its arguments but the number of threads.
+
+    Args:
+        workers: threads.
+        cancelled: asked before each step; the round then ends early.
+        verdicts: simulates the rows of each step; only those that hold go on.
+    """
+    params, model = pipeline.params("sequence"), inputs.hand
+    seed = stage_seed(pipeline.seed, shard, "sequence", number)
+    rows = empty_sequences(params.width, model.dofs, model.groups + 1)
+    result = Round()
+    with ThreadPoolExecutor(workers) as pool:
+        while rows.steps < len(inputs.objects) and len(rows) and not cancelled():
+            result.spaces.append({})
+            start = time.perf_counter()
+            rows = _step(pipeline, inputs, rows, seed, pool, result)
+            result.walls.append(time.perf_counter() - start)
+            result.levels.append(rows)
+            if verdicts and len(rows):
+                result.levels[-1] = rows = _that_hold(rows, verdicts(result.levels), inputs, result)
+    return result
+
+
+def _step(
+    pipeline: Pipeline,
+    inputs: SequenceInputs,
+    rows: SequenceTable,
+    seed: int,
+    pool: ThreadPoolExecutor,
+    result: Round,
+) -> SequenceTable:
+    """The rows that are one object longer, by row that they go on from."""
+    params, step = pipeline.params("sequence"), rows.steps
+    order = space_orders(rows, inputs.spaces, params.policy, len(inputs.objects) - step - 1, seed)
+    search = _Search(pipeline, inputs, rows, seed, pool, result)
+    if params.method != "field":
+        search.optimise(order[:, 0])
+    for wave in range(params.waves if params.method == "field" else 0):
+        space = order[np.arange(len(rows)), wave % np.maximum((order >= 0).sum(1), 1)]
+        for number in np.unique(space[space >= 0]):
+            search.go_on(np.flatnonzero((space == number) & search.wanting), int(number), wave)
+    parts = [search.longer(number) for number in search.tried]
+    if not parts:
+        return take_sequences(rows, np.zeros(0, int))
+    table = join_sequences(parts)
+    table = take_sequences(table, np.argsort(table.parent, kind="stable"))
+    return take_sequences(table, go_on(table.parent, table.metrics["room"], params))
+
+
+class _Search:
+    """Grasps of the next object for some sequences, wave by wave of candidates, until each has enough."""
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        inputs: SequenceInputs,
+        rows: SequenceTable,
+        seed: int,
+        pool: ThreadPoolExecutor,
+        result: Round,
+    ) -> None:
+        self._pipeline, self._inputs, self._rows, self._seed = pipeline, inputs, rows, seed
+        self._pool, self._result = pool, result
+        self._params = pipeline.params("sequence")
+        self._have = np.zeros(len(rows), int)
+        self._found: dict[int, list[GraspTable]] = {}
+        self.tried: dict[int, np.ndarray] = {}
+        """Rows that were gone on from with each space, (N,) bool."""
+
+    @property
+    def wanting(self) -> np.ndarray:
+        """Rows that have not enough grasps yet, (N,) bool."""
+        return self._have < self._params.branch * (_CHOICE if self._params.policy == "lookahead" else 1)
+
+    def go_on(self, chosen: np.ndarray, number: int, wave: int) -> None:
+        """Give some rows a wave of candidates with a space."""
+        if not len(chosen):
+            return
+        name, size = self._inputs.spaces[number].name, self._params.wave
+        seed = stage_seed(self._seed, self._rows.steps, name, wave)
+        context = _context(self._inputs, take_sequences(self._rows, chosen), number, size, seed)
+        grasps, meters = _from_field(self._pipeline, context, len(chosen) * size, self._pool)
+        self._take(grasps, meters, chosen, number, size, wave * size)
+
+    def optimise(self, space: np.ndarray) -> None:
+        """One grasp of each row with its space, by the optimiser."""
+        from lgrasp.sequence.optimiser.optimise import optimise  # torch
+
+        inputs, rows, params = self._inputs, self._rows, self._params
+        able = np.flatnonzero(space >= 0)
+        if not len(able):
+            return
+        joints = np.array([own.joints for own in inputs.spaces])
+        free = joints[space[able]] & ~rows.used[able]
+        start = time.perf_counter()
+        grasps = optimise(
+            inputs.hand,
+            [view.hand.model for view in inputs.views],
+            inputs.spaces,
+            [obj.model for obj in inputs.objects[: rows.steps + 1]],
+            space=space[able],
+            q=rows.posture(inputs.hand.tree)[able],
+            free=free,
+            held=rows.pose[able],
+            seed=np.array([stage_seed(self._seed, rows.steps, params.method, int(i)) for i in able]),
+            params=params.optimiser,
+            method=params.method,
+            device=inputs.device.alias,
+        )
+        add_seconds(self._result.seconds, {params.method: time.perf_counter() - start})
+        for number in np.unique(space[able]):
+            own = np.flatnonzero(space[able] == number)
+            part = replace(grasps, **{f.name: getattr(grasps, f.name)[own] for f in fields(grasps)})
+            context = _context(inputs, take_sequences(rows, able[own]), int(number), 1, self._seed)
+            meter = Meter(context.device)
+            sets = optimised_sets(part, free[own], context)
+            table = run_stage("filter", sets, self._pipeline, context, meter)
+            self._take(table, [meter], able[own], int(number), 1, 0)
+
+    def _take(
+        self, grasps: GraspTable, meters: list[Meter], chosen: np.ndarray, number: int, size: int, before: int
+    ) -> None:
+        """Keep grasps by candidates that go on from ``chosen`` rows, ``size`` each, after ``before`` others."""
+        for meter in meters:
+            self._result.add(self._inputs.spaces[number].name, meter.counts, meter.seconds)
+        row = chosen[grasps.index // size]
+        candidate = row * self._params.tries + before + grasps.index % size
+        self._found.setdefault(number, []).append(replace(grasps, index=candidate))
+        self.tried.setdefault(number, np.zeros(len(self._rows), bool))[chosen] = True
+        self._have += np.bincount(row, minlength=len(self._rows))
+
+    def longer(self, number: int) -> SequenceTable:
+        """The sequences that go on with a space; their candidates are counted through all rows."""
+        tries, rows = self._params.tries, np.flatnonzero(self.tried[number])
+        grasps = sort_grasps(join_grasps(self._found[number]))
+        place = np.searchsorted(rows, grasps.index // tries) * tries + grasps.index % tries
+        before = take_sequences(self._rows, rows)
+        context = _context(self._inputs, before, number, tries, self._seed)
+        table, counts = grow((before, number, replace(grasps, index=place)), self._params, context)
+        self._result.add(self._inputs.spaces[number].name, {"sequence": counts})
+        parent = rows[table.parent]
+        return replace(table, parent=parent, candidate=parent * tries + table.candidate % tries)
+
+
+def _context(inputs: SequenceInputs, before: SequenceTable, number: int, tries: int, seed: int) -> Context:
+    """What stages are given to go on from some sequences with an opposition space."""
+    space, view, step = inputs.spaces[number], inputs.views[number], before.steps
+    posture, frozen = before.posture(inputs.hand.tree), before.used | ~space.joints
+    holding = hold(view.hand, posture, frozen, inputs.objects[:step], before.pose, tries=tries)
+    alias = inputs.device.alias
+    return Context(view.hand, inputs.objects[step], view.field, alias, seed, 0, space=space, holding=holding)
+
+
+def _from_field(
+    pipeline: Pipeline, context: Context, candidates: int, pool: ThreadPoolExecutor
+) -> tuple[GraspTable, list[Meter]]:
+    """Grasps of all candidates that go on from the held rows; on a CPU several chunks of them at a time."""
+    size = _CPU_CHUNK if context.device == "cpu" else candidates
+    meters = [Meter(context.device) for _ in range(0, candidates, size)]
+
+    def run(number: int) -> GraspTable:
+        first = number * size
+        return run_stages(pipeline, context, first, min(size, candidates - first), "filter", meters[number])
+
+    return join_grasps(list(pool.map(run, range(len(meters))))), meters
+
+
+def _that_hold(
+    rows: SequenceTable, columns: dict[str, np.ndarray], inputs: SequenceInputs, result: Round
+) -> SequenceTable:
+    holds = next(values for name, values in columns.items() if name.endswith("_holds")).astype(bool)
+    for number, space in enumerate(inputs.spaces):
+        own = rows.space[:, -1] == number
+        if own.any():
+            counts = {"tried": int(own.sum()), "held": int(holds[own].sum())}
+            result.add(space.name, {"validate": counts})
+    return take_sequences(rows, np.flatnonzero(holds), physics=columns)

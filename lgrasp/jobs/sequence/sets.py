@@ -1,0 +1,73 @@
+"""Object sets and their orders, drawn from a pool with a seed: what a config of sequences runs over."""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from lgrasp.errors import ConfigError
+from lgrasp.jobs.sequence.size import Size, parse_size
+from lgrasp.seeding import stage_seed
+
+__all__ = ["SequenceSets", "object_sequences"]
+
+
+class SequenceSets(BaseModel):
+    """How sequences are drawn from the objects of a config."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    sets: int = Field(600, ge=1, description="Different sets of objects.")
+    length: int = Field(4, ge=2, le=16, description="Objects in a set.")
+    permutations: int = Field(4, ge=1, description="Different orders of each set.")
+    scale: str = Field("0.06:0.10", description="Factor to metres, or range of the longest side [m].")
+    method: str | None = Field(None, description="Replaces that of stage sequence.")
+    policy: str | None = Field(None, description="Replaces that of stage sequence.")
+    physics: str | None = Field(None, description="Protocol that rows must pass before they go on.")
+
+    @field_validator("scale", mode="before")
+    @classmethod
+    def _as_text(cls, value: object) -> str:
+        return str(value)
+
+    @property
+    def size(self) -> Size:
+        """The scale as numbers.
+
+        Raises:
+            ConfigError: neither a factor nor a range.
+        """
+        return parse_size(self.scale)
+
+
+def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list[tuple[str, ...]]:
+    """Sequences of objects: ``permutations`` orders of each of ``sets`` different sets.
+
+    Args:
+        pool: objects to draw from, in any order.
+
+    Raises:
+        ConfigError: there are not so many sets or orders.
+    """
+    pool = sorted(set(pool))
+    most, orders = math.comb(len(pool), sets.length), math.factorial(sets.length)
+    if sets.sets > most:
+        raise ConfigError(f"{sets.sets} sets of {sets.length} objects are asked for; {len(pool)} objects make {most}")
+    if sets.permutations > orders:
+        raise ConfigError(f"{sets.permutations} orders are asked for; {sets.length} objects have {orders}")
+    rng = np.random.default_rng(stage_seed(seed, 0, "sets"))
+    chosen: dict[tuple[int, ...], None] = {}
+    if most <= 4 * sets.sets:
+        every = list(itertools.combinations(range(len(pool)), sets.length))
+        chosen = {every[i]: None for i in rng.permutation(most)[: sets.sets]}
+    while len(chosen) < sets.sets:
+        chosen[tuple(sorted(rng.choice(len(pool), sets.length, replace=False).tolist()))] = None
+    out = []
+    for members in chosen:
+        drawn: dict[tuple[int, ...], None] = {}
+        while len(drawn) < sets.permutations:
+            drawn[tuple(rng.permutation(members).tolist())] = None
+        out += [tuple(pool[i] for i in order) for order in drawn]
+    return out

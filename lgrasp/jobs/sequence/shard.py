@@ -1,0 +1,138 @@
+"""One shard of sequences: rounds until there are enough."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.shard import add_counts, add_seconds
+from lgrasp.grasp.duplicates import KeptRows
+from lgrasp.grasp.sequences import SequenceTable, join_sequences, take_sequences
+from lgrasp.grasp.tables import user_poses
+from lgrasp.jobs.sequence.inputs import SequenceInputs
+from lgrasp.jobs.sequence.round import Round, Verdicts, run_round
+
+__all__ = ["SequenceResult", "add_spaces", "make_sequences", "most_rounds"]
+
+_EMPTY_ROUNDS = 4  # without any row of some length, before nothing more is expected
+
+
+@dataclass
+class SequenceResult:
+    """Sequences of a shard and how they came about."""
+
+    levels: list[SequenceTable] = field(default_factory=list)  # rows of 1, 2 ... objects
+    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)  # thread-seconds per stage
+    spaces: list[dict[str, dict[str, dict[str, int]]]] = field(default_factory=list)  # step, space, stage: survivors
+    reached: list[int] = field(default_factory=list)  # rows of 1, 2 ... objects that were found
+    wall: float = 0.0
+    rounds: int = 0
+    duplicates: int = 0
+    exhausted: bool = False
+    cancelled: bool = False
+
+    def __len__(self) -> int:
+        """Whole sequences."""
+        return len(self.levels[-1]) if self.levels else 0
+
+    def add(self, round_: Round) -> None:
+        """Count a further round."""
+        self.rounds += 1
+        add_counts(self.counts, round_.counts)
+        add_seconds(self.seconds, round_.seconds)
+        add_spaces(self.spaces, round_.spaces)
+        for step, table in enumerate(round_.levels):
+            self.reached += [0] * (step + 1 - len(self.reached))
+            self.reached[step] += len(table)
+
+
+def add_spaces(
+    total: list[dict[str, dict[str, dict[str, int]]]], more: list[dict[str, dict[str, dict[str, int]]]]
+) -> None:
+    """Add survivors by step, space and stage to a running total."""
+    for step, found in enumerate(more):
+        if step == len(total):
+            total.append({})
+        for space, counts in found.items():
+            add_counts(total[step].setdefault(space, {}), counts)
+
+
+def most_rounds(pipeline: Pipeline, rows: int) -> int:
+    """Rounds that a shard of ``rows`` sequences may take."""
+    params = pipeline.params("sequence")
+    return -(-rows // params.width) * params.rounds
+
+
+def make_sequences(
+    pipeline: Pipeline,
+    inputs: SequenceInputs,
+    shard: int,
+    rows: int,
+    workers: int,
+    *,
+    cancelled: Callable[[], bool] = lambda: False,
+    progress: Callable[[int, SequenceResult], None] | None = None,
+    verdicts: Verdicts | None = None,
+) -> SequenceResult:
+    """The first ``rows`` whole sequences of a shard, near-duplicates left out, with the rows that they go on from.
+
+    Args:
+        workers: threads; they do not change the rows.
+        progress: called with (sequences so far, running result) after each round.
+        verdicts: see :func:`run_round`.
+    """
+    result = SequenceResult()
+    objects = len(inputs.objects)
+    kept = KeptRows(inputs.hand.dofs, inputs.device.alias)
+    parts: list[list[SequenceTable]] = []
+    start = time.perf_counter()
+    while kept.count < rows and not result.exhausted:
+        found = run_round(pipeline, inputs, shard, result.rounds, workers, cancelled, verdicts)
+        if cancelled():
+            result.cancelled = True
+            break
+        result.add(found)
+        if len(found.levels) == objects:
+            last = found.levels[-1]
+            # two sequences are near-duplicates at most where their first objects and their joints are
+            pose = user_poses(last.pose[:, 0], inputs.objects[0].model.center)
+            new, duplicates = kept.add(pose, last.q[:, -1], rows - kept.count)
+            result.duplicates += duplicates
+            parts.append(_lineage(found.levels, new))
+        if progress:
+            progress(kept.count, result)
+        hopeless = result.rounds >= _EMPTY_ROUNDS and _missing(result, objects)
+        result.exhausted = kept.count < rows and (hopeless or result.rounds >= most_rounds(pipeline, rows))
+    result.levels = _joined(parts)
+    result.wall = time.perf_counter() - start
+    return result
+
+
+def _missing(result: SequenceResult, objects: int) -> bool:
+    """Has no row of some length been found yet?"""
+    return len(result.reached) < objects or min(result.reached) == 0
+
+
+def _lineage(levels: list[SequenceTable], rows: np.ndarray) -> list[SequenceTable]:
+    """Some rows of the last level and those that they go on from; parents are counted anew."""
+    out: list[SequenceTable] = []
+    for table in reversed(levels):
+        taken = take_sequences(table, rows)
+        rows, parent = np.unique(taken.parent, return_inverse=True)
+        out.append(replace(taken, parent=parent if table.steps > 1 else np.full(len(parent), -1)))
+    return out[::-1]
+
+
+def _joined(parts: list[list[SequenceTable]]) -> list[SequenceTable]:
+    """Rows of several rounds by number of objects; a parent is a row of the level before."""
+    if not parts:
+        return []
+    joined = []
+    for step in range(len(parts[0])):
+        shifts = np.cumsum([0, *(len(levels[step - 1]) for levels in parts)]) if step else [0] * len(parts)
+        parents = zip(parts, shifts, strict=False)
+        joined.append(join_sequences([replace(p[step], parent=p[step].parent + shift) for p, shift in parents]))
+    return joined

@@ -1,0 +1,391 @@
+"""Exact small QPs: the point of least norm in the convex hull of contact wrenches (Wolfe's algorithm in 6-D).
+
+Both published scores are this problem: FSWO (eq. 1) over the k frictionless wrenches, GSWO (eq. 2) over friction
+cones. So is the resistance to an outside force, of a hull moved by that force.
+"""
+
+import warp as wp
+
+from lgrasp.math.transforms import tangent
+
+__all__ = ["MAX_CONTACTS", "balance", "disturbance", "frictionless", "unresisted", "vec6", "wrench"]
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+MAX_CONTACTS = 7
+"""Fingers plus palm in one grasp."""
+_CORRAL = 8
+_CORRAL_C = wp.constant(_CORRAL)
+
+vec6 = wp.types.vector(6, wp.float32)
+vec8 = wp.types.vector(_CORRAL, wp.float32)
+mat8 = wp.types.matrix((_CORRAL, _CORRAL), wp.float32)
+mat86 = wp.types.matrix((_CORRAL, 6), wp.float32)
+mat83 = wp.types.matrix((_CORRAL, 3), wp.float32)
+mat63 = wp.types.matrix((MAX_CONTACTS, 3), wp.float32)
+mat_gram = wp.types.matrix((MAX_CONTACTS, MAX_CONTACTS), wp.float32)
+vec_share = wp.types.vector(MAX_CONTACTS, wp.float32)
+
+
+@wp.func
+def wrench(r: wp.vec3, f: wp.vec3, torque_scale: wp.float32):
+    """(force, torque_scale * r x f) of force f acting at arm r [m]."""
+    t = wp.cross(r, f) * torque_scale
+    return vec6(f[0], f[1], f[2], t[0], t[1], t[2])
+
+
+@wp.func
+def _best_direction(a: wp.vec3, n: wp.vec3, mu: wp.float32, edges: wp.int32):
+    """Force with unit normal part inside the friction cone that minimises a . f; edges = 0: the round cone."""
+    if mu <= 0.0:
+        return n
+    t = tangent(n)
+    b = wp.cross(n, t)
+    u = wp.dot(a, t)
+    v = wp.dot(a, b)
+    if edges == 0:
+        s = wp.sqrt(u * u + v * v)
+        if s < 1.0e-12:
+            return n
+        return n - (t * u + b * v) * (mu / s)
+    step = 6.2831853 / float(edges)
+    angle = wp.round(wp.atan2(-v, -u) / step) * step
+    return n + (t * wp.cos(angle) + b * wp.sin(angle)) * mu
+
+
+@wp.func
+def _affine_weights(G: mat8, m: wp.int32):
+    """Weights (sum 1) of the least-norm point of the affine hull of m points, Gram matrix G; regularised Cholesky."""
+    L = mat8()
+    trace = float(0.0)
+    for i in range(m):
+        trace += G[i, i]
+    eps = 1.0e-6 * trace / float(m) + 1.0e-12
+    for i in range(m):
+        for j in range(i + 1):
+            s = G[i, j]
+            if i == j:
+                s += eps
+            for c in range(j):
+                s -= L[i, c] * L[j, c]
+            if i == j:
+                L[i, i] = wp.sqrt(wp.max(s, eps * 0.01))
+            else:
+                L[i, j] = s / L[j, j]
+    z = vec8()
+    for i in range(m):
+        s = float(1.0)
+        for c in range(i):
+            s -= L[i, c] * z[c]
+        z[i] = s / L[i, i]
+    total = float(0.0)
+    for b in range(m):
+        i = m - 1 - b
+        s = z[i]
+        for c in range(i + 1, m):
+            s -= L[c, i] * z[c]
+        z[i] = s / L[i, i]
+        total += z[i]
+    for i in range(m):
+        z[i] = z[i] / total
+    return z
+
+
+@wp.func
+def _least_norm(
+    arms: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    mu: wp.float32,
+    edges: wp.int32,
+    torque_scale: wp.float32,
+    load: vec6,
+    total: wp.float32,
+    less: wp.int32,
+    stop: wp.float32,
+    limit: wp.float32,
+    exact: wp.float32,
+    forces: wp.array(dtype=wp.vec3),
+):
+    """Point of least norm of ``load`` plus wrenches with f_i in the friction cone of n_i, by Wolfe's algorithm.
+
+    The normal forces add up to ``total``, or to at most that when ``less`` is 1.
+
+    Args:
+        stop: return as soon as the norm is below this.
+        limit: return as soon as the least norm is known to be above this.
+        exact: relative error of the squared norm.
+        forces: (local, MAX_CONTACTS) receives the optimal forces.
+    """
+    P = mat86()
+    F = mat83()
+    owner = vec8()
+    w = vec8()
+    G = mat8()
+    # start at no force at all, or at the first contact's normal wrench
+    x = load
+    m = int(1)
+    owner[0] = -1.0
+    if less == 0:
+        x = load + wrench(arms[0], normals[0] * total, torque_scale)
+        F[0, 0] = normals[0][0] * total
+        F[0, 1] = normals[0][1] * total
+        F[0, 2] = normals[0][2] * total
+        owner[0] = 0.0
+    for c in range(6):
+        P[0, c] = x[c]
+    w[0] = 1.0
+    G[0, 0] = wp.dot(x, x)
+    norm2 = G[0, 0]
+    for _major in range(32):
+        if norm2 <= stop * stop:
+            break
+        # the hull point that goes farthest towards the origin: a linear problem over the cones
+        xf = wp.vec3(x[0], x[1], x[2])
+        xt = wp.vec3(x[3], x[4], x[5]) * torque_scale
+        best = float(1.0e30)
+        bi = int(-1)
+        bf = wp.vec3(0.0)
+        if less == 1:
+            best = 0.0
+        for i in range(k):
+            a = xf + wp.cross(xt, arms[i])
+            f = _best_direction(a, normals[i], mu, edges)
+            s = wp.dot(a, f)
+            if s < best:
+                best = s
+                bi = i
+                bf = f
+        best = best * total + wp.dot(x, load)
+        if best > norm2 - 1.0e-6 - exact * norm2 or m >= _CORRAL_C:
+            break
+        if best > 0.0 and best * best > limit * limit * norm2:
+            break
+        y = load
+        if bi >= 0:
+            bf = bf * total
+            y = load + wrench(arms[bi], bf, torque_scale)
+        for c in range(6):
+            P[m, c] = y[c]
+        F[m, 0] = bf[0]
+        F[m, 1] = bf[1]
+        F[m, 2] = bf[2]
+        owner[m] = float(bi)
+        w[m] = 0.0
+        for j in range(m + 1):
+            s = float(0.0)
+            for c in range(6):
+                s += P[m, c] * P[j, c]
+            G[m, j] = s
+            G[j, m] = s
+        m += 1
+        # inner loop: least-norm point of the affine hull; leave it at the boundary of the simplex, drop, repeat
+        for _minor in range(_CORRAL):
+            z = _affine_weights(G, m)
+            low = float(1.0)
+            for j in range(m):
+                low = wp.min(low, z[j])
+            if low > 1.0e-7:
+                for j in range(m):
+                    w[j] = z[j]
+                break
+            theta = float(1.0)
+            drop = int(-1)
+            for j in range(m):
+                if z[j] <= 1.0e-7:
+                    t = w[j] / wp.max(w[j] - z[j], 1.0e-12)
+                    if t < theta or drop < 0:
+                        theta = wp.min(theta, t)
+                        drop = j
+            for j in range(m):
+                w[j] = w[j] + theta * (z[j] - w[j])
+            # remove `drop`: move the last point into its place
+            m -= 1
+            if drop != m:
+                w[drop] = w[m]
+                owner[drop] = owner[m]
+                for c in range(6):
+                    P[drop, c] = P[m, c]
+                F[drop, 0] = F[m, 0]
+                F[drop, 1] = F[m, 1]
+                F[drop, 2] = F[m, 2]
+                for j in range(m):
+                    G[drop, j] = G[m, j]
+                    G[j, drop] = G[j, m]
+                G[drop, drop] = G[m, m]
+            if m <= 1:
+                w[0] = 1.0
+                break
+        share = float(0.0)
+        for j in range(m):
+            w[j] = wp.max(w[j], 0.0)
+            share += w[j]
+        for c in range(6):
+            s = float(0.0)
+            for j in range(m):
+                s += w[j] * P[j, c]
+            x[c] = s / share
+        last = norm2
+        norm2 = wp.dot(x, x)
+        if norm2 > last * 0.99999:
+            break
+    for i in range(k):
+        forces[i] = wp.vec3(0.0)
+    share = float(0.0)
+    for j in range(m):
+        share += w[j]
+    for j in range(m):
+        i = int(owner[j])
+        if i >= 0:
+            forces[i] = forces[i] + wp.vec3(F[j, 0], F[j, 1], F[j, 2]) * (w[j] / share)
+    return wp.sqrt(norm2)
+
+
+@wp.func
+def balance(
+    arms: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    mu: wp.float32,
+    edges: wp.int32,
+    torque_scale: wp.float32,
+    stop: wp.float32,
+    forces: wp.array(dtype=wp.vec3),
+):
+    """min |sum_i (f_i, torque_scale * arm_i x f_i)| with f_i in the friction cone of n_i and sum_i f_i . n_i = 1.
+
+    Args:
+        arms, normals: local arrays; contact i acts at ``arms[i]`` [m] along unit inward normal ``normals[i]``.
+        k: number of contacts. mu: friction coefficient. edges: cone edges, 0 for the round cone.
+        stop: return as soon as the norm is below this.
+        forces: (local, MAX_CONTACTS) receives the optimal forces.
+
+    Returns:
+        The least norm.
+    """
+    return _least_norm(arms, normals, k, mu, edges, torque_scale, vec6(), 1.0, 0, stop, 1.0e15, 1.0e-4, forces)
+
+
+@wp.func
+def unresisted(
+    arms: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    mu: wp.float32,
+    turn: wp.quat,
+    direction: wp.int32,
+    stop: wp.float32,
+    limit: wp.float32,
+):
+    """How much of a unit force e on the centre of mass stays unresisted, 0 to 1.
+
+    min |e + sum_i (f_i, arm_i x f_i / 5 cm)| with f_i in the round friction cone of n_i and sum_i f_i . n_i <= 5: what
+    cannot be held with five times the load is not held.
+
+    Args:
+        arms: from the centre of mass [m]. normals: inward.
+        turn: from the hand's base frame to that of arms and normals.
+        direction: of e in the hand's base frame: x, y, z, -x, -y, -z.
+        stop, limit: return as soon as the answer is known to be below, above this.
+    """
+    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    e = wp.vec3(0.0)
+    e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
+    e = wp.quat_rotate(turn, e)
+    load = vec6(e[0], e[1], e[2], 0.0, 0.0, 0.0)
+    return _least_norm(arms, normals, k, mu, 0, 20.0, load, 5.0, 1, stop, limit, 1.0e-3, forces)
+
+
+@wp.func
+def disturbance(
+    arms: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    mu: wp.float32,
+    turn: wp.quat,
+    limit: wp.float32,
+):
+    """The worst of six directions of :func:`unresisted`; some value above the limit when it is above."""
+    worst = float(0.0)
+    for direction in range(6):
+        worst = wp.max(worst, unresisted(arms, normals, k, mu, turn, direction, worst, limit))
+        if worst > limit:
+            break
+    return worst
+
+
+@wp.func
+def frictionless(
+    points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), k: wp.int32, torque_scale: wp.float32
+):
+    """FSWO (eq. 1) by active sets on the k x k Gram matrix, for the inner loop of the search.
+
+    The full-support solution is exact when all its shares are positive. Otherwise the smallest share is dropped and the
+    rest solved again, which gives a feasible point, so an upper bound: good enough to steer, and never accepted since a
+    contact without force is not.
+
+    Returns:
+        (least norm, smallest share of the normal force; 0 when a contact was dropped).
+    """
+    centroid = wp.vec3(0.0)
+    for i in range(k):
+        centroid = centroid + points[i]
+    centroid = centroid / float(k)
+    G = mat_gram()
+    W = mat63()
+    trace = float(0.0)
+    for i in range(k):
+        t = wp.cross(points[i] - centroid, normals[i]) * torque_scale
+        W[i] = t
+        for j in range(i + 1):
+            g = wp.dot(normals[i], normals[j]) + wp.dot(t, W[j])
+            G[i, j] = g
+            G[j, i] = g
+        trace += G[i, i]
+    eps = 1.0e-6 * trace / float(k)
+    active = vec_share()
+    for i in range(k):
+        active[i] = 1.0
+    least = float(0.0)
+    value = float(0.0)
+    for _drop in range(k):
+        # Cholesky of the active block; inactive rows are identity
+        L = mat_gram()
+        z = vec_share()
+        for i in range(k):
+            if active[i] > 0.0:
+                for j in range(i + 1):
+                    if active[j] > 0.0:
+                        s = G[i, j]
+                        for c in range(j):
+                            s -= L[i, c] * L[j, c]
+                        if i == j:
+                            L[i, i] = wp.sqrt(wp.max(s + eps, eps * 0.01))
+                        else:
+                            L[i, j] = s / L[j, j]
+                s = float(1.0)
+                for c in range(i):
+                    s -= L[i, c] * z[c]
+                z[i] = s / L[i, i]
+        total = float(0.0)
+        low = float(1.0e30)
+        drop = int(0)
+        for b in range(k):
+            i = k - 1 - b
+            if active[i] > 0.0:
+                s = z[i]
+                for c in range(i + 1, k):
+                    if active[c] > 0.0:
+                        s -= L[c, i] * z[c]
+                z[i] = s / L[i, i]
+                total += z[i]
+                if z[i] < low:
+                    low = z[i]
+                    drop = i
+        value = 1.0 / wp.max(total, 1.0e-12)
+        if low >= 0.0:
+            if _drop == 0:
+                least = low * value
+            break
+        active[drop] = 0.0
+    return wp.vec2(wp.sqrt(wp.max(value - eps, 0.0)), least)

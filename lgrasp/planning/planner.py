@@ -1,0 +1,220 @@
+"""Grasp planning: many starts before a surface, a parallel local search, the best of each start."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
+from lgrasp.hand.arrays import HandArrays
+from lgrasp.object.arrays import ObjectArrays, upload_object
+from lgrasp.object.model import ObjectModel
+from lgrasp.planning.starts import GOLDEN_ANGLE, palm_axis, start_poses, tilted
+from lgrasp.refine.check import OUTCOMES, check_grasps
+from lgrasp.refine.descent import Descent
+from lgrasp.refine.hands import Hands, inverse_poses
+from lgrasp.refine.params import GraspBounds, LocalSearch
+from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface
+from lgrasp.refine.volume import upload_target
+
+__all__ = ["PlanParams", "Planned", "Planner", "cloud_params"]
+
+_CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
+_COLLIDES, _CLOUD_GAP = 1.0e-3, 6.0e-3  # [m]
+_PLAN_BOUNDS = GraspBounds(
+    penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=60.0
+)
+_COARSE = GraspBounds(penetration=0.01, self_margin=0.0, gap=0.012, angle=60.0, fold=90.0, balance=10.0)
+
+
+class PlanParams(BaseModel):
+    """How many hands are tried, how far they are moved, and what a plan must satisfy."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rolls: int = Field(
+        default=30, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
+    )
+    tilts: tuple[float, ...] = Field(
+        default=(0.0, 45.0, 90.0),
+        min_length=1,
+        description="Angles between the surface's normal and the way back from it [deg], in turn.",
+    )
+    finalists: int = Field(default=10, ge=1, le=64, description="Of these go on after the first outer steps.")
+    opening: int = Field(default=5, ge=1, le=100, description="Outer steps of all of them.")
+    clearance: float = Field(
+        default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
+    )
+    distal: float = Field(
+        default=DISTAL, ge=0, le=100, description="Weight of palmar points on the last links of fingers."
+    )
+    other: float = Field(default=OTHER, ge=0, le=100, description="Weight of the other palmar points.")
+    search: LocalSearch = Field(
+        default=LocalSearch(
+            withdraw=0.0,
+            shift=0.002,
+            turn=0.02,
+            bend=0.04,
+            reach=0.15,
+            reach_end=0.1,
+            soft=0.01,
+            force=0.3,
+            margin=0.005,
+        ),
+        description="The local search.",
+    )
+    rank_friction: float = Field(
+        default=0.3, gt=0, le=2, description="Friction coefficient at which the hands of a start are compared."
+    )
+    bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
+
+    def weights(self) -> dict[str, float]:
+        """Arguments of :func:`hand_surface`."""
+        return {"distal": self.distal, "other": self.other}
+
+
+def cloud_params(params: PlanParams) -> PlanParams:
+    """The parameters for an object that is a point cloud, whose points lie off its surface by their noise."""
+    bounds = params.bounds.model_copy(update={"gap": max(params.bounds.gap, _CLOUD_GAP)})
+    return params.model_copy(update={"bounds": bounds})
+
+
+class Planned(NamedTuple):
+    """Plans of the starts."""
+
+    grasps: GraspTable
+    """The best of each start that passed all checks; ``index`` is the start."""
+    counts: dict[str, int]
+    """Starts, those whose open hand collides, and outcomes of the others."""
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Plans grasps of one object by one hand.
+
+    Args:
+        stand_off: distance of the hand's base from the surface at the start [m].
+        palmar: where the hand may touch; default: where hand.yaml lets it.
+        around: what else the hand must not touch, in the object's internal frame.
+    """
+
+    hand: HandArrays
+    model: ObjectModel
+    stand_off: float
+    params: PlanParams = field(default_factory=PlanParams)
+    palmar: Palmar | None = None
+    around: ObjectModel | None = None
+
+    def run(self, count: int, progress: Callable[[int, int], None] | None = None) -> Planned:
+        """Plans from ``count`` starts; those of a start do not depend on the others.
+
+        Args:
+            progress: called with (starts done, plans); what it raises ends the planning.
+
+        Raises:
+            HandError: no side of the hand can face an object.
+        """
+        device = self.hand.device
+        points = farthest_points(self.model.contact_points.astype(float), count)
+        some, workers = (_CPU_STARTS, os.cpu_count() or 1) if device == "cpu" else (_GPU_STARTS, 1)
+        counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *OUTCOMES], 0)
+        tables = []
+        with ThreadPoolExecutor(workers) as pool:
+            firsts, search = range(0, count, some), self._scene.search
+            parts = [pool.submit(self._plan, search, points[first : first + some], first) for first in firsts]
+            try:
+                for first, part in zip(firsts, parts, strict=True):
+                    table, outcome = part.result()
+                    tried = len(points[first : first + some])
+                    counts["starts"] += tried
+                    counts["colliding"] += tried - len(outcome)
+                    for code, name in enumerate(OUTCOMES):
+                        counts[name] += int((outcome == code).sum())
+                    tables.append(take_grasps(table, np.flatnonzero(outcome == 0)))
+                    if progress:
+                        progress(counts["starts"], counts["kept"])
+            finally:
+                pool.shutdown(cancel_futures=True)
+        return Planned(join_grasps(tables), counts)
+
+    @cached_property
+    def _scene(self) -> "_Scene":
+        device, surface = self.hand.device, hand_surface(self.hand.model, self.palmar, **self.params.weights())
+        around = None if self.around is None else upload_object(self.around, device)
+        target = upload_target(self.model, self.around, device)
+        return _Scene(
+            Descent(self.hand, target, self.params.search, surface), upload_object(self.model, device), around
+        )
+
+    def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
+        """The best hand of each start that does not collide, and its outcome."""
+        p, hand = self.params, self.hand.model
+        start, pose, q, facing = self._starts(points, first)
+        free = search.depth(self._put(pose, q)) <= _COLLIDES
+        start, at = start[free], self._put(pose[free], q[free])
+        if len(start):
+            centre, axis = palm_axis(hand)
+            travel = np.full(len(start), max(self.stand_off - float(centre @ axis) - p.clearance, 0.0))
+            search.advanced(at, facing[free], travel, p.clearance)
+            search.run(at, outer=p.opening)
+            start, at = self._best(at, start, _COARSE, p.finalists)
+            search.run(at, first=p.opening)
+            start, at = self._best(at, start, p.bounds, 1)
+        return self._checked(at, start, p.bounds)
+
+    def _best(self, at: Hands, start: np.ndarray, bounds: GraspBounds, count: int) -> tuple[np.ndarray, Hands]:
+        """The ``count`` best hands of each start: those that pass the checks first, then those that resist most."""
+        bounds = bounds.model_copy(update={"friction": self.params.rank_friction})
+        table, outcome = self._checked(at, start, bounds)
+        keys = [np.arange(len(start)), -table.metrics["epsilon"], table.metrics["disturbance"], outcome != 0, start]
+        order = np.lexsort(keys)
+        place = np.arange(len(start)) - np.searchsorted(start[order], start[order])
+        rows = np.sort(order[place < count])
+        pose, q = at.numpy()
+        return start[rows], self._put(pose[rows], q[rows])
+
+    def _starts(self, points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Start of each hand (M,), the hands' bases (M, 7) and joints (M, K), and the directions they face (M, 3).
+
+        Starts count from ``first``, ``points`` are theirs among the contact points.
+        """
+        model, settings, rolls = self.model, self.hand.model.tree.settings, self.params.rolls
+        start = np.repeat(first + np.arange(len(points)), rolls)
+        at, normals = (a[points].repeat(rolls, 0).astype(float) for a in (model.contact_points, model.contact_normals))
+        number = start * rolls + np.tile(np.arange(rolls), len(points))
+        turn = (start * GOLDEN_ANGLE + 2 * np.pi * number / rolls) % (2 * np.pi)
+        tilt = np.deg2rad(np.array(self.params.tilts))[number // len(settings) % len(self.params.tilts)]
+        back = tilted(normals, tilt, number * GOLDEN_ANGLE)
+        pose = start_poses(self.hand.model, at, back, turn, self.stand_off)
+        # shared joints take their values in turn
+        return start, pose, settings[number % len(settings)], -back
+
+    def _put(self, pose: np.ndarray, q: np.ndarray) -> Hands:
+        return Hands.put(pose, q, self.hand.device)
+
+    def _checked(self, at: Hands, start: np.ndarray, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray]:
+        pose, q = at.numpy()
+        return check_grasps(
+            self.hand,
+            self._scene.object,
+            inverse_poses(pose),
+            q,
+            bounds,
+            palmar=self.palmar,
+            around=self._scene.around,
+            index=start,
+        )
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What a planning uploads once."""
+
+    search: Descent
+    object: ObjectArrays
+    around: ObjectArrays | None

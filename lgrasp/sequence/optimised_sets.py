@@ -1,0 +1,70 @@
+"""Grasps of an optimiser as contact sets, so that they pass the same filter as all others."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lgrasp.grasp.tables import ContactSets, set_table
+from lgrasp.math.kinematics import MAX_DOFS
+from lgrasp.stages.context import Context
+
+if TYPE_CHECKING:  # torch takes a second to import
+    from lgrasp.sequence.optimiser.optimise import Optimised
+
+__all__ = ["optimised_sets"]
+
+
+def optimised_sets(grasps: "Optimised", free: np.ndarray, context: Context) -> ContactSets:
+    """Sets of the two contacts of each grasp; the candidate of row i is the first that goes on from held row i.
+
+    Grasps whose contact point is in no record of the contact field cannot be told and are left out.
+
+    Args:
+        grasps: H grasps with the context's opposition space, one for each row of its :class:`Held`.
+        free: joints that may move, (H, K) bool.
+    """
+    assert context.space is not None
+    tree = context.hand.model.tree
+    groups, rows = tree.groups, len(grasps.q)
+    record_of = np.full(len(context.hand.model.contact_points), -1)
+    point, first = np.unique(context.field.model.point, return_index=True)
+    record_of[point] = first
+    shape = (rows, groups, 1)
+    count, surface, record = (np.zeros(s, np.int32) for s in (shape[:2], shape, shape))
+    chosen = np.full((rows, groups), -1, np.int32)
+    palm_point, palm_surface = (np.full(rows, -1, np.int32) for _ in range(2))
+    known: np.ndarray = np.ones(rows, bool)
+    posture = np.zeros((*shape, MAX_DOFS), np.float32)
+    for g in range(groups):
+        columns = tree.dof_index[tree.dof_first[g] : tree.dof_first[g + 1]]
+        posture[:, g, 0, : len(columns)] = grasps.q[:, columns]
+    for side, g in enumerate(context.space.groups):
+        own = tree.dof_index[tree.dof_first[g] : tree.dof_first[g] + tree.dof_free[g]] if g >= 0 else []
+        moves = free[:, own].any(1) if g >= 0 else np.zeros(rows, bool)
+        palm_point[~moves] = grasps.hand_point[~moves, side]
+        palm_surface[~moves] = grasps.object_point[~moves, side]
+        if g >= 0:
+            found = record_of[grasps.hand_point[:, side]]
+            known &= ~moves | (found >= 0)
+            count[moves, g], chosen[moves, g] = 1, 0
+            surface[moves, g, 0], record[moves, g, 0] = grasps.object_point[moves, side], found[moves]
+    kept = np.flatnonzero(known)
+    setting = np.maximum(context.held.struct.setting.numpy(), 0)
+    arrays = {
+        "pose": np.arange(len(kept), dtype=np.int32),
+        "slot": np.zeros(len(kept), np.int32),
+        "chosen": chosen[kept],
+        "score": np.zeros(len(kept), np.float32),
+        "candidates.count": count[kept],
+        "candidates.surface": surface[kept],
+        "candidates.record": record[kept],
+        "candidates.state": np.ones_like(surface[kept]),
+        "candidates.q": posture[kept],
+        "candidates.poses.index": (kept * context.held.struct.tries).astype(np.int32),
+        "candidates.poses.pose": grasps.pose[kept].astype(np.float32),
+        "candidates.poses.palm_point": palm_point[kept],
+        "candidates.poses.palm_surface": palm_surface[kept],
+        "candidates.poses.setting": setting[kept].astype(np.int32),
+        "candidates.poses.anchor": np.full((len(kept), groups), -1, np.int32),
+    }
+    return set_table(arrays, context.device)

@@ -1,0 +1,45 @@
+"""Parameters of the sequence stage."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from lgrasp.sequence.optimiser.params import OptimiserParams
+
+__all__ = ["SequenceParams"]
+
+
+class SequenceParams(BaseModel):
+    """How sequences of grasps grow, object by object."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    method: Literal["field", "anneal", "mala"] = Field(
+        "field", description="field: the contact field proposes; anneal, mala: the published optimiser, true Langevin."
+    )
+    policy: Literal["uniform", "lookahead"] = Field(
+        "uniform",
+        description="Opposition space of a step: any that is left; or those, and grasps, that leave most for later.",
+    )
+    width: int = Field(320, ge=1, le=65_536, description="Sequences begun in a round.")
+    wave: int = Field(
+        256, ge=1, le=65_536, description="Candidates tried with one space before the next is tried (field)."
+    )
+    waves: int = Field(4, ge=1, le=256, description="Waves of a step before a sequence is given up (field).")
+    branch: int = Field(1, ge=1, le=1024, description="Most sequences that go on from one.")
+    optimiser: OptimiserParams = Field(
+        default_factory=lambda: OptimiserParams.model_validate({}),
+        description="Numbers of the methods anneal and mala.",
+    )
+    rounds: int = Field(64, ge=1, le=65_536, description="Rounds per width of sequences asked, before giving up.")
+
+    @property
+    def tries(self) -> int:
+        """Most candidates that go on from a sequence in a step."""
+        return self.wave * self.waves
+
+    @model_validator(mode="after")
+    def _numbers_fit(self) -> "SequenceParams":
+        if self.width * self.tries > 2**24:
+            raise ValueError(f"width * wave * waves = {self.width * self.tries}, at most 2^24 candidates have numbers")
+        return self

@@ -1,0 +1,154 @@
+"""Scene and protocol -> a MuJoCo model, with the tables that map rows of a shard to its state."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from lgrasp.errors import PhysicsError
+from lgrasp.simulate.assemble import OBJECT, assemble
+from lgrasp.simulate.protocol import Protocol
+from lgrasp.simulate.scene import HandSolids, Scene
+from lgrasp.simulate.solid import Solid
+from lgrasp.simulate.urdf import welded_joints
+
+__all__ = ["Model", "build_model", "import_mujoco"]
+
+_NEAR = 1.0e-3  # [m]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A hand and O objects of a scene, compiled; K columns of q, J joints of the hand in MuJoCo."""
+
+    mujoco: Any
+    """MjModel"""
+    mujoco_near: Any
+    """MjModel in which hand and objects touch within 1 mm."""
+    protocol: Protocol
+    forces: np.ndarray
+    """(O,) pull on each object [N]."""
+    joint_address: np.ndarray
+    """(J,) place of each joint in qpos."""
+    joint_matrix: np.ndarray
+    """(J, K): joint positions = joint_matrix @ q + joint_offset, mimic joints included."""
+    joint_offset: np.ndarray
+    """(J,) [rad or m]"""
+    columns: np.ndarray
+    """Columns of q in the order of the controls."""
+    held: dict[str, tuple[int, float]]
+    """Joints above the base link: column and the value at which they are welded [rad or m]."""
+    object_address: np.ndarray
+    """(O, 7) places of each object's position and quaternion in qpos."""
+    object_velocity: np.ndarray
+    """(O, 6) places of each object's linear and angular velocity in qvel."""
+    object_body: np.ndarray
+    """(O,)"""
+    base_body: int
+    link_body: np.ndarray
+    """(L,) body of each of the shard's links, -1: none."""
+    centers: np.ndarray
+    """(O, 3) centre of mass in each object's frame [m]."""
+
+    def controls(self, q: np.ndarray) -> np.ndarray:
+        """Targets of the drives at joint positions q (..., K)."""
+        return np.where(self.columns >= 0, q[..., self.columns], 0.0)
+
+
+def import_mujoco() -> Any:
+    """The module mujoco.
+
+    Raises:
+        PhysicsError: it is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError:
+        raise PhysicsError('physics needs MuJoCo, which is not installed: pip install "lgrasp[sim]"') from None
+    return mujoco
+
+
+def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequence[int] = (0,)) -> Model:
+    """Compile a hand with some objects of its scene; the last few are kept.
+
+    Args:
+        q: one row of joint positions (K,) [rad or m]; joints above the base link are welded there.
+        objects: positions in ``scene.objects``; one may be there twice.
+
+    Raises:
+        PhysicsError: MuJoCo is missing or refuses the hand; its reason is in the message.
+    """
+    import_mujoco()
+    joints = scene.hand.joint_names
+    carried = [name for name in welded_joints(scene.hand.urdf, scene.hand.base_link) if name in joints]
+    held = tuple((name, float(q[joints.index(name)])) for name in carried)
+    return _build(scene, protocol.model_dump_json(), held, tuple(objects))
+
+
+@lru_cache(maxsize=8)
+def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects: tuple[int, ...]) -> Model:
+    mujoco = import_mujoco()
+    protocol = Protocol.model_validate_json(text)
+    solids = [scene.objects[index] for index in objects]
+    try:
+        spec = assemble(mujoco, scene.hand, solids, protocol, dict(held))
+        model = spec.compile()
+        for geom in spec.geoms:
+            if geom.parent.name.startswith(OBJECT):
+                geom.margin = _NEAR
+        near = spec.compile()
+    except (ValueError, KeyError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:300]
+        names = ", ".join(f"'{solid.name}'" for solid in solids)
+        raise PhysicsError(f"MuJoCo refuses hand '{scene.hand.name}' with object {names}: {reason}") from None
+    return _tables(mujoco, model, near, scene.hand, protocol, solids, held)
+
+
+def _tables(
+    mujoco: Any,
+    model: Any,
+    near: Any,
+    hand: HandSolids,
+    protocol: Protocol,
+    solids: list[Solid],
+    held: tuple[tuple[str, float], ...],
+) -> Model:
+    column = {name: k for k, name in enumerate(hand.joint_names)}
+    joints = np.flatnonzero(model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
+    follows = {
+        int(model.eq_obj1id[e]): (int(model.eq_obj2id[e]), *model.eq_data[e, :2])
+        for e in range(model.neq)
+        if model.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT
+    }
+    matrix, offset = np.zeros((len(joints), len(column))), np.zeros(len(joints))
+    for row, joint in enumerate(joints):
+        factor, at = 1.0, int(joint)
+        while at in follows:  # a mimic joint: offset + multiplier x its source
+            source, shift, multiplier = follows[at]
+            offset[row] += factor * shift
+            factor, at = factor * multiplier, source
+        if model.joint(at).name in column:
+            matrix[row, column[model.joint(at).name]] = factor
+    driven = [model.actuator(i).name for i in range(model.nu)]
+    bodies = np.array([model.body(f"{OBJECT} {number}").id for number in range(len(solids))])
+    free = model.body_jntadr[bodies]
+    base = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, hand.base_link)
+    return Model(
+        mujoco=model,
+        mujoco_near=near,
+        protocol=protocol,
+        forces=np.array([protocol.load(solid.volume).force for solid in solids]),
+        joint_address=model.jnt_qposadr[joints].copy(),
+        joint_matrix=matrix,
+        joint_offset=offset,
+        columns=np.array([column.get(name, -1) for name in driven]),
+        held={name: (column[name], value) for name, value in held},
+        object_address=model.jnt_qposadr[free][:, None] + np.arange(7),
+        object_velocity=model.jnt_dofadr[free][:, None] + np.arange(6),
+        object_body=bodies,
+        base_body=base,
+        link_body=np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in hand.link_names]),
+        centers=np.stack([solid.center for solid in solids]),
+    )

@@ -1,0 +1,140 @@
+"""What is simulated: named protocols with every number, written beside each verdict."""
+
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from lgrasp.errors import ConfigError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from lgrasp.grasp.records import GraspRows
+
+__all__ = ["DIRECTIONS", "PROTOCOLS", "Load", "Protocol", "find_protocol"]
+
+DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
+"""Directions of the load in the hand's base frame, in the order of the columns."""
+
+_GRAVITY = 9.8  # [m/s^2]
+
+
+class Load(BaseModel):
+    """What a protocol asks of one object and its hand."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mass: float
+    """Of the object [kg]."""
+    force: float
+    """Pull on the object's centre of mass [N]."""
+    stiffness: float
+    """Of the position control of revolute joints [N m/rad]."""
+
+
+class Protocol(BaseModel):
+    """Close the hand on free objects, then pull them in six directions; they must stay in the hand."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", description="Columns are named physics/NAME_...")
+    timestep: float = Field(default=0.004, gt=0, le=0.02, description="[s]")
+    friction: float = Field(default=0.6, gt=0, le=5, description="Sliding friction of every contact.")
+    torsion: float = Field(default=0.02, ge=0, le=1, description="Torsional friction of every contact [m].")
+    impratio: float = Field(default=10.0, ge=1, description="Stiffness of friction against that of contact normals.")
+    noslip: int = Field(default=2, ge=0, description="Iterations of the solver that takes the creep out of friction.")
+    stiffness: float = Field(
+        default=5.0, gt=0, description="Of position control, per newton of load if scaled [N m/rad]."
+    )
+    stiffness_range: tuple[float, float] | None = Field(
+        default=None, description="Stiffness is scaled with the load and kept in this range; none: it is not scaled."
+    )
+    lever: float = Field(
+        default=0.1, gt=0, description="A sliding joint is as stiff as a revolute one at this arm [m]."
+    )
+    damping_ratio: float = Field(default=1.0, gt=0, description="Of the position control; 1 is critical.")
+    armature: float = Field(
+        default=2.0e-4, ge=0, description="Inertia of each drive [kg m^2] (sliding: over lever squared)."
+    )
+    kind: Literal["force", "weight"] = "force"
+    force: float = Field(default=1.0, gt=0, description="The pull [N], if kind is force.")
+    mass: float = Field(default=0.1, gt=0, description="Of the object [kg], if kind is force.")
+    density: float = Field(
+        default=500.0, gt=0, description="Of the object, if kind is weight, which then pulls [kg/m^3]."
+    )
+    start: Literal["pregrasp", "grasp"] = Field(
+        default="pregrasp", description="Where the hand is when the simulation starts."
+    )
+    phase: float = Field(default=0.4, gt=0, description="Pregrasp to grasp, and grasp to squeeze [s], each.")
+    settle: float = Field(
+        default=0.3, gt=0, description="Given to the hand at the grasp before its contacts are counted [s]."
+    )
+    rest: float = Field(default=0.0, ge=0, description="Given to the closed hand before the pull [s].")
+    hold: float = Field(default=2.0, gt=0, description="How long each direction is pulled [s].")
+    success: Literal["stays", "touches"] = Field(
+        default="stays",
+        description="stays: every object stays within most_displacement and most_rotation all the time; touches: every "
+        "object touches the hand at the end of a direction, and penetrates nothing by most_penetration at any time.",
+    )
+    most_penetration: float = Field(
+        default=0.01, gt=0, description="At the start, of all pairs [m]; what is deeper is not simulated."
+    )
+    most_displacement: float = Field(
+        default=0.05, gt=0, description="Of an object's centre of mass from its start [m]."
+    )
+    most_rotation: float = Field(default=15.0, gt=0, le=180, description="Of an object from its start [deg].")
+
+    def load(self, volume: float) -> Load:
+        """Mass, pull and stiffness for an object of some volume [m^3]."""
+        if self.kind == "force":
+            mass, force = self.mass, self.force
+        else:
+            mass = self.density * volume
+            force = _GRAVITY * mass
+        stiffness = self.stiffness
+        if self.stiffness_range is not None:
+            low, high = self.stiffness_range
+            stiffness = min(max(stiffness * force, low), high)
+        return Load(mass=mass, force=force, stiffness=stiffness)
+
+    def stops(self, rows: "GraspRows") -> "tuple[np.ndarray, ...]":
+        """Joint positions (N, K) that the hand goes through, from the start over q to q_squeeze [rad or m]."""
+        closing = (rows.q, rows.q_squeeze)
+        return closing if self.start == "grasp" else (rows.q_pregrasp, *closing)
+
+    def text(self, **resolved: Any) -> str:
+        """Every number as JSON: the ``protocol`` attribute of the columns. ``resolved`` is added."""
+        import json
+
+        return json.dumps(self.model_dump(mode="json") | resolved, sort_keys=True)
+
+
+def _protocols() -> dict[str, Protocol]:
+    gravity = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
+    # 100 steps of 1/60 s, each cut in four
+    sequence = {"start": "grasp", "success": "touches", "rest": 0.6, "hold": 100 / 60, "timestep": 1 / 240}
+    sequence |= {"most_rotation": 180.0}
+    made = (
+        Protocol(name="fc"),
+        Protocol(name="gravity6", friction=0.6, **gravity),
+        Protocol(name="gravity6_mu1", friction=1.0, **gravity),
+        Protocol(name="seq6", friction=2.0, **gravity, **sequence),
+        Protocol(name="seq6_mu06", friction=0.6, **gravity, **sequence),
+    )
+    return {protocol.name: protocol for protocol in made}
+
+
+PROTOCOLS: dict[str, Protocol] = _protocols()
+"""The named protocols: ``fc`` is DexGraspBench's, ``gravity6`` and ``gravity6_mu1`` ask for more; ``seq6`` is the one
+that sequences of objects were published with, ``seq6_mu06`` the same on smoother objects."""
+
+
+def find_protocol(name: str) -> Protocol:
+    """A protocol by name.
+
+    Raises:
+        ConfigError: no protocol of that name.
+    """
+    if name not in PROTOCOLS:
+        raise ConfigError(f"unknown protocol '{name}'; choose {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]

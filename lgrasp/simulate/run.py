@@ -1,0 +1,152 @@
+"""Verdicts of many grasps: on the CPU one thread per grasp at a time, on a GPU all side by side."""
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+
+import numpy as np
+
+from lgrasp.errors import PhysicsError
+from lgrasp.grasp.records import GraspRows
+from lgrasp.simulate.columns import stack_verdicts
+from lgrasp.simulate.groups import group_rows
+from lgrasp.simulate.model import Model, build_model, import_mujoco
+from lgrasp.simulate.protocol import Protocol
+from lgrasp.simulate.scene import Scene
+from lgrasp.simulate.trial import Trial
+from lgrasp.simulate.verdict import Verdict
+
+__all__ = ["protocol_text", "verdicts"]
+
+_HELD_TOLERANCE = 1.0e-4  # [rad or m]
+_LEAST_WORLDS, _MOST_WORLDS = 256, 8192  # on a GPU
+
+
+def verdicts(
+    scene: Scene,
+    rows: GraspRows,
+    protocol: Protocol,
+    threads: int = 2,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    all_directions: bool = False,
+    settled_stop: bool = True,
+    device: str = "cpu",
+) -> dict[str, np.ndarray]:
+    """Simulate every grasp: columns PROTOCOL_... of :data:`lgrasp.simulate.COLUMNS`, and of
+    :data:`lgrasp.simulate.OBJECT_COLUMNS` where rows have several slots or the protocol's success is to touch.
+
+    A verdict depends on its row only, not on the number of threads or the other rows; a row sees the objects that it
+    has and no others of the scene.
+
+    Args:
+        scene: hand and objects of the rows.
+        rows: N grasps of O objects at most; K columns of q and contacts as in a shard.
+        protocol: what is simulated.
+        threads: grasps simulated at a time.
+        progress: called on this thread with (rows done, rows held); what it raises ends the simulation.
+        all_directions: go on after the first direction in which an object is lost.
+        settled_stop: end a direction when the objects have come to rest well inside their bounds.
+        device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0).
+
+    Raises:
+        PhysicsError: MuJoCo is missing or refuses the scene, or a row has an object that the scene lacks.
+    """
+    slots = np.full(np.shape(rows.object_index), -1)
+    found: list[Verdict | None] = [None] * len(rows)
+    options = {"all_directions": all_directions, "settled_stop": settled_stop}
+    before = [0, 0]  # rows done and held
+
+    def advanced(done: int, held: int) -> None:
+        if progress:
+            progress(before[0] + done, before[1] + held)
+
+    for group in group_rows(rows, len(scene.objects)):
+        model = build_model(scene, protocol, rows.q[0], group.objects)
+        _check_held(model, group.rows)
+        if device == "cpu":
+            some = _on_threads(model, group.rows, threads, advanced, options)
+        else:
+            from lgrasp.simulate.gpu import WorldTrials
+
+            worlds = min(max(len(group.rows), _LEAST_WORLDS), _MOST_WORLDS)
+            some = WorldTrials(model, device, worlds=worlds, threads=threads, **options).run(group.rows, advanced)
+        slots[group.index] = group.slots
+        for row, verdict in zip(group.index, some, strict=True):
+            found[row] = verdict
+        before = [before[0] + len(some), before[1] + sum(verdict.holds for verdict in some)]
+    return stack_verdicts(protocol, [verdict for verdict in found if verdict is not None], slots)
+
+
+def _on_threads(
+    model: Model, rows: GraspRows, threads: int, progress: Callable[[int, int], None], options: dict[str, bool]
+) -> list[Verdict]:
+    """A verdict of every row, by MuJoCo."""
+    found: list[Verdict | None] = [None] * len(rows)
+    trials: queue.SimpleQueue[Trial] = queue.SimpleQueue()
+    for _ in range(threads):
+        trials.put(Trial(model, **options))
+    stop = threading.Event()
+
+    def judge(i: int) -> bool:
+        if stop.is_set():
+            return False
+        trial = trials.get()
+        try:
+            found[i] = verdict = trial.run(rows, i)
+            return verdict.holds
+        finally:
+            trials.put(trial)
+
+    done = held = 0
+    with _silence(), ThreadPoolExecutor(threads) as pool:
+        try:
+            for future in as_completed([pool.submit(judge, i) for i in range(len(rows))]):
+                done += 1
+                held += future.result()
+                progress(done, held)
+        except BaseException:
+            stop.set()
+            raise
+    return [verdict for verdict in found if verdict is not None]
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """MuJoCo writes no MUJOCO_LOG.TXT into the user's folder: what diverged is in the verdicts."""
+    mujoco = import_mujoco()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = False, device: str = "cpu") -> str:
+    """All that decides a verdict besides its row, as JSON: the ``protocol`` attribute of the columns.
+
+    Raises:
+        PhysicsError: MuJoCo is missing.
+    """
+    objects = [
+        {"name": solid.name, "pieces": len(solid.pieces), "excess": round(solid.excess, 6), "notes": list(solid.notes)}
+        | protocol.load(solid.volume).model_dump()
+        for solid in scene.objects
+    ]
+    return protocol.text(
+        simulator=f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}",
+        all_directions=all_directions,
+        ends_early=True,
+        objects=objects,
+    )
+
+
+def _check_held(model: Model, rows: GraspRows) -> None:
+    """Joints between the world and the base do not move: one value for all rows."""
+    for name, (column, value) in model.held.items():
+        poses = np.concatenate([rows.q[:, column], rows.q_pregrasp[:, column], rows.q_squeeze[:, column]])
+        if np.abs(poses - value).max() > _HELD_TOLERANCE:
+            raise PhysicsError(f"joint '{name}' carries the hand's base and must have one value in all rows")

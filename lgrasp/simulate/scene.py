@@ -1,0 +1,127 @@
+"""What a simulator is given: a hand as URDF and convex pieces, objects as convex pieces and their mass properties."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import trimesh
+from lxml import etree
+
+from lgrasp.errors import PhysicsError, ShardError
+from lgrasp.geometry.decompose import Decompose
+from lgrasp.geometry.decompose import decompose as cut_mesh
+from lgrasp.grasp.records import HandRecord, ObjectRecord, Shard
+from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh
+from lgrasp.hand.urdf import parse_robot, read_urdf
+from lgrasp.simulate.solid import Solid, solid_of_mesh
+
+__all__ = ["HandSolids", "Scene", "hand_of_record", "object_of_record", "scene_of", "scene_of_shard"]
+
+
+@dataclass(frozen=True)
+class HandSolids:
+    """A hand's URDF text and the convex pieces of each link, link frame [m]."""
+
+    name: str
+    urdf: str
+    base_link: str
+    """Frame of all poses; it does not move."""
+    joint_names: tuple[str, ...]
+    """Columns of q."""
+    link_names: tuple[str, ...]
+    pieces: dict[str, list[Piece]]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A hand and objects, for any simulator and protocol; each is itself only."""
+
+    hand: HandSolids
+    objects: tuple[Solid, ...]
+    """In the order that ``object_index`` of the rows counts."""
+
+
+def scene_of(
+    hand: HandRecord, objects: Sequence[ObjectRecord], decompose: Decompose = cut_mesh, device: str = "cpu"
+) -> Scene:
+    """The scene of a hand and the objects that rows may have, in whatever order they are given.
+
+    Args:
+        decompose: cuts dented meshes, perhaps with a cache (:func:`lgrasp.geometry.decompose.decompose`).
+        device: answers the geometric queries.
+
+    Raises:
+        ShardError: a mesh of the hand is missing.
+        HandError: the hand's URDF or a mesh cannot be used.
+        ObjectError: an object is flat.
+    """
+    solids = [object_of_record(record, decompose, device) for record in sorted(objects, key=lambda record: record.id)]
+    return Scene(hand_of_record(hand, decompose, device), tuple(solids))
+
+
+def scene_of_shard(shard: Shard, decompose: Decompose = cut_mesh, device: str = "cpu") -> Scene:
+    """The scene of a shard; nothing but the shard is read. Arguments and errors as of :func:`scene_of`."""
+    return scene_of(shard.hand, shard.objects, decompose, device)
+
+
+def hand_of_record(record: HandRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> HandSolids:
+    """The hand of a shard, cut into the convex pieces that the generator uses.
+
+    Raises:
+        ShardError: a mesh that the URDF names is not in the shard.
+        HandError: the URDF or a mesh cannot be used.
+    """
+    pieces, notes = {}, []
+    with TemporaryDirectory(prefix="lgrasp-hand-") as folder:
+        tree, _ = parse_robot(Path(f"{record.name}.urdf"), record.urdf.encode())
+        _write_meshes(tree, record, Path(folder))
+        path = Path(folder) / f"{PurePosixPath(record.name).name}.urdf"
+        path.write_bytes(etree.tostring(tree))
+        urdf = read_urdf(path)
+        for link, geometries in urdf.links.items():
+            found = []
+            for geometry in geometries:
+                parts, said = convex_pieces(urdf, geometry, geometry_mesh(urdf, geometry), decompose, device)
+                found += [part.moved(geometry.T_link_geometry) for part in parts]
+                notes += [f"link '{link}': {said}"] if said else []
+            pieces[link] = found
+    return HandSolids(
+        name=record.name,
+        urdf=record.urdf,
+        base_link=record.base_link,
+        joint_names=tuple(record.joint_names),
+        link_names=tuple(record.link_names),
+        pieces=pieces,
+        notes=tuple(notes),
+    )
+
+
+def _write_meshes(tree: etree._Element, record: HandRecord, folder: Path) -> None:
+    """Write the collision meshes that a URDF names under plain names, and name them so in the URDF."""
+    written: dict[str, str] = {}
+    for mesh in tree.iterfind(".//collision//mesh"):
+        name = mesh.get("filename", "")
+        if name not in record.meshes:
+            raise ShardError(f"hand '{record.name}': mesh '{name}' of its URDF is not in the shard")
+        if name not in written:
+            written[name] = f"{len(written)}{PurePosixPath(name).suffix}"
+            (folder / written[name]).write_bytes(record.meshes[name])
+        mesh.set("filename", written[name])
+
+
+def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> Solid:
+    """The object of a shard as a solid, in the frame of its vertices.
+
+    Raises:
+        PhysicsError: a point cloud.
+    """
+    if not len(record.faces):
+        raise PhysicsError(f"object '{record.name}' is a point cloud; a simulator needs a mesh, as of a complete scan")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mesh = trimesh.Trimesh(np.asarray(record.vertices, float), np.asarray(record.faces), process=True)
+    return solid_of_mesh(record.name, mesh, decompose, device)

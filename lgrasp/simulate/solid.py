@@ -1,0 +1,128 @@
+"""A triangle mesh as a rigid body: convex pieces that collide, and the inertia of the mesh itself."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull, QhullError
+
+from lgrasp.errors import DecomposeError, ObjectError
+from lgrasp.geometry.decompose import Decompose
+from lgrasp.hand.distance import signed_distance
+
+__all__ = ["Solid", "solid_of_mesh"]
+
+_DENT = 2.0e-3  # dents shallower than this [m] may stay filled
+_MOST_PIECES = 128
+_EFFORTS = ((1.5e-4, _DENT, 180.0), (5.0e-4, 2 * _DENT, 120.0))
+# tried in turn: surface details [m] that are smoothed away first, dents [m] that may stay filled, time [s]
+_SLIVER = 1.0e-11  # [m^3] a piece of less volume is left out
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A rigid body of uniform density."""
+
+    name: str
+    pieces: tuple[np.ndarray, ...]
+    """Vertices (V, 3) [m] of each convex piece."""
+    volume: float
+    """[m^3]"""
+    center: np.ndarray
+    """Centre of mass (3,) [m]."""
+    inertia: np.ndarray
+    """Second moments about the centre of mass at density 1 (3, 3) [m^5]."""
+    excess: float
+    """How far the pieces reach out of the mesh [m]: the dents that are filled."""
+    notes: tuple[str, ...] = ()
+    """What a user should know: the hull stands for the mesh, the mesh is not closed."""
+
+
+def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device: str = "cpu") -> Solid:
+    """A mesh as a rigid body. Where cutting it fails its hull collides, and a note says so.
+
+    Args:
+        decompose: cuts the mesh, perhaps with a cache.
+        device: answers the geometric queries.
+
+    Raises:
+        ObjectError: a flat mesh.
+    """
+    try:
+        hull = ConvexHull(mesh.vertices)
+    except QhullError:
+        raise ObjectError(f"object '{name}' is flat; a rigid body needs volume") from None
+    body, notes = mesh, []
+    if not (mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0):
+        body = mesh.convex_hull
+        notes.append("the mesh is not closed; mass and inertia are those of its convex hull")
+    pieces = [mesh.vertices[hull.vertices]]
+    excess = _excess(mesh, pieces, device)
+    if excess > _DENT:
+        failures = []
+        for effort in _EFFORTS:
+            try:
+                pieces = _cut(mesh, decompose, *effort)
+                excess = _excess(mesh, pieces, device)
+                break
+            except DecomposeError as error:
+                failures.append(str(error))
+        else:
+            notes.append(f"the convex hull stands for the mesh, its dents are filled ({failures[-1]})")
+    return Solid(
+        name=name,
+        pieces=tuple(np.ascontiguousarray(piece, float) for piece in pieces),
+        volume=float(body.volume),
+        center=np.array(body.center_mass, float),
+        inertia=np.array(body.moment_inertia, float),
+        excess=excess,
+        notes=tuple(notes),
+    )
+
+
+def _cut(mesh: trimesh.Trimesh, decompose: Decompose, detail: float, dent: float, timeout: float) -> list[np.ndarray]:
+    """Vertices (V, 3) of convex pieces of a dented mesh.
+
+    Raises:
+        DecomposeError: time-out, crash, or nothing usable came back.
+    """
+    simple = _simplified(mesh, detail)
+    points, triangles = np.asarray(simple.vertices), np.asarray(simple.faces)
+    found = decompose(points, triangles, threshold=dent, max_pieces=_MOST_PIECES, timeout=timeout)
+    pieces = []
+    for vertices in found:
+        try:
+            hull = ConvexHull(vertices)
+        except QhullError:
+            continue
+        if hull.volume > _SLIVER:
+            pieces.append(vertices[hull.vertices])
+    if not pieces:
+        raise DecomposeError("convex decomposition gave slivers only")
+    return pieces
+
+
+def _simplified(mesh: trimesh.Trimesh, detail: float) -> trimesh.Trimesh:
+    """The mesh without surface details below ``detail`` [m]; itself where it bounds no solid."""
+    try:
+        import manifold3d
+    except ImportError:  # comes with trimesh[easy]
+        return mesh
+
+    given = manifold3d.Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
+    solid = manifold3d.Manifold(given).simplify(detail)
+    if solid.is_empty():
+        return mesh
+    made = solid.to_mesh()
+    return trimesh.Trimesh(np.asarray(made.vert_properties[:, :3], float), np.asarray(made.tri_verts), process=False)
+
+
+def _excess(mesh: trimesh.Trimesh, pieces: list[np.ndarray], device: str) -> float:
+    """How far the hulls of vertex sets reach out of a mesh [m], by samples of their surfaces."""
+    points = []
+    for vertices in pieces:
+        hull = ConvexHull(vertices)
+        shell = trimesh.Trimesh(hull.points, hull.simplices, process=False)
+        count = int(np.clip(shell.area / 4.0e-6, 200, 5000))
+        points.append(trimesh.sample.sample_surface(shell, count, seed=0)[0])
+    return max(0.0, float(signed_distance(mesh, np.vstack(points), device).max()))

@@ -1,0 +1,189 @@
+"""What is found of one grasp, and the rules by which its simulation ends and holds; on the CPU as on a GPU."""
+
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from lgrasp.simulate.protocol import Protocol
+
+__all__ = [
+    "AXES",
+    "CHUNK",
+    "REST",
+    "WILD",
+    "Bounds",
+    "Closed",
+    "Look",
+    "Pulls",
+    "Verdict",
+    "conclude",
+    "links_touching",
+]
+
+CHUNK = 0.1
+"""[s] between looks at the objects."""
+WILD = 1.0e3
+"""[m/s or rad/s]: no hand and no object is so fast, the simulation has diverged."""
+REST = (0.01, 0.1)
+"""[m/s], [rad/s]: slower is at rest."""
+AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+"""Directions of the load in the hand's base frame."""
+
+_GONE = 0.5  # [m]: an object that got so far from its start will not touch the hand again
+
+
+class Verdict(NamedTuple):
+    """What is found of one grasp of O objects; COLUMNS and OBJECT_COLUMNS say what the numbers mean."""
+
+    holds: bool
+    directions: np.ndarray  # (6,) i8
+    displacement: np.ndarray  # (6,) [m]
+    rotation: np.ndarray  # (6,) [rad]
+    slip: float
+    contact_at_q: int
+    contact_at_grasp: int
+    pregrasp_penetration: float
+    settled: bool
+    diverged: bool
+    stays: bool
+    penetration: float
+    object_touches: np.ndarray  # (O,) i8
+    object_displacement: np.ndarray  # (O,) [m]
+    object_rotation: np.ndarray  # (O,) [rad]
+
+
+class Look(NamedTuple):
+    """A row before it is simulated."""
+
+    points: np.ndarray
+    """Contact points at q in the frames of their links (O, C, 3) [m]."""
+    contact_at_q: np.ndarray
+    """Links within 1 mm of each object at q (O,)."""
+    depth: float
+    """Deepest penetration at the start, links with links included [m]."""
+    object_depth: float
+    """Deepest penetration of any object at the start [m]."""
+    qpos: np.ndarray
+    """MuJoCo's state at the start."""
+
+
+class Closed(NamedTuple):
+    """The closed hand."""
+
+    contacts: int
+    """Links on the object that the fewest touch, before the squeeze."""
+    slip: float
+    settled: bool
+    moved: np.ndarray
+    """Displacement [m] and rotation [rad] of each object at worst (O, 2); NaN: not run, or diverged."""
+    depth: float
+    """Deepest penetration of any object until now [m]."""
+
+
+class Pulls(NamedTuple):
+    """The six directions of one grasp, or of any number of grasps at once (...)."""
+
+    held: np.ndarray
+    """1 held, 0 lost, -1 not run, (..., 6) i8."""
+    moved: np.ndarray
+    """Displacement [m] and rotation [rad] of each object at worst (..., 6, O, 2); NaN: not run, or diverged."""
+    touches: np.ndarray
+    """Each object touches the hand when the direction ends (..., 6, O)."""
+    depth: np.ndarray
+    """Deepest penetration of any object [m] (..., 6), at least that of closing."""
+
+    @classmethod
+    def of(cls, *shape: int) -> Self:
+        """None run yet; shape (..., O)."""
+        *many, objects = shape
+        held, touches = np.full((*many, 6), -1, np.int8), np.zeros((*many, 6, objects), bool)
+        return cls(held, np.full((*many, 6, objects, 2), np.nan), touches, np.zeros((*many, 6)))
+
+
+class Bounds:
+    """When a direction is over, and whether it is held.
+
+    Arrays have any leading axes (...); ``moved`` holds displacement [m] and rotation [rad] of O objects (..., O, 2).
+    """
+
+    def __init__(self, protocol: Protocol) -> None:
+        self.most = np.array([protocol.most_displacement, np.radians(protocol.most_rotation)])
+        self._by_contact, self._deepest = protocol.success == "touches", protocol.most_penetration
+        self._end = np.array([_GONE, np.inf]) if self._by_contact else self.most
+
+    def lost(self, moved: np.ndarray) -> Any:
+        """Is an object so far away that nothing can save the grasp (...)?"""
+        return (moved > self._end).any((-2, -1))
+
+    def held(self, moved: np.ndarray, touches: np.ndarray, depth: Any) -> Any:
+        """Is a direction held that ended so (...)?
+
+        Args:
+            moved: at worst.
+            touches: each object touches the hand (..., O).
+            depth: deepest penetration of any object until now [m] (...).
+        """
+        within = ~self.lost(moved)
+        return within & touches.all(-1) & (depth < self._deepest) if self._by_contact else within
+
+    def stays(self, moved: np.ndarray) -> Any:
+        """Does every object stay within the bounds (...)? Not where it diverged."""
+        return (moved <= self.most).all((-2, -1))
+
+    def near(self, before: np.ndarray, now: np.ndarray, chunks: Any) -> Any:
+        """Would objects that moved so in a chunk stay in half their bounds at four times that pace to the end (...)?
+
+        Args:
+            before, now: ``moved`` a chunk ago and now.
+            chunks: left (...).
+        """
+        ahead = now + 4 * np.abs(now - before) * np.asarray(chunks)[..., None, None]
+        return (ahead < 0.5 * self.most).all((-2, -1))
+
+
+def conclude(bounds: Bounds, look: Look, closed: Closed, pulls: Pulls, diverged: bool) -> Verdict:
+    """The verdict of one grasp."""
+    run = pulls.held >= 0
+    far = pulls.moved.max(1)  # (6, 2)
+    worst = pulls.moved[run].max(0) if run.any() else closed.moved  # (O, 2)
+    touches = np.where(run.any(), pulls.touches[run].all(0), -1)
+    return Verdict(
+        holds=bool((pulls.held == 1).all()),
+        directions=pulls.held,
+        displacement=far[:, 0],
+        rotation=far[:, 1],
+        slip=closed.slip,
+        contact_at_q=int(look.contact_at_q.min()),
+        contact_at_grasp=closed.contacts,
+        pregrasp_penetration=look.depth,
+        settled=closed.settled,
+        diverged=diverged,
+        stays=bool(run.all() and bounds.stays(pulls.moved).all()),
+        penetration=max(closed.depth, float(pulls.depth.max())),
+        object_touches=np.asarray(touches, np.int8),
+        object_displacement=worst[:, 0],
+        object_rotation=worst[:, 1],
+    )
+
+
+def links_touching(
+    bodies: np.ndarray, objects: np.ndarray, count: int, world: np.ndarray | int = 0, worlds: int = 1
+) -> np.ndarray:
+    """Number of the hand's bodies in contact with each object, (worlds, O).
+
+    Args:
+        bodies: both bodies of each contact (n, 2).
+        objects: bodies of the objects (O,); all others are the hand's.
+        count: bodies in all.
+        world: of each contact (n,).
+    """
+    hand = np.ones(count, bool)
+    hand[objects] = False
+    world = np.broadcast_to(world, len(bodies))
+    found = np.zeros((worlds, len(objects)), int)
+    for column, body in enumerate(objects):
+        of = (bodies == body).any(1)
+        table = np.zeros((worlds, count), bool)
+        table[world[of], bodies[of].sum(1) - body] = True
+        found[:, column] = table[:, hand].sum(1)
+    return found

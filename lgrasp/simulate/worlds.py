@@ -1,0 +1,149 @@
+"""Many copies of one scene on one device, stepped together by MuJoCo Warp."""
+
+from copy import copy
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from lgrasp.errors import PhysicsError
+from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.simulate.model import Model, import_mujoco
+from lgrasp.simulate.verdict import CHUNK, WILD, links_touching
+
+__all__ = ["Worlds"]
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_CONTACTS = 96  # per world and object, on average
+_FULL = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # buffers that may be full
+_CONSTRAINTS = 640  # rows per world and object: four a contact, limits, couplings
+
+
+@wp.kernel
+def _drive(
+    start: wp.array2d(dtype=wp.float32),
+    end: wp.array2d(dtype=wp.float32),
+    ramp: wp.float32,
+    step: wp.array(dtype=wp.float32),
+    ctrl_out: wp.array2d(dtype=wp.float32),
+):
+    """Targets of the next step, evenly from start to end over ``ramp`` steps."""
+    world, u = wp.tid()
+    share = wp.min((step[world] + 1.0) / ramp, 1.0)
+    ctrl_out[world, u] = start[world, u] + (end[world, u] - start[world, u]) * share
+
+
+@wp.kernel
+def _count(step_out: wp.array(dtype=wp.float32)):
+    step_out[wp.tid()] = step_out[wp.tid()] + 1.0
+
+
+class Worlds:
+    """W copies of one scene; their state is set and read as NumPy arrays, and stepped a chunk at a time."""
+
+    def __init__(self, model: Model, worlds: int, device: str) -> None:
+        mujoco = import_mujoco()
+        try:
+            import mujoco_warp
+        except ImportError:
+            raise PhysicsError(
+                'physics on a GPU needs MuJoCo Warp, which is not installed: pip install "lgrasp[sim,gpu-sim]"'
+            ) from None
+        self._lib: Any = mujoco_warp
+        self._model, self._device, self.worlds = model, wp.get_device(device), worlds
+        m = copy(model.mujoco)
+        if len(model.object_body) > 1:  # objects that press on each other: in single precision Newton's method fails
+            m.opt.solver = mujoco.mjtSolver.mjSOL_CG
+        m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
+        with wp.ScopedDevice(self._device):
+            self._m = mujoco_warp.put_model(m)
+            self._m.opt.warn_overflow = 0  # said by :meth:`overflowed`
+            room = {"nconmax": _CONTACTS * len(model.object_body), "njmax": _CONSTRAINTS * len(model.object_body)}
+            self._d = mujoco_warp.make_data(m, nworld=worlds, **room)
+            shape = (worlds, m.nu)
+            self._start, self._end, self._step = (wp.zeros(s, dtype=wp.float32) for s in (shape, shape, (worlds,)))
+        self._ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
+        self.chunk = max(1, round(CHUNK / m.opt.timestep))
+        self._graph: Any = None
+        self._full = sum(int(mujoco_warp.OverflowType[name]) for name in _FULL)
+        self.steps = 0
+
+    def advance(self) -> None:
+        """Step every world through one chunk."""
+        with wp.ScopedDevice(self._device):
+            if self._graph is None and self._device.is_cuda:
+                saved = self.state()
+                self._one_step()  # compiles what is needed
+                self.restore(saved)
+                with wp.ScopedCapture() as capture:
+                    self._one_step()
+                self._graph = capture.graph
+            for _ in range(self.chunk):
+                if self._graph is None:
+                    self._one_step()
+                else:
+                    wp.capture_launch(self._graph)
+        self.steps += self.chunk * self.worlds
+
+    def _one_step(self) -> None:
+        wp.launch(_drive, self._start.shape, [self._start, self._end, self._ramp, self._step], [self._d.ctrl])
+        wp.launch(_count, self.worlds, [], [self._step])
+        self._lib.step(self._m, self._d)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that decides what comes next, one row a world."""
+        d = self._d
+        arrays = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
+        own = {"start": self._start, "end": self._end, "step": self._step}
+        return {name: a.numpy().copy() for name, a in (arrays | own).items()}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Inverse of :meth:`state`."""
+        d = self._d
+        arrays = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
+        own = {"start": self._start, "end": self._end, "step": self._step}
+        for name, a in (arrays | own).items():
+            a.assign(state[name])
+
+    def moved(self, state: dict[str, np.ndarray], home: np.ndarray) -> np.ndarray:
+        """How far objects are from where they started: displacement [m] and rotation [rad], (worlds, O, 2).
+
+        Args:
+            home: poses at the start, (worlds, O, 7).
+        """
+        pose, center = state["qpos"][:, self._model.object_address].astype(float), self._model.centers
+        start = home.astype(float)
+
+        def middle(p: np.ndarray) -> np.ndarray:
+            t = 2 * np.cross(p[..., 4:], center)
+            return p[..., :3] + center + p[..., 3:4] * t + np.cross(p[..., 4:], t)
+
+        norm = np.linalg.norm(pose[..., 3:], axis=2) * np.linalg.norm(start[..., 3:], axis=2)
+        cosine = np.abs((pose[..., 3:] * start[..., 3:]).sum(2)) / np.maximum(norm, 1e-12)
+        turned = 2 * np.arccos(np.clip(cosine, 0, 1))
+        return np.stack([np.linalg.norm(middle(pose) - middle(start), axis=2), turned], axis=2)
+
+    @staticmethod
+    def wild(state: dict[str, np.ndarray]) -> np.ndarray:
+        """(worlds,) bool: where the simulation has diverged."""
+        return ~(np.abs(state["qvel"]).max(1) < WILD) | ~np.isfinite(state["qpos"]).all(1)
+
+    def overflowed(self) -> np.ndarray:
+        """(worlds,) bool: where a buffer was full since the last call, so that the state there is worth nothing."""
+        full = (self._d.overflow.numpy() & self._full) != 0
+        self._d.overflow.zero_()
+        return full
+
+    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Number of links that touch each object, (worlds, O), and deepest penetration of any object [m], (worlds,)."""
+        d, m = self._d, self._model.mujoco
+        n = min(int(d.nacon.numpy()[0]), d.naconmax)
+        geoms, world, dist = (a[:n].numpy() for a in (d.contact.geom, d.contact.worldid, d.contact.dist))
+        close = (dist < 0) & (geoms >= 0).all(1)
+        bodies, world, dist = m.geom_bodyid[geoms[close]], world[close], dist[close]
+        links = links_touching(bodies, self._model.object_body, m.nbody, world, self.worlds)
+        of_object = np.isin(bodies, self._model.object_body).any(1)
+        depth = np.zeros(self.worlds)
+        np.maximum.at(depth, world[of_object], -dist[of_object])
+        return links, depth
