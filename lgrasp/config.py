@@ -9,8 +9,6 @@ from pydantic import BaseModel, ValidationError
 
 from lgrasp.errors import ConfigError
 
-__all__ = ["parse_model", "read_yaml"]
-
 Model = TypeVar("Model", bound=BaseModel)
 
 

@@ -1,20 +1,5 @@
 """One exception tree. Every message is one line that states the value, its file and what would be accepted."""
 
-__all__ = [
-    "CacheError",
-    "CloudError",
-    "ConfigError",
-    "DecomposeError",
-    "DeviceError",
-    "HandError",
-    "LgraspError",
-    "ObjectError",
-    "OutputError",
-    "PhysicsError",
-    "ShardError",
-    "StarvedError",
-]
-
 
 class LgraspError(Exception):
     """Base of every error that lgrasp raises on purpose; the command line prints it on one line and exits."""

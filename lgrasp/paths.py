@@ -5,8 +5,6 @@ from pathlib import Path
 
 import platformdirs
 
-__all__ = ["cache_dir", "data_dirs", "package_files", "user_dir"]
-
 _PACKAGE = Path(__file__).resolve().parent
 
 

@@ -2,8 +2,6 @@
 
 import hashlib
 
-__all__ = ["stage_seed"]
-
 
 def stage_seed(base: int, shard: int, stage: str, salt: int = 0) -> int:
     """31-bit seed of a stage's random stream in one shard; ``salt`` tells passes over the same candidates apart."""

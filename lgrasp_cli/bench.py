@@ -11,8 +11,6 @@ from lgrasp_cli.interrupt import before_end
 from lgrasp_cli.options import Device, Hand, JsonPath, check_report, open_cache, warn
 from lgrasp_cli.table1 import table1
 
-__all__ = ["app"]
-
 app = typer.Typer(invoke_without_command=True, subcommand_metavar="[table1|sequence|refine [OPTIONS]]")
 app.command()(table1)
 app.command("sequence")(bench_sequence)

@@ -9,8 +9,6 @@ from lgrasp_cli.options import CacheDir, Device, JsonPath, check_report, open_ca
 if TYPE_CHECKING:
     from lgrasp.bench.refine import HandBench
 
-__all__ = ["bench_refine"]
-
 
 def bench_refine(
     hands: Annotated[str, typer.Option(help="Names, separated by commas.")] = "barrett,schunk_svh",

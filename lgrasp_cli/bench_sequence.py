@@ -9,8 +9,6 @@ from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, check_report, o
 if TYPE_CHECKING:
     pass
 
-__all__ = ["bench_sequence"]
-
 
 def bench_sequence(
     objects: Annotated[

@@ -7,8 +7,6 @@ import typer
 
 from lgrasp_cli.options import CacheDir, open_cache
 
-__all__ = ["app"]
-
 app = typer.Typer(help="What is kept between runs.", no_args_is_help=True)
 
 

@@ -7,8 +7,6 @@ from contextlib import contextmanager
 
 import typer
 
-__all__ = ["counting"]
-
 _INTERVAL = 10.0  # [s] between lines when standard error is no terminal
 
 

@@ -11,8 +11,6 @@ from lgrasp_cli.options import JsonPath, Quiet, check_report, warn
 if TYPE_CHECKING:
     from rich.table import Table
 
-__all__ = ["app"]
-
 app = typer.Typer(help="Look at, check and merge grasp files (shards).", no_args_is_help=True)
 
 _Paths = Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.", show_default=False)]

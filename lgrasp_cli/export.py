@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from lgrasp.dataset import ObjectRecord
     from lgrasp.dataset.exports.mjcf import Cut
 
-__all__ = ["export", "register"]
-
 _PLAIN_INTERVAL = 10.0  # [s] between lines when standard error is no terminal
 
 

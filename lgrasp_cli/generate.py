@@ -24,8 +24,6 @@ from lgrasp_cli.options import (
 if TYPE_CHECKING:
     from lgrasp.jobs.generate import Job, Outcome
 
-__all__ = ["conclude", "generate", "register", "run_job"]
-
 
 def register(app: typer.Typer) -> None:
     """Mount the commands of this file."""

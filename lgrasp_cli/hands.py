@@ -10,8 +10,6 @@ from lgrasp_cli.options import CacheDir, Device, PipelineName, Quiet, choose_pip
 if TYPE_CHECKING:
     from lgrasp.jobs.hand_check.check import HandCheck
 
-__all__ = ["app"]
-
 app = typer.Typer(help="The hands there are.", no_args_is_help=True)
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")]

@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-__all__ = ["Interrupted", "before_end", "on_interrupt", "stop_asked", "stop_now"]
-
 _GRACE = 1.0  # [s] that native code may take before the process is ended
 _last: list[Callable[[], None]] = []  # what is still done then
 _asked = threading.Event()

@@ -8,8 +8,6 @@ import typer
 
 from lgrasp_cli.options import CacheDir, Device, JsonPath, Quiet, check_report, open_cache
 
-__all__ = ["app"]
-
 app = typer.Typer(help="Coarse grasps from partial clouds by a small network.", no_args_is_help=True)
 
 _INTERVAL = 10.0  # [s] between lines of progress

@@ -27,8 +27,6 @@ from lgrasp_cli import (
 )
 from lgrasp_cli.interrupt import Interrupted, on_interrupt, stop_asked, stop_now
 
-__all__ = ["app", "main"]
-
 app = typer.Typer(
     help="Generate grasps for dexterous hands.",
     no_args_is_help=True,

@@ -6,8 +6,6 @@ import typer
 
 from lgrasp_cli.options import Scale
 
-__all__ = ["app"]
-
 app = typer.Typer(help="The objects there are.", no_args_is_help=True)
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")]

@@ -9,24 +9,6 @@ if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
     from lgrasp.engine.pipeline import Pipeline
 
-__all__ = [
-    "CacheDir",
-    "Contacts",
-    "Device",
-    "Hand",
-    "JsonPath",
-    "Mesh",
-    "PipelineName",
-    "Quiet",
-    "Scale",
-    "Seed",
-    "check_report",
-    "choose_pipeline",
-    "open_cache",
-    "parse_contacts",
-    "warn",
-]
-
 Hand = Annotated[str, typer.Option("--hand", help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
 Mesh = Annotated[str, typer.Option("--object", "-o", help="Mesh file, or the name of an object.", show_default=False)]
 PipelineName = Annotated[str, typer.Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.")]

@@ -12,8 +12,6 @@ from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Quiet, Scale, c
 if TYPE_CHECKING:
     from lgrasp.jobs.refine.plan import PlanOutcome
 
-__all__ = ["plan", "register"]
-
 _INTERVAL = 5.0  # [s] between lines of progress
 
 

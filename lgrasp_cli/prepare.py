@@ -8,8 +8,6 @@ import typer
 
 from lgrasp_cli.options import CacheDir, Device, PipelineName, Scale, choose_pipeline, open_cache
 
-__all__ = ["build_field", "preprocess", "register", "warm_up"]
-
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")]
 _Force = Annotated[bool, typer.Option("--force", help="Make it anew even if it is cached.")]
 

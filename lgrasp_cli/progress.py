@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from lgrasp.engine.shard import Found
 
-__all__ = ["JobProgress", "interruptible", "say"]
-
 _PLAIN_INTERVAL = 10.0  # [s] between lines when standard error is no terminal
 
 

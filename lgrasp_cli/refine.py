@@ -12,8 +12,6 @@ from lgrasp_cli.options import CacheDir, Device, JsonPath, Quiet, check_report, 
 if TYPE_CHECKING:
     from lgrasp.jobs.refine.shards import RefinedShard
 
-__all__ = ["refine", "register"]
-
 _INTERVAL = 5.0  # [s] between lines of progress
 
 

@@ -7,8 +7,6 @@ import typer
 
 from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache
 
-__all__ = ["register", "run"]
-
 
 def register(app: typer.Typer) -> None:
     """Mount the commands of this file."""

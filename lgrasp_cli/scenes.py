@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from lgrasp.jobs.scenes.config import SceneConfig
     from lgrasp.jobs.scenes.job import SceneOutcome
 
-__all__ = ["app"]
-
 app = typer.Typer(help="Tables with objects: point clouds, masks and grasps that fit in.", no_args_is_help=True)
 
 _INTERVAL = 10.0  # [s] between lines of progress

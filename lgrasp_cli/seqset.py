@@ -10,8 +10,6 @@ from lgrasp_cli.options import check_report
 if TYPE_CHECKING:
     from lgrasp.jobs.sequence.job import SequenceJob
 
-__all__ = ["run_sets"]
-
 
 def run_sets(jobs: "list[SequenceJob]", json_path: str | None, *, dry_run: bool, quiet: bool) -> None:
     """Run the jobs one after another; one that fails does not stop the others.

@@ -10,8 +10,6 @@ from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Quiet, Seed, ch
 if TYPE_CHECKING:
     from lgrasp.jobs.sequence.job import SequenceJob, SequenceOutcome
 
-__all__ = ["conclude", "register", "run_sequences", "sequence"]
-
 
 def register(app: typer.Typer) -> None:
     """Mount the commands of this file."""

@@ -17,8 +17,6 @@ from lgrasp_cli.options import (
     open_cache,
 )
 
-__all__ = ["register"]
-
 _WHAT = {
     "place": "Place the object before the hand: poses that the palm does not block.",
     "domain": "Draw the contacts that each finger can make at each pose.",

@@ -11,8 +11,6 @@ from lgrasp_cli.options import Device, JsonPath, check_report, open_cache, warn
 if TYPE_CHECKING:
     from lgrasp.jobs.config import JobConfig
 
-__all__ = ["table1"]
-
 _List = Annotated[str | None, typer.Option(help="Names or files, separated by commas.", show_default="the published")]
 
 

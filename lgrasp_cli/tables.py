@@ -6,8 +6,6 @@ from typing import Any
 
 import typer
 
-__all__ = ["job_report", "print_json", "print_pairs", "print_report", "print_table"]
-
 
 def print_json(data: Any) -> None:
     """JSON on standard output."""

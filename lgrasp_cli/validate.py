@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from lgrasp.jobs.simulate import Validated
     from lgrasp.simulate import Protocol
 
-__all__ = ["register", "validate"]
-
 _SLOW = 2.0  # [s]
 _INTERVAL = 10.0  # [s] between lines of progress when standard error is no terminal
 

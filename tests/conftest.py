@@ -2,21 +2,26 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset import read_shard
+from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.field.params import FieldParams
 from lgrasp.jobs.generate import Job, Outcome, generate
-from lgrasp.runtime.device import resolve_device
+from lgrasp.runtime.device import resolve_device, start
 from lgrasp.stages.context import Context
 
 OBJECT = "mug"
 RECORDS = 20_000
+CANDIDATES = 2000
 
 
 @pytest.fixture(scope="session")
@@ -131,3 +136,105 @@ def raw_grasps() -> Callable[[Path], dict[str, dict[str, bytes]]]:
         return out
 
     return raw
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _warp() -> None:
+    start()
+
+
+@pytest.fixture(scope="session", params=["cpu", "cuda:0"])
+def device(request: pytest.FixtureRequest) -> str:
+    """Every kernel is compared with its reference on each device there is."""
+    import warp as wp
+
+    if request.param != "cpu" and wp.get_cuda_device_count() == 0:
+        pytest.skip("no GPU here")
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def jaws(tmp_path_factory: pytest.TempPathFactory):
+    """A gripper around a cube, or nothing where there is no MuJoCo."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
+    from support.jaws import Jaws
+
+    return Jaws(tmp_path_factory.mktemp("jaws"))
+
+
+@pytest.fixture(scope="session")
+def tables(swift, context) -> SimpleNamespace:
+    """Outputs of the stages of the default pipeline for candidates 0 .. 1999."""
+    return SimpleNamespace(**{s: run_stages(swift, context, 0, CANDIDATES, s) for s in swift.order})
+
+
+@pytest.fixture(scope="session")
+def solids(inputs):
+    """The hand as the reference judge reads it from the URDF."""
+    judge = pytest.importorskip("support.judge")
+
+    def no_meshes(name):
+        raise AssertionError(f"the shipped hand has no meshes, asked for {name}")
+
+    model = inputs.hand.model
+    hand = judge.Hand(model.urdf_text, no_meshes, model.tree.base_link)
+    assert tuple(hand.links) == tuple(model.tree.link_names)
+    return hand
+
+
+@pytest.fixture(scope="session")
+def mesh(inputs) -> trimesh.Trimesh:
+    """The object in its internal frame."""
+    model = inputs.object.model
+    return trimesh.Trimesh(model.vertices - model.center, model.faces, process=False)
+
+
+@pytest.fixture(scope="session")
+def link_poses(inputs, solids) -> Callable[[np.ndarray], np.ndarray]:
+    """Joint positions (n, K) -> poses of the links in the base frame (n, L, 4, 4)."""
+
+    def poses(q: np.ndarray) -> np.ndarray:
+        names = inputs.hand.model.tree.joint_names
+        values = {name: np.asarray(q[:, i], float) for i, name in enumerate(names)}
+        return solids.forward(solids.resolve_joints(values, len(q)), len(q))
+
+    return poses
+
+
+@pytest.fixture(scope="session")
+def finger_posture(inputs) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Groups (n,) and their joints (n, MAX_DOFS) -> whole postures (n, K), other joints at 0."""
+
+    def posture(group: np.ndarray, q: np.ndarray) -> np.ndarray:
+        tree = inputs.hand.model.tree
+        out = np.zeros((len(group), len(tree.joint_names)))
+        for g in range(tree.groups):
+            rows = np.flatnonzero(group == g)
+            columns = tree.dof_index[tree.dof_first[g] : tree.dof_first[g + 1]]
+            out[np.ix_(rows, columns)] = q[rows, : len(columns)]
+        return out
+
+    return posture
+
+
+@pytest.fixture(scope="session")
+def link_distance(solids) -> Callable[[int, np.ndarray], np.ndarray]:
+    """Signed distance [m] of points (n, 3) in the frame of a link to the link's solids."""
+
+    def distance(link: int, points: np.ndarray) -> np.ndarray:
+        return np.min([s.signed(points) for s in solids.solids if s.link == link], axis=0)
+
+    return distance
+
+
+@pytest.fixture(scope="session")
+def pose_matrices() -> Callable[[np.ndarray], np.ndarray]:
+    """(n, 7) x y z, qx qy qz qw -> (n, 4, 4)."""
+
+    def matrices(pose: np.ndarray) -> np.ndarray:
+        T = np.tile(np.eye(4), (len(pose), 1, 1))
+        T[:, :3, :3] = Rotation.from_quat(pose[:, 3:]).as_matrix()
+        T[:, :3, 3] = pose[:, :3]
+        return T
+
+    return matrices

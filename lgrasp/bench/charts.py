@@ -9,8 +9,6 @@ from lgrasp.dataset.files import new_file
 from lgrasp.engine.report import check_json
 from lgrasp.errors import OutputError
 
-__all__ = ["check_plot", "draw_table"]
-
 _COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#9467bd")
 _PUBLISHED = "#b0b0b0"
 _BARS = 0.84  # of the distance between two objects

@@ -12,8 +12,6 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.report import report
 from lgrasp.jobs.generate import Job, Outcome, generate
 
-__all__ = ["Bench"]
-
 _MEASURED = ("strict_valid_per_s", "seed_count_per_s")
 _INPUTS = ("object", "field")
 _PROBE_ROWS = 256  # and at most a tenth of the rows

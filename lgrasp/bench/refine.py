@@ -33,8 +33,6 @@ from lgrasp.refine.visible_surface import seen_palmar
 from lgrasp.runtime.device import resolve_device
 from lgrasp.simulate import Scene, find_protocol, scene_of, verdicts
 
-__all__ = ["NOISES", "PUBLISHED", "STEPS", "HandBench", "Planning", "bench_hand"]
-
 NOISES = (0.0, 0.002, 0.005, 0.01)
 """Standard deviations of the points of clouds, besides meshes [m]."""
 STEPS = (0, 3, 6, 10, 13)

@@ -20,8 +20,6 @@ from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.stages.filter.params import FilterParams
 
-__all__ = ["PUBLISHED", "measure_sequences"]
-
 PUBLISHED: dict[str, Any] = {
     "source": "Grasping a Handful (Lu et al., 2025), Tables II and III, Allegro hand, one NVIDIA A100",
     "spaces": {

@@ -16,8 +16,6 @@ from lgrasp.jobs.generate import Job
 from lgrasp.object.find import find_object
 from lgrasp.runtime.device import resolve_device
 
-__all__ = ["measure_table", "new_table", "read_table", "trimmed_mean", "with_ratios", "without_missing"]
-
 Table = dict[str, Any]
 Cell = dict[str, Any]
 

@@ -13,8 +13,6 @@ import trimesh
 from lgrasp.errors import CloudError, ShardError
 from lgrasp.scenes.reader import SceneReader
 
-__all__ = ["CLOUD_SUFFIXES", "check_labels", "read_arrays", "read_mask"]
-
 CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz", ".h5")
 
 _MASK_SUFFIXES = (".npy", ".npz")

@@ -9,8 +9,6 @@ from lgrasp.errors import ObjectError
 from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.object.model import ObjectModel
 
-__all__ = ["TRUST", "cloud_object", "sdf_object"]
-
 TRUST = 0.02
 """Behind what was seen, the sign of distances is known to this depth [m]; what lies deeper counts as neither."""
 

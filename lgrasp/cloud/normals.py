@@ -3,8 +3,6 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-__all__ = ["NEIGHBOURS", "estimate_normals", "face_viewpoint"]
-
 NEIGHBOURS = 24
 """Points, the point itself among them, through which a plane is laid."""
 

@@ -11,8 +11,6 @@ from lgrasp.cloud.files import check_labels, read_arrays, read_mask
 from lgrasp.cloud.normals import estimate_normals, face_viewpoint
 from lgrasp.errors import CloudError
 
-__all__ = ["MIN_POINTS", "Cloud", "read_cloud"]
-
 MIN_POINTS = 50
 """Fewer points do not show a surface."""
 

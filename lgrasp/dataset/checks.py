@@ -7,8 +7,6 @@ import numpy as np
 from lgrasp.dataset.lineage import Column, check_parents, check_steps
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 
-__all__ = ["hand_problems", "object_problems", "row_problems"]
-
 _LIMIT_TOLERANCE = 1e-4  # rad or m
 _UNIT_TOLERANCE = 1e-3  # of quaternion and normal lengths, and of the sum of normal forces
 

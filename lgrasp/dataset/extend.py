@@ -12,8 +12,6 @@ from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import create_rows, finish
 from lgrasp.errors import ShardError
 
-__all__ = ["check_shard", "extend_shard"]
-
 
 def check_shard(path: str | os.PathLike[str]) -> None:
     """Fail at a shard that does not conform.

@@ -17,8 +17,6 @@ try:
 except ImportError:  # Windows: leftovers cannot be told from files being written
     fcntl = None
 
-__all__ = ["find_shards", "hold_file", "new_file", "new_shard_file", "remove_leftovers", "sha256_file"]
-
 _LIBVER = ("v110", "v110")  # readable since HDF5 1.10; its metadata blocks carry checksums, the older layout's do not
 
 

@@ -10,8 +10,6 @@ from struct import unpack_from
 
 from lgrasp.errors import ShardError
 
-__all__ = ["check_heaps"]
-
 _SIGNATURE = b"GCOL\x01\x00\x00\x00"
 _HEADER = 16  # bytes, of a collection and of each entry
 

@@ -10,8 +10,6 @@ import numpy as np
 from lgrasp.dataset.files import find_shards
 from lgrasp.dataset.reader import ShardReader
 
-__all__ = ["describe"]
-
 
 def describe(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[dict[str, Any]]:
     """Summaries of shards, JSON-serialisable, one per file.

@@ -7,8 +7,6 @@ import numpy as np
 from lgrasp.grasp.records import GraspRows, SequenceRows
 from lgrasp.grasp.schema import CHUNK_ROWS
 
-__all__ = ["Column", "check_parents", "check_steps"]
-
 Column = Callable[[str, int, int], np.ndarray]
 """Rows of the whole file by flat name, first row and the row after the last, as :meth:`ShardReader.column`."""
 

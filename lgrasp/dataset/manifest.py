@@ -9,8 +9,6 @@ from lgrasp.dataset.files import find_shards, new_file, sha256_file
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ShardError
 
-__all__ = ["MANIFEST_NAME", "check_manifest", "write_manifest"]
-
 MANIFEST_NAME = "manifest.json"
 _FORMAT = "lgrasp-manifest"
 _VERSION = "1.0"

@@ -20,8 +20,6 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ShardHeader
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 
-__all__ = ["merge_shards", "sum_statistics"]
-
 _Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 

@@ -21,8 +21,6 @@ from lgrasp.errors import ConfigError, OutputError
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 
-__all__ = ["METRICS", "Added", "add_metrics", "mass_frame", "row_metrics"]
-
 METRICS = {"epsilon_exact": "", "volume": ""}
 """Units of the metrics that can be added (docs/metrics.md defines them)."""
 

@@ -6,8 +6,6 @@ import numpy as np
 
 from lgrasp.grasp.schema import GRASP_FIELDS, SEQUENCE_FIELDS
 
-__all__ = ["pad_column", "widest"]
-
 
 def pad_column(name: str, values: np.ndarray, tail: tuple[int, ...]) -> np.ndarray:
     """Values of one row dataset, padded at the end of each axis with the fill value of the format.

@@ -17,17 +17,6 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 
-__all__ = [
-    "ShardReader",
-    "iter_grasps",
-    "open_hdf5",
-    "pose_matrix",
-    "read_hand",
-    "read_object",
-    "read_shard",
-    "reading",
-]
-
 
 @contextmanager
 def reading(path: str | os.PathLike[str]) -> Iterator[None]:

@@ -20,8 +20,6 @@ from lgrasp.grasp.schema import (
     DatasetSpec,
 )
 
-__all__ = ["expand", "format_problem", "schema_problems", "structure_problems", "text_sha256"]
-
 
 def format_problem(file: h5py.File) -> str | None:
     """Why a file is not a whole shard of a version that this package reads, or None."""

@@ -18,8 +18,6 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 
-__all__ = ["GraspDataset"]
-
 
 class _Source(NamedTuple):
     path: Path

@@ -6,8 +6,6 @@ from pathlib import Path
 
 from lgrasp.errors import ShardError
 
-__all__ = ["shard_tree"]
-
 
 def shard_tree(
     paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], *, leave_out: Path | None = None

@@ -11,8 +11,6 @@ from lgrasp.dataset.structure import format_problem, structure_problems, text_sh
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import object_set_sha256
 
-__all__ = ["validate_shard"]
-
 
 def validate_shard(path: str | os.PathLike[str]) -> list[str]:
     """All problems of a shard, one line each; an empty list means that it conforms.

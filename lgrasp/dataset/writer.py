@@ -16,17 +16,6 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, object_set_sha256
 from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, DatasetSpec
 
-__all__ = [
-    "create_array",
-    "create_rows",
-    "finish",
-    "write_context",
-    "write_hand",
-    "write_object",
-    "write_shard",
-    "write_spaces",
-]
-
 
 def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
     """Write a shard; the file appears under ``path`` only when it is whole and on the disk.

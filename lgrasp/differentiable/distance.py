@@ -8,8 +8,6 @@ import torch
 
 from lgrasp.object.sdf import SdfGrid
 
-__all__ = ["DistanceGrids", "SurfaceNormals"]
-
 _TOP = 1.001
 """Points are clamped this many cells below the number of nodes, as in lgrasp.math.sdf."""
 

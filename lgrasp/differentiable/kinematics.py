@@ -5,8 +5,6 @@ import torch
 
 from lgrasp.hand.tree import Tree
 
-__all__ = ["BodyKinematics"]
-
 
 class BodyKinematics:
     """Poses of all bodies of a hand (body 0 = static base, body 1 + j = joint j of the tree) for whole postures.

@@ -10,8 +10,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.sdf import SdfGrid
 
-__all__ = ["RUN", "HandPoints", "PointSolid", "hand_solids", "object_solid"]
-
 RUN = 16
 """Surface points are in compact runs of this many."""
 

@@ -10,8 +10,6 @@ from lgrasp.engine.inputs import InputKeys
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.grasp.tables import CandidateTable, candidate_arrays, candidate_table
 
-__all__ = ["BANK_CANDIDATES", "BANK_VERSION", "Bank"]
-
 BANK_CANDIDATES = 1024
 """Candidates of one bank entry; the batch size of a run that keeps banks."""
 BANK_VERSION = 2

@@ -14,8 +14,6 @@ from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_gr
 from lgrasp.runtime.meter import Meter
 from lgrasp.stages.context import Context
 
-__all__ = ["BatchResult", "finish_batch", "run_batch", "run_stage", "run_stages"]
-
 
 @dataclass
 class BatchResult:

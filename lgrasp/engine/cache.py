@@ -17,8 +17,6 @@ from lgrasp.dataset.files import hold_file, remove_leftovers
 from lgrasp.errors import CacheError
 from lgrasp.paths import cache_dir
 
-__all__ = ["Cache", "CacheEntry", "content_key"]
-
 _FORMAT = 2
 _NAMES = "/names"  # member that lists the others
 

@@ -7,8 +7,6 @@ import numpy as np
 from lgrasp.hand.model import HandModel
 from lgrasp.stages.search.params import SearchParams
 
-__all__ = ["fit_params"]
-
 
 def fit_params(stage: str, params: Any, hand: HandModel) -> Any:
     """The parameters of a stage for a hand: how many finger contacts search asks for.

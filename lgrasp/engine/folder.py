@@ -12,8 +12,6 @@ from lgrasp.dataset.files import remove_leftovers
 from lgrasp.dataset.heap import check_heaps
 from lgrasp.errors import OutputError, ShardError
 
-__all__ = ["check_folder", "clean_folder", "present_shards", "shard_path"]
-
 _LONGEST = 120  # characters of a name; file systems allow 255 bytes
 
 

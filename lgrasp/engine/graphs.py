@@ -12,8 +12,6 @@ from lgrasp.runtime.meter import Meter
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
 
-__all__ = ["Recorder"]
-
 _WORTH = 3  # times that a size has come before it is recorded, which takes as long as several batches
 _KEPT = 2  # recordings: each holds the tables of a batch
 _CLOSE = (0.99, 1.03)  # of the candidates wanted: sizes that serve as well

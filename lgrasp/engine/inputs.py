@@ -25,19 +25,6 @@ from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device
 from lgrasp.simulate.scene import Scene
 
-__all__ = [
-    "OBJECT_VERSION",
-    "InputKeys",
-    "Inputs",
-    "input_keys",
-    "load_field",
-    "load_hand",
-    "load_inputs",
-    "load_object",
-    "object_key",
-    "run_key",
-]
-
 OBJECT_VERSION = 2
 """Raised whenever preprocessing gives other arrays."""
 

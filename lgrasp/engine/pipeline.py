@@ -15,8 +15,6 @@ from lgrasp.paths import data_dirs
 from lgrasp.simulate import find_protocol
 from lgrasp.stages.simulate.params import ValidateParams
 
-__all__ = ["Pipeline", "load_pipeline", "pipeline_files"]
-
 
 class _Declared(BaseModel):
     """The file as written."""

@@ -24,8 +24,6 @@ from lgrasp.stages.search.params import SearchParams
 from lgrasp.stages.simulate import stage as validate
 from lgrasp.stages.simulate.params import ValidateParams
 
-__all__ = ["OPTIONAL", "ORDERS", "STAGES", "Stage", "check_order"]
-
 
 @dataclass(frozen=True)
 class Stage:

@@ -22,8 +22,6 @@ from lgrasp.errors import OutputError
 from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.jobs.generate import Job, Outcome
 
-__all__ = ["SEED_FSWO", "check_json", "peak_device_mb", "peak_rss_mb", "report", "survivors", "write_json"]
-
 SEED_FSWO = 0.15
 """Squared frictionless residual below which the published system counts a grasp."""
 

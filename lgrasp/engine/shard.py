@@ -21,18 +21,6 @@ from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps, user_poses
 from lgrasp.stages.context import Context
 
-__all__ = [
-    "Execution",
-    "Found",
-    "ShardResult",
-    "add_counts",
-    "add_seconds",
-    "flat_statistics",
-    "make_shard",
-    "shard_effort",
-    "split_rows",
-]
-
 _LEAST_EFFORT = 65_536
 _CPU_BATCH, _PHYSICS_BATCH = 256, 32  # rows of a simulation are dear
 _GPU_LEAST, _GPU_WHOLE, _GPU_MOST = 2_048, 16_384, 65_536

@@ -9,8 +9,6 @@ from typing import Generic, TypeVar
 from lgrasp.dataset import Shard, write_shard
 from lgrasp.engine.shard import Found
 
-__all__ = ["BackgroundWriter"]
-
 Result = TypeVar("Result", bound=Found)
 
 

@@ -11,19 +11,6 @@ from lgrasp.math.kinematics import Kinematics, vec_dof
 from lgrasp.math.transforms import decode_normal, normal_bin
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = [
-    "Boxes",
-    "Field",
-    "FieldArrays",
-    "boxes_pick",
-    "field_has",
-    "field_pair",
-    "field_pick",
-    "field_seed",
-    "query_field",
-    "upload_field",
-]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _TRIES = wp.constant(6)

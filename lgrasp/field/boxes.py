@@ -6,8 +6,6 @@ import numpy as np
 
 from lgrasp.field.params import FieldParams
 
-__all__ = ["box_index"]
-
 
 def box_index(position: np.ndarray, patch: np.ndarray, patches: int, params: FieldParams) -> dict[str, Any]:
     """Box arrays of a ContactField; empty ones when ``params.index`` is not ``bvh``.

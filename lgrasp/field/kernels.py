@@ -8,8 +8,6 @@ from lgrasp.math.kinematics import MAX_JOINTS, group_forward, vec_dof
 from lgrasp.math.transforms import encode_normal, normal_bin
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["contact_vectors", "sample_postures"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 

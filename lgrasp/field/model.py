@@ -16,8 +16,6 @@ from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.model import HandModel
 from lgrasp.math.transforms import NORMAL_BINS
 
-__all__ = ["FIELD_VERSION", "ContactField", "build_field"]
-
 FIELD_VERSION = 5
 """Raised whenever the arrays of a ContactField change meaning."""
 

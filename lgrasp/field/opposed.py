@@ -4,8 +4,6 @@ import numpy as np
 
 from lgrasp.hand.opposition.facing import opposed
 
-__all__ = ["opposed_pairs"]
-
 _DRAWN = 4_000_000  # pairs looked at, all settings together
 _KEPT = 65_536
 

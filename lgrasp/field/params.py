@@ -4,8 +4,6 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["FieldParams"]
-
 
 class FieldParams(BaseModel):
     """How the contact field of a hand is sampled and indexed; lengths in metres."""

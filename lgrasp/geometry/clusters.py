@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["CLUSTER_SIZE", "bounding_spheres", "cluster_order"]
-
 CLUSTER_SIZE = 32
 
 

@@ -14,8 +14,6 @@ import numpy as np
 
 from lgrasp.errors import DecomposeError
 
-__all__ = ["DECOMPOSE_VERSION", "Decompose", "decompose"]
-
 DECOMPOSE_VERSION = 1
 """Raised whenever the same mesh and parameters give other pieces."""
 

@@ -5,15 +5,6 @@ A pose is x y z [m] qw qx qy qz, shape [..., 7]; a quaternion is qw qx qy qz, un
 
 import numpy as np
 
-__all__ = [
-    "canonical",
-    "compose",
-    "euler_from_quaternion",
-    "inverse",
-    "pose_from_matrix",
-    "quaternion_from_euler",
-]
-
 
 def canonical(quaternion: np.ndarray) -> np.ndarray:
     """The quaternions of unit length with qw >= 0 that mean the same rotations, shape [..., 4]."""

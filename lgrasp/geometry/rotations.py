@@ -2,17 +2,6 @@
 
 import torch
 
-__all__ = [
-    "matrix_from_quaternion",
-    "matrix_from_sixd",
-    "quaternion_from_matrix",
-    "se3_exp",
-    "sixd_from_matrix",
-    "skew",
-    "so3_exp",
-    "so3_log",
-]
-
 _SMALL = 1.0e-4
 """Squared angles below this take series; the first term left out is then below 1e-17."""
 

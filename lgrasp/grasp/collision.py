@@ -9,8 +9,6 @@ from lgrasp.math.sdf import sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["body_apart", "body_clear", "body_depth", "objects_apart"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _CLUSTER = wp.constant(CLUSTER_SIZE)

@@ -6,8 +6,6 @@ from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["press_contact", "shift_contact"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _LEVER = wp.constant(0.1)  # [m] a sliding joint is as stiff as a revolute one at this arm

@@ -9,8 +9,6 @@ from scipy.spatial import cKDTree
 from lgrasp.grasp.near_kernels import list_near
 from lgrasp.runtime.device import start
 
-__all__ = ["NEAR_ANGLE", "NEAR_DISTANCE", "NEAR_JOINT", "KeptRows", "near_pairs", "new_rows"]
-
 NEAR_DISTANCE = 0.005  # [m]
 NEAR_ANGLE = np.radians(5.0)
 NEAR_JOINT = 0.1  # [rad or m]

@@ -11,17 +11,6 @@ from lgrasp.math.kinematics import MAX_DOFS, vec_dof
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = [
-    "Held",
-    "HeldArrays",
-    "body_clear_of_held",
-    "body_depth_in_held",
-    "group_fixed",
-    "hold",
-    "hold_nothing",
-    "with_frozen",
-]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 

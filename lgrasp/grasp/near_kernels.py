@@ -4,8 +4,6 @@ import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["list_near"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 

@@ -11,8 +11,6 @@ import numpy as np
 import lgrasp
 from lgrasp.grasp.schema import GRASP_FIELDS, SEQUENCE_FIELDS
 
-__all__ = ["GraspRows", "HandRecord", "ObjectRecord", "SequenceRows", "Shard", "ShardHeader", "object_set_sha256"]
-
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")

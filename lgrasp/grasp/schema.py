@@ -10,20 +10,6 @@ from typing import Literal
 
 import numpy as np
 
-__all__ = [
-    "ATTRIBUTES",
-    "CHUNK_ROWS",
-    "DATASETS",
-    "FORMAT",
-    "FORMAT_VERSION",
-    "GRASP_FIELDS",
-    "ROW_GROUPS",
-    "SEQUENCE_DATASETS",
-    "SEQUENCE_FIELDS",
-    "AttributeSpec",
-    "DatasetSpec",
-]
-
 FORMAT = "lgrasp-shard"
 FORMAT_VERSION = "1.1"
 CHUNK_ROWS = 4096

@@ -8,8 +8,6 @@ import numpy as np
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.tree import Tree
 
-__all__ = ["SequenceTable", "empty_sequences", "extend", "join_sequences", "take_sequences"]
-
 _FAMILIES = ("metrics", "physics")
 _STEPS = ("space", "free", "q", "q_pregrasp", "q_squeeze", "pose")
 _CONTACTS = ("contact_points", "contact_normals", "contact_links", "contact_forces")

@@ -11,27 +11,6 @@ import warp as wp
 
 from lgrasp.math.kinematics import MAX_DOFS, vec_dof
 
-__all__ = [
-    "CandidateTable",
-    "ContactSets",
-    "GraspTable",
-    "PoseTable",
-    "candidate_arrays",
-    "candidate_table",
-    "grasp_arrays",
-    "grasps_from_arrays",
-    "join_grasps",
-    "pose_arrays",
-    "pose_table",
-    "select_poses",
-    "set_arrays",
-    "set_table",
-    "sort_grasps",
-    "take_grasps",
-    "trim_sets",
-    "user_poses",
-]
-
 _FAMILIES = ("metrics", "physics")  # columns of a GraspTable that come by name
 
 

@@ -5,8 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull
 
-__all__ = ["EDGES", "FRICTION", "WrenchSpace", "cone_edges", "primitive_wrenches", "wrench_space", "wrench_spaces"]
-
 FRICTION = 0.5
 EDGES = 8
 

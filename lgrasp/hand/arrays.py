@@ -11,19 +11,6 @@ from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_forward, point_
 from lgrasp.math.sdf import sdf_part
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
-__all__ = [
-    "Contacts",
-    "Hand",
-    "HandArrays",
-    "Overlaps",
-    "body_poses",
-    "hand_grid",
-    "overlap_grid",
-    "point_jacobians",
-    "pose_matrices",
-    "upload_hand",
-]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 

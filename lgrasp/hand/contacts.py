@@ -9,18 +9,6 @@ from lgrasp.errors import HandError
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.spec import Cone, HandSpec, Surface
 
-__all__ = [
-    "LinkGrid",
-    "body_cones",
-    "box_grid",
-    "check_contact_links",
-    "cover_patches",
-    "finger_points",
-    "link_grid",
-    "palm_points",
-    "side_points",
-]
-
 _GRID_CELL = 8.0e-4
 _GRID_PAD = 6.0e-3
 _POINTS_PER_LINK = 600

@@ -6,8 +6,6 @@ import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
-__all__ = ["signed_distance"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 

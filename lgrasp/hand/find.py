@@ -12,8 +12,6 @@ from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Joint, Urdf, read_urdf
 from lgrasp.paths import data_dirs
 
-__all__ = ["HandSource", "find_hand", "known_hands"]
-
 
 @dataclass(frozen=True)
 class HandSource:

@@ -13,19 +13,6 @@ from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.urdf import Geometry, Urdf
 
-__all__ = [
-    "MOST_FACES",
-    "Piece",
-    "convex_piece",
-    "convex_pieces",
-    "geometry_mesh",
-    "inner_spheres",
-    "is_dented",
-    "surface_samples",
-    "thin_mesh",
-    "transform_points",
-]
-
 _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by half of it leaves +-0.2 mm
 _CYLINDER_SIDES = 32
 _MOST_BODIES = 16

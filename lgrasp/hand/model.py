@@ -22,8 +22,6 @@ from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 from lgrasp.math.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 
-__all__ = ["HAND_VERSION", "HandModel", "build_hand", "hand_digest"]
-
 HAND_VERSION = 13
 """Raised whenever the arrays of a HandModel change meaning."""
 

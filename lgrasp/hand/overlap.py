@@ -13,8 +13,6 @@ import trimesh
 
 from lgrasp.hand.contacts import LinkGrid, box_grid
 
-__all__ = ["OVERLAP", "OverlapSide", "overlap_arrays", "overlap_depth", "overlap_sides"]
-
 OVERLAP = 8.5e-4
 """Depth [m] to which such pairs may overlap; a grasp is strictly valid to 1 mm."""
 

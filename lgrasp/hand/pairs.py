@@ -13,8 +13,6 @@ from lgrasp.hand.overlap import OVERLAP, OverlapSide, overlap_arrays, overlap_de
 from lgrasp.math.convex import Pieces, pieces_clear
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
-__all__ = ["pieces_touch", "with_pairs"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _POSTURES = 256

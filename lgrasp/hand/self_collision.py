@@ -7,8 +7,6 @@ from lgrasp.hand.overlap import OVERLAP
 from lgrasp.math.convex import pieces_clear
 from lgrasp.math.sdf import sdf_value
 
-__all__ = ["group_pairs_clear", "overlap_depth"]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _OVERLAP = wp.constant(OVERLAP)

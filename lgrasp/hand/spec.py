@@ -10,19 +10,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from lgrasp.errors import HandError
 
-__all__ = [
-    "Box",
-    "Cone",
-    "ContactRule",
-    "Coupling",
-    "HandSpec",
-    "OppositionSpace",
-    "PalmRule",
-    "Surface",
-    "load_spec",
-    "spec_problem",
-]
-
 Vec3 = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
 

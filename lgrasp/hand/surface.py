@@ -9,8 +9,6 @@ import trimesh
 from lgrasp.hand.contacts import LinkGrid, cover_patches, link_grid
 from lgrasp.hand.tree import Tree
 
-__all__ = ["ContactLink", "contact_arrays", "csr", "stack_rows", "with_bare_links"]
-
 
 def csr(counts: list[int]) -> np.ndarray:
     """(n + 1,) i32: first entry of each of n runs, and their total."""

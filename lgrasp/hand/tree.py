@@ -9,8 +9,6 @@ from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.urdf import Joint, Urdf, check_mimic
 
-__all__ = ["MAX_SETTINGS", "Tree", "build_tree"]
-
 MAX_SETTINGS = 32
 """Most combinations of values of a hand's shared joints."""
 

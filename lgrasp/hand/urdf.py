@@ -13,8 +13,6 @@ from lxml import etree
 
 from lgrasp.errors import HandError
 
-__all__ = ["Geometry", "Joint", "Urdf", "check_mimic", "find_mesh", "parse_robot", "read_urdf"]
-
 _MOVABLE = {"revolute", "prismatic", "continuous"}
 
 

@@ -1,7 +1,5 @@
 """Why too few grasps came out, in words."""
 
-__all__ = ["starving_stage"]
-
 _STEPS = (
     ("place", "tried", "kept", "object poses are blocked by the palm, or no two fingers could oppose each other there"),
     ("domain", "poses", "rich", "too few fingers can reach the object's surface at these poses"),

@@ -19,18 +19,6 @@ from lgrasp.object.find import find_object
 from lgrasp.object.load import MESH_SUFFIXES
 from lgrasp.paths import data_dirs
 
-__all__ = [
-    "JobConfig",
-    "Published",
-    "array_task",
-    "config_files",
-    "default_out",
-    "in_folder",
-    "load_config",
-    "plan_jobs",
-    "plan_sequences",
-]
-
 
 class Published(BaseModel):
     """Figures of others that a benchmark shows beside its own."""

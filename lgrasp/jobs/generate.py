@@ -26,8 +26,6 @@ from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.simulate import find_protocol, protocol_text
 from lgrasp.simulate.model import import_mujoco
 
-__all__ = ["Job", "Listener", "Outcome", "find_present", "generate", "job_shards"]
-
 METRIC_UNITS = {"penetration": "m", "self_penetration": "m", "gap": "m", "normal_error": "rad"}
 
 

@@ -17,8 +17,6 @@ from lgrasp.object.find import list_objects as named_objects
 from lgrasp.object.load import load_mesh
 from lgrasp.paths import data_dirs
 
-__all__ = ["describe_hand", "describe_object", "describe_pipeline", "list_hands", "list_objects", "list_pipelines"]
-
 
 def list_hands() -> list[dict[str, Any]]:
     """Name, description, number of opposition spaces, licence and folder of every known hand.

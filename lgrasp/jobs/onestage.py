@@ -33,8 +33,6 @@ from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.stages.context import Context
 
-__all__ = ["StageRun", "run_stage"]
-
 
 @dataclass(frozen=True)
 class StageRun:

@@ -15,8 +15,6 @@ from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.device import start as start_warp
 
-__all__ = ["prepare_field", "prepare_object"]
-
 
 def prepare_field(
     cache: Cache,

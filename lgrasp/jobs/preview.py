@@ -12,8 +12,6 @@ from lgrasp.engine.inputs import input_keys, run_key
 from lgrasp.jobs.generate import Job, find_present, job_shards
 from lgrasp.runtime.device import resolve_device
 
-__all__ = ["PlanLine", "plan"]
-
 
 class PlanLine(NamedTuple):
     """One artifact of a job."""

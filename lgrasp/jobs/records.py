@@ -12,8 +12,6 @@ from lgrasp.hand.urdf import read_urdf
 from lgrasp.object.model import ObjectModel
 from lgrasp.simulate.scene import Scene, scene_of
 
-__all__ = ["hand_record", "make_scene", "mesh_blobs", "object_record"]
-
 
 def mesh_blobs(urdf: Path) -> dict[str, bytes]:
     """Collision meshes of a hand by the path its URDF names, read where the hand is now, not where it was cached."""

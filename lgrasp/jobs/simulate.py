@@ -21,8 +21,6 @@ from lgrasp.simulate import COLUMNS, OBJECT_COLUMNS, Protocol, Scene, protocol_t
 from lgrasp.simulate.model import import_mujoco
 from lgrasp.simulate.solid import Solid
 
-__all__ = ["Validated", "Validation", "summary", "validate_shards"]
-
 _CONTACTS = 2  # links that it takes to hold anything
 
 

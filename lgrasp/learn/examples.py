@@ -15,8 +15,6 @@ from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.render import LabelledMesh, render
 from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
 
-__all__ = ["Examples", "make_examples", "palm_point", "partial_clouds"]
-
 _CAMERA = CameraParams.model_validate(
     {"views": 2, "width": 96, "height": 96, "angle": 40.0, "calibration": 0.003, "voxel": 0.0, "window": 2}
 )

@@ -9,8 +9,6 @@ from lgrasp.learn.examples import Examples
 from lgrasp.learn.training import Trainer, whole_energy
 from lgrasp.refine import Pose
 
-__all__ = ["Measured", "measure"]
-
 
 class Measured(NamedTuple):
     """Means over all clouds and seeds that were measured on."""

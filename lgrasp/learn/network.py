@@ -8,8 +8,6 @@ from torch import nn
 from lgrasp.geometry.rotations import matrix_from_sixd
 from lgrasp.learn.params import LearnParams
 
-__all__ = ["Coarse", "CoarseNet", "best_answers", "seed_frames"]
-
 
 class Coarse(NamedTuple):
     """Answers for N seeds, in the frame of their clouds."""

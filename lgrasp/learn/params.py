@@ -2,8 +2,6 @@
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["LearnParams"]
-
 
 class LearnParams(BaseModel):
     """What the network sees, its size, and how long it is trained."""

@@ -12,8 +12,6 @@ from lgrasp.learn.network import Coarse, CoarseNet
 from lgrasp.learn.params import LearnParams
 from lgrasp.refine import LocalSearch, Pose, Refiner
 
-__all__ = ["Trainer", "pose_loss", "whole_energy"]
-
 _ANY_REACH = 10.0  # [m]
 
 

@@ -2,8 +2,6 @@
 
 import warp as wp
 
-__all__ = ["Pieces", "pieces_clear", "point_depth"]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 

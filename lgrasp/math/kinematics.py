@@ -2,18 +2,6 @@
 
 import warp as wp
 
-__all__ = [
-    "MAX_BODIES",
-    "MAX_DOFS",
-    "MAX_GROUPS",
-    "MAX_JOINTS",
-    "Kinematics",
-    "clamp_dofs",
-    "group_forward",
-    "point_column",
-    "vec_dof",
-]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 MAX_JOINTS = 16

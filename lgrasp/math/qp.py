@@ -8,8 +8,6 @@ import warp as wp
 
 from lgrasp.math.transforms import tangent
 
-__all__ = ["MAX_CONTACTS", "balance", "disturbance", "frictionless", "unresisted", "vec6", "wrench"]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 MAX_CONTACTS = 7

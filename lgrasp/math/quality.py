@@ -5,8 +5,6 @@ import warp as wp
 from lgrasp.math.qp import MAX_CONTACTS, vec6
 from lgrasp.math.transforms import tangent
 
-__all__ = ["epsilon_bound"]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _CONES = wp.constant(8 * MAX_CONTACTS)

@@ -2,8 +2,6 @@
 
 import warp as wp
 
-__all__ = ["Sdf", "sdf_gradient", "sdf_part", "sdf_value"]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 

@@ -2,16 +2,6 @@
 
 import warp as wp
 
-__all__ = [
-    "NORMAL_BINS",
-    "decode_normal",
-    "encode_normal",
-    "normal_bin",
-    "random_rotation",
-    "rotation_between",
-    "tangent",
-]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _RES = 8

@@ -2,8 +2,6 @@
 
 import warp as wp
 
-__all__ = ["closest_on_triangle", "least_facing"]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 

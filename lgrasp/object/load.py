@@ -19,8 +19,6 @@ from lgrasp.errors import ObjectError
 
 from .params import ObjectParams
 
-__all__ = ["MESH_SUFFIXES", "LoadedMesh", "load_mesh", "open_edges"]
-
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
 
 _FLAT = 1e-4  # thinner than this share of the largest side is a plane

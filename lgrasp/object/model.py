@@ -22,8 +22,6 @@ from .surface import (
     thin,
 )
 
-__all__ = ["ObjectModel", "preprocess_object"]
-
 _RELAXED_ANGLES = (25.0, 35.0)  # [deg] tried when the sharpness mask leaves too few contact points
 
 

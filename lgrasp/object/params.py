@@ -4,8 +4,6 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["ObjectParams"]
-
 Length = Annotated[float, Field(gt=0.0, le=1.0)]
 
 

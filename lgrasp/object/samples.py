@@ -13,8 +13,6 @@ import numpy as np
 import trimesh
 import yaml
 
-__all__ = ["SAMPLES", "build_sample", "write_samples"]
-
 _LICENCE = "Apache-2.0"
 _DECIMALS = 6  # of a metre
 _MERGE = 0.02  # [mm] detail that the boolean operations leave behind below this is simplified away

@@ -8,8 +8,6 @@ from scipy import ndimage
 
 from . import kernels
 
-__all__ = ["SdfGrid", "build_sdf", "sample_sdf"]
-
 _BAND_CELLS = 2.0  # half width of the exact band; sqrt(3) is the least that leaves no gap between its two sides
 _SPLIT_CELLS = 8.0  # longer triangles are cut before they are offered to the cells of their bounding box
 _LATTICE_SHIFT = (1.9e-5, 2.7e-5, 0.0)  # in cells: keeps columns off vertices and edges that sit on round coordinates

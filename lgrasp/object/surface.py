@@ -8,17 +8,6 @@ from scipy.spatial import KDTree
 from . import kernels
 from .sdf import SdfGrid, sample_sdf
 
-__all__ = [
-    "face_neighbours",
-    "face_normals",
-    "fold_cosine",
-    "opposite_points",
-    "probe_fits",
-    "sample_creases",
-    "sample_surface",
-    "thin",
-]
-
 _OPPOSED = float(np.cos(np.radians(30.0)))  # of the line between two opposite points to their normals, at least
 _OVERSAMPLE = 5  # candidates for one point kept
 _WALK_FACES = 256  # faces visited around a point in the fold test

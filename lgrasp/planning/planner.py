@@ -12,17 +12,16 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.palm import palm_axis
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
-from lgrasp.planning.starts import GOLDEN_ANGLE, palm_axis, start_poses, tilted
+from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted
 from lgrasp.refine.check import OUTCOMES, check_grasps
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands, inverse_poses
 from lgrasp.refine.params import GraspBounds, LocalSearch
 from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface
 from lgrasp.refine.volume import upload_target
-
-__all__ = ["PlanParams", "Planned", "Planner", "cloud_params"]
 
 _CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
 _COLLIDES, _CLOUD_GAP = 1.0e-3, 6.0e-3  # [m]

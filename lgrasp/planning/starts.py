@@ -3,42 +3,14 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lgrasp.errors import HandError
 from lgrasp.hand.model import HandModel
-
-__all__ = ["GOLDEN_ANGLE", "STAND_OFF", "palm_axis", "start_poses", "tilted"]
+from lgrasp.hand.palm import palm_axis
 
 STAND_OFF = 0.12
 """Distance of a hand's base from the surface where hand.yaml has no ``stand_off`` [m]."""
 
-_APART = 0.01  # [m]
-
 GOLDEN_ANGLE = float(np.pi * (3 - np.sqrt(5)))
 """Multiples of it are spread evenly over the circle [rad]."""
-
-
-def palm_axis(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of the palm's contact surface (3,) [m] and the unit direction it faces (3,), base frame.
-
-    A hand without a palm faces, from the middle of its fingers' first joints, the middle of its canonical box.
-
-    Raises:
-        HandError: that middle is that of the joints.
-    """
-    first, end = model.contact_first[-2:]
-    if first < end:
-        facing = model.contact_normals[first:end].mean(0)
-        return model.contact_points[first:end].mean(0), facing / np.linalg.norm(facing)
-    tree = model.tree
-    centre = tree.T_parent_joint[np.flatnonzero(tree.joint_parent < 0), :3, 3].mean(0)
-    facing = model.canonical_box.mean(0) - centre
-    length = np.linalg.norm(facing)
-    if length < _APART:
-        raise HandError(
-            f"hand '{model.name}' has no palm, and its canonical_box is about its fingers' first joints: no side of it "
-            "can face an object (hand.yaml: palm or canonical_box)"
-        )
-    return centre, facing / length
 
 
 def start_poses(

@@ -20,8 +20,6 @@ from lgrasp.refine.check_kernels import (
 from lgrasp.refine.params import GraspBounds
 from lgrasp.refine.surface import Palmar, ruled_palmar
 
-__all__ = ["OUTCOMES", "check_grasps", "contact_width"]
-
 OUTCOMES = ("kept", "contact", "self-collision", "object collision", "balance", "disturbance")
 """Outcome codes of a row: the first check that it failed."""
 

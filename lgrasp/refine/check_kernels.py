@@ -13,8 +13,6 @@ from lgrasp.math.sdf import sdf_gradient, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["balance_rows", "choose_contacts", "clear_of_itself", "control_rows", "deepen_rows", "link_contacts"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _NEAR = wp.constant(0.006)  # [m] to a contact point of the object

@@ -6,7 +6,7 @@ import warp as wp
 from lgrasp.differentiable.solids import hand_solids
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import HandArrays, body_poses, pose_matrices
-from lgrasp.planning.starts import palm_axis
+from lgrasp.hand.palm import palm_axis
 from lgrasp.refine.descent_kernels import advance, deepest, descend
 from lgrasp.refine.energy_gradient import MAX_COLUMNS, Search
 from lgrasp.refine.hands import Hands
@@ -26,8 +26,6 @@ from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
 from lgrasp.refine.resolve_penetration import withdraw
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
-
-__all__ = ["Descent"]
 
 _ADVANCES = 30
 _ROWS = 32  # hands of a block of threads: few hands spread over many processors

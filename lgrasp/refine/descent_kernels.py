@@ -9,8 +9,6 @@ from lgrasp.refine.match_kernels import Correspondences, Points, Solids
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["advance", "deepest", "descend"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _TINY = wp.constant(1.0e-12)

@@ -8,16 +8,6 @@ import torch
 from lgrasp.refine.links import Intrusions
 from lgrasp.refine.params import LENGTH, LIMIT_SHARE, STEEPEST, LocalSearch
 
-__all__ = [
-    "Energies",
-    "Matches",
-    "barrier",
-    "intrusion_energies",
-    "limit_energy",
-    "matching_energies",
-    "wrench_energy",
-]
-
 
 class Matches(NamedTuple):
     """What the points of a hand are matched to, frozen while the hand moves; N samples, L blocks of P points."""

@@ -14,8 +14,6 @@ from lgrasp.refine.params import LENGTH, STEEPEST
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["MAX_COLUMNS", "Search", "beyond", "joint_pulls", "point_pulls", "solid_pulls", "wrench_pulls"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 MAX_COLUMNS = 32

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-__all__ = ["Hands", "inverse_poses"]
-
 
 @dataclass(frozen=True)
 class Hands:

@@ -11,8 +11,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.refine.match_kernels import DEEPEST, LINK_DEEPEST
 from lgrasp.refine.surface import LINK_POINTS, link_probes
 
-__all__ = ["Intrusions", "LinkSolids"]
-
 _NOTHING = -1.0  # [m] offset of a plane that nothing is near
 
 

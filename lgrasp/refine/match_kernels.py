@@ -11,19 +11,6 @@ from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_part, sdf_value
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = [
-    "DEEPEST",
-    "LINK_DEEPEST",
-    "Correspondences",
-    "Points",
-    "Solids",
-    "choose_contacts",
-    "match_links",
-    "match_points",
-    "match_solids",
-    "place_bodies",
-]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 DEEPEST, LINK_DEEPEST = 4, 2

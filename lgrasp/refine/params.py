@@ -4,8 +4,6 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["LENGTH", "LIMIT_SHARE", "STEEPEST", "GraspBounds", "LocalSearch"]
-
 LENGTH = 0.01
 """The energy counts distances in this unit [m]."""
 STEEPEST = 0.1

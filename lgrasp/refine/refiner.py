@@ -30,8 +30,6 @@ from lgrasp.refine.surface import HandSurface, hand_surface
 from lgrasp.refine.target import Target
 from lgrasp.refine.volume import upload_target
 
-__all__ = ["Pose", "Refined", "Refiner", "object_pose", "table_pose"]
-
 
 class Pose(NamedTuple):
     """Hands in the object's internal frame, N of them."""

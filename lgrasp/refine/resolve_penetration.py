@@ -8,8 +8,6 @@ from scipy.spatial.transform import Rotation
 from lgrasp.hand.tree import Tree
 from lgrasp.refine.hands import Hands
 
-__all__ = ["Depths", "withdraw"]
-
 _DEEP, _FREE = 0.002, 0.0005  # [m] hands deeper than this are taken out; those less deep are out
 _STEP = 0.002  # [m]
 _WAYS = np.array([w for w in np.ndindex(3, 3, 3) if w != (1, 1, 1)]) - 1.0

@@ -6,8 +6,6 @@ import torch
 
 from lgrasp.refine.params import LocalSearch
 
-__all__ = ["Gradient", "clipped"]
-
 
 class Gradient(NamedTuple):
     """Of the total energy by motions of the base about the hand's middle and by the joints."""

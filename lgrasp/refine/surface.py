@@ -8,20 +8,6 @@ import numpy as np
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.model import HandModel
 
-__all__ = [
-    "BLOCK",
-    "DISTAL",
-    "LINK_POINTS",
-    "OTHER",
-    "HandSurface",
-    "Palmar",
-    "farthest_points",
-    "hand_surface",
-    "last_bodies",
-    "link_probes",
-    "ruled_palmar",
-]
-
 BLOCK = 24
 """Points are in blocks of this many, each on one body."""
 DISTAL, OTHER = 1.0, 0.2

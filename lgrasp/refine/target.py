@@ -9,8 +9,6 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.object.sdf import SdfGrid
 from lgrasp.refine.volume import solid_cloud, surface_radius
 
-__all__ = ["Target"]
-
 
 class Target:
     """An object, perhaps among others that are only kept out of, in the object's internal frame.

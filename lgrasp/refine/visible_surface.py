@@ -8,8 +8,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.refine.surface import Palmar, last_bodies
 
-__all__ = ["seen_palmar"]
-
 _POSTURES = 64
 _SEEN = 0.3  # share of postures
 

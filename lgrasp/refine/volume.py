@@ -8,17 +8,6 @@ import warp as wp
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
-__all__ = [
-    "Normal",
-    "TargetArrays",
-    "Volume",
-    "solid_cloud",
-    "surface_radius",
-    "turning_normal",
-    "upload_target",
-    "volume_at",
-]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _CLOUD = 512

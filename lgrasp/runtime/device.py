@@ -12,8 +12,6 @@ import warp as wp
 from lgrasp.errors import DeviceError
 from lgrasp.paths import cache_dir
 
-__all__ = ["KERNEL_OPTIONS", "Device", "resolve_device", "start"]
-
 KERNEL_OPTIONS = {"enable_backward": False, "max_unroll": 1}
 """Module options of every non-differentiable kernel module (they decide compile time: minutes or seconds)."""
 

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-__all__ = ["fetch"]
-
 _LINE = 256  # bytes that places in the staging memory are rounded up to
 _staging: dict[str, wp.array] = {}  # by device
 _lock = threading.Lock()

@@ -11,8 +11,6 @@ import warp as wp
 
 import lgrasp
 
-__all__ = ["import_all", "kernel_modules", "load_kernels"]
-
 
 def import_all() -> None:
     """Import every module of lgrasp, so that :func:`kernel_modules` sees them."""

@@ -7,8 +7,6 @@ import warp as wp
 
 from lgrasp.runtime.tally import Tally, read_tallies
 
-__all__ = ["Meter"]
-
 _Moment = wp.Event | float
 
 

@@ -2,8 +2,6 @@
 
 import warp as wp
 
-__all__ = ["running_sums"]
-
 
 def running_sums(values: wp.array) -> None:
     """Replace each number by the sum of all up to it.

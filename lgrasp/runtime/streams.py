@@ -4,8 +4,6 @@ import math
 
 import torch
 
-__all__ = ["normals", "uniforms"]
-
 _GAMMA, _A, _B = -7046029254386353131, -4658895280553007687, -7723592293110705685  # splitmix64
 
 

@@ -7,8 +7,6 @@ import warp as wp
 
 from lgrasp.runtime.fetch import fetch
 
-__all__ = ["Tally", "empty_tally", "read_tallies"]
-
 
 class Tally(Mapping[str, int]):
     """Counts by name; the first look waits for the device."""

@@ -11,8 +11,6 @@ import numpy as np
 from lgrasp.geometry.poses import canonical
 from lgrasp.scenes.params import CameraParams
 
-__all__ = ["Intrinsics", "intrinsics_of", "look_at", "place_cameras"]
-
 
 @dataclass(frozen=True)
 class Intrinsics:

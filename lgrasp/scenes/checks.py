@@ -7,8 +7,6 @@ import numpy as np
 from lgrasp.dataset.checks import hand_problems, object_problems
 from lgrasp.scenes.records import SceneRecord
 
-__all__ = ["scene_problems"]
-
 _UNIT = 1.0e-3  # of the lengths of quaternions and normals
 _LIMIT = 1.0e-4  # [rad or m] outside the joint limits
 

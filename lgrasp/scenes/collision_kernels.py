@@ -8,8 +8,6 @@ from lgrasp.math.convex import Pieces
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["hand_depths"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 

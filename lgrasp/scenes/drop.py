@@ -14,8 +14,6 @@ from lgrasp.simulate.assemble import add_hull
 from lgrasp.simulate.model import import_mujoco
 from lgrasp.simulate.solid import Solid
 
-__all__ = ["Settled", "drop"]
-
 _DENSITY = 500.0  # [kg/m^3]
 _STILL = (2.0e-3, 0.02)  # [m/s], [rad/s] below which an object lies still
 _QUIET = 0.2  # [s] for which it must

@@ -19,8 +19,6 @@ from lgrasp.scenes.transfer import find_collisions, hand_poses
 from lgrasp.seeding import stage_seed
 from lgrasp.simulate.solid import Solid
 
-__all__ = ["Item", "draw_items", "make_scene", "observe"]
-
 
 @dataclass(frozen=True)
 class Item:

@@ -4,8 +4,6 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-__all__ = ["CameraParams", "DropParams", "SceneParams"]
-
 _Length = Annotated[float, Field(gt=0.0, le=5.0)]
 
 

@@ -19,8 +19,6 @@ from lgrasp.scenes.checks import scene_problems
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
 
-__all__ = ["Layout", "SceneReader", "check_scene", "read_scene"]
-
 
 class Layout(NamedTuple):
     """M objects on a table."""

@@ -11,8 +11,6 @@ import lgrasp
 from lgrasp.dataset import HandRecord, ObjectRecord
 from lgrasp.scenes.camera import Intrinsics
 
-__all__ = ["CloudRecord", "SceneGrasps", "SceneRecord", "ViewsRecord"]
-
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")

@@ -11,8 +11,6 @@ from lgrasp.runtime.device import start
 from lgrasp.scenes import render_kernels as kernels
 from lgrasp.scenes.camera import Intrinsics
 
-__all__ = ["NOTHING", "TABLE", "Images", "LabelledMesh", "image_normals", "join_surfaces", "render", "table_surface"]
-
 NOTHING, TABLE = -1, 0
 """Labels of pixels that see nothing, and of the table; object k is k + 1."""
 

@@ -4,8 +4,6 @@ import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["cast_rays", "fit_normals"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 

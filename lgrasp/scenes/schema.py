@@ -6,8 +6,6 @@ Capital letters in a shape hold across the file: ``M`` objects on the table, ``V
 
 from lgrasp.grasp.schema import AttributeSpec, DatasetSpec
 
-__all__ = ["ATTRIBUTES", "DATASETS", "DEPTH_UNIT", "FORMAT", "FORMAT_VERSION"]
-
 FORMAT = "lgrasp-scene"
 FORMAT_VERSION = "1.0"
 

@@ -9,8 +9,6 @@ from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.render import Images, image_normals
 from lgrasp.scenes.schema import DEPTH_UNIT
 
-__all__ = ["Merged", "add_noise", "draw_offsets", "merge_views"]
-
 _MOST_STEPS = 2**16 - 1  # that a file can hold
 
 

@@ -11,8 +11,6 @@ from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.scenes import collision_kernels as kernels
 
-__all__ = ["Collisions", "find_collisions", "hand_poses"]
-
 
 @dataclass(frozen=True)
 class Collisions:

@@ -15,8 +15,6 @@ from lgrasp.scenes.checks import scene_problems
 from lgrasp.scenes.records import SceneRecord
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
 
-__all__ = ["write_scene"]
-
 
 def write_scene(path: str | os.PathLike[str], scene: SceneRecord) -> None:
     """Write a scene; the file appears under ``path`` only when it is whole and on the disk.

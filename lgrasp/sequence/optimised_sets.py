@@ -11,8 +11,6 @@ from lgrasp.stages.context import Context
 if TYPE_CHECKING:  # torch takes a second to import
     from lgrasp.sequence.optimiser.optimise import Optimised
 
-__all__ = ["optimised_sets"]
-
 
 def optimised_sets(grasps: "Optimised", free: np.ndarray, context: Context) -> ContactSets:
     """Sets of the two contacts of each grasp; the candidate of row i is the first that goes on from held row i.

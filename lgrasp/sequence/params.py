@@ -6,8 +6,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lgrasp.sequence.optimiser.params import OptimiserParams
 
-__all__ = ["SequenceParams"]
-
 
 class SequenceParams(BaseModel):
     """How sequences of grasps grow, object by object."""

@@ -8,8 +8,6 @@ from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.opposition.spaces import Space, available, longest
 from lgrasp.seeding import stage_seed
 
-__all__ = ["space_orders"]
-
 
 def space_orders(table: SequenceTable, spaces: Sequence[Space], policy: str, left: int, seed: int) -> np.ndarray:
     """The next step's opposition spaces of each row, in the order in which they are tried.

@@ -12,8 +12,6 @@ from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.context import Context
 
-__all__ = ["room_left"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _POSTURES = wp.constant(16)  # of each finger, the same for all grasps

@@ -9,8 +9,6 @@ from lgrasp.sequence.params import SequenceParams
 from lgrasp.sequence.room import room_left
 from lgrasp.stages.context import Context
 
-__all__ = ["VERSION", "go_on", "run"]
-
 VERSION = 1
 
 

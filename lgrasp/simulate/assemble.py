@@ -13,8 +13,6 @@ from lgrasp.simulate.scene import HandSolids
 from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.urdf import bare_urdf, joint_ends
 
-__all__ = ["OBJECT", "add_hull", "assemble"]
-
 OBJECT = "lgrasp object"
 """Begins the name of every object's body; its number follows."""
 

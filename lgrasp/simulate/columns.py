@@ -7,8 +7,6 @@ import numpy as np
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.verdict import Verdict
 
-__all__ = ["COLUMNS", "OBJECT_COLUMNS", "stack_verdicts"]
-
 COLUMNS: dict[str, str] = {
     "holds": "bool [N]: success in all six directions",
     "directions": "int8 [N, 6]: +x -x +y -y +z -z of the hand base frame; 1 held, 0 lost, -1 not run",

@@ -13,8 +13,6 @@ from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import AXES, CHUNK, REST, Bounds, Closed, Look, Pulls, Verdict, conclude
 from lgrasp.simulate.worlds import Worlds
 
-__all__ = ["WorldTrials"]
-
 
 @dataclass
 class _Closing:

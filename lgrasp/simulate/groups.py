@@ -9,8 +9,6 @@ import numpy as np
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 
-__all__ = ["Group", "group_rows"]
-
 _BY_SLOT = ("object_pose", "object_index", "contact_points", "contact_normals", "contact_links", "contact_forces")
 
 

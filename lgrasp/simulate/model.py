@@ -14,8 +14,6 @@ from lgrasp.simulate.scene import HandSolids, Scene
 from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.urdf import welded_joints
 
-__all__ = ["Model", "build_model", "import_mujoco"]
-
 _NEAR = 1.0e-3  # [m]
 
 

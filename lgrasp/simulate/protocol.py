@@ -11,8 +11,6 @@ if TYPE_CHECKING:
 
     from lgrasp.grasp.records import GraspRows
 
-__all__ = ["DIRECTIONS", "PROTOCOLS", "Load", "Protocol", "find_protocol"]
-
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Directions of the load in the hand's base frame, in the order of the columns."""
 

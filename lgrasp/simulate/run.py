@@ -18,8 +18,6 @@ from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import Verdict
 
-__all__ = ["protocol_text", "verdicts"]
-
 _HELD_TOLERANCE = 1.0e-4  # [rad or m]
 _LEAST_WORLDS, _MOST_WORLDS = 256, 8192  # on a GPU
 

@@ -18,8 +18,6 @@ from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh
 from lgrasp.hand.urdf import parse_robot, read_urdf
 from lgrasp.simulate.solid import Solid, solid_of_mesh
 
-__all__ = ["HandSolids", "Scene", "hand_of_record", "object_of_record", "scene_of", "scene_of_shard"]
-
 
 @dataclass(frozen=True)
 class HandSolids:

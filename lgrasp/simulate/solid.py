@@ -10,8 +10,6 @@ from lgrasp.errors import DecomposeError, ObjectError
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.distance import signed_distance
 
-__all__ = ["Solid", "solid_of_mesh"]
-
 _DENT = 2.0e-3  # dents shallower than this [m] may stay filled
 _MOST_PIECES = 128
 _EFFORTS = ((1.5e-4, _DENT, 180.0), (5.0e-4, 2 * _DENT, 120.0))

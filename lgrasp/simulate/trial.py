@@ -21,8 +21,6 @@ from lgrasp.simulate.verdict import (
     links_touching,
 )
 
-__all__ = ["Trial"]
-
 
 class Trial:
     """A simulation that serves one grasp after another; every thread has its own.

@@ -10,8 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.hand.urdf import parse_robot
 
-__all__ = ["bare_urdf", "joint_ends", "welded_joints"]
-
 _COMPILER = {"strippath": "false", "discardvisual": "true", "balanceinertia": "true", "fusestatic": "false"}
 
 

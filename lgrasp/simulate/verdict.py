@@ -6,20 +6,6 @@ import numpy as np
 
 from lgrasp.simulate.protocol import Protocol
 
-__all__ = [
-    "AXES",
-    "CHUNK",
-    "REST",
-    "WILD",
-    "Bounds",
-    "Closed",
-    "Look",
-    "Pulls",
-    "Verdict",
-    "conclude",
-    "links_touching",
-]
-
 CHUNK = 0.1
 """[s] between looks at the objects."""
 WILD = 1.0e3

@@ -11,8 +11,6 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.simulate.model import Model, import_mujoco
 from lgrasp.simulate.verdict import CHUNK, WILD, links_touching
 
-__all__ = ["Worlds"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _CONTACTS = 96  # per world and object, on average

@@ -14,8 +14,6 @@ from lgrasp.object.arrays import ObjectArrays
 from lgrasp.seeding import stage_seed
 from lgrasp.simulate.scene import Scene
 
-__all__ = ["Context"]
-
 
 @dataclass(frozen=True)
 class Context:

@@ -6,8 +6,8 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from reference.wrench import cone_forces, epsilon, residual, wrenches
 from scipy.spatial import ConvexHull
+from support.wrench import cone_forces, epsilon, residual, wrenches
 from typer.testing import CliRunner
 
 from lgrasp.dataset import read_shard, validate_shard, write_shard

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from reference.hands import HANDS, LOCKED, hand_model, hand_source, minimal_spec
-from reference.kinematics import link_poses
+from support.hands import HANDS, LOCKED, hand_model, hand_source, minimal_spec
+from support.kinematics import link_poses
 
 from lgrasp.differentiable.kinematics import BodyKinematics
 from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand

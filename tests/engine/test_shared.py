@@ -4,7 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from reference.judge import judge
+from support.judge import judge
 
 from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import warp as wp
-from reference.directions import decode, normal_bin
-from reference.hands import hand_model, hand_source, minimal_spec
-from reference.kinematics import link_poses
+from support.directions import decode, normal_bin
+from support.hands import hand_model, hand_source, minimal_spec
+from support.kinematics import link_poses
 
 from lgrasp.errors import HandError
 from lgrasp.field.arrays import Field, field_has, field_pick, field_seed, query_field, upload_field

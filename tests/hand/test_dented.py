@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from reference.hands import hand_source, minimal_spec
-from reference.solids import ELL, YOU, prism
+from support.hands import hand_source, minimal_spec
+from support.solids import ELL, YOU, prism
 
 from lgrasp.errors import DecomposeError
 from lgrasp.field.kernels import sample_postures

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
-from reference.convex import hull_distance
-from reference.hands import HANDS, hand_model, hand_source, minimal_spec
+from support.convex import hull_distance
+from support.hands import HANDS, hand_model, hand_source, minimal_spec
 
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import finger_points

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import yourdfpy
-from reference.hands import minimal_spec
+from support.hands import minimal_spec
 
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import body_poses, upload_hand

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from reference.hands import REAL, ROOT, minimal_spec
+from support.hands import REAL, ROOT, minimal_spec
 
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import check_contact_links

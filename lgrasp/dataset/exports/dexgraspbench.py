@@ -14,8 +14,6 @@ from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import compose, inverse
 
-__all__ = ["DEXGRASPBENCH_NOTES", "read_dexgraspbench", "write_dexgraspbench"]
-
 _POSTURES = ("grasp_qpos", "pregrasp_qpos", "squeeze_qpos")
 
 DEXGRASPBENCH_NOTES = """\

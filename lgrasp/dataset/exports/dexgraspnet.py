@@ -14,8 +14,6 @@ from lgrasp.dataset.exports.records import GraspSet, make_set, order_of
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import euler_from_quaternion, quaternion_from_euler
 
-__all__ = ["DEXGRASPNET_NOTES", "read_dexgraspnet", "write_dexgraspnet"]
-
 _WRIST = ("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz")
 _POSTURES = ("qpos", "qpos_pregrasp", "qpos_squeeze")
 

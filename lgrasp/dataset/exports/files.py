@@ -9,8 +9,6 @@ from pathlib import Path
 from lgrasp.dataset.files import new_file
 from lgrasp.errors import OutputError
 
-__all__ = ["check_empty", "write_file", "write_small", "writing"]
-
 
 def check_empty(out: Path) -> None:
     """May an export be written into a folder? It need not exist.

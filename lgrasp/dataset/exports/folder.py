@@ -18,8 +18,6 @@ from lgrasp.dataset.exports.records import ReadObject
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 
-__all__ = ["GRASPS", "HAND", "OBJECTS", "ExportFolder", "object_text", "open_folder", "write_assets", "write_index"]
-
 HAND, OBJECTS, GRASPS = "hand", "objects", "grasps"
 """Folders of an export."""
 _INDEX = "export.json"

@@ -20,8 +20,6 @@ from lgrasp.dataset.exports.where import parse_condition
 from lgrasp.dataset.files import find_shards
 from lgrasp.errors import ConfigError
 
-__all__ = ["FORMATS", "Exported", "Format", "export_shards", "read_grasps"]
-
 
 class Format(NamedTuple):
     """A format of another program."""

@@ -14,8 +14,6 @@ from lgrasp.geometry.poses import compose, inverse, pose_from_matrix
 from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.urdf import parse_robot
 
-__all__ = ["HandFrames", "hand_files"]
-
 
 def hand_files(hand: HandRecord, where: Path) -> dict[str, bytes]:
     """Files that make the hand usable alone, by their path: ``hand.urdf`` and what it names under ``meshes/``.

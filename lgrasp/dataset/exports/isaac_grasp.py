@@ -16,8 +16,6 @@ from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 
-__all__ = ["ISAAC_GRASP_NOTES", "read_isaac_grasp", "write_isaac_grasp"]
-
 _POSTURES = ("cspace_position", "pregrasp_cspace_position", "squeeze_cspace_position")
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 

@@ -19,8 +19,6 @@ from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 from lgrasp.grasp.records import ObjectRecord
 
-__all__ = ["MJCF_NOTES", "Cut", "MjcfWriter", "read_mjcf"]
-
 Cut = Callable[[ObjectRecord], Sequence[np.ndarray]]
 """Convex pieces of an object, vertices [m] of each, shape [V, 3]."""
 

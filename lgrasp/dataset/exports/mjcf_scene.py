@@ -12,8 +12,6 @@ from lgrasp.errors import PhysicsError
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["Keyframe", "MjcfScene", "SceneObject"]
-
 _COMPILER = {"strippath": "false", "discardvisual": "true", "balanceinertia": "true", "fusestatic": "false"}
 _COMPILER |= {"meshdir": "../"}  # of the export, seen from the scenes
 _TIMESTEP = 0.004  # [s]

@@ -18,8 +18,6 @@ import numpy as np
 from lgrasp.dataset.exports.files import write_small, writing
 from lgrasp.errors import ShardError
 
-__all__ = ["load_objects", "save_object", "save_objects"]
-
 _PROTOCOL = 3  # names are plain text in it, and every Python 3 reads it
 _BATCH = 1024  # objects written at once
 

@@ -14,8 +14,6 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.schema import CHUNK_ROWS
 
-__all__ = ["HOLDS", "Batch", "ExportObject", "Plan", "make_plan"]
-
 HOLDS = "physics/fc_holds"
 """Column that says whether a simulator saw the grasp hold."""
 

@@ -6,8 +6,6 @@ from lgrasp.dataset.exports.folder import HAND, OBJECTS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.plan import Plan
 
-__all__ = ["readme"]
-
 _TEXT = """\
 {rows:,} grasps of the hand {hand}, exported by lgrasp from {shards}{chosen}.
 

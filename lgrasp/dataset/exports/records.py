@@ -10,8 +10,6 @@ from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import canonical
 from lgrasp.grasp.records import GraspRows
 
-__all__ = ["GraspSet", "ReadObject", "make_set", "order_of"]
-
 
 class ReadObject(NamedTuple):
     """An object that grasps of another format name."""

@@ -9,8 +9,6 @@ import numpy as np
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ConfigError, ShardError
 
-__all__ = ["OBJECTS_HELD", "Condition", "parse_condition"]
-
 OBJECTS_HELD = "objects"
 """The number of objects in the hand, as if it were a column."""
 

@@ -4,8 +4,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["BANDS", "TURNS", "Coverage"]
-
 BANDS, TURNS = 12, 24  # of the sphere: bands of equal height, sectors of equal angle
 _ROTATION = (6, 12, 12)  # cos(theta), phi, psi of Rz(phi) Ry(theta) Rz(psi)
 

@@ -16,8 +16,6 @@ from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.sample import EvenSample
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 
-__all__ = ["BLOCK_ROWS", "HandRows", "ObjectRows"]
-
 BLOCK_ROWS = 16_384
 _SAMPLE_ROWS = 50_000
 

@@ -10,8 +10,6 @@ from lgrasp.dataset.report.physics import Verdicts, add_verdicts
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.grasp.records import GraspRows
 
-__all__ = ["HeldRows", "add_held", "held_numbers"]
-
 (_PENETRATION,) = (q for q in QUANTITIES if q.name == "penetration")
 
 

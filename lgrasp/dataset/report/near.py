@@ -4,8 +4,6 @@ import numpy as np
 
 from lgrasp.grasp.duplicates import KeptRows, near_pairs
 
-__all__ = ["NearRows"]
-
 _MOST = 2_000_000  # rows held for comparison
 
 

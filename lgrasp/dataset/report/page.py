@@ -25,8 +25,6 @@ from lgrasp.dataset.report.tables import (
     validity_table,
 )
 
-__all__ = ["page"]
-
 
 def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows]) -> str:
     """The page.

@@ -3,8 +3,6 @@
 import html
 from collections.abc import Iterable, Sequence
 
-__all__ = ["escape", "figure", "number", "table", "tiles"]
-
 escape = html.escape
 
 

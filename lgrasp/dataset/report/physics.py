@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["DIRECTIONS", "Verdicts", "add_verdicts"]
-
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Of the six columns of ``P_directions``."""
 

@@ -11,16 +11,6 @@ import numpy as np
 from lgrasp.dataset.report.posture import Posture
 from lgrasp.dataset.report.quantity import Distribution
 
-__all__ = [
-    "MAPS",
-    "contact_chart",
-    "direction_maps",
-    "failure_chart",
-    "position_chart",
-    "posture_chart",
-    "quantity_chart",
-]
-
 MAPS = 12
 
 _INK = "#010203"  # replaced by currentColor

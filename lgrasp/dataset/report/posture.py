@@ -4,8 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["Posture", "principal_postures"]
-
 
 class Posture(NamedTuple):
     """How the joints vary together."""

@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["QUANTITIES", "Distribution", "Quantity"]
-
 _CELLS = 4096
 
 

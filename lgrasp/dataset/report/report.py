@@ -13,8 +13,6 @@ from lgrasp.dataset.report.summary import summary
 from lgrasp.dataset.report.survey import survey
 from lgrasp.errors import OutputError
 
-__all__ = ["read_dataset", "report_dataset"]
-
 _Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["EvenSample"]
-
 
 class EvenSample:
     """Every k-th row of a stream, however it is cut; k doubles whenever more than ``limit`` rows are held.

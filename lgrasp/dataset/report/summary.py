@@ -11,8 +11,6 @@ from lgrasp.dataset.report.survey import Head
 from lgrasp.engine.registry import STAGES
 from lgrasp.engine.report import survivors
 
-__all__ = ["summary"]
-
 
 def summary(heads: Sequence[Head], remarks: list[str], hands: Mapping[tuple[str, str], HandRows]) -> dict[str, Any]:
     """Everything that the page shows but the sampled dots."""

@@ -11,8 +11,6 @@ from lgrasp.dataset.heap import check_heaps
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.tree import shard_tree
 
-__all__ = ["Head", "survey"]
-
 
 class Head(NamedTuple):
     """What a shard says of itself."""

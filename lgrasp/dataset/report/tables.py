@@ -5,8 +5,6 @@ from typing import Any
 
 from lgrasp.dataset.report.parts import escape, number, table
 
-__all__ = ["diversity_table", "held_tables", "physics_table", "protocol_list", "run_tables", "validity_table"]
-
 _SHOWN = (  # metric, head, format
     ("penetration", "penetration [mm]", ".2f"),
     ("self_penetration", "self-pen. [mm]", ".2f"),

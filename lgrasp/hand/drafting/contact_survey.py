@@ -11,8 +11,6 @@ from lgrasp.hand.geometry import Piece
 from lgrasp.hand.model import HandModel, build_hand
 from lgrasp.hand.urdf import Urdf
 
-__all__ = ["Side", "Survey", "pad_axis", "static_depth", "survey_hand"]
-
 _POSTURES = 1200
 _LEAST_TIP = 5.0e-5  # [m^2] distal half of a fingertip
 _PALM_SPREAD = 45.0

@@ -18,8 +18,6 @@ from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 from lgrasp.math.kinematics import MAX_JOINTS
 
-__all__ = ["draft_spec"]
-
 _LEAST_EXTENT, _MOST_EXTENT = 0.02, 3.0  # [m] of a hand, an arm included
 _OPEN_DRAWS = 800
 _ARM_TRIALS = 5

@@ -9,8 +9,6 @@ from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Joint, Urdf
 
-__all__ = ["Anatomy", "finger_names", "held_value", "probe_spec", "study_anatomy", "tip_link"]
-
 _MOST_FINGERS = 6
 
 

@@ -20,8 +20,6 @@ from lgrasp.hand.spec import HandSpec, load_spec
 from lgrasp.hand.urdf import find_mesh, parse_robot, read_urdf
 from lgrasp.paths import user_dir
 
-__all__ = ["Adopted", "add_hand"]
-
 _DULL = {"hand", "robot", "model", "urdf", "gripper"}
 _LARGE = 5_000_000  # bytes of a mesh file that is worth looking into
 

@@ -10,8 +10,6 @@ from lgrasp.hand.drafting.finger_structure import Anatomy, study_anatomy
 from lgrasp.hand.drafting.surface_visibility import Postures
 from lgrasp.hand.urdf import read_urdf
 
-__all__ = ["find_jaws", "make_base"]
-
 
 def find_jaws(urdf_path: Path) -> tuple[str, str] | None:
     """Links of the two jaws of a hand whose every finger is moved by one drive; None for other hands.

@@ -11,8 +11,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.check import moving_joints
 from lgrasp.hand.spec import Surface
 
-__all__ = ["Beside", "Finger", "find_fingers", "finger_rows", "neighbours", "rounded_axis"]
-
 _PAD, _FLANK = 60.0, 45.0  # degrees around the axis
 _FLANK_BODIES = 3  # the last of a finger
 _BESIDE = 0.5  # cosine of a finger's lateral axis to the way to its neighbour, at least

@@ -9,8 +9,6 @@ from lgrasp.hand.model import hand_digest
 from lgrasp.hand.spec import HandSpec, load_spec
 from lgrasp.paths import cache_dir, package_files
 
-__all__ = ["PACKAGE_HANDS", "drafted_folder", "package_urdf"]
-
 _DRAFT_VERSION = 3
 
 PACKAGE_HANDS = {

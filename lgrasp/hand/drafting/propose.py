@@ -14,8 +14,6 @@ from lgrasp.hand.opposition.spaces import hand_spaces, side_surface
 from lgrasp.hand.spec import Box, Cone, HandSpec, OppositionSpace, Surface
 from lgrasp.hand.urdf import Urdf
 
-__all__ = ["propose_spaces"]
-
 _STRAIGHT = 0.9  # cosine of an axis of a palm link to the way across the palm, for the palm to be cut
 _ALIKE = 0.99  # cosine of these axes of several palm links
 _MARGIN = 0.005  # [m] of a part of the palm beyond its surface

@@ -7,8 +7,6 @@ import numpy as np
 
 from lgrasp.hand.drafting.surface_visibility import Postures
 
-__all__ = ["Hold", "Touch", "best_hold", "finger_touches", "still_touches"]
-
 _CELL = 0.010  # [m], more where fingers reach farther than hands do
 _MOST_CELLS = 400_000
 _RADII = (0.02, 0.025, 0.03)  # of the balls that are held [m]

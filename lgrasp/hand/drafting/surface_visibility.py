@@ -13,8 +13,6 @@ from lgrasp.hand.pairs import pieces_touch
 from lgrasp.hand.urdf import Urdf
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
-__all__ = ["Postures", "Skin", "link_skins", "sample_bodies", "see_skins"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _POINTS = 400

@@ -6,8 +6,6 @@ import yaml
 
 from lgrasp.hand.spec import Cone, HandSpec, OppositionSpace, Surface
 
-__all__ = ["space_lines", "write_spec"]
-
 
 def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
     """Write a hand.yaml with a comment on every key and what was decided on top."""

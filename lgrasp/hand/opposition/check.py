@@ -8,8 +8,6 @@ from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec, OppositionSpace
 from lgrasp.hand.tree import Tree
 
-__all__ = ["check_spaces", "moving_joints", "side_links", "space_problem"]
-
 
 def side_links(space: OppositionSpace) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Links of both sides."""

@@ -9,8 +9,6 @@ from lgrasp.hand.drafting.surface_visibility import Postures, sample_bodies
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space, SpaceSide
 
-__all__ = ["Opening", "opposed", "space_opening", "space_postures"]
-
 _CONE = np.cos(np.radians(35.0))  # of each hand normal to the line between the two, at least
 _PALM_CONE = np.cos(np.radians(16.0))  # of the palm's, which no finger can turn
 _WIDTHS = (0.002, 0.20)  # [m]

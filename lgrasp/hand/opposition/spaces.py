@@ -20,19 +20,6 @@ from lgrasp.hand.surface import ContactLink, contact_arrays, with_bare_links
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 
-__all__ = [
-    "Space",
-    "SpaceSide",
-    "available",
-    "consumed",
-    "free_joints",
-    "hand_spaces",
-    "longest",
-    "side_surface",
-    "space_sides",
-    "space_view",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Space:

@@ -20,8 +20,6 @@ from lgrasp.jobs.hand_check.diagnose import diagnose, hand_findings
 from lgrasp.jobs.hand_check.pictures import draw_grasps, draw_hand, draw_palmar, draw_spaces, draw_workspace
 from lgrasp.jobs.hand_check.space_check import SpaceCheck, check_spaces, longest_sequence
 
-__all__ = ["HandCheck", "ObjectCheck", "check_hand", "check_objects"]
-
 _EFFORT = 300  # candidates per row before an object is given up
 
 

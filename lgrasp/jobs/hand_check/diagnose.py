@@ -11,8 +11,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.math.transforms import NORMAL_BINS
 
-__all__ = ["diagnose", "field_vectors", "finger_label", "hand_findings"]
-
 _SHOWN = 20_000  # contact vectors of a finger that are looked at
 _NEAR = 0.015  # [m]
 _FACING = 0.95  # cosine

@@ -19,8 +19,6 @@ from lgrasp.jobs.hand_check.plotting import add_box, add_triangles, frame_points
 from lgrasp.refine.surface import DISTAL, OTHER, last_bodies
 from lgrasp.refine.visible_surface import seen_palmar
 
-__all__ = ["draw_grasps", "draw_hand", "draw_palmar", "draw_spaces", "draw_workspace"]
-
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#e377c2", "#17becf")
 _PALM = "#e8a400"
 _LINK = "#c4c8cc"

@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["add_box", "add_triangles", "frame_points", "new_figure", "save_figure", "shade"]
-
 _LIGHT = np.array([0.35, 0.25, 0.9]) / np.linalg.norm([0.35, 0.25, 0.9])
 
 

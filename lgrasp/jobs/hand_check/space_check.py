@@ -11,8 +11,6 @@ from lgrasp.hand.opposition.spaces import hand_spaces, longest, space_sides
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hand_check.diagnose import finger_label
 
-__all__ = ["SpaceCheck", "check_spaces", "longest_sequence"]
-
 
 @dataclass(frozen=True)
 class SpaceCheck:

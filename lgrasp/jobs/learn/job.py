@@ -28,8 +28,6 @@ from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import Trainer
 from lgrasp.runtime.device import resolve_device
 
-__all__ = ["OUTER", "Fit", "evaluate", "fit", "load_predictor"]
-
 OUTER = (3, 6, 10, 13)
 """Outer steps of the refiner that the published table has."""
 

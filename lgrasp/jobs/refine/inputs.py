@@ -6,8 +6,6 @@ from lgrasp.hand.find import HandSource, find_hand
 from lgrasp.hand.model import HAND_VERSION, HandModel, hand_digest
 from lgrasp.runtime.device import Device
 
-__all__ = ["named_hand"]
-
 
 def named_hand(cache: Cache, name: str, device: Device) -> tuple[HandSource, HandModel]:
     """A hand by name, folder or URDF, from the cache if it was there before.

@@ -18,8 +18,6 @@ from lgrasp.refine.energy import Energies
 from lgrasp.refine.refiner import Pose, Refiner, object_pose
 from lgrasp.stages.refine.params import RefineParams
 
-__all__ = ["Moved", "move_rows"]
-
 _ROWS = 256  # at a time
 _FAR = 0.5  # [m] from the object: nothing pulls there
 _BETTER = 1e-3  # of a unit pull that must be resisted more to replace a valid row

@@ -26,9 +26,6 @@ from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.visible_surface import seen_palmar
 from lgrasp.runtime.device import resolve_device
 
-__all__ = ["PlanJob", "PlanOutcome", "plan_grasps"]
-
-
 _REACH = 0.3  # [m] what is farther from the target than this is no hand's business
 _LEAST_AROUND = 50
 _FARTHEST = 1.0  # [m] of a base from a start

@@ -10,8 +10,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.jobs.generate import METRIC_UNITS
 from lgrasp.object.model import ObjectModel
 
-__all__ = ["shard_rows"]
-
 _LEAST = 1e-3  # of the normal forces together, which are 1
 
 

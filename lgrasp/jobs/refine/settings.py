@@ -4,8 +4,6 @@ from lgrasp.config import parse_model
 from lgrasp.refine.params import LocalSearch
 from lgrasp.stages.refine.params import RefineParams
 
-__all__ = ["COARSE", "refine_params"]
-
 COARSE = LocalSearch(outer=13, shift=0.0015, turn=0.015, bend=0.02, reach=0.05, reach_end=0.03)
 """For poses as a network predicts them: off by centimetres."""
 

@@ -23,8 +23,6 @@ from lgrasp.jobs.refine.sources import grasp_shards, object_of_record
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.stages.refine.params import RefineParams
 
-__all__ = ["RefinedShard", "Refinement", "refine_shards"]
-
 
 @dataclass(frozen=True)
 class Refinement:

@@ -20,8 +20,6 @@ from lgrasp.jobs.records import hand_record, mesh_blobs
 from lgrasp.object.load import load_mesh
 from lgrasp.object.model import ObjectModel, preprocess_object
 
-__all__ = ["grasp_shards", "object_of_record"]
-
 
 def object_of_record(cache: Cache, record: ObjectRecord, device: str) -> ObjectModel:
     """The object of a shard, preprocessed, in its user frame; a mesh from the cache if it was there before.

@@ -10,8 +10,6 @@ from lgrasp.errors import ConfigError
 from lgrasp.paths import data_dirs
 from lgrasp.scenes.params import SceneParams
 
-__all__ = ["SceneConfig", "load_scene_config", "scene_configs"]
-
 
 class SceneConfig(BaseModel):
     """Scenes of one hand. Paths are relative to the current folder."""

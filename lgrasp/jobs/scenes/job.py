@@ -23,8 +23,6 @@ from lgrasp.scenes.reader import SceneReader, check_scene
 from lgrasp.scenes.writer import write_scene
 from lgrasp.simulate.model import import_mujoco
 
-__all__ = ["SceneJob", "SceneListener", "SceneOutcome", "make_scenes", "scene_numbers"]
-
 
 @dataclass(frozen=True)
 class SceneJob:

@@ -9,8 +9,6 @@ import numpy as np
 from lgrasp.jobs.scenes.job import SceneOutcome
 from lgrasp.scenes.reader import SceneReader
 
-__all__ = ["describe_scenes", "report"]
-
 _COUNTS = ("grasps_tested", "grasps_free", "grasps_into_table", "grasps_into_objects")
 
 

@@ -18,8 +18,6 @@ from lgrasp.object.model import ObjectModel, preprocess_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device
 
-__all__ = ["Part", "check_hand", "object_model", "read_parts", "record_hash"]
-
 _COLUMNS = ("q", "q_pregrasp", "q_squeeze", "candidate")
 
 

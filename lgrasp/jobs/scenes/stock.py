@@ -28,8 +28,6 @@ from lgrasp.runtime.device import Device
 from lgrasp.scenes.make import Item
 from lgrasp.simulate.scene import object_of_record
 
-__all__ = ["Stock", "load_stock"]
-
 
 @dataclass(frozen=True)
 class Stock:

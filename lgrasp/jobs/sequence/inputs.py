@@ -28,8 +28,6 @@ from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device
 from lgrasp.simulate.scene import Scene
 
-__all__ = ["SequenceInputs", "SequenceKeys", "SpaceView", "load_sequence_inputs", "sequence_keys"]
-
 Report = Callable[[str, float], None]
 
 

@@ -29,15 +29,6 @@ from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.simulate import find_protocol, protocol_text, verdicts
 from lgrasp.simulate.model import import_mujoco
 
-__all__ = [
-    "SequenceJob",
-    "SequenceOutcome",
-    "generate_sequences",
-    "sequence_name",
-    "sequence_shards",
-    "simulated",
-]
-
 
 @dataclass(frozen=True)
 class SequenceJob:

@@ -10,8 +10,6 @@ from lgrasp.jobs.generate import METRIC_UNITS
 from lgrasp.jobs.records import object_record
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 
-__all__ = ["object_records", "sequence_rows"]
-
 _ROUND_BITS, _SHARD_BITS = np.uint64(24), np.uint64(40)
 
 

@@ -11,8 +11,6 @@ from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.jobs.sequence.job import SequenceJob, SequenceOutcome, sequence_shards
 from lgrasp.jobs.sequence.shard import add_spaces
 
-__all__ = ["report", "unheld"]
-
 
 def report(job: SequenceJob, outcome: SequenceOutcome) -> dict[str, Any]:
     """The report of a job, JSON-serialisable.

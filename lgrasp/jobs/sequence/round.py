@@ -22,8 +22,6 @@ from lgrasp.sequence.stage import go_on
 from lgrasp.sequence.stage import run as grow
 from lgrasp.stages.context import Context
 
-__all__ = ["Round", "Verdicts", "run_round"]
-
 _CPU_CHUNK = 1024  # candidates of a thread at a time
 _CHOICE = 4  # grasps among which policy lookahead chooses, for each that goes on
 

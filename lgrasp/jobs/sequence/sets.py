@@ -11,8 +11,6 @@ from lgrasp.errors import ConfigError
 from lgrasp.jobs.sequence.size import Size, parse_size
 from lgrasp.seeding import stage_seed
 
-__all__ = ["SequenceSets", "object_sequences"]
-
 
 class SequenceSets(BaseModel):
     """How sequences are drawn from the objects of a config."""

@@ -14,8 +14,6 @@ from lgrasp.grasp.tables import user_poses
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.jobs.sequence.round import Round, Verdicts, run_round
 
-__all__ = ["SequenceResult", "add_spaces", "make_sequences", "most_rounds"]
-
 _EMPTY_ROUNDS = 4  # without any row of some length, before nothing more is expected
 
 

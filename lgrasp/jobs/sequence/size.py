@@ -13,8 +13,6 @@ from lgrasp.object.load import load_mesh
 from lgrasp.object.params import ObjectParams
 from lgrasp.seeding import stage_seed
 
-__all__ = ["Size", "object_scales", "parse_size"]
-
 
 class Size(NamedTuple):
     """A factor on all meshes (``high`` 0), or the bounds of the longest side of each object [m]."""

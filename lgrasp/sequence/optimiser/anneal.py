@@ -10,8 +10,6 @@ from lgrasp.sequence.optimiser.culling import Culling
 from lgrasp.sequence.optimiser.params import OptimiserParams
 from lgrasp.sequence.optimiser.replay import replayed
 
-__all__ = ["Annealing", "Chain", "Proposals", "accepted", "run_chain", "step_lengths", "temperatures"]
-
 _DRAWS = 5  # uniform numbers of a row and step: acceptance, two switches, two contact points
 
 

@@ -7,8 +7,6 @@ import torch
 from lgrasp.geometry.rotations import matrix_from_sixd
 from lgrasp.sequence.optimiser.problem import GraspProblem
 
-__all__ = ["touching_points"]
-
 _GAP = 0.002
 _BEND = 1 - math.cos(math.radians(20))
 _FC = 0.1

@@ -4,8 +4,6 @@ from typing import NamedTuple
 
 import torch
 
-__all__ = ["Culling", "Kept"]
-
 _SLACK = 1.5
 """Room that is made beyond what was needed, when there was too little."""
 

@@ -14,8 +14,6 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.object.sdf import SdfGrid
 from lgrasp.sequence.optimiser.penetration import PenetrationSums
 
-__all__ = ["TERMS", "GraspEnergy", "HandContacts"]
-
 TERMS = ("fc", "dis", "hop", "hsp", "joint", "oop")
 """Names of the energies, in order."""
 

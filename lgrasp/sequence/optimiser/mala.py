@@ -7,8 +7,6 @@ import torch
 from lgrasp.runtime.streams import normals
 from lgrasp.sequence.optimiser.anneal import Chain
 
-__all__ = ["Langevin"]
-
 _NOISE = 1 << 31
 """Added to steps: streams of noise beside those of :func:`run_chain`."""
 

@@ -25,8 +25,6 @@ from lgrasp.sequence.optimiser.params import OptimiserParams
 from lgrasp.sequence.optimiser.problem import GraspProblem, Sides
 from lgrasp.sequence.optimiser.start import start_poses
 
-__all__ = ["Optimised", "optimise"]
-
 _CPU_ROWS, _GPU_ROWS = 256, 512  # worked on at once; fewer leave a GPU half idle
 
 

@@ -2,8 +2,6 @@
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["OptimiserParams"]
-
 
 class OptimiserParams(BaseModel):
     """Minimisation of the grasp energy from random starts; lengths in metres. Defaults are published ones."""

@@ -10,8 +10,6 @@ from lgrasp.differentiable.distance import DistanceGrids
 from lgrasp.differentiable.solids import RUN, PointSolid
 from lgrasp.sequence.optimiser.culling import Culling, Kept
 
-__all__ = ["PenetrationSums"]
-
 _QUANTUM = 2.0**-48
 """Sums are made in integers of this unit: exact in any order, so no result depends on batch, threads or atomics. Their
 range is 32,768: metres, or points that pull."""

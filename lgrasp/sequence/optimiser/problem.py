@@ -10,8 +10,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space
 from lgrasp.sequence.optimiser.energy import GraspEnergy, HandContacts
 
-__all__ = ["GraspProblem", "Sides"]
-
 
 class Sides:
     """Contact points of the two sides of each of S opposition spaces.

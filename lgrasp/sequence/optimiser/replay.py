@@ -6,8 +6,6 @@ import torch
 
 from lgrasp.sequence.optimiser.culling import Culling
 
-__all__ = ["replayed"]
-
 _STRETCH = 100  # steps after which it is asked whether there was room for all entries
 _WARM_UP = 3
 

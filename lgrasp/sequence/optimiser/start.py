@@ -10,8 +10,6 @@ from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.model import HandModel
 from lgrasp.object.model import ObjectModel
 
-__all__ = ["start_poses"]
-
 
 def start_poses(
     hand: HandModel, objects: Sequence[ObjectModel], held: tuple[torch.Tensor, torch.Tensor], u: torch.Tensor

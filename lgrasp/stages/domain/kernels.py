@@ -9,8 +9,6 @@ from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["draw_domains", "draw_domains_bvh", "drop_poor", "keep_frozen"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _NEAR = wp.constant(16.0)  # contact points before and after one that count as near it

@@ -2,8 +2,6 @@
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["DomainParams"]
-
 
 class DomainParams(BaseModel):
     """How contact domains are drawn."""

@@ -11,8 +11,6 @@ from lgrasp.stages.context import Context
 from lgrasp.stages.domain.kernels import draw_domains, draw_domains_bvh, drop_poor, keep_frozen
 from lgrasp.stages.domain.params import DomainParams
 
-__all__ = ["VERSION", "run"]
-
 VERSION = 2
 
 

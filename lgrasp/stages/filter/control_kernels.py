@@ -11,8 +11,6 @@ from lgrasp.math.kinematics import MAX_BODIES, group_forward, vec_dof
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["control_poses", "open_poses"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _SHARES = wp.constant(5)  # of the way open that are tried

@@ -8,8 +8,6 @@ from lgrasp.hand.arrays import Hand
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["deepen", "deepen_held"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 

@@ -1,7 +1,5 @@
 """Outcomes of a contact set and the numbers kept of a grasp."""
 
-__all__ = ["METRICS", "REASONS"]
-
 REASONS = ("kept", "unused finger", "self-collision", "object collision", "contact", "balance", "disturbance")
 """Outcome codes of a set."""
 

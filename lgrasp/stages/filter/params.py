@@ -2,8 +2,6 @@
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["FilterParams"]
-
 
 class FilterParams(BaseModel):
     """Exact checks of every emitted grasp; bounds are tighter than those of strict validity. Lengths in metres."""

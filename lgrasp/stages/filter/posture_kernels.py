@@ -12,8 +12,6 @@ from lgrasp.math.triangles import least_facing
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["fill_unused", "place_used"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _DOUBT = wp.constant(3.0e-5)  # [m]

@@ -9,17 +9,6 @@ from lgrasp.math.quality import epsilon_bound
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = [
-    "balance_grasps",
-    "center_forces",
-    "count_outcomes",
-    "grasp_epsilon",
-    "list_kept",
-    "pack_rows",
-    "resist_loads",
-    "self_overlap",
-]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _NARROWER = wp.constant(2)  # cones tried before the full one

@@ -27,8 +27,6 @@ from lgrasp.stages.filter.quality_kernels import (
     self_overlap,
 )
 
-__all__ = ["VERSION", "run"]
-
 VERSION = 6
 
 

@@ -12,8 +12,6 @@ from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["avoid_held", "flag_realised", "mark_chosen", "realise_contacts", "take_realised"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 mat_dof = wp.types.matrix((MAX_DOFS, MAX_DOFS), wp.float32)

@@ -2,8 +2,6 @@
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["IkParams"]
-
 
 class IkParams(BaseModel):
     """Two-point damped least squares on the contact; lengths in metres."""

@@ -11,8 +11,6 @@ from lgrasp.stages.context import Context
 from lgrasp.stages.ik.kernels import avoid_held, flag_realised, mark_chosen, realise_contacts, take_realised
 from lgrasp.stages.ik.params import IkParams
 
-__all__ = ["VERSION", "run"]
-
 VERSION = 2
 
 

@@ -11,8 +11,6 @@ from lgrasp.math.transforms import random_rotation, rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["choose_poses", "propose_poses", "take_poses"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _HITS = wp.constant(6)  # rated contacts per group

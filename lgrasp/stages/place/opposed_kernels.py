@@ -11,8 +11,6 @@ from lgrasp.math.transforms import rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-__all__ = ["propose_opposed"]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 _DRAWS = wp.constant(16)  # of two opposite object points and a contact vector of the first side

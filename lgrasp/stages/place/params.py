@@ -2,8 +2,6 @@
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["PlaceParams"]
-
 
 class PlaceParams(BaseModel):
     """Where objects are put; weights need not sum to 1."""

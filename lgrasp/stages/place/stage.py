@@ -11,8 +11,6 @@ from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
 from lgrasp.stages.place.opposed_kernels import propose_opposed
 from lgrasp.stages.place.params import PlaceParams
 
-__all__ = ["VERSION", "run"]
-
 VERSION = 5
 
 

@@ -4,8 +4,6 @@ from pydantic import Field
 
 from lgrasp.refine.params import GraspBounds, LocalSearch
 
-__all__ = ["RefineParams"]
-
 
 class RefineParams(LocalSearch, GraspBounds):
     """How finished grasps are moved, in small steps and drawn to balance, and the bounds of filter for moved ones."""

@@ -14,8 +14,6 @@ from lgrasp.refine.volume import upload_target
 from lgrasp.stages.context import Context
 from lgrasp.stages.refine.params import RefineParams
 
-__all__ = ["VERSION", "run"]
-
 VERSION = 2
 
 _making = threading.Lock()

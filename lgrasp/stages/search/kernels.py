@@ -12,17 +12,6 @@ from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.search.params import MAX_KINDS
 
-__all__ = [
-    "MAX_KEEP",
-    "check_starts",
-    "keep_sets",
-    "list_hits",
-    "list_usable",
-    "take_sets",
-    "try_starts",
-    "vec_kinds",
-]
-
 wp.set_module_options(KERNEL_OPTIONS)
 
 MAX_KEEP = 64

@@ -4,8 +4,6 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["MAX_KINDS", "SearchParams"]
-
 MAX_KINDS = 16
 """Most entries of ``contacts``."""
 

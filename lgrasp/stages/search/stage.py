@@ -20,8 +20,6 @@ from lgrasp.stages.search.kernels import (
 )
 from lgrasp.stages.search.params import MAX_KINDS, SearchParams
 
-__all__ = ["VERSION", "run"]
-
 VERSION = 7
 
 _CPU_LANES = 2

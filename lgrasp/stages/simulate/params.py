@@ -4,8 +4,6 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from lgrasp.simulate.protocol import PROTOCOLS
 
-__all__ = ["ValidateParams"]
-
 
 class ValidateParams(BaseModel):
     """Which physics protocol a grasp must pass."""

@@ -12,8 +12,6 @@ from lgrasp.simulate import find_protocol, verdicts
 from lgrasp.stages.context import Context
 from lgrasp.stages.simulate.params import ValidateParams
 
-__all__ = ["VERSION", "run"]
-
 VERSION = 1
 """Raised also whenever a named protocol's numbers or the simulated scene change."""
 

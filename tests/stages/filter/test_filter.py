@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from reference.wrench import residual
 from scipy.spatial.transform import Rotation
+from support.wrench import residual
 
 from lgrasp.grasp.tables import set_arrays, set_table
 from lgrasp.stages.filter.stage import REASONS, run

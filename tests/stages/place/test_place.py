@@ -31,7 +31,7 @@ def test_counts_and_order(context):
 
 def test_palm_is_free(context, tables, solids, mesh, pose_matrices, inputs):
     """Dense points of the palm in the object and of the object in the palm's solids."""
-    from reference.judge import Object, hand_object_penetration
+    from support.judge import Object, hand_object_penetration
 
     tree = inputs.hand.model.tree
     static = copy(solids)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from reference.wrench import cone_forces, residual, wrenches
 from scipy.optimize import nnls
+from support.wrench import cone_forces, residual, wrenches
 
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import set_arrays
@@ -89,7 +89,7 @@ def test_sets_of_a_pose_are_apart(found, inputs):
 
 
 def test_fingers_do_not_meet(found, inputs, solids, link_poses, finger_posture):
-    from reference.judge import SolidPoses
+    from support.judge import SolidPoses
 
     arrays, _, _ = found
     tree = inputs.hand.model.tree

@@ -1,0 +1,190 @@
+"""Benchmarks: what is handed from run to run, the arithmetic of the published table, and its picture."""
+
+import json
+from pathlib import Path
+from statistics import median
+
+import pytest
+
+from lgrasp.bench import rate as bench_module
+from lgrasp.bench.charts import check_plot, draw_table
+from lgrasp.bench.rate import Bench
+from lgrasp.bench.table1 import measure_table, new_table, read_table, trimmed_mean, with_ratios, without_missing
+from lgrasp.errors import ConfigError, OutputError
+from lgrasp.jobs.config import JobConfig, Published, in_folder, load_config, plan_jobs
+from lgrasp.jobs.generate import generate
+
+QUICK = str(Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml")
+
+OBJECTS = ("capsule", "mug", "box")
+PUBLISHED = Published(
+    source="a paper", device="a GPU", per_s={"allegro": {"capsule": 100.0, "mug": 400.0, "box": 10.0}}
+)
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """The jobs that a benchmark runs, with what came out."""
+    seen = []
+
+    def watched(job):
+        outcome = generate(job)
+        seen.append((job, outcome))
+        return outcome
+
+    monkeypatch.setattr(bench_module, "generate", watched)
+    return seen
+
+
+def test_yield_goes_from_run_to_run(job, runs):
+    with Bench() as several:
+        results = several.measure([job(object="tiny", rows=40), job(object="tiny", rows=20)], repeat=2)
+    trials = [(trial.rows, trial.rate) for trial, _ in runs]
+    after = [outcome.rate for _, outcome in runs]
+    # two probes, then the jobs in turns; each begins with what the run before of the same job measured
+    assert trials[:2] == [(4, 1.0), (2, 1.0)]
+    assert trials[2:] == [(40, after[0]), (20, after[1]), (40, after[2]), (20, after[3])]
+    assert all(0 < rate < 100 for rate in after)
+    assert [r["grasps"] for r in results] == [40, 20]
+    assert all(not trial.out.exists() for trial, _ in runs)
+
+
+def test_inputs_are_made_once(job, runs):
+    with Bench() as several:
+        first = several.measure([job(object="tiny", rows=10)], 1)
+        second = several.measure([job(object="tiny", rows=10)], 1)
+    assert [all(outcome.inputs.hits.values()) for _, outcome in runs] == [False, True, True, True]
+    assert first[0]["build_seconds"] == second[0]["build_seconds"]
+    assert first[0]["load_seconds"]["field"] < first[0]["build_seconds"]["field"]
+
+
+@pytest.mark.parametrize(
+    ("values", "mean"), [([3.0], 3.0), ([1.0, 3.0], 2.0), ([9.0, 2.0, 1.0], 2.0), ([1.0, 2.0, 4.0, 100.0], 3.0)]
+)
+def test_trimmed_mean(values, mean):
+    assert trimmed_mean(values) == mean
+
+
+def test_published_figures():
+    config = load_config("table1")
+    assert config.published is not None
+    assert tuple(config.published.per_s) == config.hands
+    assert all(tuple(figures) == config.objects for figures in config.published.per_s.values())
+    # what the paper prints below its columns
+    means = {hand: round(trimmed_mean(list(row.values()))) for hand, row in config.published.per_s.items()}
+    assert means == {"allegro": 1150, "leap": 420, "shadow": 559, "dclaw": 249}  # printed for allegro: 1091
+
+
+def config(**changes):
+    given = {"objects": OBJECTS, "pipelines": ("swift", "lightning"), "rows": 100, "device": "cpu"}
+    return JobConfig(**given | {"published": PUBLISHED} | changes)
+
+
+def spread(*rates):
+    return {"median": median(rates), "min": min(rates), "max": max(rates)}
+
+
+def cell(mesh, swift, lightning, hand="allegro", error=""):
+    one = {"swift": swift, "lightning": lightning}
+    runs = {} if error else {name: {"strict_valid_per_s": spread(*rates)} for name, rates in one.items()}
+    return {"hand": hand, "object": mesh, "error": error, "pipelines": runs}
+
+
+@pytest.fixture
+def table():
+    """Three measured cells, in the wrong order."""
+    cells = [cell("box", [10, 20, 90], [0]), cell("capsule", [300], [100]), cell("mug", [200], [50])]
+    return with_ratios(new_table(config(), repeat=3, baseline_rows=10) | {"cells": cells})
+
+
+def test_ratios(table):
+    capsule, mug, box = table["cells"]
+    assert [c["object"] for c in table["cells"]] == list(OBJECTS)
+    assert capsule["ratio"] == {"lightning": 3.0}
+    assert capsule["published_ratio"] == {"swift": 3.0, "lightning": 1.0}
+    assert mug["published_ratio"]["swift"] == 0.5
+    assert box["ratio"] == {"lightning": None}  # nothing came out
+    (mean,) = table["means"]
+    assert mean["strict_valid_per_s"] == {"swift": 200.0, "lightning": 50.0}
+    assert mean["ratio"] == {"lightning": 4.0}
+    assert mean["published_per_s"] == 100.0
+    assert mean["published_ratio"]["swift"] == 2.0
+    assert table["complete"]
+
+
+def test_ratios_without_published_figures(table):
+    bare = with_ratios(table | {"published": None})
+    assert {c["published_per_s"] for c in bare["cells"]} == {None}
+    assert bare["means"][0]["published_ratio"] == {"swift": None, "lightning": None}
+    some = table["published"] | {"per_s": {"allegro": {"mug": 400.0}}}
+    part = with_ratios(table | {"published": some})
+    assert [c["published_ratio"]["swift"] for c in part["cells"]] == [None, 0.5, None]
+    assert part["means"][0]["published_per_s"] is None  # of other cells it would compare nothing
+
+
+def test_plot(table, tmp_path):
+    for name, drawn in (("whole", table), ("bare", with_ratios(table | {"published": None}))):
+        path = tmp_path / f"{name}.png"
+        check_plot(path)
+        draw_table(drawn, path)
+        assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    lost = with_ratios(table | {"cells": [cell("box", [], [], error="no such mesh")]})
+    draw_table(lost, tmp_path / "lost.png")
+    assert (tmp_path / "lost.png").stat().st_size > 0
+    with pytest.raises(OutputError, match=r"\.png"):
+        check_plot(tmp_path / "table.pdf")
+
+
+def test_resume_keeps_measured_cells(table, tmp_path):
+    path = tmp_path / "table.json"
+    wanted = new_table(config(), repeat=3, baseline_rows=10)
+    assert read_table(path, wanted) == wanted
+    lost = cell("mug", [], [], error="it was away")
+    path.write_text(json.dumps(with_ratios(table | {"cells": [table["cells"][0], lost]})))
+    kept = read_table(path, wanted)
+    assert kept["cells"] == table["cells"][:1]
+    assert not kept["complete"]
+    with pytest.raises(ConfigError, match="measured with rows 100, not 200"):
+        read_table(path, new_table(config(rows=200), repeat=3, baseline_rows=10))
+    with pytest.raises(ConfigError, match="measured with objects"):
+        read_table(path, new_table(config(objects=("mug",)), repeat=3, baseline_rows=10))
+    path.write_text("[]")
+    with pytest.raises(ConfigError, match="no table"):
+        read_table(path, wanted)
+
+
+def test_measured_cells_are_left_alone(table, job):
+    assert list(measure_table(Bench(), table, config(), job().cache)) == []
+
+
+def test_cells_that_cannot_be_measured(job):
+    chosen = config(objects=("absent", "tiny"), pipelines=(QUICK,), rows=10)
+    with Bench() as several:
+        parts = list(measure_table(several, new_table(chosen, repeat=1, baseline_rows=1), chosen, job().cache))
+    assert [len(table["cells"]) for table, _ in parts] == [1, 2]
+    absent, tiny = parts[-1][0]["cells"]
+    assert "absent" in absent["error"]
+    assert not absent["pipelines"]
+    assert not tiny["error"]
+    assert tiny["pipelines"]["quick"]["grasps"] == 10
+    assert parts[-1][0]["means"][0]["cells"] == 1
+
+
+def test_names_must_differ():
+    with pytest.raises(ConfigError, match="'mug' is named twice"):
+        new_table(config(objects=("mug", "other/mug.obj")), repeat=1, baseline_rows=1)
+
+
+def test_folders_come_first(tmp_path, job):
+    (tmp_path / "allegro").mkdir()
+    (tmp_path / "allegro" / "allegro.urdf").touch()
+    (tmp_path / "mug.stl").touch()
+    chosen = config(hands=("allegro", "leap"), hand_dir=tmp_path, object_dir=tmp_path, pipelines=("swift",))
+    jobs = plan_jobs(chosen, job().cache)
+    assert {j.hand for j in jobs} == {str(tmp_path / "allegro" / "allegro.urdf"), "leap"}
+    assert {j.object for j in jobs} == {"capsule", str(tmp_path / "mug.stl"), "box"}
+    assert in_folder(None, "mug") == "mug"
+    kept, missing = without_missing(config(objects=("mug", "plier")))
+    assert (kept.objects, missing) == (("mug",), ["plier"])
+    with pytest.raises(ConfigError, match="hand_dir"):
+        plan_jobs(config(hand_dir=tmp_path / "none"), job().cache)

@@ -1,0 +1,69 @@
+"""Convex decomposition in a process of its own: what comes back, what is kept, what happens when it fails."""
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+from support.solids import ELL, YOU, prism
+
+from lgrasp.engine.cache import Cache
+from lgrasp.errors import DecomposeError
+from lgrasp.geometry import decompose as module
+from lgrasp.geometry.decompose import decompose
+
+
+@pytest.fixture(autouse=True)
+def nothing_made(monkeypatch):
+    monkeypatch.setattr(module, "_made", {})
+
+
+def depth(pieces: list[np.ndarray], p: np.ndarray) -> np.ndarray:
+    """How far points (n, 3) are outside of all pieces [m]; negative inside one."""
+    hulls = [ConvexHull(v).equations for v in pieces]
+    return np.min([(p @ e[:, :3].T + e[:, 3]).max(1) for e in hulls], 0)
+
+
+@pytest.mark.parametrize(("outline", "notch"), [(ELL, [0.01, 0.025, 0.025]), (YOU, [0.01, 0.0, 0.013])])
+def test_notch_stays_empty_and_the_surface_covered(outline, notch):
+    mesh = prism(outline)
+    pieces = decompose(mesh.vertices, mesh.faces)
+    assert 2 <= len(pieces) <= 4
+    assert depth(pieces, np.array([notch]))[0] > 0.004
+    surface = np.vstack([mesh.vertices, mesh.sample(2000, seed=0)])
+    assert depth(pieces, surface).max() < 1e-4
+    assert sum(ConvexHull(v).volume for v in pieces) < 1.05 * mesh.volume
+
+
+def test_open_mesh_is_closed_first():
+    mesh = prism(ELL)
+    pieces = decompose(mesh.vertices, mesh.faces[1:])
+    assert len(pieces) >= 2
+    assert depth(pieces, np.array([[0.01, 0.025, 0.025]]))[0] > 0.004
+
+
+def test_time_out_and_crash_are_errors_of_ours():
+    mesh = prism(ELL)
+    with pytest.raises(DecomposeError, match=r"longer than 0\.01 s"):
+        decompose(mesh.vertices, mesh.faces, timeout=0.01)
+    with pytest.raises(DecomposeError, match="failed"):
+        decompose(mesh.vertices, mesh.faces + 10_000_000, threshold=0.005)
+
+
+def test_results_are_kept(tmp_path, monkeypatch):
+    mesh, cache, runs = prism(ELL), Cache(tmp_path), []
+    run = module._run
+    monkeypatch.setattr(module, "_run", lambda *a: runs.append(a) or run(*a))
+    first = decompose(mesh.vertices, mesh.faces, store=cache)
+    decompose(mesh.vertices, mesh.faces, store=cache)  # in this process
+    monkeypatch.setattr(module, "_made", {})
+    again = decompose(mesh.vertices, mesh.faces, store=cache)  # in another one
+    assert len(runs) == 1
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    # other content or parameters are another entry; the same ones give the same pieces
+    monkeypatch.setattr(module, "_run", lambda *a: {"vertices": mesh.vertices, "first": np.array([0, 12])})
+    assert len(decompose(mesh.vertices, mesh.faces, max_pieces=1, store=cache)) == 1
+    assert len(decompose(mesh.vertices * 2, mesh.faces, store=cache)) == 1
+    monkeypatch.setattr(module, "_made", {})
+    monkeypatch.setattr(module, "_run", run)
+    for a, b in zip(first, decompose(mesh.vertices, mesh.faces), strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -1,0 +1,200 @@
+"""Rules drafted from a URDF alone: grippers, coupled jaws, other base frames, left hands, and what is refused."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import trimesh
+from support.hands import ROOT
+from support.urdfs import fingers, gripper, turned
+
+from lgrasp.errors import HandError
+from lgrasp.hand.drafting.draft import draft_spec
+from lgrasp.hand.drafting.finger_structure import held_value
+from lgrasp.hand.drafting.import_urdf import add_hand
+from lgrasp.hand.drafting.surface_visibility import sample_bodies
+from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.spec import load_spec
+from lgrasp.hand.tree import build_tree
+from lgrasp.hand.urdf import Joint, read_urdf
+
+ALLEGRO = ROOT / "hands" / "allegro" / "hand.urdf"
+TIPS = {"link_3.0_tip", "link_7.0_tip", "link_11.0_tip", "link_15.0_tip"}
+
+
+def contact_links(spec) -> set[str]:
+    return {link for rule in spec.contact for link in rule.links}
+
+
+def placed_normals(model: HandModel, q: np.ndarray, group: int) -> np.ndarray:
+    """Contact normals of a group in the base frame at one posture."""
+    rows = slice(model.contact_first[group], model.contact_first[group + 1])
+    R = sample_bodies(model, q[None]).R[0][model.contact_body[rows]]
+    return np.einsum("nij,nj->ni", R, model.contact_normals[rows])
+
+
+@pytest.fixture(scope="module")
+def allegro():
+    return draft_spec(ALLEGRO, "drafted")
+
+
+def test_known_hand_is_drafted_like_its_author_did(allegro):
+    spec, said = allegro
+    author = load_spec(ALLEGRO.parent / "hand.yaml")
+    assert contact_links(spec) >= TIPS
+    assert spec.palm.links == author.palm.links
+    assert np.allclose(spec.palm.allowed[0].axis, author.palm.allowed[0].axis)
+    low, high = (np.array(getattr(author.canonical_box, k)) for k in ("min", "max"))
+    centre = (np.array(spec.canonical_box.min) + spec.canonical_box.max) / 2
+    assert (np.maximum(low - centre, centre - high) < 0.03).all()
+    keys = "\n".join(said)
+    assert all(f"({key})" in keys or f"; {key})" in keys for key in ("base_link", "contact", "palm", "canonical_box"))
+
+
+def test_open_posture_is_free_and_inside_the_limits(allegro):
+    spec, _ = allegro
+    model = build_hand(ALLEGRO, spec)
+    q = np.array([spec.open_posture[name] for name in model.tree.joint_names])
+    assert (q >= model.tree.joint_lower - 1e-6).all()
+    assert (q <= model.tree.joint_upper + 1e-6).all()
+    assert not sample_bodies(model, q[None]).touching[0]
+
+
+@pytest.mark.parametrize(("rpy", "mirror"), [("1.1 -0.7 2.3", False), ("0 0 0", True)], ids=["turned", "left"])
+def test_other_base_and_left_hand(allegro, tmp_path, rpy, mirror):
+    spec, _ = draft_spec(turned(ALLEGRO, tmp_path, rpy, mirror=mirror), "turned")
+    assert spec.base_link == "mount"
+    assert contact_links(spec) == contact_links(allegro[0])
+    assert spec.palm.links == allegro[0].palm.links
+    sign = -1 if mirror else 1
+    assert np.allclose(spec.palm.allowed[0].axis, [sign * x for x in allegro[0].palm.allowed[0].axis], atol=0.05)
+
+
+def test_prismatic_jaws_face_each_other(tmp_path):
+    path = gripper(tmp_path)
+    spec, _ = draft_spec(path)
+    model = build_hand(path, spec)
+    assert contact_links(spec) == {"jaw_l", "jaw_r"}
+    middle = (model.tree.joint_lower + model.tree.joint_upper) / 2
+    left, right = (placed_normals(model, middle, g).mean(0) for g in range(2))
+    assert left[0] < -0.9
+    assert right[0] > 0.9
+    assert spec.canonical_box.min[0] < 0 < spec.canonical_box.max[0]
+    assert spec.canonical_box.min[2] > 0.03
+
+
+def test_jaws_with_one_drive_get_a_jaw_as_base(tmp_path):
+    path = gripper(tmp_path, mimic=True)
+    with pytest.raises(HandError, match=r"one drive moves all fingers.*lgrasp hands add"):
+        draft_spec(path)
+    made = add_hand(path, out=tmp_path / "made")
+    assert made.spec.base_link in ("jaw_l", "jaw_r")
+    assert made.spec.palm.links == (made.spec.base_link,)
+    assert any("made the base" in line for line in made.decisions)
+    # the distance of the jaws is that of the original at every joint value
+    model = build_hand(made.folder / "hand.urdf", made.spec)
+    other = model.tree.link_names.index("jaw_r" if made.spec.base_link == "jaw_l" else "jaw_l")
+    postures = sample_bodies(model, np.array([[0.0], [0.02], [0.05]]))
+    gaps = np.linalg.norm(postures.t[:, model.tree.link_body[other]], axis=1)
+    assert gaps == pytest.approx([0.0, 0.04, 0.1], abs=1e-6)
+
+
+def test_visual_geometry_stands_in(tmp_path):
+    path = gripper(tmp_path, kind="visual")
+    with pytest.raises(HandError, match=r"no collision geometry.*lgrasp hands add"):
+        draft_spec(path)
+    made = add_hand(path, out=tmp_path / "made")
+    assert any("visual geometry of 3 elements is used as collision" in line for line in made.decisions)
+
+
+def test_one_finger_is_refused(tmp_path):
+    with pytest.raises(HandError, match=r"one finger.*add the missing fingers"):
+        draft_spec(fingers(tmp_path, 1))
+
+
+def test_one_finger_may_close_against_the_palm(tmp_path):
+    path = fingers(tmp_path, 2)
+    lone = path.read_text().replace(
+        'type="revolute"><parent link="base"/><child link="a1"/>',
+        'type="fixed"><parent link="base"/><child link="a1"/>',
+    )
+    path.write_text(lone.replace('type="revolute"><parent link="a1"/>', 'type="fixed"><parent link="a1"/>'))
+    spec, _ = draft_spec(path)
+    assert contact_links(spec) == {"b0"}
+    assert set(spec.palm.links) & {"base", "a1", "b1"}
+
+
+def test_limits_in_degrees_are_refused(tmp_path):
+    with pytest.raises(HandError, match=r"'j0' turns from -0.2 to 90 rad.*degrees.*0\.0174533"):
+        draft_spec(fingers(tmp_path, 2, upper=90.0))
+
+
+def test_mesh_in_millimetres_is_refused_by_its_own_name(tmp_path):
+    trimesh.creation.capsule(height=20.0, radius=8.0).export(tmp_path / "tip.stl")
+    path = fingers(tmp_path, 2, '<geometry><mesh filename="tip.stl"/></geometry>')
+    with pytest.raises(HandError, match=r"tip.stl is .* m wide.*millimetres.*scale") as caught:
+        add_hand(path, out=tmp_path / "made")
+    assert str(tmp_path / "tip.stl") in str(caught.value)
+    assert not (tmp_path / "made").exists()
+
+
+def test_huge_mesh_is_thinned_and_keeps_its_shape(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=7, radius=0.012)
+    ball.export(tmp_path / "tip.stl")
+    made = add_hand(fingers(tmp_path, 2, '<geometry><mesh filename="tip.stl"/></geometry>'), out=tmp_path / "made")
+    assert any("tip.stl has 327,680 faces: thinned to" in line for line in made.decisions)
+    thin = trimesh.load_mesh(made.folder / "meshes" / "collision" / "tip.stl")
+    assert len(thin.faces) <= 40_000
+    assert np.abs(np.linalg.norm(thin.vertices, axis=1) - 0.012).max() < 5e-5
+
+
+def test_folder_is_whole_or_absent(tmp_path):
+    path, folder = gripper(tmp_path), tmp_path / "hands" / "jaws"
+    made = add_hand(path, out=folder)
+    assert load_spec(folder / "hand.yaml") == made.spec
+    before = (folder / "hand.yaml").read_bytes()
+    with pytest.raises(HandError, match=r"exists.*--name.*--force"):
+        add_hand(path, out=folder)
+    add_hand(path, out=folder, force=True)
+    assert (folder / "hand.yaml").read_bytes() == before  # drafting twice gives the same
+    with pytest.raises(HandError, match="one finger"):
+        add_hand(fingers(tmp_path, 1), out=folder, force=True)
+    assert (folder / "hand.yaml").read_bytes() == before
+    assert [p.name for p in folder.parent.iterdir()] == ["jaws"]
+    with pytest.raises(HandError, match="holds something that is no hand"):
+        add_hand(path, out=tmp_path, force=True)
+
+
+def test_hand_file_explains_every_key(tmp_path):
+    made = add_hand(gripper(tmp_path), out=tmp_path / "made")
+    lines = (made.folder / "hand.yaml").read_text().splitlines()
+    keys = {line.split(":")[0] for line in lines if line and not line.startswith((" ", "#"))}
+    assert keys >= set(type(made.spec).model_fields) - {"description", "notes"}
+    for above, line in pairwise(lines):
+        if line.split(":")[0] in ("base_link", "locked", "contact", "palm", "canonical_box", "open_posture"):
+            assert above.startswith("#"), line
+
+
+def test_joints_are_held_inside_their_limits():
+    """The middle and the ends of a range are rounded, but not out of it."""
+    joint = Joint("j", "a", "b", np.eye(4), True, False, np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, None)
+    for share in (0.0, 0.5, 1.0):
+        assert joint.lower <= held_value(joint, share) <= joint.upper
+    assert held_value(joint) == 0.0
+    assert held_value(replace(joint, lower=0.2)) == round((0.2 + np.pi) / 2, 4)
+
+
+def test_a_spread_joint_is_shared_and_no_link_is_stuck_where_joints_are_held():
+    """The thumb's opposition carries part of the palm, so it is held, at a value where no links overlap for ever."""
+    urdf = ROOT / "hands" / "schunk_svh" / "hand.urdf"
+    spec, said = draft_spec(urdf, "drafted")
+    assert set(spec.locked) == {"right_hand_Thumb_Opposition"}
+    assert set(spec.shared) == {"right_hand_Finger_Spread"}
+    assert len(spec.shared["right_hand_Finger_Spread"]) == 4
+    assert any("'right_hand_Finger_Spread' moves several fingers" in line for line in said)
+    build_tree(read_urdf(urdf), spec)
+    model = build_hand(urdf, spec)
+    names = model.tree.link_names
+    kept = {frozenset((names[a], names[b])) for a, b in model.piece_link[model.pairs]}
+    assert frozenset(("right_hand_a", "right_hand_e1")) in kept

@@ -1,0 +1,83 @@
+"""All kernels of a job run on its device: on a machine with a GPU, Warp need not be able to compile for the CPU."""
+
+import traceback
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.inputs import input_keys, load_inputs
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.hand.drafting.surface_visibility import sample_bodies
+from lgrasp.hand.model import HandModel
+from lgrasp.jobs.hand_check.pictures import draw_palmar
+from lgrasp.jobs.hand_check.space_check import check_spaces
+from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
+from lgrasp.jobs.scenes.config import SceneConfig
+from lgrasp.jobs.scenes.job import SceneJob, make_scenes
+from lgrasp.runtime.device import Device, start
+
+OTHER = "other"
+JOBS = ("generate", "refine.plan", "scenes.job")
+
+
+@pytest.fixture
+def on_cpu(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Jobs run on a second device of Warp, which is the processor by another name; where kernels are launched on the
+    processor itself."""
+    from warp._src import context
+
+    start()
+    runtime = context.runtime
+    monkeypatch.setitem(runtime.device_map, OTHER, context.Device(runtime, OTHER, ordinal=-1))
+    # of a processor Warp asks a package that need not be there
+    monkeypatch.setattr(context.Device, "free_memory", property(lambda device: 4 << 30))
+    for job in JOBS:
+        monkeypatch.setattr(f"lgrasp.engine.{job}.resolve_device", lambda name: Device(OTHER, OTHER))
+    launch, found = wp.launch, []
+
+    def watched(kernel, *args, **more):
+        if wp.get_device(more.get("device")) is runtime.device_map["cpu"]:
+            frame = next(f for f in reversed(traceback.extract_stack()) if "/lgrasp/" in f.filename)
+            found.append(f"{Path(frame.filename).name}:{frame.lineno} {kernel.key}")
+        return launch(kernel, *args, **more)
+
+    monkeypatch.setattr(wp, "launch", watched)
+    return found
+
+
+@pytest.fixture
+def cold(tmp_path: Path) -> Cache:
+    """An empty cache: hands and objects are made on the device too."""
+    return Cache(tmp_path / "cache", pytest.fail)
+
+
+def test_plan(on_cpu, cold, tmp_path):
+    outcome = plan_grasps(PlanJob(hand="barrett", object="sphere", starts=3, out=tmp_path / "out", cache=cold))
+    assert len(outcome.grasps)
+    assert on_cpu == []
+
+
+def test_scenes(on_cpu, cold, tmp_path):
+    pipeline = Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml"
+    small = {"objects": 1, "camera": {"width": 40, "height": 30, "views": 1}}
+    given = {"objects": ["tiny"], "pipeline": str(pipeline), "stock": 3, "scenes": 1, "workers": 1, "scene": small}
+    made = make_scenes(SceneJob(SceneConfig.model_validate(given | {"out": tmp_path / "out"}), cache=cold))
+    assert len(made.written) == 1
+    assert on_cpu == []
+
+
+def test_pictures_and_spaces_of_a_hand(on_cpu, swift: Pipeline, cache_root, tmp_path):
+    keys = input_keys("allegro", "mug", 1.0, swift.object, swift.field)
+    cache, device = Cache(cache_root, pytest.fail), Device(OTHER, OTHER)
+    inputs = load_inputs(cache, keys, 1.0, swift.object, swift.field, device)
+    assert draw_palmar(inputs, tmp_path / "palmar.png").stat().st_size > 20_000
+    assert len(check_spaces(inputs)) == 7
+    assert on_cpu == []
+
+
+def test_launches_on_the_processor_are_seen(on_cpu, inputs):
+    model: HandModel = inputs.hand.model
+    sample_bodies(model, model.tree.joint_open[None])
+    assert any("_body_poses" in line for line in on_cpu)

@@ -1,0 +1,25 @@
+"""A hand with locked joints: a shard must be usable on the URDF as it is, without knowing hand.yaml."""
+
+import numpy as np
+from support.judge import judge
+
+from lgrasp.dataset import read_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.hand.find import find_hand
+from lgrasp.jobs.generate import Job, generate
+
+
+def test_locked_joints_are_in_the_shard(tmp_path):
+    name = "shadow"
+    pipeline = load_pipeline("swift")
+    pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 20_000})})
+    outcome = generate(Job(name, "sphere", 12, pipeline, tmp_path / "out", cache=Cache(tmp_path / "cache")))
+    shard = read_shard(outcome.paths[0])
+    names = list(shard.hand.joint_names)
+    locked = find_hand(name).spec.locked
+    held = [j for j in locked if j in names]
+    assert held, "no locked joint is in the shard"
+    for joint in held:
+        assert np.all(shard.grasps.q[:, names.index(joint)] == np.float32(locked[joint]))
+    assert judge(outcome.paths).valid.mean() > 0.9

@@ -1,0 +1,202 @@
+"""Refined shards: rows keep their places and their ids, and those that were replaced pass an independent judge."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+from support.judge import judge
+from support.wrench import unresisted
+
+from lgrasp.dataset import GraspRows, Shard, read_shard, validate_shard, write_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.errors import ShardError
+from lgrasp.grasp.schema import GRASP_FIELDS
+from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.refine.shards import RefinedShard, Refinement, refine_shards
+from lgrasp.stages.refine.params import RefineParams
+
+ROWS = 40
+SPOILT = np.arange(ROWS) % 2 == 0
+
+
+@pytest.fixture(scope="module")
+def source(swift: Pipeline, cache_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A shard of 40 valid grasps of which every second hand was moved by millimetres, with verdicts of a simulator."""
+    folder = tmp_path_factory.mktemp("source")
+    made = generate(
+        Job(
+            hand="allegro",
+            object="mug",
+            rows=ROWS,
+            pipeline=swift,
+            out=folder / "made",
+            shard_rows=ROWS,
+            device="cpu",
+            workers=1,
+            batch=128,
+            cache=Cache(cache_root, pytest.fail),
+        )
+    )
+    shard = read_shard(made.paths[0])
+    rows = replace(
+        spoil(shard.grasps, shard),
+        physics={"fc_holds": np.ones(ROWS, bool)},
+        physics_protocols={"fc_holds": '{"name": "fc"}'},
+    )
+    write_shard(folder / "shards" / "mug.h5", replace(shard, grasps=rows))
+    return folder / "shards" / "mug.h5"
+
+
+def spoil(rows: GraspRows, shard: Shard) -> GraspRows:
+    """Every second hand off by 4 mm and 3 degrees an axis, and 3 degrees a joint."""
+    rng, n = np.random.default_rng(0), int(SPOILT.sum())
+    pose, q = rows.object_pose.copy(), rows.q.copy()
+    turned = Rotation.from_rotvec(0.05 * rng.normal(size=(n, 3))) * Rotation.from_quat(
+        pose[SPOILT, 0, 3:], scalar_first=True
+    )
+    pose[SPOILT, 0, :3] += 0.004 * rng.normal(size=(n, 3))
+    pose[SPOILT, 0, 3:] = turned.as_quat(canonical=True, scalar_first=True)
+    q[SPOILT] += 0.05 * rng.normal(size=(n, q.shape[1]))
+    return replace(rows, object_pose=pose, q=np.clip(q, shard.hand.joint_lower, shard.hand.joint_upper))
+
+
+@pytest.fixture(scope="module")
+def refine(cache_root: Path) -> Callable[..., RefinedShard]:
+    """refine(source, folder, **changes): the one shard that comes of it."""
+
+    def refine(source: Path, out: Path, **changes) -> RefinedShard:
+        cache = Cache(cache_root, pytest.fail)
+        (done,) = refine_shards(Refinement(sources=[source], out=out, device="cpu", cache=cache, **changes))
+        return done
+
+    return refine
+
+
+@pytest.fixture(scope="module")
+def done(refine, source, tmp_path_factory: pytest.TempPathFactory) -> RefinedShard:
+    return refine(source, tmp_path_factory.mktemp("refined"))
+
+
+def both(source: Path, done: RefinedShard) -> tuple[GraspRows, GraspRows, np.ndarray]:
+    """Rows before and after, and which of them were replaced."""
+    before, after = read_shard(source).grasps, read_shard(done.path).grasps
+    return before, after, after.metrics["refined"] == 1
+
+
+def test_rows_keep_their_places_and_ids(source, done):
+    assert validate_shard(done.path) == []
+    assert done.path.name == source.name
+    before, after = read_shard(source), read_shard(done.path)
+    np.testing.assert_array_equal(after.grasps.candidate, before.grasps.candidate)
+    assert len(after.grasps) == ROWS
+    assert after.hand.sha256 == before.hand.sha256
+    assert after.header.config["run_key"] == before.header.config["run_key"]
+    assert after.header.config["refine"]["outer"] > 0
+    assert after.statistics["refine_tried"] == ROWS
+    assert after.statistics["refine_replaced"] == (after.grasps.metrics["refined"] == 1).sum()
+    for a, b in zip(after.objects, before.objects, strict=True):
+        np.testing.assert_array_equal(a.vertices, b.vertices)
+
+
+def test_rows_that_stay_are_as_they_were(source, done):
+    before, after, replaced = both(source, done)
+    assert 0 < replaced.sum() < ROWS
+    old, new = before.columns(), after.columns()
+    for name, values in old.items():
+        if name.startswith("physics/"):
+            assert name not in new  # a verdict of rows that are no longer all there
+            continue
+        kept = new[name][~replaced]
+        if values.ndim == 4 or name == "contact_links":  # contacts are padded to the widest row
+            width = values.shape[2]
+            assert (kept[:, :, width:] == -1).all() if name == "contact_links" else np.isnan(kept[:, :, width:]).all()
+            kept = kept[:, :, :width]
+        np.testing.assert_array_equal(kept, values[~replaced], err_msg=name)
+
+
+def test_replaced_rows_pass_the_judge(source, done):
+    _, after, replaced = both(source, done)
+    report = judge(done.path)
+    assert report.valid[replaced].all(), report
+    assert (after.metrics["valid"][replaced] == 1).all()
+    assert not judge(source).valid[SPOILT].any()
+    assert replaced[SPOILT].sum() >= 4  # a part of the spoilt grasps is valid again
+    assert done.moved.valid[1] >= done.moved.valid[0] + replaced[SPOILT].sum()
+
+
+def test_a_valid_row_is_replaced_by_one_that_resists_pulls_better(source, done, refine, tmp_path):
+    before, after, replaced = both(source, done)
+    still = refine(source, tmp_path, params=RefineParams(outer=0))  # says which rows pass the checks as they are
+    assert not both(source, still)[2].any()
+    improved = replaced & (read_shard(still.path).grasps.metrics["valid"] == 1)
+    assert improved.sum() >= 4
+    assert (after.metrics["disturbance"][improved] < before.metrics["disturbance"][improved]).all()
+    mesh = read_shard(source).objects[0]
+    centre = trimesh.Trimesh(mesh.vertices, mesh.faces).center_mass
+    for row in np.flatnonzero(improved).tolist():
+        assert unheld(after, row, centre) < unheld(before, row, centre)
+
+
+def unheld(rows: GraspRows, row: int, centre: np.ndarray) -> float:
+    """Unresisted part of a unit force along an axis of the hand, by the reference, from the contacts stored."""
+    there = rows.contact_links[row, 0] >= 0
+    points, normals = (values[row, 0, there].astype(float) for values in (rows.contact_points, rows.contact_normals))
+    turn = Rotation.from_quat(rows.object_pose[row, 0, 3:], scalar_first=True).inv()
+    return unresisted(points - centre, -normals, 0.5, turn.apply(np.vstack([np.eye(3), -np.eye(3)])))
+
+
+def test_energies_are_those_of_the_postures_stored(source, done, refine, tmp_path):
+    """Refined by nothing, the refined rows have the energies that were told of them."""
+    _, after, _ = both(source, done)
+    still = refine(done.path, tmp_path, params=RefineParams(outer=0))
+    np.testing.assert_allclose(read_shard(still.path).grasps.metrics["energy"], after.metrics["energy"], rtol=1e-3)
+    assert done.moved.energy[1] < done.moved.energy[0]
+
+
+def test_always_moves_every_row(source, refine, tmp_path):
+    done = refine(source, tmp_path, always=True)
+    before, after, replaced = both(source, done)
+    assert replaced.all()
+    assert validate_shard(done.path) == []
+    assert (np.abs(after.q - before.q).max(1) > 1e-6).all()
+    assert done.moved.energy[1] < 0.5 * done.moved.energy[0]
+    # of those that the checks pass the judge finds none bad, and they are told from the others
+    valid = after.metrics["valid"] == 1
+    assert 0 < valid.sum() < ROWS
+    assert judge(done.path).valid[valid].all()
+
+
+def test_the_same_job_gives_the_same_bytes(source, done, refine, tmp_path, raw_grasps):
+    again = refine(source, tmp_path)
+    assert raw_grasps(again.path.parent) == raw_grasps(done.path.parent)
+
+
+def test_a_row_does_not_depend_on_the_others(source, done, refine, tmp_path):
+    shard = read_shard(source)
+    some = np.array([7, 4, 31, 12])
+    rows = shard.grasps
+    part = replace(rows, **{name: getattr(rows, name)[some] for name in GRASP_FIELDS}, metrics={}, physics={})
+    write_shard(tmp_path / "part.h5", replace(shard, grasps=part))
+    after = read_shard(done.path).grasps
+    found = read_shard(refine(tmp_path / "part.h5", tmp_path / "out").path).grasps
+    np.testing.assert_array_equal(found.metrics["refined"], after.metrics["refined"][some])
+    np.testing.assert_allclose(found.q, after.q[some], atol=1e-5)
+    np.testing.assert_allclose(found.object_pose, after.object_pose[some], atol=1e-5)
+
+
+def test_shards_without_rows_are_left_out(source, cache_root, tmp_path):
+    shard = read_shard(source)
+    rows = shard.grasps
+    none = replace(rows, **{name: getattr(rows, name)[:0] for name in GRASP_FIELDS}, metrics={}, physics={})
+    write_shard(tmp_path / "none.h5", replace(shard, grasps=none))
+    told: list[str] = []
+    cache = Cache(cache_root, told.append)
+    with pytest.raises(ShardError, match="no grasps to refine"):
+        refine_shards(Refinement(sources=[tmp_path / "none.h5"], out=tmp_path / "out", device="cpu", cache=cache))
+    assert told == [f"{tmp_path / 'none.h5'} holds no grasps; it is left out"]
+    assert not (tmp_path / "out").exists()

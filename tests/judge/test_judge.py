@@ -1,0 +1,482 @@
+"""The judge must pass a valid grasp and catch each planted defect."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+import yourdfpy
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("coal")
+
+
+def _load() -> ModuleType:
+    path = Path(__file__).parents[1] / "support" / "judge.py"
+    spec = importlib.util.spec_from_file_location("reference_judge", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+J: Any = _load()
+
+# Two prismatic jaws over a palm, the right one a mesh; far behind, a thumb with a fixed tip drives a mimic lever.
+URDF = """<robot name="jaws">
+  <link name="palm"><collision><origin xyz="0 0 -0.02"/>
+    <geometry><box size="0.1 0.12 0.02"/></geometry></collision></link>
+  <link name="left"><collision><origin xyz="0 0 0.03"/>
+    <geometry><box size="0.02 0.01 0.06"/></geometry></collision></link>
+  <link name="right"><collision><origin xyz="0 0 0.03"/>
+    <geometry><mesh filename="package://jaws/meshes/jaw.obj" scale="0.001 0.001 0.001"/></geometry></collision></link>
+  <link name="thumb"><collision><origin xyz="-0.1 0 0.1"/>
+    <geometry><cylinder radius="0.004" length="0.02"/></geometry></collision></link>
+  <link name="tip"><collision><geometry><sphere radius="0.005"/></geometry></collision></link>
+  <link name="lever"><collision><geometry><sphere radius="0.005"/></geometry></collision></link>
+  <joint name="slide_left" type="prismatic"><parent link="palm"/><child link="left"/>
+    <axis xyz="0 1 0"/><limit lower="0" upper="0.06" effort="1" velocity="1"/></joint>
+  <joint name="slide_right" type="prismatic"><parent link="palm"/><child link="right"/>
+    <axis xyz="0 -1 0"/><limit lower="0" upper="0.06" effort="1" velocity="1"/></joint>
+  <joint name="swing" type="revolute"><parent link="palm"/><child link="thumb"/>
+    <origin xyz="-0.1 0 0" rpy="0.1 0.2 0.3"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="cap" type="fixed"><parent link="thumb"/><child link="tip"/><origin xyz="-0.1 0 0.13"/></joint>
+  <joint name="follow" type="revolute"><parent link="tip"/><child link="lever"/><origin xyz="-0.05 0 0"/>
+    <axis xyz="1 1 0"/><mimic joint="swing" multiplier="0.5" offset="0.01"/>
+    <limit lower="-0.49" upper="0.46" effort="1" velocity="1"/></joint>
+</robot>"""
+LINKS = ["palm", "left", "right", "thumb", "tip", "lever"]
+JAW = trimesh.creation.box((20.0, 10.0, 60.0))
+CUBE = trimesh.creation.box((0.04, 0.04, 0.04))
+PLATE = trimesh.creation.box((0.04, 0.08, 0.003))
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def _row(**changes: Any) -> dict[str, Any]:
+    """A valid squeeze of the cube by two opposed contacts, with changes."""
+    row: dict[str, Any] = {
+        "q": [0.025, 0.025, 0.3],
+        "follow": 0.16,
+        "pose": [0, 0, 0.035, 1, 0, 0, 0],
+        "object": 0,
+        "points": [[0, 0.02, 0.001], [0, -0.02, 0.001]],
+        "normals": [[0, 1, 0], [0, -1, 0]],
+        "links": [1, 2],
+    }
+    assert set(changes) <= set(row)
+    return row | changes
+
+
+def _write(path: Path, rows: list[dict[str, Any]], metrics: dict[str, tuple[list[float], str]] | None = None) -> Path:
+    n, width = len(rows), 4
+    points, normals, forces = (np.full((n, 1, width, 3), np.nan, "f4") for _ in range(3))
+    links = np.full((n, 1, width), -1, "i2")
+    for i, row in enumerate(rows):
+        k = len(row["links"])
+        points[i, 0, :k], normals[i, 0, :k], links[i, 0, :k] = row["points"], row["normals"], row["links"]
+        forces[i, 0, :k] = -normals[i, 0, :k] / k
+    with h5py.File(path, "w") as f:
+        f.attrs["format"], f.attrs["format_version"] = "lgrasp-shard", "1.0"
+        hand = f.create_group("hand")
+        hand.attrs["base_link"] = "palm"
+        hand["urdf"] = URDF
+        hand["joint_names"] = ["slide_left", "slide_right", "swing", "follow"]
+        hand["link_names"] = LINKS
+        blob = JAW.export(file_type="obj").encode()
+        hand["meshes/0"] = np.frombuffer(blob, np.uint8)
+        hand["meshes/0"].attrs["path"] = "package://jaws/meshes/jaw.obj"
+        for name, mesh in (("a_cube", CUBE), ("b_plate", PLATE)):
+            group = f.create_group(f"objects/{name}")
+            group.attrs["scale"] = 1.0
+            group["vertices"], group["faces"] = mesh.vertices.astype("f4"), mesh.faces.astype("i4")
+        g = f.create_group("grasps")
+        g["q"] = np.array([[*r["q"], r["follow"]] for r in rows], "f4")
+        g["object_pose"] = np.array([r["pose"] for r in rows], "f4")[:, None]
+        g["object_index"] = np.array([r["object"] for r in rows], "i4")[:, None]
+        g["contact_points"], g["contact_normals"], g["contact_links"] = points, normals, links
+        g["contact_forces"] = forces
+        for name, (values, unit) in (metrics or {}).items():
+            g[f"metrics/{name}"] = np.array(values, "f4")
+            g[f"metrics/{name}"].attrs["unit"] = unit
+    return path
+
+
+def _failed(report: Any) -> list[set[str]]:
+    return [{name for name, mask in report.failed.items() if mask[i]} for i in range(report.rows)]
+
+
+def test_valid_row_passes_with_exact_numbers(tmp_path: Path) -> None:
+    pressed = _row(q=[0.024, 0.025, 0.3])  # the left jaw 1 mm into the cube
+    metrics = {
+        "gswo": ([0.0, 0.0], "1"),
+        "penetration": ([0.0, 1e-3], "m"),
+        "self_penetration": ([0.0, 0.0], "m"),
+        "gap": ([0.0, 1.5], "mm"),
+        "normal_error": ([0.0, 0.1], "rad"),
+    }
+    report = J.judge(_write(tmp_path / "s.h5", [_row(), pressed], metrics))
+    assert _failed(report) == [set(), set()]
+    assert report.valid_share == 1.0
+    assert report.values["penetration_mm"] == pytest.approx([0.0, 1.0], abs=1e-3)
+    assert report.values["object_in_link_mm"] == pytest.approx([0.0, 1.0], abs=1e-3)
+    assert report.values["link_in_object_mm"] == pytest.approx([0.0, 1.0], abs=1e-3)
+    assert report.values["contact_link_mm"] == pytest.approx([0.0, 1.0], abs=1e-3)
+    assert report.values["residual"] == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert report.values["force_balance"] == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert report.values["force_normal_sum_error"] == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert report.values["contacts"].tolist() == [2, 2]
+    assert report.solver_gap < 1e-12
+    deviations = {name: d["max"] for name, d in report.metrics.items()}
+    assert deviations["gswo (norm)"] < 1e-6
+    assert deviations["penetration [mm]"] == pytest.approx(0.0, abs=1e-3)
+    assert deviations["gap [mm]"] == pytest.approx(0.5, abs=1e-3)
+    assert deviations["normal_error [deg]"] == pytest.approx(np.degrees(0.1), abs=1e-3)
+
+
+def _tilted() -> dict[str, Any]:
+    """The cube held by two edges whose faces are 30 deg from the jaws."""
+    turn = Rotation.from_euler("x", -30, degrees=True)
+    x, y, z, w = turn.as_quat()
+    reach = turn.apply([0, 0.02, 0.02])[1]  # the edge furthest along y
+    points = [[0, 0.02, 0.019], [0, -0.02, -0.019]]
+    return _row(q=[reach + 0.005, reach + 0.005, 0.3], pose=[0, 0, 0.035, w, x, y, z], points=points)
+
+
+def test_planted_defects_are_caught(tmp_path: Path) -> None:
+    nan = [[0, 0.02, np.nan], [0, -0.02, 0]]
+    cases: list[tuple[str, dict[str, Any], set[str]]] = [
+        ("into the palm by 5 mm", _row(pose=[0, 0, 0.005, 1, 0, 0, 0]), {"penetration"}),
+        ("joint over its limit", _row(q=[0.025, 0.025, -1.001], follow=-0.4905), {"limits", "mimic_limits"}),
+        ("mimic joint over its limit", _row(q=[0.025, 0.025, 0.95], follow=0.485), {"mimic_limits"}),
+        ("mimic relation broken", _row(follow=0.17), {"mimic"}),
+        (
+            "contact inside the jaw",
+            _row(points=[[0, 0.0225, 0], [0, -0.02, 0]]),
+            {"contact_on_object", "contact_on_link"},
+        ),
+        ("contact beside the jaw", _row(points=[[0, 0.02, 0], [0.013, -0.02, 0]]), {"contact_on_link"}),
+        ("flipped normal", _row(normals=[[0, -1, 0], [0, -1, 0]]), {"stored_normal"}),
+        ("edge contacts", _tilted(), {"normal", "residual"}),
+        ("wrong link", _row(links=[2, 2]), {"contact_on_link", "normal"}),
+        (
+            "one-sided",
+            _row(points=[[0.005, 0.02, 0], [-0.005, 0.02, 0]], normals=[[0, 1, 0]] * 2, links=[1, 1]),
+            {"residual"},
+        ),
+        ("no contacts", _row(points=np.zeros((0, 3)), normals=np.zeros((0, 3)), links=[]), {"residual"}),
+        ("not finite", _row(points=nan), {"finite"}),
+        ("quaternion not unit", _row(pose=[0, 0, 0.035, 0.9, 0, 0, 0]), {"finite"}),
+        ("unknown object", _row(object=2), {"indices"}),
+        ("unknown link", _row(links=[1, 6]), {"indices"}),
+    ]
+    clash = _row(q=[0.002, 0.002, 0.3], pose=[0, 0, 0.3, 1, 0, 0, 0])
+    # a 3 mm plate across the left jaw: no point of the jaw is more than 1.5 mm inside the plate
+    plate = _row(q=[0.01, 0.05, 0.3], pose=[0, 0, 0.03, 1, 0, 0, 0], object=1)
+    report = J.judge(_write(tmp_path / "s.h5", [case[1] for case in cases] + [clash, plate, _row()]))
+    found = _failed(report)
+    assert {name: got for (name, _, _), got in zip(cases, found, strict=False)} == {name: w for name, _, w in cases}
+    assert report.values["penetration_mm"][0] == pytest.approx(5.0, abs=1e-3)
+    assert report.values["residual"][9] == pytest.approx(1.0, abs=1e-6)
+    assert report.values["force_balance"][9] == pytest.approx(1.0, abs=1e-6)
+    assert "self_penetration" in found[-3]
+    assert report.values["self_penetration_mm"][-3] == pytest.approx(6.0, abs=1e-3)
+    assert report.self_pairs == {"left x right": 1}
+    assert "penetration" in found[-2]
+    assert report.values["link_in_object_mm"][-2] <= 1.5 + 1e-3
+    assert report.values["object_in_link_mm"][-2] == pytest.approx(5.0, abs=0.2)
+    assert found[-1] == set()
+    assert report.valid.sum() == 1
+
+
+def test_original_files_override_the_shard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shard = _write(tmp_path / "s.h5", [_row(), _row(q=[0.025, 0.025, 0.31], follow=0.165)])
+    (tmp_path / "hand" / "meshes").mkdir(parents=True)
+    urdf = tmp_path / "hand" / "jaws.urdf"
+    urdf.write_text(URDF.replace('upper="0.06"', 'upper="0.02"'))
+    JAW.export(tmp_path / "hand" / "meshes" / "jaw.obj")
+    bigger = CUBE.copy()
+    bigger.apply_scale(1.3)  # 6 mm into each jaw
+    bigger.export(tmp_path / "big.obj")
+    assert J.main([str(shard)]) == 0
+    assert "2 of 2 judged rows" in capsys.readouterr().out
+    assert J.judge(shard, rows=1).rows == 1
+    assert (
+        J.main([str(shard), str(shard), "--urdf", str(urdf), "--mesh", f"a_cube={tmp_path / 'big.obj'}", "--json"]) == 1
+    )
+    out = json.loads(capsys.readouterr().out)
+    assert out["failures"]["limits"] == 4
+    assert out["failures"]["penetration"] == 4
+    assert out["total_rows"] == 4
+    assert out["near_duplicates"] == 3
+    assert out["distinct_object_poses"] == 1
+
+
+def test_object_against_object() -> None:
+    one, two = J.Object(CUBE), J.Object(PLATE)
+    T = np.eye(4)[None].repeat(2, axis=0)
+    T[0, :3, 3] = [0, 0, 0.02 + 0.0015 - 0.001]
+    T[1, :3, 3] = [0, 0, 0.02 + 0.0015 + 0.001]
+    assert J.object_object_penetration(one, two, T) == pytest.approx([1e-3, 0.0], abs=1e-6)
+
+
+# Two pairs of prismatic jaws side by side over a palm, each pair for one object.
+PAIRS = """<robot name="pairs">
+  <link name="palm"><collision><origin xyz="0.03 0 -0.02"/>
+    <geometry><box size="0.2 0.12 0.02"/></geometry></collision></link>"""
+for _name, _x, _sign in (("a", 0.0, 1), ("b", 0.0, -1), ("c", 0.06, 1), ("d", 0.06, -1)):
+    PAIRS += f"""
+  <link name="{_name}"><collision><origin xyz="0 0 0.03"/>
+    <geometry><box size="0.02 0.01 0.06"/></geometry></collision></link>
+  <joint name="slide_{_name}" type="prismatic"><parent link="palm"/><child link="{_name}"/><origin xyz="{_x} 0 0"/>
+    <axis xyz="0 {_sign} 0"/><limit lower="0" upper="0.06" effort="1" velocity="1"/></joint>"""
+PAIRS += "</robot>"
+
+
+def _sequence(path: Path, **changes: Callable[[dict[str, np.ndarray]], None]) -> Path:
+    """Two cubes: row 0 takes one with the first pair, rows 1 and on extend it by another in the second pair."""
+    n = 2 + len(changes)
+    shut, wide = 0.025, 0.05
+    q = np.full((n, 2, 4), [[shut, shut, wide, wide], [shut] * 4])
+    squeeze = np.full((n, 2, 4), [[0.02, 0.02, wide, wide], [0.02] * 4])
+    pose = np.full((n, 2, 7), [[0, 0, 0.035, 1, 0, 0, 0], [0.06, 0, 0.035, 1, 0, 0, 0]])
+    points = np.full((n, 2, 2, 3), [[0, 0.02, 0.001], [0, -0.02, 0.001]])
+    normals = np.full((n, 2, 2, 3), [[0, 1, 0], [0, -1, 0]])
+    values: dict[str, np.ndarray] = {
+        "object_pose": pose.astype("f4"),
+        "object_index": np.zeros((n, 2), "i4"),
+        "contact_points": points.astype("f4"),
+        "contact_normals": normals.astype("f4"),
+        "contact_forces": (-normals / 2).astype("f4"),
+        "contact_links": np.full((n, 2, 2), [[1, 2], [3, 4]], "i2"),
+        "sequence/q": q.astype("f4"),
+        "sequence/q_pregrasp": q.astype("f4"),
+        "sequence/q_squeeze": squeeze.astype("f4"),
+        "sequence/space": np.full((n, 2), [0, 1], "i2"),
+        "sequence/free_joints": np.full((n, 2, 4), [[True, True, False, False], [False, False, True, True]]),
+        "sequence/parent": np.array([-1, *[0] * (n - 1)]),
+    }
+    for value in values.values():  # the first row has but one object
+        if value.ndim > 1:
+            value[0, 1] = {"f": np.nan, "i": -1, "b": False}[value.dtype.kind]
+    for row, change in enumerate(changes.values(), 2):
+        change({name: value[row : row + 1] for name, value in values.items()})
+    held = (values["object_index"] >= 0).sum(1)
+    for name in ("q", "q_pregrasp", "q_squeeze"):
+        values[name] = values[f"sequence/{name}"][np.arange(n), held - 1]
+    with h5py.File(path, "w") as f:
+        f.create_group("hand").attrs["base_link"] = "palm"
+        f["hand/urdf"] = PAIRS
+        f["hand/joint_names"] = [f"slide_{k}" for k in "abcd"]
+        f["hand/link_names"] = ["palm", *"abcd"]
+        group = f.create_group("objects/cube")
+        group["vertices"], group["faces"] = CUBE.vertices.astype("f4"), CUBE.faces.astype("i4")
+        for name, value in values.items():
+            f[f"grasps/{name}"] = value
+    return path
+
+
+def _put(name: str, where: Any, value: Any) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(row: dict[str, np.ndarray]) -> None:
+        row[name][(0, *where)] = value
+
+    return change
+
+
+def _closer(row: dict[str, np.ndarray]) -> None:
+    """The second cube 3 mm into the first, still between its jaws."""
+    row["object_pose"][0, 1, 0] = 0.037
+    row["contact_points"][0, 1, :, 0] = 0.0195
+
+
+def _same_joint(row: dict[str, np.ndarray]) -> None:
+    """The second step moves a jaw that holds the first cube, and says so."""
+    row["sequence/free_joints"][0, :, 1] = [False, True]
+    row["sequence/q"][0, 1, 1] += 1e-4
+
+
+def test_sequences(tmp_path: Path) -> None:
+    """What is planted in rows of two objects is found, and rows of fewer and more are counted apart."""
+    cases = {
+        "loose": (_put("sequence/q", (1, slice(2, 4)), 0.03), {"contact_on_link"}),
+        "first_loose": (_put("sequence/q", (slice(0, 2), 0), 0.03), {"contact_on_link", "parent", "frozen"}),
+        "overlap": (_closer, {"object_object"}),
+        "creep": (_put("sequence/q", (1, 0), 0.02501), {"frozen"}),
+        "pregrasp": (_put("sequence/q_pregrasp", (1, 1), 0.03), {"frozen"}),
+        "let_go": (_put("sequence/q_squeeze", (1, 0), 0.025), {"frozen"}),
+        "twice": (_put("sequence/free_joints", (1, 0), True), {"frozen"}),
+        "carried": (_same_joint, {"frozen", "parent"}),
+        "orphan": (_put("sequence/parent", (), -1), {"parent"}),
+        "ahead": (_put("sequence/parent", (), 15), {"parent"}),
+        "other": (_put("object_pose", (0, 2), 0.0351), {"parent"}),
+        "space": (_put("sequence/space", (1,), 0), {"parent"}),
+        "one_sided": (_put("contact_links", (1, 1), -1), {"residual"}),
+    }
+    _sequence(tmp_path / "s.h5", **{name: change for name, (change, _) in cases.items()})
+    report = J.judge(tmp_path)
+    found = _failed(report)
+    assert found[:2] == [set(), set()]
+    assert dict(zip(cases, found[2:], strict=True)) == {name: wanted for name, (_, wanted) in cases.items()}
+    assert {k: (d["rows"], d["valid"]) for k, d in report.by_objects.items()} == {1: (1, 1), 2: (14, 1)}
+    assert report.values["object_object_mm"][4] == pytest.approx(3.0, abs=1e-3)
+    assert "objects held" in str(report)
+
+
+def test_which_joints_carry_a_link() -> None:
+    blob = JAW.export(file_type="obj").encode()
+    resolve = J._resolver({"package://jaws/meshes/jaw.obj": blob}, None)
+    names = ["slide_left", "slide_right", "swing"]
+    moves = J.Hand(URDF, resolve).riders(names)
+    assert moves.sum() == 5  # a jaw by its slide, a jaw by its slide, thumb, tip and lever by the swing
+    assert [names[k] for k in moves.argmax(axis=0)[1:]] == ["slide_left", "slide_right", "swing", "swing", "swing"]
+    seen = J.Hand(URDF, resolve, "tip").riders(names)  # from the tip all else swings
+    assert seen[2].tolist() == [True, True, True, False, False, True]
+
+
+def _closest_brute(p: np.ndarray, tri: np.ndarray) -> float:
+    """Distance from a point to triangles (F, 3, 3), by plane and edges."""
+    a, b, c = tri[:, 0], tri[:, 1], tri[:, 2]
+    n = np.cross(b - a, c - a)
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    height = ((p - a) * n).sum(axis=1)
+    foot = p - height[:, None] * n
+    inside = np.all([(np.cross(v - u, foot - u) * n).sum(axis=1) >= 0 for u, v in ((a, b), (b, c), (c, a))], axis=0)
+    edges = []
+    for u, v in ((a, b), (b, c), (c, a)):
+        t = (((p - u) * (v - u)).sum(axis=1) / ((v - u) ** 2).sum(axis=1)).clip(0, 1)
+        edges.append(np.linalg.norm(p - u - t[:, None] * (v - u), axis=1))
+    return float(np.where(inside, np.abs(height), np.min(edges, axis=0)).min())
+
+
+def test_mesh_distance_against_brute_force() -> None:
+    mesh = trimesh.creation.annulus(0.02, 0.023, 0.05, sections=48)  # a wall of 3 mm
+    field = J.MeshField(mesh)
+    points = np.random.default_rng(0).uniform(-0.03, 0.03, (600, 3))
+    signed = field.query(points)[0]
+    brute = np.array([_closest_brute(p, mesh.triangles) for p in points])
+    np.testing.assert_allclose(np.abs(signed), brute, atol=1e-7)
+    clear = brute > 1e-6
+    np.testing.assert_array_equal((signed < 0)[clear], mesh.contains(points)[clear])
+    assert (signed < 0).sum() > 30
+    np.testing.assert_allclose(field.depth(points), np.maximum(-signed, 0.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["box", "sphere", "cylinder"])
+def test_primitives_against_their_mesh(kind: str) -> None:
+    T = J._origin(None)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", [0.3, -0.5, 1.0]).as_matrix(), [0.01, -0.02, 0.03]
+    solid, mesh = {
+        "box": (J.Box(0, T, np.array([0.01, 0.02, 0.03])), trimesh.creation.box((0.02, 0.04, 0.06))),
+        "sphere": (J.Sphere(0, T, np.array([0.02])), trimesh.creation.icosphere(5, 0.02)),
+        "cylinder": (J.Cylinder(0, T, np.array([0.015, 0.02])), trimesh.creation.cylinder(0.015, 0.04, 400)),
+    }[kind]
+    mesh.apply_transform(T)
+    field = J.MeshField(mesh)
+    points = np.random.default_rng(1).uniform(-0.05, 0.05, (400, 3)) + T[:3, 3]
+    np.testing.assert_allclose(solid.signed(points), field.query(points)[0], atol=2e-5)
+    h = 1e-6
+    gradient = np.stack([solid.signed(points + h * e) - solid.signed(points - h * e) for e in np.eye(3)], axis=1) / (
+        2 * h
+    )
+    smooth = np.abs(np.linalg.norm(gradient, axis=1) - 1.0) < 1e-6
+    np.testing.assert_allclose(solid.normals(points)[smooth, 0], gradient[smooth], atol=1e-4)
+    assert len(solid.samples) >= 0.95 * J.LINK_SAMPLES
+    np.testing.assert_allclose(solid.signed(solid.samples), 0.0, atol=1e-12)
+
+
+def test_dented_meshes_are_not_hulls() -> None:
+    tube = J.MeshSolid(0, np.eye(4), trimesh.creation.annulus(0.02, 0.023, 0.05, sections=48))
+    ball = J.Sphere(1, np.eye(4), np.array([0.01]))  # inside the bore, touching nothing
+    assert not tube.convex
+    T = np.eye(4)[None, None].repeat(2, axis=1)
+    assert J.SolidPoses([tube, ball], T).depth(0, 0, 1, 0.0) < 0.0
+    T = T.copy()
+    T[0, 1, 0, 3] = 0.0115  # 1.5 mm into the wall
+    assert J.SolidPoses([tube, ball], T).depth(0, 0, 1, 0.0) == pytest.approx(1.5e-3, abs=1e-4)
+
+
+def test_forward_kinematics_against_yourdfpy() -> None:
+    blob = JAW.export(file_type="obj").encode()
+    hand = J.Hand(URDF, J._resolver({"package://jaws/meshes/jaw.obj": blob}, None), "left")
+    other = yourdfpy.URDF.load(io.BytesIO(URDF.encode()), load_meshes=False)
+    assert [j.name for j in hand.actuated] == list(other.actuated_joint_names)
+    assert hand.always_touching == []
+    values = {"slide_left": 0.01, "slide_right": 0.02, "swing": 0.7}
+    other.update_cfg(values)
+    T = hand.forward(hand.resolve_joints({k: np.array([v]) for k, v in values.items()}, 1), 1)[0]
+    for i, name in enumerate(hand.links):
+        np.testing.assert_allclose(T[i], other.get_transform(name, "left"), atol=1e-12)
+    pairs = {tuple(sorted(hand.links[hand.solids[k].link] for k in pair)) for pair in hand.pairs}
+    assert ("left", "right") in pairs
+    assert not pairs & {("left", "palm"), ("thumb", "tip"), ("lever", "tip"), ("palm", "thumb")}
+
+
+def test_wrench_residual_is_the_minimum() -> None:
+    rng = np.random.default_rng(0)
+    for count in (2, 3, 4, 5):
+        points = rng.normal(size=(count, 3)) * 0.03
+        inward = -points + rng.normal(size=(count, 3)) * 0.02
+        inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+        forces = J.cone_forces(inward)
+        np.testing.assert_allclose(np.einsum("cek,ck->ce", forces, inward), 1.0)
+        f = forces.reshape(-1, 3)
+        G = np.vstack([f.T, 10.0 * np.cross(np.repeat(points - points.mean(axis=0), 8, axis=0), f).T])
+        m = G.shape[1]
+        best = minimize(
+            lambda x, G=G: ((G @ x) ** 2).sum(),
+            np.full(m, 1.0 / m),
+            jac=lambda x, G=G: 2.0 * G.T @ (G @ x),
+            bounds=[(0, 1)] * m,
+            constraints={"type": "eq", "fun": lambda x: x.sum() - 1.0, "jac": np.ones_like},
+            method="SLSQP",
+            options={"ftol": 1e-16, "maxiter": 500},
+        )
+        norm, gap = J.wrench_residual(points, inward)
+        assert norm**2 == pytest.approx(best.fun, abs=1e-8)
+        assert abs(gap) < 1e-12
+
+
+def test_ferrari_canny_of_a_symmetric_grasp() -> None:
+    directions = np.vstack([np.eye(3), -np.eye(3)])
+    full = J.ferrari_canny(directions * 0.02, -directions, np.zeros(3), 0.02)
+    assert 0.1 < full < 0.5
+    assert J.ferrari_canny(directions[:2] * 0.02, -directions[:2], np.zeros(3), 0.02) == 0.0
+
+
+def test_near_duplicates_against_brute_force() -> None:
+    rng = np.random.default_rng(0)
+    n = 300
+    centres = rng.integers(0, 60, n)
+    t = rng.uniform(0, 0.05, (60, 3))[centres] + rng.normal(0, 0.0015, (n, 3))
+    r = Rotation.random(60, rng=1)[centres] * Rotation.from_rotvec(rng.normal(0, 0.02, (n, 3)))
+    q = rng.uniform(0, 1, (60, 7))[centres] + rng.normal(0, 0.03, (n, 7))
+    quaternion = r.as_quat()[:, [3, 0, 1, 2]] * rng.choice([-1, 1], (n, 1))
+    combined, largest = J.near_duplicates(np.hstack([t, quaternion])[:, None], q, np.full(7, 0.1))
+    expected = np.zeros((2, n), bool)
+    for i in range(1, n):
+        a = np.linalg.norm(t[:i] - t[i], axis=1) / 0.005
+        b = np.degrees((r[:i].inv() * r[i]).magnitude()) / 5.0
+        c = np.abs(q[:i] - q[i]).max(axis=1) / 0.1
+        expected[0, i] = (a * a + b * b + c * c <= 1.0).any()
+        expected[1, i] = (np.maximum(np.maximum(a, b), c) <= 1.0).any()
+    np.testing.assert_array_equal(combined, expected[0])
+    np.testing.assert_array_equal(largest, expected[1])
+    assert 20 < combined.sum() < largest.sum() < n
+
+
+def test_distinct_poses() -> None:
+    poses = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 5e-7], [0.0, 1e-3], [np.nan, 0.0]])
+    assert J.distinct_poses(poses) == 3

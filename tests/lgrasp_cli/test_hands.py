@@ -1,0 +1,73 @@
+"""Opposition spaces on the command line: listed, shown, measured, and refused when they do not fit."""
+
+import json
+
+import pytest
+import yaml
+from support.urdfs import gripper
+
+PINCH = "finger_1-finger_2"
+
+
+@pytest.fixture
+def jaws(cli, tmp_path):
+    """Folder of a drafted gripper; its two jaws are one opposition space."""
+    folder = tmp_path / "made"
+    assert "opposition spaces" in cli("hands", "add", gripper(tmp_path), "--out", folder).out
+    return folder
+
+
+def change(folder, spaces) -> None:
+    path = folder / "hand.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"opposition_spaces": spaces}, sort_keys=False))
+
+
+def test_list_and_show_tell_the_spaces(cli, jaws):
+    counts = {hand["name"]: hand["spaces"] for hand in json.loads(cli("hands", "list", "--json").out)}
+    assert counts["allegro"] == 7
+    assert min(counts.values()) >= 3
+    assert "opposition spaces  7: index-palm, middle-palm, ring-palm, thumb-palm" in cli("hands", "show", "allegro").out
+    spaces = json.loads(cli("hands", "show", "allegro", "--json").out)["opposition_spaces"]
+    assert spaces["thumb-index"] == [f"joint_{k}.0" for k in (0, 1, 2, 3, 12, 13, 14, 15)]
+    assert f"opposition spaces  1: {PINCH}" in cli("hands", "show", jaws).out
+    change(jaws, {})
+    assert "opposition spaces  none" in cli("hands", "show", jaws).out
+
+
+def test_check_measures_the_spaces(cli, jaws, tmp_path):
+    rules = yaml.safe_load((jaws / "hand.yaml").read_text())["opposition_spaces"]
+    away = [part | {"axis": [-x for x in part["axis"]]} for part in rules[PINCH]["sides"]]
+    thin = [part | {"box": {"min": [5, 5, 5], "max": [6, 6, 6]}} for part in rules[PINCH]["sides"]]
+    change(jaws, rules | {"away": rules[PINCH] | {"sides": away}, "nothing": rules[PINCH] | {"sides": thin}})
+    folder = tmp_path / "pictures"
+    shown = cli("hands", "check", jaws, "-n", 5, "--device", "cpu", "--workers", 1, "--out", folder, "--quiet")
+    assert shown.code == 0, shown
+    lines = shown.out.splitlines()
+    table = next(i for i, line in enumerate(lines) if line.startswith("space "))
+    name, joints, side, area, other, _, apart = lines[table + 1].split()
+    assert (name, joints, {side, other}) == (PINCH, "2", {"finger_1", "finger_2"})
+    assert float(area) == pytest.approx(12.0, rel=0.1)  # 20 x 60 mm
+    low, high = map(int, apart.split("-"))
+    assert 2 <= low < 15
+    assert 95 < high < 122
+    assert "away can hold nothing: its sides never face each other" in lines
+    (nothing,) = [line for line in lines if line.startswith("nothing can hold nothing")]
+    assert "side 1" in nothing
+    assert "has no surface" in nothing
+    assert "a sequence holds 1 object at most" in lines
+    for name in ("spaces.png", "palmar.png"):
+        assert (folder / name).stat().st_size > 20_000
+        assert f"wrote {folder / name}" in lines
+
+
+def test_spaces_that_do_not_fit_are_refused(cli, jaws):
+    side = {"links": ["jaw_l"], "axis": [1, 0, 0], "angle": 30}
+    change(jaws, {"pinch": {"joints": ["l"], "sides": [side, side | {"links": ["jaw_q"]}]}})
+    assert (
+        "opposition space 'pinch': link 'jaw_q' does not exist; links: base, jaw_l"
+        in cli("hands", "show", jaws).error()
+    )
+    change(jaws, {"pinch": {"joints": ["l"], "sides": [side]}})
+    assert "opposition_spaces.pinch.sides" in cli("hands", "show", jaws).error()
+    change(jaws, {"pinch": {"joints": ["l"], "side": [side, side]}})
+    assert "did you mean 'sides'" in cli("hands", "show", jaws).error()

@@ -1,0 +1,1 @@
+from support.refining import coarse, filtered, make, valid  # noqa: F401

@@ -1,0 +1,69 @@
+"""Starting Warp: quiet, without swallowing what others write."""
+
+import subprocess
+import sys
+
+import pytest
+
+from lgrasp.errors import DeviceError
+from lgrasp.runtime.device import resolve_device
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+def test_start_is_silent():
+    result = run("from lgrasp.runtime.device import resolve_device; print(resolve_device('cpu').alias)")
+    assert result.stdout.strip() == "cpu"
+    assert result.stderr == ""
+
+
+def test_other_native_output_during_the_start_is_kept():
+    code = """
+import os, warp as wp
+from lgrasp.runtime import device as runtime
+init = wp.init
+def noisy():
+    os.write(2, b"disk is full\\n")
+    init()
+wp.init = noisy
+runtime.start()
+os.write(2, b"after\\n")
+"""
+    assert run(code).stderr.splitlines() == ["disk is full", "after"]
+
+
+def test_error_during_the_start_is_kept():
+    code = """
+import os, warp as wp
+from lgrasp.runtime import device as runtime
+def broken():
+    os.write(2, b"no native library\\n")
+    raise RuntimeError("broken install")
+wp.init = broken
+runtime.start()
+"""
+    result = run(code)
+    assert result.returncode != 0
+    assert "no native library" in result.stderr
+    assert "broken install" in result.stderr
+
+
+def test_closed_stderr_does_not_stop_the_start():
+    code = (
+        "import os; os.close(2); from lgrasp.runtime.device import resolve_device; print(resolve_device('cpu').alias)"
+    )
+    assert run(code).stdout.strip() == "cpu"
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:99", "", "cpu:0"])
+def test_unknown_device_lists_what_exists(name):
+    with pytest.raises(DeviceError, match=r"choose auto, cpu"):
+        resolve_device(name)
+
+
+def test_auto_is_one_of_the_devices():
+    device = resolve_device()
+    assert device.is_cuda == (device.alias != "cpu")
+    assert device.name

@@ -1,0 +1,88 @@
+"""MuJoCo Warp judges as MuJoCo does."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from support.jaws import Jaws
+from support.twins import in_one_gripper, twin_rows, twin_shard
+
+from lgrasp.runtime.device import start
+from lgrasp.simulate import PROTOCOLS, scene_of_shard, verdicts
+from lgrasp.simulate.columns import stack_verdicts
+from lgrasp.simulate.groups import group_rows
+from lgrasp.simulate.model import build_model
+
+pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed (extra gpu-sim)")
+
+start()
+GPU = wp.get_cuda_device_count() > 0
+pytestmark = pytest.mark.skipif(
+    not GPU and not os.environ.get("LGRASP_TEST_WARP_CPU"),
+    reason="no GPU; LGRASP_TEST_WARP_CPU=1 takes Warp's CPU device, which compiles for minutes",
+)
+FC = PROTOCOLS["fc"]
+
+
+@pytest.fixture
+def six(jaws: Jaws):
+    """A scene and six grasps; the first presses too little, the last ones hold."""
+    shard = jaws.shard(0.002, count=6)
+    depth = np.linspace(0.0002, 0.004, 6, dtype="f4")[:, None]
+    return scene_of_shard(shard), Jaws.rows(shard, q_squeeze=shard.grasps.q - depth)
+
+
+def judge(scene, rows, worlds: int = 8, protocol=FC):
+    from lgrasp.simulate.gpu import WorldTrials
+
+    (group,) = group_rows(rows, len(scene.objects))
+    model = build_model(scene, protocol, rows.q[0], group.objects)
+    trials = WorldTrials(model, "cuda:0" if GPU else "cpu", worlds=worlds, all_directions=True)
+    return stack_verdicts(protocol, trials.run(group.rows), group.slots)
+
+
+def test_same_verdicts(six):
+    """In as many worlds as there are grasps, and in fewer."""
+    here = verdicts(*six, FC, all_directions=True)
+    assert 0 < here["fc_holds"].sum() < 6
+    for worlds in (8, 4):
+        there = judge(*six, worlds=worlds)
+        for name in ("holds", "directions", "contact_at_q", "settled", "diverged"):
+            np.testing.assert_array_equal(here[f"fc_{name}"], there[f"fc_{name}"], err_msg=name)
+        for name, bound in (("displacement", 2e-3), ("slip", 2e-4), ("pregrasp_penetration", 1e-6)):
+            np.testing.assert_allclose(here[f"fc_{name}"], there[f"fc_{name}"], atol=bound, err_msg=name)
+
+
+def test_a_world_without_room_is_judged_by_mujoco(six, monkeypatch):
+    """Rows that need more constraints than there is room for get MuJoCo's own verdict."""
+    from lgrasp.simulate import worlds
+
+    monkeypatch.setattr(worlds, "_CONSTRAINTS", 8)
+    here, there = verdicts(*six, FC, all_directions=True), judge(*six)
+    for name, values in here.items():
+        np.testing.assert_array_equal(values, there[name], err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["seq6", "gravity6"])
+def test_two_objects(name: str):
+    """Held in a gripper each, one let go, one inside the other, both in one gripper."""
+    protocol, rows = PROTOCOLS[name], twin_rows(count=4)
+    squeeze, q, start, pose = rows.q_squeeze.copy(), rows.q.copy(), rows.q_pregrasp.copy(), rows.object_pose.copy()
+    pose[1, 1, 2] += 0.3
+    pose[2, 0] = pose[2, 1]
+    pose[2, 0, 0] += 0.02
+    one = in_one_gripper(0.004)
+    squeeze[3], q[3], start[3], pose[3] = one.q_squeeze[0], one.q[0], one.q_pregrasp[0], one.object_pose[0]
+    rows = replace(rows, q=q, q_squeeze=squeeze, q_pregrasp=start, object_pose=pose)
+    scene = scene_of_shard(twin_shard(rows))
+    here, there = verdicts(scene, rows, protocol, all_directions=True), judge(scene, rows, protocol=protocol)
+    assert here[f"{name}_holds"].tolist() == [True, False, False, True]
+    for column in ("holds", "directions", "stays", "object_touches", "settled", "diverged", "contact_at_q"):
+        np.testing.assert_array_equal(here[f"{name}_{column}"], there[f"{name}_{column}"], err_msg=column)
+    for column, bound in (("object_displacement", 2e-3), ("penetration", 5e-4), ("slip", 2e-4)):
+        kept = [0, 3]
+        np.testing.assert_allclose(
+            here[f"{name}_{column}"][kept], there[f"{name}_{column}"][kept], atol=bound, err_msg=column
+        )

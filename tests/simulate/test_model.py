@@ -1,0 +1,139 @@
+"""What MuJoCo is given: the kinematics of the URDF, the generator's solids, the inertia of the mesh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from support.jaws import Jaws, mesh_record, shipped_hand
+from support.kinematics import link_poses
+from support.solids import YOU, prism
+
+from lgrasp.engine.cache import Cache
+from lgrasp.errors import DecomposeError
+from lgrasp.geometry.decompose import decompose
+from lgrasp.simulate import PROTOCOLS, Scene, scene_of_shard, verdicts
+from lgrasp.simulate.model import build_model
+from lgrasp.simulate.scene import hand_of_record, object_of_record
+
+mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
+
+FC = PROTOCOLS["fc"]
+HANDS = ("allegro", "barrett", "dclaw", "leap", "schunk_svh", "shadow")
+
+
+def no_cut(*_: object, **__: object) -> list[np.ndarray]:
+    raise DecomposeError("made up")
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_links_are_where_the_urdf_puts_them(name: str):
+    """All joints: actuated, locked above and below the base link, and mimic ones, of the URDF or of hand.yaml."""
+    record, path, tree = shipped_hand(name)
+    cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
+    rng = np.random.default_rng(0)
+    rows = tree.listed_values(rng.uniform(tree.joint_lower, tree.joint_upper).astype("f4")[None])
+    model = build_model(Scene(hand_of_record(record, no_cut), (cube,)), FC, rows[0])
+    data = mujoco.MjData(model.mujoco)
+    data.qpos[model.joint_address] = model.joint_matrix @ rows[0] + model.joint_offset
+    mujoco.mj_kinematics(model.mujoco, data)
+    base = data.body(record.base_link)
+    R_base = base.xmat.reshape(3, 3)
+    wanted = link_poses(path, dict(zip(tree.listed_names, rows[0].tolist(), strict=True)), record.base_link)
+    assert len(model.link_body) == len(wanted)
+    for link, body in zip(record.link_names, model.link_body, strict=True):
+        T = wanted[link]
+        np.testing.assert_allclose(R_base.T @ (data.xpos[body] - base.xpos), T[:3, 3], atol=1e-6, err_msg=link)
+        np.testing.assert_allclose(R_base.T @ data.xmat[body].reshape(3, 3), T[:3, :3], atol=1e-6, err_msg=link)
+
+
+def test_drives_are_near_critically_damped(jaws: Jaws):
+    """A drive that is let go returns within a tenth of a second and overshoots by no more than 5 %."""
+    record, _, tree = shipped_hand("allegro")
+    cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
+    q = tree.listed_values(tree.joint_open[None])[0]
+    m = build_model(Scene(hand_of_record(record, no_cut), (cube,)), FC, q)
+    data = mujoco.MjData(m.mujoco)
+    data.qpos[m.object_address[0, 0]] = 10.0
+    data.qpos[m.joint_address] = m.joint_matrix @ q + m.joint_offset
+    data.ctrl[:] = q[m.columns]
+    data.ctrl[2] += 0.2
+    trace = []
+    for _ in range(100):
+        mujoco.mj_step(m.mujoco, data)
+        trace.append((data.qpos[m.joint_address[2]] - q[2]) / 0.2)
+    assert max(trace) < 1.05
+    assert min(trace[25:]) > 0.95
+
+
+def test_inertia_is_that_of_the_mesh(jaws: Jaws):
+    shard = jaws.shard()
+    mesh = prism(YOU, 0.02)
+    shard = replace(shard, objects=[mesh_record("you", mesh)])
+    scene = scene_of_shard(shard, no_cut)
+    model = build_model(scene, FC, shard.grasps.q[0])
+    (body,) = model.object_body
+    mesh.density = FC.mass / mesh.volume
+    assert model.mujoco.body_mass[body] == pytest.approx(FC.mass)
+    np.testing.assert_allclose(model.mujoco.body_ipos[body], mesh.center_mass, atol=1e-7)
+    np.testing.assert_allclose(
+        np.sort(model.mujoco.body_inertia[body]), np.sort(mesh.principal_inertia_components), rtol=1e-4
+    )
+
+
+def test_a_dent_stays_open(tmp_path):
+    """The slot of a U is no part of its pieces; where cutting fails the hull fills it, and that is said."""
+    record = mesh_record("you", prism(YOU, 0.02))
+    cut = object_of_record(record, lambda *a, **k: decompose(*a, **k, store=Cache(tmp_path)))
+    assert len(cut.pieces) >= 3
+    assert cut.excess < 1e-3
+    assert not cut.notes
+    hull = object_of_record(record, no_cut)
+    assert len(hull.pieces) == 1
+    assert hull.excess == pytest.approx(0.006, abs=3e-4)  # half the slot's width
+    assert hull.notes == ("the convex hull stands for the mesh, its dents are filled (made up)",)
+    assert hull.volume == cut.volume == pytest.approx(prism(YOU, 0.02).volume, rel=1e-5)
+
+
+def test_a_mesh_that_is_not_closed_is_said():
+    cube = trimesh.creation.box([0.03] * 3)
+    cube.update_faces(np.arange(len(cube.faces)) > 0)
+    solid = object_of_record(mesh_record("open", cube), no_cut)
+    assert solid.volume == pytest.approx(0.03**3)
+    assert any("not closed" in note for note in solid.notes)
+
+
+@pytest.mark.parametrize("kind", ["fixed", "revolute", "prismatic"])
+def test_what_carries_the_base_does_not_matter(jaws: Jaws, kind: str):
+    """The base on a turned mount, or on a joint that is held somewhere: poses and pulls are in the base's frame."""
+    plain = jaws.shard(0.004)
+    limit = '<limit lower="-1" upper="1" effort="1" velocity="1"/>' if kind != "fixed" else ""
+    mount = (
+        f'<link name="mount"/><joint name="w" type="{kind}"><parent link="mount"/><child link="base"/>'
+        f'<origin xyz="0.1 -0.2 0.3" rpy="0.3 -1.2 2"/><axis xyz="0 0.6 0.8"/>{limit}</joint></robot>'
+    )
+    urdf = plain.hand.urdf.replace("</robot>", mount)
+    names = ("l", "r") if kind == "fixed" else ("l", "r", "w")
+    rows = plain.grasps
+    if kind != "fixed":
+        wide = {n: np.hstack([getattr(rows, n), [[np.float32(0.5)]]]) for n in ("q", "q_pregrasp", "q_squeeze")}
+        rows = replace(rows, **wide)
+    carried = replace(plain, hand=replace(plain.hand, urdf=urdf, joint_names=names), grasps=rows)
+    a, b = (verdicts(scene_of_shard(s), s.grasps, FC, all_directions=True) for s in (plain, carried))
+    assert a["fc_holds"].all()
+    for name, values in a.items():
+        np.testing.assert_allclose(values, b[name], atol=1e-5, err_msg=name)
+
+
+def test_neighbours_and_sockets_do_not_collide():
+    """At random postures of the Allegro no pair of joined links is in contact, nor one with the welded base."""
+    record, _, tree = shipped_hand("allegro")
+    cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
+    q = tree.listed_values(tree.joint_open[None])[0]
+    m = build_model(Scene(hand_of_record(record, no_cut), (cube,)), FC, q)
+    data = mujoco.MjData(m.mujoco)
+    data.qpos[m.object_address[0, 0]] = 10.0
+    data.qpos[m.joint_address] = m.joint_matrix @ q + m.joint_offset
+    mujoco.mj_forward(m.mujoco, data)
+    assert data.ncon == 0
+    assert (m.mujoco.body_weldid[m.mujoco.geom_bodyid] == 0).any()

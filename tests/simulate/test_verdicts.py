@@ -1,0 +1,169 @@
+"""Verdicts against what statics says, planted failures, and what must not matter."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.jaws import EDGE, Jaws
+
+from lgrasp.errors import ConfigError, PhysicsError
+from lgrasp.simulate import COLUMNS, PROTOCOLS, find_protocol, protocol_text, scene_of_shard, verdicts
+
+pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
+
+FC = PROTOCOLS["fc"]
+SLIDING = FC.stiffness / FC.lever**2  # [N/m] of a jaw
+
+
+def judge(shard, protocol=FC, rows=None, **more):
+    found = verdicts(scene_of_shard(shard), rows or shard.grasps, protocol, **more)
+    assert set(found) == {f"{protocol.name}_{name}" for name in COLUMNS}
+    return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
+
+
+def press(force: float) -> float:
+    """Squeeze [m] with which each jaw presses with some force [N]."""
+    return force / SLIDING
+
+
+@pytest.mark.parametrize("normal", [0.6, 1.1])
+def test_friction_of_two_jaws(jaws: Jaws, normal: float):
+    """Each jaw bears mu x N: the cube stays under 1 N when 2 x 0.6 x N > 1; against jaws and palm it always does."""
+    found = judge(jaws.shard(press(normal)), all_directions=True)
+    holds = 2 * FC.friction * normal > FC.force
+    assert found["holds"] == [holds]
+    np.testing.assert_array_equal(found["directions"][0], [1, 1, *[int(holds)] * 3, 1])
+    assert found["contact_at_q"] == 2
+    # against a jaw: the cube gives way by force / stiffness of both jaws, and swings as far again at most
+    give = found["displacement"][0, :2] * (2 * SLIDING) / FC.force
+    assert ((give > 1) & (give < 2.3)).all()
+
+
+def test_stops_at_the_first_loss(jaws: Jaws):
+    found = judge(jaws.shard(press(0.5)))
+    np.testing.assert_array_equal(found["directions"][0], [1, 1, 0, -1, -1, -1])
+    assert np.isnan(found["displacement"][0, 3:]).all()
+    assert found["displacement"][0, 2] > FC.most_displacement
+    assert not found["diverged"].any()
+
+
+def test_planted_failures(jaws: Jaws):
+    good = jaws.shard(press(4.0))
+    assert judge(good)["holds"].all()
+    away = good.grasps.object_pose.copy()
+    away[..., 1] += 0.05
+    assert not judge(good, rows=Jaws.rows(good, object_pose=away))["holds"].any()
+    slippery = judge(good, FC.model_copy(update={"friction": 0.05}))
+    assert not slippery["holds"].any()
+    opened = good.grasps.q_pregrasp
+    unclosed = judge(good, rows=Jaws.rows(good, q=opened, q_squeeze=opened))
+    assert not unclosed["holds"].any()
+    assert unclosed["contact_at_q"] == unclosed["contact_at_grasp"] == 0
+    inside = Jaws.rows(good, q_pregrasp=np.full_like(opened, EDGE / 2 - 0.012))
+    deep = judge(good, rows=inside)
+    assert deep["pregrasp_penetration"] == pytest.approx(0.012, abs=2e-4)
+    assert not deep["holds"].any()
+    assert (deep["directions"] == -1).all()
+
+
+def test_contact_and_slip(jaws: Jaws):
+    """At q the jaws just touch; a jaw that closes alone pushes the cube, and its contact slides nowhere."""
+    good = jaws.shard(press(4.0))
+    found = judge(good)
+    assert found["contact_at_q"] == 2
+    assert found["slip"] < 1e-3
+    shifted = good.grasps.object_pose.copy()
+    shifted[..., 1] += 0.006  # contacts are where q puts the links, 6 mm beside where they were meant to be
+    q = good.grasps.q + np.float32(0.002)
+    assert judge(good, rows=Jaws.rows(good, q=q))["contact_at_q"] == 0  # 2 mm off
+    assert judge(good, rows=Jaws.rows(good, q=q))["slip"] == pytest.approx(0.0025, abs=1e-3)
+    assert judge(good, rows=Jaws.rows(good, object_pose=shifted))["slip"] < 1e-3
+
+
+def test_rows_stand_alone(jaws: Jaws):
+    """Neither the number of threads nor the other rows decide a verdict."""
+    shard = jaws.shard(press(1.0), count=6)
+    depth = np.linspace(0.5, 3.0, 6, dtype="f4")[:, None]
+    rows = Jaws.rows(shard, q_squeeze=shard.grasps.q - np.float32(press(1.0)) * depth)
+    one, two = (judge(shard, rows=rows, threads=n) for n in (1, 2))
+    assert 0 < one["holds"].sum() < 6
+    last = {name: values[-1:] for name, values in rows.columns().items()}
+    single = judge(shard, rows=replace(rows, **last))
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, two[name], err_msg=name)
+        np.testing.assert_array_equal(values[-1:], single[name], err_msg=name)
+
+
+def test_frame_of_the_object_does_not_matter(jaws: Jaws):
+    shard = jaws.shard(press(1.0))
+    shift = np.array([0.3, -0.2, 0.1], "f4")
+    cube = shard.objects[0]
+    moved = replace(shard, objects=[replace(cube, vertices=cube.vertices + shift)])
+    pose = shard.grasps.object_pose.copy()
+    pose[..., :3] -= shift
+    rows = Jaws.rows(shard, object_pose=pose, contact_points=shard.grasps.contact_points + shift)
+    a, b = judge(shard, all_directions=True), judge(moved, rows=rows, all_directions=True)
+    np.testing.assert_array_equal(a["directions"], b["directions"])
+    for name in ("displacement", "slip", "pregrasp_penetration"):
+        np.testing.assert_allclose(a[name], b[name], atol=2e-4, err_msg=name)
+
+
+def test_weight_of_an_object(jaws: Jaws):
+    """gravity6: 0.5 g/cm3 x 64 cm3 = 32 g, which pull with 0.31 N."""
+    protocol = PROTOCOLS["gravity6"]
+    load = protocol.load(EDGE**3)
+    assert load.mass == pytest.approx(0.032)
+    assert load.force == pytest.approx(0.3136)
+    assert load.stiffness == 5.0
+    assert protocol.load(10 * EDGE**3).stiffness == pytest.approx(5 * 3.136)
+    assert protocol.load(100 * EDGE**3).stiffness == 100.0
+    for normal, holds in ((0.2, False), (0.35, True)):  # 2 x 0.6 x N against 0.31 N
+        assert judge(jaws.shard(press(normal)), protocol)["holds"] == [holds]
+
+
+def test_divergence_is_a_failure_and_writes_nothing(jaws: Jaws, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = judge(jaws.shard(press(4.0)), FC.model_copy(update={"force": 1.0e12}))
+    assert found["diverged"].all()
+    assert not found["holds"].any()
+    assert not list(tmp_path.iterdir())
+
+
+def test_progress_can_end_it(jaws: Jaws):
+    def stop(done: int, held: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        judge(jaws.shard(press(1.0), count=50), progress=stop)
+
+
+def test_no_rows(jaws: Jaws):
+    shard = jaws.shard(count=0)
+    found = judge(shard)
+    assert found["directions"].shape == (0, 6)
+
+
+def test_protocol_text_names_every_number(jaws: Jaws):
+    text = json.loads(protocol_text(scene_of_shard(jaws.shard()), FC))
+    assert text["name"] == "fc"
+    for name, value in FC.model_dump(mode="json").items():
+        assert text[name] == value
+    (cube,) = text["objects"]
+    assert (cube["name"], cube["mass"], cube["force"], cube["stiffness"]) == ("cube", 0.1, 1.0, 5.0)
+    assert text["simulator"].startswith("mujoco ")
+
+
+def test_errors(jaws: Jaws, monkeypatch):
+    with pytest.raises(ConfigError, match="unknown protocol 'fd'; choose fc, gravity6"):
+        find_protocol("fd")
+    shard = jaws.shard()
+    for index, said in ((-1, r"row 1 has object_index \[-1\]"), (1, r"\[1\]; one object at least, of 1 that there")):
+        with pytest.raises(PhysicsError, match=said):
+            judge(shard, rows=jaws.rows(jaws.shard(count=2), object_index=np.array([[0], [index]])))
+    heavy = shard.hand.urdf.replace("</link>", '<inertial><mass value="-1"/></inertial></link>', 1)
+    with pytest.raises(PhysicsError, match="MuJoCo refuses hand 'jaws'"):
+        judge(jaws.shard(urdf=heavy))
+    monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
+    with pytest.raises(PhysicsError, match=r'pip install "lgrasp\[sim\]"'):
+        judge(shard)
