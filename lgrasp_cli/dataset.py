@@ -94,7 +94,7 @@ def metrics(
 ) -> None:
     """Copy shards and add quality metrics to the copies; those that are in --out already are kept.
 
-    Subfolders are looked into and made in --out too. docs/metrics.md defines the metrics.
+    Subfolders are looked into and made in --out too. docs/reference/metrics.md defines the metrics.
 
     Example: lgrasp dataset metrics grasps/allegro-mug --add volume,epsilon_exact -o grasps/measured
     """

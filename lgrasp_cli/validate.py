@@ -49,7 +49,7 @@ def validate(
 
     The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
     directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects: the
-    hand starts at q, and every object must still touch it. docs/physics.md says what exactly is simulated.
+    hand starts at q, and every object must still touch it. docs/guides/physics.md says what exactly is simulated.
 
     Example: lgrasp validate grasps/allegro-mug --out grasps/allegro-mug-fc --protocol fc
     """

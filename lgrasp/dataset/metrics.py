@@ -22,7 +22,7 @@ from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 
 METRICS = {"epsilon_exact": "", "volume": ""}
-"""Units of the metrics that can be added (docs/metrics.md defines them)."""
+"""Units of the metrics that can be added (docs/reference/metrics.md defines them)."""
 
 _TASK_ROWS = 32
 _ROW = ("candidate", "q", "contact_points")  # what tells rows apart

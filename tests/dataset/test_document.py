@@ -1,4 +1,4 @@
-"""docs/file-format.md names every member of the format, and its examples run."""
+"""docs/reference/file-format.md names every member of the format, and its examples run."""
 
 import re
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 from lgrasp.dataset import write_shard
 from lgrasp.grasp.schema import ATTRIBUTES, DATASETS, FORMAT_VERSION, SEQUENCE_DATASETS
 
-TEXT = (Path(__file__).parents[2] / "docs" / "file-format.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).parents[2] / "docs" / "reference" / "file-format.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
 
 

@@ -252,7 +252,7 @@ def test_open_grasps_have_neither():
 
 
 def test_example_of_the_docs():
-    text = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "metrics.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     names: dict = {}
     exec(code.replace("print(", "got = ("), names)

@@ -18,7 +18,7 @@ from lgrasp.jobs.refine.plan import PlanJob, PlanOutcome, plan_grasps
 from lgrasp.object.find import find_object
 from lgrasp.planning.planner import PlanParams
 
-PENETRATION, GAP, CLOUD_GAP, ANGLE = 2.0, 4.0, 6.0, 45.0  # [mm, deg] that docs/refine.md promises
+PENETRATION, GAP, CLOUD_GAP, ANGLE = 2.0, 4.0, 6.0, 45.0  # [mm, deg] that docs/guides/refine.md promises
 ROUNDING = 0.1  # [mm] of distance grids; the judge measures meshes
 RADIUS, STARTS = 0.035, 12
 

@@ -1,4 +1,4 @@
-"""docs/scenes.md names every member of the format and every parameter with its default."""
+"""docs/guides/scenes.md names every member of the format and every parameter with its default."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ from lgrasp.cloud.files import CLOUD_SUFFIXES
 from lgrasp.jobs.scenes.config import SceneConfig
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
 
-TEXT = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).parents[2] / "docs" / "guides" / "scenes.md").read_text(encoding="utf-8")
 NAMES = {"f4": "float32", "i4": "int32", "i2": "int16", "u2": "uint16", "u8": "uint64", "?": "bool"}
 
 

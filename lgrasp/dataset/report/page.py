@@ -114,8 +114,8 @@ def _histograms(hand: HandRows) -> list[str]:
         out.append(figure(quantity_chart(bounded), text))
     if free:
         text = (
-            "Epsilon and volume as docs/metrics.md defines them: friction 0.5, eight-edge cones, torque over the "
-            "object's radius. 0: the origin is not inside the hull, so some load cannot be held at this friction."
+            "Epsilon and volume as docs/reference/metrics.md defines them: friction 0.5, eight-edge cones, torque over "
+            "the object's radius. 0: the origin is not inside the hull, so some load cannot be held at this friction."
         )
         out += ["<h3>Quality</h3>", figure(quantity_chart(free), text)]
     return out

@@ -25,7 +25,7 @@ def report_dataset(paths: _Paths, out: Path, *, progress: Callable[[int, int], N
         progress: Called with (rows done, rows in all) now and then.
 
     Returns:
-        The numbers of the report, JSON-serialisable; docs/metrics.md lists them.
+        The numbers of the report, JSON-serialisable; docs/reference/metrics.md lists them.
 
     Raises:
         ShardError: No shard is found, or one cannot be read.

@@ -26,7 +26,7 @@ class SearchParams(BaseModel):
     friction: float = Field(0.5, gt=0, le=2, description="Friction coefficient of gswo.")
     balance: float = Field(0.03, gt=0, le=1, description="Largest gswo residual (norm, inscribed round cone) of a set.")
     disturbance: float = Field(
-        1.0, gt=0, le=1, description="Largest disturbance residual of a set (docs/pipeline.md); 1 asks for nothing."
+        1.0, gt=0, le=1, description="Largest disturbance residual of a set; 1 asks for nothing."
     )
     least_force: float = Field(0.03, ge=0, le=0.5, description="Smallest share of the normal force on a contact.")
     torque_scale: float = Field(10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")

@@ -1,4 +1,4 @@
-"""The examples of docs/exports.md and docs/training.md run, and the network of the latter learns."""
+"""The examples of docs/guides/exports.md and docs/guides/training.md run, and the network of the latter learns."""
 
 import re
 from dataclasses import replace
@@ -10,7 +10,7 @@ import torch
 
 from lgrasp.dataset import write_shard
 
-DOCS = Path(__file__).resolve().parents[3] / "docs"
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "guides"
 
 
 def examples(name: str) -> str:
