@@ -2,14 +2,40 @@
 
 import difflib
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, ClassVar, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, model_validator
 
 from lgrasp.errors import ConfigError
+from lgrasp.notices import notice
 
 Model = TypeVar("Model", bound=BaseModel)
+
+
+class Params(BaseModel):
+    """Frozen parameters whose unknown keys fail; keys of the release before are still read, with a notice."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    RENAMED: ClassVar[dict[str, str]] = {}
+    """Old key -> the field that it is now called."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_old_keys(cls, data: Any, info: ValidationInfo) -> Any:
+        if not isinstance(data, dict) or not cls.RENAMED.keys() & data.keys():
+            return data
+        where = f"{info.context['where']}: " if info.context else ""
+        read = {}
+        for key, value in data.items():
+            name = cls.RENAMED.get(key, key)
+            if name != key:
+                if name in data:
+                    raise ValueError(f"'{key}' is the old name of '{name}': give one of them")
+                notice(f"{where}'{key}' is now called '{name}'; the old name works in this release only")
+            read[name] = value
+        return read
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -34,7 +60,7 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
         ConfigError: one line with ``where``, the key, the value and what is accepted.
     """
     try:
-        return model.model_validate(data)
+        return model.model_validate(data, context={"where": where})
     except ValidationError as error:
         errors = error.errors()
         # a mistyped key is missing under its right name as well; the typing error says more
@@ -47,6 +73,8 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
             raise ConfigError(f"{where}: unknown key '{key}'; {hint}valid keys: {', '.join(valid)}") from None
         if first["type"] == "missing":
             raise ConfigError(f"{where}: key '{key}' is missing") from None
+        if not first["loc"]:
+            raise ConfigError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
         raise ConfigError(f"{where}: key '{key}' = {first['input']!r}: {first['msg']}") from None
 
 

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from lgrasp.notices import on_notice
 from lgrasp_cli import (
     bench,
     cache,
@@ -26,6 +27,7 @@ from lgrasp_cli import (
     validate,
 )
 from lgrasp_cli.interrupt import Interrupted, on_interrupt, stop_asked, stop_now
+from lgrasp_cli.options import warn
 
 app = typer.Typer(
     help="Generate grasps for dexterous hands.",
@@ -63,6 +65,7 @@ def _options(
 
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 bad input or output, 3 too few grasps, 130 interrupted."""
+    on_notice(warn)
     if os.environ.get("LGRASP_DEBUG"):
         code = app(prog_name="lgrasp", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)

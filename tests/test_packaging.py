@@ -15,7 +15,7 @@ HEAVY = ("torch", "warp", "trimesh", "yourdfpy", "h5py", "scipy", "numpy", "coac
 DATA = ("hands", "objects", "pipelines", "configs")
 
 ORDER = (
-    ("errors", "paths", "config", "seeding"),
+    ("errors", "paths", "notices", "config", "seeding"),
     ("geometry", "math", "runtime"),
     ("hand", "object"),
     ("cloud", "differentiable", "field"),

@@ -1,0 +1,47 @@
+"""Declarations: old keys are read for one release, unknown ones fail."""
+
+from typing import ClassVar
+
+import pytest
+
+from lgrasp import notices
+from lgrasp.config import Params, parse_model
+from lgrasp.errors import ConfigError
+
+
+class Stage(Params):
+    RENAMED: ClassVar = {"slack": "allowed_penetration"}
+
+    allowed_penetration: float = 0.001
+
+
+@pytest.fixture
+def said(monkeypatch):
+    lines: list[str] = []
+    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(notices, "_listeners", [lines.append])
+    return lines
+
+
+def test_old_key_is_read_and_said_once(said):
+    for _ in range(2):
+        assert parse_model(Stage, {"slack": 0.002}, "pipeline mine, stage ik").allowed_penetration == 0.002
+    assert said == [
+        "pipeline mine, stage ik: 'slack' is now called 'allowed_penetration'; the old name works in this release only"
+    ]
+
+
+def test_new_key_says_nothing(said):
+    assert parse_model(Stage, {"allowed_penetration": 0.002}, "here").allowed_penetration == 0.002
+    assert Stage().allowed_penetration == 0.001
+    assert said == []
+
+
+def test_both_keys_fail(said):
+    with pytest.raises(ConfigError, match="'slack' is the old name of 'allowed_penetration'"):
+        parse_model(Stage, {"slack": 0.002, "allowed_penetration": 0.001}, "here")
+
+
+def test_unknown_key_names_the_nearest(said):
+    with pytest.raises(ConfigError, match="did you mean 'allowed_penetration'"):
+        parse_model(Stage, {"allowed_penetrations": 0.002}, "here")
