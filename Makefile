@@ -13,12 +13,12 @@ endif
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check lint format type pytest bench wheel clean
+.PHONY: help setup demo test check lint format type pytest docs bench wheel clean
 
 help:
 	@echo "make demo    set up, build the Allegro contact field, generate 1,000 grasps of the sample mug"
 	@echo "make test    set up, then the gate: ruff, pyright, pytest"
-	@echo "make setup | check | lint | format | type | pytest | bench | wheel | clean"
+	@echo "make setup | check | lint | format | type | pytest | docs | bench | wheel | clean"
 
 setup: $(STAMP)
 
@@ -52,6 +52,10 @@ type: setup
 # WORKERS test files run side by side, each on one thread.
 pytest: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+# Pages that are made from the code: docs/reference/cli.md.
+docs: setup
+	$(BIN)/python -m lgrasp_cli.reference
 
 bench: setup
 	$(BIN)/lgrasp bench

@@ -1,0 +1,91 @@
+"""Writes docs/reference/cli.md from the commands themselves: ``make docs``."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+_PAGE = Path(__file__).parents[1] / "docs" / "reference" / "cli.md"
+_HEAD = """\
+<!-- Made from the commands by `make docs`; do not edit. -->
+
+# Command line
+
+Reports go to standard output; progress, warnings and errors go to standard error. A failure is one line.
+[Running jobs](../guides/jobs.md) explains reports, resuming and arrays.
+
+| exit code | meaning |
+|---|---|
+| 0 | done |
+| 1 | a fault of lgrasp, please report it |
+| 2 | bad input, or output that cannot be written; no half-written file is left |
+| 3 | fewer grasps than asked for after the effort that the pipeline allows; those found are on disk |
+| 130 | interrupted; finished files are on disk and the same command continues |
+
+| variable | meaning |
+|---|---|
+| `LGRASP_CACHE_DIR` | folder of the cache |
+| `LGRASP_PATH` | folders with `hands`, `objects`, `pipelines`, `configs` that come before the shipped ones |
+| `LGRASP_DEBUG` | 1: tracebacks |
+| `WARP_CACHE_PATH` | folder of the compiled kernels |
+"""
+
+
+def cli_page() -> str:
+    """The page: every command with its help, arguments and options."""
+    from lgrasp_cli.main import app
+
+    lines = [_HEAD]
+    for command, context in _commands(typer.main.get_command(app), None, "lgrasp"):
+        if context.parent is not None:
+            lines += _section(command, context)
+        if context.command_path == "lgrasp run":
+            lines += _config_keys()
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _commands(command: Any, parent: typer.Context | None, name: str) -> Iterator[tuple[Any, typer.Context]]:
+    """A command and those below it, each with its context."""
+    context = typer.Context(command, info_name=name, parent=parent)
+    yield command, context
+    for below, sub in getattr(command, "commands", {}).items():
+        if not sub.hidden:
+            yield from _commands(sub, context, below)
+
+
+def _section(command: Any, context: typer.Context) -> list[str]:
+    text, _, example = (command.help or "").partition("Example: ")
+    lines = [f"## {context.command_path}", ""]
+    for paragraph in filter(str.strip, text.split("\n\n")):
+        lines += [" ".join(paragraph.split()), ""]
+    if example:
+        lines += ["```", example.strip(), "```", ""]
+    records = [p.get_help_record(context) for p in command.get_params(context) if "--help" not in p.opts]
+    rows = [(_cell(names), _cell(what)) for names, what in filter(None, records)]
+    if rows:
+        lines += ["| option | meaning |", "|---|---|"]
+        lines += [f"| `{names}` | {what} |" for names, what in rows] + [""]
+    return lines
+
+
+def _config_keys() -> list[str]:
+    """The keys of a config, from its model."""
+    from lgrasp.jobs.config import JobConfig
+
+    lines = ["Keys of a config:", "", "| key | default | meaning |", "|---|---|---|"]
+    for name, field in JobConfig.model_fields.items():
+        default = field.get_default(call_default_factory=True)
+        shown = ", ".join(default) if isinstance(default, tuple) else "" if default is None else str(default)
+        lines.append(f"| `{name}` | {_cell(shown)} | {_cell(field.description or '')} |")
+    return [*lines, ""]
+
+
+def _cell(text: str) -> str:
+    return re.sub(r"\s+", " ", text).replace("|", r"\|")
+
+
+if __name__ == "__main__":
+    _PAGE.write_text(cli_page(), encoding="utf-8")
+    typer.echo(_PAGE)

@@ -1,0 +1,20 @@
+"""docs/reference/cli.md says what the commands say."""
+
+from pathlib import Path
+
+from lgrasp_cli.reference import cli_page
+
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "cli.md"
+
+
+def test_page_equals_commands():
+    same = PAGE.read_text(encoding="utf-8") == cli_page()  # a long difference would hide the remedy
+    assert same, "docs/reference/cli.md is not what the commands say; write it again with: make docs"
+
+
+def test_page_names_commands_options_and_keys():
+    page = cli_page()
+    assert "## lgrasp generate\n" in page
+    assert "## lgrasp dataset merge\n" in page
+    assert "| `-n, --rows <int>` |" in page
+    assert "| `object_dir` |" in page
