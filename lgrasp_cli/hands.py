@@ -120,13 +120,13 @@ def check_hand(
     """
     from dataclasses import asdict
 
-    from lgrasp.hand.find import find_hand
     from lgrasp.jobs.hand_check.check import check_hand as check
+    from lgrasp.jobs.hands import hand_source
     from lgrasp_cli.progress import say
     from lgrasp_cli.tables import print_json, print_table
 
     chosen, cache = choose_pipeline(pipeline), open_cache(cache_dir)
-    folder = out or Path("check") / find_hand(name).name
+    folder = out or Path("check") / hand_source(name).name
     found = check(
         name,
         chosen,

@@ -65,15 +65,16 @@ def plan(
     from lgrasp.cloud.read import read_cloud
     from lgrasp.config import parse_model
     from lgrasp.errors import ConfigError, StarvedError
-    from lgrasp.hand.find import find_hand
+    from lgrasp.jobs.hands import hand_source
     from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
     from lgrasp.planning.planner import PlanParams
+    from lgrasp.scenes.reader import scene_cloud
 
     if (mesh is None) == (cloud is None):
         raise ConfigError("give --object (a mesh or a name) or --cloud (a file of points), one of the two")
     given = None
     if cloud is not None:
-        given = read_cloud(cloud, mask, label, scale, _numbers(viewpoint), scene=False)
+        given = read_cloud(cloud, mask, label, scale, _numbers(viewpoint), scene=False, read_scene=scene_cloud)
         for note in given.notes:
             warn(note)
     elif mask is not None or label is not None or viewpoint is not None:
@@ -82,7 +83,7 @@ def plan(
     params = parse_model(PlanParams, {"distal": distal, "other": other}, "plan")
     job = PlanJob(
         hand=hand,
-        out=out or Path("plans") / f"{find_hand(hand).name}-{name}",
+        out=out or Path("plans") / f"{hand_source(hand).name}-{name}",
         starts=starts,
         object=mesh,
         scale=scale,

@@ -69,8 +69,8 @@ def sequence(
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10
     """
     cache = open_cache(cache_dir, fresh=force)
-    from lgrasp.hand.find import find_hand
     from lgrasp.jobs.config import array_task
+    from lgrasp.jobs.hands import hand_source
     from lgrasp.jobs.sequence.job import SequenceJob, sequence_name
     from lgrasp.jobs.sequence.size import parse_size
 
@@ -84,7 +84,7 @@ def sequence(
         objects=tuple(objects),
         rows=rows,
         pipeline=chosen,
-        out=out or Path("grasps") / sequence_name(find_hand(hand).name, tuple(objects)),
+        out=out or Path("grasps") / sequence_name(hand_source(hand).name, tuple(objects)),
         size=parse_size(scale),
         physics=physics,
         device=device,

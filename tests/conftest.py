@@ -15,6 +15,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.field.params import FieldParams
+from lgrasp.hand.find import find_hand
 from lgrasp.jobs.generate import Job, Outcome, generate
 from lgrasp.runtime.device import resolve_device, start
 from lgrasp.stages.context import Context
@@ -48,7 +49,7 @@ def load(swift: Pipeline, cache_root: Path) -> Callable[..., Inputs]:
     """load(object) or load(object, pipeline): hand, object and field on the CPU."""
 
     def load(name: str = OBJECT, pipeline: Pipeline = swift) -> Inputs:
-        keys = input_keys("allegro", name, 1.0, pipeline.object, pipeline.field)
+        keys = input_keys(find_hand("allegro"), name, 1.0, pipeline.object, pipeline.field)
         cache = Cache(cache_root, pytest.fail)
         return load_inputs(cache, keys, 1.0, pipeline.object, pipeline.field, resolve_device("cpu"))
 

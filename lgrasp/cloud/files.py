@@ -4,6 +4,7 @@ import contextlib
 import io
 import logging
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,27 +12,36 @@ import numpy as np
 import trimesh
 
 from lgrasp.errors import CloudError, ShardError
-from lgrasp.scenes.reader import SceneReader
 
 CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz", ".h5")
+
+SceneCloud = Callable[[Path], dict[str, np.ndarray]]
+"""Reads the merged cloud of a scene (.h5): points (n, 3) [m], normals (n, 3), labels (n,)."""
 
 _MASK_SUFFIXES = (".npy", ".npz")
 _LABELS = ("label", "labels")  # names that a file may give to the label of a point
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, read_scene: SceneCloud | None = None) -> dict[str, np.ndarray]:
     """What a cloud's file says of n points: ``points`` (n, 3), and perhaps ``normals`` (n, 3) and ``labels`` (n,).
 
     An image of points, (h, w, 3), is read row by row. A scene (.h5) gives its merged cloud. Of a mesh (.ply) the
     vertices are the points, and their normals those of the faces around; it has ``faces`` (f, 3) too.
 
+    Args:
+        read_scene: reader of .h5 files; without one they are not accepted.
+
     Raises:
         CloudError: no such file, an unknown suffix, or not the form of that suffix.
     """
-    data = _read_bytes(path, CLOUD_SUFFIXES, "a point cloud")
+    accepted = CLOUD_SUFFIXES if read_scene else tuple(s for s in CLOUD_SUFFIXES if s != ".h5")
+    data = _read_bytes(path, accepted, "a point cloud")
     kind = path.suffix.lower()
-    if kind == ".h5":
-        return _read_scene(path)
+    if kind == ".h5" and read_scene is not None:
+        try:
+            return read_scene(path)
+        except ShardError as error:
+            raise CloudError(str(error)) from None
     try:
         with _silence():
             found = _parse_ply(data) if kind == ".ply" else _parse_xyz(data) if kind == ".xyz" else _parse_numpy(data)
@@ -103,15 +113,6 @@ def _read_bytes(path: Path, suffixes: tuple[str, ...], what: str) -> bytes:
     if not data:
         raise CloudError(f"{path}: 0 bytes; {what} ({accepted}) is accepted")
     return data
-
-
-def _read_scene(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with SceneReader(path) as reader:
-            cloud = reader.cloud()
-    except ShardError as error:
-        raise CloudError(str(error)) from None
-    return {"points": cloud.points.astype(np.float64), "normals": cloud.normals, "labels": cloud.labels}
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lgrasp.cloud.files import check_labels, read_arrays, read_mask
+from lgrasp.cloud.files import SceneCloud, check_labels, read_arrays, read_mask
 from lgrasp.cloud.normals import estimate_normals, face_viewpoint
 from lgrasp.errors import CloudError
 
@@ -55,17 +55,19 @@ def read_cloud(
     viewpoint: Sequence[float] | np.ndarray | None = None,
     *,
     scene: bool = True,
+    read_scene: SceneCloud | None = None,
 ) -> Cloud:
     """Read a whole cloud; with a label, its ``target`` are the points of that label.
 
     Args:
-        path: File (see ``cloud_files.CLOUD_SUFFIXES``) with points and perhaps normals and labels.
+        path: File (see ``cloud.files.CLOUD_SUFFIXES``) with points and perhaps normals and labels.
         mask: File with a label for each point (.npy, .npz); default: the labels in the cloud's own file.
         label: Which points are the target; 1 where a mask of flags is given and no label.
         scale: Factor from the file's unit to metres.
         viewpoint: Where the points were seen from, x y z in the file's frame [m] after scaling. Normals are turned to
             it. Without one, normals that the file lacks are turned to the origin, which must lie outside the cloud.
         scene: Without a label it may be a scene, larger than anything that a hand grasps.
+        read_scene: Reader of scenes of this project (.h5), such as :func:`lgrasp.scenes.reader.scene_cloud`.
 
     Raises:
         CloudError: no usable points, a mask of another length or that selects next to nothing, an unlikely size, or
@@ -74,7 +76,7 @@ def read_cloud(
     path, notes = Path(path), []
     if not (np.isfinite(scale) and scale > 0.0):
         raise CloudError(f"scale {scale} cannot be used; a positive number such as 0.001 (millimetres to metres) is")
-    found = read_arrays(path)
+    found = read_arrays(path, read_scene)
     points, normals, labels = found["points"] * scale, found.get("normals"), found.get("labels")
     if labels is not None:
         labels = check_labels(labels, len(points), str(path))

@@ -16,8 +16,9 @@ from lgrasp.field.model import FIELD_VERSION, ContactField, build_field
 from lgrasp.field.params import FieldParams
 from lgrasp.geometry.decompose import decompose
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.hand.find import HandSource, find_hand
-from lgrasp.hand.model import HAND_VERSION, HandModel, build_hand, hand_digest
+from lgrasp.hand.build import build_hand, hand_digest
+from lgrasp.hand.find import HandSource
+from lgrasp.hand.model import HAND_VERSION, HandModel
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel, preprocess_object
@@ -56,13 +57,14 @@ class Inputs:
     scene: Scene | None = None  # for a physics simulation, if there is one
 
 
-def input_keys(hand: str, mesh: str | None, scale: float, objects: ObjectParams, fields: FieldParams) -> InputKeys:
-    """Find hand and object and compute the content keys of their artifacts.
+def input_keys(
+    source: HandSource, mesh: str | None, scale: float, objects: ObjectParams, fields: FieldParams
+) -> InputKeys:
+    """Find the object of a hand and compute the content keys of their artifacts.
 
     Raises:
-        HandError, ObjectError: see :func:`find_hand`, :func:`find_object`.
+        HandError, ObjectError: see :func:`hand_digest`, :func:`object_key`.
     """
-    source = find_hand(hand)
     digest = hand_digest(source.urdf, source.spec)
     hand_key = content_key("hand", HAND_VERSION, content=digest)
     field_key = content_key("field", FIELD_VERSION, hand=hand_key, params=fields.model_dump(mode="json"))

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from lgrasp.errors import HandError
 from lgrasp.hand.distance import signed_distance
-from lgrasp.hand.spec import Cone, HandSpec, Surface
+from lgrasp.hand.spec import Cone, Surface
 
 _GRID_CELL = 8.0e-4
 _GRID_PAD = 6.0e-3
@@ -175,19 +174,3 @@ def cover_patches(points: np.ndarray, normals: np.ndarray, rng: np.random.Genera
             near[seed] = True
             patch[near & (patch < 0)] = patch.max() + 1
     return patch
-
-
-def check_contact_links(spec: HandSpec, link_names: tuple[str, ...], geometry: dict[str, object]) -> None:
-    """Every link that a contact rule names exists and has collision geometry.
-
-    Raises:
-        HandError: naming the link and the links there are.
-    """
-    named = [link for rule in spec.contact for link in rule.links] + list(spec.palm.links)
-    for link in named:
-        if link not in link_names:
-            raise HandError(f"hand '{spec.name}': contact link '{link}' does not exist; links: {', '.join(link_names)}")
-        if not geometry.get(link):
-            raise HandError(f"hand '{spec.name}': contact link '{link}' has no collision geometry")
-        if named.count(link) > 1:
-            raise HandError(f"hand '{spec.name}': link '{link}' is in two contact rules; name it once")

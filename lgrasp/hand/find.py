@@ -1,13 +1,14 @@
 """What the user names as a hand -> its URDF file and rules."""
 
 import difflib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from lgrasp.errors import HandError
-from lgrasp.hand.drafting.packages import PACKAGE_HANDS, drafted_folder, package_urdf
-from lgrasp.hand.opposition.check import space_problem
+from lgrasp.hand.packages import PACKAGE_HANDS, package_urdf
 from lgrasp.hand.spec import Coupling, HandSpec, load_spec
+from lgrasp.hand.spec_check import space_problem
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Joint, Urdf, read_urdf
 from lgrasp.paths import data_dirs
@@ -23,6 +24,10 @@ class HandSource:
     note: str = ""
 
 
+Drafter = Callable[[Path, str], Path]
+"""(URDF, name of the hand) -> folder with a drafted hand.yaml and its URDF."""
+
+
 def known_hands() -> dict[str, Path]:
     """Name -> folder of every hand on the search path; the user's own come before shipped ones."""
     found: dict[str, Path] = {}
@@ -33,15 +38,18 @@ def known_hands() -> dict[str, Path]:
     return found
 
 
-def find_hand(name: str) -> HandSource:
+def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
     """A known name, a folder with hand.yaml, a URDF file, or a hand of an installed package (PACKAGE_HANDS, or
     ``DISTRIBUTION:URDF``).
 
     For a URDF the rules are those of the hand.yaml beside it, else those of the known hand whose joint and link names
     all occur in it.
 
+    Args:
+        draft: makes the rules of a package's URDF that no known hand fits.
+
     Raises:
-        HandError: nothing of that name; the message lists what is known.
+        HandError: nothing of that name (the message lists what is known), or rules to be drafted and no drafter.
     """
     known = known_hands()
     if name in known:
@@ -49,7 +57,7 @@ def find_hand(name: str) -> HandSource:
     path = Path(name).expanduser()
     urdf = None if path.exists() else package_urdf(name)
     if urdf is not None:
-        return _from_package(urdf, name.replace(":", "_"), known)
+        return _from_package(urdf, name.replace(":", "_"), known, draft)
     if path.is_dir():
         if not (path / "hand.yaml").is_file():
             raise HandError(f"hand folder {path} has no hand.yaml; name a URDF file or a folder with hand.yaml")
@@ -132,10 +140,14 @@ def _missing_couplings(joints: tuple[Joint, ...], known: tuple[Joint, ...]) -> d
     }
 
 
-def _from_package(urdf: Path, name: str, known: dict[str, Path]) -> HandSource:
+def _from_package(urdf: Path, name: str, known: dict[str, Path], draft: Drafter | None) -> HandSource:
     source = _rules_of_known(urdf, known)
     if source is not None and all(read_urdf(urdf).links.get(link) for link in source.spec.palm.links):
         return HandSource(name, urdf, source.spec.model_copy(update={"name": name}), source.note)
-    folder, _ = drafted_folder(urdf, name)
+    if draft is None:
+        raise HandError(
+            f"hand '{name}': no known hand has the joints and links of {urdf}; 'lgrasp hands add' drafts one"
+        )
+    folder = draft(urdf, name)
     spec = load_spec(folder / "hand.yaml")
     return HandSource(spec.name, folder / spec.urdf, spec, f"rules drafted from {urdf.name} of an installed package")

@@ -11,8 +11,8 @@ from lgrasp.config import parse_model, read_yaml
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.errors import ConfigError
-from lgrasp.hand.find import find_hand
 from lgrasp.jobs.generate import Job
+from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.sequence.job import SequenceJob, sequence_name
 from lgrasp.jobs.sequence.sets import SequenceSets, object_sequences
 from lgrasp.object.find import find_object
@@ -228,4 +228,4 @@ def default_out(hand: str, mesh: str, physics: str | None = None) -> Path:
     Raises:
         HandError, ObjectError: there is no such hand or object.
     """
-    return Path("grasps") / f"{find_hand(hand).name}-{find_object(mesh).stem}{f'-{physics}' if physics else ''}"
+    return Path("grasps") / f"{hand_source(hand).name}-{find_object(mesh).stem}{f'-{physics}' if physics else ''}"

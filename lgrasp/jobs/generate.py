@@ -20,6 +20,7 @@ from lgrasp.engine.shard import Execution, Found, ShardResult, flat_statistics, 
 from lgrasp.engine.writing import BackgroundWriter
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import GraspTable, take_grasps, user_poses
+from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.records import hand_record, make_scene, mesh_blobs, object_record
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
@@ -131,7 +132,7 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     pipeline = job.pipeline
     if "validate" in pipeline.order:
         import_mujoco()
-    keys = input_keys(job.hand, job.object, job.scale, pipeline.object, pipeline.field)
+    keys = input_keys(hand_source(job.hand), job.object, job.scale, pipeline.object, pipeline.field)
     assert keys.mesh is not None
     check_folder(job.out)
     key = run_key(pipeline.describe(), keys, job.shard_rows)

@@ -7,11 +7,12 @@ import numpy as np
 from lgrasp.config import read_yaml
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.errors import ConfigError
-from lgrasp.hand.find import find_hand, known_hands
-from lgrasp.hand.opposition.check import check_spaces
+from lgrasp.hand.find import known_hands
 from lgrasp.hand.spec import load_spec
+from lgrasp.hand.spec_check import check_spaces
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
+from lgrasp.jobs.hands import hand_source
 from lgrasp.object.find import find_object
 from lgrasp.object.find import list_objects as named_objects
 from lgrasp.object.load import load_mesh
@@ -43,7 +44,7 @@ def describe_hand(name: str) -> dict[str, Any]:
     Raises:
         HandError: no such hand, or one that cannot be used.
     """
-    source = find_hand(name)
+    source = hand_source(name)
     spec = source.spec
     urdf = read_urdf(source.urdf)
     tree = build_tree(urdf, spec)

@@ -29,6 +29,7 @@ from lgrasp.grasp.tables import (
     set_table,
 )
 from lgrasp.jobs.generate import Job
+from lgrasp.jobs.hands import hand_source
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.stages.context import Context
@@ -68,7 +69,7 @@ def run_stage(
         raise ConfigError(f"--first {first} --candidates {count} --shard-index {shard}: need 0, 1 and 0 or more")
     pipeline, cache = job.pipeline, job.cache
     device = resolve_device(job.device)
-    keys = input_keys(job.hand, job.object, job.scale, pipeline.object, pipeline.field)
+    keys = input_keys(hand_source(job.hand), job.object, job.scale, pipeline.object, pipeline.field)
     stages = pipeline.order[: pipeline.order.index(last) + 1]
     files = _stage_keys(pipeline, keys, stages, first, count, shard)
     found = {stage: arrays for stage in stages if (arrays := cache.load(stage, files[stage])) is not None}

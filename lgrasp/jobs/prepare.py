@@ -11,6 +11,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import input_keys, load_field, load_hand, load_object, object_key
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import upload_hand
+from lgrasp.jobs.hands import hand_source
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.device import start as start_warp
@@ -37,7 +38,7 @@ def prepare_field(
     if index is not None:
         params = parse_model(FieldParams, params.model_dump() | {"index": index}, "--index")
     where = resolve_device(device)
-    keys = input_keys(hand, None, 1.0, ObjectParams(), params)
+    keys = input_keys(hand_source(hand), None, 1.0, ObjectParams(), params)
     start = time.perf_counter()
     model, _ = load_hand(cache, keys.source, keys.hand, where)
     field, hit = load_field(cache, keys, upload_hand(model, where.alias), params, report)

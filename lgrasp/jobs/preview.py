@@ -10,6 +10,7 @@ from lgrasp.engine.bank import BANK_CANDIDATES, Bank
 from lgrasp.engine.folder import check_folder, shard_path
 from lgrasp.engine.inputs import input_keys, run_key
 from lgrasp.jobs.generate import Job, find_present, job_shards
+from lgrasp.jobs.hands import hand_source
 from lgrasp.runtime.device import resolve_device
 
 
@@ -33,7 +34,7 @@ def plan(job: Job) -> list[PlanLine]:
     with _no_kernel_folder():
         resolve_device(job.device)
     pipeline = job.pipeline
-    keys = input_keys(job.hand, job.object, job.scale, pipeline.object, pipeline.field)
+    keys = input_keys(hand_source(job.hand), job.object, job.scale, pipeline.object, pipeline.field)
     assert keys.mesh is not None
     check_folder(job.out)
     key = run_key(pipeline.describe(), keys, job.shard_rows)

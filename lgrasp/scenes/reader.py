@@ -179,3 +179,14 @@ def _structure_problems(file: h5py.File) -> list[str]:
         return ["objects: no object"]
     missing = [f"{name}: missing group" for name in ("hand", "scene", "views", "cloud", "grasps") if name not in file]
     return missing or schema_problems(file, DATASETS, ATTRIBUTES)
+
+
+def scene_cloud(path: Path) -> dict[str, np.ndarray]:
+    """The merged cloud of a scene: points (n, 3) [m], normals (n, 3) and labels (n,).
+
+    Raises:
+        ShardError: see :class:`SceneReader`.
+    """
+    with SceneReader(path) as reader:
+        cloud = reader.cloud()
+    return {"points": cloud.points.astype(np.float64), "normals": cloud.normals, "labels": cloud.labels}

@@ -10,7 +10,8 @@ from support.kinematics import link_poses
 
 from lgrasp.differentiable.kinematics import BodyKinematics
 from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
-from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.build import build_hand
+from lgrasp.hand.model import HandModel
 
 # two fingers on a turning palm (shared: each finger has a copy of that joint), a slide, a coupling with an offset
 FORK = """<robot name="fork">

@@ -8,6 +8,7 @@ from lgrasp.engine.batch import run_batch
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import input_keys, load_inputs
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.hand.find import find_hand
 from lgrasp.runtime.device import resolve_device, start
 from lgrasp.stages.context import Context
 
@@ -18,7 +19,7 @@ def test_yield_per_stage_agrees(mesh, tmp_path):
     if wp.get_cuda_device_count() == 0:
         pytest.skip("no GPU here")
     pipeline, cache = load_pipeline("swift"), Cache(tmp_path)
-    keys = input_keys("allegro", mesh, 1.0, pipeline.object, pipeline.field)
+    keys = input_keys(find_hand("allegro"), mesh, 1.0, pipeline.object, pipeline.field)
     found = {}
     for device in ("cpu", "cuda:0"):
         inputs = load_inputs(cache, keys, 1.0, pipeline.object, pipeline.field, resolve_device(device))

@@ -12,6 +12,7 @@ from lgrasp.engine.inputs import input_keys, run_key
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.engine.registry import ORDERS, STAGES
 from lgrasp.errors import ConfigError
+from lgrasp.hand.find import find_hand
 from lgrasp.object.find import find_object
 
 
@@ -154,7 +155,7 @@ def test_run_keys(swift, tmp_path):
     mesh.write_bytes(find_object("mug").read_bytes())
 
     def keys(pipeline=swift, name=str(mesh), scale=1.0, shard_rows=100):
-        found = input_keys("allegro", name, scale, pipeline.object, pipeline.field)
+        found = input_keys(find_hand("allegro"), name, scale, pipeline.object, pipeline.field)
         return run_key(pipeline.describe(), found, shard_rows)
 
     first = keys()
@@ -178,7 +179,7 @@ def test_run_keys(swift, tmp_path):
 
 def test_object_key_ignores_the_field_and_back(swift):
     def keys(pipeline):
-        return input_keys("allegro", "mug", 1.0, pipeline.object, pipeline.field)
+        return input_keys(find_hand("allegro"), "mug", 1.0, pipeline.object, pipeline.field)
 
     base = keys(swift)
     field = keys(swift.model_copy(update={"field": swift.field.model_copy(update={"seed": 3})}))

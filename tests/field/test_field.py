@@ -12,7 +12,8 @@ from lgrasp.field.arrays import Field, field_has, field_pick, field_seed, query_
 from lgrasp.field.model import ContactField, build_field
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import Hand, body_poses, upload_hand
-from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.build import build_hand
+from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import space_view
 from lgrasp.hand.pairs import pieces_touch
 from lgrasp.math.transforms import NORMAL_BINS

@@ -14,8 +14,9 @@ from lgrasp.errors import DecomposeError
 from lgrasp.field.kernels import sample_postures
 from lgrasp.geometry.decompose import decompose
 from lgrasp.hand.arrays import body_poses, upload_hand
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.geometry import convex_pieces, is_dented
-from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.model import HandModel
 from lgrasp.hand.overlap import OVERLAP
 from lgrasp.hand.urdf import Geometry, Urdf, read_urdf
 from lgrasp.runtime.device import start

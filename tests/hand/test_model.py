@@ -9,9 +9,10 @@ from support.convex import hull_distance
 from support.hands import HANDS, hand_model, hand_source, minimal_spec
 
 from lgrasp.errors import HandError
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.contacts import finger_points
 from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres
-from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Geometry, Joint, read_urdf

@@ -7,8 +7,8 @@ from support.hands import minimal_spec
 
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import body_poses, upload_hand
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
-from lgrasp.hand.model import build_hand
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf

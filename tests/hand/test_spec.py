@@ -2,6 +2,8 @@
 
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,10 +11,10 @@ import yaml
 from support.hands import REAL, ROOT, minimal_spec
 
 from lgrasp.errors import HandError
-from lgrasp.hand.contacts import check_contact_links
+from lgrasp.hand.build import build_hand, hand_digest
 from lgrasp.hand.find import find_hand, known_hands
-from lgrasp.hand.model import build_hand, hand_digest
 from lgrasp.hand.spec import HandSpec, load_spec
+from lgrasp.hand.spec_check import check_contact_links
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
 
@@ -198,3 +200,12 @@ def test_hand_without_solids(tmp_path):
     refused(
         lambda: build_tree(read_urdf(path), minimal_spec("bare", ["b"], locked={"j": 0.5})), path, "every joint.*locked"
     )
+
+
+def test_a_hand_is_found_without_drafting():
+    code = (
+        "import sys; from lgrasp.jobs.hands import hand_source; hand_source('allegro'); "
+        "print([m for m in sys.modules if m.startswith('lgrasp.hand.drafting')])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

@@ -12,6 +12,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.hand.drafting.import_urdf import add_hand
+from lgrasp.hand.find import find_hand
 from lgrasp.jobs.hand_check.check import check_hand, check_objects
 from lgrasp.jobs.hand_check.diagnose import diagnose, field_vectors, hand_findings
 from lgrasp.object.find import find_object
@@ -67,7 +68,7 @@ def share_of_colours(picture: Path) -> tuple[float, ...]:
 
 
 def load_hand(hand: str, swift: Pipeline, cache_root: Path) -> Inputs:
-    keys = input_keys(hand, "tiny", 1.0, swift.object, swift.field)
+    keys = input_keys(find_hand(hand), "tiny", 1.0, swift.object, swift.field)
     return load_inputs(Cache(cache_root), keys, 1.0, swift.object, swift.field, resolve_device("cpu"))
 
 

@@ -9,8 +9,9 @@ import warp as wp
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.hand.drafting.surface_visibility import sample_bodies
+from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.postures import sample_bodies
 from lgrasp.jobs.hand_check.pictures import draw_palmar
 from lgrasp.jobs.hand_check.space_check import check_spaces
 from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
@@ -69,7 +70,7 @@ def test_scenes(on_cpu, cold, tmp_path):
 
 
 def test_pictures_and_spaces_of_a_hand(on_cpu, swift: Pipeline, cache_root, tmp_path):
-    keys = input_keys("allegro", "mug", 1.0, swift.object, swift.field)
+    keys = input_keys(find_hand("allegro"), "mug", 1.0, swift.object, swift.field)
     cache, device = Cache(cache_root, pytest.fail), Device(OTHER, OTHER)
     inputs = load_inputs(cache, keys, 1.0, swift.object, swift.field, device)
     assert draw_palmar(inputs, tmp_path / "palmar.png").stat().st_size > 20_000

@@ -14,7 +14,7 @@ from lgrasp.errors import CloudError, ConfigError, LgraspError, OutputError, Sha
 from lgrasp.jobs.scenes.config import SceneConfig, load_scene_config, scene_configs
 from lgrasp.jobs.scenes.job import SceneJob, SceneListener, SceneOutcome, make_scenes
 from lgrasp.jobs.scenes.report import describe_scenes
-from lgrasp.scenes.reader import SceneReader, check_scene, read_scene
+from lgrasp.scenes.reader import SceneReader, check_scene, read_scene, scene_cloud
 from lgrasp.scenes.writer import write_scene
 
 QUICK = Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml"
@@ -134,12 +134,12 @@ def test_grasps_are_those_of_the_shards(folder):
 
 def test_the_cloud_of_a_scene_is_read_like_any_other(folder):
     path = files(folder)[0]
-    cloud, scene = read_cloud(path, label=2), read_scene(path)
+    cloud, scene = read_cloud(path, label=2, read_scene=scene_cloud), read_scene(path)
     np.testing.assert_array_equal(cloud.points, scene.cloud.points)
     np.testing.assert_allclose(cloud.normals, scene.cloud.normals, atol=1e-6)
     np.testing.assert_array_equal(cloud.target, scene.cloud.labels == 2)
     with pytest.raises(CloudError, match="label 9 selects 0 points"):
-        read_cloud(path, label=9)
+        read_cloud(path, label=9, read_scene=scene_cloud)
 
 
 def test_array_tasks_and_threads_give_the_same_scenes(folder, make, tmp_path):

@@ -10,7 +10,8 @@ from support.hands import HANDS, LOCKED, hand_model, hand_source, minimal_spec
 from support.kinematics import link_poses
 
 from lgrasp.hand.arrays import body_poses, point_jacobians, upload_hand
-from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.build import build_hand
+from lgrasp.hand.model import HandModel
 
 JAWS = """<robot name="jaws">
   <link name="base"><collision><geometry><box size="0.1 0.1 0.02"/></geometry></collision></link>

@@ -9,8 +9,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
-from lgrasp.hand.model import build_hand
 from lgrasp.hand.opposition.spaces import hand_spaces, space_view
 from lgrasp.object.model import preprocess_object
 from lgrasp.object.params import ObjectParams

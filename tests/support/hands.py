@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
-from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.model import HandModel
 from lgrasp.hand.spec import HandSpec
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -4,11 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.finger_structure import Anatomy, probe_spec, tip_link
 from lgrasp.hand.drafting.reach import Hold, Touch, best_hold, finger_touches, still_touches
-from lgrasp.hand.drafting.surface_visibility import Postures, Skin, link_skins, sample_bodies, see_skins
+from lgrasp.hand.drafting.surface_visibility import Skin, link_skins, see_skins
 from lgrasp.hand.geometry import Piece
-from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.postures import Postures, sample_bodies
 from lgrasp.hand.urdf import Urdf
 
 _POSTURES = 1200

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from lgrasp.errors import HandError
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.contact_survey import Survey, survey_hand
 from lgrasp.hand.drafting.finger_structure import Anatomy, finger_names, held_value, probe_spec, study_anatomy, tip_link
 from lgrasp.hand.drafting.lateral_surfaces import rounded_axis
 from lgrasp.hand.drafting.propose import propose_spaces
-from lgrasp.hand.drafting.surface_visibility import sample_bodies
-from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf

@@ -11,11 +11,11 @@ import trimesh
 from lxml import etree
 
 from lgrasp.errors import HandError, LgraspError
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.jaws import find_jaws, make_base
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, thin_mesh
-from lgrasp.hand.model import build_hand
 from lgrasp.hand.spec import HandSpec, load_spec
 from lgrasp.hand.urdf import find_mesh, parse_robot, read_urdf
 from lgrasp.paths import user_dir

@@ -7,7 +7,7 @@ from lxml import etree
 
 from lgrasp.hand.drafting.contact_survey import Side, survey_hand
 from lgrasp.hand.drafting.finger_structure import Anatomy, study_anatomy
-from lgrasp.hand.drafting.surface_visibility import Postures
+from lgrasp.hand.postures import Postures
 from lgrasp.hand.urdf import read_urdf
 
 

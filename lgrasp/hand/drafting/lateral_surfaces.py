@@ -6,10 +6,11 @@ from itertools import combinations, groupby
 import numpy as np
 
 from lgrasp.hand.drafting.contact_survey import Survey, pad_axis
-from lgrasp.hand.drafting.surface_visibility import Postures, Skin, sample_bodies
+from lgrasp.hand.drafting.surface_visibility import Skin
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.opposition.check import moving_joints
+from lgrasp.hand.postures import Postures, sample_bodies
 from lgrasp.hand.spec import Surface
+from lgrasp.hand.spec_check import moving_joints
 
 _PAD, _FLANK = 60.0, 45.0  # degrees around the axis
 _FLANK_BODIES = 3  # the last of a finger

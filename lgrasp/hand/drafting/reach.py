@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from lgrasp.hand.drafting.surface_visibility import Postures
+from lgrasp.hand.postures import Postures
 
 _CELL = 0.010  # [m], more where fingers reach farther than hands do
 _MOST_CELLS = 400_000

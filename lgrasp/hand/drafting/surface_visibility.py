@@ -6,10 +6,9 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.geometry import geometry_mesh
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.pairs import pieces_touch
+from lgrasp.hand.postures import Postures
 from lgrasp.hand.urdf import Urdf
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
@@ -36,36 +35,6 @@ class Skin:
     def seen_area(self) -> float:
         """Area weighted by how often it is seen [m^2]."""
         return self.area * float(self.seen.mean())
-
-
-@dataclass(frozen=True)
-class Postures:
-    """Random postures: body rotations (N, B, 3, 3), positions (N, B, 3) [m] and which fingers are clear (N, G)."""
-
-    q: np.ndarray  # (N, K)
-    R: np.ndarray
-    t: np.ndarray
-    clear: np.ndarray  # (N, G) of the static base and of itself
-    touching: np.ndarray  # (N,) do any two parts touch?
-
-
-def sample_bodies(model: HandModel, q: np.ndarray, device: str = "cpu") -> Postures:
-    """Body poses at postures q (N, K) and what is clear there."""
-    from scipy.spatial.transform import Rotation
-
-    start()
-    poses = body_poses(upload_hand(model, device), q)
-    R = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix().reshape(*poses.shape[:2], 3, 3)
-    clear = np.ones((len(q), model.groups), bool)
-    touching: np.ndarray = np.zeros(len(q), bool)
-    if len(model.pairs):
-        touch = pieces_touch(model, q, model.pairs, device=device)
-        group = model.tree.body_group[model.piece_body[model.pairs]]  # (Q, 2), the base is -1
-        for g in range(model.groups):
-            own = (group[:, 1] == g) & ((group[:, 0] == -1) | (group[:, 0] == g))
-            clear[:, g] = ~touch[:, own].any(1)
-        touching = np.asarray(touch.any(1))
-    return Postures(q, R, poses[..., :3].astype(float), clear, touching)
 
 
 def link_skins(urdf: Urdf, model: HandModel) -> list[Skin]:

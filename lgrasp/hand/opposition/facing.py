@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lgrasp.hand.drafting.surface_visibility import Postures, sample_bodies
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space, SpaceSide
+from lgrasp.hand.postures import Postures, sample_bodies
 
 _CONE = np.cos(np.radians(35.0))  # of each hand normal to the line between the two, at least
 _PALM_CONE = np.cos(np.radians(16.0))  # of the palm's, which no finger can turn

@@ -14,8 +14,8 @@ from lgrasp.errors import HandError
 from lgrasp.hand.contacts import LinkGrid, body_cones, side_points
 from lgrasp.hand.geometry import geometry_mesh
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.opposition.check import side_links
 from lgrasp.hand.spec import Cone, HandSpec, Surface
+from lgrasp.hand.spec_check import side_links
 from lgrasp.hand.surface import ContactLink, contact_arrays, with_bare_links
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf, read_urdf

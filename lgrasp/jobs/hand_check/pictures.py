@@ -9,10 +9,11 @@ from scipy.spatial import cKDTree
 
 from lgrasp.engine.inputs import Inputs
 from lgrasp.grasp.records import Shard
-from lgrasp.hand.drafting.surface_visibility import Skin, link_skins, sample_bodies
+from lgrasp.hand.drafting.surface_visibility import Skin, link_skins
 from lgrasp.hand.geometry import thin_mesh
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import space_sides
+from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hand_check.diagnose import field_vectors, finger_label
 from lgrasp.jobs.hand_check.plotting import add_box, add_triangles, frame_points, new_figure, save_figure, shade

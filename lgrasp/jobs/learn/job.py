@@ -20,6 +20,7 @@ from lgrasp.engine.inputs import input_keys, load_hand
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.hand.model import HandModel
+from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.scenes.shards import check_hand, object_model, read_parts
 from lgrasp.learn.examples import Examples, make_examples
 from lgrasp.learn.measure import Measured, measure
@@ -151,7 +152,9 @@ def _examples(
     """The hand; clouds to train on and others, with the grasps, object by object."""
     parts = read_parts(list(shard_tree(shards).values()))
     pipeline = load_pipeline("swift")
-    keys = input_keys(name or next(iter(parts.values())).hand[0], None, 1.0, pipeline.object, pipeline.field)
+    keys = input_keys(
+        hand_source(name or next(iter(parts.values())).hand[0]), None, 1.0, pipeline.object, pipeline.field
+    )
     check_hand(keys.source, list(parts.values()))
     found = resolve_device(device)
     hand, _ = load_hand(cache, keys.source, keys.hand, found)

@@ -12,8 +12,8 @@ from lgrasp.dataset import ObjectRecord, ShardReader
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import OBJECT_VERSION
 from lgrasp.errors import ConfigError, ShardError
+from lgrasp.hand.build import hand_digest
 from lgrasp.hand.find import HandSource
-from lgrasp.hand.model import hand_digest
 from lgrasp.object.model import ObjectModel, preprocess_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device

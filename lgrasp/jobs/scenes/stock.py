@@ -16,8 +16,9 @@ from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.hand.find import HandSource, find_hand
+from lgrasp.hand.find import HandSource
 from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.records import hand_record, mesh_blobs
 from lgrasp.jobs.scenes.config import SceneConfig
 from lgrasp.jobs.scenes.shards import Part, check_hand, object_model, read_parts, record_hash
@@ -59,7 +60,7 @@ def load_stock(config: SceneConfig, cache: Cache, device: Device, report: Callab
     found = read_parts(shards)
     name = config.hand or next(iter(found.values())).hand[0]
     chosen = {key: part for key, part in found.items() if wanted is None or part.record.sha256 in wanted}
-    _check(config, find_hand(name), found, chosen, wanted)
+    _check(config, hand_source(name), found, chosen, wanted)
     hand, record = _load_hand(name, cache, device, report)
     items, digest = [], hashlib.sha256(record.sha256.encode())
     for key in sorted(chosen):
@@ -90,7 +91,7 @@ def _generated(config: SceneConfig, cache: Cache, device: Device, report: Callab
             object=name,
             rows=config.stock,
             pipeline=load_pipeline(config.pipeline).model_copy(update={"seed": config.seed}),
-            out=config.out / "grasps" / f"{find_hand(hand).name}-{find_object(name).stem}",
+            out=config.out / "grasps" / f"{hand_source(hand).name}-{find_object(name).stem}",
             scale=config.scale,
             device=device.alias,
             workers=config.workers,
@@ -119,7 +120,7 @@ def _source_hash(name: str) -> str:
 def _load_hand(name: str, cache: Cache, device: Device, report: Callable[[str], None]) -> tuple[HandArrays, HandRecord]:
     report("hand")
     pipeline = load_pipeline("swift")
-    keys = input_keys(name, None, 1.0, pipeline.object, pipeline.field)
+    keys = input_keys(hand_source(name), None, 1.0, pipeline.object, pipeline.field)
     model, _ = load_hand(cache, keys.source, keys.hand, device)
     return upload_hand(model, device.alias), hand_record(model, mesh_blobs(keys.source.urdf))
 

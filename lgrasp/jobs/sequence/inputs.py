@@ -18,9 +18,11 @@ from lgrasp.field.arrays import FieldArrays, upload_field
 from lgrasp.field.model import FIELD_VERSION, ContactField, build_field
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.hand.find import HandSource, find_hand
-from lgrasp.hand.model import HAND_VERSION, HandModel, hand_digest
+from lgrasp.hand.build import hand_digest
+from lgrasp.hand.find import HandSource
+from lgrasp.hand.model import HAND_VERSION, HandModel
 from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, space_view
+from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.sequence.size import Size, object_scales
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
@@ -91,7 +93,7 @@ def sequence_keys(
     """Find hand and objects and compute the content keys of their artifacts.
 
     Raises:
-        HandError, ObjectError: see :func:`find_hand`, :func:`find_object`.
+        HandError, ObjectError: see :func:`hand_source`, :func:`find_object`.
         ConfigError: fewer than two objects, or a hand without opposition spaces.
     """
     if len(meshes) < 2:
@@ -99,7 +101,7 @@ def sequence_keys(
         raise ConfigError(
             f"a sequence needs at least two objects, got {named}; for one object: lgrasp generate --object MESH"
         )
-    source = find_hand(hand)
+    source = hand_source(hand)
     if not source.spec.opposition_spaces:
         raise ConfigError(
             f"hand '{source.name}' has no opposition spaces; add opposition_spaces to its hand.yaml "

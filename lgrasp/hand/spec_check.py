@@ -1,4 +1,4 @@
-"""Do the opposition spaces of hand.yaml fit the hand?"""
+"""Does a hand.yaml fit its URDF? Contact links, opposition spaces, sizes that the kernels hold."""
 
 from collections.abc import Mapping
 
@@ -7,6 +7,41 @@ import numpy as np
 from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec, OppositionSpace
 from lgrasp.hand.tree import Tree
+from lgrasp.math.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
+
+
+def check_size(spec: HandSpec, tree: Tree) -> None:
+    """The kernels hold as many joints as the hand has.
+
+    Raises:
+        HandError: naming the numbers of joints and drives and the largest that are supported.
+    """
+    if len(tree.joint_dof) > MAX_BODIES:
+        raise HandError(
+            f"hand '{spec.name}' has {len(tree.joint_dof)} movable joints, at most {MAX_BODIES} are supported"
+        )
+    joints, dofs = int(np.diff(tree.joint_first).max()), int(np.diff(tree.dof_first).max())
+    if joints > MAX_JOINTS or dofs > MAX_DOFS:
+        raise HandError(
+            f"hand '{spec.name}': one dependency group has {joints} joints and {dofs} drives, at most {MAX_JOINTS} and "
+            f"{MAX_DOFS} are supported; lock the joint that moves several fingers (hand.yaml: locked)"
+        )
+
+
+def check_contact_links(spec: HandSpec, link_names: tuple[str, ...], geometry: dict[str, object]) -> None:
+    """Every link that a contact rule names exists and has collision geometry.
+
+    Raises:
+        HandError: naming the link and the links there are.
+    """
+    named = [link for rule in spec.contact for link in rule.links] + list(spec.palm.links)
+    for link in named:
+        if link not in link_names:
+            raise HandError(f"hand '{spec.name}': contact link '{link}' does not exist; links: {', '.join(link_names)}")
+        if not geometry.get(link):
+            raise HandError(f"hand '{spec.name}': contact link '{link}' has no collision geometry")
+        if named.count(link) > 1:
+            raise HandError(f"hand '{spec.name}': link '{link}' is in two contact rules; name it once")
 
 
 def side_links(space: OppositionSpace) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -1,15 +1,9 @@
 """Hands inside installed packages, found through their metadata; the packages are never imported."""
 
-import hashlib
 from pathlib import Path
 
 from lgrasp.errors import HandError
-from lgrasp.hand.drafting.import_urdf import add_hand
-from lgrasp.hand.model import hand_digest
-from lgrasp.hand.spec import HandSpec, load_spec
-from lgrasp.paths import cache_dir, package_files
-
-_DRAFT_VERSION = 3
+from lgrasp.paths import package_files
 
 PACKAGE_HANDS = {
     "allegro_right": ("example-robot-data", "allegro_right_hand"),
@@ -55,20 +49,3 @@ def package_urdf(name: str) -> Path | None:
         known = ", ".join(sorted({f.stem for f in urdfs})[:40]) or "none"
         raise HandError(f"package {distribution} has no URDF '{stem}'; it has: {known}")
     return min(found, key=lambda f: len(f.parts))
-
-
-def drafted_folder(urdf: Path, name: str) -> tuple[Path, list[str]]:
-    """Folder of a hand drafted from a package's URDF, kept in the cache; and what was decided, when it was made now.
-
-    Raises:
-        HandError: see :func:`add_hand`.
-    """
-    probe = {"name": name, "contact": [{"links": ["-"]}], "canonical_box": {"min": (0, 0, 0), "max": (1, 1, 1)}}
-    content = hand_digest(urdf, HandSpec.model_validate(probe))
-    key = hashlib.sha256(f"{_DRAFT_VERSION} {content}".encode()).hexdigest()
-    folder = cache_dir() / "drafts" / key[:32] / name
-    try:
-        load_spec(folder / "hand.yaml")
-        return folder, []
-    except HandError:
-        return folder, add_hand(urdf, name=name, out=folder, force=folder.exists()).decisions

@@ -1,0 +1,20 @@
+"""A hand by name, with rules drafted for those of installed packages."""
+
+from pathlib import Path
+
+from lgrasp.hand.find import HandSource, find_hand
+
+
+def hand_source(name: str) -> HandSource:
+    """What the user names as a hand; see :func:`lgrasp.hand.find.find_hand`.
+
+    Raises:
+        HandError: nothing of that name, or a URDF that no rules can be drafted for.
+    """
+    return find_hand(name, _draft)
+
+
+def _draft(urdf: Path, name: str) -> Path:
+    from lgrasp.hand.drafting.drafted import drafted_folder  # needed by few hands, and slow to load
+
+    return drafted_folder(urdf, name)
