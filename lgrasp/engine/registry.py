@@ -2,48 +2,53 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 from pydantic import BaseModel
 
 from lgrasp.errors import ConfigError
-from lgrasp.sequence import stage as sequence
 from lgrasp.sequence.params import SequenceParams
-from lgrasp.stages.domain import stage as domain
 from lgrasp.stages.domain.params import DomainParams
-from lgrasp.stages.filter import stage as filter_
 from lgrasp.stages.filter.params import FilterParams
-from lgrasp.stages.ik import stage as ik
 from lgrasp.stages.ik.params import IkParams
-from lgrasp.stages.place import stage as place
 from lgrasp.stages.place.params import PlaceParams
-from lgrasp.stages.refine import stage as refine
 from lgrasp.stages.refine.params import RefineParams
-from lgrasp.stages.search import stage as search
 from lgrasp.stages.search.params import SearchParams
-from lgrasp.stages.simulate import stage as validate
 from lgrasp.stages.simulate.params import ValidateParams
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage: ``run(inputs, params, context) -> (table, counts)``."""
+    """A stage; its module, with its kernels, is imported when it is first used."""
 
     name: str
     params: type[BaseModel]
-    version: int
-    run: Callable[..., tuple[Any, Mapping[str, int]]]
+    module: str
+
+    @property
+    def version(self) -> int:
+        """Raised whenever the stage gives other results."""
+        return import_module(self.module).VERSION
+
+    @property
+    def run(self) -> Callable[..., tuple[Any, Mapping[str, int]]]:
+        """``run(inputs, params, context) -> (table, counts)``."""
+        return import_module(self.module).run
 
 
 STAGES: dict[str, Stage] = {
-    "place": Stage("place", PlaceParams, place.VERSION, place.run),
-    "domain": Stage("domain", DomainParams, domain.VERSION, domain.run),
-    "ik": Stage("ik", IkParams, ik.VERSION, ik.run),
-    "search": Stage("search", SearchParams, search.VERSION, search.run),
-    "filter": Stage("filter", FilterParams, filter_.VERSION, filter_.run),
-    "refine": Stage("refine", RefineParams, refine.VERSION, refine.run),
-    "sequence": Stage("sequence", SequenceParams, sequence.VERSION, sequence.run),
-    "validate": Stage("validate", ValidateParams, validate.VERSION, validate.run),
+    stage.name: stage
+    for stage in (
+        Stage("place", PlaceParams, "lgrasp.stages.place.stage"),
+        Stage("domain", DomainParams, "lgrasp.stages.domain.stage"),
+        Stage("ik", IkParams, "lgrasp.stages.ik.stage"),
+        Stage("search", SearchParams, "lgrasp.stages.search.stage"),
+        Stage("filter", FilterParams, "lgrasp.stages.filter.stage"),
+        Stage("refine", RefineParams, "lgrasp.stages.refine.stage"),
+        Stage("sequence", SequenceParams, "lgrasp.sequence.stage"),
+        Stage("validate", ValidateParams, "lgrasp.stages.simulate.stage"),
+    )
 }
 
 ORDERS = (("place", "domain", "ik", "search", "filter"), ("place", "domain", "search", "ik", "filter"))

@@ -1,10 +1,7 @@
 """Near-duplicates: object translation within 5 mm, rotation within 5 degrees and every joint within 0.1 rad."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import warp as wp
-from scipy.spatial import cKDTree
 
 from lgrasp.grasp.near_kernels import list_near
 from lgrasp.runtime.device import start
@@ -13,7 +10,7 @@ NEAR_DISTANCE = 0.005  # [m]
 NEAR_ANGLE = np.radians(5.0)
 NEAR_JOINT = 0.1  # [rad or m]
 
-_REACH = NEAR_DISTANCE * 1.001  # of the tree look-ups, which only propose pairs
+_REACH = NEAR_DISTANCE * 1.001  # of the grid look-ups, which only propose pairs
 
 
 def near_pairs(pose: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -25,9 +22,8 @@ def near_pairs(pose: np.ndarray, q: np.ndarray) -> np.ndarray:
     """
     if len(pose) < 2:
         return np.zeros((0, 2), int)
-    pairs = cKDTree(pose[:, :3]).query_pairs(_REACH, output_type="ndarray")
-    i, j = pairs[:, 0], pairs[:, 1]
-    pairs = pairs[_near(pose[i], q[i], pose[j], q[j])]
+    start()
+    pairs = _NearRows("cpu").before(pose, q, 0)
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
@@ -50,10 +46,9 @@ class KeptRows:
 
     def __init__(self, joints: int, device: str = "cpu") -> None:
         start()
-        self._device = device
+        self._near = _NearRows(device)
         self._pose = np.zeros((0, 7), np.float32)
         self._q = np.zeros((0, joints), np.float32)
-        self._grid = wp.HashGrid(128, 128, 128, device=device)
         self.count = 0
 
     def add(self, pose: np.ndarray, q: np.ndarray, room: int) -> tuple[np.ndarray, int]:
@@ -70,8 +65,11 @@ class KeptRows:
             self._pose, self._q = (_longer(a, self.count, 2 * end) for a in (self._pose, self._q))
         self._pose[self.count : end], self._q[self.count : end] = pose, q
         keep = np.ones(end, bool)
-        for row, before in self._near_before(end):
-            keep[row] = not keep[before].any()
+        pairs = self._near.before(self._pose[:end], self._q[:end], self.count)
+        old = pairs[:, 0] < self.count
+        keep[pairs[old, 1]] = False
+        for before, row in pairs[~old].tolist():
+            keep[row] &= not keep[before]
         kept = np.flatnonzero(keep[self.count :])[:room]
         looked_at = kept[-1] + 1 if len(kept) and len(kept) == room else len(pose)
         after = self.count + len(kept)
@@ -79,12 +77,20 @@ class KeptRows:
         self.count = after
         return kept, int(looked_at - len(kept))
 
-    def _near_before(self, end: int) -> Iterator[tuple[int, np.ndarray]]:
-        """Each of the rows ``count .. end - 1`` that has near-duplicates before it, in order, and which these are."""
+
+class _NearRows:
+    """Finds near-duplicates with a hash grid over object positions."""
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+        self._grid = wp.HashGrid(128, 128, 128, device=device)
+
+    def before(self, pose: np.ndarray, q: np.ndarray, first: int) -> np.ndarray:
+        """Pairs (i < j), shape (n, 2), of near-duplicates of which j is at least ``first``, by rising j."""
         d = self._device
-        position = wp.array(np.ascontiguousarray(self._pose[:end, :3]), dtype=wp.vec3, device=d)
-        rotation = wp.array(np.ascontiguousarray(self._pose[:end, 3:]), dtype=wp.vec4, device=d)
-        q = wp.array(self._q[:end], dtype=wp.float32, device=d)
+        position = wp.array(np.ascontiguousarray(pose[:, :3], np.float32), dtype=wp.vec3, device=d)
+        rotation = wp.array(np.ascontiguousarray(pose[:, 3:], np.float32), dtype=wp.vec4, device=d)
+        joints = wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=d)
         self._grid.build(position, _REACH)
 
         def listed(asked: np.ndarray, places: np.ndarray, room: int) -> tuple[np.ndarray, np.ndarray]:
@@ -93,22 +99,19 @@ class KeptRows:
             # with some slack for rounding: pairs are decided in double precision below
             limits = [_REACH, float(np.cos(NEAR_ANGLE / 2)) - 1e-6, NEAR_JOINT * 1.00001]
             given = [wp.array(a.astype(np.int32), dtype=wp.int32, device=d) for a in (asked, places)]
-            inputs = [self._grid.id, position, rotation, q, given[0], *limits, given[1]]
+            inputs = [self._grid.id, position, rotation, joints, given[0], *limits, given[1]]
             wp.launch(list_near, len(asked), inputs, [number, others], device=d)
             return number.numpy(), others.numpy()
 
-        rows = np.arange(self.count, end)
+        rows = np.arange(first, len(pose))
         number, _ = listed(rows, rows[:0], 0)
-        suspects, number = rows[number > 0], number[number > 0]
-        if len(suspects) == 0:
-            return
-        first = np.concatenate([[0], np.cumsum(number)])
-        _, other = listed(suspects, first[:-1], int(first[-1]))
-        row = np.repeat(suspects, number)
-        same = _near(self._pose[other], self._q[other], self._pose[row], self._q[row])
-        for i, suspect in enumerate(suspects):
-            part = slice(first[i], first[i + 1])
-            yield int(suspect), other[part][same[part]]
+        rows, number = rows[number > 0], number[number > 0]
+        if len(rows) == 0:
+            return np.zeros((0, 2), int)
+        _, other = listed(rows, np.cumsum(number) - number, int(number.sum()))
+        row = np.repeat(rows, number)
+        same = _near(pose[other], q[other], pose[row], q[row])
+        return np.stack([other[same], row[same]], 1).astype(int)
 
 
 def _longer(array: np.ndarray, count: int, length: int) -> np.ndarray:

@@ -1,6 +1,5 @@
-"""URDF file -> links with collision geometry and a joint tree, checked; parsing itself is yourdfpy's."""
+"""URDF file -> links with collision geometry and a joint tree, checked."""
 
-import io
 import math
 import os
 from collections.abc import Iterable
@@ -8,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yourdfpy
 from lxml import etree
 
 from lgrasp.errors import HandError
@@ -67,22 +65,25 @@ def read_urdf(path: Path) -> Urdf:
     except OSError as error:
         raise HandError(f"URDF {path} cannot be read: {error.strerror}") from None
     tree, raw = parse_robot(path, raw)
-    robot = _parse(path, tree)
-    for part in (*robot.links, *robot.joints):
-        if not part.name or not part.name.isprintable():
-            raise HandError(f"URDF {path} has a link or joint named {part.name!r}; every one needs a printable name")
+    for part in (*tree.findall("link"), *tree.findall("joint")):
+        if not part.get("name", "") or not part.get("name").isprintable():
+            name = part.get("name")
+            raise HandError(f"URDF {path} has a link or joint named {name!r}; every one needs a printable name")
     links: dict[str, tuple[Geometry, ...]] = {}
     meshes: dict[str, Path] = {}
-    for link in robot.links:
-        if link.name in links:
-            raise HandError(f"URDF {path}: link '{link.name}' is declared twice; names must be unique")
-        links[link.name] = tuple(_geometry(path, link.name, c, meshes) for c in link.collisions)
-    joints = [_joint(path, j, links) for j in robot.joints]
+    for link in tree.findall("link"):
+        name = link.get("name", "")
+        if name in links:
+            raise HandError(f"URDF {path}: link '{name}' is declared twice; names must be unique")
+        links[name] = tuple(_geometry(path, name, c, meshes) for c in link.findall("collision"))
+    joints = [_joint(path, j, links) for j in tree.findall("joint")]
     ordered, root = _order(path, links, joints)
     if not any(j.movable for j in ordered):
         raise HandError(f"URDF {path} has no movable joint; a hand needs revolute, continuous or prismatic joints")
     check_mimic(path, ordered)
-    return Urdf(path, robot.name or path.stem, raw.decode("utf-8", "replace"), root, links, tuple(ordered), meshes)
+    return Urdf(
+        path, tree.get("name") or path.stem, raw.decode("utf-8", "replace"), root, links, tuple(ordered), meshes
+    )
 
 
 def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
@@ -126,57 +127,77 @@ def _without_prefixed(raw: bytes) -> etree._Element | None:
     return tree
 
 
-def _parse(path: Path, tree: etree._Element) -> yourdfpy.urdf.Robot:
-    for element in tree.iter("limit"):
-        # absent effort and velocity are common and of no use here
-        for key in ("effort", "velocity"):
-            if key not in element.attrib:
-                element.set(key, "0")
-    try:
-        model = yourdfpy.URDF.load(
-            io.BytesIO(etree.tostring(tree)), build_scene_graph=False, load_meshes=False, mesh_dir=str(path.parent)
-        )
-    except Exception as error:  # yourdfpy raises many kinds, all mean the same to the user
-        raise HandError(f"URDF {path} is malformed: {type(error).__name__}: {_one_line(error)}") from None
-    return model.robot
-
-
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:200]
 
 
-def _matrix(origin: np.ndarray | None) -> np.ndarray:
-    return np.eye(4) if origin is None else np.asarray(origin, float)
+def _numbers(path: Path, where: str, element: etree._Element, key: str, default: str | None = None) -> np.ndarray:
+    """The numbers of an attribute, separated by spaces or commas, (n,).
+
+    Raises:
+        HandError: no such attribute, or something else in it.
+    """
+    text = element.get(key, default)
+    if text is None:
+        raise HandError(f"URDF {path} is malformed: <{element.tag}> of {where} has no {key}")
+    try:
+        return np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        raise HandError(f"URDF {path} is malformed: {where}: {key}={text[:80]!r}; numbers are needed") from None
 
 
-def _geometry(path: Path, link: str, collision, meshes: dict[str, Path]) -> Geometry:
-    g, origin = collision.geometry, _matrix(collision.origin)
-    if g is None:
-        raise HandError(f"URDF {path}: link '{link}' has a collision element without geometry")
-    if g.box is not None:
-        kind, size, name = "box", tuple(float(x) for x in g.box.size), ""
-    elif g.sphere is not None:
-        kind, size, name = "sphere", (float(g.sphere.radius),), ""
-    elif g.cylinder is not None:
-        kind, size, name = "cylinder", (float(g.cylinder.radius), float(g.cylinder.length)), ""
-    elif g.mesh is not None:
-        name = g.mesh.filename
-        scale = np.asarray(1.0 if g.mesh.scale is None else g.mesh.scale, float)
+def _number(path: Path, where: str, element: etree._Element, key: str, default: str | None = None) -> float:
+    values = _numbers(path, where, element, key, default)
+    if len(values) != 1:
+        raise HandError(f"URDF {path} is malformed: {where}: {key}={element.get(key)!r}; one number is needed")
+    return float(values[0])
+
+
+def _origin(path: Path, where: str, element: etree._Element) -> np.ndarray:
+    """The transform (4, 4) of the <origin> of an element: roll, pitch, yaw about fixed axes, then xyz."""
+    T = np.eye(4)
+    origin = element.find("origin")
+    if origin is None:
+        return T
+    xyz, rpy = (_numbers(path, where, origin, key, "0 0 0") for key in ("xyz", "rpy"))
+    if xyz.shape != (3,) or rpy.shape != (3,) or not np.isfinite([xyz, rpy]).all():
+        raise HandError(f"URDF {path}: {where} has an origin that is not finite or not of three numbers each")
+    (si, sj, sk), (ci, cj, ck) = np.sin(rpy), np.cos(rpy)
+    T[:3, :3] = [
+        [cj * ck, sj * (si * ck) - ci * sk, sj * (ci * ck) + si * sk],
+        [cj * sk, sj * (si * sk) + ci * ck, sj * (ci * sk) - si * ck],
+        [-sj, cj * si, cj * ci],
+    ]
+    T[:3, 3] = xyz
+    return T + 0.0  # no negative zeros
+
+
+def _geometry(path: Path, link: str, collision: etree._Element, meshes: dict[str, Path]) -> Geometry:
+    where = f"link '{link}'"
+    geometry, origin = collision.find("geometry"), _origin(path, where, collision)
+    if geometry is None:
+        raise HandError(f"URDF {path}: {where} has a collision element without geometry")
+    shape = next((e for e in geometry if e.tag in ("box", "sphere", "cylinder", "mesh")), None)
+    if shape is None:
+        raise HandError(f"URDF {path}: {where} has an unknown collision geometry; use box, sphere, cylinder or mesh")
+    kind = str(shape.tag)
+    if kind == "mesh":
+        name = shape.get("filename", "")
+        scale = _numbers(path, where, shape, "scale", "1")
         if scale.size not in (1, 3) or not np.isfinite(scale).all() or not scale.all():
             raise HandError(
                 f"URDF {path}: mesh '{name}' has scale {scale.tolist()}; three numbers other than 0 are needed"
             )
-        kind, size = "mesh", tuple(float(x) for x in np.broadcast_to(scale, 3))
         meshes[name] = find_mesh(path, link, name)
+        return Geometry(kind, tuple(float(x) for x in np.broadcast_to(scale, 3)), origin, name)
+    if kind == "box":
+        size = tuple(float(x) for x in _numbers(path, where, shape, "size"))
     else:
-        raise HandError(
-            f"URDF {path}: link '{link}' has an unknown collision geometry; use box, sphere, cylinder or mesh"
-        )
-    if kind != "mesh" and not all(x > 0 and math.isfinite(x) for x in size):
-        raise HandError(f"URDF {path}: link '{link}' has a {kind} of size {size}; sizes must be positive")
-    if not np.isfinite(origin).all():
-        raise HandError(f"URDF {path}: link '{link}' has a collision origin that is not finite")
-    return Geometry(kind, size, origin, name)
+        keys = ("radius", "length") if kind == "cylinder" else ("radius",)
+        size = tuple(_number(path, where, shape, key) for key in keys)
+    if (kind == "box" and len(size) != 3) or not all(x > 0 and math.isfinite(x) for x in size):
+        raise HandError(f"URDF {path}: {where} has a {kind} of size {size}; sizes must be positive")
+    return Geometry(kind, size, origin)
 
 
 def find_mesh(path: Path, link: str, name: str) -> Path:
@@ -206,38 +227,41 @@ def find_mesh(path: Path, link: str, name: str) -> Path:
     raise HandError(f"URDF {path}: link '{link}' names mesh '{name}', which does not exist ({trials[0]})")
 
 
-def _joint(path: Path, j, links: dict[str, tuple[Geometry, ...]]) -> Joint:
-    for end in (j.parent, j.child):
+def _joint(path: Path, element: etree._Element, links: dict[str, tuple[Geometry, ...]]) -> Joint:
+    name, kind = element.get("name", ""), element.get("type")
+    where = f"joint '{name}'"
+    parent, child = (e.get("link", "") if (e := element.find(end)) is not None else "" for end in ("parent", "child"))
+    for end in (parent, child):
         if end not in links:
-            raise HandError(f"URDF {path}: joint '{j.name}' connects link '{end}', which is not declared")
-    movable = j.type in _MOVABLE
-    if not movable and j.type != "fixed":
-        raise HandError(f"URDF {path}: joint '{j.name}' is {j.type}; accepted: fixed, revolute, continuous, prismatic")
-    axis = np.array([1.0, 0.0, 0.0]) if j.axis is None else np.asarray(j.axis, float)
-    lower = upper = 0.0
+            raise HandError(f"URDF {path}: {where} connects link '{end}', which is not declared")
+    movable = kind in _MOVABLE
+    if not movable and kind != "fixed":
+        raise HandError(f"URDF {path}: {where} is {kind}; accepted: fixed, revolute, continuous, prismatic")
+    axis, (lower, upper), mimic = np.array([1.0, 0.0, 0.0]), (0.0, 0.0), None
+    if (turning := element.find("axis")) is not None:
+        axis = _numbers(path, where, turning, "xyz", "1 0 0")
     if movable:
         length = float(np.linalg.norm(axis))
         if axis.shape != (3,) or not np.isfinite(length) or length < 1e-9:
-            raise HandError(
-                f"URDF {path}: joint '{j.name}' has axis {axis.tolist()}; three numbers, not all 0, are needed"
-            )
+            raise HandError(f"URDF {path}: {where} has axis {axis.tolist()}; three numbers, not all 0, are needed")
         axis = axis / length
-        if j.type == "continuous":
-            lower, upper = -math.pi, math.pi
-        elif j.limit is None or j.limit.lower is None or j.limit.upper is None:
-            raise HandError(f"URDF {path}: joint '{j.name}' has no limits; add <limit lower=… upper=…>")
-        else:
-            lower, upper = float(j.limit.lower), float(j.limit.upper)
-        if not (math.isfinite(lower) and math.isfinite(upper) and lower < upper):
-            raise HandError(f"URDF {path}: joint '{j.name}' has limits [{lower}, {upper}]; lower must be below upper")
-    mimic = None
-    if movable and j.mimic is not None:
-        mult = 1.0 if j.mimic.multiplier is None else float(j.mimic.multiplier)
-        mimic = (j.mimic.joint, mult, 0.0 if j.mimic.offset is None else float(j.mimic.offset))
-    origin = _matrix(j.origin)
-    if not np.isfinite(origin).all():
-        raise HandError(f"URDF {path}: joint '{j.name}' has an origin that is not finite")
-    return Joint(j.name, j.parent, j.child, origin, movable, j.type == "prismatic", axis, lower, upper, mimic)
+        lower, upper = (-math.pi, math.pi) if kind == "continuous" else _bounds(path, where, element)
+        if (source := element.find("mimic")) is not None:
+            factor, offset = (_number(path, where, source, *x) for x in (("multiplier", "1"), ("offset", "0")))
+            mimic = (source.get("joint", ""), factor, offset)
+    origin = _origin(path, where, element)
+    return Joint(name, parent, child, origin, movable, kind == "prismatic", axis, lower, upper, mimic)
+
+
+def _bounds(path: Path, where: str, joint: etree._Element) -> tuple[float, float]:
+    """Lower and upper limit of a joint [rad or m]."""
+    limit = joint.find("limit")
+    if limit is None or limit.get("lower") is None or limit.get("upper") is None:
+        raise HandError(f"URDF {path}: {where} has no limits; add <limit lower=… upper=…>")
+    lower, upper = (_number(path, where, limit, key) for key in ("lower", "upper"))
+    if not (math.isfinite(lower) and math.isfinite(upper) and lower < upper):
+        raise HandError(f"URDF {path}: {where} has limits [{lower}, {upper}]; lower must be below upper")
+    return lower, upper
 
 
 def _order(path: Path, links: dict[str, tuple[Geometry, ...]], joints: list[Joint]) -> tuple[list[Joint], str]:

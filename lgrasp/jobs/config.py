@@ -4,6 +4,7 @@ import difflib
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -13,11 +14,13 @@ from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.errors import ConfigError
 from lgrasp.jobs.generate import Job
 from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.sequence.job import SequenceJob, sequence_name
 from lgrasp.jobs.sequence.sets import SequenceSets, object_sequences
 from lgrasp.object.find import find_object
 from lgrasp.object.load import MESH_SUFFIXES
 from lgrasp.paths import data_dirs
+
+if TYPE_CHECKING:
+    from lgrasp.jobs.sequence.job import SequenceJob
 
 
 class Published(BaseModel):
@@ -128,12 +131,14 @@ def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1
 
 def plan_sequences(
     config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1), resume: bool = True
-) -> list[SequenceJob]:
+) -> "list[SequenceJob]":
     """One job for each pipeline, hand and sequence of objects; tasks of an array share the sequences.
 
     Raises:
         ConfigError: a config without ``sequences``, a pipeline or a folder that cannot be used, too few objects.
     """
+    from lgrasp.jobs.sequence.job import SequenceJob, sequence_name  # heavier than all the rest
+
     sets = config.sequences
     if sets is None:
         raise ConfigError("the config has no sequences")

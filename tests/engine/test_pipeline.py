@@ -193,5 +193,5 @@ def test_object_key_ignores_the_field_and_back(swift):
 
 def test_version_of_a_stage_is_in_the_key(swift, monkeypatch):
     before = swift.describe()
-    monkeypatch.setitem(STAGES, "ik", replace(STAGES["ik"], version=STAGES["ik"].version + 1))
+    monkeypatch.setattr("lgrasp.stages.ik.stage.VERSION", STAGES["ik"].version + 1)
     assert swift.describe() != before

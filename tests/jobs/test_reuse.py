@@ -1,12 +1,10 @@
 """Candidate banks and several passes over them."""
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lgrasp.engine import batch as batch_module
 from lgrasp.engine.bank import BANK_CANDIDATES, Bank
 from lgrasp.engine.batch import run_batch
 from lgrasp.engine.cache import Cache
@@ -30,16 +28,15 @@ def calls(monkeypatch):
     """Stage -> number of launches, counted where batches run them."""
     counted = dict.fromkeys(STAGES, 0)
 
-    def count(name):
-        stage = STAGES[name]
-
-        def run(*args, **options):
+    def count(name, run):
+        def counting(*args, **options):
             counted[name] += 1
-            return stage.run(*args, **options)
+            return run(*args, **options)
 
-        return replace(stage, run=run)
+        return counting
 
-    monkeypatch.setattr(batch_module, "STAGES", {name: count(name) for name in STAGES})
+    for name, stage in STAGES.items():
+        monkeypatch.setattr(f"{stage.module}.run", count(name, stage.run))
     return counted
 
 
