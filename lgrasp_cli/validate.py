@@ -12,7 +12,7 @@ from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cac
 
 if TYPE_CHECKING:
     from lgrasp.jobs.simulate import Validated
-    from lgrasp.simulate import Protocol
+    from lgrasp.simulate.protocol import Protocol
 
 _SLOW = 2.0  # [s]
 _INTERVAL = 10.0  # [s] between lines of progress when standard error is no terminal
@@ -55,7 +55,7 @@ def validate(
     """
     check_report(json_path)
     from lgrasp.jobs.simulate import Validation, summary, validate_shards
-    from lgrasp.simulate import find_protocol
+    from lgrasp.simulate.protocol import find_protocol
     from lgrasp_cli.tables import print_report
 
     chosen = find_protocol(protocol)
@@ -72,7 +72,7 @@ def validate(
 
 
 def _show(entries: list[dict[str, Any]], done: "list[Validated]", protocol: "Protocol") -> None:
-    from lgrasp.simulate import DIRECTIONS
+    from lgrasp.simulate.protocol import DIRECTIONS
     from lgrasp_cli.tables import print_pairs, print_table
 
     stay = ("stay",) if any(entry["stay"] is not None for entry in entries) else ()

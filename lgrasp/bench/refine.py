@@ -31,7 +31,9 @@ from lgrasp.refine.refiner import Pose, Refiner, table_pose
 from lgrasp.refine.surface import hand_surface
 from lgrasp.refine.visible_surface import seen_palmar
 from lgrasp.runtime.device import resolve_device
-from lgrasp.simulate import Scene, find_protocol, scene_of, verdicts
+from lgrasp.simulate.protocol import find_protocol
+from lgrasp.simulate.run import verdicts
+from lgrasp.simulate.scene import Scene, scene_of
 
 NOISES = (0.0, 0.002, 0.005, 0.01)
 """Standard deviations of the points of clouds, besides meshes [m]."""

@@ -12,7 +12,7 @@ from lgrasp.errors import ConfigError
 from lgrasp.field.params import FieldParams
 from lgrasp.object.params import ObjectParams
 from lgrasp.paths import data_dirs
-from lgrasp.simulate import find_protocol
+from lgrasp.simulate.protocol import find_protocol
 from lgrasp.stages.simulate.params import ValidateParams
 
 

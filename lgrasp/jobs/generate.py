@@ -24,8 +24,6 @@ from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.records import hand_record, make_scene, mesh_blobs, object_record
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
-from lgrasp.simulate import find_protocol, protocol_text
-from lgrasp.simulate.model import import_mujoco
 
 METRIC_UNITS = {"penetration": "m", "self_penetration": "m", "gap": "m", "normal_error": "rad"}
 
@@ -131,6 +129,8 @@ def generate(job: Job, listener: Listener | None = None) -> Outcome:
     device = resolve_device(job.device)
     pipeline = job.pipeline
     if "validate" in pipeline.order:
+        from lgrasp.simulate.model import import_mujoco
+
         import_mujoco()
     keys = input_keys(hand_source(job.hand), job.object, job.scale, pipeline.object, pipeline.field)
     assert keys.mesh is not None
@@ -264,4 +264,7 @@ def _protocol(pipeline: Pipeline, inputs: Inputs) -> str:
     """What was simulated, "" if nothing was."""
     if inputs.scene is None:
         return ""
+    from lgrasp.simulate.protocol import find_protocol
+    from lgrasp.simulate.run import protocol_text
+
     return protocol_text(inputs.scene, find_protocol(pipeline.params("validate").protocol))

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lgrasp.dataset import HandRecord, ObjectRecord
 from lgrasp.engine.cache import Cache
@@ -10,7 +11,9 @@ from lgrasp.geometry.decompose import decompose
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.object.model import ObjectModel
-from lgrasp.simulate.scene import Scene, scene_of
+
+if TYPE_CHECKING:
+    from lgrasp.simulate.scene import Scene
 
 
 def mesh_blobs(urdf: Path) -> dict[str, bytes]:
@@ -49,6 +52,8 @@ def object_record(obj: ObjectModel, id: str | None = None) -> ObjectRecord:
 
 def make_scene(
     cache: Cache, hand: HandModel, objects: Sequence[ObjectRecord], meshes: dict[str, bytes], device: str
-) -> Scene:
+) -> "Scene":
     """What the simulator is given: the scene of the job's shards; ``meshes`` are the hand's :func:`mesh_blobs`."""
+    from lgrasp.simulate.scene import scene_of
+
     return scene_of(hand_record(hand, meshes), objects, partial(decompose, store=cache), device)

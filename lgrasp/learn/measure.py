@@ -7,7 +7,7 @@ import torch
 
 from lgrasp.learn.examples import Examples
 from lgrasp.learn.training import Trainer, whole_energy
-from lgrasp.refine import Pose
+from lgrasp.refine.refiner import Pose
 
 
 class Measured(NamedTuple):

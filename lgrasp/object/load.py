@@ -16,8 +16,7 @@ import trimesh
 from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import ObjectError
-
-from .params import ObjectParams
+from lgrasp.object.params import ObjectParams
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
 

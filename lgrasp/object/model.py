@@ -8,11 +8,10 @@ import numpy as np
 import trimesh
 
 from lgrasp.geometry.clusters import bounding_spheres, cluster_order
-
-from .load import LoadedMesh, load_mesh
-from .params import ObjectParams
-from .sdf import SdfGrid, build_sdf
-from .surface import (
+from lgrasp.object.load import LoadedMesh, load_mesh
+from lgrasp.object.params import ObjectParams
+from lgrasp.object.sdf import SdfGrid, build_sdf
+from lgrasp.object.surface import (
     face_normals,
     fold_cosine,
     opposite_points,

@@ -5,8 +5,9 @@ import warp as wp
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from lgrasp.object.sdf import SdfGrid, sample_sdf
+
 from . import kernels
-from .sdf import SdfGrid, sample_sdf
 
 _OPPOSED = float(np.cos(np.radians(30.0)))  # of the line between two opposite points to their normals, at least
 _OVERSAMPLE = 5  # candidates for one point kept

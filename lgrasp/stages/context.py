@@ -3,16 +3,19 @@
 from dataclasses import dataclass
 from dataclasses import field as with_default
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import warp as wp
 
 from lgrasp.field.arrays import FieldArrays
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.opposition.spaces import Space
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.seeding import stage_seed
-from lgrasp.simulate.scene import Scene
+
+if TYPE_CHECKING:
+    from lgrasp.hand.opposition.spaces import Space
+    from lgrasp.simulate.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -26,9 +29,9 @@ class Context:
     base_seed: int
     shard: int
 
-    scene: Scene | None = None
+    scene: "Scene | None" = None
     """What a physics simulation is given; there if the pipeline has one."""
-    space: Space | None = None
+    space: "Space | None" = None
     """Opposition space that grasps must use; hand and field are then those of the space."""
     holding: HeldArrays | None = None
     """What the hand holds already, and what of it may not move; None: nothing."""

@@ -15,7 +15,7 @@ from lgrasp.learn.network import Coarse, CoarseNet, best_answers, seed_frames
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import Trainer, pose_loss, whole_energy
 from lgrasp.object.sdf import SdfGrid, sample_sdf
-from lgrasp.refine import Pose
+from lgrasp.refine.refiner import Pose
 
 PARAMS = LearnParams.model_validate({"points": 48, "width": 32, "batch": 24, "clouds": 4, "held_out": 3})
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lgrasp.object import find_object
+from lgrasp.object.find import find_object
 
 
 @pytest.mark.parametrize(

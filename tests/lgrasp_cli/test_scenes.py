@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from lgrasp.object import find_object
+from lgrasp.object.find import find_object
 
 SMALL = {"objects": 2, "grasps": 5, "colliding": 5, "tested": 20, "camera": {"width": 80, "height": 60, "views": 2}}
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lgrasp.object import ObjectParams
+from lgrasp.object.params import ObjectParams
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "objects"
 

@@ -7,8 +7,9 @@ import pytest
 import trimesh
 
 from lgrasp.errors import ObjectError
-from lgrasp.object import ObjectParams, find_object, list_objects
+from lgrasp.object.find import find_object, list_objects
 from lgrasp.object.load import load_mesh, open_edges
+from lgrasp.object.params import ObjectParams
 
 BOX = trimesh.creation.box(extents=(0.05, 0.07, 0.1))
 

@@ -5,7 +5,10 @@ import pytest
 import trimesh
 from scipy.spatial import KDTree
 
-from lgrasp.object import CLUSTER_SIZE, ObjectModel, ObjectParams, find_object, preprocess_object
+from lgrasp.geometry.clusters import CLUSTER_SIZE
+from lgrasp.object.find import find_object
+from lgrasp.object.model import ObjectModel, preprocess_object
+from lgrasp.object.params import ObjectParams
 from lgrasp.object.sdf import SdfGrid, sample_sdf
 
 

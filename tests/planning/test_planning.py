@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lgrasp.planning.planner import Planner, PlanParams
-from lgrasp.refine import LocalSearch
 from lgrasp.refine.check import OUTCOMES
+from lgrasp.refine.params import LocalSearch
 
 QUICK = PlanParams(rolls=3, finalists=1, opening=2, search=PlanParams().search.model_copy(update={"outer": 6}))
 

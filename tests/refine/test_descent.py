@@ -7,9 +7,10 @@ import torch
 from lgrasp.cloud.model import cloud_object
 from lgrasp.errors import HandError
 from lgrasp.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
-from lgrasp.refine import LocalSearch, Pose, Refiner
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands, inverse_poses
+from lgrasp.refine.params import LocalSearch
+from lgrasp.refine.refiner import Pose, Refiner
 from lgrasp.refine.surface import hand_surface
 from lgrasp.refine.target import Target
 from lgrasp.refine.volume import upload_target

@@ -5,10 +5,9 @@ import pytest
 import torch
 
 from lgrasp.geometry.rotations import so3_exp
-from lgrasp.refine import Pose
 from lgrasp.refine.check import check_grasps
 from lgrasp.refine.params import GraspBounds
-from lgrasp.refine.refiner import object_pose
+from lgrasp.refine.refiner import Pose, object_pose
 
 
 def some(pose: Pose, rows: slice, dtype: torch.dtype = torch.float32) -> Pose:

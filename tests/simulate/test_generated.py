@@ -9,7 +9,9 @@ import pytest
 from lgrasp.dataset import GraspRows, ShardReader, read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.jobs.generate import Job, generate
-from lgrasp.simulate import PROTOCOLS, Scene, scene_of_shard, verdicts
+from lgrasp.simulate.protocol import PROTOCOLS
+from lgrasp.simulate.run import verdicts
+from lgrasp.simulate.scene import Scene, scene_of_shard
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

@@ -10,10 +10,12 @@ from support.jaws import Jaws
 from support.twins import in_one_gripper, twin_rows, twin_shard
 
 from lgrasp.runtime.device import start
-from lgrasp.simulate import PROTOCOLS, scene_of_shard, verdicts
 from lgrasp.simulate.columns import stack_verdicts
 from lgrasp.simulate.groups import group_rows
 from lgrasp.simulate.model import build_model
+from lgrasp.simulate.protocol import PROTOCOLS
+from lgrasp.simulate.run import verdicts
+from lgrasp.simulate.scene import scene_of_shard
 
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed (extra gpu-sim)")
 

@@ -12,9 +12,10 @@ from support.solids import YOU, prism
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import DecomposeError
 from lgrasp.geometry.decompose import decompose
-from lgrasp.simulate import PROTOCOLS, Scene, scene_of_shard, verdicts
 from lgrasp.simulate.model import build_model
-from lgrasp.simulate.scene import hand_of_record, object_of_record
+from lgrasp.simulate.protocol import PROTOCOLS
+from lgrasp.simulate.run import verdicts
+from lgrasp.simulate.scene import Scene, hand_of_record, object_of_record, scene_of_shard
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

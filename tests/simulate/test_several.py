@@ -8,7 +8,10 @@ from support.jaws import EDGE
 from support.twins import SIDE, in_one_gripper, twin_rows, twin_shard
 
 from lgrasp.dataset import GraspRows, Shard
-from lgrasp.simulate import COLUMNS, OBJECT_COLUMNS, PROTOCOLS, scene_of, scene_of_shard, verdicts
+from lgrasp.simulate.columns import COLUMNS, OBJECT_COLUMNS
+from lgrasp.simulate.protocol import PROTOCOLS
+from lgrasp.simulate.run import verdicts
+from lgrasp.simulate.scene import scene_of, scene_of_shard
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

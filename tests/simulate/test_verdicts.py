@@ -8,7 +8,10 @@ import pytest
 from support.jaws import EDGE, Jaws
 
 from lgrasp.errors import ConfigError, PhysicsError
-from lgrasp.simulate import COLUMNS, PROTOCOLS, find_protocol, protocol_text, scene_of_shard, verdicts
+from lgrasp.simulate.columns import COLUMNS
+from lgrasp.simulate.protocol import PROTOCOLS, find_protocol
+from lgrasp.simulate.run import protocol_text, verdicts
+from lgrasp.simulate.scene import scene_of_shard
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

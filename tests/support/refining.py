@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from lgrasp.engine.batch import run_stages
-from lgrasp.refine import LocalSearch, Pose, Refiner
-from lgrasp.refine.refiner import table_pose
+from lgrasp.refine.params import LocalSearch
+from lgrasp.refine.refiner import Pose, Refiner, table_pose
 
 
 @pytest.fixture(scope="session")

@@ -26,8 +26,9 @@ from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_roun
 from lgrasp.jobs.sequence.size import Size
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
-from lgrasp.simulate import find_protocol, protocol_text, verdicts
 from lgrasp.simulate.model import import_mujoco
+from lgrasp.simulate.protocol import find_protocol
+from lgrasp.simulate.run import protocol_text, verdicts
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ import numpy as np
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.grasp.tables import GraspTable, take_grasps, user_poses
-from lgrasp.simulate import find_protocol, verdicts
+from lgrasp.simulate.protocol import find_protocol
+from lgrasp.simulate.run import verdicts
 from lgrasp.stages.context import Context
 from lgrasp.stages.simulate.params import ValidateParams
 

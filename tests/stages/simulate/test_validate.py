@@ -12,7 +12,10 @@ from lgrasp.errors import ConfigError, OutputError, PhysicsError
 from lgrasp.grasp.tables import GraspTable, grasp_arrays
 from lgrasp.jobs.generate import generate
 from lgrasp.jobs.records import make_scene, mesh_blobs, object_record
-from lgrasp.simulate import COLUMNS, PROTOCOLS, scene_of_shard, verdicts
+from lgrasp.simulate.columns import COLUMNS
+from lgrasp.simulate.protocol import PROTOCOLS
+from lgrasp.simulate.run import verdicts
+from lgrasp.simulate.scene import scene_of_shard
 from lgrasp.stages.context import Context
 from lgrasp.stages.simulate.params import ValidateParams
 from lgrasp.stages.simulate.stage import run
