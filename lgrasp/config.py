@@ -19,17 +19,18 @@ class Params(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     RENAMED: ClassVar[dict[str, str]] = {}
-    """Old key -> the field that it is now called."""
+    """Old key -> the field that it is now called; those of the models that this one builds on are read too."""
 
     @model_validator(mode="before")
     @classmethod
     def _read_old_keys(cls, data: Any, info: ValidationInfo) -> Any:
-        if not isinstance(data, dict) or not cls.RENAMED.keys() & data.keys():
+        renamed = {old: new for base in reversed(cls.__mro__) for old, new in vars(base).get("RENAMED", {}).items()}
+        if not isinstance(data, dict) or not renamed.keys() & data.keys():
             return data
         where = f"{info.context['where']}: " if info.context else ""
         read = {}
         for key, value in data.items():
-            name = cls.RENAMED.get(key, key)
+            name = renamed.get(key, key)
             if name != key:
                 if name in data:
                     raise ValueError(f"'{key}' is the old name of '{name}': give one of them")

@@ -71,7 +71,7 @@ def evaluate(
     cache_dir: CacheDir = None,
     quiet: Quiet = False,
 ) -> None:
-    """Energies of a predictor's answers on new clouds, and after 3, 6, 10 and 13 outer steps of the refiner.
+    """Energies of a predictor's answers on new clouds, and after 3, 6, 10 and 13 rounds of the refiner.
 
     Example: lgrasp learn eval coarse.pt grasps
     """
@@ -87,7 +87,7 @@ def evaluate(
     ]
     pairs += [
         (f"{steps}-step", f"{energy:.4f}  ({data['coarse'] / energy:.1f}x lower)")
-        for steps, energy in zip(data["outer"], data["refined"], strict=True)
+        for steps, energy in zip(data["rounds"], data["refined"], strict=True)
     ]
     _report(data, json_path, quiet, pairs)
 

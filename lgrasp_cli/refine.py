@@ -36,10 +36,14 @@ def refine(
     hand: Annotated[
         str | None, typer.Option(help="Hand of the grasps; default: the one that the shards name.", show_default=False)
     ] = None,
-    outer: Annotated[
+    matching_rounds: Annotated[
         int | None, typer.Option(help="Times that nearest points are matched.", show_default=False)
     ] = None,
-    inner: Annotated[int | None, typer.Option(help="Gradient steps after each.", show_default=False)] = None,
+    gradient_steps: Annotated[
+        int | None, typer.Option(help="Gradient steps after each matching.", show_default=False)
+    ] = None,
+    outer: Annotated[int | None, typer.Option(hidden=True)] = None,
+    inner: Annotated[int | None, typer.Option(hidden=True)] = None,
     coarse: Annotated[
         bool, typer.Option("--coarse", help="Large steps and a long reach: for poses that are far off.")
     ] = False,
@@ -70,7 +74,9 @@ def refine(
         form=form,
         hand=hand,
         always=always,
-        params=refine_params(outer=outer, inner=inner, coarse=coarse),
+        params=refine_params(
+            matching_rounds=matching_rounds, gradient_steps=gradient_steps, outer=outer, inner=inner, coarse=coarse
+        ),
         device=device,
         force=force,
         cache=cache,

@@ -92,7 +92,7 @@ class HandBench(NamedTuple):
     clouds: dict[float, Planning]
     """By noise [m]."""
     energy: tuple[float, ...]
-    """Mean E* of coarse poses after STEPS outer steps."""
+    """Mean E* of coarse poses after STEPS rounds of matching."""
     milliseconds: tuple[float, ...]
     """Time of one pose there, all poses side by side."""
     poses: int
@@ -200,7 +200,7 @@ def _displaced(table: GraspTable, holds: np.ndarray, device: str) -> Pose:
 
 
 def _falls(hand, palmar, coarse: list[tuple[ObjectModel, Pose]], device: str):
-    """Mean energy of coarse poses, and the milliseconds of one, after STEPS outer steps; and their number."""
+    """Mean energy of coarse poses, and the milliseconds of one, after STEPS rounds of matching; and their number."""
     surface = hand_surface(hand, palmar)
     energy, seconds, count = np.zeros(len(STEPS)), np.zeros(len(STEPS)), 0
     for model, pose in coarse:
@@ -210,7 +210,7 @@ def _falls(hand, palmar, coarse: list[tuple[ObjectModel, Pose]], device: str):
         count += len(pose.t)
         for k, steps in enumerate(STEPS):
             begin = time.perf_counter()
-            found = refiner(*pose, outer=steps).energies.total
+            found = refiner(*pose, rounds=steps).energies.total
             energy[k] += float(found.sum())
             seconds[k] += time.perf_counter() - begin
     each = max(count, 1)

@@ -44,8 +44,8 @@ class PlanParams(BaseModel):
         min_length=1,
         description="Angles between the surface's normal and the way back from it [deg], in turn.",
     )
-    finalists: int = Field(default=10, ge=1, le=64, description="Of these go on after the first outer steps.")
-    opening: int = Field(default=5, ge=1, le=100, description="Outer steps of all of them.")
+    finalists: int = Field(default=10, ge=1, le=64, description="Of these go on after the first matchings.")
+    opening: int = Field(default=5, ge=1, le=100, description="Matchings of all of them.")
     clearance: float = Field(
         default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
     )
@@ -55,10 +55,10 @@ class PlanParams(BaseModel):
     other: float = Field(default=OTHER, ge=0, le=100, description="Weight of the other palmar points.")
     search: LocalSearch = Field(
         default=LocalSearch(
-            withdraw=0.0,
-            shift=0.002,
-            turn=0.02,
-            bend=0.04,
+            max_exit_distance=0.0,
+            max_translation_step=0.002,
+            max_rotation_step=0.02,
+            max_joint_step=0.04,
             reach=0.15,
             reach_end=0.1,
             soft=0.01,
@@ -154,13 +154,13 @@ class Planner:
         """The best hand of each start that does not collide, and its outcome."""
         p, hand = self.params, self.hand.model
         start, pose, q, facing = self._starts(points, first)
-        free = search.depth(self._put(pose, q)) <= _COLLIDES
+        free = search.max_penetration(self._put(pose, q)) <= _COLLIDES
         start, at = start[free], self._put(pose[free], q[free])
         if len(start):
             centre, axis = palm_axis(hand)
             travel = np.full(len(start), max(self.stand_off - float(centre @ axis) - p.clearance, 0.0))
             search.advanced(at, facing[free], travel, p.clearance)
-            search.run(at, outer=p.opening)
+            search.run(at, rounds=p.opening)
             start, at = self._best(at, start, _COARSE, p.finalists)
             search.run(at, first=p.opening)
             start, at = self._best(at, start, p.bounds, 1)

@@ -7,7 +7,7 @@ from lgrasp.differentiable.solids import hand_solids
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import HandArrays, body_poses, pose_matrices
 from lgrasp.hand.palm import palm_axis
-from lgrasp.refine.descent_kernels import advance, deepest, descend
+from lgrasp.refine.descent_kernels import advance, descend, penetration
 from lgrasp.refine.energy_gradient import MAX_COLUMNS, Search
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.match_kernels import (
@@ -23,7 +23,7 @@ from lgrasp.refine.match_kernels import (
     place_bodies,
 )
 from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
-from lgrasp.refine.resolve_penetration import withdraw
+from lgrasp.refine.resolve_penetration import resolve_penetration
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
 
@@ -55,31 +55,31 @@ class Descent:
         self._search = self._settings(surface)
         self._back = -palm_axis(model)[1]
 
-    def run(self, at: Hands, *, outer: int | None = None, first: int = 0) -> None:
-        """Move hands: match, then ``inner`` gradient steps, for outer steps ``first`` to ``outer``, in place.
+    def run(self, at: Hands, *, rounds: int | None = None, first: int = 0) -> None:
+        """Move hands in place: match and take ``gradient_steps`` steps, in rounds ``first`` to ``rounds``.
 
-        Hands deep in the object are first taken out, straight along the shortest of some ways or by opening
-        (``withdraw``): through a thin wall the gradient leads to either side.
+        Hands deep in the object are first moved out, straight along the shortest of some ways or by opening, within
+        ``max_exit_distance``: through a thin wall the gradient leads to either side.
 
         Args:
-            outer: default: the parameters'. Sizes and reach fall along the parameters' outer steps or these, whichever
-                are more.
+            rounds: default: the parameters' ``matching_rounds``. Sizes and reach fall along these or the parameters'
+                rounds, whichever are more.
         """
         p = self.params
-        outer = p.outer if outer is None else outer
-        whole, rows = max(outer, p.outer), at.pose.shape[0]
-        if rows == 0 or outer <= first:
+        rounds = p.matching_rounds if rounds is None else rounds
+        whole, rows = max(rounds, p.matching_rounds), at.pose.shape[0]
+        if rows == 0 or rounds <= first:
             return
-        if first == 0 and p.withdraw > 0:
-            withdraw(self, self._hand.model.tree, self._back, at, p.withdraw)
+        if first == 0 and p.max_exit_distance > 0:
+            resolve_penetration(self, self._hand.model.tree, self._back, at, p.max_exit_distance)
         first_moment, second_moment = self._moments(rows), self._moments(rows)
         m, body = self._matches(rows), self._body(rows)
-        for i in range(first, outer):
+        for i in range(first, rounds):
             self._match(at, m, body, p.reach * (p.reach_end / p.reach) ** (i / whole))
-            self._descend(at, m, (i - first) * p.inner, first, whole, False, first_moment, second_moment)
+            self._descend(at, m, (i - first) * p.gradient_steps, first, whole, False, first_moment, second_moment)
 
     def gradient(self, at: Hands) -> np.ndarray:
-        """Derivatives of E* by a shift [1/m], a turn about the hand's middle and the joints, (N, 6 + K)."""
+        """Derivatives of E* by translation [1/m], rotation about the hand's middle [1/rad] and joints, (N, 6 + K)."""
         rows = at.pose.shape[0]
         m, body, out = self._matches(rows), self._body(rows), self._moments(rows)
         self._match(at, m, body, self.params.reach)
@@ -100,7 +100,7 @@ class Descent:
         inputs = [self._points, t.own, t.around, int(t.has_around), _ADVANCES, clearance, ways, most, body]
         wp.launch(advance, dim=rows, inputs=inputs, outputs=[at.pose], device=d)
 
-    def depth(self, at: Hands) -> np.ndarray:
+    def max_penetration(self, at: Hands) -> np.ndarray:
         """Depth of the deepest point of hands in anything, or of that in them [m], negative apart, (N,)."""
         rows = at.pose.shape[0]
         m, body = self._matches(rows), self._body(rows)
@@ -108,7 +108,7 @@ class Descent:
         self._match_object(m, body, self.params.reach)
         out = wp.empty(rows, dtype=wp.float32, device=self.device)
         inputs = [m, self._points, self._solids, body]
-        wp.launch(deepest, dim=rows, inputs=inputs, outputs=[out], device=self.device)
+        wp.launch(penetration, dim=rows, inputs=inputs, outputs=[out], device=self.device)
         return out.numpy()
 
     def _settings(self, surface: HandSurface) -> "Search":
@@ -117,9 +117,10 @@ class Descent:
         s = Search()
         s.points, s.normals = p.points / total, p.normals / total
         s.force, s.barrier, s.limits = p.force / p.contacts**2, p.barrier, p.limits / len(tree.joint_lower)
-        s.margin, s.link_margin, s.contacts, s.inner = p.margin, p.link_margin, p.contacts, p.inner
+        s.margin, s.link_margin, s.contacts, s.gradient_steps = p.margin, p.link_margin, p.contacts, p.gradient_steps
         s.sgd, s.momentum, s.decay = int(p.optimizer == "sgd"), p.momentum, p.decay
-        s.shift, s.turn, s.bend = p.shift, p.turn, p.bend
+        s.max_translation_step, s.max_rotation_step = p.max_translation_step, p.max_rotation_step
+        s.max_joint_step = p.max_joint_step
         s.middle = wp.vec3(*map(float, _middle(self._hand, surface)))
         s.com, s.radius = t.com, t.radius
 
@@ -175,7 +176,7 @@ class Descent:
         self, at: Hands, m: "Correspondences", taken: int, first: int, whole: int, gradient: bool, *moments: wp.array
     ) -> None:
         inputs = [self._hand.struct.kin, self._points, self._solids, self._target.own, self._search, m]
-        inputs += [taken, first * self.params.inner, float(whole), int(gradient), *moments]
+        inputs += [taken, first * self.params.gradient_steps, float(whole), int(gradient), *moments]
         wp.launch(
             descend,
             dim=at.pose.shape[0],

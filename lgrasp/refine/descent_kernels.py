@@ -79,12 +79,12 @@ def descend(
     pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),
 ):
-    """``inner`` steps of hands, in place; launched over hands.
+    """``gradient_steps`` steps of hands, in place; launched over hands.
 
     Args:
-        taken: steps before these. skipped: further ones that sizes fall by. whole: outer steps along which they fall.
+        taken: steps before these. skipped: further ones that sizes fall by. whole: rounds along which they fall.
         first, second: moments of the gradient.
-        gradient: 1: take no step, leave the derivatives by shift, turn and joints in ``first``.
+        gradient: 1: take no step, leave the derivatives by translation, rotation and joints in ``first``.
     """
     row = wp.tid()
     X = wp.zeros(shape=(_BODIES,), dtype=wp.transform)
@@ -92,7 +92,7 @@ def descend(
     M = wp.zeros(shape=(_BODIES,), dtype=wp.vec3)
     T = pose[row]
     bodies = 1 + h.joint_first[h.groups]
-    for inner in range(s.inner):
+    for k in range(s.gradient_steps):
         for b in range(bodies):
             F[b] = wp.vec3()
             M[b] = wp.vec3()
@@ -115,10 +115,10 @@ def descend(
             for c in range(q.shape[1]):
                 first[row, 6 + c] = by_q[c]
             return
-        step = taken + inner + 1
-        size = wp.pow(s.decay, float(skipped + taken + inner) / (float(s.inner) * whole))
-        shift = s.shift * size * _three_moved(first, second, row, 0, by_shift, step, s)
-        turn = s.turn * size * _three_moved(first, second, row, 3, by_turn, step, s)
+        step = taken + k + 1
+        size = wp.pow(s.decay, float(skipped + taken + k) / (float(s.gradient_steps) * whole))
+        translation = s.max_translation_step * size * _three_moved(first, second, row, 0, by_shift, step, s)
+        rotation = s.max_rotation_step * size * _three_moved(first, second, row, 3, by_turn, step, s)
         scale = float(1.0)
         if s.sgd == 1:
             norm = float(0.0)
@@ -127,13 +127,13 @@ def descend(
             scale = 1.0 / wp.max(wp.sqrt(norm), 1.0)
         for c in range(q.shape[1]):
             slope = by_q[c] * scale
-            x = q[row, c] + s.bend * size * _moved(first, second, row, 6 + c, slope, slope * slope, step, s)
+            x = q[row, c] + s.max_joint_step * size * _moved(first, second, row, 6 + c, slope, slope * slope, step, s)
             q[row, c] = wp.clamp(x, s.lower[c], s.upper[c])
-        angle = wp.length(turn)
+        angle = wp.length(rotation)
         r = wp.quat_identity()
         if angle > 1.0e-9:
-            r = wp.quat_from_axis_angle(turn / angle, angle)
-        at = centre + shift + wp.quat_rotate(r, wp.transform_get_translation(T) - centre)
+            r = wp.quat_from_axis_angle(rotation / angle, angle)
+        at = centre + translation + wp.quat_rotate(r, wp.transform_get_translation(T) - centre)
         T = wp.transform(at, wp.normalize(r * wp.transform_get_rotation(T)))
     pose[row] = T
 
@@ -173,12 +173,12 @@ def advance(
 
 
 @wp.kernel
-def deepest(
+def penetration(
     m: Correspondences,
     points: Points,
     solids: Solids,
     body: wp.array2d(dtype=wp.transform),
-    depth_out: wp.array(dtype=wp.float32),
+    penetration_out: wp.array(dtype=wp.float32),
 ):
     """Depth of the deepest point of hands in anything, or of that in them, at their matches [m]; over hands."""
     row = wp.tid()
@@ -190,4 +190,4 @@ def deepest(
     for i in range(m.deep.shape[1]):
         T = wp.transform_inverse(body[row, solids.body[i // each]])
         deep = wp.max(deep, -beyond(m.deep_plane[row, i], wp.transform_point(T, m.deep[row, i])))
-    depth_out[row] = deep
+    penetration_out[row] = deep

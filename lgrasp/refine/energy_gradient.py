@@ -40,12 +40,12 @@ class Search:
     margin: wp.float32
     link_margin: wp.float32
     contacts: wp.int32
-    inner: wp.int32
+    gradient_steps: wp.int32
     sgd: wp.int32
     momentum: wp.float32
-    shift: wp.float32
-    turn: wp.float32
-    bend: wp.float32
+    max_translation_step: wp.float32
+    max_rotation_step: wp.float32
+    max_joint_step: wp.float32
     decay: wp.float32
     middle: wp.vec3  # what hands are turned about, base frame [m]
     com: wp.vec3

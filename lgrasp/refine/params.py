@@ -1,8 +1,10 @@
 """Parameters of the local search and its energy; lengths in metres, angles in radians."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from lgrasp.config import Params
 
 LENGTH = 0.01
 """The energy counts distances in this unit [m]."""
@@ -12,30 +14,39 @@ LIMIT_SHARE = 0.15
 """Joint limits repel within this share of the range."""
 
 
-class LocalSearch(BaseModel):
+class LocalSearch(Params):
     """Weights of the energy, and how far and how often poses are moved."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    RENAMED: ClassVar[dict[str, str]] = {
+        "outer": "matching_rounds",
+        "inner": "gradient_steps",
+        "shift": "max_translation_step",
+        "turn": "max_rotation_step",
+        "bend": "max_joint_step",
+        "withdraw": "max_exit_distance",
+    }
 
-    outer: int = Field(default=20, ge=0, le=1000, description="Outer steps: correspondences are matched anew.")
-    inner: int = Field(default=10, ge=1, le=1000, description="Gradient steps per outer step.")
+    matching_rounds: int = Field(default=20, ge=0, le=1000, description="Times that nearest points are matched.")
+    gradient_steps: int = Field(default=10, ge=1, le=1000, description="Gradient steps after each matching.")
     optimizer: Literal["adam", "sgd"] = Field(default="adam", description="adam, or sgd with momentum.")
     momentum: float = Field(default=0.9, ge=0, lt=1, description="Of sgd; the decay of adam's first moment.")
-    shift: float = Field(default=0.0015, gt=0, le=0.1, description="Largest translation of the hand in one step.")
-    turn: float = Field(default=0.015, gt=0, le=1, description="Largest rotation of the hand in one step.")
-    bend: float = Field(default=0.02, gt=0, le=1, description="Largest motion of a joint in one step.")
+    max_translation_step: float = Field(
+        default=0.0015, gt=0, le=0.1, description="Largest translation of the hand in one step."
+    )
+    max_rotation_step: float = Field(default=0.015, gt=0, le=1, description="Largest rotation of the hand in one step.")
+    max_joint_step: float = Field(default=0.02, gt=0, le=1, description="Largest motion of a joint in one step.")
     decay: float = Field(default=0.05, gt=0, le=1, description="Size of the last step over that of the first.")
     reach: float = Field(
-        default=0.02, gt=0, le=1, description="Points farther from the object do not pull, first outer step."
+        default=0.02, gt=0, le=1, description="Points farther from the object do not pull, first matching."
     )
-    reach_end: float = Field(default=0.01, gt=0, le=1, description="The same in the last outer step.")
+    reach_end: float = Field(default=0.01, gt=0, le=1, description="The same at the last matching.")
     soft: float = Field(default=0.004, gt=0, le=1, description="Distance about which pulls stop growing.")
     touching: int = Field(default=4, ge=1, le=16, description="Palmar points of a link, nearest first, that pull.")
-    withdraw: float = Field(
+    max_exit_distance: float = Field(
         default=0.012,
         ge=0,
         le=0.1,
-        description="How far a hand that begins deep in the object may be taken straight out; four times, opened.",
+        description="How far a hand that begins deep in the object may be moved straight out; opened, four times.",
     )
     points: float = Field(
         default=1.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared."

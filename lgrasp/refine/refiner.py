@@ -101,13 +101,13 @@ class Refiner(nn.Module):
         self._middle = x.reshape(-1, 3)[self._palmar].mean(0)  # of the palmar side, base frame
 
     def forward(
-        self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, outer: int | None = None, first: int = 0
+        self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, rounds: int | None = None, first: int = 0
     ) -> Refined:
-        """Refine hands: match, then ``inner`` gradient steps, for outer steps ``first`` to ``outer``.
+        """Refine hands: match and take ``gradient_steps`` steps, in rounds ``first`` to ``rounds``.
 
         Args:
-            outer: default: the parameters'. Sizes and reach fall along the parameters' outer steps or these, whichever
-                are more.
+            rounds: default: the parameters' ``matching_rounds``. Sizes and reach fall along these or the parameters'
+                rounds, whichever are more.
             R: rotations of the hand's base in the object's internal frame, (N, 3, 3). t: its origin [m], (N, 3).
             q: joint positions [rad or m], (N, K); outside the limits they are clamped first.
         """
@@ -116,7 +116,7 @@ class Refiner(nn.Module):
 
             def search(part: Pose) -> Pose:
                 at = self._put(part)
-                fast.run(at, outer=outer, first=first)
+                fast.run(at, rounds=rounds, first=first)
                 return self._taken(at, t.dtype)
 
             workers = torch.get_num_threads() if self._device.type == "cpu" else 1
@@ -126,10 +126,10 @@ class Refiner(nn.Module):
             pose = Pose(*(torch.cat(x) for x in zip(*found, strict=True)))
             return Refined(pose, self.energy(*pose))
 
-    def depth(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+    def max_penetration(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Depth of the deepest point of hands in anything, or of that in them [m], negative apart, (N,)."""
         with torch.no_grad():
-            return torch.as_tensor(self._fast().depth(self._put(Pose(R, t, q))), device=self._device)
+            return torch.as_tensor(self._fast().max_penetration(self._put(Pose(R, t, q))), device=self._device)
 
     def _fast(self) -> Descent:
         if self._descent is None:
@@ -151,8 +151,8 @@ class Refiner(nn.Module):
     ) -> Pose:
         """``steps`` plain clipped gradient steps on one matching; differentiable by R, t and q.
 
-        A step has the size of the parameters' (``shift``, ``turn``, ``bend``) times the gradient over
-        sqrt(1 + |gradient|^2), per sample.
+        A step has the largest size of the parameters (``max_*_step``) times the gradient over sqrt(1 + |gradient|^2),
+        per sample.
 
         Args:
             matches: default: those of the poses given.
@@ -228,8 +228,8 @@ class Refiner(nn.Module):
             total = self.energy(R, t, q, matches=matches).total.sum()
             by_R, by_t, by_q = torch.autograd.grad(total, [R, t, q], create_graph=True)
             arm = t - self.middle(R, t)
-            turn = torch.linalg.cross(R, by_R, dim=1).sum(2) + torch.linalg.cross(arm, by_t)
-        return Gradient(by_t, turn, by_q)
+            rotation = torch.linalg.cross(R, by_R, dim=1).sum(2) + torch.linalg.cross(arm, by_t)
+        return Gradient(by_t, rotation, by_q)
 
     def middle(self, R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
         """Middle of the palmar side of open hands [m], (N, 3): what they are turned about."""
@@ -238,9 +238,9 @@ class Refiner(nn.Module):
     def _moved(self, pose: Pose, by: Gradient) -> Pose:
         """The poses after a translation, a rotation about the hand's middle, and a motion of the joints."""
         centre = self.middle(pose.R, pose.t)
-        T = so3_exp(by.turn)
-        t = centre + by.shift + (T @ (pose.t - centre)[..., None])[..., 0]
-        return Pose(T @ pose.R, t, self._clamped(pose.q + by.bend))
+        T = so3_exp(by.rotation)
+        t = centre + by.translation + (T @ (pose.t - centre)[..., None])[..., 0]
+        return Pose(T @ pose.R, t, self._clamped(pose.q + by.joints))
 
     def _clamped(self, q: torch.Tensor) -> torch.Tensor:
         return q.maximum(self.lower).minimum(self.upper)

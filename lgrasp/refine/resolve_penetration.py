@@ -21,19 +21,19 @@ class Depths(Protocol):
 
     device: str
 
-    def depth(self, at: Hands) -> np.ndarray:
+    def max_penetration(self, at: Hands) -> np.ndarray:
         """Depth of the deepest point [m], negative apart, (N,)."""
         ...
 
 
-def withdraw(search: Depths, tree: Tree, back: np.ndarray, at: Hands, most: float) -> None:
+def resolve_penetration(search: Depths, tree: Tree, back: np.ndarray, at: Hands, most: float) -> None:
     """Move deep hands out, in place: straight along the shortest of some ways, or else opened and back.
 
     Args:
         back: direction away from what the palm faces, base frame, (3,).
         most: how far straight at most [m].
     """
-    least = search.depth(at)
+    least = search.max_penetration(at)
     left = np.flatnonzero(least > _DEEP)
     if len(left) == 0:
         return
@@ -47,7 +47,7 @@ def withdraw(search: Depths, tree: Tree, back: np.ndarray, at: Hands, most: floa
         tried, bent = (x[left][:, None].repeat(ways, 1) for x in (given, joints))
         tried[..., :3] += shifts
         bent += opened[:, None] * (tree.joint_open - bent)
-        depth = search.depth(Hands.put(tried.reshape(-1, 7), bent.reshape(-1, q.shape[1]), search.device))
+        depth = search.max_penetration(Hands.put(tried.reshape(-1, 7), bent.reshape(-1, q.shape[1]), search.device))
         depth = depth.reshape(-1, ways)
         free = depth < _FREE
         best = np.where(free.any(1), free.argmax(1), depth.argmin(1))

@@ -10,9 +10,9 @@ from lgrasp.refine.params import LocalSearch
 class Gradient(NamedTuple):
     """Of the total energy by motions of the base about the hand's middle and by the joints."""
 
-    shift: torch.Tensor  # (N, 3)
-    turn: torch.Tensor  # (N, 3)
-    bend: torch.Tensor  # (N, K)
+    translation: torch.Tensor  # (N, 3) [1/m]
+    rotation: torch.Tensor  # (N, 3) [1/rad]
+    joints: torch.Tensor  # (N, K)
 
 
 def clipped(g: Gradient, p: LocalSearch) -> Gradient:
@@ -22,4 +22,8 @@ def clipped(g: Gradient, p: LocalSearch) -> Gradient:
         scaled = x * size
         return -size * scaled / (1 + (scaled * scaled).sum(-1, keepdim=True)).sqrt()
 
-    return Gradient(down(g.shift, p.shift), down(g.turn, p.turn), down(g.bend, p.bend))
+    return Gradient(
+        down(g.translation, p.max_translation_step),
+        down(g.rotation, p.max_rotation_step),
+        down(g.joints, p.max_joint_step),
+    )

@@ -96,7 +96,7 @@ def test_rows_keep_their_places_and_ids(source, done):
     assert len(after.grasps) == ROWS
     assert after.hand.sha256 == before.hand.sha256
     assert after.header.config["run_key"] == before.header.config["run_key"]
-    assert after.header.config["refine"]["outer"] > 0
+    assert after.header.config["refine"]["matching_rounds"] > 0
     assert after.statistics["refine_tried"] == ROWS
     assert after.statistics["refine_replaced"] == (after.grasps.metrics["refined"] == 1).sum()
     for a, b in zip(after.objects, before.objects, strict=True):
@@ -131,7 +131,7 @@ def test_replaced_rows_pass_the_judge(source, done):
 
 def test_a_valid_row_is_replaced_by_one_that_resists_pulls_better(source, done, refine, tmp_path):
     before, after, replaced = both(source, done)
-    still = refine(source, tmp_path, params=RefineParams(outer=0))  # says which rows pass the checks as they are
+    still = refine(source, tmp_path, params=RefineParams(matching_rounds=0))
     assert not both(source, still)[2].any()
     improved = replaced & (read_shard(still.path).grasps.metrics["valid"] == 1)
     assert improved.sum() >= 4
@@ -153,7 +153,7 @@ def unheld(rows: GraspRows, row: int, centre: np.ndarray) -> float:
 def test_energies_are_those_of_the_postures_stored(source, done, refine, tmp_path):
     """Refined by nothing, the refined rows have the energies that were told of them."""
     _, after, _ = both(source, done)
-    still = refine(done.path, tmp_path, params=RefineParams(outer=0))
+    still = refine(done.path, tmp_path, params=RefineParams(matching_rounds=0))
     np.testing.assert_allclose(read_shard(still.path).grasps.metrics["energy"], after.metrics["energy"], rtol=1e-3)
     assert done.moved.energy[1] < done.moved.energy[0]
 

@@ -130,7 +130,7 @@ def test_training_lowers_the_loss_and_joint_training_the_energy(inputs: Inputs, 
     frozen = measure(trainer, [held_out], seeds=2)
     assert frozen == measure(trainer, [held_out], seeds=2)
     trainer.fit_jointly()
-    joint = measure(trainer, [held_out], seeds=2, outer=(2,))
+    joint = measure(trainer, [held_out], seeds=2, rounds=(2,))
     assert joint.unrolled < 0.85 * frozen.unrolled
     assert joint.refined[0] < joint.coarse
     assert any((before[name] != values).any() for name, values in trainer.net.state_dict().items())

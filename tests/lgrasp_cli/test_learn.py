@@ -22,7 +22,7 @@ def test_fit_and_eval(generate, cli):
     assert data["frozen"]["poses"] == data["joint"]["poses"] > 0
     told = cli("learn", "eval", "net.pt", "out", "--clouds", 1, "--device", "cpu", "--json", "-")
     found = json.loads(told.out)
-    assert found["outer"] == [3, 6, 10, 13]
+    assert found["rounds"] == [3, 6, 10, 13]
     assert len(found["refined"]) == 4
     assert found["refined"][-1] < found["coarse"]
     Path("bad.pt").write_bytes(b"nonsense")

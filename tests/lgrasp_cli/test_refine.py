@@ -41,7 +41,12 @@ def test_shards(cli, shards, tmp_path):
 
 def test_every_row_is_moved_if_asked(cli, shards, tmp_path):
     out = tmp_path / "refined"
-    assert cli("refine", shards, "--out", out, "--always", "--coarse", "--outer", 2, "--device", "cpu", "-q").code == 0
+    assert (
+        cli(
+            "refine", shards, "--out", out, "--always", "--coarse", "--matching-rounds", 2, "--device", "cpu", "-q"
+        ).code
+        == 0
+    )
     (path,) = out.glob("*.h5")
     assert (read_shard(path).grasps.metrics["refined"] == 1).all()
 
@@ -96,7 +101,7 @@ def test_rows_that_cannot_be_repaired(cli, shards, tmp_path, name, change, words
 
 def test_joints_outside_their_limits_are_clamped(cli, shards, tmp_path):
     folder, out = spoilt(shards, tmp_path / "spoilt", q=put(9.0, 2)), tmp_path / "refined"
-    found = cli("refine", folder, "--out", out, "--outer", 1, "--device", "cpu", "--json", "-")
+    found = cli("refine", folder, "--out", out, "--matching-rounds", 1, "--device", "cpu", "--json", "-")
     assert found.code == 0, found
     assert found.err.startswith("warning: joints of 1 rows were outside their limits")
     (data,) = json.loads(found.out)
@@ -109,7 +114,7 @@ def test_joints_outside_their_limits_are_clamped(cli, shards, tmp_path):
 
 def test_hands_that_are_far_off_are_told(cli, shards, tmp_path):
     folder, out = spoilt(shards, tmp_path / "spoilt", object_pose=put(3.0, 0)), tmp_path / "refined"
-    found = cli("refine", folder, "--out", out, "--outer", 1, "--device", "cpu", "-q")
+    found = cli("refine", folder, "--out", out, "--matching-rounds", 1, "--device", "cpu", "-q")
     assert found.code == 0, found
     assert "the hands of 1 rows are more than half a metre from their object" in found.err
     (path,) = out.glob("*.h5")
@@ -171,7 +176,8 @@ def test_exports_of_another_hand_or_without_a_mesh(cli, export, tmp_path):
 def test_bad_input(cli, shards, tmp_path):
     out = ("--out", tmp_path / "x")
     assert "nothing: no such file" in cli("refine", "nothing", *out).error()
-    assert "'inner' = 0" in cli("refine", shards, *out, "--inner", 0).error()
+    assert "'gradient_steps' = 0" in cli("refine", shards, *out, "--gradient-steps", 0).error()
+    assert "'outer' is now called 'matching_rounds'" in cli("refine", "nothing", *out, "--outer", 3).err
     line = cli("refine", shards, *out, "--hand", "barrett").error()
     assert "allegro-tiny-00000.h5: its grasps are of hand 'allegro'" in line
     assert "not of 'barrett'" in line
@@ -191,7 +197,7 @@ def test_a_tree_of_shards_stays_a_tree(cli, shards, tmp_path):
     for name in ("a", "b"):
         (tmp_path / "tree" / name).mkdir(parents=True)
         shutil.copy(path, tmp_path / "tree" / name)
-    quick = ("--device", "cpu", "--outer", 1, "--inner", 1, "-q")
+    quick = ("--device", "cpu", "--matching-rounds", 1, "--gradient-steps", 1, "-q")
     assert cli("refine", tmp_path / "tree", "--out", tmp_path / "x", *quick).code == 0
     assert sorted(p.parent.name for p in (tmp_path / "x").rglob("*.h5")) == ["a", "b"]
     (tmp_path / "x" / "a" / path.name).unlink()
@@ -206,7 +212,7 @@ def test_plans_of_a_cloud_can_be_refined(cli, tmp_path):
     planned, out = tmp_path / "planned", tmp_path / "refined"
     cloud = ("plan", "--cloud", tmp_path / "ball.npz", "--starts", 2, "--device", "cpu", "-q")
     assert cli(*cloud, "--out", planned).code == 0
-    assert cli("refine", planned, "--out", out, "--always", "--outer", 2, "--device", "cpu", "-q").code == 0
+    assert cli("refine", planned, "--out", out, "--always", "--matching-rounds", 2, "--device", "cpu", "-q").code == 0
     before, after = (read_shard(next(folder.glob("*.h5"))) for folder in (planned, out))
     np.testing.assert_array_equal(after.objects[0].normals, before.objects[0].normals)
     assert (after.grasps.metrics["energy"] > 0).all()
@@ -216,7 +222,9 @@ def test_plans_of_a_cloud_can_be_refined(cli, tmp_path):
 def test_interrupted(process, shards, tmp_path):
     """Ctrl-C ends with 130 and leaves no half file."""
     out = tmp_path / "refined"
-    with process("refine", shards, "--outer", 1000, "--inner", 50, "--device", "cpu", "--out", out) as run:
+    with process(
+        "refine", shards, "--matching-rounds", 1000, "--gradient-steps", 50, "--device", "cpu", "--out", out
+    ) as run:
         time.sleep(5)
         run.send_signal(signal.SIGINT)
         assert run.wait(20) == 130

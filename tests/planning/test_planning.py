@@ -7,7 +7,9 @@ from lgrasp.planning.planner import Planner, PlanParams
 from lgrasp.refine.check import OUTCOMES
 from lgrasp.refine.params import LocalSearch
 
-QUICK = PlanParams(rolls=3, finalists=1, opening=2, search=PlanParams().search.model_copy(update={"outer": 6}))
+QUICK = PlanParams(
+    rolls=3, finalists=1, opening=2, search=PlanParams().search.model_copy(update={"matching_rounds": 6})
+)
 
 
 @pytest.fixture(scope="module")

@@ -46,4 +46,6 @@ def test_a_hand_in_the_object_is_told(inputs, filtered, make, valid):
     deep = table.metrics["penetration"] > 0.002
     assert deep.mean() > 0.6
     assert (outcome[deep] != 0).all()
-    np.testing.assert_array_equal(deep[(refiner.depth(*valid._replace(t=valid.t - 0.006 * n)) > 0.0025).numpy()], True)
+    np.testing.assert_array_equal(
+        deep[(refiner.max_penetration(*valid._replace(t=valid.t - 0.006 * n)) > 0.0025).numpy()], True
+    )

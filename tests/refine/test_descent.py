@@ -15,7 +15,7 @@ from lgrasp.refine.surface import hand_surface
 from lgrasp.refine.target import Target
 from lgrasp.refine.volume import upload_target
 
-SEARCH = LocalSearch(withdraw=0.0, reach=0.05, reach_end=0.03, contacts=5, inner=1, force=0.3)
+SEARCH = LocalSearch(max_exit_distance=0.0, reach=0.05, reach_end=0.03, contacts=5, gradient_steps=1, force=0.3)
 
 
 @pytest.fixture(scope="module")
@@ -68,15 +68,15 @@ def test_a_step_is_as_large_as_adam_makes_it(inputs, valid, coarse):
     pose = Pose(*(x[:32] for x in coarse(valid)))
     pose = pose._replace(q=pose.q.maximum(refiner.lower + 0.05).minimum(refiner.upper - 0.05))
     g, at = descent.gradient(put(pose)), put(pose)
-    descent.run(at, outer=1)
+    descent.run(at, rounds=1)
     moved, q = at.numpy()
     # first step: the mean over its root is the sign, over one scale for the three axes
-    expected = -SEARCH.bend * np.sign(g[:, 6:])
+    expected = -SEARCH.max_joint_step * np.sign(g[:, 6:])
     np.testing.assert_allclose((q - pose.q.numpy())[g[:, 6:] != 0], expected[g[:, 6:] != 0], atol=2e-6)
-    turn = -SEARCH.turn * np.clip(g[:, 3:6] / np.sqrt((g[:, 3:6] ** 2).mean(1, keepdims=True)), -1, 1)
+    turn = -SEARCH.max_rotation_step * np.clip(g[:, 3:6] / np.sqrt((g[:, 3:6] ** 2).mean(1, keepdims=True)), -1, 1)
     T = so3_exp(torch.as_tensor(turn, dtype=torch.float32))
     c = refiner.middle(pose.R, pose.t)
-    shift = -SEARCH.shift * np.clip(g[:, :3] / np.sqrt((g[:, :3] ** 2).mean(1, keepdims=True)), -1, 1)
+    shift = -SEARCH.max_translation_step * np.clip(g[:, :3] / np.sqrt((g[:, :3] ** 2).mean(1, keepdims=True)), -1, 1)
     t = c + torch.as_tensor(shift, dtype=torch.float32) + (T @ (pose.t - c)[..., None])[..., 0]
     np.testing.assert_allclose(moved[:, :3], t.numpy(), atol=1e-6)
     quaternion = quaternion_from_matrix(T @ pose.R).numpy()
@@ -85,15 +85,15 @@ def test_a_step_is_as_large_as_adam_makes_it(inputs, valid, coarse):
 
 def test_energy_falls_as_with_steps_in_torch(inputs, valid, coarse):
     """Plain adam of torch on the same matches goes as far down."""
-    params = SEARCH.model_copy(update={"inner": 10, "decay": 1.0})
+    params = SEARCH.model_copy(update={"gradient_steps": 10, "decay": 1.0})
     refiner, descent = both(inputs, params)
     pose = Pose(*(x[:48] for x in coarse(valid)))
     pose = pose._replace(q=pose.q.maximum(refiner.lower).minimum(refiner.upper))
     matches, at = refiner.match(*pose), put(pose)
-    descent.run(at, outer=1)
+    descent.run(at, rounds=1)
     turn, shift, q = torch.zeros(48, 3), torch.zeros(48, 3), pose.q.clone()
     variables = [x.requires_grad_() for x in (turn, shift, q)]
-    sizes = (params.turn, params.shift, params.bend)
+    sizes = (params.max_rotation_step, params.max_translation_step, params.max_joint_step)
     adam = torch.optim.Adam([{"params": x, "lr": s} for x, s in zip(variables, sizes, strict=True)], betas=(0.9, 0.99))
     c = refiner.middle(pose.R, pose.t)
 

@@ -46,14 +46,14 @@ def test_gradient_through_unrolled_steps(exact):
 
 
 def test_a_sample_does_not_depend_on_the_others(make, valid, coarse):
-    refiner, pose = make(outer=3), coarse(valid)
+    refiner, pose = make(matching_rounds=3), coarse(valid)
     whole, part = refiner(*some(pose, slice(9))).pose, refiner(*some(pose, slice(4, 6))).pose
     for a, b in zip(whole, part, strict=True):
         torch.testing.assert_close(a[4:6], b, rtol=0, atol=0)
 
 
 def test_energy_of_coarse_poses_falls(make, valid, coarse):
-    refiner, pose = make(outer=13, reach=0.05, reach_end=0.03), some(coarse(valid), slice(48))
+    refiner, pose = make(matching_rounds=13, reach=0.05, reach_end=0.03), some(coarse(valid), slice(48))
     before = refiner.energy(*pose).total.mean()
     found = refiner(*pose)
     after = found.energies.total.mean()
@@ -66,7 +66,7 @@ def test_penetration_is_left(make, valid, inputs):
     refiner = make()
     _, n = refiner.target.nearest(refiner.middle(valid.R, valid.t))
     into = valid._replace(t=valid.t - 0.006 * n)
-    deep = refiner.depth(*into) > 0.004
+    deep = refiner.max_penetration(*into) > 0.004
     assert deep.sum() > 40
     found = refiner(*(x[deep] for x in into)).pose
     table, _ = check_grasps(inputs.hand, inputs.object, object_pose(found), found.q.numpy(), GraspBounds())
@@ -75,19 +75,20 @@ def test_penetration_is_left(make, valid, inputs):
 
 def test_hands_are_taken_out_before_the_search(make, valid, coarse):
     """Coarse hands through the mug's walls come free, by opening where a straight way is not enough; others stay."""
-    tiny = {"outer": 1, "inner": 1, "shift": 1e-9, "turn": 1e-9, "bend": 1e-9}
+    tiny = {"matching_rounds": 1, "gradient_steps": 1}
+    tiny |= {f"max_{kind}_step": 1e-9 for kind in ("translation", "rotation", "joint")}
     refiner, pose = make(**tiny), coarse(valid)
-    before, moved = refiner.depth(*pose), refiner(*pose).pose
+    before, moved = refiner.max_penetration(*pose), refiner(*pose).pose
     deep, q = before > 0.002, pose.q.maximum(refiner.lower).minimum(refiner.upper)
     assert deep.float().mean() > 0.3
-    assert (refiner.depth(*moved)[deep] < 0.002).float().mean() > 0.95
+    assert (refiner.max_penetration(*moved)[deep] < 0.002).float().mean() > 0.95
     shift = (moved.t - pose.t).norm(dim=1)
-    assert shift.max() < 4 * refiner.params.withdraw + 1e-5
+    assert shift.max() < 4 * refiner.params.max_exit_distance + 1e-5
     straight = deep & (moved.q - q).abs().amax(1).lt(1e-6)
-    assert shift[straight].max() < refiner.params.withdraw + 1e-5
-    again = refiner.depth(pose.R, pose.t, q) < 0.0019
+    assert shift[straight].max() < refiner.params.max_exit_distance + 1e-5
+    again = refiner.max_penetration(pose.R, pose.t, q) < 0.0019
     torch.testing.assert_close(moved.t[again], pose.t[again], rtol=0, atol=1e-6)
-    for still in (make(**tiny, withdraw=0.0)(*pose).pose, refiner(*pose, outer=0).pose):
+    for still in (make(**tiny, max_exit_distance=0.0)(*pose).pose, refiner(*pose, rounds=0).pose):
         torch.testing.assert_close(still.t, pose.t, rtol=0, atol=1e-6)
 
 
@@ -101,7 +102,7 @@ def test_unrolled_steps_stay_rotations_and_lower_the_energy(make, valid, coarse)
 
 
 def test_joints_stay_in_their_limits(make, valid):
-    refiner = make(outer=2)
+    refiner = make(matching_rounds=2)
     pose = some(valid, slice(4))
     found = refiner(pose.R, pose.t, pose.q + 5).pose.q
     assert (found <= refiner.upper).all()
@@ -109,5 +110,5 @@ def test_joints_stay_in_their_limits(make, valid):
 
 
 def test_sgd_refines_too(make, valid, coarse):
-    refiner, pose = make(outer=8, optimizer="sgd", reach=0.05), some(coarse(valid), slice(24))
+    refiner, pose = make(matching_rounds=8, optimizer="sgd", reach=0.05), some(coarse(valid), slice(24))
     assert refiner(*pose).energies.total.mean() < 0.7 * refiner.energy(*pose).total.mean()

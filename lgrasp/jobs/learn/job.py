@@ -29,7 +29,7 @@ from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import Trainer
 from lgrasp.runtime.device import resolve_device
 
-OUTER = (3, 6, 10, 13)
+ROUNDS = (3, 6, 10, 13)
 """Outer steps of the refiner that the published table has."""
 
 _FORMAT, _VERSION = "lgrasp-coarse", 1
@@ -114,8 +114,8 @@ def evaluate(
     trainer = Trainer(hand, examples, params, device=alias)
     trainer.net.load_state_dict(net.state_dict())
     start = time.perf_counter()
-    found = measure(trainer, examples, outer=OUTER)
-    names = {"hand": hand.name, "objects": [e.model.name for e in examples], "outer": list(OUTER)}
+    found = measure(trainer, examples, rounds=ROUNDS)
+    names = {"hand": hand.name, "objects": [e.model.name for e in examples], "rounds": list(ROUNDS)}
     return names | _numbers(found) | {"refined": list(found.refined), "seconds": time.perf_counter() - start}
 
 

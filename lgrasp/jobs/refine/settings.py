@@ -4,16 +4,16 @@ from lgrasp.config import parse_model
 from lgrasp.refine.params import LocalSearch
 from lgrasp.stages.refine.params import RefineParams
 
-COARSE = LocalSearch(outer=13, shift=0.0015, turn=0.015, bend=0.02, reach=0.05, reach_end=0.03)
+COARSE = LocalSearch(matching_rounds=13, reach=0.05, reach_end=0.03)
 """For poses as a network predicts them: off by centimetres."""
 
 
-def refine_params(*, outer: int | None = None, inner: int | None = None, coarse: bool = False) -> RefineParams:
-    """The stage's parameters, or those for coarse poses, with other numbers of steps.
+def refine_params(*, coarse: bool = False, **options: int | None) -> RefineParams:
+    """The stage's parameters, or those for coarse poses, with the options that are given (not None) in their place.
 
     Raises:
         ConfigError: a value out of range.
     """
-    changes = {name: value for name, value in (("outer", outer), ("inner", inner)) if value is not None}
+    given = parse_model(LocalSearch, {name: value for name, value in options.items() if value is not None}, "refine")
     search = COARSE.model_dump() if coarse else {}
-    return parse_model(RefineParams, search | changes, "refine")
+    return parse_model(RefineParams, search | given.model_dump(exclude_unset=True), "refine")

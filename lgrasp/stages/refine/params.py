@@ -8,11 +8,13 @@ from lgrasp.refine.params import GraspBounds, LocalSearch
 class RefineParams(LocalSearch, GraspBounds):
     """How finished grasps are moved, in small steps and drawn to balance, and the bounds of filter for moved ones."""
 
-    outer: int = Field(default=8, ge=0, le=1000, description="Outer steps: correspondences are matched anew.")
-    shift: float = Field(default=0.0005, gt=0, le=0.1, description="Largest translation of the hand in one step.")
-    turn: float = Field(default=0.005, gt=0, le=1, description="Largest rotation of the hand in one step.")
-    bend: float = Field(default=0.01, gt=0, le=1, description="Largest motion of a joint in one step.")
-    reach_end: float = Field(default=0.02, gt=0, le=1, description="As reach, in the last outer step.")
+    matching_rounds: int = Field(default=8, ge=0, le=1000, description="Times that nearest points are matched.")
+    max_translation_step: float = Field(
+        default=0.0005, gt=0, le=0.1, description="Largest translation of the hand in one step."
+    )
+    max_rotation_step: float = Field(default=0.005, gt=0, le=1, description="Largest rotation of the hand in one step.")
+    max_joint_step: float = Field(default=0.01, gt=0, le=1, description="Largest motion of a joint in one step.")
+    reach_end: float = Field(default=0.02, gt=0, le=1, description="As reach, at the last matching.")
     force: float = Field(default=0.3, ge=0, le=1e6, description="Weight of the net wrench of four contacts.")
     points: float = Field(default=3.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per cm squared.")
     barrier: float = Field(default=0.002, ge=0, le=1e6, description="Weight of the barriers, per point.")
