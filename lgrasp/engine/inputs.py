@@ -13,16 +13,15 @@ from typing import TYPE_CHECKING
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.errors import ObjectError
 from lgrasp.field.arrays import FieldArrays, upload_field
-from lgrasp.field.model import FIELD_VERSION, ContactField, build_field
+from lgrasp.field.model import FIELD_VERSION, ContactField
 from lgrasp.field.params import FieldParams
-from lgrasp.geometry.decompose import decompose
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.hand.build import build_hand, hand_digest
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
-from lgrasp.object.model import ObjectModel, preprocess_object
+from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device
 
@@ -94,6 +93,9 @@ def load_hand(cache: Cache, source: HandSource, key: str, device: Device) -> tup
     """The HandModel from the cache, or built and cached; and whether it was a hit."""
 
     def make():
+        from lgrasp.geometry.decompose import decompose
+        from lgrasp.hand.build import build_hand  # slow to load, as all that makes what is not cached
+
         cut = partial(decompose, store=cache)
         return build_hand(source.urdf, source.spec, device.alias, decompose=cut).to_arrays()
 
@@ -107,6 +109,8 @@ def load_object(
     """The ObjectModel from the cache, or preprocessed and cached; and whether it was a hit."""
 
     def make():
+        from lgrasp.object.preprocess import preprocess_object
+
         return preprocess_object(mesh, scale=scale, params=params, device=device).to_arrays()
 
     arrays, hit = cache.get("object", key, make)
@@ -117,7 +121,13 @@ def load_field(
     cache: Cache, keys: InputKeys, hand: HandArrays, params: FieldParams, report: Report | None = None
 ) -> tuple[ContactField, bool]:
     """The ContactField from the cache, or built and cached; and whether it was a hit."""
-    arrays, hit = cache.get("field", keys.field, lambda: build_field(hand, params, report).to_arrays())
+
+    def make():
+        from lgrasp.field.build import build_field
+
+        return build_field(hand, params, report).to_arrays()
+
+    arrays, hit = cache.get("field", keys.field, make)
     return ContactField.from_arrays(arrays), hit
 
 

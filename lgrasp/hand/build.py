@@ -1,6 +1,5 @@
 """URDF and rules -> HandModel: solids, contact surface, pairs of parts that must stay apart."""
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from lgrasp.errors import HandError
 from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.contacts import body_cones, finger_points, palm_points
+from lgrasp.hand.digest import urdf_digest
 from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh, inner_spheres, surface_samples
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.overlap import overlap_arrays
@@ -22,22 +22,6 @@ from lgrasp.hand.urdf import Urdf, read_urdf
 
 _SPHERES_PER_PIECE = 12
 _SAMPLE_SPACING = 4.0e-3  # [m]
-
-
-def hand_digest(urdf_path: Path, spec: HandSpec) -> str:
-    """SHA-256 over the URDF, the collision meshes it names and the rules: the content key of a hand."""
-    urdf = read_urdf(urdf_path)
-    return _digest(urdf, spec)
-
-
-def _digest(urdf: Urdf, spec: HandSpec) -> str:
-    h = hashlib.sha256(urdf.text.encode())
-    for name in sorted(urdf.mesh_files):
-        h.update(name.encode())
-        h.update(urdf.mesh_files[name].read_bytes())
-    # neither changes a HandModel; views of opposition spaces have digests of their own
-    h.update(spec.model_dump_json(exclude={"opposition_spaces", "stand_off"}).encode())
-    return h.hexdigest()
 
 
 def build_hand(
@@ -80,7 +64,7 @@ def build_hand(
     }
     model = HandModel(
         name=spec.name,
-        sha256=_digest(urdf, spec),
+        sha256=urdf_digest(urdf, spec),
         urdf_text=urdf.text,
         notes=tuple(solids.notes),
         contacts=spec.contacts,

@@ -12,9 +12,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.hand.contacts import LinkGrid, box_grid
-
-OVERLAP = 8.5e-4
-"""Depth [m] to which such pairs may overlap; a grasp is strictly valid to 1 mm."""
+from lgrasp.hand.self_collision import OVERLAP
 
 _SPACING = 8.0e-4
 _MOST_POINTS = 20_000

@@ -9,7 +9,8 @@ import warp as wp
 
 from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.overlap import OVERLAP, OverlapSide, overlap_arrays, overlap_depth, overlap_sides
+from lgrasp.hand.overlap import OverlapSide, overlap_arrays, overlap_depth, overlap_sides
+from lgrasp.hand.self_collision import OVERLAP
 from lgrasp.math.convex import Pieces, pieces_clear
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 

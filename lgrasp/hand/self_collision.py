@@ -3,11 +3,13 @@
 import warp as wp
 
 from lgrasp.hand.arrays import Hand, overlap_grid
-from lgrasp.hand.overlap import OVERLAP
 from lgrasp.math.convex import pieces_clear
 from lgrasp.math.sdf import sdf_value
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+OVERLAP = 8.5e-4
+"""Depth [m] to which such pairs may overlap; a grasp is strictly valid to 1 mm."""
 
 _OVERLAP = wp.constant(OVERLAP)
 

@@ -15,8 +15,7 @@ from lgrasp.errors import ConfigError
 from lgrasp.jobs.generate import Job
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.sequence.sets import SequenceSets, object_sequences
-from lgrasp.object.find import find_object
-from lgrasp.object.load import MESH_SUFFIXES
+from lgrasp.object.find import MESH_SUFFIXES, find_object
 from lgrasp.paths import data_dirs
 
 if TYPE_CHECKING:

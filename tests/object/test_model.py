@@ -7,8 +7,9 @@ from scipy.spatial import KDTree
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.object.find import find_object
-from lgrasp.object.model import ObjectModel, preprocess_object
+from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
+from lgrasp.object.preprocess import preprocess_object
 from lgrasp.object.sdf import SdfGrid, sample_sdf
 
 

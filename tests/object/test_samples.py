@@ -7,7 +7,7 @@ import trimesh
 import yaml
 
 from lgrasp.object.find import find_object
-from lgrasp.object.model import preprocess_object
+from lgrasp.object.preprocess import preprocess_object
 from lgrasp.object.samples import SAMPLES, build_sample, write_samples
 
 SHIPPED = Path(__file__).resolve().parents[2] / "objects"

@@ -12,7 +12,7 @@ from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.palm import palm_axis
 from lgrasp.jobs.refine.inputs import named_hand
 from lgrasp.object.find import find_object
-from lgrasp.object.model import preprocess_object
+from lgrasp.object.preprocess import preprocess_object
 from lgrasp.planning.planner import Planner, PlanParams
 from lgrasp.planning.starts import start_poses, tilted
 from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface, ruled_palmar

@@ -12,8 +12,8 @@ from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.opposition.spaces import hand_spaces, space_view
-from lgrasp.object.model import preprocess_object
 from lgrasp.object.params import ObjectParams
+from lgrasp.object.preprocess import preprocess_object
 from lgrasp.runtime.streams import uniforms
 from lgrasp.sequence.optimiser.optimise import Optimised, optimise
 from lgrasp.sequence.optimiser.params import OptimiserParams

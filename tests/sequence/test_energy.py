@@ -9,8 +9,9 @@ from support.hands import hand_model
 
 from lgrasp.geometry.rotations import se3_exp
 from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
-from lgrasp.object.model import ObjectModel, preprocess_object
+from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
+from lgrasp.object.preprocess import preprocess_object
 from lgrasp.sequence.optimiser.energy import TERMS, GraspEnergy, HandContacts
 
 PARAMS = ObjectParams(sdf_cells=48**3, obstacle_count=2048, contact_count=256)

@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 from lgrasp.errors import HandError
-from lgrasp.hand.build import hand_digest
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.drafting.import_urdf import add_hand
 from lgrasp.hand.spec import HandSpec, load_spec
 from lgrasp.paths import cache_dir

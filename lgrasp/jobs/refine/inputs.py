@@ -2,7 +2,7 @@
 
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import load_hand
-from lgrasp.hand.build import hand_digest
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
 from lgrasp.jobs.hands import hand_source

@@ -18,7 +18,8 @@ from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.records import hand_record, mesh_blobs
 from lgrasp.object.load import load_mesh
-from lgrasp.object.model import ObjectModel, preprocess_object
+from lgrasp.object.model import ObjectModel
+from lgrasp.object.preprocess import preprocess_object
 
 
 def object_of_record(cache: Cache, record: ObjectRecord, device: str) -> ObjectModel:

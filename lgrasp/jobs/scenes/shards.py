@@ -12,10 +12,11 @@ from lgrasp.dataset import ObjectRecord, ShardReader
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import OBJECT_VERSION
 from lgrasp.errors import ConfigError, ShardError
-from lgrasp.hand.build import hand_digest
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
-from lgrasp.object.model import ObjectModel, preprocess_object
+from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
+from lgrasp.object.preprocess import preprocess_object
 from lgrasp.runtime.device import Device
 
 _COLUMNS = ("q", "q_pregrasp", "q_squeeze", "candidate")

@@ -15,10 +15,11 @@ from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import load_hand, load_object, object_key
 from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays, upload_field
-from lgrasp.field.model import FIELD_VERSION, ContactField, build_field
+from lgrasp.field.build import build_field
+from lgrasp.field.model import FIELD_VERSION, ContactField
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.hand.build import hand_digest
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
 from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, space_view

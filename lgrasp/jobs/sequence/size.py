@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from lgrasp.errors import ConfigError
-from lgrasp.object.load import load_mesh
 from lgrasp.object.params import ObjectParams
 from lgrasp.seeding import stage_seed
 
@@ -48,6 +47,8 @@ def object_scales(meshes: Sequence[Path], size: Size, seed: int, params: ObjectP
     """
     if not size.high:
         return (size.low,) * len(meshes)
+    from lgrasp.object.load import load_mesh  # slow to load
+
     rng = np.random.default_rng(stage_seed(seed, 0, "size"))
     drawn: dict[Path, float] = {}
     for path in meshes:

@@ -12,7 +12,8 @@ from scipy.ndimage import map_coordinates
 from support.hands import ROOT, hand_model, hand_source
 
 from lgrasp.errors import HandError
-from lgrasp.hand.build import build_hand, hand_digest
+from lgrasp.hand.build import build_hand
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space, available, consumed, free_joints, hand_spaces, longest, space_view

@@ -10,8 +10,8 @@ from lgrasp.differentiable.distance import DistanceGrids
 from lgrasp.differentiable.kinematics import BodyKinematics
 from lgrasp.differentiable.solids import RUN, HandPoints, PointSolid, hand_solids, object_solid
 from lgrasp.object.find import find_object
-from lgrasp.object.model import preprocess_object
 from lgrasp.object.params import ObjectParams
+from lgrasp.object.preprocess import preprocess_object
 from lgrasp.object.sdf import SdfGrid
 from lgrasp.sequence.optimiser.culling import Culling
 from lgrasp.sequence.optimiser.penetration import PenetrationSums

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.field.arrays import query_field
 from lgrasp.grasp.tables import pose_arrays
-from lgrasp.object.model import preprocess_object
 from lgrasp.object.params import ObjectParams
+from lgrasp.object.preprocess import preprocess_object
 from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.stage import run
 

@@ -1,0 +1,169 @@
+"""Hand -> ContactField: postures are drawn, the contact vectors that they make are sorted into voxels."""
+
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from lgrasp.errors import HandError
+from lgrasp.field.boxes import box_index
+from lgrasp.field.kernels import contact_vectors, sample_postures
+from lgrasp.field.model import ContactField
+from lgrasp.field.opposed import opposed_pairs
+from lgrasp.field.params import FieldParams
+from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.model import HandModel
+from lgrasp.math.transforms import NORMAL_BINS
+
+_CLEARANCE = 5.0e-4  # [m] postures of the field keep this distance to the palm
+_VECTOR_BYTES = 24  # at most, of one contact vector in all arrays
+_LEAST_RECORDS = 60_000  # of a slot, when the records of a group are divided among settings
+_PER_POSTURE = 4  # contact vectors drawn from one posture
+
+
+def build_field(
+    hand: HandArrays, params: FieldParams, progress: Callable[[str, float], None] | None = None
+) -> ContactField:
+    """Sample and index the contact field of a hand (Def. 4.2); groups without contact surface have no vectors.
+
+    Args:
+        progress: called with (what, share done).
+
+    Raises:
+        HandError: a group that no posture frees from the palm.
+    """
+    parts = []
+    groups = hand.model.groups
+    slots = len(hand.model.tree.settings) * groups
+    for slot in range(slots):
+        if progress:
+            progress(f"group {slot + 1} of {slots}", slot / slots)
+        parts.append(_sample_slot(hand, slot, params))
+    _check_clear(hand.model, np.array([p["clear"] for p in parts]).reshape(-1, groups))
+    cell = _bounded_cell([p["position"] for p in parts], params)
+    origins, shapes, keys, base = [], [], [], 0
+    for p in parts:
+        origin = p["position"].min(0) - 1e-4 if len(p["position"]) else np.zeros(3, np.float32)
+        top = p["position"].max(0) if len(p["position"]) else np.zeros(3, np.float32)
+        shape = np.floor((top - origin) / cell).astype(np.int64) + 1
+        place = (p["position"] - origin) / cell
+        index = np.minimum(place.astype(np.int64), shape - 1)
+        voxel = base + (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+        inside = np.clip((place - index) * 256, 0, 255).astype(np.int64)
+        p["offset"] = inside[:, 0] << 16 | inside[:, 1] << 8 | inside[:, 2]
+        keys.append(voxel * NORMAL_BINS + p["bin"])
+        origins.append(origin)
+        shapes.append(shape)
+        base += int(shape.prod())
+    key = np.concatenate(keys)
+    order = np.argsort(key, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(key, minlength=base * NORMAL_BINS))])
+    filled = (np.diff(start) > 0).reshape(base, NORMAL_BINS)
+    mask = np.packbits(filled, axis=1, bitorder="little").view(np.uint64).ravel()
+    if progress:
+        progress("index", 1.0)
+
+    def gather(name: str, dtype) -> np.ndarray:
+        return np.concatenate([p[name] for p in parts])[order].astype(dtype)
+
+    position, point = gather("position", np.float32), gather("point", np.int32)
+    setting = np.repeat(np.arange(slots) // groups, [len(p["point"]) for p in parts])[order]
+    patch = setting * hand.model.patches + hand.model.contact_patch[point]
+    boxes = box_index(position, patch, slots // groups * hand.model.patches, params)
+    return ContactField(
+        hand_sha256=hand.model.sha256,
+        cell=cell,
+        origin=np.array(origins, np.float32),
+        shape=np.array(shapes, np.int32),
+        cell_first=np.concatenate([[0], np.cumsum([s.prod() for s in shapes])]).astype(np.int32),
+        start=start.astype(np.int32),
+        mask=mask,
+        point=point,
+        offset=gather("offset", np.int32),
+        normal=gather("normal", np.uint16),
+        posture=gather("posture", np.uint8),
+        clear_share=np.array([p["clear"] for p in parts], np.float32),
+        **opposed_pairs(parts, groups, _palm_part(hand.model), params.seed),
+        **boxes,
+    )
+
+
+def _palm_part(model: HandModel) -> dict[str, np.ndarray]:
+    index = np.arange(model.contact_first[model.groups], model.contact_first[model.groups + 1])
+    return {"position": model.contact_points[index], "direction": model.contact_normals[index], "index": index}
+
+
+def _bounded_cell(positions: list[np.ndarray], params: FieldParams) -> float:
+    """The voxel edge [m], grown until table and vectors fit the memory bound."""
+    vectors = sum(len(p) for p in positions) * _VECTOR_BYTES
+    cell = params.cell
+    while True:
+        cells = sum(float(np.prod(np.floor(np.ptp(p, axis=0) / cell) + 2)) for p in positions if len(p))
+        fits = cells * (4 * NORMAL_BINS + 8) + vectors <= params.max_mb * 1e6
+        if fits and cells * NORMAL_BINS < 2**31:  # rows of the table are 32-bit
+            return cell
+        cell *= 1.25
+
+
+def _check_clear(model: HandModel, clear: np.ndarray) -> None:
+    """Raises HandError when a group is clear of the palm in no setting; ``clear`` (V, G) are shares of postures."""
+    for group in np.flatnonzero((clear == 0.0).all(0)):
+        links = [
+            n
+            for n, b in zip(model.tree.link_names, model.tree.link_body, strict=True)
+            if model.tree.body_group[b] == group
+        ]
+        raise HandError(
+            f"hand '{model.name}': no posture of finger ({', '.join(links)}) is clear of the palm and of itself"
+        )
+
+
+def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, np.ndarray]:
+    """Contact vectors of a group in a setting; none when no posture is clear."""
+    model, device = hand.model, hand.device
+    settings = len(model.tree.settings)
+    setting, group = divmod(slot, model.groups)
+    width = int(np.diff(model.tree.dof_first).max())
+    if model.contact_first[group + 1] == model.contact_first[group]:
+        return _no_vectors(width)
+    # vectors may fill half of the memory bound, the table the rest
+    room = int(0.5e6 * params.max_mb / _VECTOR_BYTES / (model.groups * settings))
+    records = params.records if settings == 1 else max(params.records // settings, min(params.records, _LEAST_RECORDS))
+    postures = max(1000, int(1.5 * records / _PER_POSTURE))
+    posture = wp.zeros((postures, width), dtype=wp.uint8, device=device)
+    clear = wp.empty(postures, dtype=wp.int32, device=device)
+    seed = params.seed * 1009 + slot
+    inputs = [hand.struct, group, setting, seed, _CLEARANCE]
+    wp.launch(sample_postures, postures, inputs, [posture, clear], device=device)
+    good = np.flatnonzero(clear.numpy())
+    count = min(records, room) if len(good) else 0
+    chosen = np.resize(np.repeat(good, _PER_POSTURE), count).astype(np.int32)
+    kinds = (wp.int32, wp.vec3, wp.int32, wp.int32, wp.vec3)
+    out = [wp.empty(count, dtype=t, device=device) for t in kinds]
+    indices = wp.array(chosen, dtype=wp.int32, device=device)
+    if count:
+        inputs = [hand.struct, group, setting, seed + 500_009, posture, indices]
+        wp.launch(contact_vectors, count, inputs, out, device=device)
+    point, position, bins, normal, direction = (a.numpy() for a in out)
+    return {
+        "point": point,
+        "position": position.reshape(-1, 3),
+        "bin": bins,
+        "normal": normal,
+        "direction": direction.reshape(-1, 3),
+        "posture": posture.numpy()[chosen],
+        "clear": np.asarray(len(good) / postures, np.float32),
+    }
+
+
+def _no_vectors(width: int) -> dict[str, np.ndarray]:
+    """What _sample_slot gives for a group without contact surface."""
+    return {
+        "point": np.zeros(0, np.int32),
+        "position": np.zeros((0, 3), np.float32),
+        "bin": np.zeros(0, np.int32),
+        "normal": np.zeros(0, np.int32),
+        "direction": np.zeros((0, 3), np.float32),
+        "posture": np.zeros((0, width), np.uint8),
+        "clear": np.asarray(np.nan, np.float32),
+    }

@@ -1,0 +1,23 @@
+"""What a hand is made of, in one digest."""
+
+import hashlib
+from pathlib import Path
+
+from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.urdf import Urdf, read_urdf
+
+
+def hand_digest(urdf_path: Path, spec: HandSpec) -> str:
+    """SHA-256 over the URDF, the collision meshes it names and the rules: the content key of a hand."""
+    return urdf_digest(read_urdf(urdf_path), spec)
+
+
+def urdf_digest(urdf: Urdf, spec: HandSpec) -> str:
+    """:func:`hand_digest` of a URDF that has been read."""
+    h = hashlib.sha256(urdf.text.encode())
+    for name in sorted(urdf.mesh_files):
+        h.update(name.encode())
+        h.update(urdf.mesh_files[name].read_bytes())
+    # neither changes a HandModel; views of opposition spaces have digests of their own
+    h.update(spec.model_dump_json(exclude={"opposition_spaces", "stand_off"}).encode())
+    return h.hexdigest()
