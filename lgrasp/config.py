@@ -1,6 +1,7 @@
 """YAML declarations -> checked pydantic models; unknown keys fail and name the nearest valid one."""
 
 import difflib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_args
 
@@ -77,6 +78,41 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
         if not first["loc"]:
             raise ConfigError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
         raise ConfigError(f"{where}: key '{key}' = {first['input']!r}: {first['msg']}") from None
+
+
+def apply_settings(parts: Mapping[str, BaseModel], settings: Sequence[str], where: str) -> dict[str, BaseModel]:
+    """Models with some of their fields replaced and checked.
+
+    Args:
+        parts: models by name.
+        settings: ``PART.KEY=VALUE`` each, the value as in YAML.
+
+    Raises:
+        ConfigError: one line with the setting and what is accepted.
+    """
+    changes: dict[str, dict[str, Any]] = {}
+    for text in settings:
+        name, equals, value = text.partition("=")
+        part, dot, key = name.strip().partition(".")
+        if not (equals and dot and key):
+            raise ConfigError(f"--set '{text}': give PART.KEY=VALUE, such as bounds.friction=0.8")
+        known = {f"{p}.{k}" for p, model in parts.items() for k in type(model).model_fields}
+        if part not in parts or key not in type(parts[part]).model_fields:
+            near = difflib.get_close_matches(name.strip(), sorted(known), n=1, cutoff=0.4)
+            keys = [k for k in sorted(known) if k.startswith(f"{part}.")] or sorted(parts)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            raise ConfigError(f"--set '{text}': {where} has no '{name.strip()}'; {hint}known: {', '.join(keys)}")
+        try:
+            changes.setdefault(part, {})[key] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ConfigError(f"--set '{text}': the value cannot be read") from None
+    made = dict(parts)
+    for part, values in changes.items():
+        model = parts[part]
+        # another profile of bounds brings its own numbers
+        kept = {} if "profile" in values else model.model_dump()
+        made[part] = parse_model(type(model), kept | values, f"--set, {part}")
+    return made
 
 
 def _keys_at(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:

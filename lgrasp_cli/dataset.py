@@ -89,6 +89,15 @@ def metrics(
     paths: _Paths,
     add: Annotated[str, typer.Option(help="Metrics, separated by commas: volume, epsilon_exact.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the new shards.", show_default=False)],
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="bounds.KEY=VALUE",
+            help="Measure with another value than the rows passed, such as bounds.friction=0.8.",
+            show_default=False,
+        ),
+    ] = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0: all cores.")] = 0,
     quiet: Quiet = False,
 ) -> None:
@@ -108,7 +117,7 @@ def metrics(
     start = time.monotonic()
     with counting("measured", quiet=quiet) as progress:
         names = [name.strip() for name in add.split(",")]
-        added = add_metrics(paths, out, names, workers=workers, progress=progress)
+        added = add_metrics(paths, out, names, settings=settings or (), workers=workers, progress=progress)
     if not quiet:
         kept = len(added.files) - added.written
         there = f"; {kept} there already" if kept else ""

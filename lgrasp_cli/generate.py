@@ -16,6 +16,7 @@ from lgrasp_cli.options import (
     Quiet,
     Scale,
     Seed,
+    Settings,
     check_report,
     choose_pipeline,
     open_cache,
@@ -34,7 +35,8 @@ def generate(
     mesh: Mesh,
     hand: Hand = "allegro",
     rows: Annotated[int, typer.Option("-n", "--rows", help="Grasps asked.")] = 1000,
-    pipeline: PipelineName = "swift",
+    pipeline: PipelineName = "robust",
+    settings: Settings = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Folder of the shards; default: grasps/HAND-OBJECT", show_default=False),
@@ -81,7 +83,7 @@ def generate(
     from lgrasp.jobs.generate import Job
 
     index, number = array_task(shard_index, num_shards)
-    chosen = choose_pipeline(pipeline, seed, contacts)
+    chosen = choose_pipeline(pipeline, seed, contacts, settings)
     job = Job(
         hand=hand,
         object=mesh,

@@ -107,7 +107,7 @@ def check_hand(
         Path | None, typer.Option(help="Folder of the pictures; default: check/NAME.", show_default=False)
     ] = None,
     rows: Annotated[int, typer.Option("-n", "--rows", min=1, help="Grasps asked per object.")] = 200,
-    pipeline: PipelineName = "swift",
+    pipeline: PipelineName = "robust",
     device: Device = "auto",
     workers: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
     cache_dir: CacheDir = None,

@@ -26,6 +26,15 @@ JsonPath = Annotated[
     str | None,
     typer.Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
 ]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="PART.KEY=VALUE",
+        help="Another value of a parameter, such as bounds.friction=0.8 or search.restarts=40; may be repeated.",
+        show_default=False,
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no report; warnings and errors only.")]
 
 
@@ -75,8 +84,10 @@ def parse_contacts(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in parts)
 
 
-def choose_pipeline(name: str, seed: int | None = None, contacts: str | None = None) -> "Pipeline":
-    """A pipeline with the seed and the numbers of contacts of the command line.
+def choose_pipeline(
+    name: str, seed: int | None = None, contacts: str | None = None, settings: list[str] | None = None
+) -> "Pipeline":
+    """A pipeline with the seed, the numbers of contacts and the other parameters of the command line.
 
     Raises:
         ConfigError: unknown pipeline, or a value out of range.
@@ -91,4 +102,6 @@ def choose_pipeline(name: str, seed: int | None = None, contacts: str | None = N
         pipeline = pipeline.model_copy(update={"seed": seed})
     if contacts is not None:
         pipeline = pipeline.with_params("search", contacts=parse_contacts(contacts))
+    if settings:
+        pipeline = pipeline.with_settings(settings)
     return pipeline

@@ -131,7 +131,7 @@ def _report(done: "PlanOutcome", starts: int) -> dict[str, Any]:
         "counts": done.counts,
         "seconds": done.seconds,
         "epsilon": float(np.median(metrics["epsilon"])) if len(done.grasps) else None,
-        "disturbance": float(np.median(metrics["disturbance"])) if len(done.grasps) else None,
+        "unresisted_load": float(np.median(metrics["unresisted_load"])) if len(done.grasps) else None,
         "out": None if done.path is None else str(done.path),
     }
 
@@ -145,7 +145,7 @@ def _show(data: dict[str, Any]) -> None:
             ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({_lost(data['counts']) or 'none lost'})"),
             ("where", data["out"]),
             ("hand, object", f"{data['hand']}, {data['object']}"),
-            ("quality", f"median epsilon {data['epsilon']:.3f}, disturbance {data['disturbance']:.2f}"),
+            ("quality", f"median epsilon {data['epsilon']:.3f}, unresisted load {data['unresisted_load']:.2f}"),
             ("wall", f"{data['seconds']:.1f} s, {each:.3f} s a plan"),
         ]
     )

@@ -32,7 +32,7 @@ def build_field(
     index: Annotated[
         str | None, typer.Option(help="voxel or bvh; default: the pipeline's.", show_default=False)
     ] = None,
-    pipeline: PipelineName = "swift",
+    pipeline: PipelineName = "robust",
     device: Device = "auto",
     cache_dir: CacheDir = None,
     force: _Force = False,
@@ -74,7 +74,7 @@ def build_field(
 def preprocess(
     mesh: Annotated[str, typer.Argument(metavar="OBJECT", help="Mesh file, or the name of an object.")],
     scale: Scale = 1.0,
-    pipeline: PipelineName = "swift",
+    pipeline: PipelineName = "robust",
     cache_dir: CacheDir = None,
     force: _Force = False,
     as_json: _AsJson = False,

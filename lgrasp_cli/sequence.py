@@ -5,7 +5,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Quiet, Seed, check_report, choose_pipeline, open_cache
+from lgrasp_cli.options import (
+    CacheDir,
+    Device,
+    Hand,
+    JsonPath,
+    Quiet,
+    Seed,
+    Settings,
+    check_report,
+    choose_pipeline,
+    open_cache,
+)
 
 if TYPE_CHECKING:
     from lgrasp.jobs.sequence.job import SequenceJob, SequenceOutcome
@@ -40,6 +51,7 @@ def sequence(
     pipeline: Annotated[
         str, typer.Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.")
     ] = "sequence",
+    settings: Settings = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT...", show_default=False),
@@ -74,7 +86,7 @@ def sequence(
     from lgrasp.jobs.sequence.job import SequenceJob, sequence_name
     from lgrasp.jobs.sequence.size import parse_size
 
-    chosen = choose_pipeline(pipeline, seed)
+    chosen = choose_pipeline(pipeline, seed, settings=settings)
     if "sequence" in chosen.order and (method or policy):
         changes = {"method": method, "policy": policy}
         chosen = chosen.with_params("sequence", **{name: value for name, value in changes.items() if value})

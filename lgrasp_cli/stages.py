@@ -38,7 +38,7 @@ def _verb(stage: str):
     def run(
         mesh: Mesh,
         hand: Hand = "allegro",
-        pipeline: PipelineName = "swift",
+        pipeline: PipelineName = "robust",
         candidates: Annotated[int, typer.Option(help="Candidates in the batch.")] = 1024,
         first: Annotated[int, typer.Option(help="First candidate of the batch.")] = 0,
         shard_index: Annotated[int, typer.Option(help="Shard whose candidate stream is used.")] = 0,

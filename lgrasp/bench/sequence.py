@@ -9,6 +9,7 @@ import numpy as np
 
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.opposition.spaces import consumed
 from lgrasp.jobs.records import make_scene, mesh_blobs
@@ -18,7 +19,6 @@ from lgrasp.jobs.sequence.records import object_records
 from lgrasp.jobs.sequence.round import Round, Verdicts, run_round
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
-from lgrasp.stages.filter.params import FilterParams
 
 PUBLISHED: dict[str, Any] = {
     "source": "Grasping a Handful (Lu et al., 2025), Tables II and III, Allegro hand, one NVIDIA A100",
@@ -59,7 +59,7 @@ def measure_sequences(
         diversity [rad]), ``strict_per_s`` (strict-valid rows of two objects, simulation not counted).
     """
     device = resolve_device(jobs[0].device)
-    bounds = jobs[0].pipeline.params("filter")
+    bounds = jobs[0].pipeline.bounds
     length = max(len(job.objects) for job in jobs)
     spaces: dict[str, dict[str, int]] = {}
     objects = [_Objects() for _ in range(length)]
@@ -98,14 +98,16 @@ def _as_published(pipeline: Pipeline) -> Pipeline:
     """The pipeline; for an optimiser with the published bounds in place of those of strict validity."""
     if pipeline.params("sequence").method == "field":
         return pipeline
-    return pipeline.with_params("filter", penetration=0.01, self_margin=0.0, gap=0.01, angle=60.0, balance=1.0)
+    return pipeline.with_bounds(
+        max_penetration=0.01, min_self_distance=0.0, max_gap=0.01, max_normal_angle=60.0, max_gswo=1.0
+    )
 
 
-def _strict(table: SequenceTable, bounds: FilterParams) -> np.ndarray:
-    """Rows within the bounds of the filter in every step, (N,) bool."""
+def _strict(table: SequenceTable, bounds: GraspBounds) -> np.ndarray:
+    """Rows within the bounds in every step, (N,) bool."""
     m = table.metrics
-    near = (m["gap"] <= bounds.gap) & (m["normal_error"] <= np.radians(bounds.angle))
-    return near & (m["penetration"] <= bounds.penetration) & (m["gswo"] <= bounds.balance)
+    near = (m["gap"] <= bounds.max_gap) & (m["normal_error"] <= np.radians(bounds.max_normal_angle))
+    return near & (m["penetration"] <= bounds.max_penetration) & (m["gswo"] <= bounds.max_gswo)
 
 
 def _watched(simulate: Verdicts, seen: list[SequenceTable]) -> Verdicts:

@@ -13,11 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
+from lgrasp.config import apply_settings
 from lgrasp.dataset.extend import check_shard, extend_shard
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.tree import shard_tree
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.errors import ConfigError, OutputError
+from lgrasp.grasp.bounds import stored_bounds
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 
@@ -45,6 +47,7 @@ def add_metrics(
     out: Path,
     names: Sequence[str],
     *,
+    settings: Sequence[str] = (),
     workers: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Added:
@@ -54,6 +57,7 @@ def add_metrics(
         paths: Shard files or folders; what lies in subfolders of a folder goes to such subfolders of ``out``.
         out: Folder of the copies.
         names: Some of ``METRICS``.
+        settings: ``bounds.KEY=VALUE`` each, in place of what the rows of a shard passed.
         workers: Processes; 0 is one per core, 1 computes in this process.
         progress: Called with (rows done, rows in all) now and then.
 
@@ -78,9 +82,9 @@ def add_metrics(
     with _process_map(workers) as each:
         for place, source in sources.items():
             n = _length(source)
-            if not _is_extended(out / place, source, names):
+            if settings or not _is_extended(out / place, source, names):
                 check_shard(source)
-                columns = _measure(source, each, 8 * workers * _TASK_ROWS, report)
+                columns = _measure(source, settings, each, 8 * workers * _TASK_ROWS, report)
                 extend_shard(source, out / place, {name: columns[name] for name in names}, METRICS)
                 written, rows = written + 1, rows + n
             done += n
@@ -88,23 +92,30 @@ def add_metrics(
     return Added([out / place for place in sources], written, rows)
 
 
-def _measure(path: Path, each: _Map, step: int, report: Callable[[int], None]) -> dict[str, np.ndarray]:
+def _measure(
+    path: Path, settings: Sequence[str], each: _Map, step: int, report: Callable[[int], None]
+) -> dict[str, np.ndarray]:
     """All metrics of a shard by name, each shape [N], ``step`` rows at a time; then ``report(rows done)`` is called."""
     with ShardReader(path) as reader:
         frames = [mass_frame(record) for record in reader.objects()]
+        bounds = stored_bounds(reader.header.config)
+        friction = apply_settings({"bounds": bounds}, settings, "dataset metrics")["bounds"].friction
         table = np.zeros((len(reader), len(METRICS)), np.float32)
         for start in range(0, len(reader), step):
-            table[start : start + step] = row_metrics(reader.rows(start, start + step), frames, each)
+            table[start : start + step] = row_metrics(reader.rows(start, start + step), frames, friction, each)
             report(min(start + step, len(reader)))
     return dict(zip(METRICS, table.T, strict=True))
 
 
-def row_metrics(rows: GraspRows, frames: Sequence[tuple[np.ndarray, float]], each: _Map = map) -> np.ndarray:
+def row_metrics(
+    rows: GraspRows, frames: Sequence[tuple[np.ndarray, float]], friction: float, each: _Map = map
+) -> np.ndarray:
     """The columns of ``METRICS`` for some rows, shape [n, 2]; of several objects in a row the least.
 
     Args:
         rows: Grasps.
         frames: What :func:`mass_frame` says of each of the shard's objects, sorted by id.
+        friction: Coefficient of friction.
         each: ``map``, or another that works on several items at once and yields in order.
     """
     tasks = []  # rows of one object each
@@ -112,7 +123,8 @@ def row_metrics(rows: GraspRows, frames: Sequence[tuple[np.ndarray, float]], eac
         for i, (center, radius) in enumerate(frames):
             chosen = np.flatnonzero(present == i)
             for part in (chosen[at : at + _TASK_ROWS] for at in range(0, len(chosen), _TASK_ROWS)):
-                tasks.append((part, rows.contact_points[part, o], -rows.contact_normals[part, o], center, radius))
+                contacts = rows.contact_points[part, o], -rows.contact_normals[part, o]
+                tasks.append((part, *contacts, center, radius, friction))
     table = np.full((len(rows), len(METRICS)), np.inf)
     if tasks:
         parts, *arguments = zip(*tasks, strict=True)

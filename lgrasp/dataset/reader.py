@@ -17,6 +17,14 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 
+RENAMED = {"metrics/disturbance": "metrics/unresisted_load"}
+"""Flat names of columns in shards of earlier releases -> their names; readers give the columns by these."""
+
+
+def current_name(name: str) -> str:
+    """A column's name as readers give it."""
+    return RENAMED.get(name, name)
+
 
 @contextmanager
 def reading(path: str | os.PathLike[str]) -> Iterator[None]:
@@ -101,15 +109,16 @@ class ShardReader:
         """Shape and dtype of every row dataset by its flat name (``q``, ``metrics/gap``, ...)."""
         names = [*GRASP_FIELDS, *(SEQUENCE_FIELDS if self.space_names is not None else ())]
         for group in ("metrics", "physics"):
-            names += [path.removeprefix("grasps/") for path in expand(self._file, f"grasps/{group}/*")]
+            names += [current_name(path.removeprefix("grasps/")) for path in expand(self._file, f"grasps/{group}/*")]
         return {name: (self._dataset(name).shape, self._dataset(name).dtype) for name in names}
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows ``start`` to ``stop`` of one dataset by its flat name.
+        """Rows ``start`` to ``stop`` of one dataset by its flat name; names of earlier releases do too.
 
         Raises:
             ShardError: The shard has no such dataset, or its bytes are damaged.
         """
+        name = current_name(name)
         if name not in self.columns:
             raise ShardError(f"{self.path}: no dataset {name!r}; it has {', '.join(self.columns)}")
         with reading(self.path):
@@ -176,7 +185,9 @@ class ShardReader:
 
     def _dataset(self, name: str) -> h5py.Dataset:
         with reading(self.path):
-            return self._file[GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"]
+            path = GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"
+            old = next((f"grasps/{was}" for was, now in RENAMED.items() if now == name), path)
+            return self._file[old if old in self._file and path not in self._file else path]
 
 
 def read_hand(file: h5py.File) -> HandRecord:

@@ -1,15 +1,19 @@
 """pipelines/NAME.yaml: ordered stages with parameters; all of it is in the content keys."""
 
 import difflib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny
 
-from lgrasp.config import parse_model, read_yaml
+from lgrasp.config import apply_settings, parse_model, read_yaml
+from lgrasp.engine.migration import ALIASES, move_to_bounds
 from lgrasp.engine.registry import STAGES, check_order
 from lgrasp.errors import ConfigError
 from lgrasp.field.params import FieldParams
+from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.notices import notice
 from lgrasp.object.params import ObjectParams
 from lgrasp.paths import data_dirs
 from lgrasp.simulate.protocol import find_protocol
@@ -25,6 +29,7 @@ class _Declared(BaseModel):
     description: str = ""
     seed: int = Field(default=0, ge=0, lt=2**63)
     effort: int = Field(default=400, ge=1, le=10**6, description="Candidates tried per row asked before giving up.")
+    bounds: dict[str, Any] = Field(default_factory=dict)
     object: dict[str, Any] = Field(default_factory=dict)
     field: dict[str, Any] = Field(default_factory=dict)
     stages: list[dict[str, dict[str, Any] | None]]
@@ -39,6 +44,7 @@ class Pipeline(BaseModel):
     description: str = ""
     seed: int = 0
     effort: int = 400
+    bounds: GraspBounds = GraspBounds()
     object: ObjectParams
     field: FieldParams
     stages: tuple[tuple[str, SerializeAsAny[BaseModel]], ...]
@@ -58,6 +64,26 @@ class Pipeline(BaseModel):
         stages = tuple((n, changed if n == stage else p) for n, p in self.stages)
         return self.model_copy(update={"stages": stages})
 
+    def with_bounds(self, **changes: Any) -> "Pipeline":
+        """A copy with some of the bounds replaced and checked."""
+        return self.model_copy(update={"bounds": self.bounds.changed(**changes)})
+
+    def with_settings(self, settings: Sequence[str]) -> "Pipeline":
+        """A copy with parameters replaced and checked.
+
+        Args:
+            settings: ``PART.KEY=VALUE`` each; a part is ``bounds``, ``object``, ``field`` or a stage.
+
+        Raises:
+            ConfigError: an unknown part or key, or a value out of range.
+        """
+        parts = {"bounds": self.bounds, "object": self.object, "field": self.field, **dict(self.stages)}
+        made = apply_settings(parts, settings, f"pipeline {self.name}")
+        stages = tuple((name, made[name]) for name in self.order)
+        return self.model_copy(
+            update={"stages": stages, **{name: made[name] for name in ("bounds", "object", "field")}}
+        )
+
     def with_physics(self, protocol: str) -> "Pipeline":
         """A copy that keeps only grasps which pass a physics protocol.
 
@@ -74,6 +100,7 @@ class Pipeline(BaseModel):
             "name": self.name,
             "seed": self.seed,
             "effort": self.effort,
+            "bounds": self.bounds.describe(),
             "object": self.object.model_dump(mode="json"),
             "field": self.field.model_dump(mode="json"),
             "stages": [{n: {"version": STAGES[n].version, **p.model_dump(mode="json")}} for n, p in self.stages],
@@ -96,6 +123,9 @@ def load_pipeline(name: str) -> Pipeline:
         ConfigError: no such pipeline, or a wrong key or value in it.
     """
     files = pipeline_files()
+    if name in ALIASES and name not in files:
+        notice(f"pipeline '{name}' is now called '{ALIASES[name]}'; the old name works in this release only")
+        name = ALIASES[name]
     path = files.get(name) or Path(name).expanduser()
     if not path.is_file():
         near = difflib.get_close_matches(name, files, n=1)
@@ -103,6 +133,7 @@ def load_pipeline(name: str) -> Pipeline:
         known = ", ".join(files)
         raise ConfigError(f"unknown pipeline '{name}'; {hint}known: {known}, or give the path of a YAML file")
     declared = parse_model(_Declared, read_yaml(path), f"pipeline {path}")
+    declared = declared.model_copy(update=move_to_bounds(declared.bounds, declared.stages, f"pipeline {path}"))
     stages = []
     for entry in declared.stages:
         for stage, params in entry.items():
@@ -117,6 +148,7 @@ def load_pipeline(name: str) -> Pipeline:
         description=declared.description,
         seed=declared.seed,
         effort=declared.effort,
+        bounds=parse_model(GraspBounds, declared.bounds, f"pipeline {path}, bounds"),
         object=parse_model(ObjectParams, declared.object, f"pipeline {path}, object"),
         field=parse_model(FieldParams, declared.field, f"pipeline {path}, field"),
         stages=tuple(stages),

@@ -177,7 +177,9 @@ def make_shard(
         progress: called with (rows so far, running result) after each batch.
     """
     device = inputs.device.alias
-    context = Context(inputs.hand, inputs.object, inputs.field, device, pipeline.seed, shard, inputs.scene)
+    context = Context(
+        inputs.hand, inputs.object, inputs.field, device, pipeline.seed, shard, pipeline.bounds, inputs.scene
+    )
     bank = Bank(bank_cache, pipeline, inputs.keys, shard, device) if bank_cache else None
     limit = shard_effort(pipeline, rows)
     result: ShardResult | None = None

@@ -3,12 +3,13 @@
 import warp as wp
 
 from lgrasp.hand.arrays import Hand
+from lgrasp.math.constants import SLIDING_ARM
 from lgrasp.math.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_LEVER = wp.constant(0.1)  # [m] a sliding joint is as stiff as a revolute one at this arm
+_ARM = wp.constant(SLIDING_ARM)
 
 
 @wp.func
@@ -60,7 +61,7 @@ def press_contact(
     while a >= 0:
         stiffness = k
         if hand.kin.joint_prismatic[j0 + a] == 1:
-            stiffness = k / (_LEVER * _LEVER)
+            stiffness = k / (_ARM * _ARM)
         d = hand.kin.joint_dof[j0 + a]
         if d < hand.kin.dof_free[g]:
             q[d] = q[d] + wp.dot(point_column(hand.kin, j0 + a, body[j0 + a], p), f) / stiffness

@@ -5,8 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull
 
-FRICTION = 0.5
-EDGES = 8
+from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.math.constants import CONE_EDGES
+
+FRICTION: float = GraspBounds.model_fields["friction"].default
+"""Of the strict bounds."""
 
 _NIL = 1e-8  # epsilon below this is rounding: the origin lies on the hull or outside
 
@@ -20,7 +23,7 @@ class WrenchSpace(NamedTuple):
     """6-D volume of the hull; 0 when the origin is not inside."""
 
 
-def cone_edges(normals: np.ndarray, *, friction: float = FRICTION, edges: int = EDGES) -> np.ndarray:
+def cone_edges(normals: np.ndarray, *, friction: float = FRICTION, edges: int = CONE_EDGES) -> np.ndarray:
     """Forces of unit normal part along the edges of friction pyramids.
 
     Args:
@@ -48,7 +51,7 @@ def primitive_wrenches(
     center: np.ndarray,
     radius: float,
     friction: float = FRICTION,
-    edges: int = EDGES,
+    edges: int = CONE_EDGES,
 ) -> np.ndarray:
     """Wrenches (f, (p - center) x f / radius) of the forces f of :func:`cone_edges`, shape [k * edges, 6].
 
@@ -78,7 +81,9 @@ def wrench_space(wrenches: np.ndarray) -> WrenchSpace:
     return WrenchSpace(epsilon, float(hull.volume)) if epsilon > _NIL else WrenchSpace(0.0, 0.0)
 
 
-def wrench_spaces(points: np.ndarray, normals: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
+def wrench_spaces(
+    points: np.ndarray, normals: np.ndarray, center: np.ndarray, radius: float, friction: float
+) -> np.ndarray:
     """Epsilon and volume of several grasps of one object, shape [n, 2].
 
     Args:
@@ -86,11 +91,12 @@ def wrench_spaces(points: np.ndarray, normals: np.ndarray, center: np.ndarray, r
         normals: Normals into the object, shape [n, c, 3], NaN where there is no contact.
         center: The object's centre of mass [m], shape [3].
         radius: The object's largest distance from there [m].
+        friction: Coefficient of friction.
     """
     out = np.zeros((len(points), 2))
     for i in range(len(points)):
         touches = np.isfinite(points[i]).all(-1)
         p, n = points[i, touches].astype(float), normals[i, touches].astype(float)
         n /= np.linalg.norm(n, axis=1, keepdims=True)
-        out[i] = wrench_space(primitive_wrenches(p, n, center=center, radius=radius))
+        out[i] = wrench_space(primitive_wrenches(p, n, center=center, radius=radius, friction=friction))
     return out

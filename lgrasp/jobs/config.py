@@ -42,7 +42,7 @@ class JobConfig(BaseModel):
     hand_dir: Path | None = Field(None, description="Folder where NAME/NAME.urdf is looked up first.")
     objects: tuple[str, ...] = Field((), description="Names or paths; none: all meshes of object_dir.")
     object_dir: Path | None = Field(None, description="Folder where the names of objects are looked up first.")
-    pipelines: tuple[str, ...] = Field(("swift",), min_length=1, description="Names or paths.")
+    pipelines: tuple[str, ...] = Field(("robust",), min_length=1, description="Names or paths.")
     rows: int = Field(1000, ge=1, description="Grasps per hand, object and pipeline.")
     seed: int | None = Field(None, ge=0, lt=2**63, description="Replaces the pipelines' own.")
     scale: float = Field(1.0, gt=0, description="Factor from the meshes' unit to metres.")

@@ -211,6 +211,7 @@ def _shard(job: Job, inputs: Inputs, meshes: dict[str, bytes], key: str, shard: 
             config={
                 "run_key": key,
                 "pipeline": job.pipeline.describe(),
+                "bounds": job.pipeline.bounds.describe(),
                 "object": job.object,
                 "scale": job.scale,
                 "shard_rows": job.shard_rows,

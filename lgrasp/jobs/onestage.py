@@ -82,7 +82,7 @@ def run_stage(
     if done == len(stages):
         return runs
     inputs = load_inputs(cache, keys, job.scale, pipeline.object, pipeline.field, device, report)
-    context = Context(inputs.hand, inputs.object, inputs.field, device.alias, pipeline.seed, shard)
+    context = Context(inputs.hand, inputs.object, inputs.field, device.alias, pipeline.seed, shard, pipeline.bounds)
     table: Any = _table(found[stages[done - 1]], device.alias) if done else (first, count)
     load_kernels(device.alias, kernel_modules("lgrasp.stages."), report)
     runs = [run for run in runs if run.stage in stages[:done]]
@@ -106,7 +106,7 @@ def _stage_keys(
     made: dict[str, str] = {}
     before = content_key("start", 1, inputs=[keys.hand, keys.object, keys.field], candidates=[first, count])
     for stage in stages:
-        params = pipeline.params(stage).model_dump(mode="json")
+        params = pipeline.params(stage).model_dump(mode="json") | {"bounds": pipeline.bounds.describe()}
         before = made[stage] = content_key(
             stage, STAGES[stage].version, params=params, seed=pipeline.seed, shard=shard, input=before
         )

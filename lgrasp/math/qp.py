@@ -6,6 +6,7 @@ cones. So is the resistance to an outside force, of a hull moved by that force.
 
 import warp as wp
 
+from lgrasp.math.constants import LOAD_ARM, LOAD_FORCE
 from lgrasp.math.transforms import tangent
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
@@ -14,6 +15,10 @@ MAX_CONTACTS = 7
 """Fingers plus palm in one grasp."""
 _CORRAL = 8
 _CORRAL_C = wp.constant(_CORRAL)
+_LOAD_SCALE = wp.constant(1.0 / LOAD_ARM)  # [1/m]
+_LOAD_FORCE = wp.constant(LOAD_FORCE)
+_EXACT, _LOAD_EXACT = wp.constant(1.0e-4), wp.constant(1.0e-3)  # relative errors of squared norms
+_NO_LIMIT = wp.constant(1.0e15)
 
 vec6 = wp.types.vector(6, wp.float32)
 vec8 = wp.types.vector(_CORRAL, wp.float32)
@@ -89,32 +94,43 @@ def _affine_weights(G: mat8, m: wp.int32):
     return z
 
 
+@wp.struct
+class Program:
+    """What is asked of the forces of a grasp."""
+
+    friction: wp.float32
+    edges: wp.int32  # of each friction pyramid, 0 for round cones
+    torque_scale: wp.float32  # weight of torque against force [1/m]
+    load: vec6  # that the forces meet
+    total: wp.float32  # normal forces of all contacts together
+    less: wp.int32  # 1: fewer may do
+    stop: wp.float32  # the norm below which any answer does
+    limit: wp.float32  # the norm above which any answer does
+    exact: wp.float32  # relative error of the squared norm
+
+
 @wp.func
 def _least_norm(
     arms: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     k: wp.int32,
-    mu: wp.float32,
-    edges: wp.int32,
-    torque_scale: wp.float32,
-    load: vec6,
-    total: wp.float32,
-    less: wp.int32,
-    stop: wp.float32,
-    limit: wp.float32,
-    exact: wp.float32,
+    p: Program,
     forces: wp.array(dtype=wp.vec3),
 ):
-    """Point of least norm of ``load`` plus wrenches with f_i in the friction cone of n_i, by Wolfe's algorithm.
-
-    The normal forces add up to ``total``, or to at most that when ``less`` is 1.
+    """Point of least norm of ``p.load`` plus wrenches with f_i in the friction cone of n_i, by Wolfe's algorithm.
 
     Args:
-        stop: return as soon as the norm is below this.
-        limit: return as soon as the least norm is known to be above this.
-        exact: relative error of the squared norm.
         forces: (local, MAX_CONTACTS) receives the optimal forces.
     """
+    mu = p.friction
+    edges = p.edges
+    torque_scale = p.torque_scale
+    load = p.load
+    total = p.total
+    less = p.less
+    stop = p.stop
+    limit = p.limit
+    exact = p.exact
     P = mat86()
     F = mat83()
     owner = vec8()
@@ -261,7 +277,15 @@ def balance(
     Returns:
         The least norm.
     """
-    return _least_norm(arms, normals, k, mu, edges, torque_scale, vec6(), 1.0, 0, stop, 1.0e15, 1.0e-4, forces)
+    p = Program()
+    p.friction = mu
+    p.edges = edges
+    p.torque_scale = torque_scale
+    p.total = 1.0
+    p.stop = stop
+    p.limit = _NO_LIMIT
+    p.exact = _EXACT
+    return _least_norm(arms, normals, k, p, forces)
 
 
 @wp.func
@@ -277,8 +301,8 @@ def unresisted(
 ):
     """How much of a unit force e on the centre of mass stays unresisted, 0 to 1.
 
-    min |e + sum_i (f_i, arm_i x f_i / 5 cm)| with f_i in the round friction cone of n_i and sum_i f_i . n_i <= 5: what
-    cannot be held with five times the load is not held.
+    min |e + sum_i (f_i, arm_i x f_i / LOAD_ARM)| with f_i in the round friction cone of n_i and
+    sum_i f_i . n_i <= LOAD_FORCE: what cannot be held with so many times the load is not held.
 
     Args:
         arms: from the centre of mass [m]. normals: inward.
@@ -290,12 +314,20 @@ def unresisted(
     e = wp.vec3(0.0)
     e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
     e = wp.quat_rotate(turn, e)
-    load = vec6(e[0], e[1], e[2], 0.0, 0.0, 0.0)
-    return _least_norm(arms, normals, k, mu, 0, 20.0, load, 5.0, 1, stop, limit, 1.0e-3, forces)
+    p = Program()
+    p.friction = mu
+    p.torque_scale = _LOAD_SCALE
+    p.load = vec6(e[0], e[1], e[2], 0.0, 0.0, 0.0)
+    p.total = _LOAD_FORCE
+    p.less = 1
+    p.stop = stop
+    p.limit = limit
+    p.exact = _LOAD_EXACT
+    return _least_norm(arms, normals, k, p, forces)
 
 
 @wp.func
-def disturbance(
+def unresisted_load(
     arms: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     k: wp.int32,

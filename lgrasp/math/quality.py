@@ -1,15 +1,18 @@
 """Ferrari-Canny quality of a grasp."""
 
+import math
+
 import warp as wp
 
+from lgrasp.math.constants import CONE_EDGES
 from lgrasp.math.qp import MAX_CONTACTS, vec6
 from lgrasp.math.transforms import tangent
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
-_CONES = wp.constant(8 * MAX_CONTACTS)
-
-_EDGES = wp.constant(8)
+_EDGES = wp.constant(CONE_EDGES)
+_CONES = wp.constant(CONE_EDGES * MAX_CONTACTS)
+_STEP = wp.constant(2.0 * math.pi / CONE_EDGES)  # [rad] between edges
 _STARTS = wp.constant(12)
 _SHOTS = wp.constant(20)
 _WALKS = wp.constant(12)
@@ -61,7 +64,7 @@ def epsilon_bound(
         t = tangent(n)
         b = wp.cross(n, t)
         for e in range(_EDGES):
-            angle = 0.78539816 * float(e)
+            angle = _STEP * float(e)
             cones[i * _EDGES + e] = n + (t * wp.cos(angle) + b * wp.sin(angle)) * mu
     scale = 1.0 / radius
     least = float(1.0e30)

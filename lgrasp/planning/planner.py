@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.palm import palm_axis
@@ -19,16 +20,14 @@ from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted
 from lgrasp.refine.check import OUTCOMES, check_grasps
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands, inverse_poses
-from lgrasp.refine.params import GraspBounds, LocalSearch
+from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface
 from lgrasp.refine.volume import upload_target
 
 _CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
 _COLLIDES, _CLOUD_GAP = 1.0e-3, 6.0e-3  # [m]
-_PLAN_BOUNDS = GraspBounds(
-    penetration=0.002, self_margin=0.0, gap=0.004, angle=45.0, fold=60.0, balance=10.0, squeeze_force=60.0
-)
-_COARSE = GraspBounds(penetration=0.01, self_margin=0.0, gap=0.012, angle=60.0, fold=90.0, balance=10.0)
+_COARSE = {"max_penetration": 0.01, "max_gap": 0.012, "max_normal_angle": 60.0, "max_normal_spread": 90.0}
+_PLAN = GraspBounds(profile="plan")
 
 
 class PlanParams(BaseModel):
@@ -70,7 +69,7 @@ class PlanParams(BaseModel):
     rank_friction: float = Field(
         default=0.3, gt=0, le=2, description="Friction coefficient at which the hands of a start are compared."
     )
-    bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
+    bounds: GraspBounds = Field(default=_PLAN, description="What a plan must satisfy.")
 
     def weights(self) -> dict[str, float]:
         """Arguments of :func:`hand_surface`."""
@@ -79,8 +78,13 @@ class PlanParams(BaseModel):
 
 def cloud_params(params: PlanParams) -> PlanParams:
     """The parameters for an object that is a point cloud, whose points lie off its surface by their noise."""
-    bounds = params.bounds.model_copy(update={"gap": max(params.bounds.gap, _CLOUD_GAP)})
+    bounds = params.bounds.changed(max_gap=max(params.bounds.max_gap, _CLOUD_GAP))
     return params.model_copy(update={"bounds": bounds})
+
+
+def _loosened(bounds: GraspBounds) -> GraspBounds:
+    """What hands must meet after the first outer steps, to be told from those that found no contact at all."""
+    return bounds.changed(**{name: max(least, getattr(bounds, name)) for name, least in _COARSE.items()})
 
 
 class Planned(NamedTuple):
@@ -161,16 +165,16 @@ class Planner:
             travel = np.full(len(start), max(self.stand_off - float(centre @ axis) - p.clearance, 0.0))
             search.advanced(at, facing[free], travel, p.clearance)
             search.run(at, rounds=p.opening)
-            start, at = self._best(at, start, _COARSE, p.finalists)
+            start, at = self._best(at, start, _loosened(p.bounds), p.finalists)
             search.run(at, first=p.opening)
             start, at = self._best(at, start, p.bounds, 1)
         return self._checked(at, start, p.bounds)
 
     def _best(self, at: Hands, start: np.ndarray, bounds: GraspBounds, count: int) -> tuple[np.ndarray, Hands]:
         """The ``count`` best hands of each start: those that pass the checks first, then those that resist most."""
-        bounds = bounds.model_copy(update={"friction": self.params.rank_friction})
+        bounds = bounds.changed(friction=self.params.rank_friction)
         table, outcome = self._checked(at, start, bounds)
-        keys = [np.arange(len(start)), -table.metrics["epsilon"], table.metrics["disturbance"], outcome != 0, start]
+        keys = [np.arange(len(start)), -table.metrics["epsilon"], table.metrics["unresisted_load"], outcome != 0, start]
         order = np.lexsort(keys)
         place = np.arange(len(start)) - np.searchsorted(start[order], start[order])
         rows = np.sort(order[place < count])

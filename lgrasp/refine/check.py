@@ -5,6 +5,7 @@ import math
 import numpy as np
 import warp as wp
 
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.math.qp import MAX_CONTACTS
@@ -17,10 +18,9 @@ from lgrasp.refine.check_kernels import (
     deepen_rows,
     link_contacts,
 )
-from lgrasp.refine.params import GraspBounds
 from lgrasp.refine.surface import Palmar, ruled_palmar
 
-OUTCOMES = ("kept", "contact", "self-collision", "object collision", "balance", "disturbance")
+OUTCOMES = ("kept", "contact", "self-collision", "object collision", "balance", "unresisted load")
 """Outcome codes of a row: the first check that it failed."""
 
 _FAR = 0.03  # [m] depths above this are of no account
@@ -66,9 +66,9 @@ def check_grasps(
             wp.array(side.normals.astype(np.float32), dtype=wp.vec3, device=d),
             wp.array(runs, dtype=wp.int32, device=d),
             run_body,
-            bounds.gap,
-            math.cos(math.radians(bounds.angle)),
-            math.cos(math.radians(bounds.fold)),
+            bounds.max_gap,
+            math.cos(math.radians(bounds.max_normal_angle)),
+            math.cos(math.radians(bounds.max_normal_spread)),
             poses,
             joints,
         ],
@@ -83,7 +83,7 @@ def check_grasps(
     wp.launch(
         clear_of_itself,
         dim=n,
-        inputs=[hand.struct, bounds.self_margin, joints],
+        inputs=[hand.struct, bounds.min_self_distance, joints],
         outputs=[body, clear, overlap],
         device=d,
     )
@@ -113,11 +113,11 @@ def check_grasps(
         inputs=[
             hand.struct,
             obj.struct,
-            bounds.open_distance,
-            bounds.open_margin,
-            bounds.self_margin,
+            bounds.pregrasp_distance,
+            bounds.min_pregrasp_distance,
+            bounds.min_self_distance,
             bounds.squeeze_force,
-            bounds.stiffness,
+            bounds.squeeze_stiffness,
             poses,
             joints,
             body,
@@ -138,9 +138,9 @@ def check_grasps(
         [
             groups.numpy() < 2,
             clear.numpy() == 0,
-            deep > bounds.penetration,
-            gswo > bounds.balance,
-            disturbance > bounds.disturbance,
+            deep > bounds.max_penetration,
+            gswo > bounds.max_gswo,
+            disturbance > bounds.max_unresisted_load,
         ],
         range(1, len(OUTCOMES)),
         0,
@@ -156,7 +156,7 @@ def check_grasps(
     metrics = {
         "fswo": fswo,
         "gswo": gswo,
-        "disturbance": disturbance,
+        "unresisted_load": disturbance,
         "epsilon": epsilon,
         "penetration": deep,
         "self_penetration": overlap.numpy(),

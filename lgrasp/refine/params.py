@@ -63,33 +63,3 @@ class LocalSearch(Params):
     nearest: float = Field(
         default=0.2, gt=0, le=1, description="Share of the palmar points, nearest first, they come from."
     )
-
-
-class GraspBounds(BaseModel):
-    """What a finished grasp must satisfy, and its control poses; tighter than strict validity. Angles in degrees."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    penetration: float = Field(default=0.0008, ge=0, le=0.01, description="Largest hand-object penetration.")
-    self_margin: float = Field(default=0.0003, ge=0, le=0.01, description="Least distance of non-adjacent links.")
-    gap: float = Field(default=0.0013, gt=0, le=0.02, description="Largest distance of link and object at a contact.")
-    angle: float = Field(default=17.0, gt=0, le=90, description="Largest angle of the normals at a contact [deg].")
-    fold: float = Field(
-        default=20.0, gt=0, le=180, description="Largest angle of the object's normals about a contact [deg]."
-    )
-    friction: float = Field(default=0.5, gt=0, le=2, description="Friction coefficient of gswo and epsilon.")
-    balance: float = Field(default=0.035, gt=0, le=10, description="Largest gswo residual (norm).")
-    torque_scale: float = Field(default=10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")
-    disturbance: float = Field(
-        default=1.0, gt=0, le=1, description="Largest disturbance residual: unresisted part of a unit force."
-    )
-    open_distance: float = Field(
-        default=0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the normals."
-    )
-    open_margin: float = Field(
-        default=0.001, ge=0, le=0.05, description="Least distance of hand and object in q_pregrasp."
-    )
-    squeeze_force: float = Field(
-        default=15.0, ge=0, le=1000, description="Normal forces that q_squeeze presses with [N]."
-    )
-    stiffness: float = Field(default=5.0, gt=0, le=1e6, description="Stiffness that q_squeeze is meant for [N m/rad].")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from lgrasp.field.arrays import FieldArrays
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
@@ -29,6 +30,8 @@ class Context:
     base_seed: int
     shard: int
 
+    bounds: GraspBounds = with_default(default_factory=GraspBounds)
+    """What a grasp must satisfy, and what its measures are measured with: those of the pipeline."""
     scene: "Scene | None" = None
     """What a physics simulation is given; there if the pipeline has one."""
     space: "Space | None" = None

@@ -107,11 +107,11 @@ def test_several_objects_give_the_least(make_shard):
     """A row is as good as its worst object; absent objects and other shards' padding do not count."""
     shard = make_shard(40, objects=3, columns=2, contacts=6)
     frames = [mass_frame(record) for record in shard.objects]
-    got = row_metrics(shard.grasps, frames)
+    got = row_metrics(shard.grasps, frames, 0.5)
     alone = []
     for o in range(2):
         one = {n: v[:, o : o + 1] for n, v in shard.grasps.columns().items() if n.startswith(("object_", "contact_"))}
-        values = row_metrics(replace(shard.grasps, **one), frames)
+        values = row_metrics(replace(shard.grasps, **one), frames, 0.5)
         alone.append(np.where(shard.grasps.object_index[:, o, None] >= 0, values, np.inf))
     np.testing.assert_array_equal(got, np.minimum(*alone))
     assert np.isfinite(got).all()

@@ -264,6 +264,6 @@ def test_padding_and_frame():
     (points, normals), center = contacts(3, 3), np.array([0.3, -0.2, 0.1])
     padded_points, padded_normals = np.full((2, 4, 3), np.nan), np.full((2, 4, 3), np.nan)
     padded_points[0, [0, 2, 3]], padded_normals[0, [0, 2, 3]] = points + center, normals
-    got = wrench_spaces(padded_points.astype("f4"), padded_normals.astype("f4"), center, 0.05)
+    got = wrench_spaces(padded_points.astype("f4"), padded_normals.astype("f4"), center, 0.05, 0.5)
     assert got[0] == pytest.approx(exact(points, normals, 0.05), rel=1e-4)
     assert got[1].tolist() == [0, 0]

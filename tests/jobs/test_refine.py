@@ -135,7 +135,7 @@ def test_a_valid_row_is_replaced_by_one_that_resists_pulls_better(source, done, 
     assert not both(source, still)[2].any()
     improved = replaced & (read_shard(still.path).grasps.metrics["valid"] == 1)
     assert improved.sum() >= 4
-    assert (after.metrics["disturbance"][improved] < before.metrics["disturbance"][improved]).all()
+    assert (after.metrics["unresisted_load"][improved] < before.metrics["unresisted_load"][improved]).all()
     mesh = read_shard(source).objects[0]
     centre = trimesh.Trimesh(mesh.vertices, mesh.faces).center_mass
     for row in np.flatnonzero(improved).tolist():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.wrench import cone_forces, is_balanced, residual, unresisted
 
-from lgrasp.math.qp import MAX_CONTACTS, balance, disturbance, frictionless
+from lgrasp.math.qp import MAX_CONTACTS, balance, frictionless, unresisted_load
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -90,7 +90,7 @@ def _disturbance(
     for c in range(arm.shape[1]):
         arms[c] = arm[i, c]
         normals[c] = normal[i, c]
-    worst_out[i] = disturbance(arms, normals, arm.shape[1], mu, turn[i], limit)
+    worst_out[i] = unresisted_load(arms, normals, arm.shape[1], mu, turn[i], limit)
 
 
 def unheld(device, arms, normals, turn, mu=0.5, limit=1.0) -> np.ndarray:

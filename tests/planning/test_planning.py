@@ -30,8 +30,8 @@ def test_every_start_is_accounted_for(planned):
 
 def test_plans_satisfy_their_bounds(planned):
     metrics, bounds = planned.grasps.metrics, QUICK.bounds
-    assert metrics["penetration"].max() <= bounds.penetration
-    assert metrics["gap"].max() <= bounds.gap
+    assert metrics["penetration"].max() <= bounds.max_penetration
+    assert metrics["gap"].max() <= bounds.max_gap
     assert ((planned.grasps.contact_links >= 0).sum(1) >= 2).all()
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.refine.check import OUTCOMES, check_grasps
-from lgrasp.refine.params import GraspBounds
 from lgrasp.refine.refiner import object_pose
 
 
@@ -35,7 +35,7 @@ def test_forces_balance(checked):
     table, outcome = checked
     force, normal = (np.nan_to_num(a[outcome == 0]) for a in (table.contact_forces, table.contact_normals))
     np.testing.assert_allclose(-(force * normal).sum((1, 2)), 1, atol=1e-3)
-    assert np.linalg.norm(force.sum(1), axis=1).max() < GraspBounds().balance + 1e-3
+    assert np.linalg.norm(force.sum(1), axis=1).max() < GraspBounds().max_gswo + 1e-3
 
 
 def test_a_hand_in_the_object_is_told(inputs, filtered, make, valid):

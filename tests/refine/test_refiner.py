@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from lgrasp.geometry.rotations import so3_exp
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.refine.check import check_grasps
-from lgrasp.refine.params import GraspBounds
 from lgrasp.refine.refiner import Pose, object_pose
 
 

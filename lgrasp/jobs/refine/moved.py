@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from lgrasp.dataset import GraspRows, pose_matrix
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays, join_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.jobs.refine.rows import shard_rows
@@ -45,6 +46,7 @@ def move_rows(
     obj: ObjectModel,
     rows: GraspRows,
     params: RefineParams,
+    bounds: GraspBounds,
     *,
     always: bool = False,
     stored: bool = True,
@@ -63,7 +65,7 @@ def move_rows(
     refiner = Refiner(hand.model, obj, params, device=hand.device)
     arrays = upload_object(obj, hand.device)
     outside = _outside(rows, hand)
-    known = np.asarray(rows.metrics.get("disturbance", np.full(len(rows), np.nan))) if stored else None
+    known = np.asarray(rows.metrics.get("unresisted_load", np.full(len(rows), np.nan))) if stored else None
     parts, before, after, oks = [], [], [], []
     far = 0
     for first in range(0, len(rows), _ROWS):
@@ -71,13 +73,15 @@ def move_rows(
         given = _hands(rows, part, hand, obj)
         refined = refiner(*given)
         index = np.arange(len(rows))[part]
-        old, old_outcome = check_grasps(hand, arrays, object_pose(given), given.q.cpu().numpy(), params, index=index)
+        old, old_outcome = check_grasps(hand, arrays, object_pose(given), given.q.cpu().numpy(), bounds, index=index)
         new, new_outcome = check_grasps(
-            hand, arrays, object_pose(refined.pose), refined.pose.q.cpu().numpy(), params, index=index
+            hand, arrays, object_pose(refined.pose), refined.pose.q.cpu().numpy(), bounds, index=index
         )
         good, was = new_outcome == 0, old_outcome == 0
-        least = old.metrics["disturbance"] if known is None else np.fmin(old.metrics["disturbance"], known[part])
-        lower = new.metrics["disturbance"] < least - _BETTER
+        least = (
+            old.metrics["unresisted_load"] if known is None else np.fmin(old.metrics["unresisted_load"], known[part])
+        )
+        lower = new.metrics["unresisted_load"] < least - _BETTER
         take = np.ones_like(good) if always else good & (~was | lower)
         energies = _numbers(refiner.energy(*given)), _numbers(refined.energies)
         before.append(energies[0])

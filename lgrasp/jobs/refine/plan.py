@@ -108,7 +108,12 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
             pipeline="plan",
             seed=0,
             shard_index=0,
-            config={"plan": params.model_dump(mode="json"), "starts": job.starts, "stand_off": stand_off},
+            config={
+                "bounds": params.bounds.describe(),
+                "plan": params.model_dump(mode="json"),
+                "starts": job.starts,
+                "stand_off": stand_off,
+            },
         )
         record = hand_record(hand, mesh_blobs(source.urdf))
         statistics = {"device": device.name, "seconds_wall": seconds}

@@ -15,6 +15,7 @@ from lgrasp.dataset.tree import shard_tree
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder, shard_path
 from lgrasp.errors import ConfigError, HandError, OutputError, ShardError
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.records import Shard
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.refine.inputs import named_hand
@@ -34,6 +35,7 @@ class Refinement:
     hand: str | None = None  # none: the one that the shards name
     always: bool = False  # every row takes its refined posture, whatever the checks say
     params: RefineParams = field(default_factory=RefineParams)
+    bounds: GraspBounds = field(default_factory=GraspBounds)
     device: str = "auto"
     force: bool = False
     cache: Cache = field(default_factory=Cache)
@@ -80,6 +82,7 @@ def refine_shards(job: Refinement, progress: Callable[[Path, int, int], None] | 
             model,
             shard.grasps,
             job.params,
+            job.bounds,
             always=job.always,
             stored=job.form is None,
             progress=partial(progress, target, len(shard.grasps)) if progress else None,
@@ -147,7 +150,12 @@ def _hand(job: Refinement, path: Path, shard: Shard, hands: dict[str, HandArrays
 
 
 def _written(shard: Shard, rows: GraspRows, job: Refinement, seconds: float) -> Shard:
-    config = {**shard.header.config, "refine": job.params.model_dump(mode="json"), "refine_always": job.always}
+    config = {
+        **shard.header.config,
+        "bounds": job.bounds.describe(),
+        "refine": job.params.model_dump(mode="json"),
+        "refine_always": job.always,
+    }
     header = ShardHeader(
         pipeline=shard.header.pipeline,
         seed=shard.header.seed,

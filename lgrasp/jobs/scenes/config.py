@@ -21,7 +21,7 @@ class SceneConfig(BaseModel):
     objects: tuple[str, ...] = Field((), description="Names or paths; default: all objects of the grasps.")
     scale: float = Field(1.0, gt=0, description="Factor from the meshes' unit to metres.")
     grasps: Path | None = Field(None, description="Folder of shards; default: grasps are generated.")
-    pipeline: str = Field("swift", description="Generates grasps where no folder of them is given.")
+    pipeline: str = Field("robust", description="Generates grasps where no folder of them is given.")
     stock: int = Field(1000, ge=1, description="Grasps that are generated of each object.")
     scenes: int = Field(100, ge=1)
     seed: int = Field(0, ge=0, lt=2**63)

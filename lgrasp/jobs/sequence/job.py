@@ -198,6 +198,7 @@ def _shard(
             config={
                 "run_key": key,
                 "pipeline": job.pipeline.describe(),
+                "bounds": job.pipeline.bounds.describe(),
                 "objects": list(job.objects),
                 "scales": list(keys.scales),
                 "shard_rows": job.shard_rows,

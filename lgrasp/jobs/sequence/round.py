@@ -10,6 +10,7 @@ import numpy as np
 from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts, add_seconds
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.held import hold
 from lgrasp.grasp.sequences import SequenceTable, empty_sequences, join_sequences, take_sequences
 from lgrasp.grasp.tables import GraspTable, join_grasps, sort_grasps
@@ -135,7 +136,7 @@ class _Search:
             return
         name, size = self._inputs.spaces[number].name, self._params.wave
         seed = stage_seed(self._seed, self._rows.steps, name, wave)
-        context = _context(self._inputs, take_sequences(self._rows, chosen), number, size, seed)
+        context = _context(self._pipeline.bounds, self._inputs, take_sequences(self._rows, chosen), number, size, seed)
         grasps, meters = _from_field(self._pipeline, context, len(chosen) * size, self._pool)
         self._take(grasps, meters, chosen, number, size, wave * size)
 
@@ -168,7 +169,9 @@ class _Search:
         for number in np.unique(space[able]):
             own = np.flatnonzero(space[able] == number)
             part = replace(grasps, **{f.name: getattr(grasps, f.name)[own] for f in fields(grasps)})
-            context = _context(inputs, take_sequences(rows, able[own]), int(number), 1, self._seed)
+            context = _context(
+                self._pipeline.bounds, inputs, take_sequences(rows, able[own]), int(number), 1, self._seed
+            )
             meter = Meter(context.device)
             sets = optimised_sets(part, free[own], context)
             table = run_stage("filter", sets, self._pipeline, context, meter)
@@ -192,20 +195,22 @@ class _Search:
         grasps = sort_grasps(join_grasps(self._found[number]))
         place = np.searchsorted(rows, grasps.index // tries) * tries + grasps.index % tries
         before = take_sequences(self._rows, rows)
-        context = _context(self._inputs, before, number, tries, self._seed)
+        context = _context(self._pipeline.bounds, self._inputs, before, number, tries, self._seed)
         table, counts = grow((before, number, replace(grasps, index=place)), self._params, context)
         self._result.add(self._inputs.spaces[number].name, {"sequence": counts})
         parent = rows[table.parent]
         return replace(table, parent=parent, candidate=parent * tries + table.candidate % tries)
 
 
-def _context(inputs: SequenceInputs, before: SequenceTable, number: int, tries: int, seed: int) -> Context:
+def _context(
+    bounds: GraspBounds, inputs: SequenceInputs, before: SequenceTable, number: int, tries: int, seed: int
+) -> Context:
     """What stages are given to go on from some sequences with an opposition space."""
     space, view, step = inputs.spaces[number], inputs.views[number], before.steps
     posture, frozen = before.posture(inputs.hand.tree), before.used | ~space.joints
     holding = hold(view.hand, posture, frozen, inputs.objects[:step], before.pose, tries=tries)
     alias = inputs.device.alias
-    return Context(view.hand, inputs.objects[step], view.field, alias, seed, 0, space=space, holding=holding)
+    return Context(view.hand, inputs.objects[step], view.field, alias, seed, 0, bounds, space=space, holding=holding)
 
 
 def _from_field(

@@ -4,6 +4,7 @@ import warp as wp
 
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import overlap_depth
+from lgrasp.math.constants import BALANCED, CONE_EDGES
 from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted
 from lgrasp.math.quality import epsilon_bound
 from lgrasp.object.arrays import Object
@@ -11,6 +12,8 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
+_EDGES = wp.constant(CONE_EDGES)
+_BALANCED = wp.constant(BALANCED)
 _NARROWER = wp.constant(2)  # cones tried before the full one
 _SLACK = wp.constant(1.0e-3)  # by which their residual may be larger
 
@@ -79,7 +82,7 @@ def balance_grasps(
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     k = _contacts(obj, contact_surface[i], points, normals)
     fswo_out[i] = _balanced(points, normals, k, 0.0, 0, torque_scale, 0.0, forces)
-    gswo = _balanced(points, normals, k, friction, 8, torque_scale, 1.0e-4, forces)
+    gswo = _balanced(points, normals, k, friction, _EDGES, torque_scale, _BALANCED, forces)
     gswo_out[i] = gswo
     if gswo > balanced:
         outcome_out[i] = 5

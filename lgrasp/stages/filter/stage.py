@@ -27,7 +27,7 @@ from lgrasp.stages.filter.quality_kernels import (
     self_overlap,
 )
 
-VERSION = 6
+VERSION = 7
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, Tally]:
@@ -58,9 +58,9 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
             field,
             obj,
             context.held.struct,
-            params.self_margin,
-            params.gap,
-            math.cos(math.radians(params.angle)),
+            context.bounds.min_self_distance,
+            context.bounds.max_gap,
+            math.cos(math.radians(context.bounds.max_normal_angle)),
             poses.index,
             poses.pose,
             poses.palm_point,
@@ -79,7 +79,17 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
         wp.launch(
             deepen,
             dim=(bodies, n),
-            inputs=[hand, obj, params.penetration, used, poses.pose, inputs.pose, inputs.chosen, body, outcome],
+            inputs=[
+                hand,
+                obj,
+                context.bounds.max_penetration,
+                used,
+                poses.pose,
+                inputs.pose,
+                inputs.chosen,
+                body,
+                outcome,
+            ],
             outputs=[depth],
             device=d,
         )
@@ -94,10 +104,10 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
             obj,
             context.held.struct,
             context.seed("filter"),
-            params.penetration,
+            context.bounds.max_penetration,
             params.draws,
-            params.slack,
-            params.self_margin,
+            context.bounds.allowed_penetration,
+            context.bounds.min_self_distance,
             poses.index,
             poses.pose,
             poses.setting,
@@ -118,8 +128,8 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
                 hand,
                 obj,
                 context.held.struct,
-                params.penetration,
-                params.apart,
+                context.bounds.max_penetration,
+                context.bounds.min_object_distance,
                 poses.index,
                 poses.pose,
                 inputs.pose,
@@ -134,10 +144,10 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
         dim=n,
         inputs=[
             obj,
-            params.friction,
-            params.balance,
-            params.torque_scale,
-            params.penetration,
+            context.bounds.friction,
+            context.bounds.max_gswo,
+            context.bounds.torque_scale,
+            context.bounds.max_penetration,
             contact_surface,
             depth,
         ],
@@ -147,14 +157,26 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     wp.launch(
         resist_loads,
         dim=(6, n),
-        inputs=[obj, params.friction, params.disturbance, poses.pose, inputs.pose, contact_surface, outcome],
+        inputs=[
+            obj,
+            context.bounds.friction,
+            context.bounds.max_unresisted_load,
+            poses.pose,
+            inputs.pose,
+            contact_surface,
+            outcome,
+        ],
         outputs=[disturbance],
         device=d,
     )
     tally = empty_tally(REASONS, d)
     row, upto = (wp.empty(n, dtype=wp.int32, device=d) for _ in range(2))
     wp.launch(
-        count_outcomes, dim=n, inputs=[params.disturbance, disturbance], outputs=[outcome, upto, tally.device], device=d
+        count_outcomes,
+        dim=n,
+        inputs=[context.bounds.max_unresisted_load, disturbance],
+        outputs=[outcome, upto, tally.device],
+        device=d,
     )
     running_sums(upto)
     wp.launch(list_kept, dim=n, inputs=[outcome, upto], outputs=[row], device=d)
@@ -188,7 +210,15 @@ def _kept_rows(
     wp.launch(
         center_forces,
         dim=m,
-        inputs=[obj, params.friction, params.torque_scale, checked.contact_surface, checked.numbers[3], rows, row],
+        inputs=[
+            obj,
+            context.bounds.friction,
+            context.bounds.torque_scale,
+            checked.contact_surface,
+            checked.numbers[3],
+            rows,
+            row,
+        ],
         outputs=[checked.force],
         device=d,
     )
@@ -198,9 +228,9 @@ def _kept_rows(
         inputs=[
             hand,
             obj,
-            params.open_distance,
-            params.squeeze_force,
-            params.stiffness,
+            context.bounds.pregrasp_distance,
+            context.bounds.squeeze_force,
+            context.bounds.squeeze_stiffness,
             poses.pose,
             inputs.pose,
             checked.contact,
@@ -221,8 +251,8 @@ def _kept_rows(
             hand,
             obj,
             context.held.struct,
-            params.open_margin,
-            params.self_margin,
+            context.bounds.min_pregrasp_distance,
+            context.bounds.min_self_distance,
             poses.index,
             poses.pose,
             inputs.pose,
@@ -239,7 +269,7 @@ def _kept_rows(
     wp.launch(
         grasp_epsilon,
         dim=m,
-        inputs=[obj, context.seed("filter", 1), params.friction, checked.contact_surface, rows, row],
+        inputs=[obj, context.seed("filter", 1), context.bounds.friction, checked.contact_surface, rows, row],
         outputs=[epsilon],
         device=d,
     )
@@ -277,7 +307,7 @@ def _kept_rows(
     values = {
         "fswo": fswo,
         "gswo": gswo,
-        "disturbance": disturbance,
+        "unresisted_load": disturbance,
         "epsilon": fetched[10],
         "penetration": depth,
         "self_penetration": fetched[11],

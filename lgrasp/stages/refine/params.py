@@ -2,11 +2,11 @@
 
 from pydantic import Field
 
-from lgrasp.refine.params import GraspBounds, LocalSearch
+from lgrasp.refine.params import LocalSearch
 
 
-class RefineParams(LocalSearch, GraspBounds):
-    """How finished grasps are moved, in small steps and drawn to balance, and the bounds of filter for moved ones."""
+class RefineParams(LocalSearch):
+    """How finished grasps are moved: in small steps, and drawn to balance."""
 
     matching_rounds: int = Field(default=8, ge=0, le=1000, description="Times that nearest points are matched.")
     max_translation_step: float = Field(

@@ -14,7 +14,7 @@ from lgrasp.refine.volume import upload_target
 from lgrasp.stages.context import Context
 from lgrasp.stages.refine.params import RefineParams
 
-VERSION = 2
+VERSION = 3
 
 _making = threading.Lock()
 _made: dict[tuple[object, ...], Descent] = {}  # the latest
@@ -35,9 +35,11 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
     at = Hands.put(inverse_poses(inputs.pose), np.clip(inputs.q, tree.joint_lower, tree.joint_upper), context.device)
     _descent(params, context).run(at)
     pose, q = at.numpy()
-    table, outcome = check_grasps(context.hand, context.object, inverse_poses(pose), q, params, index=inputs.index)
+    table, outcome = check_grasps(
+        context.hand, context.object, inverse_poses(pose), q, context.bounds, index=inputs.index
+    )
     passed = outcome == 0
-    better = passed & (table.metrics["disturbance"] < inputs.metrics["disturbance"])
+    better = passed & (table.metrics["unresisted_load"] < inputs.metrics["unresisted_load"])
     counts = {"tried": len(inputs), "passed": int(passed.sum()), "replaced": int(better.sum())}
     return _replaced(_widened(inputs, width), _widened(table, width), better), counts
 

@@ -6,8 +6,9 @@ import warp as wp
 
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
+from lgrasp.math.constants import INSCRIBED
 from lgrasp.math.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward, vec_dof
-from lgrasp.math.qp import MAX_CONTACTS, balance, disturbance, frictionless
+from lgrasp.math.qp import MAX_CONTACTS, balance, frictionless, unresisted_load
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.search.params import MAX_KINDS
@@ -17,8 +18,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 MAX_KEEP = 64
 """Most candidates per pose and group."""
 
-_INSCRIBED = wp.constant(0.92388)
-"""cos(22.5 deg): the round cone inside an 8-edge cone however the edges are turned."""
+_INSCRIBED = wp.constant(INSCRIBED)
 vec_set = wp.types.vector(MAX_GROUPS, wp.int32)
 vec_kinds = wp.types.vector(MAX_KINDS, wp.int32)
 
@@ -277,7 +277,7 @@ def check_starts(
         for c in range(n):
             points[c] = points[c] - obj.com
         turn = wp.quat_inverse(wp.transform_get_rotation(pose[row]))
-        if disturbance(points, normals, n, friction, turn, most) > most:
+        if unresisted_load(points, normals, n, friction, turn, most) > most:
             score_out[row, lane] = -1.0
             return
     if realised == 0:

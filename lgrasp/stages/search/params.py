@@ -23,13 +23,10 @@ class SearchParams(BaseModel):
         "fswo", description="Residual that the search lowers: frictionless or with friction."
     )
     threshold: float = Field(0.1, gt=0, le=1, description="Squared residual at which a set is taken.")
-    friction: float = Field(0.5, gt=0, le=2, description="Friction coefficient of gswo.")
-    balance: float = Field(0.03, gt=0, le=1, description="Largest gswo residual (norm, inscribed round cone) of a set.")
-    disturbance: float = Field(
-        1.0, gt=0, le=1, description="Largest disturbance residual of a set; 1 asks for nothing."
+    gswo_share: float = Field(
+        6 / 7, gt=0, le=1, description="Largest gswo residual of a set, in round cones, over bounds.max_gswo."
     )
     least_force: float = Field(0.03, ge=0, le=0.5, description="Smallest share of the normal force on a contact.")
-    torque_scale: float = Field(10.0, gt=0, le=1000, description="Weight of torque against force [1/m].")
     restarts: int = Field(20, ge=1, le=4096, description="Random starts per pose.")
     moves: int = Field(12, ge=0, le=1000, description="Replacements of one contact per start and round.")
     rounds: int = Field(
@@ -40,7 +37,6 @@ class SearchParams(BaseModel):
     )
     per_pose: int = Field(3, ge=1, le=64, description="Most sets per pose.")
     passes: int = Field(1, ge=1, le=64, description="Rounds over the same candidates (multi-pass generation).")
-    margin: float = Field(0.0003, ge=0, le=0.01, description="Least distance between fingers [m].")
     separation: float = Field(
         0.12, ge=0, le=3, description="Sets of one pose with the same fingers differ by this [rad]."
     )

@@ -1,18 +1,20 @@
 """filter: what is emitted was asked for, holds what it claims, and nothing is lost."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.wrench import residual
 
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.tables import set_arrays, set_table
 from lgrasp.stages.filter.stage import REASONS, run
 
 
 @pytest.fixture(scope="module")
 def finished(tables, context, swift):
-    params = swift.params("filter")
-    return *run(tables.search, params, context), params
+    return *run(tables.search, swift.params("filter"), context), context.bounds
 
 
 def test_counts_and_order(finished, tables):
@@ -37,7 +39,7 @@ def test_joints(finished, inputs):
 
 
 def test_wrenches(finished, inputs):
-    grasps, _, params = finished
+    grasps, _, bounds = finished
     for i in range(len(grasps)):
         used = grasps.contact_links[i] >= 0
         points, normals = grasps.contact_points[i][used], -grasps.contact_normals[i][used]
@@ -46,22 +48,22 @@ def test_wrenches(finished, inputs):
         # cone edges are laid out in the object's frame
         turned = normals.astype(float)
         arms = (points - points.mean(0)).astype(float)
-        fswo = residual(arms, turned, 0.0, 0, params.torque_scale)
+        fswo = residual(arms, turned, 0.0, 0, bounds.torque_scale)
         assert grasps.metrics["fswo"][i] == pytest.approx(fswo, abs=2e-3)
-        gswo = residual(arms, turned, params.friction, 8, params.torque_scale)
+        gswo = residual(arms, turned, bounds.friction, 8, bounds.torque_scale)
         assert grasps.metrics["gswo"][i] == pytest.approx(gswo, abs=2e-3)
-        assert grasps.metrics["gswo"][i] <= params.balance
+        assert grasps.metrics["gswo"][i] <= bounds.max_gswo
         # the stored forces: in their cones, normal parts sum to 1, as balanced as the residual says
         normal = (forces * normals).sum(1)
         assert normal.sum() == pytest.approx(1.0, abs=1e-3)
         tangent = np.linalg.norm(forces - normal[:, None] * normals, axis=1)
-        assert (tangent <= params.friction * normal + 1e-4).all()
-        torque = params.torque_scale * np.cross(points - points.mean(0), forces).sum(0)
+        assert (tangent <= bounds.friction * normal + 1e-4).all()
+        torque = bounds.torque_scale * np.cross(points - points.mean(0), forces).sum(0)
         assert np.linalg.norm([*forces.sum(0), *torque]) == pytest.approx(gswo, abs=2e-3)
 
 
 def test_contacts(finished, inputs, link_poses, link_distance):
-    grasps, _, params = finished
+    grasps, _, bounds = finished
     X = link_poses(grasps.q)
     R, t = Rotation.from_quat(grasps.pose[:, 3:]), grasps.pose[:, :3]
     worst = np.zeros(len(grasps))
@@ -73,14 +75,14 @@ def test_contacts(finished, inputs, link_poses, link_distance):
             T = X[rows[mine], link]
             p = np.einsum("nji,nj->ni", T[:, :3, :3], points[mine] - T[:, :3, 3])
             worst[rows[mine]] = np.maximum(worst[rows[mine]], np.abs(link_distance(int(link), p)))
-    assert worst.max() < params.gap + 5e-5
+    assert worst.max() < bounds.max_gap + 5e-5
     # curved solids are facets in the stored gap
     np.testing.assert_allclose(grasps.metrics["gap"], worst, atol=1.5e-4)
 
 
 def test_control_poses(finished, inputs, link_poses):
     """The pregrasp backs off along the contact normals; the squeeze presses with the balancing forces."""
-    grasps, _, params = finished
+    grasps, _, bounds = finished
     tree = inputs.hand.model.tree
     R, t = Rotation.from_quat(grasps.pose[:, 3:]), grasps.pose[:, :3]
     base, opened = (link_poses(q) for q in (grasps.q, grasps.q_pregrasp))
@@ -92,7 +94,7 @@ def test_control_poses(finished, inputs, link_poses):
         link = grasps.contact_links[rows, c]
         p = R[rows].apply(grasps.contact_points[rows, c]) + t[rows]
         n = R[rows].apply(grasps.contact_normals[rows, c])
-        f = R[rows].apply(grasps.contact_forces[rows, c]) * params.squeeze_force
+        f = R[rows].apply(grasps.contact_forces[rows, c]) * bounds.squeeze_force
         B = base[rows, link]
         local = np.einsum("nji,nj->ni", B[:, :3, :3], p - B[:, :3, 3])
 
@@ -106,16 +108,16 @@ def test_control_poses(finished, inputs, link_poses):
             step[:, d] = 1e-3
             column = (moved(link_poses(grasps.q + step)) - moved(link_poses(grasps.q - step))) / 2e-3
             torque[rows, d] += (column * f).sum(1)
-    assert np.median(away) > 0.7 * params.open_distance
+    assert np.median(away) > 0.7 * bounds.pregrasp_distance
     assert np.quantile(away, 0.1) >= 0
-    wanted = grasps.q + torque / params.stiffness
+    wanted = grasps.q + torque / bounds.squeeze_stiffness
     inside = np.clip(wanted, tree.listed_limits[:, 0], tree.listed_limits[:, 1])
     np.testing.assert_allclose(grasps.q_squeeze, inside, atol=2e-4)
 
 
 def test_pregrasp_is_clear(finished, inputs, link_poses, link_distance):
     """Touching links are off the object by the margin, unless the pregrasp is the grasp itself."""
-    grasps, _, params = finished
+    grasps, _, bounds = finished
     X = link_poses(grasps.q_pregrasp)
     vertices = inputs.object.model.obstacle_points[::7]
     checked = 0
@@ -127,17 +129,17 @@ def test_pregrasp_is_clear(finished, inputs, link_poses, link_distance):
             if link >= 0 and inputs.hand.model.tree.link_body[link] > 0:
                 local = (points - X[i, link, :3, 3]) @ X[i, link, :3, :3]
                 near = np.linalg.norm(local, axis=1) < 0.08
-                assert link_distance(int(link), local[near]).min() > 0.5 * params.open_margin
+                assert link_distance(int(link), local[near]).min() > 0.5 * bounds.min_pregrasp_distance
                 checked += 1
     assert checked > 10
 
 
-def test_disturbance_is_bounded_where_asked(tables, context, swift):
-    params = swift.params("filter").model_copy(update={"disturbance": 0.2})
-    free, bound = run(tables.search, swift.params("filter"), context), run(tables.search, params, context)
-    assert (free[0].metrics["disturbance"] > 0.2).sum() == bound[1]["disturbance"] > 0
-    assert bound[0].metrics["disturbance"].max() <= 0.2
-    kept = free[0].metrics["disturbance"] <= 0.2
+def test_unresisted_load_is_bounded_where_asked(tables, context, swift):
+    params, other = swift.params("filter"), replace(context, bounds=GraspBounds(max_unresisted_load=0.2))
+    free, bound = run(tables.search, params, context), run(tables.search, params, other)
+    assert (free[0].metrics["unresisted_load"] > 0.2).sum() == bound[1]["unresisted load"] > 0
+    assert bound[0].metrics["unresisted_load"].max() <= 0.2
+    kept = free[0].metrics["unresisted_load"] <= 0.2
     np.testing.assert_array_equal(free[0].q[kept], bound[0].q)
 
 
@@ -145,13 +147,13 @@ def test_bounds_bind(tables, context, swift):
     params = swift.params("filter")
     base = run(tables.search, params, context)[1]
     for changes, reason in (
-        ({"penetration": 0.0}, "object collision"),
-        ({"gap": 1e-5}, "contact"),
-        ({"angle": 0.5}, "contact"),
-        ({"balance": 1e-7}, "balance"),
-        ({"self_margin": 0.01}, "self-collision"),
+        ({"max_penetration": 0.0}, "object collision"),
+        ({"max_gap": 1e-5}, "contact"),
+        ({"max_normal_angle": 0.5}, "contact"),
+        ({"max_gswo": 1e-7}, "balance"),
+        ({"min_self_distance": 0.01}, "self-collision"),
     ):
-        counts = run(tables.search, params.model_copy(update=changes), context)[1]
+        counts = run(tables.search, params, replace(context, bounds=GraspBounds(**changes)))[1]
         assert counts[reason] > base[reason], changes
         assert counts["kept"] < base["kept"]
         assert sum(counts.values()) == sum(base.values())

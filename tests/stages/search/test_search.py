@@ -6,6 +6,7 @@ from scipy.optimize import nnls
 from support.wrench import cone_forces, residual, wrenches
 
 from lgrasp.errors import ConfigError
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.tables import set_arrays
 from lgrasp.stages.search.params import SearchParams
 from lgrasp.stages.search.stage import run
@@ -20,6 +21,9 @@ def contacts(arrays, obj, i, T):
         surface.append(arrays["candidates.poses.palm_surface"][p])
     points = obj.contact_points[surface] @ T[p, :3, :3].T
     return (points - points.mean(0)).astype(float), -(obj.contact_normals[surface] @ T[p, :3, :3].T).astype(float)
+
+
+BOUNDS = GraspBounds()
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +61,13 @@ def test_residuals(found, inputs, pose_matrices):
     T = pose_matrices(arrays["candidates.poses.pose"])
     for i in range(len(arrays["pose"])):
         arms, normals = contacts(arrays, inputs.object.model, i, T)
-        exact = residual(arms, normals, 0.0, 0, params.torque_scale)
+        exact = residual(arms, normals, 0.0, 0, BOUNDS.torque_scale)
         assert exact == pytest.approx(arrays["score"][i], abs=2e-3)
         assert arrays["score"][i] ** 2 <= params.threshold
-        assert residual(arms, normals, params.friction, 8, params.torque_scale) < params.balance + 2e-3
+        assert (
+            residual(arms, normals, BOUNDS.friction, 8, BOUNDS.torque_scale)
+            < params.gswo_share * BOUNDS.max_gswo + 2e-3
+        )
 
 
 def test_every_contact_carries_its_share(found, inputs, pose_matrices):
@@ -68,7 +75,7 @@ def test_every_contact_carries_its_share(found, inputs, pose_matrices):
     T = pose_matrices(arrays["candidates.poses.pose"])
     for i in range(len(arrays["pose"])):
         arms, normals = contacts(arrays, inputs.object.model, i, T)
-        W = wrenches(arms, cone_forces(normals, 0.0, 0), params.torque_scale).T
+        W = wrenches(arms, cone_forces(normals, 0.0, 0), BOUNDS.torque_scale).T
         w, _ = nnls(np.vstack([W, np.ones(W.shape[1])]), np.append(np.zeros(6), 1.0))
         if np.linalg.matrix_rank(np.vstack([W, np.ones(W.shape[1])]), tol=1e-2) == W.shape[1]:  # else not unique
             assert (w / w.sum()).min() > params.least_force - 5e-3
@@ -130,7 +137,10 @@ def test_gswo_score(tables, context, swift, inputs, pose_matrices):
     T = pose_matrices(arrays["candidates.poses.pose"])
     for i in range(0, len(arrays["pose"]), 3):
         arms, normals = contacts(arrays, inputs.object.model, i, T)
-        assert residual(arms, normals, params.friction, 8, params.torque_scale) < params.balance + 2e-3
+        assert (
+            residual(arms, normals, BOUNDS.friction, 8, BOUNDS.torque_scale)
+            < params.gswo_share * BOUNDS.max_gswo + 2e-3
+        )
 
 
 def test_k_is_as_asked(tables, context):

@@ -1,0 +1,99 @@
+"""The one declaration of a valid grasp: every bound that a row must meet, and what its measures are measured with."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import Field, ValidationInfo, model_validator
+
+from lgrasp.config import Params
+from lgrasp.math.constants import DRIVE_STIFFNESS
+
+PROFILES: dict[str, dict[str, float]] = {
+    "strict": {},
+    "plan": {
+        "max_gap": 0.004,
+        "max_normal_angle": 45.0,
+        "max_normal_spread": 60.0,
+        "max_penetration": 0.002,
+        "min_self_distance": 0.0,
+        "max_gswo": 10.0,
+        "squeeze_force": 60.0,
+    },
+}
+"""Named profiles: ``strict`` are the defaults; ``plan`` is what a plan from far away must meet, whose residual is not
+bounded."""
+
+
+class GraspBounds(Params):
+    """What a finished grasp must satisfy, and its control poses; a profile's numbers stand in for those not given.
+
+    Lengths in metres, angles in degrees. A pipeline declares them once, under ``bounds``; no stage has its own.
+    """
+
+    profile: str = Field("strict", description="Where numbers that are not given come from: strict or plan.")
+    max_gap: float = Field(0.0013, gt=0, le=0.02, description="Largest distance of link and object at a contact.")
+    max_normal_angle: float = Field(
+        17.0, gt=0, le=90, description="Largest angle of the normals of link and object at a contact [deg]."
+    )
+    max_normal_spread: float = Field(
+        20.0, gt=0, le=180, description="Largest angle of the object's normals about a contact that is searched [deg]."
+    )
+    max_penetration: float = Field(0.0008, ge=0, le=0.02, description="Largest penetration of hand and object.")
+    allowed_penetration: float = Field(
+        0.0005, ge=0, le=0.01, description="Penetration of a finger's inner spheres that quick tests forgive."
+    )
+    min_self_distance: float = Field(0.0003, ge=0, le=0.01, description="Least distance of links that do not touch.")
+    min_object_distance: float = Field(
+        0.0005, ge=0, le=0.05, description="Least distance of the object from objects held."
+    )
+    friction: float = Field(0.5, gt=0, le=2, description="Friction coefficient of every measure.")
+    torque_scale: float = Field(10.0, gt=0, le=1000, description="Weight of torque against force in fswo, gswo [1/m].")
+    max_gswo: float = Field(0.035, gt=0, le=10, description="Largest residual of gswo (norm).")
+    max_unresisted_load: float = Field(
+        1.0, gt=0, le=1, description="Largest part of a unit force that is not resisted; 1 asks for nothing."
+    )
+    pregrasp_distance: float = Field(
+        0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the contact normals."
+    )
+    min_pregrasp_distance: float = Field(
+        0.001, ge=0, le=0.05, description="Least distance of touching fingers and object in q_pregrasp."
+    )
+    squeeze_force: float = Field(
+        15.0, ge=0, le=1000, description="Normal forces of all contacts together that q_squeeze presses with [N]."
+    )
+    squeeze_stiffness: float = Field(
+        DRIVE_STIFFNESS, gt=0, le=1e6, description="Of the position control that q_squeeze is meant for [N m/rad]."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in(cls, data: Any, info: ValidationInfo) -> Any:
+        if not isinstance(data, dict):
+            return data
+        profile = data.get("profile", "strict")
+        if profile not in PROFILES:
+            raise ValueError(f"unknown profile {profile!r}; profiles: {', '.join(PROFILES)}")
+        return PROFILES[profile] | data
+
+    def changed(self, **changes: float) -> "GraspBounds":
+        """A copy with some numbers replaced and checked; with another profile, that one's numbers and the changes."""
+        kept = {} if "profile" in changes else self.model_dump()
+        return GraspBounds.model_validate(kept | changes)
+
+    def describe(self) -> dict[str, Any]:
+        """As shards store them: the profile, and every number."""
+        return {"profile": self.profile, "numbers": self.model_dump(mode="json", exclude={"profile"})}
+
+
+def stored_bounds(config: Mapping[str, Any]) -> GraspBounds:
+    """The bounds that the rows of a shard passed, by its ``config``; of shards that tell none, the strict ones with the
+    friction that their filter had."""
+    told = config.get("bounds")
+    if told:
+        known = {name: x for name, x in told["numbers"].items() if name in GraspBounds.model_fields}
+        profile = told["profile"] if told["profile"] in PROFILES else "strict"
+        return GraspBounds.model_validate({"profile": profile} | known)
+    for stage in config.get("pipeline", {}).get("stages", ()) if isinstance(config.get("pipeline"), dict) else ():
+        if "friction" in stage.get("filter", {}):
+            return GraspBounds(friction=stage["filter"]["friction"])
+    return GraspBounds()
