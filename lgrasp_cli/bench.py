@@ -1,20 +1,28 @@
-"""``lgrasp bench``: how fast, on this machine; ``lgrasp bench table1``: beside the published figures."""
+"""``lgrasp bench``: how fast, on this machine; its commands set published figures beside ours."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lgrasp_cli.bench_refine import bench_refine
-from lgrasp_cli.bench_sequence import bench_sequence
 from lgrasp_cli.interrupt import before_end
-from lgrasp_cli.options import Device, Hand, JsonPath, check_report, open_cache, warn
-from lgrasp_cli.table1 import table1
+from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, check_report, open_cache, warn
+
+if TYPE_CHECKING:
+    from lgrasp.bench.comparison import Table
+    from lgrasp.bench.page import Page
+    from lgrasp.engine.cache import Cache
+    from lgrasp.jobs.config import JobConfig
 
 app = typer.Typer(invoke_without_command=True, subcommand_metavar="[table1|sequence|refine [OPTIONS]]")
-app.command()(table1)
-app.command("sequence")(bench_sequence)
-app.command("refine")(bench_refine)
+
+_List = Annotated[str | None, typer.Option(help="Names or files, separated by commas.", show_default="the published")]
+_ObjectDir = Annotated[
+    Path | None, typer.Option(help="Folder where the names of objects are looked up first.", show_default=False)
+]
+_Repeat = Annotated[int, typer.Option(min=1, help="Runs of each pipeline and object.")]
+_Seed = Annotated[int | None, typer.Option(help="Base seed; default: the pipelines'.", show_default=False)]
+_Workers = Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")]
 
 
 @app.callback()
@@ -22,20 +30,20 @@ def bench(
     context: typer.Context,
     hand: Hand = "allegro",
     objects: Annotated[str, typer.Option(help="Names or mesh files, separated by commas.")] = "mug",
-    pipelines: Annotated[str, typer.Option(help="Names or YAML files, separated by commas.")] = "swift,lightning",
+    pipelines: Annotated[
+        str, typer.Option(help="Names or YAML files, separated by commas.")
+    ] = "robust,swift,lightning",
     rows: Annotated[int, typer.Option("-n", "--rows", help="Grasps per run.")] = 2000,
-    repeat: Annotated[int, typer.Option(min=1, help="Runs of each pipeline and object.")] = 3,
-    object_dir: Annotated[
-        Path | None, typer.Option(help="Folder where the names of objects are looked up first.", show_default=False)
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Base seed; default: the pipelines'.", show_default=False)] = None,
+    repeat: _Repeat = 3,
+    object_dir: _ObjectDir = None,
+    seed: _Seed = None,
     device: Device = "auto",
-    workers: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
+    workers: _Workers = 0,
     json_path: JsonPath = None,
 ) -> None:
-    """Measure pipelines side by side: grasps per second of placement through filter, and what lies beside it.
+    """Measure pipelines side by side: strict-valid grasps per second of placement through filter.
 
-    Leaves no files behind, except compiled kernels in the cache.
+    The pipelines take turns on each object; ratios are to the last one. Nothing is left behind except compiled kernels.
 
     Example: lgrasp bench --objects mug,bowl --repeat 5
     """
@@ -43,31 +51,226 @@ def bench(
         _refuse_options(context)
         return
     cache = open_cache(None)
-    from lgrasp.bench.rate import Bench
+    from lgrasp.bench.comparison import new_table
     from lgrasp.config import parse_model
-    from lgrasp.engine.pipeline import pipeline_files
-    from lgrasp.jobs.config import JobConfig, plan_jobs
-    from lgrasp_cli.tables import print_report
+    from lgrasp.jobs.config import JobConfig
 
-    names = [name.strip() for name in pipelines.split(",")]
-    if "lightning" in names and "lightning" not in pipeline_files():
-        warn("pipeline lightning is not installed; left out")
-        names.remove("lightning")
     given = {
         "hands": [hand],
-        "objects": [name.strip() for name in objects.split(",")],
+        "objects": _split(objects),
         "object_dir": object_dir,
-        "pipelines": names,
+        "pipelines": _split(pipelines),
         "rows": rows,
         "seed": seed,
         "device": device,
         "workers": workers,
     }
-    jobs = plan_jobs(parse_model(JobConfig, given, "bench"), cache)
+    config = parse_model(JobConfig, given, "bench")
     check_report(json_path)
-    with Bench() as runs, before_end(runs.discard):
-        results = runs.measure(jobs, repeat, lambda line: typer.echo(line, err=True))
-    print_report(results, json_path, lambda: _show(results, rows, repeat))
+    table = _measure(new_table(config, repeat=repeat, baseline_rows=rows), config, cache)
+    _print_comparison(table, json_path)
+
+
+@app.command()
+def table1(
+    hands: _List = None,
+    objects: _List = None,
+    hand_dir: Annotated[
+        Path | None, typer.Option(help="Folder where NAME/NAME.urdf is looked up first.", show_default=False)
+    ] = None,
+    object_dir: _ObjectDir = None,
+    pipelines: Annotated[
+        str | None,
+        typer.Option(
+            help="Names or files; the last of several is the baseline.", show_default="those of configs/table1.yaml"
+        ),
+    ] = None,
+    rows: Annotated[
+        int | None, typer.Option("-n", "--rows", min=1, help="Grasps per run.", show_default="2000")
+    ] = None,
+    baseline_rows: Annotated[
+        int | None,
+        typer.Option("--baseline-n", min=1, help="Grasps per run of the baseline.", show_default="a tenth of -n"),
+    ] = None,
+    repeat: _Repeat = 3,
+    shard_rows: Annotated[
+        int | None, typer.Option(min=1, help="Rows of a shard; large ones fill a GPU.", show_default="10000")
+    ] = None,
+    seed: _Seed = None,
+    device: Device = "auto",
+    workers: _Workers = 0,
+    json_path: JsonPath = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Also draw the table as bars.", show_default=False)
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep the cells that --json PATH holds.")] = False,
+) -> None:
+    """Measure the table of Lightning Grasp: four hands, eight objects, our pipelines in turn, published figures beside.
+
+    A cell is a hand with an object; --json PATH is written after each, so that an interrupted run keeps what it has.
+    Hands and objects are those of configs/table1.yaml; without --hand-dir they have primitive geometry.
+
+    Example: lgrasp bench table1 --hand-dir hands --object-dir meshes --json table1.json --plot table1.png
+    """
+    cache = open_cache(None)
+    from lgrasp.bench.charts import check_plot, draw_table
+    from lgrasp.bench.comparison import new_table, read_table
+    from lgrasp.bench.page import load_published
+    from lgrasp.config import parse_model
+    from lgrasp.errors import ConfigError
+    from lgrasp.jobs.config import JobConfig, load_config
+
+    changes = {
+        "hands": hands and _split(hands),
+        "objects": objects and _split(objects),
+        "hand_dir": hand_dir,
+        "object_dir": object_dir,
+        "pipelines": pipelines and _split(pipelines),
+        "rows": rows,
+        "shard_rows": shard_rows,
+        "seed": seed,
+        "device": device,
+        "workers": workers,
+    }
+    given = {name: value for name, value in changes.items() if value is not None}
+    config = parse_model(JobConfig, load_config("table1").model_dump() | given, "bench table1")
+    file = None if json_path in (None, "-") else json_path
+    if resume and not file:
+        raise ConfigError("--resume needs the file to continue: --json PATH")
+    check_report(json_path)
+    if plot:
+        check_plot(plot)
+    if not objects:
+        config = _those_here(config)
+    baseline = baseline_rows or max(1, config.rows // 10)
+    table = new_table(config, repeat=repeat, baseline_rows=baseline, published=load_published("lightning"))
+    if resume and file:
+        table = read_table(Path(file), table)
+    table = _measure(table, config, cache, file)
+    if plot:
+        draw_table(table, plot)
+    _print_comparison(table, json_path)
+
+
+@app.command("sequence")
+def bench_sequence(
+    objects: Annotated[
+        list[str] | None,
+        typer.Argument(help="Pool of objects: mesh files or names.", show_default="mug sphere box capsule bottle bowl"),
+    ] = None,
+    hand: Hand = "allegro",
+    length: Annotated[int, typer.Option(min=2, help="Objects in a sequence.")] = 4,
+    sequences: Annotated[int, typer.Option(min=1, help="Sequences of objects, drawn from the pool.")] = 3,
+    width: Annotated[int, typer.Option("-n", "--width", min=1, help="Attempts begun with each sequence.")] = 256,
+    methods: Annotated[str, typer.Option(help="Methods, separated by commas.")] = "field,anneal",
+    baseline_width: Annotated[
+        int, typer.Option("--baseline-n", min=1, help="Attempts of methods after the first.")
+    ] = 32,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="Of the optimiser; default: as published.", show_default="6000")
+    ] = None,
+    policy: Annotated[str, typer.Option(help="uniform, as published, or lookahead.")] = "uniform",
+    physics: Annotated[str, typer.Option(help="Protocol: seq6 (friction 2.0, as published) or seq6_mu06.")] = "seq6",
+    scale: Annotated[str, typer.Option(help="Factor to metres, or range of the longest side [m].")] = "0.06:0.10",
+    pipeline: Annotated[
+        str, typer.Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.")
+    ] = "sequence",
+    seed: Annotated[int, typer.Option(min=0, help="Draws the sequences and the grasps.")] = 0,
+    device: Device = "auto",
+    workers: _Workers = 0,
+    json_path: JsonPath = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Measure the tables of SeqGrasp: success by opposition space and number of objects, for each method.
+
+    Every row is simulated, and only rows that hold are continued. Nothing is written but the cache.
+
+    Example: lgrasp bench sequence --sequences 2 --methods field
+    """
+    check_report(json_path)
+    cache = open_cache(cache_dir)
+    from lgrasp.bench.sequence import bench_methods, sequence_page
+    from lgrasp.config import parse_model
+    from lgrasp.jobs.sequence.job import SequenceJob
+    from lgrasp.jobs.sequence.sets import SequenceSets, object_sequences
+    from lgrasp.jobs.sequence.size import parse_size
+    from lgrasp_cli.options import choose_pipeline
+
+    pool = objects or ["mug", "sphere", "box", "capsule", "bottle", "bowl"]
+    sets = parse_model(SequenceSets, {"sets": sequences, "length": length, "permutations": 1}, "bench sequence")
+    chosen = choose_pipeline(pipeline, seed)
+    optimiser = chosen.params("sequence").optimiser.model_dump() | ({"iterations": iterations} if iterations else {})
+    chosen = chosen.with_params("sequence", policy=policy, width=width, optimiser=optimiser)
+    jobs = [
+        SequenceJob(
+            hand=hand,
+            objects=names,
+            rows=1,
+            pipeline=chosen,
+            out=Path("."),
+            size=parse_size(scale),
+            physics=physics,
+            device=device,
+            workers=workers,
+            cache=cache,
+        )
+        for names in object_sequences(pool, sets, seed)
+    ]
+    result = bench_methods(jobs, _split(methods), baseline_width, _say)
+    _print(result, json_path, sequence_page(result))
+
+
+@app.command("refine")
+def bench_refine(
+    hands: Annotated[str, typer.Option(help="Names, separated by commas.")] = "barrett,schunk_svh",
+    objects: Annotated[str, typer.Option(help="Names or mesh files, separated by commas.")] = "bowl,box,bottle,mug",
+    starts: Annotated[int, typer.Option("--starts", "-n", min=1, help="Starts on each object.")] = 80,
+    physics: Annotated[str, typer.Option(help="Protocol that decides what is valid.")] = "fc",
+    noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Table IV too: clouds with noise.")] = True,
+    device: Device = "auto",
+    json_path: JsonPath = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Measure tables I, III and IV of DiPGrasp: plans on meshes and noisy clouds, and coarse poses refined.
+
+    Plans are made with one hand at each start, as published, and with the best of several. A plan is valid when it
+    holds its object in simulation.
+
+    Example: lgrasp bench refine --objects bottle,mug --starts 40
+    """
+    check_report(json_path)
+    cache = open_cache(cache_dir)
+    from lgrasp.bench.refine import NOISES, bench_hands, refine_page
+
+    noises = NOISES if noise else ()
+    result = bench_hands(
+        _split(hands), _split(objects), starts, physics, noises=noises, device=device, cache=cache, progress=_say
+    )
+    _print(result, json_path, refine_page(result))
+
+
+def _split(names: str) -> list[str]:
+    return [name.strip() for name in names.split(",")]
+
+
+def _say(line: str) -> None:
+    typer.echo(line, err=True)
+
+
+def _print(result: Any, json_path: str | None, page: "Page") -> None:
+    from lgrasp_cli.tables import print_report, print_table
+
+    def show() -> None:
+        for line in page.head:
+            typer.echo(line)
+        for table in page.tables:
+            typer.echo(f"\n{table.title}" if table.title else "")
+            print_table(table.columns, table.rows, right=table.columns[table.texts :])
+        typer.echo()
+        for line in page.notes:
+            typer.echo(line)
+
+    print_report(result, json_path, show)
 
 
 def _refuse_options(context: typer.Context) -> None:
@@ -78,44 +281,37 @@ def _refuse_options(context: typer.Context) -> None:
         raise typer.BadParameter(f"options of 'bench {name}' come after its name: lgrasp bench {name} --device cpu")
 
 
-def _show(results: list[dict[str, Any]], rows: int, repeat: int) -> None:
-    from lgrasp_cli.tables import print_table
+def _those_here(config: "JobConfig") -> "JobConfig":
+    """The config without the objects that are not here, with a warning."""
+    from lgrasp.bench.comparison import without_missing
 
-    first = results[0]
-    typer.echo(f"{first['hand']} on {first['device']}: {rows:,} grasps, median of {repeat} (lowest to highest)")
-    columns = ("object", "pipeline", "strict/s", "range", "seed/s", "grasps", "near-dup", "poses", "survivors")
-    print_table(columns, [_speed(result) for result in results], right=("strict/s", "range", "seed/s", *columns[5:8]))
-    typer.echo()
-    stages = sorted({stage for result in results for stage in result["counts"]})
-    columns = ("object", "pipeline", *stages, "wall s", "object s", "field s", "load s", "MB")
-    print_table(columns, [_times(result, stages) for result in results], right=columns[2:])
-    typer.echo("thread-seconds per stage; object, field: made from nothing; load: both from the cache")
+    config, missing = without_missing(config)
+    if missing:
+        warn(f"left out {', '.join(missing)}: not shipped with lgrasp; --object-dir names a folder that has them")
+    return config
 
 
-def _speed(result: dict[str, Any]) -> tuple[str, ...]:
-    strict = result["strict_valid_per_s"]
-    return (
-        result["object"],
-        result["pipeline"],
-        f"{strict['median']:,.0f}",
-        f"{strict['min']:,.0f}-{strict['max']:,.0f}",
-        f"{result['seed_count_per_s']['median']:,.0f}",
-        f"{result['grasps']:,}" + (" starved" if result["starved"] else ""),
-        f"{result['near_duplicates']:,}",
-        f"{result['distinct_poses']:,}",
-        "  ".join(f"{stage} {count:,}" for stage, count in result["survivors"].items()),
-    )
+def _measure(table: "Table", config: "JobConfig", cache: "Cache", file: str | None = None) -> "Table":
+    """The table with all its cells; written to the file after each."""
+    from lgrasp.bench.comparison import cell_line, measure_table
+    from lgrasp.bench.rate import Bench
+    from lgrasp.engine.report import write_json
+
+    with Bench() as runs, before_end(runs.discard):
+        measured = measure_table(runs, table, config, cache, progress=_say)
+        for table, cell in measured:
+            if file:
+                write_json(file, table)
+            _say(cell_line(table, cell))
+    return table
 
 
-def _times(result: dict[str, Any], stages: list[str]) -> tuple[str, ...]:
-    seconds, built = result["seconds"], result["build_seconds"]
-    return (
-        result["object"],
-        result["pipeline"],
-        *(f"{seconds.get(stage, 0.0):.2f}" for stage in stages),
-        f"{seconds['wall']:.2f}",
-        f"{built['object']:.2f}",
-        f"{built['field']:.2f}",
-        f"{sum(result['load_seconds'].values()):.2f}",
-        f"{result['peak_rss_mb']:,.0f}",
-    )
+def _print_comparison(table: "Table", json_path: str | None) -> None:
+    """Print a table; the exit code is that of bad input if no cell could be measured."""
+    from lgrasp.bench.comparison import comparison_page
+    from lgrasp.errors import ConfigError
+
+    _print(table, json_path, comparison_page(table))
+    errors = [cell["error"] for cell in table["cells"]]
+    if all(errors):
+        raise ConfigError(f"no cell could be measured: {errors[0]}")

@@ -31,7 +31,7 @@ def draw_table(table: dict[str, Any], path: Path) -> None:
     One bar per pipeline with whiskers from the lowest to the highest run, and the published figure beside them.
 
     Args:
-        table: of :func:`lgrasp.bench.table1.measure_table`.
+        table: of :func:`lgrasp.bench.comparison.measure_table`.
 
     Raises:
         OutputError: the file cannot be written.

@@ -43,9 +43,9 @@ class Bench:
     def measure(self, jobs: list[Job], repeat: int, progress: Progress | None = None) -> list[dict[str, Any]]:
         """Run each job ``repeat`` times, in turns, and report the middle and the spread.
 
-        A small run comes first, untimed: it makes the inputs, loads the kernels and tells the rows to expect per
-        candidate, by which a GPU's first batch is sized; every run hands what it measured to the next run of its job,
-        as the shards of a long run do.
+        A small untimed run comes first: it makes the inputs, loads the kernels and measures the rows kept per
+        candidate, by which a GPU's first batch is sized. Every run passes its own yield to the next one of its job, as
+        the shards of a long run do.
 
         Args:
             jobs: what is compared; their folders and caches are not used.

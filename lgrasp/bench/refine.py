@@ -1,24 +1,26 @@
-"""The published tables of the local search, for our hands and objects: planning, refining, noise."""
+"""The tables of DiPGrasp for our hands and objects: plans on meshes and noisy clouds, coarse poses refined."""
 
 import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 
+from lgrasp.bench.page import Page, Table, caveats, load_published, number, over
 from lgrasp.cloud.model import cloud_object
-from lgrasp.dataset import GraspRows
+from lgrasp.dataset import GraspRows, HandRecord
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import load_object, object_key
 from lgrasp.geometry.decompose import decompose
 from lgrasp.geometry.rotations import so3_exp
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
+from lgrasp.hand.model import HandModel
 from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
 from lgrasp.jobs.refine.inputs import named_hand
 from lgrasp.jobs.refine.rows import shard_rows
@@ -28,9 +30,9 @@ from lgrasp.object.params import ObjectParams
 from lgrasp.planning.planner import Planner, PlanParams, cloud_params
 from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.refiner import Pose, Refiner, table_pose
-from lgrasp.refine.surface import hand_surface
+from lgrasp.refine.surface import Palmar, hand_surface
 from lgrasp.refine.visible_surface import seen_palmar
-from lgrasp.runtime.device import resolve_device
+from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts
 from lgrasp.simulate.scene import Scene, scene_of
@@ -38,64 +40,12 @@ from lgrasp.simulate.scene import Scene, scene_of
 NOISES = (0.0, 0.002, 0.005, 0.01)
 """Standard deviations of the points of clouds, besides meshes [m]."""
 STEPS = (0, 3, 6, 10, 13)
-"""Outer steps after which the energy is measured."""
+"""Rounds of matching after which the energy is measured."""
 
-PUBLISHED = {
-    "barrett": {
-        "epsilon": 0.201,
-        "valid": (0.6766, 0.6432, 0.5598, 0.3745),
-        "seconds": (0.030, 0.032, 0.036, 0.054),
-        "energy": (863.61, 148.44, 90.08, 67.43, 60.32),
-    },
-    "schunk_svh": {
-        "epsilon": 0.170,
-        "valid": (0.2650, 0.2511, 0.2121, 0.1470),
-        "seconds": (0.118, 0.125, 0.147, 0.213),
-        "energy": (3323.51, 669.42, 381.05, 266.21, 227.39),
-    },
-}
-"""Figures of the paper on an RTX 3080 by hand: epsilon; valid shares and seconds per valid grasp by NOISES; energy by
-STEPS, in 1e-5 of its unit."""
-
+ONE = {"rolls": 1, "tilts": (0.0,), "finalists": 1}
+"""Changes of the planner's parameters that leave one hand at each start, along the normal, as published."""
 _POINTS = 6000
-_SHIFT, _TURN, _BEND = (
-    0.01,
-    0.15,
-    0.15,
-)  # standard deviations of a coarse pose: [m] an axis, [rad] an axis, [rad] a joint
-
-
-class Planning(NamedTuple):
-    """Plans of one hand over some objects."""
-
-    starts: int
-    planned: int
-    valid: int  # of these that hold their object in simulation
-    epsilon: float  # mean of the valid ones
-    seconds: float  # of the planning
-
-    @property
-    def share(self) -> float:
-        return self.valid / max(self.starts, 1)
-
-    @property
-    def seconds_each(self) -> float:
-        """Per valid grasp."""
-        return self.seconds / max(self.valid, 1)
-
-
-class HandBench(NamedTuple):
-    """What was measured of a hand."""
-
-    hand: str
-    mesh: Planning
-    clouds: dict[float, Planning]
-    """By noise [m]."""
-    energy: tuple[float, ...]
-    """Mean E* of coarse poses after STEPS rounds of matching."""
-    milliseconds: tuple[float, ...]
-    """Time of one pose there, all poses side by side."""
-    poses: int
+_SHIFT, _TURN, _BEND = 0.01, 0.15, 0.15  # standard deviations of a coarse pose [m, rad] an axis, [rad] a joint
 
 
 @dataclass(frozen=True)
@@ -108,74 +58,120 @@ class _Case:
 
 @dataclass
 class _Total:
+    """Plans over some objects."""
+
     starts: int = 0
     planned: int = 0
     seconds: float = 0.0
     epsilon: list[np.ndarray] = field(default_factory=list)
 
-    def result(self) -> Planning:
+    def result(self) -> dict[str, Any]:
         epsilon = np.concatenate([np.zeros(0), *self.epsilon])
-        mean = float(epsilon.mean()) if len(epsilon) else 0.0
-        return Planning(self.starts, self.planned, len(epsilon), mean, self.seconds)
+        return {
+            "starts": self.starts,
+            "planned": self.planned,
+            "valid": len(epsilon),
+            "share": len(epsilon) / max(self.starts, 1),
+            "epsilon": float(epsilon.mean()) if len(epsilon) else None,
+            "seconds": self.seconds,
+            "seconds_each": over(self.seconds, len(epsilon)),
+        }
 
 
-def bench_hand(
-    hand: str,
+def bench_hands(
+    hands: Sequence[str],
     objects: Sequence[str],
     starts: int,
-    *,
     protocol: str = "fc",
+    *,
     noises: Sequence[float] = NOISES,
     device: str = "auto",
     cache: Cache | None = None,
     progress: Callable[[str], None] = lambda line: None,
-) -> HandBench:
-    """Plan and refine with one hand.
+) -> dict[str, Any]:
+    """Plan and refine with some hands.
 
-    Tables I and IV: ``starts`` on each object, once on its mesh and once for each noise on points of its surface with
-    the normals of the clean surface; a plan is valid when it holds the true object under the physics protocol.
-    Table III: the valid plans on meshes, displaced as a network would be (1 cm and 0.15 rad an axis, 0.15 rad a joint),
-    refined by ``COARSE``.
+    Tables I and IV: ``starts`` on each object, on its mesh and for each noise on points of its surface with the normals
+    of the clean surface, once with one hand at each start and once with the best of several. A plan is valid when it
+    holds the true object under the physics protocol. Table III: the valid plans on meshes, displaced as a network would
+    (1 cm and 0.15 rad an axis, 0.15 rad a joint), refined by ``COARSE``.
+
+    Returns:
+        What was asked; ``published``; ``best_of``, the hands at a start; and for each hand ``planning`` (``mesh`` or
+        ``cloud_N_mm`` -> ``one`` and ``best`` -> starts, planned, valid, share, epsilon (mean of the valid), seconds,
+        seconds_each (per valid plan)), ``energy`` (mean E* of coarse poses after ``steps`` rounds of matching),
+        ``milliseconds`` (of one pose there, all side by side) and ``poses``.
 
     Raises:
         LgraspError: hand, object, device or protocol are unknown.
     """
-    cache, at = cache or Cache(), resolve_device(device)
+    find_protocol(protocol)
+    store, at = cache or Cache(), resolve_device(device)
+    return {
+        "device": at.name,
+        "objects": list(objects),
+        "starts": starts,
+        "protocol": protocol,
+        "best_of": PlanParams().rolls,
+        "steps": list(STEPS),
+        "published": load_published("dipgrasp").model_dump(mode="json"),
+        "hands": {hand: _bench_hand(hand, objects, starts, protocol, noises, at, store, progress) for hand in hands},
+    }
+
+
+def _bench_hand(
+    hand: str,
+    objects: Sequence[str],
+    starts: int,
+    protocol: str,
+    noises: Sequence[float],
+    at: Device,
+    cache: Cache,
+    progress: Callable[[str], None],
+) -> dict[str, Any]:
     source, model = named_hand(cache, hand, at)
     arrays, palmar = upload_hand(model, at.alias), seen_palmar(source, model, at.alias)
     record = hand_record(model, mesh_blobs(source.urdf))
-    judge = partial(_holds, find_protocol(protocol).name)
-    cases = []
-    for name in objects:
-        mesh, key = object_key(name, 1.0, ObjectParams())
-        obj, _ = load_object(cache, mesh, key, 1.0, ObjectParams(), at.alias)
-        cut = partial(decompose, store=cache)
-        cases.append(_Case(obj, scene_of(record, [object_record(obj)], cut, at.alias)))
     stand_off = source.spec.stand_off or STAND_OFF
-    totals: dict[float | None, _Total] = {None: _Total(), **{noise: _Total() for noise in noises}}
+    totals = {(noise, hands): _Total() for noise in (None, *noises) for hands in ("one", "best")}
     coarse: list[tuple[ObjectModel, Pose]] = []
-    for case in cases:
-        for noise, total in totals.items():
+    for name in objects:
+        case = _case(name, record, cache, at.alias)
+        for (noise, hands), total in totals.items():
             target = case.model if noise is None else _cloud(case.model, noise)
-            what = "mesh" if noise is None else f"cloud, {1e3 * noise:g} mm"
-            params = PlanParams() if noise is None else cloud_params(PlanParams())
+            params = PlanParams(**ONE) if hands == "one" else PlanParams()
+            params = params if noise is None else cloud_params(params)
             planner = Planner(arrays, target, stand_off, params, palmar)
             if not any(t.starts for t in totals.values()):
                 planner.run(1)  # kernels are compiled outside of the clock
             begin = time.perf_counter()
             grasps, counts = planner.run(starts)
             seconds = time.perf_counter() - begin
-            holds = judge(case.scene, shard_rows(grasps, model, target)) if len(grasps) else np.zeros(0, bool)
-            progress(f"{hand}, {case.model.name}, {what}: {int(holds.sum())} of {starts}, {seconds:.1f} s")
+            rows = shard_rows(grasps, model, target)
+            holds = _holds(protocol, case.scene, rows) if len(grasps) else np.zeros(0, bool)
+            what = f"{hand}, {name}, {_named(noise)}, {'one hand' if hands == 'one' else f'best of {params.rolls}'}"
+            progress(f"{what}: {int(holds.sum())} of {starts}, {seconds:.1f} s")
             total.starts += counts["starts"]
             total.planned += len(grasps)
             total.seconds += seconds
             total.epsilon.append(grasps.metrics["epsilon"][holds])
-            if noise is None:
+            if noise is None and hands == "best":
                 coarse.append((case.model, _displaced(grasps, holds, at.alias)))
     energy, milliseconds, poses = _falls(arrays.model, palmar, coarse, at.alias)
-    clouds = {noise: total.result() for noise, total in totals.items() if noise is not None}
-    return HandBench(hand, totals[None].result(), clouds, energy, milliseconds, poses)
+    planning: dict[str, dict[str, Any]] = {}
+    for (noise, hands), total in totals.items():
+        planning.setdefault(_named(noise), {})[hands] = total.result()
+    return {"planning": planning, "energy": energy, "milliseconds": milliseconds, "poses": poses}
+
+
+def _named(noise: float | None) -> str:
+    return "mesh" if noise is None else f"cloud_{1e3 * noise:g}_mm"
+
+
+def _case(name: str, record: HandRecord, cache: Cache, device: str) -> _Case:
+    mesh, key = object_key(name, 1.0, ObjectParams())
+    model, _ = load_object(cache, mesh, key, 1.0, ObjectParams(), device)
+    return _Case(model, scene_of(record, [object_record(model)], partial(decompose, store=cache), device))
 
 
 def _holds(protocol: str, scene: Scene, rows: GraspRows) -> np.ndarray:
@@ -199,8 +195,10 @@ def _displaced(table: GraspTable, holds: np.ndarray, device: str) -> Pose:
     return Pose(so3_exp(_TURN * noise[:, :3]) @ R, t + _SHIFT * noise[:, 3:6], q + _BEND * noise[:, 6:])
 
 
-def _falls(hand, palmar, coarse: list[tuple[ObjectModel, Pose]], device: str):
-    """Mean energy of coarse poses, and the milliseconds of one, after STEPS rounds of matching; and their number."""
+def _falls(
+    hand: HandModel, palmar: Palmar, coarse: list[tuple[ObjectModel, Pose]], device: str
+) -> tuple[list[float], list[float], int]:
+    """Mean energy of coarse poses, and the milliseconds of one, after STEPS outer steps; and their number."""
     surface = hand_surface(hand, palmar)
     energy, seconds, count = np.zeros(len(STEPS)), np.zeros(len(STEPS)), 0
     for model, pose in coarse:
@@ -214,4 +212,70 @@ def _falls(hand, palmar, coarse: list[tuple[ObjectModel, Pose]], device: str):
             energy[k] += float(found.sum())
             seconds[k] += time.perf_counter() - begin
     each = max(count, 1)
-    return tuple((energy / each).tolist()), tuple((1e3 * seconds / each).tolist()), count
+    return (energy / each).tolist(), (1e3 * seconds / each).tolist(), count
+
+
+def refine_page(result: dict[str, Any]) -> Page:
+    """The tables as texts: the paper's figures stand beside one hand at each start."""
+    published, starts = result["published"], result["starts"]
+    head = [
+        f"{result['device']}: {starts} starts on each of {', '.join(result['objects'])}; valid by {result['protocol']}"
+    ]
+    columns = ("hand", "whose", "epsilon", "valid", "s each", "planned")
+    tables = [Table("Table I: plans on meshes", columns, _plans(result), 2)]
+    columns = ("hand", "whose", *map(str, result["steps"]), "falls", "ms")
+    tables.append(Table("Table III: energy of coarse poses after rounds of matching", columns, _energies(result), 2))
+    clouds = [name for one in result["hands"].values() for name in one["planning"] if name != "mesh"]
+    if clouds:
+        names = tuple(dict.fromkeys(clouds))
+        columns = ("hand", "whose", *(name[6:].replace("_", " ") for name in names), "kept", "s each")
+        rows = [row for hand in result["hands"] for row in _noisy(result, hand, names)]
+        tables.append(Table("Table IV: valid plans on points of the surface, by noise", columns, rows, 2))
+    return Page(head, tables, caveats(published))
+
+
+def _whose(result: dict[str, Any]) -> dict[str, str]:
+    return {"one": "ours, one hand", "best": f"ours, best of {result['best_of']}"}
+
+
+def _plans(result: dict[str, Any]) -> list[tuple[str, ...]]:
+    rows = []
+    for hand, one in result["hands"].items():
+        for hands, whose in _whose(result).items():
+            plans = one["planning"]["mesh"][hands]
+            planned = f"{plans['planned'] / max(plans['starts'], 1):.1%}"
+            rows.append((hand, whose, *_plan(plans["epsilon"], plans["share"], plans["seconds_each"]), planned))
+            if hands == "one" and (paper := result["published"]["figures"].get(hand)):
+                rows.append((hand, "paper", *_plan(paper["epsilon"], paper["valid"][0], paper["seconds"][0]), "-"))
+    return rows
+
+
+def _plan(epsilon: float | None, share: float, seconds: float | None) -> tuple[str, str, str]:
+    return number(epsilon, ".3f"), f"{share:.1%}", number(seconds, ".2g")
+
+
+def _energies(result: dict[str, Any]) -> list[tuple[str, ...]]:
+    rows = []
+    for hand, one in result["hands"].items():
+        energy, paper = one["energy"], result["published"]["figures"].get(hand)
+        ours = (f"ours, {one['poses']} poses", *(f"{e:.4f}" for e in energy))
+        rows.append((hand, *ours, number(over(energy[0], energy[-1]), ".1f", "x"), f"{one['milliseconds'][-1]:.1f}"))
+        if paper:
+            energy = paper["energy"]
+            rows.append((hand, "paper", *(f"{e:.0f}" for e in energy), f"{energy[0] / energy[-1]:.1f}x", "-"))
+    return rows
+
+
+def _noisy(result: dict[str, Any], hand: str, names: Sequence[str]) -> list[tuple[str, ...]]:
+    def row(whose: str, shares: list[float], seconds: float | None) -> tuple[str, ...]:
+        kept = number(over(shares[-1], shares[0]), ".0%")
+        return (hand, whose, *(f"{share:.1%}" for share in shares), kept, number(seconds, ".2g"))
+
+    rows, planning = [], result["hands"][hand]["planning"]
+    for hands, whose in _whose(result).items():
+        plans = [planning[name][hands] for name in names]
+        rows.append(row(whose, [p["share"] for p in plans], plans[-1]["seconds_each"]))
+        paper = result["published"]["figures"].get(hand)
+        if hands == "one" and paper and len(paper["valid"]) == len(names):
+            rows.append(row("paper", paper["valid"], paper["seconds"][-1]))
+    return rows

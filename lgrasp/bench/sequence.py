@@ -1,12 +1,13 @@
-"""The published tables of sequential grasps, measured: success by opposition space and by number of objects."""
+"""The tables of SeqGrasp, measured: success by opposition space and by number of objects, for several methods."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from lgrasp.bench.page import Page, Table, caveats, load_published, number, over, times
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts
 from lgrasp.grasp.bounds import GraspBounds
@@ -20,50 +21,56 @@ from lgrasp.jobs.sequence.round import Round, Verdicts, run_round
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 
-PUBLISHED: dict[str, Any] = {
-    "source": "Grasping a Handful (Lu et al., 2025), Tables II and III, Allegro hand, one NVIDIA A100",
-    "spaces": {
-        "middle-ring": 14.30,
-        "index-middle": 13.90,
-        "thumb-index": 5.75,
-        "ring-palm": 45.57,
-        "middle-palm": 37.74,
-        "index-palm": 35.52,
-        "thumb-palm": 17.67,
-    },
-    "consumed": [0.0, 3.88, 49.68, 100.0],
-    "success": [50.04, 21.21, 19.49, 2.93],
-    "penetration": [1.73, 2.14, 2.23, 2.70],
-    "seconds_per_256": [900.0, 900.0, 900.0, 900.0],
-    "diversity": [0.332, 0.367, 0.349, 0.312],
-}
-"""Success and consumed shares [%], mean largest penetration [mm], seconds for a batch of 256, diversity [rad]."""
+_RATES = ("held_per_s", "strict_per_s")
 
 
-def measure_sequences(
-    jobs: list[SequenceJob], rounds: int, progress: Callable[[str], None] | None = None
+def bench_methods(
+    jobs: list[SequenceJob], methods: Sequence[str], baseline_width: int, progress: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Run rounds of each job, simulate every row and go on from those that hold; nothing is written.
+    """Run each method on the same sequences of objects; methods after the first with ``baseline_width`` attempts.
+
+    Returns:
+        ``published``; ``device``, ``physics`` and ``sequences`` as asked; ``methods``: name -> see
+        :func:`measure_sequences`, with the ``ratios`` of the first method to it, by rows per second.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for method in methods:
+        changes: dict[str, Any] = {"method": method} | ({"width": baseline_width} if found else {})
+        own = [replace(job, pipeline=job.pipeline.with_params("sequence", **changes)) for job in jobs]
+        found[method] = measure_sequences(own, progress)
+    first = found[methods[0]]["objects"]
+    for one in found.values():
+        one["ratios"] = [
+            {name: over(a[name], b[name]) for name in _RATES} for a, b in zip(first, one["objects"], strict=True)
+        ]
+    return {
+        "published": load_published("seqgrasp").model_dump(mode="json"),
+        "device": resolve_device(jobs[0].device).name,
+        "sequences": [list(job.objects) for job in jobs],
+        "physics": jobs[0].physics,
+        "methods": found,
+    }
+
+
+def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] | None = None) -> dict[str, Any]:
+    """Run a round of each job, simulate every row and continue those that hold; nothing is written.
 
     Grasps of an optimiser are simulated as published: only a penetration of 1 cm, contacts farther away than that, and
     links in links are left out before.
 
     Args:
         jobs: the same method on several sequences of objects; each names a physics protocol.
-        rounds: of each job.
         progress: called with one line before each round.
 
     Returns:
-        ``spaces`` (name -> sequences tried with it, rows found, rows that held), ``objects`` (for each number of
-        objects: rows simulated, strict-valid and held, consumed, ``seconds`` of the step, penetration of all rows [mm],
-        diversity [rad]), ``strict_per_s`` (strict-valid rows of two objects, simulation not counted).
+        ``begun`` (attempts of each sequence), ``spaces`` (name -> sequences tried with it, rows found, rows that held)
+        and ``objects`` (for each number of objects, see :class:`_Objects`).
     """
     device = resolve_device(jobs[0].device)
     bounds = jobs[0].pipeline.bounds
     length = max(len(job.objects) for job in jobs)
     spaces: dict[str, dict[str, int]] = {}
     objects = [_Objects() for _ in range(length)]
-    two, seconds = 0, 0.0
     for job in jobs:
         pipeline, cache = _as_published(job.pipeline), job.cache
         keys = sequence_keys(job.hand, job.objects, job.size, pipeline.seed, pipeline.object, pipeline.field)
@@ -73,25 +80,23 @@ def measure_sequences(
         inputs = replace(inputs, scene=scene)
         load_kernels(device.alias, kernel_modules("lgrasp.stages."))
         assert job.physics
-        simulate = simulated(inputs, job.physics)
-        for number in range(rounds):
-            if progress:
-                names = " ".join(inputs.object_ids)
-                progress(f"{pipeline.params('sequence').method}, {names}: round {number + 1} of {rounds}")
-            seen: list[SequenceTable] = []
-            workers = job.workers or os.cpu_count() or 1
-            found = run_round(pipeline, inputs, 0, number, workers, verdicts=_watched(simulate, seen))
-            _count_spaces(spaces, found)
-            for step, table in enumerate(seen):
-                strict = int(_strict(table, bounds).sum())
-                objects[step].add(table, found.levels[step], inputs, found.walls[step], strict)
-            two += int(_strict(seen[1], bounds).sum()) if len(seen) > 1 else 0
-            seconds += sum(found.walls[:2])
-    return {
-        "spaces": spaces,
-        "objects": [entry.summary() for entry in objects],
-        "strict_per_s": two / seconds if seconds else 0.0,
-    }
+        params = pipeline.params("sequence")
+        if progress:
+            progress(f"{params.method}, {' '.join(inputs.object_ids)}: {params.width} attempts")
+        seen: list[SequenceTable] = []
+        workers = job.workers or os.cpu_count() or 1
+        found = run_round(pipeline, inputs, 0, 0, workers, verdicts=_watched(simulated(inputs, job.physics), seen))
+        _count_spaces(spaces, found)
+        attempts = [params.width, *map(len, found.levels)]
+        for step, entry in enumerate(objects):
+            entry.begun += params.width
+            entry.attempts += attempts[step] if step < len(attempts) else 0
+            entry.seconds += sum(found.walls[step : step + 1])
+            entry.total += sum(found.walls[: step + 1])
+        for step, table in enumerate(seen):
+            objects[step].add(table, found.levels[step], inputs, int(_strict(table, bounds).sum()))
+    begun = jobs[0].pipeline.params("sequence").width
+    return {"begun": begun, "spaces": spaces, "objects": [entry.summary() for entry in objects]}
 
 
 def _as_published(pipeline: Pipeline) -> Pipeline:
@@ -133,44 +138,141 @@ def _count_spaces(spaces: dict[str, dict[str, int]], found: Round) -> None:
 
 
 class _Objects:
-    """Rows of one number of objects, over rounds and sequences."""
+    """Rows of one number of objects, over the sequences."""
 
     def __init__(self) -> None:
-        self._simulated = self._held = self._consumed = self._strict = 0
-        self._seconds = 0.0
+        self.begun = self.attempts = 0  # with the first object; with this one, after rows that held
+        self.seconds = self.total = 0.0  # of this step; of it and those before; simulation not counted
+        self._simulated = self._strict = self._held = self._consumed = 0
         self._depth: list[np.ndarray] = []
         self._q: list[np.ndarray] = []
 
-    def add(
-        self, tried: SequenceTable, held: SequenceTable, inputs: SequenceInputs, seconds: float, strict: int
-    ) -> None:
-        self._strict += strict
+    def add(self, tried: SequenceTable, held: SequenceTable, inputs: SequenceInputs, strict: int) -> None:
+        """Count rows: those simulated, those of them that held, and how many were strict."""
         self._simulated += len(tried)
+        self._strict += strict
         self._held += len(held)
-        used = held.used
-        self._consumed += sum(
-            consumed(inputs.spaces, frozenset(s.tolist()), u) for s, u in zip(held.space, used, strict=True)
-        )
-        self._seconds += seconds
+        pairs = zip(held.space, held.used, strict=True)
+        self._consumed += sum(consumed(inputs.spaces, frozenset(s.tolist()), used) for s, used in pairs)
         self._depth.append(1e3 * tried.metrics["penetration"])
         self._q.append(held.q[:, -1])
 
     def summary(self) -> dict[str, Any]:
-        depth = np.concatenate(self._depth) if self._depth else np.zeros(0)
+        """The numbers.
+
+        Returns:
+            Counts; shares that hold [%]: of all attempts begun (``success``), of those that reached this step, of the
+            rows simulated; rows per second of all steps so far; ``penetration_*`` [mm] of the rows simulated;
+            ``diversity``, the standard deviation of the joints of held rows [rad].
+        """
+        depth = np.concatenate([np.zeros(0), *self._depth])
         q = np.concatenate(self._q) if self._q else np.zeros((0, 1))
         return {
+            "begun": self.begun,
+            "attempts": self.attempts,
             "simulated": self._simulated,
             "strict": self._strict,
             "held": self._held,
-            "success": _percent(self._held, self._simulated),
+            "success": _percent(self._held, self.begun),
+            "success_of_attempts": _percent(self._held, self.attempts),
+            "success_of_simulated": _percent(self._held, self._simulated),
             "consumed": _percent(self._consumed, self._held),
+            "penetration_mean": float(depth.mean()) if len(depth) else None,
             "penetration_median": float(np.median(depth)) if len(depth) else None,
             "penetration_max": float(depth.max()) if len(depth) else None,
-            "seconds": self._seconds,
-            "seconds_per_256": 256 * self._seconds / self._simulated if self._simulated else None,
+            "seconds": self.seconds,
+            "seconds_per_256": over(256 * self.seconds, self.attempts),
+            "held_per_s": over(self._held, self.total),
+            "strict_per_s": over(self._strict, self.total),
             "diversity": float(q.std(0).mean()) if len(q) > 1 else None,
         }
 
 
 def _percent(part: int, whole: int) -> float | None:
-    return 100.0 * part / whole if whole else None
+    return over(100.0 * part, whole)
+
+
+def sequence_page(result: dict[str, Any]) -> Page:
+    """The tables as texts; published figures stand in parentheses beside what is counted as they are."""
+    published, count = result["published"]["figures"], len(result["sequences"])
+    head = [f"{result['device']}: {count} sequence{'s' if count > 1 else ''} of objects; physics {result['physics']}"]
+    tables = []
+    for method, found in result["methods"].items():
+        title = f"{method}: {found['begun']} attempts begun with each sequence"
+        tables += [_space_table(title, found["spaces"], published["spaces"])]
+        tables += [_share_table(found["objects"], published), _measure_table(found["objects"], published)]
+    tables.append(_rate_table(result))
+    notes = [
+        "hold/tried, hold/begun: of all attempts, as published; the other shares are of what was left of them",
+        "(...): published; strict: rows within the bounds of the pipeline, whether they hold or not",
+        *caveats(result["published"]),
+    ]
+    return Page(head, tables, notes)
+
+
+def _space_table(title: str, spaces: dict[str, dict[str, int]], published: dict[str, float]) -> Table:
+    rows = [
+        (
+            name,
+            *(number(counts[key]) for key in ("tried", "found", "held")),
+            number(_percent(counts["held"], counts["tried"]), ".1f", " %"),
+            number(published.get(name), ".1f", " %"),
+            number(_percent(counts["held"], counts["found"]), ".1f", " %"),
+        )
+        for name, counts in spaces.items()
+    ]
+    return Table(title, ("space", "tried", "found", "hold", "hold/tried", "published", "hold/found"), rows)
+
+
+def _share_table(entries: list[dict[str, Any]], published: dict[str, list[float]]) -> Table:
+    columns = ("objects", "begun", "attempts", "simulated", "strict", "hold", "hold/begun", "hold/attempts", "hold/sim")
+    rows = [
+        (
+            str(n + 1),
+            *(number(entry[key]) for key in ("begun", "attempts", "simulated", "strict", "held")),
+            _beside(entry["success"], published["success"], n, ".1f", " %"),
+            number(entry["success_of_attempts"], ".1f", " %"),
+            number(entry["success_of_simulated"], ".1f", " %"),
+        )
+        for n, entry in enumerate(entries)
+    ]
+    return Table("", columns, rows)
+
+
+def _measure_table(entries: list[dict[str, Any]], published: dict[str, list[float]]) -> Table:
+    columns = ("objects", "penetration: mean mm", "median", "largest", "consumed", "s per 256 attempts", "diversity")
+    rows = [
+        (
+            str(n + 1),
+            _beside(entry["penetration_mean"], published["penetration"], n, ".2f"),
+            *(number(entry[key], ".2f") for key in ("penetration_median", "penetration_max")),
+            _beside(entry["consumed"], published["consumed"], n, ".1f", " %"),
+            _beside(entry["seconds_per_256"], published["seconds_per_256"], n, ".1f"),
+            _beside(entry["diversity"], published["diversity"], n, ".3f"),
+        )
+        for n, entry in enumerate(entries)
+    ]
+    return Table("", columns, rows)
+
+
+def _rate_table(result: dict[str, Any]) -> Table:
+    """Rows per second of each method and of the paper, by what counts as a row; the first method over the others."""
+    first = next(iter(result["methods"]))
+    columns = ("objects", "method", "hold/s", "strict/s", f"{first}/it, hold", f"{first}/it, strict")
+    rows = []
+    figures = result["published"]["figures"]
+    for n in range(max(len(found["objects"]) for found in result["methods"].values())):
+        for method, found in result["methods"].items():
+            rates = [number(found["objects"][n][name], ",.3g") for name in _RATES]
+            ratios = [times(found["ratios"][n][name]) for name in _RATES]
+            rows.append((str(n + 1), method, *rates, *(ratios if method != first else ("", ""))))
+        if n < len(figures["success"]):
+            seconds = sum(figures["seconds_per_256"][: n + 1])
+            held = 256 * figures["success"][n] / 100 / seconds
+            ratio = over(result["methods"][first]["objects"][n]["held_per_s"], held)
+            rows.append((str(n + 1), "published", f"{held:,.3g}", "-", times(ratio), "-"))
+    return Table("rows per second, all steps so far, simulation not counted", columns, rows, 2)
+
+
+def _beside(ours: float | None, theirs: list[float], n: int, form: str, unit: str = "") -> str:
+    return f"{number(ours, form, unit)} ({number(theirs[n] if n < len(theirs) else None, form, unit)})"

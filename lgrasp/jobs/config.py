@@ -22,16 +22,6 @@ if TYPE_CHECKING:
     from lgrasp.jobs.sequence.job import SequenceJob
 
 
-class Published(BaseModel):
-    """Figures of others that a benchmark shows beside its own."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    source: str = Field(description="Where they are printed.")
-    device: str = Field(description="What they were measured on.")
-    per_s: dict[str, dict[str, float]] = Field(description="Hand -> object -> grasps per second.")
-
-
 class JobConfig(BaseModel):
     """Many hands and objects in one run: configs/NAME.yaml. Paths are relative to the current folder."""
 
@@ -54,7 +44,6 @@ class JobConfig(BaseModel):
     batch: int = Field(0, ge=0)
     shard_rows: int = Field(10_000, ge=1)
     reuse: bool = False
-    published: Published | None = Field(None, description="Figures of others; for lgrasp bench table1.")
     sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn of them.")
 
     @model_validator(mode="after")

@@ -8,17 +8,26 @@ import pytest
 
 from lgrasp.bench import rate as bench_module
 from lgrasp.bench.charts import check_plot, draw_table
+from lgrasp.bench.comparison import (
+    comparison_page,
+    measure_table,
+    new_table,
+    read_table,
+    trimmed_mean,
+    with_ratios,
+    without_missing,
+)
+from lgrasp.bench.page import Published, load_published
 from lgrasp.bench.rate import Bench
-from lgrasp.bench.table1 import measure_table, new_table, read_table, trimmed_mean, with_ratios, without_missing
 from lgrasp.errors import ConfigError, OutputError
-from lgrasp.jobs.config import JobConfig, Published, in_folder, load_config, plan_jobs
+from lgrasp.jobs.config import JobConfig, in_folder, load_config, plan_jobs
 from lgrasp.jobs.generate import generate
 
 QUICK = str(Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml")
 
 OBJECTS = ("capsule", "mug", "box")
 PUBLISHED = Published(
-    source="a paper", device="a GPU", per_s={"allegro": {"capsule": 100.0, "mug": 400.0, "box": 10.0}}
+    source="a paper", device="a GPU", figures={"allegro": {"capsule": 100.0, "mug": 400.0, "box": 10.0}}
 )
 
 
@@ -66,18 +75,34 @@ def test_trimmed_mean(values, mean):
 
 
 def test_published_figures():
-    config = load_config("table1")
-    assert config.published is not None
-    assert tuple(config.published.per_s) == config.hands
-    assert all(tuple(figures) == config.objects for figures in config.published.per_s.values())
+    config, published = load_config("table1"), load_published("lightning").figures
+    assert tuple(published) == config.hands
+    assert all(tuple(figures) == config.objects for figures in published.values())
     # what the paper prints below its columns
-    means = {hand: round(trimmed_mean(list(row.values()))) for hand, row in config.published.per_s.items()}
+    means = {hand: round(trimmed_mean(list(row.values()))) for hand, row in published.items()}
     assert means == {"allegro": 1150, "leap": 420, "shadow": 559, "dclaw": 249}  # printed for allegro: 1091
+
+
+@pytest.mark.parametrize("name", ["lightning", "seqgrasp", "dipgrasp"])
+def test_published_figures_name_source_and_differences(name):
+    published = load_published(name)
+    assert published.source
+    assert published.device
+    assert published.differs
+
+
+def test_unknown_published_figures():
+    with pytest.raises(ConfigError, match=r"no published figures 'nobody'.*nobody\.yaml"):
+        load_published("nobody")
 
 
 def config(**changes):
     given = {"objects": OBJECTS, "pipelines": ("swift", "lightning"), "rows": 100, "device": "cpu"}
-    return JobConfig(**given | {"published": PUBLISHED} | changes)
+    return JobConfig(**given | changes)
+
+
+def empty(chosen=None, repeat=3, baseline_rows=10):
+    return new_table(chosen or config(), repeat=repeat, baseline_rows=baseline_rows, published=PUBLISHED)
 
 
 def spread(*rates):
@@ -90,33 +115,79 @@ def cell(mesh, swift, lightning, hand="allegro", error=""):
     return {"hand": hand, "object": mesh, "error": error, "pipelines": runs}
 
 
+RUN = {
+    "grasps": 10,
+    "starved": False,
+    "seed_count_per_s": spread(1.0),
+    "near_duplicates": 0,
+    "distinct_poses": 5,
+    "survivors": {"place": 3},
+    "counts": {"place": {"kept": 3}},
+    "seconds": {"place": 0.1, "wall": 0.2},
+    "build_seconds": {"object": 1.0, "field": 2.0},
+    "load_seconds": {"object": 0.1, "field": 0.2},
+    "peak_rss_mb": 100.0,
+}
+
+
 @pytest.fixture
 def table():
     """Three measured cells, in the wrong order."""
     cells = [cell("box", [10, 20, 90], [0]), cell("capsule", [300], [100]), cell("mug", [200], [50])]
-    return with_ratios(new_table(config(), repeat=3, baseline_rows=10) | {"cells": cells})
+    return with_ratios(empty() | {"cells": cells})
 
 
 def test_ratios(table):
     capsule, mug, box = table["cells"]
     assert [c["object"] for c in table["cells"]] == list(OBJECTS)
-    assert capsule["ratio"] == {"lightning": 3.0}
+    assert capsule["ratio"] == {"swift": 3.0}
     assert capsule["published_ratio"] == {"swift": 3.0, "lightning": 1.0}
     assert mug["published_ratio"]["swift"] == 0.5
-    assert box["ratio"] == {"lightning": None}  # nothing came out
+    assert box["ratio"] == {"swift": None}  # nothing came out
     (mean,) = table["means"]
     assert mean["strict_valid_per_s"] == {"swift": 200.0, "lightning": 50.0}
-    assert mean["ratio"] == {"lightning": 4.0}
+    assert mean["ratio"] == {"swift": 4.0}
     assert mean["published_per_s"] == 100.0
     assert mean["published_ratio"]["swift"] == 2.0
     assert table["complete"]
+
+
+def test_only_the_last_pipeline_is_the_baseline(job):
+    asked = []
+
+    class Watched:
+        def measure(self, jobs, repeat, progress):
+            asked.extend(job.rows for job in jobs)
+            raise ConfigError("enough")
+
+    chosen = config(objects=("tiny",), pipelines=("swift", "robust", "lightning"), rows=50)
+    list(measure_table(Watched(), empty(chosen, 1, 5), chosen, job().cache))
+    assert asked == [50, 50, 5]
+
+
+def test_page_sets_figures_beside_rates(table):
+    cells = [c | {"pipelines": {name: RUN | run for name, run in c["pipelines"].items()}} for c in table["cells"]]
+    page = comparison_page(table | {"cells": [c | {"hand_from": "allegro"} for c in cells]})
+    rates = page.tables[0]
+    assert rates.columns == (
+        "object",
+        "swift/s",
+        "lightning/s",
+        "swift/lightning",
+        "published/s",
+        "swift/published",
+        "lightning/published",
+    )
+    assert rates.rows[0] == ("capsule", "300", "100", "3.0", "100", "3.0", "1.0")
+    assert rates.rows[-1] == ("trimmed mean", "200", "50", "4.0", "100", "2.0", "0.5")
+    assert any("a paper, on a GPU" in line for line in page.notes)
 
 
 def test_ratios_without_published_figures(table):
     bare = with_ratios(table | {"published": None})
     assert {c["published_per_s"] for c in bare["cells"]} == {None}
     assert bare["means"][0]["published_ratio"] == {"swift": None, "lightning": None}
-    some = table["published"] | {"per_s": {"allegro": {"mug": 400.0}}}
+    some = table["published"] | {"figures": {"allegro": {"mug": 400.0}}}
     part = with_ratios(table | {"published": some})
     assert [c["published_ratio"]["swift"] for c in part["cells"]] == [None, 0.5, None]
     assert part["means"][0]["published_per_s"] is None  # of other cells it would compare nothing
@@ -137,7 +208,7 @@ def test_plot(table, tmp_path):
 
 def test_resume_keeps_measured_cells(table, tmp_path):
     path = tmp_path / "table.json"
-    wanted = new_table(config(), repeat=3, baseline_rows=10)
+    wanted = empty()
     assert read_table(path, wanted) == wanted
     lost = cell("mug", [], [], error="it was away")
     path.write_text(json.dumps(with_ratios(table | {"cells": [table["cells"][0], lost]})))
@@ -145,9 +216,9 @@ def test_resume_keeps_measured_cells(table, tmp_path):
     assert kept["cells"] == table["cells"][:1]
     assert not kept["complete"]
     with pytest.raises(ConfigError, match="measured with rows 100, not 200"):
-        read_table(path, new_table(config(rows=200), repeat=3, baseline_rows=10))
+        read_table(path, empty(config(rows=200)))
     with pytest.raises(ConfigError, match="measured with objects"):
-        read_table(path, new_table(config(objects=("mug",)), repeat=3, baseline_rows=10))
+        read_table(path, empty(config(objects=("mug",))))
     path.write_text("[]")
     with pytest.raises(ConfigError, match="no table"):
         read_table(path, wanted)

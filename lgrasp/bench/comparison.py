@@ -1,4 +1,4 @@
-"""The published comparison: hands x objects, pipelines in turn in one run on one device, beside published figures."""
+"""Hands x objects, pipelines in turn in one run on one device, beside published figures if there are any."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -8,6 +8,8 @@ from statistics import fmean
 from typing import Any
 
 import lgrasp
+from lgrasp.bench.page import Page, Published, caveats, number, over, times
+from lgrasp.bench.page import Table as Texts
 from lgrasp.bench.rate import Bench
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, LgraspError, ObjectError
@@ -20,8 +22,8 @@ Table = dict[str, Any]
 Cell = dict[str, Any]
 
 
-def new_table(config: JobConfig, *, repeat: int, baseline_rows: int) -> Table:
-    """A table without cells: what is going to be measured, and how.
+def new_table(config: JobConfig, *, repeat: int, baseline_rows: int, published: Published | None = None) -> Table:
+    """A table without cells: what will be measured, and how. The last of several pipelines is the baseline.
 
     Returns:
         ``settings`` (two tables can be joined if theirs agree), ``hands``, ``objects``, ``published``, ``complete``,
@@ -52,7 +54,7 @@ def new_table(config: JobConfig, *, repeat: int, baseline_rows: int) -> Table:
         "settings": settings,
         "hands": hands,
         "objects": objects,
-        "published": config.published and config.published.model_dump(mode="json"),
+        "published": published and published.model_dump(mode="json"),
         "cells": [],
         "means": [],
         "complete": False,
@@ -63,7 +65,7 @@ def _names(kind: str, given: tuple[str, ...]) -> list[str]:
     names = [Path(name).stem for name in given]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise ConfigError(f"bench table1: {kind} '{twice[0]}' is named twice; each needs a name of its own")
+        raise ConfigError(f"bench: {kind} '{twice[0]}' is named twice; each needs a name of its own")
     return names
 
 
@@ -111,8 +113,8 @@ def measure_table(
 ) -> Iterator[tuple[Table, Cell]]:
     """Measure the cells that a table lacks; the table so far and its newest cell come back after each.
 
-    A cell is one hand and one object: all pipelines in turn, ``repeat`` times. Pipelines after the first are baselines
-    and run ``baseline_rows`` rows. A cell that cannot be measured says why in ``error`` and does not stop the others.
+    A cell is one hand and one object: all pipelines in turn, ``repeat`` times, the baseline with ``baseline_rows``
+    rows. A cell that cannot be measured says why in ``error`` and does not stop the others.
 
     Raises:
         ConfigError: see :func:`plan_jobs`.
@@ -123,12 +125,12 @@ def measure_table(
     # plan_jobs: pipeline, hand, object; here all pipelines of a hand and object go together
     pairs = [(hand, mesh) for hand in table["hands"] for mesh in table["objects"]]
     done = {(cell["hand"], cell["object"]) for cell in table["cells"]}
-    for number, (hand, mesh) in enumerate(pairs):
+    for first, (hand, mesh) in enumerate(pairs):
         if (hand, mesh) in done:
             continue
         cell_jobs = [
-            job if k == 0 else replace(job, rows=settings["baseline_rows"])
-            for k, job in enumerate(jobs[number + k * len(pairs)] for k in range(count))
+            replace(job, rows=settings["baseline_rows"]) if 0 < k == count - 1 else job
+            for k, job in enumerate(jobs[first + k * len(pairs)] for k in range(count))
         ]
         cell = _cell(bench, cell_jobs, settings, progress) | {"hand": hand, "object": mesh}
         table = with_ratios(table | {"cells": [*table["cells"], cell]})
@@ -149,9 +151,9 @@ def _cell(bench: Bench, jobs: list[Job], settings: dict[str, Any], progress: Cal
 
 
 def with_ratios(table: Table) -> Table:
-    """The table with the ratios of its cells, the means of its hands and whether it is complete, all counted anew."""
+    """The table with the ratios of its cells, the means of its hands and whether it is complete."""
     names = table["settings"]["pipelines"]
-    published = (table["published"] or {}).get("per_s", {})
+    published = (table["published"] or {}).get("figures", {})
     cells = []
     for cell in sorted(
         table["cells"], key=lambda c: (table["hands"].index(c["hand"]), table["objects"].index(c["object"]))
@@ -168,10 +170,10 @@ def with_ratios(table: Table) -> Table:
 
 
 def _ratios(names: list[str], rates: dict[str, float], figure: float | None) -> dict[str, Any]:
-    """First pipeline over each other one, and each pipeline over the published figure; None where there is nothing."""
+    """Each pipeline over the baseline and over the published figure; None where there is nothing."""
     return {
-        "ratio": {name: _over(rates.get(names[0]), rates.get(name)) for name in names[1:]},
-        "published_ratio": {name: _over(rates.get(name), figure) for name in names},
+        "ratio": {name: over(rates.get(name), rates.get(names[-1])) for name in names[:-1]},
+        "published_ratio": {name: over(rates.get(name), figure) for name in names},
     }
 
 
@@ -190,10 +192,85 @@ def _rate(cell: Cell, name: str) -> float:
     return cell["pipelines"][name]["strict_valid_per_s"]["median"]
 
 
-def _over(a: float | None, b: float | None) -> float | None:
-    return a / b if a is not None and b else None
-
-
 def trimmed_mean(values: list[float]) -> float:
     """Mean without the highest and the lowest of three or more values; of fewer, the mean."""
     return fmean(sorted(values)[1:-1] if len(values) > 2 else values)
+
+
+def cell_line(table: Table, cell: Cell) -> str:
+    """What the newest cell gave, in one line."""
+    total = len(table["hands"]) * len(table["objects"])
+    rates = ", ".join(f"{name} {number(_rate(cell, name))}/s" for name in cell["pipelines"])
+    return f"[{len(table['cells'])}/{total}] {cell['hand']} {cell['object']}: {cell['error'] or rates}"
+
+
+def comparison_page(table: Table) -> Page:
+    """A table as texts: rates with ratios for each hand, then what lies behind them."""
+    settings, published = table["settings"], table["published"]
+    names = settings["pipelines"]
+    baseline = f", {names[-1]} {settings['baseline_rows']:,}" if len(names) > 1 else ""
+    head = [
+        f"{settings['device']}: {settings['rows']:,} grasps{baseline}; strict-valid grasps per second, "
+        f"median of {settings['repeat']}"
+    ]
+    tables = [part for hand in table["hands"] for part in _hand_tables(table, hand)]
+    notes = ["trimmed mean: without the highest and the lowest object"] if len(table["objects"]) > 1 else []
+    notes += [
+        "thread-seconds by stage; object s, field s: made from nothing, not part of the rates; load s: from the cache"
+    ]
+    notes += [
+        f"{cell['hand']} {cell['object']} could not be measured: {cell['error']}"
+        for cell in table["cells"]
+        if cell["error"]
+    ]
+    return Page(head, tables, notes + (caveats(published) if published else []))
+
+
+def _hand_tables(table: Table, hand: str) -> list[Texts]:
+    names, published = table["settings"]["pipelines"], table["published"]
+    cells = [cell for cell in table["cells"] if cell["hand"] == hand and not cell["error"]]
+    if not cells:
+        return []
+    source = cells[0]["hand_from"]
+    columns = ("object", *(f"{n}/s" for n in names), *(f"{n}/{names[-1]}" for n in names[:-1]))
+    if published:
+        columns = (*columns, "published/s", *(f"{n}/published" for n in names))
+    rows = [_rates(cell["object"], {n: _rate(cell, n) for n in names}, cell, published) for cell in cells]
+    if len(cells) > 1:
+        mean = next(mean for mean in table["means"] if mean["hand"] == hand)
+        rows.append(_rates("trimmed mean", mean["strict_valid_per_s"], mean, published))
+    runs = [(cell["object"], name, cell["pipelines"][name]) for cell in cells for name in names]
+    behind = ("object", "pipeline", "grasps", "range/s", "seed/s", "near-dup", "poses", "survivors")
+    stages = sorted({stage for *_, run in runs for stage in run["counts"]})
+    seconds = ("object", "pipeline", *stages, "wall s", "object s", "field s", "load s", "MB")
+    return [
+        Texts(hand + (f" ({source})" if source != hand else ""), columns, rows),
+        Texts("", behind, [_behind(*run) for run in runs], 2),
+        Texts("", seconds, [_seconds(*run, stages) for run in runs], 2),
+    ]
+
+
+def _rates(what: str, rates: dict[str, float], of: dict[str, Any], published: Any) -> tuple[str, ...]:
+    texts = (what, *(number(rate) for rate in rates.values()), *map(times, of["ratio"].values()))
+    return (*texts, number(of["published_per_s"]), *map(times, of["published_ratio"].values())) if published else texts
+
+
+def _behind(mesh: str, name: str, run: dict[str, Any]) -> tuple[str, ...]:
+    strict = run["strict_valid_per_s"]
+    return (
+        mesh,
+        name,
+        number(run["grasps"]) + (" starved" if run["starved"] else ""),
+        f"{strict['min']:,.0f}-{strict['max']:,.0f}",
+        number(run["seed_count_per_s"]["median"]),
+        number(run["near_duplicates"]),
+        number(run["distinct_poses"]),
+        "  ".join(f"{stage} {count:,}" for stage, count in run["survivors"].items()),
+    )
+
+
+def _seconds(mesh: str, name: str, run: dict[str, Any], stages: list[str]) -> tuple[str, ...]:
+    seconds, built = run["seconds"], run["build_seconds"]
+    parts = [*(seconds.get(stage, 0.0) for stage in stages), seconds["wall"], built["object"], built["field"]]
+    loaded = sum(run["load_seconds"].values())
+    return (mesh, name, *(f"{x:.2f}" for x in (*parts, loaded)), number(run["peak_rss_mb"]))
