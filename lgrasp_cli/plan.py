@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Quiet, Scale, check_report, open_cache, warn
+from lgrasp_cli.options import CacheDir, Device, JsonPath, Quiet, Scale, check_report, open_cache, warn
 
 if TYPE_CHECKING:
     from lgrasp.jobs.refine.plan import PlanOutcome
@@ -22,7 +22,7 @@ def register(app: typer.Typer) -> None:
 
 def plan(
     mesh: Annotated[
-        str | None, typer.Option("--object", "-o", help="Mesh file, or the name of an object.", show_default=False)
+        str | None, typer.Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.", show_default=False)
     ] = None,
     cloud: Annotated[
         Path | None, typer.Option(help="Point cloud (.ply .xyz .npy .npz .h5), perhaps a scene.", show_default=False)
@@ -36,7 +36,9 @@ def plan(
         typer.Option(metavar="X,Y,Z", help="Where the cloud was seen from [m]; turns its normals.", show_default=False),
     ] = None,
     scale: Scale = 1.0,
-    hand: Hand = "barrett",
+    hand: Annotated[
+        str, typer.Option(help="Name of a hand, a URDF file, a folder with hand.yaml, or a shard (its hand).")
+    ] = "barrett",
     starts: Annotated[int, typer.Option("--starts", "-n", help="Points of the surface that are tried.")] = 80,
     stand_off: Annotated[
         float | None,
@@ -65,7 +67,6 @@ def plan(
     from lgrasp.cloud.read import read_cloud
     from lgrasp.config import parse_model
     from lgrasp.errors import ConfigError, StarvedError
-    from lgrasp.jobs.hands import hand_source
     from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
     from lgrasp.planning.planner import PlanParams
     from lgrasp.scenes.reader import scene_cloud
@@ -83,7 +84,7 @@ def plan(
     params = parse_model(PlanParams, {"distal": distal, "other": other}, "plan")
     job = PlanJob(
         hand=hand,
-        out=out or Path("plans") / f"{hand_source(hand).name}-{name}",
+        out=out,
         starts=starts,
         object=mesh,
         scale=scale,

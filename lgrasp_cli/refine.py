@@ -34,7 +34,8 @@ def refine(
         ),
     ] = None,
     hand: Annotated[
-        str | None, typer.Option(help="Hand of the grasps; default: the one that the shards name.", show_default=False)
+        str | None,
+        typer.Option(help="Hand of grasps in another format; shards hold their own.", show_default=False),
     ] = None,
     matching_rounds: Annotated[
         int | None, typer.Option(help="Times that nearest points are matched.", show_default=False)

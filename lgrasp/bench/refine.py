@@ -22,9 +22,9 @@ from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
-from lgrasp.jobs.refine.inputs import named_hand
 from lgrasp.jobs.refine.rows import shard_rows
 from lgrasp.jobs.refine.settings import COARSE
+from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.planning.planner import Planner, PlanParams, cloud_params

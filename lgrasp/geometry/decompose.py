@@ -93,7 +93,7 @@ def _run(
         task, result = Path(folder) / "task.npz", Path(folder) / "result.npz"
         np.savez(task, vertices=vertices, faces=faces, parameters=np.asarray(json.dumps(parameters)))
         # -P: no module of the folder that the user is in gets in the way
-        where = os.pathsep.join([str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])])
+        where = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
         try:
             done = subprocess.run(
                 [sys.executable, "-P", "-m", "lgrasp.geometry.decompose", str(task), str(result)],

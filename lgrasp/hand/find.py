@@ -57,7 +57,7 @@ def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
     path = Path(name).expanduser()
     urdf = None if path.exists() else package_urdf(name)
     if urdf is not None:
-        return _from_package(urdf, name.replace(":", "_"), known, draft)
+        return _from_package(urdf, name.replace(":", "_"), draft)
     if path.is_dir():
         if not (path / "hand.yaml").is_file():
             raise HandError(f"hand folder {path} has no hand.yaml; name a URDF file or a folder with hand.yaml")
@@ -84,7 +84,7 @@ def _from_urdf(path: Path, known: dict[str, Path]) -> HandSource:
     if beside.is_file():
         spec = load_spec(beside)
         return HandSource(spec.name, path, spec)
-    source = _rules_of_known(path, known)
+    source = rules_of_known(path)
     if source is None:
         raise HandError(
             f"URDF {path}: no hand.yaml beside it and no known hand has its joint and link names; draft one with "
@@ -93,11 +93,11 @@ def _from_urdf(path: Path, known: dict[str, Path]) -> HandSource:
     return source
 
 
-def _rules_of_known(path: Path, known: dict[str, Path]) -> HandSource | None:
+def rules_of_known(path: Path) -> HandSource | None:
     """The URDF with the rules of the known hand whose joint and link names all occur in it."""
     urdf = read_urdf(path)
     movable = {j.name for j in urdf.joints if j.movable}
-    for folder in known.values():
+    for folder in known_hands().values():
         try:
             source = _from_folder(folder)
             own = read_urdf(source.urdf)
@@ -140,8 +140,8 @@ def _missing_couplings(joints: tuple[Joint, ...], known: tuple[Joint, ...]) -> d
     }
 
 
-def _from_package(urdf: Path, name: str, known: dict[str, Path], draft: Drafter | None) -> HandSource:
-    source = _rules_of_known(urdf, known)
+def _from_package(urdf: Path, name: str, draft: Drafter | None) -> HandSource:
+    source = rules_of_known(urdf)
     if source is not None and all(read_urdf(urdf).links.get(link) for link in source.spec.palm.links):
         return HandSource(name, urdf, source.spec.model_copy(update={"name": name}), source.note)
     if draft is None:

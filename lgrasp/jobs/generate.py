@@ -21,7 +21,7 @@ from lgrasp.engine.writing import BackgroundWriter
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import GraspTable, take_grasps, user_poses
 from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.records import hand_record, make_scene, mesh_blobs, object_record
+from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs, object_record
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 
@@ -216,7 +216,7 @@ def _shard(job: Job, inputs: Inputs, meshes: dict[str, bytes], key: str, shard: 
                 "scale": job.scale,
                 "shard_rows": job.shard_rows,
                 "reuse": job.reuse,
-                "locked": dict(inputs.keys.source.spec.locked),
+                **hand_config(inputs.keys.source),
             },
         ),
         hand=hand_record(inputs.hand.model, meshes),

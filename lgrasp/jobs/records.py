@@ -3,17 +3,26 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lgrasp.dataset import HandRecord, ObjectRecord
 from lgrasp.engine.cache import Cache
 from lgrasp.geometry.decompose import decompose
+from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.object.model import ObjectModel
 
 if TYPE_CHECKING:
     from lgrasp.simulate.scene import Scene
+
+RULES = "hand_rules"
+"""Key of a shard's config: the contents of the hand's hand.yaml, as JSON text (the order of its keys counts)."""
+
+
+def hand_config(source: HandSource) -> dict[str, Any]:
+    """What the config of a shard says of its hand: the rules, and joints that were held [rad or m]."""
+    return {RULES: source.spec.model_dump_json(), "locked": dict(source.spec.locked)}
 
 
 def mesh_blobs(urdf: Path) -> dict[str, bytes]:

@@ -3,19 +3,19 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import trimesh
-from lxml import etree
 
-from lgrasp.errors import PhysicsError, ShardError
+from lgrasp.errors import PhysicsError
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.decompose import decompose as cut_mesh
+from lgrasp.grasp.hand_files import write_hand
 from lgrasp.grasp.records import HandRecord, ObjectRecord, Shard
 from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh
-from lgrasp.hand.urdf import parse_robot, read_urdf
+from lgrasp.hand.urdf import read_urdf
 from lgrasp.simulate.solid import Solid, solid_of_mesh
 
 
@@ -75,11 +75,7 @@ def hand_of_record(record: HandRecord, decompose: Decompose = cut_mesh, device: 
     """
     pieces, notes = {}, []
     with TemporaryDirectory(prefix="lgrasp-hand-") as folder:
-        tree, _ = parse_robot(Path(f"{record.name}.urdf"), record.urdf.encode())
-        _write_meshes(tree, record, Path(folder))
-        path = Path(folder) / f"{PurePosixPath(record.name).name}.urdf"
-        path.write_bytes(etree.tostring(tree))
-        urdf = read_urdf(path)
+        urdf = read_urdf(write_hand(record, Path(folder)))
         for link, geometries in urdf.links.items():
             found = []
             for geometry in geometries:
@@ -96,19 +92,6 @@ def hand_of_record(record: HandRecord, decompose: Decompose = cut_mesh, device: 
         pieces=pieces,
         notes=tuple(notes),
     )
-
-
-def _write_meshes(tree: etree._Element, record: HandRecord, folder: Path) -> None:
-    """Write the collision meshes that a URDF names under plain names, and name them so in the URDF."""
-    written: dict[str, str] = {}
-    for mesh in tree.iterfind(".//collision//mesh"):
-        name = mesh.get("filename", "")
-        if name not in record.meshes:
-            raise ShardError(f"hand '{record.name}': mesh '{name}' of its URDF is not in the shard")
-        if name not in written:
-            written[name] = f"{len(written)}{PurePosixPath(name).suffix}"
-            (folder / written[name]).write_bytes(record.meshes[name])
-        mesh.set("filename", written[name])
 
 
 def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> Solid:

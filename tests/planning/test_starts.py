@@ -10,7 +10,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.palm import palm_axis
-from lgrasp.jobs.refine.inputs import named_hand
+from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.object.find import find_object
 from lgrasp.object.preprocess import preprocess_object
 from lgrasp.planning.planner import Planner, PlanParams

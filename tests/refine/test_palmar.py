@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from lgrasp.engine.cache import Cache
-from lgrasp.jobs.refine.inputs import named_hand
+from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.refine.visible_surface import seen_palmar
 from lgrasp.runtime.device import resolve_device, start
 

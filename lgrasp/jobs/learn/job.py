@@ -16,12 +16,10 @@ from lgrasp.dataset.files import new_file
 from lgrasp.dataset.tree import shard_tree
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder
-from lgrasp.engine.inputs import input_keys, load_hand
-from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.hand.model import HandModel
-from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.scenes.shards import check_hand, object_model, read_parts
+from lgrasp.jobs.scenes.shards import load_hand, read_parts
+from lgrasp.jobs.shard_inputs import object_of_shard
 from lgrasp.learn.examples import Examples, make_examples
 from lgrasp.learn.measure import Measured, measure
 from lgrasp.learn.network import CoarseNet
@@ -151,19 +149,14 @@ def _examples(
 ) -> tuple[HandModel, list[Examples], list[Examples]]:
     """The hand; clouds to train on and others, with the grasps, object by object."""
     parts = read_parts(list(shard_tree(shards).values()))
-    pipeline = load_pipeline("swift")
-    keys = input_keys(
-        hand_source(name or next(iter(parts.values())).hand[0]), None, 1.0, pipeline.object, pipeline.field
-    )
-    check_hand(keys.source, list(parts.values()))
     found = resolve_device(device)
-    hand, _ = load_hand(cache, keys.source, keys.hand, found)
+    hand, _ = load_hand(parts.values(), name, cache, found)
     sets: tuple[list[Examples], list[Examples]] = ([], [])
     for number, (_, part) in enumerate(sorted(parts.items())):
         rows = part.joined()
         if not len(rows["q"]):
             continue
-        model = object_model(part.record, cache, found)
+        model = object_of_shard(cache, part.record, found)
         for which, (into, clouds) in enumerate(zip(sets, (params.clouds, params.held_out), strict=True)):
             rng = np.random.default_rng([params.seed, number, which])
             q = rows["q"][:, : hand.dofs]

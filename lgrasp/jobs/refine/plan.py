@@ -12,15 +12,13 @@ from lgrasp.cloud.read import Cloud
 from lgrasp.dataset import ObjectRecord, Shard, ShardHeader, write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder, clean_folder, shard_path
-from lgrasp.engine.inputs import load_object, object_key
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
-from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
-from lgrasp.jobs.refine.inputs import named_hand
+from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
 from lgrasp.jobs.refine.rows import shard_rows
+from lgrasp.jobs.shard_inputs import named_hand, named_object
 from lgrasp.object.model import ObjectModel
-from lgrasp.object.params import ObjectParams
 from lgrasp.planning.planner import Planner, PlanParams, cloud_params
 from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.visible_surface import seen_palmar
@@ -36,7 +34,7 @@ class PlanJob:
     """On what and where; an object or a cloud."""
 
     hand: str
-    out: Path
+    out: Path | None = None  # none: plans/HAND-OBJECT
     starts: int = 80
     object: str | None = None
     scale: float = 1.0
@@ -90,10 +88,10 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
         model, around = _cloud_models(job.cloud, job.cloud_name)
     else:
         assert job.object is not None
-        mesh, key = object_key(job.object, job.scale, ObjectParams())
-        model, _ = load_object(job.cache, mesh, key, job.scale, ObjectParams(), device.alias)
-    path = shard_path(job.out, hand.name, model.name, 0)
-    check_folder(job.out)
+        model = named_object(job.cache, job.object, job.scale, device)
+    out = job.out or Path("plans") / f"{hand.name}-{model.name}"
+    path = shard_path(out, hand.name, model.name, 0)
+    check_folder(out)
     if path.exists() and not job.force:
         raise OutputError(f"{path} exists; choose another folder with --out, or --force to replace it")
     clean_folder(path)
@@ -113,6 +111,7 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
                 "plan": params.model_dump(mode="json"),
                 "starts": job.starts,
                 "stand_off": stand_off,
+                **hand_config(source),
             },
         )
         record = hand_record(hand, mesh_blobs(source.urdf))

@@ -18,9 +18,9 @@ from lgrasp.errors import ConfigError, HandError, OutputError, ShardError
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.records import Shard
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.jobs.refine.inputs import named_hand
 from lgrasp.jobs.refine.moved import Moved, move_rows
-from lgrasp.jobs.refine.sources import grasp_shards, object_of_record
+from lgrasp.jobs.refine.sources import grasp_shards
+from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.stages.refine.params import RefineParams
 
@@ -32,7 +32,7 @@ class Refinement:
     sources: Sequence[Path]  # shards, folders of them at any depth; or one export, see ``form``
     out: Path
     form: str | None = None  # format of another program; none: shards
-    hand: str | None = None  # none: the one that the shards name
+    hand: str | None = None  # of grasps in another format; shards hold their own
     always: bool = False  # every row takes its refined posture, whatever the checks say
     params: RefineParams = field(default_factory=RefineParams)
     bounds: GraspBounds = field(default_factory=GraspBounds)
@@ -75,7 +75,7 @@ def refine_shards(job: Refinement, progress: Callable[[Path, int, int], None] | 
             continue
         _check_rows(source, shard)
         hand = _hand(job, source, shard, hands, device)
-        model = object_of_record(job.cache, shard.objects[0], device.alias)
+        model = object_of_shard(job.cache, shard.objects[0], device)
         begin = time.perf_counter()
         moved = move_rows(
             hand,
@@ -134,19 +134,17 @@ def _check_rows(path: Path, shard: Shard) -> None:
 
 
 def _hand(job: Refinement, path: Path, shard: Shard, hands: dict[str, HandArrays], device: Device) -> HandArrays:
-    name = job.hand or shard.hand.name
-    if shard.hand.sha256 not in hands:
-        _, model = named_hand(job.cache, name, device)
-        if model.sha256 != shard.hand.sha256:
-            other = (
-                f"hand '{shard.hand.name}'" if shard.hand.name != model.name else f"another version of hand '{name}'"
-            )
+    """The hand of a shard, whatever is installed under its name; ``--hand`` is only compared with it."""
+    digest = shard.hand.sha256
+    if digest not in hands:
+        if job.hand is not None and (named := named_hand(job.cache, job.hand, device)[1]).sha256 != digest:
             raise HandError(
-                f"{path}: its grasps are of {other} (hash {shard.hand.sha256[:12]}), not of '{name}' (hash "
-                f"{model.sha256[:12]}); name theirs with --hand"
+                f"{path}: its grasps are of hand '{shard.hand.name}' (hash {digest[:12]}), not of '{named.name}' (hash "
+                f"{named.sha256[:12]}); leave --hand out, the hand is in the shard"
             )
-        hands[shard.hand.sha256] = upload_hand(model, device.alias)
-    return hands[shard.hand.sha256]
+        _, model = hand_of_shard(job.cache, shard.hand, shard.header.config, device)
+        hands[digest] = upload_hand(model, device.alias)
+    return hands[digest]
 
 
 def _written(shard: Shard, rows: GraspRows, job: Refinement, seconds: float) -> Shard:

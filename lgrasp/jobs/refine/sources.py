@@ -1,50 +1,18 @@
-"""What is refined: objects of shards, and grasps that other programs wrote, as shards."""
+"""Grasps that other programs wrote, as shards."""
 
-import hashlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
-from lgrasp.cloud.model import cloud_object
 from lgrasp.dataset import ObjectRecord, Shard, ShardHeader
 from lgrasp.dataset.exports.formats import read_grasps
-from lgrasp.engine.cache import Cache, content_key
-from lgrasp.engine.inputs import OBJECT_VERSION
 from lgrasp.errors import ShardError
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
-from lgrasp.jobs.records import hand_record, mesh_blobs
+from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs
 from lgrasp.object.load import load_mesh
-from lgrasp.object.model import ObjectModel
-from lgrasp.object.preprocess import preprocess_object
-
-
-def object_of_record(cache: Cache, record: ObjectRecord, device: str) -> ObjectModel:
-    """The object of a shard, preprocessed, in its user frame; a mesh from the cache if it was there before.
-
-    Raises:
-        ObjectError: it cannot be used.
-        ShardError: a point cloud without normals.
-    """
-    vertices, faces = np.asarray(record.vertices, float), np.asarray(record.faces)
-    if len(faces) == 0:
-        if record.normals is None:
-            raise ShardError(
-                f"object '{record.id}' is a point cloud without normals; meshes and clouds with normals can"
-            )
-        return cloud_object(vertices, record.normals, name=record.name)
-    key = content_key(
-        "object",
-        OBJECT_VERSION,
-        content=hashlib.sha256(vertices.tobytes() + faces.astype(np.int64).tobytes()).hexdigest(),
-        name=record.name,
-    )
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    arrays, _ = cache.get("object", key, lambda: preprocess_object(mesh, device=device).to_arrays())
-    return ObjectModel.from_arrays(arrays)
 
 
 def grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) -> Iterator[Shard]:
@@ -80,5 +48,7 @@ def grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) -> 
         )
         own = replace(rows, **{name: np.asarray(values)[chosen] for name, values in rows.columns().items()})
         own = replace(own, object_index=np.zeros((len(chosen), 1), np.int32))
-        header = ShardHeader(pipeline=form, seed=0, shard_index=0, config={"read_from": str(path)})
+        header = ShardHeader(
+            pipeline=form, seed=0, shard_index=0, config={"read_from": str(path), **hand_config(source)}
+        )
         yield Shard(header=header, hand=record, objects=[solid], grasps=own)

@@ -18,7 +18,7 @@ from lgrasp.engine.writing import BackgroundWriter
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.jobs.generate import Listener
-from lgrasp.jobs.records import hand_record, make_scene, mesh_blobs
+from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs
 from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.records import object_records, sequence_rows
 from lgrasp.jobs.sequence.round import Verdicts
@@ -203,7 +203,7 @@ def _shard(
                 "scales": list(keys.scales),
                 "shard_rows": job.shard_rows,
                 "physics": job.physics,
-                "locked": dict(keys.source.spec.locked),
+                **hand_config(keys.source),
             },
         ),
         hand=hand_record(inputs.hand, meshes),

@@ -1,0 +1,171 @@
+"""Hand and object of a shard as the models that jobs work with; whatever is installed under their names."""
+
+import atexit
+import hashlib
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from lgrasp.cloud.model import cloud_object
+from lgrasp.dataset import HandRecord, ObjectRecord, ShardReader
+from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.inputs import OBJECT_VERSION, load_hand, load_object, object_key
+from lgrasp.errors import HandError, ShardError
+from lgrasp.grasp.hand_files import write_hand
+from lgrasp.hand.digest import hand_digest
+from lgrasp.hand.find import HandSource, rules_of_known
+from lgrasp.hand.model import HAND_VERSION, HandModel
+from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.tree import build_tree
+from lgrasp.hand.urdf import read_urdf
+from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.records import RULES
+from lgrasp.object.model import ObjectModel
+from lgrasp.object.params import ObjectParams
+from lgrasp.runtime.device import Device
+
+
+def named_hand(cache: Cache, name: str, device: Device) -> tuple[HandSource, HandModel]:
+    """A hand by name, folder or URDF (see :func:`hand_source`), or that of a shard (*.h5); cached.
+
+    Raises:
+        HandError, ShardError: there is no such hand, or it cannot be used.
+    """
+    if name.endswith(".h5"):
+        with ShardReader(Path(name).expanduser()) as reader:
+            return hand_of_shard(cache, reader.hand(), reader.header.config, device)
+    return _built(cache, hand_source(name), device)
+
+
+def hand_of_shard(
+    cache: Cache, record: HandRecord, config: Mapping[str, Any], device: Device
+) -> tuple[HandSource, HandModel]:
+    """The hand that the rows of a shard are of, made from the shard alone; cached by its content.
+
+    The rules are those in the shard's ``config``. A shard of an older version has none: then those of the very same
+    hand where it is installed, else of a known hand with its joint and link names, else a draft; said in one line.
+
+    Raises:
+        ShardError: a mesh of the hand is missing from the shard.
+        HandError: the hand cannot be used, or no rules fit it.
+    """
+    source = _with_rules(_files(record), record, config)
+    if source.note:
+        cache.warn(f"the shard does not hold the rules of its hand '{record.name}'; taken are {source.note}")
+    return _built(cache, source, device)
+
+
+def object_of_shard(
+    cache: Cache, record: ObjectRecord, device: Device, params: ObjectParams | None = None
+) -> ObjectModel:
+    """The object of a shard, preprocessed, in its user frame; cached by its content and the parameters.
+
+    Raises:
+        ObjectError: it cannot be used.
+        ShardError: a point cloud without normals.
+    """
+    if len(record.faces) == 0:
+        if record.normals is None:
+            raise ShardError(
+                f"object '{record.id}' is a point cloud without normals; meshes and clouds with normals can be used"
+            )
+        return cloud_object(np.asarray(record.vertices, float), record.normals, name=record.name)
+    params = params or ObjectParams()
+    described = {"content": mesh_hash(record), "params": params.model_dump(mode="json"), "name": record.id}
+
+    def make() -> dict[str, np.ndarray]:
+        import trimesh
+
+        from lgrasp.object.preprocess import preprocess_object  # slow to load
+
+        mesh = trimesh.Trimesh(np.asarray(record.vertices, float), np.asarray(record.faces), process=False)
+        mesh.metadata["name"] = record.id
+        return preprocess_object(mesh, params=params, device=device.alias).to_arrays()
+
+    arrays, _ = cache.get("object", content_key("object", OBJECT_VERSION, **described), make)
+    return ObjectModel.from_arrays(arrays)
+
+
+def named_object(cache: Cache, name: str, scale: float, device: Device) -> ObjectModel:
+    """An object by name or mesh file (see :func:`find_object`), or the only one of a shard (*.h5); cached.
+
+    Raises:
+        ObjectError, ShardError: there is no such object, or it cannot be used.
+    """
+    if not name.endswith(".h5"):
+        mesh, key = object_key(name, scale, ObjectParams())
+        return load_object(cache, mesh, key, scale, ObjectParams(), device.alias)[0]
+    with ShardReader(Path(name).expanduser()) as reader:
+        if len(reader.object_ids) != 1:
+            raise ShardError(f"{name}: holds the objects {', '.join(reader.object_ids)}; a shard of one is accepted")
+        (record,) = reader.objects()
+    if scale != 1.0:
+        raise ShardError(f"{name}: its object is in metres; --scale {scale:g} is for mesh files")
+    return object_of_shard(cache, record, device)
+
+
+def mesh_hash(record: ObjectRecord) -> str:
+    """SHA-256 of a mesh as grasped."""
+    h = hashlib.sha256(np.ascontiguousarray(record.vertices, np.float32).tobytes())
+    h.update(np.ascontiguousarray(record.faces, np.int32).tobytes())
+    return h.hexdigest()
+
+
+def _built(cache: Cache, source: HandSource, device: Device) -> tuple[HandSource, HandModel]:
+    key = content_key("hand", HAND_VERSION, content=hand_digest(source.urdf, source.spec))
+    return source, load_hand(cache, source, key, device)[0]
+
+
+def _files(record: HandRecord) -> Path:
+    """The URDF of a shard's hand beside its meshes, in a folder that goes when the program ends."""
+    folder = Path(tempfile.mkdtemp(prefix="lgrasp-hand-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return write_hand(record, folder)
+
+
+def _with_rules(urdf: Path, record: HandRecord, config: Mapping[str, Any]) -> HandSource:
+    """The URDF with the first rules that fit the shard; see :func:`hand_of_shard`.
+
+    Raises:
+        HandError: no rules fit.
+    """
+    for source in _sources(urdf, record, config):
+        try:
+            tree = build_tree(read_urdf(urdf), source.spec)
+        except HandError:
+            continue
+        there = tree.base_link, tuple(tree.listed_names), tuple(tree.link_names)
+        if there == (record.base_link, tuple(record.joint_names), tuple(record.link_names)):
+            return source
+    raise HandError(
+        f"the shard does not hold the rules of its hand '{record.name}', and those of no known hand fit it nor does a "
+        "draft; generate the shard with this version of lgrasp, or install the hand that it was made with"
+    )
+
+
+def _sources(urdf: Path, record: HandRecord, config: Mapping[str, Any]) -> Iterator[HandSource]:
+    """Rules that may fit, the likeliest first."""
+    name = record.name
+    if RULES in config:
+        with suppress(ValidationError):
+            yield HandSource(name, urdf, HandSpec.model_validate_json(config[RULES]))
+    with suppress(HandError):
+        spec = hand_source(name).spec
+        if hand_digest(urdf, spec) == record.sha256:
+            yield HandSource(name, urdf, spec)
+    known = rules_of_known(urdf)
+    if known is not None:
+        held = {"name": name, "locked": config.get("locked", known.spec.locked)}
+        yield HandSource(name, urdf, known.spec.model_copy(update=held), known.note)
+    from lgrasp.hand.drafting.draft import draft_spec  # slow to load
+
+    with suppress(HandError):
+        spec, _ = draft_spec(urdf, name)
+        held = {"locked": config.get("locked", spec.locked)}
+        yield HandSource(name, urdf, spec.model_copy(update=held), "drafted rules")

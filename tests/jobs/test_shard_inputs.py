@@ -1,0 +1,160 @@
+"""Hand and object of a shard: made from the shard alone, whatever lies under their names where it is read."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.errors import HandError, ShardError
+from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
+from lgrasp.jobs.refine.shards import Refinement, refine_shards
+from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, named_object, object_of_shard
+from lgrasp.object.params import ObjectParams
+from lgrasp.runtime.device import resolve_device
+
+CPU = resolve_device("cpu")
+REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "hands" / "allegro"
+
+
+@pytest.fixture(scope="module")
+def made(swift, cache_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A shard of an Allegro that no longer exists: its URDF, named by its path, differed from the shipped one."""
+    folder = tmp_path_factory.mktemp("own")
+    shutil.copytree(hand_source("allegro").urdf.parent, folder / "hand")
+    (folder / "hand" / "hand.yaml").unlink()
+    (urdf,) = (folder / "hand").glob("*.urdf")
+    urdf.write_text(urdf.read_text().replace("</robot>", "  <!-- mine -->\n</robot>"))
+    job = Job(str(urdf), "mug", 12, swift, folder / "out", device="cpu", workers=1, batch=128, cache=Cache(cache_root))
+    path = generate(job).paths[0]
+    shutil.rmtree(folder / "hand")
+    return path
+
+
+def without_rules(shard: Shard, **hand) -> Shard:
+    """As written before shards held the rules of their hand."""
+    config = {name: value for name, value in shard.header.config.items() if name != "hand_rules"}
+    return replace(shard, header=replace(shard.header, config=config), hand=replace(shard.hand, **hand))
+
+
+def same(one, other) -> None:
+    for name, values in one.to_arrays().items():
+        np.testing.assert_array_equal(values, other.to_arrays()[name], err_msg=name)
+
+
+def test_rows_are_refined_with_the_hand_in_their_shard(made: Path, cache_root: Path, tmp_path: Path):
+    """The hand installed as 'allegro' is another one."""
+    shard = read_shard(made)
+    assert shard.hand.name == "allegro"
+    cache = Cache(cache_root, pytest.fail)
+    (done,) = refine_shards(Refinement([made], tmp_path / "out", device="cpu", cache=cache))
+    assert validate_shard(done.path) == []
+    assert read_shard(done.path).hand.sha256 == shard.hand.sha256
+
+
+def test_a_named_hand_must_be_that_of_the_shard(made: Path, cache_root: Path, tmp_path: Path):
+    job = Refinement([made], tmp_path / "out", hand="allegro", device="cpu", cache=Cache(cache_root))
+    with pytest.raises(HandError, match="leave --hand out, the hand is in the shard"):
+        refine_shards(job)
+
+
+def test_the_hand_is_the_one_that_was_generated_with(job: Callable[..., Job], cache_root: Path):
+    outcome = generate(job(rows=5))
+    shard = read_shard(outcome.paths[0])
+    source, model = hand_of_shard(Cache(cache_root, pytest.fail), shard.hand, shard.header.config, CPU)
+    assert source.spec == hand_source("allegro").spec
+    same(model, outcome.inputs.hand.model)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real Allegro with mesh fingertips is not here")
+def test_meshes_come_from_the_shard(swift, cache_root: Path, tmp_path: Path):
+    """Its URDF names them as package://...; the folder is gone and nothing is in the cache."""
+    shutil.copytree(REAL, tmp_path / "before")
+    job = Job(str(tmp_path / "before/allegro.urdf"), "sphere", 5, swift, tmp_path / "a", cache=Cache(cache_root))
+    outcome = generate(job)
+    shutil.rmtree(tmp_path / "before")
+    shard = read_shard(outcome.paths[0])
+    assert shard.hand.meshes
+    fresh = Cache(tmp_path / "cache", pytest.fail)
+    _, model = hand_of_shard(fresh, shard.hand, shard.header.config, CPU)
+    same(model, outcome.inputs.hand.model)
+    lost = replace(shard.hand, meshes=dict(list(shard.hand.meshes.items())[1:]))
+    with pytest.raises(ShardError, match="is not in the shard"):
+        hand_of_shard(fresh, lost, shard.header.config, CPU)
+    (name, data), *_ = shard.hand.meshes.items()
+    outside = replace(
+        shard.hand,
+        urdf=shard.hand.urdf.replace(name, "../../m.stl"),
+        meshes={**shard.hand.meshes, "../../m.stl": data},
+    )
+    with pytest.raises(ShardError, match="outside the hand's folder"):
+        hand_of_shard(fresh, outside, shard.header.config, CPU)
+
+
+def test_older_shards_take_the_rules_of_a_known_hand_and_say_so(made: Path, cache_root: Path):
+    said: list[str] = []
+    old = without_rules(read_shard(made), name="mine")
+    source, model = hand_of_shard(Cache(cache_root, said.append), old.hand, old.header.config, CPU)
+    assert source.spec.contact == hand_source("allegro").spec.contact
+    assert model.name == "mine"
+    (line,) = said
+    assert "does not hold the rules of its hand 'mine'" in line
+    assert "known hand 'allegro'" in line
+
+
+def test_older_shards_of_an_installed_hand_need_no_words(job: Callable[..., Job], cache_root: Path):
+    old = without_rules(read_shard(generate(job(rows=5)).paths[0]))
+    source, _ = hand_of_shard(Cache(cache_root, pytest.fail), old.hand, old.header.config, CPU)
+    assert source.spec == hand_source("allegro").spec
+
+
+def test_rules_that_fit_nothing_are_an_error(made: Path, cache_root: Path):
+    old = without_rules(read_shard(made), base_link="link_3.0")
+    with pytest.raises(HandError, match="does not hold the rules"):
+        hand_of_shard(Cache(cache_root), old.hand, old.header.config, CPU)
+
+
+def test_plans_take_hand_and_object_from_a_shard(made: Path, cache_root: Path, tmp_path: Path):
+    cache = Cache(cache_root, pytest.fail)
+    done = plan_grasps(
+        PlanJob(hand=str(made), object=str(made), out=tmp_path / "plans", starts=12, device="cpu", cache=cache)
+    )
+    assert done.path is not None
+    plan, shard = read_shard(done.path), read_shard(made)
+    assert plan.hand == replace(shard.hand, joint_lower=plan.hand.joint_lower, joint_upper=plan.hand.joint_upper)
+    np.testing.assert_array_equal(plan.objects[0].faces, shard.objects[0].faces)
+    np.testing.assert_allclose(plan.objects[0].vertices, shard.objects[0].vertices, atol=1e-7)
+
+
+def test_an_object_is_cached_by_content_and_parameters(made: Path, tmp_path: Path):
+    cache, (record,) = Cache(tmp_path / "cache", pytest.fail), read_shard(made).objects
+    few = ObjectParams(obstacle_count=1024)
+    whole, thin = object_of_shard(cache, record, CPU), object_of_shard(cache, record, CPU, few)
+    assert len(thin.obstacle_points) < len(whole.obstacle_points)
+    same(object_of_shard(cache, record, CPU), whole)
+    moved = replace(record, vertices=record.vertices * np.float32(1.1))
+    assert object_of_shard(cache, moved, CPU).extents[0] > whole.extents[0]
+    assert len(cache.entries()) == 3
+
+
+def test_a_shard_of_no_single_object_is_no_object(made: Path, cache_root: Path, tmp_path: Path):
+    shard = read_shard(made)
+    two = [shard.objects[0], replace(shard.objects[0], id="zwei")]
+    write_shard(tmp_path / "two.h5", replace(shard, objects=two))
+    with pytest.raises(ShardError, match="holds the objects mug, zwei"):
+        named_object(Cache(cache_root), str(tmp_path / "two.h5"), 1.0, CPU)
+    with pytest.raises(ShardError, match="in metres"):
+        named_object(Cache(cache_root), str(made), 0.001, CPU)
+
+
+def test_rules_are_plain_json(made: Path, cache_root: Path):
+    config = read_shard(made).header.config
+    assert json.loads(config["hand_rules"])["name"] == "allegro"
+    assert named_hand(Cache(cache_root, pytest.fail), str(made), CPU)[1].sha256 == read_shard(made).hand.sha256
