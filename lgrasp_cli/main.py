@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from lgrasp.judge import command as judge
 from lgrasp.notices import on_notice
 from lgrasp_cli import (
     bench,
@@ -37,6 +38,7 @@ app = typer.Typer(
 )
 for module in (prepare, generate, sequence, plan, refine, run, validate, stages, export):
     module.register(app)
+app.command("judge")(judge.command)
 for group in (bench, hands, objects, pipelines, cache, dataset, scenes, learn):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])
 

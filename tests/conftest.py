@@ -171,14 +171,14 @@ def tables(swift, context) -> SimpleNamespace:
 
 @pytest.fixture(scope="session")
 def solids(inputs):
-    """The hand as the reference judge reads it from the URDF."""
-    judge = pytest.importorskip("support.judge")
+    """The hand as the judge reads it from the URDF."""
+    from lgrasp.judge.collision import JudgedHand
 
     def no_meshes(name):
         raise AssertionError(f"the shipped hand has no meshes, asked for {name}")
 
     model = inputs.hand.model
-    hand = judge.Hand(model.urdf_text, no_meshes, model.tree.base_link)
+    hand = JudgedHand(model.urdf_text, no_meshes, model.tree.base_link)
     assert tuple(hand.links) == tuple(model.tree.link_names)
     return hand
 

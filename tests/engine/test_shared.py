@@ -4,13 +4,13 @@ from itertools import product
 
 import numpy as np
 import pytest
-from support.judge import judge
 
 from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.generate import Job, generate
+from lgrasp.judge.run import judge
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,13 @@
 """A hand with locked joints: a shard must be usable on the URDF as it is, without knowing hand.yaml."""
 
 import numpy as np
-from support.judge import judge
 
 from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.generate import Job, generate
+from lgrasp.judge.run import judge
 
 
 def test_locked_joints_are_in_the_shard(tmp_path):

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import trimesh
 from support.jaws import mesh_record
-from support.judge import Report, judge
 
 from lgrasp.cloud.read import Cloud
 from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, ObjectError, OutputError
 from lgrasp.jobs.refine.plan import PlanJob, PlanOutcome, plan_grasps
+from lgrasp.judge.report import Report
+from lgrasp.judge.run import judge
 from lgrasp.object.find import find_object
 from lgrasp.planning.planner import PlanParams
 

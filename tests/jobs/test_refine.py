@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from support.judge import judge
 from support.wrench import unresisted
 
 from lgrasp.dataset import GraspRows, Shard, read_shard, validate_shard, write_shard
@@ -18,6 +17,7 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.jobs.generate import Job, generate
 from lgrasp.jobs.refine.shards import RefinedShard, Refinement, refine_shards
+from lgrasp.judge.run import judge
 from lgrasp.stages.refine.params import RefineParams
 
 ROWS = 40

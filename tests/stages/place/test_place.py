@@ -31,7 +31,7 @@ def test_counts_and_order(context):
 
 def test_palm_is_free(context, tables, solids, mesh, pose_matrices, inputs):
     """Dense points of the palm in the object and of the object in the palm's solids."""
-    from support.judge import Object, hand_object_penetration
+    from lgrasp.judge.collision import JudgedObject, hand_in_object
 
     tree = inputs.hand.model.tree
     static = copy(solids)
@@ -40,7 +40,7 @@ def test_palm_is_free(context, tables, solids, mesh, pose_matrices, inputs):
     T = np.linalg.inv(pose_matrices(pose_arrays(tables.place)["pose"][:50]))[:, None]
     names = inputs.hand.model.tree.joint_names
     zero = solids.forward(solids.resolve_joints({n: np.zeros(1) for n in names}, 1), 1)
-    depth = np.max(hand_object_penetration(static, Object(mesh), T @ zero), axis=0)
+    depth = np.max(hand_in_object(static, JudgedObject(mesh), T @ zero), axis=0)
     assert depth.max() < PlaceParams().clearance + 5e-4
 
 

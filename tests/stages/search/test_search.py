@@ -96,7 +96,7 @@ def test_sets_of_a_pose_are_apart(found, inputs):
 
 
 def test_fingers_do_not_meet(found, inputs, solids, link_poses, finger_posture):
-    from support.judge import SolidPoses
+    from lgrasp.judge.collision import PlacedSolids
 
     arrays, _, _ = found
     tree = inputs.hand.model.tree
@@ -107,7 +107,7 @@ def test_fingers_do_not_meet(found, inputs, solids, link_poses, finger_posture):
         at = rows[used]
         values = arrays["candidates.q"][arrays["pose"][at], g, arrays["chosen"][at, g]]
         q[used] += finger_posture(np.full(len(used), g), values)
-    poses = SolidPoses(solids.solids, link_poses(q))
+    poses = PlacedSolids(solids.solids, link_poses(q))
     group = [tree.body_group[tree.link_body[s.link]] for s in solids.solids]
     checked = 0
     for a, b in solids.pairs:

@@ -1,0 +1,31 @@
+"""The bounds of a strictly valid grasp: the only numbers that a verdict depends on. Metres, radians, newtons."""
+
+import math
+
+LIMIT_EXCESS = 1e-4
+"""Joint values beyond their limits, and mimic joints off their relation [rad or m]."""
+PENETRATION = 2e-3
+"""Hand in object, and object in object [m]."""
+SELF_PENETRATION = 1e-3
+"""Links in each other, neighbours in the tree and pairs that always touch left out [m]."""
+CONTACT_DISTANCE = 2e-3
+"""A contact point from the object's surface, and from that of the link it names [m]."""
+NORMAL_DEG = 20.0
+"""The link's outward normal against the object's inward normal at a contact [deg]."""
+RESIDUAL = 0.05
+"""Least wrench that contact forces with normal parts of sum 1 leave over."""
+
+MU = 0.5
+CONE_EDGES = 8
+TORQUE_SCALE = 10.0
+"""Torques beside forces in the residual [1/m]."""
+
+DUPLICATE_T, DUPLICATE_R, DUPLICATE_Q = 5e-3, math.radians(5.0), 0.1
+"""Translation [m], rotation [rad], joint difference [rad] that count as 1; a sliding joint's is a translation."""
+
+UNIT_QUATERNION = 1e-3
+UNIT_NORMAL = 1e-2
+
+
+class JudgeError(Exception):
+    """A file that cannot be judged, in one line: the file, what is wrong, what would be accepted."""

@@ -1,0 +1,261 @@
+"""All checks on rows of one shard; every number is derived from the URDF, the object meshes and the row alone."""
+
+import itertools
+import math
+
+import numpy as np
+
+from lgrasp.judge import bounds
+from lgrasp.judge.collision import PlacedSolids, hand_in_object, object_in_object
+from lgrasp.judge.kinematics import inverse, pose_transforms
+from lgrasp.judge.meshes import PROBES
+from lgrasp.judge.sequences import check_frozen, check_parents
+from lgrasp.judge.shard import JudgedShard
+from lgrasp.judge.wrench import ferrari_canny, force_errors, wrench_residual
+
+CHECKS: dict[str, tuple[str, float]] = {
+    "finite": ("", 0.0),
+    "indices": ("", 0.0),
+    "limits": ("limit_excess", bounds.LIMIT_EXCESS),
+    "mimic": ("mimic_error", bounds.LIMIT_EXCESS),
+    "mimic_limits": ("mimic_limit_excess", bounds.LIMIT_EXCESS),
+    "penetration": ("penetration_mm", 1e3 * bounds.PENETRATION),
+    "self_penetration": ("self_penetration_mm", 1e3 * bounds.SELF_PENETRATION),
+    "contact_on_object": ("contact_object_mm", 1e3 * bounds.CONTACT_DISTANCE),
+    "contact_on_link": ("contact_link_mm", 1e3 * bounds.CONTACT_DISTANCE),
+    "normal": ("normal_deg", bounds.NORMAL_DEG),
+    "stored_normal": ("stored_normal_deg", bounds.NORMAL_DEG),
+    "residual": ("residual", bounds.RESIDUAL),
+    "object_object": ("object_object_mm", 1e3 * bounds.PENETRATION),
+    "frozen": ("", 0.0),
+    "parent": ("", 0.0),
+}
+"""The strict checks by name, each with the value it bounds ('' for a check of form) and the bound."""
+
+VALUES = (
+    *(value for value, _ in CHECKS.values() if value),
+    "object_in_link_mm",
+    "link_in_object_mm",
+    "residual_stored_normals",
+    "residual_round_cone",
+    "residual_frictionless",
+    "force_balance",
+    "force_normal_sum_error",
+    "force_cone_excess",
+    "contacts",
+    "links_in_contact",
+    "epsilon",
+)
+ROUND_EDGES = 48
+"""Close to the round cone: what a pyramid turned about its normal could reach at best."""
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle in degrees between unit vectors (..., 3), accurate near 0."""
+    return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+class RowChecks:
+    """Checks on chosen rows of one shard.
+
+    Attributes:
+        values: recomputed numbers by name, (n,) each, NaN where not judged.
+        failed: by check, (n,) each. Rows that are not finite or whose indices are wrong fail only that.
+        solver_gap: largest optimality gap of the wrench problems.
+        self_pairs: pairs of links with self-penetration beyond the bound, and their rows.
+    """
+
+    def __init__(self, shard: JudgedShard, rows: np.ndarray, *, epsilon: bool = False) -> None:
+        self.shard, self.hand, self.rows, n = shard, shard.hand, rows, len(rows)
+        self.g = {k: v[rows] for k, v in shard.grasps.items()}
+        self.values = {k: np.full(n, np.nan) for k in VALUES}
+        self.failed = {k: np.zeros(n, bool) for k in CHECKS}
+        self.solver_gap = 0.0
+        self.self_pairs: dict[str, int] = {}
+        self._form()
+        bad = self.failed["finite"] | self.failed["indices"]
+        good = self.good = np.flatnonzero(~bad)
+        if len(good):
+            T_links = self.hand.forward(self._joints(), len(good))
+            poses = np.asarray(self.g["object_pose"], float)[good]
+            T_objects = np.full((*poses.shape[:2], 4, 4), np.nan)
+            for o in range(poses.shape[1]):
+                here = self.index[good, o] >= 0
+                T_objects[here, o] = pose_transforms(poses[here, o])
+            self._self_penetration(T_links)
+            self._penetration(T_links, T_objects)
+            self._contacts(T_links, T_objects)
+            for row in good:
+                self._wrenches(row, epsilon)
+        if shard.steps:
+            touching = self.link_of, self.used
+            self.failed["frozen"] = check_frozen(shard, rows, self.index, *touching) & ~bad
+            self.failed["parent"] = check_parents(shard, rows) & ~bad
+
+    def _set(self, check: str, value: np.ndarray) -> None:
+        """Numbers of the good rows, in the unit of the check's bound."""
+        name, bound = CHECKS[check]
+        self.values[name][self.good] = value
+        self.failed[check][self.good] = ~(value <= bound)
+
+    def _form(self) -> None:
+        """Finite numbers, unit quaternions and indices that exist."""
+        g = self.g
+        self.index = np.asarray(g["object_index"], int)
+        links = np.asarray(g["contact_links"], int)
+        present = self.index >= 0
+        self.used = (links >= 0) & present[..., None]  # (n, O, C)
+        pose = np.asarray(g["object_pose"], float)
+        with np.errstate(invalid="ignore", over="ignore"):
+            unit = np.abs(np.linalg.norm(pose[..., 3:], axis=-1) - 1.0) <= bounds.UNIT_QUATERNION
+        bad = (present & ~(np.isfinite(pose).all(axis=-1) & unit)).any(axis=1)
+        for name in ("q", "q_pregrasp", "q_squeeze"):
+            if name in g:
+                bad |= ~np.isfinite(g[name]).all(axis=1)
+        for name in ("contact_points", "contact_normals", "contact_forces"):
+            if name in g:
+                bad |= (self.used & ~np.isfinite(g[name]).all(axis=-1)).any(axis=(1, 2))
+        self.failed["finite"] = bad
+        names = self.shard.link_names
+        known = np.array([self.hand.index.get(name, -1) for name in names] + [-1])
+        self.link_of = known[np.where((links >= 0) & (links < len(names)), links, len(names))]
+        absent = (self.index >= len(self.shard.objects)).any(axis=1) | ~present.any(axis=1)
+        self.failed["indices"] = (self.used & (self.link_of < 0)).any(axis=(1, 2)) | absent
+
+    def _joints(self) -> dict[str, np.ndarray]:
+        """Limits and mimic relations; values of all joints."""
+        n = len(self.good)
+        stored = dict(zip(self.shard.joint_names, np.asarray(self.g["q"], float)[self.good].T, strict=True))
+        full = self.hand.resolve_joints(stored, n)
+        own, driven, relation = (np.zeros(n) for _ in range(3))
+        for name, j in self.hand.movable.items():
+            excess = np.maximum(np.maximum(j.lower - full[name], full[name] - j.upper), 0.0)
+            if j.mimic is None:
+                own = np.maximum(own, excess)
+            else:
+                driven = np.maximum(driven, excess)
+                relation = np.maximum(relation, np.abs(stored.get(name, full[name]) - full[name]))
+        self._set("limits", own)
+        self._set("mimic_limits", driven)
+        self._set("mimic", relation)
+        return full
+
+    def _self_penetration(self, T_links: np.ndarray) -> None:
+        hand, depth = self.hand, np.zeros(len(self.good))
+        poses = PlacedSolids(hand.solids, T_links)
+        beyond: dict[str, set[int]] = {}
+        for a, b in hand.pairs:
+            for i in np.flatnonzero(~poses.far(a, b)).tolist():
+                d = poses.depth(i, a, b, bounds.SELF_PENETRATION)
+                depth[i] = max(depth[i], d)
+                if d > bounds.SELF_PENETRATION:
+                    name = " x ".join(sorted(hand.links[hand.solids[k].link] for k in (a, b)))
+                    beyond.setdefault(name, set()).add(i)
+        self.self_pairs = {k: len(v) for k, v in beyond.items()}
+        self._set("self_penetration", 1e3 * depth)
+
+    def _penetration(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
+        index, objects, n = self.index[self.good], self.shard.objects, len(self.good)
+        in_link, in_object, between = (np.zeros(n) for _ in range(3))
+        slots = range(index.shape[1])
+        for o, k in itertools.product(slots, range(len(objects))):
+            rows = np.flatnonzero(index[:, o] == k)
+            if len(rows):
+                T = inverse(T_objects[rows, o])[:, None] @ T_links[rows]
+                a, b = hand_in_object(self.hand, objects[k], T)
+                in_link[rows], in_object[rows] = np.maximum(in_link[rows], a), np.maximum(in_object[rows], b)
+        for a, b in itertools.combinations(slots, 2):
+            for i in np.flatnonzero((index[:, a] >= 0) & (index[:, b] >= 0)):
+                T = (inverse(T_objects[i, a]) @ T_objects[i, b])[None]
+                depth = object_in_object(objects[index[i, a]], objects[index[i, b]], T)
+                between[i] = max(between[i], depth[0])
+        self.values["object_in_link_mm"][self.good] = 1e3 * in_link
+        self.values["link_in_object_mm"][self.good] = 1e3 * in_object
+        self._set("penetration", 1e3 * np.maximum(in_link, in_object))
+        if len(slots) > 1:
+            self._set("object_object", 1e3 * between)
+
+    def _contacts(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
+        """Contact distances and normals; keeps the recomputed outward object normals for the wrenches."""
+        self.normals = np.full((*self.used.shape, 3), np.nan)
+        i, o, c = np.nonzero(self.used[self.good])
+        r = self.good[i]
+        points, given = (np.asarray(self.g[k], float)[r, o, c] for k in ("contact_points", "contact_normals"))
+        object_normals, on_object = np.zeros((len(r), len(PROBES) + 1, 3)), np.zeros(len(r))
+        for k, obj in enumerate(self.shard.objects):
+            m = np.flatnonzero(self.index[r, o] == k)
+            on_object[m] = obj.surface.closest(points[m])[0]
+            object_normals[m] = obj.surface.normals(points[m])
+        links = self.link_of[r, o, c]
+        T = inverse(T_objects[i, o]) @ T_links[i, links]  # object from link
+        on_link, link_normals = self._on_links(links, np.einsum("nji,nj->ni", T[:, :3, :3], points - T[:, :3, 3]))
+        link_normals = np.einsum("nij,npj->npi", T[:, :3, :3], link_normals)
+        between = angle_deg(-link_normals[:, :, None], object_normals[:, None])  # (n, P, P)
+        length = np.linalg.norm(given, axis=1, keepdims=True)
+        off = angle_deg((given / np.maximum(length, 1e-12))[:, None], object_normals).min(axis=1)
+        off = np.where(np.abs(length[:, 0] - 1.0) <= bounds.UNIT_NORMAL, off, 180.0)
+        for check, found in (
+            ("contact_on_object", 1e3 * on_object),
+            ("contact_on_link", 1e3 * np.abs(on_link)),
+            ("normal", between.min(axis=(1, 2))),
+            ("stored_normal", off),
+        ):
+            worst = np.zeros(len(self.good))
+            np.maximum.at(worst, i, found)
+            self._set(check, worst)
+        # the wrench uses the mesh normal; on an edge or vertex, the admissible one nearest the link's
+        nominal = between[:, :, 0].min(axis=1) <= bounds.NORMAL_DEG
+        chosen = np.where(nominal, 0, between.min(axis=1).argmin(axis=1))
+        self.normals[r, o, c] = object_normals[np.arange(len(r)), chosen]
+
+    def _on_links(self, links: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distance to the union of the named link's solids and the admissible normals there (link frame)."""
+        distance = np.full(len(points), np.inf)
+        normals = np.zeros((len(points), len(PROBES) + 1, 3))
+        for solid in self.hand.solids:
+            m = np.flatnonzero(links == solid.link)
+            signed = solid.signed(points[m])
+            closer = signed < distance[m]
+            m, signed = m[closer], signed[closer]
+            if len(m):
+                found = solid.normals(points[m])
+                distance[m] = signed
+                normals[m] = found[:, [*range(found.shape[1]), *[0] * (normals.shape[1] - found.shape[1])]]
+        return distance, normals
+
+    def _wrenches(self, row: int, epsilon: bool) -> None:
+        """Of several objects the worst; an object without contacts is held by nothing."""
+        found: dict[str, list[float]] = {}
+        links = []
+        for o in np.flatnonzero(self.index[row] >= 0):
+            used = self.used[row, o]
+            links.append(self.link_of[row, o, used])
+            points, stored = (np.asarray(self.g[k], float)[row, o, used] for k in ("contact_points", "contact_normals"))
+            inward = -self.normals[row, o, used]
+            numbers = self._residuals(points, inward, -stored) if used.any() else {"residual": math.inf}
+            if used.any() and "contact_forces" in self.g:
+                names = ("force_balance", "force_normal_sum_error", "force_cone_excess")
+                forces = np.asarray(self.g["contact_forces"], float)[row, o, used]
+                numbers |= dict(zip(names, force_errors(points, inward, forces), strict=True))
+            if used.any() and epsilon:
+                obj = self.shard.objects[self.index[row, o]]
+                numbers["epsilon"] = -ferrari_canny(points, inward, obj.centre_of_mass, obj.radius)
+            for name, value in numbers.items():
+                found.setdefault(name, []).append(value)
+        for name, each in found.items():
+            self.values[name][row] = max(each)
+        self.values["epsilon"][row] *= -1.0
+        self.failed["residual"][row] = not self.values["residual"][row] <= bounds.RESIDUAL
+        self.values["contacts"][row] = sum(len(x) for x in links)
+        self.values["links_in_contact"][row] = len(np.unique(np.concatenate(links)))
+
+    def _residuals(self, points: np.ndarray, inward: np.ndarray, given: np.ndarray) -> dict[str, float]:
+        norm, gap = wrench_residual(points, inward)
+        self.solver_gap = max(self.solver_gap, gap)
+        given = given / np.maximum(np.linalg.norm(given, axis=1, keepdims=True), 1e-12)
+        return {
+            "residual": norm,
+            "residual_round_cone": wrench_residual(points, inward, edges=ROUND_EDGES)[0],
+            "residual_frictionless": wrench_residual(points, inward, mu=0.0)[0],
+            "residual_stored_normals": wrench_residual(points, given)[0],
+        }

@@ -1,0 +1,211 @@
+"""Triangle meshes: exact closest points, signed distance, depth, admissible normals, dense samples."""
+
+import io
+import math
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.ndimage import label
+from scipy.spatial import cKDTree
+
+from lgrasp.judge.inside import Inside
+
+FEATURE = 5e-5
+"""Normals of all faces this close to the closest point are admissible [m]."""
+PAIRS = 1_000_000  # points x boxes held at once
+CELLS = 48
+"""Cells along the longest side of the grid that tells inside from outside away from the surface."""
+FEW = 256
+"""Points that are told without the grid."""
+OUTSIDE, INSIDE, CROSSED = range(3)
+
+_ICO = trimesh.creation.icosahedron().vertices
+PROBES = np.vstack([np.zeros((1, 3)), _ICO / np.linalg.norm(_ICO, axis=1, keepdims=True) * FEATURE])  # (13, 3)
+
+
+def closest_on_triangles(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Closest points (..., 3) of triangles (..., 3, 3) of positive area to points (..., 3)."""
+    a, b, c = (corners[..., k, :] for k in range(3))
+    ab, ac, ap = b - a, c - a, p - a
+    n = np.cross(ab, ac)
+    nn = (n * n).sum(-1)
+    v = (np.cross(ap, ac) * n).sum(-1) / nn
+    w = (np.cross(ab, ap) * n).sum(-1) / nn
+    best = a + v[..., None] * ab + w[..., None] * ac
+    outside = np.nonzero((v < 0.0) | (w < 0.0) | (v + w > 1.0))
+    p, corners = np.broadcast_to(p, best.shape)[outside], corners[outside]
+    least = np.full(len(p), np.inf)
+    foot = np.zeros_like(p)
+    for k in range(3):
+        start, edge = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
+        t = (((p - start) * edge).sum(-1) / (edge * edge).sum(-1)).clip(0.0, 1.0)
+        near = start + t[:, None] * edge
+        d = ((p - near) ** 2).sum(-1)
+        foot[d < least] = near[d < least]
+        least = np.minimum(least, d)
+    best[outside] = foot
+    return best
+
+
+class Boxes:
+    """A balanced tree of bounding boxes over triangles, level by level: level l has 2^l nodes, leaves 2 to 4 triangles.
+
+    Node i of level l holds the triangles at ``order[i F // 2^l : (i + 1) F // 2^l]``.
+    """
+
+    def __init__(self, corners: np.ndarray) -> None:
+        count, middle = len(corners), corners.mean(axis=1)
+        depth = max(0, math.ceil(math.log2(count / 4)) if count > 4 else 0)
+        self.starts = [(np.arange(2**level + 1) * count) >> level for level in range(depth + 1)]
+        self.order = np.arange(count)
+        for start in self.starts[:-1]:
+            sorted_middle = middle[self.order]
+            low, high = (f.reduceat(sorted_middle, start[:-1]) for f in (np.minimum, np.maximum))
+            node = np.repeat(np.arange(len(start) - 1), np.diff(start))
+            axis = (high - low).argmax(axis=1)[node]
+            self.order = self.order[np.lexsort((sorted_middle[np.arange(count), axis], node))]
+        low, high = corners.min(axis=1)[self.order], corners.max(axis=1)[self.order]
+        self.low = [np.minimum.reduceat(low, start[:-1]) for start in self.starts]
+        self.high = [np.maximum.reduceat(high, start[:-1]) for start in self.starts]
+
+    def near(self, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of points (n, 3) and triangles whose leaf comes within a point's reach (n,): indices (m,), (m,)."""
+        row, node = np.arange(len(points)), np.zeros(len(points), int)
+        for low, high in zip(self.low[1:], self.high[1:], strict=True):
+            row, node = np.repeat(row, 2), np.column_stack([2 * node, 2 * node + 1]).ravel()
+            gap = np.maximum(np.maximum(low[node] - points[row], points[row] - high[node]), 0.0)
+            keep = (gap * gap).sum(axis=1) <= reach[row] ** 2
+            row, node = row[keep], node[keep]
+            if len(row) > PAIRS and len(points) > 1:
+                half = len(points) // 2
+                parts = [self.near(points[rows], reach[rows]) for rows in (slice(half), slice(half, None))]
+                return np.concatenate([parts[0][0], parts[1][0] + half]), np.concatenate([p[1] for p in parts])
+        first = self.starts[-1][node]
+        many = self.starts[-1][node + 1] - first
+        at = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many) + np.repeat(first, many)
+        return np.repeat(row, many), self.order[at]
+
+
+class Surface:
+    """Signed distance to a triangle mesh: exact closest points, sign from crossings of rays."""
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        self.mesh = mesh
+        real = mesh.area_faces > 0.0
+        self.corners = np.asarray(mesh.triangles, float)[real]  # (F, 3, 3)
+        self.face_normals = np.cross(*np.moveaxis(np.diff(self.corners, axis=1), 1, 0))
+        self.face_normals /= np.linalg.norm(self.face_normals, axis=1, keepdims=True)
+        self.low, self.high = mesh.bounds
+        self.cell = max(float((self.high - self.low).max()) / CELLS, 1e-9)
+        self.shape = np.maximum(np.ceil((self.high - self.low) / self.cell).astype(int), 1)
+        self.boxes = Boxes(self.corners)
+        self.guess = cKDTree(surface_samples(mesh, 8_000))
+        self.inside = Inside(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), bool(mesh.is_watertight))
+
+    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distance (n,), face of positive area (n,) and point (n, 3) of the surface closest to points (n, 3)."""
+        distance, face, foot = np.full(len(points), np.inf), np.zeros(len(points), int), np.zeros((len(points), 3))
+        for rows in np.array_split(np.arange(len(points)), math.ceil(len(points) / 4096)) if len(points) else []:
+            p = points[rows]
+            row, triangle = self.boxes.near(p, self.guess.query(p)[0] * (1.0 + 1e-9) + 1e-12)
+            feet = closest_on_triangles(p[row], self.corners[triangle])
+            d = np.linalg.norm(feet - p[row], axis=1)
+            order = np.lexsort((d, row))
+            best = order[np.searchsorted(row[order], np.arange(len(p)))]
+            distance[rows], face[rows], foot[rows] = d[best], triangle[best], feet[best]
+        return distance, face, foot
+
+    def signed(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance (n,) of points (n, 3), negative inside."""
+        return np.where(self.contains(points), -1.0, 1.0) * self.closest(points)[0]
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Which of the points (n, 3) are inside."""
+        out = np.all((points > self.low) & (points < self.high), axis=1)
+        rows = np.flatnonzero(out)
+        if len(rows) > FEW:
+            state = self.states[tuple(self._cells(points[rows]).T)]
+            out[rows] = state == INSIDE
+            rows = rows[state == CROSSED]
+        out[rows] = self.inside(points[rows])
+        return out
+
+    def _cells(self, points: np.ndarray) -> np.ndarray:
+        return np.minimum(((points - self.low) / self.cell).astype(int), self.shape - 1)
+
+    @cached_property
+    def states(self) -> np.ndarray:
+        """Cells of a grid over the mesh that the surface may cross, and the others' side, shape (X, Y, Z).
+
+        Of a closed mesh connected cells are on one side. Of an open one, whose inside has no edge, a cell is judged by
+        its middle.
+        """
+        axes = [lo + (np.arange(k) + 0.5) * self.cell for lo, k in zip(self.low, self.shape, strict=True)]
+        middles = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        crossed = np.zeros(len(middles), bool)
+        crossed[self.boxes.near(middles, np.full(len(middles), self.cell))[0]] = True  # above half a diagonal
+        if self.inside.closed:
+            regions = label(~crossed.reshape(self.shape))[0].ravel()
+            _, first, region = np.unique(regions, return_index=True, return_inverse=True)
+            within = self.inside(middles[first])[region]
+        else:
+            within = self.inside(middles)
+        return np.where(crossed, CROSSED, np.where(within, INSIDE, OUTSIDE)).reshape(self.shape)
+
+    def depth(self, points: np.ndarray) -> np.ndarray:
+        """Depth of each point (n, 3) inside the mesh [m], 0 outside."""
+        out = np.zeros(len(points))
+        within = self.contains(points)
+        out[within] = self.closest(points[within])[0]
+        return out
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """Admissible outward normals at the closest points, (n, 14, 3); entry 0 is that of the closest face."""
+        distance, face, foot = self.closest(points)
+        probes = foot[:, None] + PROBES
+        normals = self.face_normals[self.closest(probes.reshape(-1, 3))[1]].reshape(*probes.shape)
+        normals[:, 0] = self.face_normals[face]
+        # the gradient of the distance: inside the normal cone of an edge or a vertex
+        away = (
+            (points - foot) * np.where(self.contains(points), -1.0, 1.0)[:, None] / np.maximum(distance, 1e-12)[:, None]
+        )
+        gradient = np.where(distance[:, None] > 1e-4, away, normals[:, 0])
+        return np.concatenate([normals, gradient[:, None]], axis=1)
+
+
+def surface_samples(mesh: trimesh.Trimesh, count: int) -> np.ndarray:
+    """Every vertex and ``count`` area-stratified low-discrepancy surface points, (V + count, 3)."""
+    cumulative = np.cumsum(mesh.area_faces)
+    i = np.arange(count)
+    face = np.searchsorted(cumulative, (i + 0.5) / count * cumulative[-1]).clip(max=len(mesh.faces) - 1)
+    u, v = np.modf(0.5 + i * 0.7548776662466927)[0], np.modf(0.5 + i * 0.5698402909980532)[0]
+    fold = u + v > 1.0
+    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
+    a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
+    return np.vstack([mesh.vertices, a + u[:, None] * (b - a) + v[:, None] * (c - a)])
+
+
+def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
+    """Mesh with vertices merged by position and faces turned outward.
+
+    Raises:
+        ValueError: no face, vertices that are not finite or not there, or no area.
+    """
+    vertices, faces = np.asarray(vertices, float), np.asarray(faces, np.int64)
+    if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
+        raise ValueError("a mesh needs faces that index finite vertices")
+    mesh = trimesh.Trimesh(vertices, faces, process=True)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    if not mesh.area > 0.0:
+        raise ValueError("a mesh has no area")
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh
+
+
+def load_mesh(source: Path | bytes, name: str) -> trimesh.Trimesh:
+    """Mesh of a file or of its bytes; all parts of a scene in one."""
+    file = io.BytesIO(source) if isinstance(source, bytes) else str(source)
+    return trimesh.load_scene(file, file_type=Path(name).suffix.lstrip(".").lower()).to_mesh()

@@ -1,0 +1,109 @@
+"""Judges shards: files, folders of them, all of their rows or some."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lgrasp.judge.bounds import JudgeError
+from lgrasp.judge.checks import CHECKS, VALUES, RowChecks
+from lgrasp.judge.claims import metric_errors
+from lgrasp.judge.duplicates import count_repeats
+from lgrasp.judge.report import Report, ShardVerdict
+from lgrasp.judge.shard import JudgedShard, read_shard
+
+BLOCK = 64
+EPSILON_ROWS = 128
+"""Ferrari-Canny is recomputed for this many rows of a shard that stores it."""
+
+
+def judge(
+    shards: Sequence[str | Path] | str | Path,
+    *,
+    urdf: str | Path | None = None,
+    mesh: str | Path | Mapping[str, str | Path] | None = None,
+    rows: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Report:
+    """Judge every row of grasp shards by the strict bounds.
+
+    Args:
+        shards: shard files of format 1, or folders that hold some at any depth.
+        urdf: original URDF in place of the stored one; its meshes are looked up beside it.
+        mesh: original object mesh in place of the stored one (times the stored scale), or meshes by object id.
+        rows: judge only this many rows, drawn at random with a fixed seed; duplicates and poses are of all rows.
+        progress: called with rows done and rows to do.
+
+    Raises:
+        JudgeError: nothing to judge, or a file that cannot be judged.
+    """
+    paths = find_shards([shards] if isinstance(shards, str | Path) else shards)
+    if rows is not None and rows < 1:
+        raise JudgeError(f"rows {rows}: at least 1")
+    meshes = {} if mesh is None else mesh if isinstance(mesh, Mapping) else {"": mesh}
+    start = time.perf_counter()
+    sources = {k: _existing(p) for k, p in meshes.items()}
+    read = [read_shard(p, None if urdf is None else _existing(urdf), sources) for p in paths]
+    counts = [len(s.kept_invalid) for s in read]
+    total = sum(counts)
+    if not total:
+        raise JudgeError(f"no row in {', '.join(map(str, paths[:3]))}")
+    chosen = np.arange(total)
+    if rows is not None and rows < total:
+        chosen = np.sort(np.random.default_rng(0).choice(total, rows, replace=False))
+    loaded = time.perf_counter()
+    verdicts, done = [], 0
+    for s, first in zip(read, np.cumsum([0, *counts]), strict=False):
+        mine = chosen[(chosen >= first) & (chosen < first + len(s.kept_invalid))] - first
+        verdicts.append(_judge_shard(s, mine, lambda n, done=done: progress and progress(done + n, len(chosen))))
+        done += len(mine)
+    return Report(verdicts, count_repeats(read), time.perf_counter() - loaded, loaded - start)
+
+
+def _judge_shard(shard: JudgedShard, rows: np.ndarray, step: Callable[[int], object]) -> ShardVerdict:
+    """All checks on chosen rows, a block at a time."""
+    stored = any("epsilon" in name.lower() for name in shard.metrics)
+    blocks = []
+    for first in range(0, len(rows), BLOCK):
+        step(first)
+        blocks.append(RowChecks(shard, rows[first : first + BLOCK], epsilon=stored and first < EPSILON_ROWS))
+    self_pairs: dict[str, int] = {}
+    for name, count in (item for b in blocks for item in b.self_pairs.items()):
+        self_pairs[name] = self_pairs.get(name, 0) + count
+    values = {k: np.concatenate([np.zeros(0), *(b.values[k] for b in blocks)]) for k in VALUES}
+    return ShardVerdict(
+        path=shard.path,
+        total_rows=len(shard.kept_invalid),
+        rows=rows,
+        kept_invalid=shard.kept_invalid[rows],
+        values=values,
+        failed={k: np.concatenate([np.zeros(0, bool), *(b.failed[k] for b in blocks)]) for k in CHECKS},
+        metrics=metric_errors(shard, rows, values),
+        held=(np.asarray(shard.grasps["object_index"])[rows] >= 0).sum(axis=1),
+        self_pairs=self_pairs,
+        solver_gap=max((b.solver_gap for b in blocks), default=0.0),
+        claims=shard.claims,
+        notes=shard.notes,
+    )
+
+
+def find_shards(given: Sequence[str | Path]) -> list[Path]:
+    """Files, and every ``*.h5`` in folders at any depth, each once.
+
+    Raises:
+        JudgeError: no such file or folder, or a folder without shards.
+    """
+    found: list[Path] = []
+    for path in map(_existing, given):
+        files = sorted(path.rglob("*.h5")) if path.is_dir() else [path]
+        if not files:
+            raise JudgeError(f"{path}: no shard (*.h5) in this folder")
+        found += files
+    return list(dict.fromkeys(found))
+
+
+def _existing(path: str | Path) -> Path:
+    if not Path(path).exists():
+        raise JudgeError(f"{path}: no such file or folder")
+    return Path(path)

@@ -1,0 +1,230 @@
+"""Reads what is judged from a shard: hand, objects, rows, claims. Everything in the file is taken as untrusted."""
+
+import hashlib
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import trimesh
+
+from lgrasp.judge.bounds import LIMIT_EXCESS, JudgeError
+from lgrasp.judge.collision import POSTURES, JudgedHand, JudgedObject
+from lgrasp.judge.heaps import check_strings
+from lgrasp.judge.meshes import clean_mesh, load_mesh
+
+MOST_BYTES = 4 << 30
+"""Of one dataset."""
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "q": ("K",),
+    "q_pregrasp": ("K",),
+    "q_squeeze": ("K",),
+    "object_pose": ("O", "7"),
+    "object_index": ("O",),
+    "contact_points": ("O", "C", "3"),
+    "contact_normals": ("O", "C", "3"),
+    "contact_links": ("O", "C"),
+    "contact_forces": ("O", "C", "3"),
+}
+STEPS: dict[str, tuple[str, ...]] = {
+    "space": ("O",),
+    "free_joints": ("O", "K"),
+    "parent": (),
+    "q": ("O", "K"),
+    "q_pregrasp": ("O", "K"),
+    "q_squeeze": ("O", "K"),
+}
+OPTIONAL = ("q_pregrasp", "q_squeeze", "contact_forces")
+
+
+@dataclass
+class JudgedShard:
+    """One shard. ``metrics`` holds columns with their units; ``claims`` is what the file says of itself."""
+
+    path: Path
+    hand: JudgedHand
+    hand_key: str
+    joint_names: list[str]
+    link_names: list[str]
+    objects: list[JudgedObject]
+    object_keys: list[str]
+    grasps: dict[str, np.ndarray]
+    steps: dict[str, np.ndarray]
+    metrics: dict[str, tuple[np.ndarray, str]]
+    kept_invalid: np.ndarray  # (n,), rows that the file itself calls invalid
+    claims: dict[str, str]
+    notes: list[str]
+
+
+_CACHE: dict[str, Any] = {}
+
+
+def _cached(key: str, make: Callable[[], Any]) -> Any:
+    if key not in _CACHE:
+        if len(_CACHE) > 64:
+            _CACHE.clear()
+        _CACHE[key] = make()
+    return _CACHE[key]
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def _array(group: h5py.Group, name: str) -> np.ndarray:
+    """A dataset of bounded size, its bytes in this very file."""
+    data = group.get(name)
+    if not isinstance(data, h5py.Dataset):
+        raise JudgeError(f"no dataset {group.name.rstrip('/')}/{name}")
+    if data.nbytes > MOST_BYTES or data.external or data.is_virtual:
+        raise JudgeError(f"{data.name} is larger than {MOST_BYTES >> 30} GiB, or its bytes are in other files")
+    return data[()]
+
+
+def _columns(group: h5py.Group, shapes: Mapping[str, tuple[str, ...]], sizes: dict[str, int]) -> dict[str, np.ndarray]:
+    """Columns of numbers, all with the same number of rows, joints, objects and contacts."""
+    out = {}
+    for name, axes in shapes.items():
+        if name in OPTIONAL and name not in group and "space" not in shapes:
+            continue
+        data = out[name] = _array(group, name)
+        for size, axis in zip(data.shape, ("N", *axes), strict=False):
+            sizes.setdefault(axis, size)
+        wanted = tuple(int(axis) if axis.isdigit() else sizes.get(axis, 0) for axis in ("N", *axes))
+        if data.dtype.kind not in "fiub" or data.shape != wanted:
+            raise JudgeError(f"{group.name}/{name}: {data.dtype} of shape {data.shape}, not numbers of shape {wanted}")
+    return out
+
+
+def _resolver(blobs: Mapping[str, bytes], folder: Path | None) -> Callable[[str], trimesh.Trimesh]:
+    """From a file name in the URDF to its mesh: near a folder, or among the shard's own files."""
+
+    def resolve(name: str) -> trimesh.Trimesh:
+        bare = name.split("://", 1)[-1]
+        if folder is not None:
+            parts = Path(bare).parts
+            for root, k in itertools.product([folder, *folder.parents][:4], range(len(parts))):
+                path = root.joinpath(*parts[k:])
+                if path.is_file():
+                    return load_mesh(path, path.name)
+            raise JudgeError(f"mesh {name!r} named in the URDF not found near {folder}")
+        same = [name] if name in blobs else [p for p in blobs if Path(p).name == Path(bare).name]
+        if len(same) != 1:
+            raise JudgeError(
+                f"mesh {name!r} named in the URDF is not in the shard: {', '.join(sorted(blobs)) or 'none'}"
+            )
+        return load_mesh(blobs[same[0]], same[0])
+
+    return resolve
+
+
+def read_hand(group: h5py.Group, urdf: Path | None) -> tuple[JudgedHand, str]:
+    """The hand of a shard, or of a URDF in its place, and the key of its content."""
+    text = urdf.read_text() if urdf is not None else _text(_array(group, "urdf"))
+    meshes = group.get("meshes", {})
+    blobs = {_text(meshes[name].attrs["path"]): _array(meshes, name).tobytes() for name in meshes}
+    base = _text(group.attrs["base_link"]) if "base_link" in group.attrs else None
+    digest = hashlib.sha256(repr((text, base, str(urdf))).encode())
+    for name in sorted(blobs) if urdf is None else []:
+        digest.update(name.encode() + blobs[name])
+    resolve = _resolver(blobs, urdf.resolve().parent if urdf is not None else None)
+    return _cached(digest.hexdigest(), lambda: JudgedHand(text, resolve, base)), digest.hexdigest()
+
+
+def read_object(group: h5py.Group, source: Path | None) -> tuple[JudgedObject, str]:
+    """An object of a shard, or the original mesh times the stored scale, and the key of its content."""
+    if source is not None:
+        raw = load_mesh(source, source.name)
+        vertices, faces = np.asarray(raw.vertices) * float(group.attrs.get("scale", 1.0)), np.asarray(raw.faces)
+    else:
+        vertices, faces = _array(group, "vertices"), _array(group, "faces")
+        if not faces.size:
+            name = group.name.rpartition("/")[2]
+            raise JudgeError(f"object {name} is a point cloud; give the mesh that it is of: --mesh {name}=PATH")
+    if vertices.ndim != 2 or faces.ndim != 2 or (vertices.shape[1], faces.shape[1]) != (3, 3):
+        raise JudgeError(f"{group.name}: vertices and faces have shapes {vertices.shape} and {faces.shape}")
+    key = hashlib.sha256(vertices.tobytes() + faces.tobytes() + str(vertices.dtype).encode()).hexdigest()
+    return _cached(key, lambda: JudgedObject(clean_mesh(vertices, faces))), key
+
+
+def read_shard(path: Path, urdf: Path | None = None, mesh: Mapping[str, Path] | None = None) -> JudgedShard:
+    """Read one shard of format 1.
+
+    Args:
+        urdf: original URDF in place of the stored one.
+        mesh: original meshes in place of the stored ones by the object's id ('' for any).
+
+    Raises:
+        JudgeError: the file is damaged, foreign, not whole or cannot be judged; the message names it.
+    """
+    check_strings(path)
+    try:
+        with h5py.File(path, "r", locking=False) as f:
+            return _read(f, path, urdf, mesh or {})
+    except JudgeError as error:
+        raise JudgeError(f"{path}: {error}") from error
+    except Exception as error:  # whatever HDF5, trimesh and numbers out of place raise about a file's content
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise JudgeError(f"{path}: cannot be judged: {reason}") from error
+
+
+def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path]) -> JudgedShard:
+    attrs = {k: f.attrs.get(k) for k in ("format", "format_version", "complete")}
+    if attrs["format"] != "lgrasp-shard" or not str(attrs["format_version"]).startswith("1."):
+        raise JudgeError(f"not a grasp shard of version 1.x: format {attrs['format']}, version {attrs['format_version']}")
+    if not np.array_equal(attrs["complete"], 1):
+        raise JudgeError("incomplete: attribute complete is not 1")
+    for name in ("hand", "objects", "grasps"):
+        if not isinstance(f.get(name), h5py.Group) or not len(f[name]):
+            raise JudgeError(f"no group {name}, or nothing in it")
+    hand, hand_key = read_hand(f["hand"], urdf)
+    joint_names, link_names = ([_text(v) for v in _array(f["hand"], k)] for k in ("joint_names", "link_names"))
+    unknown = [n for n in joint_names if n not in hand.movable]
+    if unknown or len(set(joint_names)) < len(joint_names):
+        raise JudgeError(f"joint_names: not movable in the URDF, or named twice: {', '.join(unknown or joint_names)}")
+    ids = sorted(f["objects"])
+    objects = [read_object(f["objects"][k], mesh.get(k, mesh.get(""))) for k in ids]
+    g, sizes = f["grasps"], {"K": len(joint_names)}
+    grasps = _columns(g, COLUMNS, sizes)
+    steps = _columns(g["sequence"], STEPS, sizes) if "sequence" in g else {}
+    metrics = {}
+    for name in g.get("metrics", ()):
+        column = _columns(g["metrics"], {name: ()}, sizes)[name]
+        metrics[name] = column, _text(g[f"metrics/{name}"].attrs.get("unit", ""))
+    kept = metrics["valid"][0] == 0 if "valid" in metrics else np.zeros(sizes["N"], bool)
+    claims = {k: _text(f.attrs[k]) for k in ("pipeline", "profile", "bounds", "lgrasp_version") if k in f.attrs}
+    shard = JudgedShard(
+        path, hand, hand_key, joint_names, link_names, *map(list, zip(*objects, strict=True)),
+        grasps, steps, metrics, kept, claims, [],
+    )  # fmt: skip
+    shard.notes = _notes(shard, f["hand"], ids)
+    return shard
+
+
+def _notes(shard: JudgedShard, group: h5py.Group, ids: list[str]) -> list[str]:
+    """What a reader of the verdict must know about hand and objects."""
+    hand, names, notes = shard.hand, shard.joint_names, []
+    actuated = [j.name for j in hand.actuated]
+    if [n for n in names if n in actuated] != [n for n in actuated if n in names]:
+        notes.append("joint_names are not in the URDF's order")
+    missing = [n for n in actuated if n not in names]
+    if missing:
+        notes.append(f"joints absent from q, taken at 0 within limits: {', '.join(missing)}")
+    for key, side in (("joint_lower", "lower"), ("joint_upper", "upper")):
+        if key in group:
+            stored, real = _array(group, key), np.array([getattr(hand.movable[n], side) for n in names])
+            if stored.shape != real.shape or np.any(np.abs(stored - real)[np.isfinite(real)] > LIMIT_EXCESS):
+                notes.append(f"stored {key} differs from the URDF")
+    if hand.always_touching:
+        pairs = ", ".join(" x ".join(pair) for pair in hand.always_touching)
+        notes.append(f"links that touch in all of {POSTURES} random postures, left out: {pairs}")
+    dented = sorted({hand.links[s.link] for s in hand.solids if not s.convex})
+    if dented:
+        notes.append(f"links whose meshes are not convex, judged by their true surface: {', '.join(dented)}")
+    opened = [k for k, obj in zip(ids, shard.objects, strict=True) if not obj.mesh.is_watertight]
+    if opened:
+        notes.append(f"objects that are not watertight, inside by the winding number: {', '.join(opened)}")
+    return notes

@@ -1,0 +1,157 @@
+"""The command of the judge: what it prints, how it exits, that it stands alone, that bad files are one line."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from support.jawshard import URDF, row, write_shard
+from typer.testing import CliRunner
+
+from lgrasp.judge.bounds import JudgeError
+from lgrasp.judge.run import judge
+from lgrasp_cli.main import app
+
+ROOT = Path(__file__).resolve().parents[2]
+ALONE = """
+import sys
+
+class Closed:
+    def find_spec(self, name, path=None, target=None):
+        inner = name.startswith("lgrasp.") and name.split(".")[1] != "judge"
+        if inner or name.split(".")[0] in ("lgrasp_cli", "warp", "torch"):
+            raise ModuleNotFoundError(f"{name} is closed to the judge")
+
+sys.meta_path.insert(0, Closed())
+sys.argv = ["judge", *sys.argv[1:]]
+import runpy
+runpy.run_module("lgrasp.judge", run_name="__main__")
+"""
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, ["judge", *map(str, arguments)])
+
+
+def test_table_json_and_exit_code(tmp_path):
+    write_shard(tmp_path / "good.h5", [row(), row(q=[0.025, 0.025, 0.5], follow=0.26)])
+    result = run(tmp_path)
+    assert result.exit_code == 0
+    assert "good.h5       2       2  100.00 %  none" in result.stdout
+    write_shard(tmp_path / "sub" / "bad.h5", [row(), row(pose=[0, 0, 0.005, 1, 0, 0, 0])])
+    result = run(tmp_path, "--json", tmp_path / "out.json")
+    assert result.exit_code == 1
+    assert "bad.h5 2 1 50.00 % penetration 1 (5, 2)" in " ".join(result.stdout.split())
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert [s["valid_rows"] for s in found["shards"]] == [2, 1]
+    assert found["shards"][1]["failures"] == {"penetration": {"rows": 1, "worst": pytest.approx(5.0), "bound": 2.0}}
+    assert found["shards"][0]["claims"] == {"pipeline": "by hand"}
+    assert run(tmp_path / "good.h5", "--quiet").stdout == ""
+
+
+def test_rows_that_the_file_calls_invalid_count_apart(tmp_path):
+    rows = [row(), row(pose=[0, 0, 0.005, 1, 0, 0, 0]), row(q=[0.025, 0.025, 0.5], follow=0.26)]
+    path = write_shard(tmp_path / "kept.h5", rows, {"valid": ([1, 0, 0], "1")})
+    result = run(path)
+    assert result.exit_code == 0
+    assert "kept as invalid: 2, of which 1 pass" in result.stdout
+    assert "1 of 1 judged rows (100.00 %)" in result.stdout
+    assert judge(path).valid.tolist() == [True, False, True]
+
+
+def test_it_stands_alone(tmp_path):
+    """With every other room closed, and the libraries of the product, the judge judges."""
+    path = write_shard(tmp_path / "s.h5", [row()])
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    asked = [sys.executable, "-c", ALONE, str(path)]
+    result = subprocess.run(asked, capture_output=True, text=True, env=environment)
+    assert result.returncode == 0, result.stderr
+    assert "1 of 1 judged rows" in result.stdout
+
+
+def _damage(name):
+    def change(path: Path) -> None:
+        with h5py.File(path, "r+") as f:
+            MENDS[name](f)
+
+    return change
+
+
+def _replace(f: h5py.File, name: str, value: object) -> None:
+    del f[name]
+    f[name] = value
+
+
+def _huge(f: h5py.File) -> None:
+    del f["grasps/q"]
+    f.create_dataset("grasps/q", (1 << 40, 4), "f4", chunks=(4096, 4))
+
+
+def _elsewhere(f: h5py.File) -> None:
+    del f["grasps/q"]
+    f.create_dataset("grasps/q", (1, 4), "f4", external=[("/dev/zero", 0, 16)])
+
+
+BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>'
+MENDS = {
+    "format": lambda f: f.attrs.__setitem__("format", "other"),
+    "version": lambda f: f.attrs.__setitem__("format_version", "2.0"),
+    "complete": lambda f: f.attrs.__setitem__("complete", 0),
+    "no group grasps": lambda f: f.__delitem__("grasps"),
+    "no dataset /grasps/contact_links": lambda f: f.__delitem__("grasps/contact_links"),
+    "not numbers of shape": lambda f: _replace(f, "grasps/object_pose", np.zeros((1, 1, 6))),
+    "/grasps/object_index": lambda f: _replace(f, "grasps/object_index", np.zeros((2, 1), "i4")),
+    "larger than": _huge,
+    "other files": _elsewhere,
+    "no row": lambda f: [_replace(f, f"grasps/{k}", v[()][:0]) for k, v in list(f["grasps"].items())],
+    "a mesh needs faces": lambda f: f["objects/a_cube/faces"].__setitem__((0, 0), 99),
+    "point cloud": lambda f: _replace(f, "objects/a_cube/faces", np.zeros((0, 3), "i4")),
+    "not XML": lambda f: _replace(f, "hand/urdf", "<robot"),
+    "entities": lambda f: _replace(f, "hand/urdf", BOMB + URDF),
+    "mimics itself": lambda f: _replace(f, "hand/urdf", URDF.replace('mimic joint="swing"', 'mimic joint="follow"')),
+    "outside the tree": lambda f: _replace(f, "hand/urdf", URDF.replace('<parent link="tip"/>', '<parent link="x"/>')),
+    "not movable": lambda f: _replace(f, "hand/joint_names", ["a", "b", "c", "d"]),
+    "sizes are positive": lambda f: _replace(f, "hand/urdf", URDF.replace('radius="0.004"', 'radius="-1"')),
+    "not in the shard": lambda f: f.__delitem__("hand/meshes"),
+    "base link": lambda f: f["hand"].attrs.__setitem__("base_link", "arm"),
+}
+
+
+@pytest.mark.parametrize("what", MENDS)
+def test_files_that_cannot_be_judged(tmp_path, what):
+    path = write_shard(tmp_path / "s.h5", [row()])
+    _damage(what)(path)
+    with pytest.raises(JudgeError, match=what) as caught:
+        judge(path)
+    assert str(path) in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_no_shard_at_all(tmp_path):
+    (tmp_path / "text.h5").write_text("no shard")
+    (tmp_path / "empty.h5").touch()
+    (tmp_path / "folder").mkdir()
+    whole = write_shard(tmp_path / "s.h5", [row()]).read_bytes()
+    (tmp_path / "half.h5").write_bytes(whole[: len(whole) // 2])
+    for name in ("text.h5", "empty.h5", "half.h5", "folder", "missing.h5"):
+        result = run(tmp_path / name)
+        assert result.exit_code == 2, name
+        assert result.stderr.startswith(f"error: {tmp_path / name}: ")
+        assert result.stderr.count("\n") == 1
+        assert not result.stdout
+    assert run(tmp_path / "s.h5", "--rows", 0).exit_code == 2
+    assert run(tmp_path / "s.h5", "--json", tmp_path / "no" / "out.json").exit_code == 2
+
+
+def test_damaged_string_heaps_are_found_before_they_are_read(tmp_path):
+    path = write_shard(tmp_path / "s.h5", [row()])
+    data = bytearray(path.read_bytes())
+    heap = data.find(b"GCOL\x01\x00\x00\x00")
+    data[heap + 24 : heap + 32] = (1 << 60).to_bytes(8, "little")
+    path.write_bytes(data)
+    with pytest.raises(JudgeError, match=f"string heap at byte {heap}"):
+        judge(path)
