@@ -56,7 +56,7 @@ def _commands(command: Any, parent: typer.Context | None, name: str) -> Iterator
 
 
 def _section(command: Any, context: typer.Context) -> list[str]:
-    text, _, example = (command.help or "").partition("Example: ")
+    text, _, example = (command.help or "").replace("\b", "").partition("Example: ")
     lines = [f"## {context.command_path}", ""]
     for paragraph in filter(str.strip, text.split("\n\n")):
         lines += [" ".join(paragraph.split()), ""]

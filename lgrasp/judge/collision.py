@@ -9,14 +9,14 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from lgrasp.judge.kinematics import LinkTree, inverse
-from lgrasp.judge.meshes import Surface, surface_samples
+from lgrasp.judge.meshes import MeshDistance, surface_samples
 from lgrasp.judge.solids import JudgedSolid
 from lgrasp.judge.urdf import parse, read_joint, read_solids
 
 POSTURES = 200
 """Random postures in all of which a pair of links touches before it is left out."""
 SAMPLES = 30_000
-"""Surface points of an object, beside every vertex."""
+"""MeshDistance points of an object, beside every vertex."""
 
 
 class JudgedHand(LinkTree):
@@ -105,7 +105,7 @@ class JudgedObject:
     """An object mesh with dense surface points."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self.mesh, self.surface = mesh, Surface(mesh)
+        self.mesh, self.surface = mesh, MeshDistance(mesh)
         self.depth = self.surface.depth
         self.samples = surface_samples(mesh, SAMPLES)
         self.tree = cKDTree(self.samples)

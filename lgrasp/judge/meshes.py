@@ -49,7 +49,7 @@ def closest_on_triangles(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return best
 
 
-class Boxes:
+class BoxTree:
     """A balanced tree of bounding boxes over triangles, level by level: level l has 2^l nodes, leaves 2 to 4 triangles.
 
     Node i of level l holds the triangles at ``order[i F // 2^l : (i + 1) F // 2^l]``.
@@ -88,7 +88,7 @@ class Boxes:
         return np.repeat(row, many), self.order[at]
 
 
-class Surface:
+class MeshDistance:
     """Signed distance to a triangle mesh: exact closest points, sign from crossings of rays."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -100,7 +100,7 @@ class Surface:
         self.low, self.high = mesh.bounds
         self.cell = max(float((self.high - self.low).max()) / CELLS, 1e-9)
         self.shape = np.maximum(np.ceil((self.high - self.low) / self.cell).astype(int), 1)
-        self.boxes = Boxes(self.corners)
+        self.boxes = BoxTree(self.corners)
         self.guess = cKDTree(surface_samples(mesh, 8_000))
         self.inside = Inside(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), bool(mesh.is_watertight))
 

@@ -185,6 +185,7 @@ class Report:
             share = f"{100.0 * d['valid_rows'] / d['rows']:.2f} %" if d["rows"] else "-"
             line = f"{s.path.name:<{width}}{d['rows']:>8}{d['valid_rows']:>8}{share:>10}  "
             line += ", ".join(_failure(check, f) for check, f in d["failures"].items()) or "none"
+            line += f"; made for profile {s.claims['profile']}" if s.claims.get("profile", "strict") != "strict" else ""
             if d["kept_invalid_rows"]:
                 line += f"; kept as invalid: {d['kept_invalid_rows']}, of which {d['kept_invalid_but_valid']} pass"
             yield line

@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -174,7 +175,9 @@ def read_shard(path: Path, urdf: Path | None = None, mesh: Mapping[str, Path] | 
 def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path]) -> JudgedShard:
     attrs = {k: f.attrs.get(k) for k in ("format", "format_version", "complete")}
     if attrs["format"] != "lgrasp-shard" or not str(attrs["format_version"]).startswith("1."):
-        raise JudgeError(f"not a grasp shard of version 1.x: format {attrs['format']}, version {attrs['format_version']}")
+        raise JudgeError(
+            f"not a grasp shard of version 1.x: format {attrs['format']}, version {attrs['format_version']}"
+        )
     if not np.array_equal(attrs["complete"], 1):
         raise JudgeError("incomplete: attribute complete is not 1")
     for name in ("hand", "objects", "grasps"):
@@ -195,7 +198,10 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
         column = _columns(g["metrics"], {name: ()}, sizes)[name]
         metrics[name] = column, _text(g[f"metrics/{name}"].attrs.get("unit", ""))
     kept = metrics["valid"][0] == 0 if "valid" in metrics else np.zeros(sizes["N"], bool)
-    claims = {k: _text(f.attrs[k]) for k in ("pipeline", "profile", "bounds", "lgrasp_version") if k in f.attrs}
+    claims = {k: _text(f.attrs[k]) for k in ("pipeline", "lgrasp_version") if k in f.attrs}
+    told = json.loads(_text(f.attrs.get("config", "{}")))
+    if isinstance(told, dict) and isinstance(told.get("bounds"), dict):
+        claims["profile"] = str(told["bounds"].get("profile"))
     shard = JudgedShard(
         path, hand, hand_key, joint_names, link_names, *map(list, zip(*objects, strict=True)),
         grasps, steps, metrics, kept, claims, [],

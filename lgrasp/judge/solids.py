@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.judge.bounds import JudgeError
-from lgrasp.judge.meshes import PROBES, Surface, surface_samples
+from lgrasp.judge.meshes import PROBES, MeshDistance, surface_samples
 
 try:
     import coal
@@ -16,7 +16,7 @@ except ModuleNotFoundError as error:
     raise JudgeError("the judge measures links in links with coal: pip install 'lgrasp[judge]'") from error
 
 SAMPLES = 2_000
-"""Surface points of a solid, beside every vertex."""
+"""MeshDistance points of a solid, beside every vertex."""
 DENT = 5e-4
 """A mesh whose hull is nowhere further from its surface counts as convex [m]."""
 
@@ -156,7 +156,7 @@ class MeshSolid(JudgedSolid):
     """A mesh as it is: its own surface for distances, its hull only for the convex test between links."""
 
     def __init__(self, link: int, T: np.ndarray, mesh: trimesh.Trimesh) -> None:
-        self.mesh, self.surface, self.hull = mesh, Surface(mesh), mesh.convex_hull
+        self.mesh, self.surface, self.hull = mesh, MeshDistance(mesh), mesh.convex_hull
         dents = self.surface.closest(surface_samples(self.hull, 2_000))[0]
         super().__init__(link, T, np.zeros(0))
         self.convex = bool(dents.max() <= DENT)

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 from lgrasp.judge.checks import CHECKS
 from lgrasp.judge.collision import JudgedHand, JudgedObject, PlacedSolids, object_in_object
 from lgrasp.judge.duplicates import distinct_poses, near_duplicates
-from lgrasp.judge.meshes import Surface
+from lgrasp.judge.meshes import MeshDistance
 from lgrasp.judge.run import judge
 from lgrasp.judge.shard import _resolver
 from lgrasp.judge.solids import SAMPLES, BoxSolid, CylinderSolid, MeshSolid, SphereSolid
@@ -287,7 +287,7 @@ def _closest_brute(p: np.ndarray, tri: np.ndarray) -> float:
 
 def test_mesh_distance_against_brute_force() -> None:
     mesh = trimesh.creation.annulus(0.02, 0.023, 0.05, sections=48)  # a wall of 3 mm
-    field = Surface(mesh)
+    field = MeshDistance(mesh)
     points = np.random.default_rng(0).uniform(-0.03, 0.03, (600, 3))
     signed = field.signed(points)
     brute = np.array([_closest_brute(p, mesh.triangles) for p in points])
@@ -308,7 +308,7 @@ def test_primitives_against_their_mesh(kind: str) -> None:
         "cylinder": (CylinderSolid(0, T, np.array([0.015, 0.02])), trimesh.creation.cylinder(0.015, 0.04, 400)),
     }[kind]
     mesh.apply_transform(T)
-    field = Surface(mesh)
+    field = MeshDistance(mesh)
     points = np.random.default_rng(1).uniform(-0.05, 0.05, (400, 3)) + T[:3, 3]
     np.testing.assert_allclose(solid.signed(points), field.signed(points), atol=2e-5)
     h = 1e-6

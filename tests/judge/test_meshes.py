@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from lgrasp.judge.inside import Crossings, Inside
-from lgrasp.judge.meshes import Surface, clean_mesh
+from lgrasp.judge.meshes import MeshDistance, clean_mesh
 
 
 def test_lines_through_edges_and_vertices_count_once():
@@ -37,7 +37,7 @@ def test_open_box_has_an_inside():
     """A box without its lid: deep points are inside, points beyond every wall are not, whichever way lines look."""
     box = trimesh.creation.box((2, 2, 2))
     box.update_faces(box.face_normals[:, 2] < 0.5)
-    surface = Surface(box)
+    surface = MeshDistance(box)
     assert not surface.inside.closed
     rng = np.random.default_rng(1)
     deep = rng.uniform(-0.9, [0.9, 0.9, 0.2], (600, 3))
@@ -52,7 +52,7 @@ def test_signed_distance_of_a_box(count):
     points = np.random.default_rng(count).uniform(-2, 2, (count, 3))
     beyond = np.abs(points) - [1.0, 0.5, 1.5]
     exact = np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
-    surface = Surface(trimesh.creation.box((2, 1, 3)))
+    surface = MeshDistance(trimesh.creation.box((2, 1, 3)))
     np.testing.assert_allclose(surface.signed(points), exact, atol=1e-12)
     np.testing.assert_allclose(surface.depth(points), np.maximum(-exact, 0.0), atol=1e-12)
 

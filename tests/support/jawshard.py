@@ -66,7 +66,7 @@ def write_shard(
         forces[i, 0, :k] = -normals[i, 0, :k] / k
     with h5py.File(path, "w") as f:
         f.attrs["format"], f.attrs["format_version"], f.attrs["complete"] = "lgrasp-shard", "1.0", 1
-        f.attrs["pipeline"] = "by hand"
+        f.attrs["pipeline"], f.attrs["config"] = "by hand", '{"bounds": {"profile": "plan"}}'
         hand = f.create_group("hand")
         hand.attrs["base_link"] = "palm"
         hand["urdf"] = URDF
