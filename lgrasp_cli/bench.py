@@ -192,8 +192,7 @@ def bench_sequence(
     from lgrasp.bench.sequence import bench_methods, sequence_page
     from lgrasp.config import parse_model
     from lgrasp.jobs.sequence.job import SequenceJob
-    from lgrasp.jobs.sequence.sets import SequenceSets, object_sequences
-    from lgrasp.jobs.sequence.size import parse_size
+    from lgrasp.jobs.sets import SequenceSets, object_sequences
     from lgrasp_cli.options import choose_pipeline
 
     pool = objects or ["mug", "sphere", "box", "capsule", "bottle", "bowl"]
@@ -208,7 +207,7 @@ def bench_sequence(
             rows=1,
             pipeline=chosen,
             out=Path("."),
-            size=parse_size(scale),
+            scale=scale,
             physics=physics,
             device=device,
             workers=workers,

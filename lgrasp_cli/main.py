@@ -65,9 +65,22 @@ def _options(
     """
 
 
+def _with_json_path(arguments: list[str]) -> list[str]:
+    """``--json`` without a path, as some commands had it until 0.1, means standard output."""
+    out = []
+    for number, word in enumerate(arguments):
+        after = next(iter(arguments[number + 1 :]), None)
+        out.append(word)
+        if word == "--json" and (after is None or (after.startswith("-") and after != "-")):
+            warn("--json takes a path; - is standard output (without one it works in this release only)")
+            out.append("-")
+    return out
+
+
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 bad input or output, 3 too few grasps, 130 interrupted."""
     on_notice(warn)
+    sys.argv[1:] = _with_json_path(sys.argv[1:])
     if os.environ.get("LGRASP_DEBUG"):
         code = app(prog_name="lgrasp", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)

@@ -22,7 +22,8 @@ def register(app: typer.Typer) -> None:
 
 def plan(
     mesh: Annotated[
-        str | None, typer.Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.", show_default=False)
+        str | None,
+        typer.Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.", show_default=False),
     ] = None,
     cloud: Annotated[
         Path | None, typer.Option(help="Point cloud (.ply .xyz .npy .npz .h5), perhaps a scene.", show_default=False)

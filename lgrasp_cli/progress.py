@@ -1,22 +1,18 @@
-"""While a job runs: progress on standard error, Ctrl-C to stop after the running batch."""
+"""While a job runs: one stream of progress on standard error, Ctrl-C to stop at the end of what is being made."""
 
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from lgrasp.engine.report import survivors
-from lgrasp.jobs.generate import Listener
+from lgrasp.engine.events import Events
 from lgrasp_cli.interrupt import on_interrupt, stop_now
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lgrasp.engine.shard import Found
+    from lgrasp.engine.events import Made, Part
 
 _PLAIN_INTERVAL = 10.0  # [s] between lines when standard error is no terminal
 
@@ -26,30 +22,27 @@ def say(line: str) -> None:
     typer.echo(line, err=True)
 
 
-class JobProgress(Listener):
-    """Progress of a job: a bar on a terminal, else a plain line every ten seconds, or nothing.
+class Bar:
+    """How far something is: a bar on a terminal, else a plain line every ten seconds, or nothing.
 
     Args:
-        shards: rows of every shard of this job.
         quiet: show nothing.
     """
 
-    def __init__(self, shards: dict[int, int], *, quiet: bool = False) -> None:
-        self.stop = False
-        self.running = False
-        self._shards = shards
-        self._asked = sum(shards.values())
-        self._done = 0  # rows of finished shards
+    def __init__(self, *, quiet: bool = False) -> None:
         self._quiet = quiet
-        self._start = self._said = time.monotonic()
-        self._bar: Progress | None = None
+        self._said = time.monotonic()
+        self._bar: Any = None
         self._task: Any = None
 
-    def __enter__(self) -> "JobProgress":
+    def __enter__(self) -> "Bar":
         if not self._quiet and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
             columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
             self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True))
-            self._task = self._bar.add_task("loading", total=None, note="")
+            self._task = self._bar.add_task("", total=None, note="")
             self._bar.start()
         return self
 
@@ -57,42 +50,55 @@ class JobProgress(Listener):
         if self._bar:
             self._bar.stop()
 
-    def _show(self, what: str, done: int | None, note: str) -> None:
+    def show(self, what: str, done: int | None = None, total: int = 0, note: str = "") -> None:
+        """Tell what is going on, and how much of how much is done if that is known."""
         if self._bar:
-            total = self._asked if done is not None else None
-            self._bar.update(self._task, description=what, completed=done or 0, total=total, note=note)
+            whole = total if done is not None and total else None
+            self._bar.update(self._task, description=what, completed=done or 0, total=whole, note=note)
         elif not self._quiet and time.monotonic() - self._said >= _PLAIN_INTERVAL:
             self._said = time.monotonic()
-            say(f"{what} {note}" if done is None else f"{what} {done:,}/{self._asked:,} {note}")
+            count = "" if done is None else f" {done:,}/{total:,}"
+            say(f"{what}{count} {note}".rstrip())
 
-    def loading(self, what: str, share: float) -> None:
-        self._show("loading", None, f"{what} {share:.0%}" if share else what)
 
-    def started(self, inputs: Any, shards: list[int], present: list[int]) -> None:
+class JobProgress(Events):
+    """What a job tells, on a bar.
+
+    Args:
+        unit: what the job counts.
+    """
+
+    def __init__(self, bar: Bar, unit: str) -> None:
+        self.stop = self.running = False
+        self._bar, self._unit = bar, unit
+        self._rows: dict[int, int] = {}  # done, by part
+        self._asked = 0
+
+    def loading(self, what: str, share: float = 0.0) -> None:
+        self._bar.show("loading", note=f"{what} {share:.0%}" if share else what)
+
+    def started(self, parts: "Sequence[Part]", present: Mapping[int, int]) -> None:
         self.running = True
-        self._done = sum(self._shards[s] for s in present)
-        self._start = time.monotonic()
+        self._asked, self._rows = sum(part.rows for part in parts), dict(present)
 
-    def advanced(self, shard: int, rows: int, result: "Found") -> None:
-        per_second = rows / max(time.monotonic() - self._start, 1e-9)
-        flow = "  ".join(f"{stage} {count:,}" for stage, count in survivors(result.counts).items())
-        self._show(f"shard {shard}", self._done + rows, f"{per_second:,.0f}/s  {flow}")
+    def advanced(self, part: "Part", done: int, note: str = "") -> None:
+        self._rows[part.number] = done
+        self._bar.show(f"{self._unit} ({part.file.name})", sum(self._rows.values()), self._asked, note)
 
-    def wrote(self, shard: int, path: "Path", result: "Found") -> None:
-        self._done += len(result)
-        self._start = time.monotonic()
+    def wrote(self, part: "Part", made: "Made") -> None:
+        self._rows[part.number] = max(made.rows, self._rows.get(part.number, 0))
 
     def cancelled(self) -> bool:
         return self.stop
 
 
 def interruptible(progress: JobProgress) -> AbstractContextManager[None]:
-    """The first Ctrl-C (or SIGTERM) ends the job after the running batch, the second at once; whole shards stay."""
+    """The first Ctrl-C (or SIGTERM) ends the job as soon as it can, the second at once; whole files stay."""
 
     def stop() -> None:
         if progress.stop or not progress.running:
             stop_now()
         progress.stop = True
-        say("stopping after the running batch; Ctrl-C again stops at once")
+        say("stopping as soon as what is being made can be left; Ctrl-C again stops at once")
 
     return on_interrupt(stop)

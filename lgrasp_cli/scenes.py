@@ -71,7 +71,7 @@ def make(
     Example: lgrasp scenes make mug bowl bottle box sphere hammer --hand allegro -n 100 --out scenes
     """
     cache = open_cache(cache_dir)
-    from lgrasp.jobs.config import array_task
+    from lgrasp.engine.run import array_task
     from lgrasp.jobs.scenes.job import SceneJob, scene_numbers
 
     changes = {

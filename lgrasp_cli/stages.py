@@ -51,15 +51,11 @@ def _verb(stage: str):
         as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
     ) -> None:
         cache = open_cache(cache_dir, fresh=force)
-        from pathlib import Path
-
-        from lgrasp.jobs.generate import Job
-        from lgrasp.jobs.onestage import run_stage
+        from lgrasp.jobs.onestage import run_up_to
         from lgrasp_cli.tables import print_json, print_table
 
         chosen = choose_pipeline(pipeline, seed, contacts)
-        job = Job(hand, mesh, candidates, chosen, Path(), scale=scale, device=device, cache=cache)
-        runs = run_stage(job, stage, first, candidates, shard_index)
+        runs = run_up_to(stage, chosen, hand, mesh, first, candidates, shard_index, cache, scale=scale, device=device)
         if as_json:
             print_json([{**vars(run), "path": str(run.path)} for run in runs])
             return

@@ -50,13 +50,18 @@ def _print_rows(rows: list[list[str]], right: Sequence[int]) -> None:
         typer.echo("  ".join(cells).rstrip())
 
 
+def counted(data: dict[str, Any], unit: str) -> str:
+    """How much is there of what was asked."""
+    extra = f" ({data['present']:,} were there)" if data["present"] else ""
+    return f"{data[unit]:,} of {data['asked']:,} asked{extra}"
+
+
 def job_report(data: dict[str, Any]) -> list[tuple[str, str]]:
     """The report of a job as pairs of texts."""
     seconds, made = data["seconds"], data["made"]
     stages = list(data["counts"])
-    extra = f" ({data['present']:,} were there)" if data["present"] else ""
     pairs = [
-        ("grasps", f"{data['grasps']:,} of {data['asked']:,} asked{extra}"),
+        ("grasps", counted(data, "grasps")),
         ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
         ("hand, object", f"{data['hand']}, {data['object']}; pipeline {data['pipeline']}, seed {data['seed']}"),
         ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it placement through filter"),

@@ -14,9 +14,10 @@ from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.engine.run import Outcome
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.find import find_hand
-from lgrasp.jobs.generate import Job, Outcome, generate
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.runtime.device import resolve_device, start
 from lgrasp.stages.context import Context
 
@@ -68,8 +69,8 @@ def context(inputs: Inputs) -> Context:
 
 
 @pytest.fixture
-def job(swift: Pipeline, cache_root: Path, tmp_path: Path) -> Callable[..., Job]:
-    """A small job on the CPU; keywords replace fields of :class:`Job`."""
+def job(swift: Pipeline, cache_root: Path, tmp_path: Path) -> Callable[..., GenerateJob]:
+    """A small job on the CPU; keywords replace fields of :class:`GenerateJob`."""
     defaults = {
         "hand": "allegro",
         "object": OBJECT,
@@ -82,13 +83,13 @@ def job(swift: Pipeline, cache_root: Path, tmp_path: Path) -> Callable[..., Job]
         "batch": 128,
         "cache": Cache(cache_root, pytest.fail),
     }
-    return lambda **changes: Job(**defaults | changes)
+    return lambda **changes: GenerateJob(**defaults | changes)
 
 
 @pytest.fixture
-def run(job: Callable[..., Job]) -> Callable[..., Outcome]:
-    """Run a small job; keywords replace fields of :class:`Job`."""
-    return lambda **changes: generate(job(**changes))
+def run(job: Callable[..., GenerateJob]) -> Callable[..., Outcome]:
+    """Run a small job; keywords replace fields of :class:`GenerateJob`, ``array`` and ``resume`` say which parts."""
+    return lambda array=(0, 1), resume=True, **changes: generate(job(**changes), array=array, resume=resume)
 
 
 @pytest.fixture(scope="session")

@@ -147,6 +147,15 @@ def test_imports_run_one_way(name):
             assert stage == other or shared or not stage, f"{where}: stages never import stages"
 
 
+def test_engine_knows_no_feature():
+    """What all jobs share imports none of them and stays small; stages are imported by name when they are used."""
+    own = [name for name in MODULES if room(name) == "engine"]
+    assert len(own) <= 16, sorted(own)
+    features = {"jobs", "sequence", "scenes", "learn", "refine", "planning", "simulate"}
+    found = [f"{name}:{line} {target}" for name in own for target, line in resolved(name) if room(target) in features]
+    assert not found
+
+
 def folder(name: str) -> str:
     """The folder that a module lies in; a package's own face lies in the package."""
     return name if name in PACKAGES else name.rpartition(".")[0]

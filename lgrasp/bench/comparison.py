@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -14,7 +13,7 @@ from lgrasp.bench.rate import Bench
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, LgraspError, ObjectError
 from lgrasp.jobs.config import JobConfig, in_folder, plan_jobs
-from lgrasp.jobs.generate import Job
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.object.find import find_object
 from lgrasp.runtime.device import resolve_device
 
@@ -129,7 +128,7 @@ def measure_table(
         if (hand, mesh) in done:
             continue
         cell_jobs = [
-            replace(job, rows=settings["baseline_rows"]) if 0 < k == count - 1 else job
+            job.changed(rows=settings["baseline_rows"]) if 0 < k == count - 1 else job
             for k, job in enumerate(jobs[first + k * len(pairs)] for k in range(count))
         ]
         cell = _cell(bench, cell_jobs, settings, progress) | {"hand": hand, "object": mesh}
@@ -137,7 +136,9 @@ def measure_table(
         yield table, cell
 
 
-def _cell(bench: Bench, jobs: list[Job], settings: dict[str, Any], progress: Callable[[str], None] | None) -> Cell:
+def _cell(
+    bench: Bench, jobs: list[GenerateJob], settings: dict[str, Any], progress: Callable[[str], None] | None
+) -> Cell:
     runs: list[dict[str, Any]] = []
     error = ""
     try:

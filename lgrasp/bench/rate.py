@@ -3,14 +3,14 @@
 import shutil
 import tempfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.report import report
-from lgrasp.jobs.generate import Job, Outcome, generate
+from lgrasp.engine.report import job_report
+from lgrasp.engine.run import Outcome
+from lgrasp.jobs.generate import GenerateJob, generate
 
 _MEASURED = ("strict_valid_per_s", "seed_count_per_s")
 _INPUTS = ("object", "field")
@@ -40,7 +40,7 @@ class Bench:
         shutil.rmtree(self._folder.name, ignore_errors=True)
         self._folder.cleanup()
 
-    def measure(self, jobs: list[Job], repeat: int, progress: Progress | None = None) -> list[dict[str, Any]]:
+    def measure(self, jobs: list[GenerateJob], repeat: int, progress: Progress | None = None) -> list[dict[str, Any]]:
         """Run each job ``repeat`` times, in turns, and report the middle and the spread.
 
         A small untimed run comes first: it makes the inputs, loads the kernels and measures the rows kept per
@@ -66,25 +66,24 @@ class Bench:
             for number, job in enumerate(jobs):
                 say(f"run {turn + 1}/{repeat}: {job.pipeline.name}, {Path(job.object).stem}, {job.rows:,} rows")
                 data, outcome = self._run(job)
-                jobs[number] = replace(job, rate=outcome.rate)
+                jobs[number] = job.changed(rate=outcome.job.measured_rate)
                 runs[number].append(data)
         return [_summary(found, self._built) for found in runs]
 
-    def _probed(self, job: Job, say: Progress) -> Job:
+    def _probed(self, job: GenerateJob, say: Progress) -> GenerateJob:
         """The job with the rows per candidate of a run of a few rows."""
         rows = max(1, min(_PROBE_ROWS, job.rows // 10))
         say(f"untimed: {job.pipeline.name}, {Path(job.object).stem}, {rows:,} rows")
-        _, outcome = self._run(replace(job, rows=rows))
-        return replace(job, rate=outcome.rate)
+        _, outcome = self._run(job.changed(rows=rows))
+        return job.changed(rate=outcome.job.measured_rate)
 
-    def _run(self, job: Job) -> tuple[dict[str, Any], Outcome]:
+    def _run(self, job: GenerateJob) -> tuple[dict[str, Any], Outcome]:
         with tempfile.TemporaryDirectory(dir=self._folder.name) as out:
-            trial = replace(job, out=Path(out), cache=self._cache, resume=False)
-            outcome = generate(trial)
-            data = report(trial, outcome)
-        data["keys"] = {kind: getattr(outcome.inputs.keys, kind) for kind in _INPUTS}
+            outcome = generate(job.changed(out=Path(out), cache=self._cache), resume=False)
+            data = job_report(outcome)
+        data["keys"] = {kind: getattr(outcome.job.inputs.keys, kind) for kind in _INPUTS}
         for kind, key in data["keys"].items():
-            if not outcome.inputs.hits[kind]:
+            if not outcome.job.inputs.hits[kind]:
                 self._built[kind][key] = data["seconds"][kind]
         return data, outcome
 

@@ -18,11 +18,11 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import load_object, object_key
 from lgrasp.geometry.decompose import decompose
 from lgrasp.geometry.rotations import so3_exp
+from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
-from lgrasp.jobs.refine.rows import shard_rows
 from lgrasp.jobs.refine.settings import COARSE
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.object.model import ObjectModel
@@ -147,7 +147,7 @@ def _bench_hand(
             begin = time.perf_counter()
             grasps, counts = planner.run(starts)
             seconds = time.perf_counter() - begin
-            rows = shard_rows(grasps, model, target)
+            rows = grasp_rows(press(grasps), model.tree, target.center)
             holds = _holds(protocol, case.scene, rows) if len(grasps) else np.zeros(0, bool)
             what = f"{hand}, {name}, {_named(noise)}, {'one hand' if hands == 'one' else f'best of {params.rolls}'}"
             progress(f"{what}: {int(holds.sum())} of {starts}, {seconds:.1f} s")

@@ -14,7 +14,7 @@ from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.opposition.spaces import consumed
 from lgrasp.jobs.records import make_scene, mesh_blobs
-from lgrasp.jobs.sequence.inputs import SequenceInputs, load_sequence_inputs, sequence_keys
+from lgrasp.jobs.sequence.inputs import SequenceInputs, load_sequence_inputs
 from lgrasp.jobs.sequence.job import SequenceJob, simulated
 from lgrasp.jobs.sequence.records import object_records
 from lgrasp.jobs.sequence.round import Round, Verdicts, run_round
@@ -36,7 +36,7 @@ def bench_methods(
     found: dict[str, dict[str, Any]] = {}
     for method in methods:
         changes: dict[str, Any] = {"method": method} | ({"width": baseline_width} if found else {})
-        own = [replace(job, pipeline=job.pipeline.with_params("sequence", **changes)) for job in jobs]
+        own = [job.changed(pipeline=job.pipeline.with_params("sequence", **changes)) for job in jobs]
         found[method] = measure_sequences(own, progress)
     first = found[methods[0]]["objects"]
     for one in found.values():
@@ -73,7 +73,7 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
     objects = [_Objects() for _ in range(length)]
     for job in jobs:
         pipeline, cache = _as_published(job.pipeline), job.cache
-        keys = sequence_keys(job.hand, job.objects, job.size, pipeline.seed, pipeline.object, pipeline.field)
+        keys = job.keys
         inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device)
         meshes = mesh_blobs(keys.source.urdf)
         scene = make_scene(cache, inputs.hand, object_records(inputs), meshes, device.alias)

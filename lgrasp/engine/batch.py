@@ -35,19 +35,13 @@ def run_stages(
     return table
 
 
-def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter, salt: int = 0) -> Any:
+def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter) -> Any:
     """The table that one stage makes of another."""
     params = fit_params(stage, pipeline.params(stage), context.hand.model)
-    options = {"realised": _realised(pipeline), "salt": salt} if stage == "search" else {}
     start = meter.now()
-    table, counts = STAGES[stage].run(table, params, context, **options)
+    table, counts = STAGES[stage].run(table, params, context)
     meter.add(stage, counts, start, meter.now())
     return table
-
-
-def _realised(pipeline: Pipeline) -> bool:
-    """Does ik come before search in this pipeline?"""
-    return pipeline.order.index("ik") < pipeline.order.index("search")
 
 
 def finish_batch(pipeline: Pipeline, context: Context, sets: ContactSets, meter: Meter) -> BatchResult:
@@ -84,7 +78,7 @@ def run_batch(pipeline: Pipeline, context: Context, first: int, count: int, bank
     for salt in range(passes):
         result: Any = table
         for stage in pipeline.order[at:]:
-            result = run_stage(stage, result, pipeline, context, meter, salt)
+            result = run_stage(stage, result, pipeline, context.with_salt(salt), meter)
         parts.append(result)
         if salt == 0 and passes > 1:
             table = _richest(table, result, context)

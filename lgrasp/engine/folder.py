@@ -3,13 +3,14 @@
 import os
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from lgrasp.dataset import ShardReader, validate_shard
 from lgrasp.dataset.files import remove_leftovers
 from lgrasp.dataset.heap import check_heaps
+from lgrasp.engine.events import Part
 from lgrasp.errors import OutputError, ShardError
 
 _LONGEST = 120  # characters of a name; file systems allow 255 bytes
@@ -45,22 +46,21 @@ def check_folder(out: Path) -> None:
         raise OutputError(f"output folder {out} cannot be written: {why}; choose another with --out") from None
 
 
-def clean_folder(path: Path) -> None:
-    """Remove what killed processes left while writing shards like ``path``; files being written stay."""
-    remove_leftovers(path.parent, f"{_stem(path)}-*.tmp")
+def clean_folder(files: Sequence[Path]) -> None:
+    """Remove what killed processes left while writing files like these; files being written stay."""
+    for folder, stem in {(path.parent, _stem(path)) for path in files}:
+        remove_leftovers(folder, f"{stem}-*.tmp")
 
 
-def present_shards(
-    files: dict[int, Path], rows: dict[int, int], key: str, effort: Callable[[int], int], warn: Callable[[str], None]
+def present_parts(
+    parts: Sequence[Part], key: str, effort: Callable[[int], int], warn: Callable[[str], None]
 ) -> dict[int, int]:
-    """Shards that are on disk and may stay, with their numbers of rows.
+    """Rows of the shards that are on disk and may stay, by number of the part.
 
     A shard stays when it holds what is asked (or more: nothing is thrown away when fewer are asked later), or when all
     candidates that it may try were tried.
 
     Args:
-        files: file of each shard of the job.
-        rows: rows asked of each shard.
         key: content key of the run.
         effort: candidates that a shard of some number of rows may try.
         warn: called with one line when a file is damaged.
@@ -68,24 +68,24 @@ def present_shards(
     Raises:
         OutputError: a file, or the folder's first of that name, belongs to another run.
     """
-    if files:
+    if parts:
         # one of the others is enough: whoever wrote into the folder looked as well
-        first = next(iter(files.values()))
-        others = sorted(set(first.parent.glob(f"{_stem(first)}-[0-9][0-9][0-9][0-9][0-9].h5")) - set(files.values()))
+        first, own = parts[0].file, {part.file for part in parts}
+        others = sorted(set(first.parent.glob(f"{_stem(first)}-[0-9][0-9][0-9][0-9][0-9].h5")) - own)
         for path in others[:1]:
             _check_run(path, _read(path), key)
     present = {}
-    for shard, path in files.items():
-        if not os.path.lexists(path):
+    for part in parts:
+        if not os.path.lexists(part.file):
             continue
-        problems = validate_shard(path)
-        found = None if problems else _read(path)
+        problems = validate_shard(part.file)
+        found = None if problems else _read(part.file)
         if found is None:
-            warn(f"shard {path} is damaged ({(problems or ['header'])[0]}); it is made anew")
+            warn(f"shard {part.file} is damaged ({(problems or ['header'])[0]}); it is made anew")
             continue
-        _check_run(path, found, key)
-        if found.rows >= rows[shard] or found.tried >= effort(rows[shard]):
-            present[shard] = found.rows
+        _check_run(part.file, found, key)
+        if found.rows >= part.rows or found.tried >= effort(part.rows):
+            present[part.number] = found.rows
     return present
 
 

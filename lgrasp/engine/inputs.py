@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from dataclasses import field as with_default
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.errors import ObjectError
@@ -24,12 +24,10 @@ from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device
+from lgrasp.stages.context import Keeper
 
 OBJECT_VERSION = 2
 """Raised whenever preprocessing gives other arrays."""
-
-if TYPE_CHECKING:
-    from lgrasp.simulate.scene import Scene
 
 Report = Callable[[str, float], None]
 
@@ -56,7 +54,8 @@ class Inputs:
     device: Device
     seconds: dict[str, float] = with_default(default_factory=dict)
     hits: dict[str, bool] = with_default(default_factory=dict)
-    scene: "Scene | None" = None  # for a physics simulation, if there is one
+    scene: Any = None  # for a physics simulation, if there is one
+    kept: Keeper = with_default(default_factory=Keeper)  # what stages keep from batch to batch
 
 
 def input_keys(

@@ -9,15 +9,13 @@ from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny
 
 from lgrasp.config import apply_settings, parse_model, read_yaml
 from lgrasp.engine.migration import ALIASES, move_to_bounds
-from lgrasp.engine.registry import STAGES, check_order
+from lgrasp.engine.registry import SEQUENCE, STAGES, Stage, check_order
 from lgrasp.errors import ConfigError
 from lgrasp.field.params import FieldParams
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.notices import notice
 from lgrasp.object.params import ObjectParams
 from lgrasp.paths import data_dirs
-from lgrasp.simulate.protocol import find_protocol
-from lgrasp.stages.simulate.params import ValidateParams
 
 
 class _Declared(BaseModel):
@@ -33,6 +31,7 @@ class _Declared(BaseModel):
     object: dict[str, Any] = Field(default_factory=dict)
     field: dict[str, Any] = Field(default_factory=dict)
     stages: list[dict[str, dict[str, Any] | None]]
+    sequence: dict[str, Any] | None = None
 
 
 class Pipeline(BaseModel):
@@ -48,19 +47,34 @@ class Pipeline(BaseModel):
     object: ObjectParams
     field: FieldParams
     stages: tuple[tuple[str, SerializeAsAny[BaseModel]], ...]
+    sequence: SerializeAsAny[BaseModel] | None = None
+    """How sequences go on with the next object; None: the pipeline is for single objects."""
 
     @property
     def order(self) -> tuple[str, ...]:
         return tuple(name for name, _ in self.stages)
 
+    @property
+    def realised(self) -> bool:
+        """Does ik come before search?"""
+        return self.order.index("ik") < self.order.index("search")
+
+    @property
+    def sections(self) -> tuple[tuple[Stage, BaseModel], ...]:
+        """Everything that has parameters and a version: the stages, and ``sequence`` where there is one."""
+        stages = tuple((STAGES[name], params) for name, params in self.stages)
+        return stages if self.sequence is None else (*stages, (SEQUENCE, self.sequence))
+
     def params(self, stage: str) -> Any:
-        """Parameters of a stage."""
-        return dict(self.stages)[stage]
+        """Parameters of a stage, or of ``sequence``."""
+        return next(params for found, params in self.sections if found.name == stage)
 
     def with_params(self, stage: str, **changes: Any) -> "Pipeline":
-        """A copy with some parameters of one stage replaced and checked."""
-        where = f"pipeline {self.name}, stage {stage}"
-        changed = parse_model(STAGES[stage].params, self.params(stage).model_dump() | changes, where)
+        """A copy with some parameters of one stage, or of ``sequence``, replaced and checked."""
+        where, kind = f"pipeline {self.name}, {_section(stage)}", SEQUENCE if stage == SEQUENCE.name else STAGES[stage]
+        changed = parse_model(kind.params, self.params(stage).model_dump() | changes, where)
+        if kind is SEQUENCE:
+            return self.model_copy(update={"sequence": changed})
         stages = tuple((n, changed if n == stage else p) for n, p in self.stages)
         return self.model_copy(update={"stages": stages})
 
@@ -77,11 +91,16 @@ class Pipeline(BaseModel):
         Raises:
             ConfigError: an unknown part or key, or a value out of range.
         """
-        parts = {"bounds": self.bounds, "object": self.object, "field": self.field, **dict(self.stages)}
+        parts = {"bounds": self.bounds, "object": self.object, "field": self.field}
+        parts |= {part.name: params for part, params in self.sections}
         made = apply_settings(parts, settings, f"pipeline {self.name}")
         stages = tuple((name, made[name]) for name in self.order)
         return self.model_copy(
-            update={"stages": stages, **{name: made[name] for name in ("bounds", "object", "field")}}
+            update={
+                "stages": stages,
+                "sequence": made.get("sequence"),
+                **{name: made[name] for name in ("bounds", "object", "field")},
+            }
         )
 
     def with_physics(self, protocol: str) -> "Pipeline":
@@ -90,7 +109,7 @@ class Pipeline(BaseModel):
         Raises:
             ConfigError: no such protocol.
         """
-        params = ValidateParams(protocol=find_protocol(protocol).name)
+        params = parse_model(STAGES["validate"].params, {"protocol": protocol}, "--physics")
         stages = tuple((name, own) for name, own in self.stages if name != "validate")
         return self.model_copy(update={"stages": (*stages, ("validate", params))})
 
@@ -103,7 +122,7 @@ class Pipeline(BaseModel):
             "bounds": self.bounds.describe(),
             "object": self.object.model_dump(mode="json"),
             "field": self.field.model_dump(mode="json"),
-            "stages": [{n: {"version": STAGES[n].version, **p.model_dump(mode="json")}} for n, p in self.stages],
+            "stages": [{s.name: {"version": s.version, **p.model_dump(mode="json")}} for s, p in self.sections],
         }
 
 
@@ -134,9 +153,15 @@ def load_pipeline(name: str) -> Pipeline:
         raise ConfigError(f"unknown pipeline '{name}'; {hint}known: {known}, or give the path of a YAML file")
     declared = parse_model(_Declared, read_yaml(path), f"pipeline {path}")
     declared = declared.model_copy(update=move_to_bounds(declared.bounds, declared.stages, f"pipeline {path}"))
-    stages = []
+    stages, sequence = [], declared.sequence
     for entry in declared.stages:
         for stage, params in entry.items():
+            if stage == SEQUENCE.name:
+                notice(
+                    f"pipeline {path}: write 'sequence:' beside 'stages:'; in the list it works in this release only"
+                )
+                sequence = params or {}
+                continue
             if stage not in STAGES:
                 near = difflib.get_close_matches(stage, STAGES, n=1)
                 hint = f"did you mean '{near[0]}'? " if near else ""
@@ -152,4 +177,11 @@ def load_pipeline(name: str) -> Pipeline:
         object=parse_model(ObjectParams, declared.object, f"pipeline {path}, object"),
         field=parse_model(FieldParams, declared.field, f"pipeline {path}, field"),
         stages=tuple(stages),
+        sequence=None
+        if sequence is None
+        else parse_model(SEQUENCE.params, sequence, f"pipeline {path}, {_section(SEQUENCE.name)}"),
     )
+
+
+def _section(name: str) -> str:
+    return name if name == SEQUENCE.name else f"stage {name}"

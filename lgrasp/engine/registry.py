@@ -1,4 +1,4 @@
-"""The stages there are: name -> parameters, version and function."""
+"""The stages there are, by name; the code of a stage is imported when it is asked for."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,56 +8,57 @@ from typing import Any
 from pydantic import BaseModel
 
 from lgrasp.errors import ConfigError
-from lgrasp.sequence.params import SequenceParams
-from lgrasp.stages.domain.params import DomainParams
-from lgrasp.stages.filter.params import FilterParams
-from lgrasp.stages.ik.params import IkParams
-from lgrasp.stages.place.params import PlaceParams
-from lgrasp.stages.refine.params import RefineParams
-from lgrasp.stages.search.params import SearchParams
-from lgrasp.stages.simulate.params import ValidateParams
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage; its module, with its kernels, is imported when it is first used."""
+    """A stage: ``run(table, params, context) -> (table, counts)``, in a package with ``stage.py`` and ``params.py``."""
 
     name: str
-    params: type[BaseModel]
-    module: str
+    package: str
+    params_name: str
+
+    @property
+    def params(self) -> type[BaseModel]:
+        """The model of its parameters."""
+        return getattr(import_module(f"{self.package}.params"), self.params_name)
+
+    @property
+    def module(self) -> str:
+        """Where its function is."""
+        return f"{self.package}.stage"
 
     @property
     def version(self) -> int:
-        """Raised whenever the stage gives other results."""
+        """Raised whenever it gives other tables; part of every content key."""
         return import_module(self.module).VERSION
 
     @property
     def run(self) -> Callable[..., tuple[Any, Mapping[str, int]]]:
-        """``run(inputs, params, context) -> (table, counts)``."""
+        """The function."""
         return import_module(self.module).run
 
 
 STAGES: dict[str, Stage] = {
-    stage.name: stage
-    for stage in (
-        Stage("place", PlaceParams, "lgrasp.stages.place.stage"),
-        Stage("domain", DomainParams, "lgrasp.stages.domain.stage"),
-        Stage("ik", IkParams, "lgrasp.stages.ik.stage"),
-        Stage("search", SearchParams, "lgrasp.stages.search.stage"),
-        Stage("filter", FilterParams, "lgrasp.stages.filter.stage"),
-        Stage("refine", RefineParams, "lgrasp.stages.refine.stage"),
-        Stage("sequence", SequenceParams, "lgrasp.sequence.stage"),
-        Stage("validate", ValidateParams, "lgrasp.stages.simulate.stage"),
-    )
+    "place": Stage("place", "lgrasp.stages.place", "PlaceParams"),
+    "domain": Stage("domain", "lgrasp.stages.domain", "DomainParams"),
+    "ik": Stage("ik", "lgrasp.stages.ik", "IkParams"),
+    "search": Stage("search", "lgrasp.stages.search", "SearchParams"),
+    "filter": Stage("filter", "lgrasp.stages.filter", "FilterParams"),
+    "refine": Stage("refine", "lgrasp.stages.refine", "RefineParams"),
+    "validate": Stage("validate", "lgrasp.stages.simulate", "ValidateParams"),
 }
+
+SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
+"""How a pipeline goes on with the next object: no stage of one object, but with parameters and a version of its own."""
 
 ORDERS = (("place", "domain", "ik", "search", "filter"), ("place", "domain", "search", "ik", "filter"))
 """Accepted orders: contacts realised before they are combined, or (the published order) after."""
 
-OPTIONAL = ("refine", "sequence", "validate")
-"""Stages that may follow: grasps are refined, sequences go on with the next object, other grasps are simulated."""
+OPTIONAL = ("refine", "validate")
+"""Stages that may follow, in this order: grasps are refined, simulated."""
 
-_ENDS = ((), ("refine",), ("sequence",), ("validate",), ("refine", "validate"))
+_ENDS = ((), ("refine",), ("validate",), ("refine", "validate"))
 
 
 def check_order(names: tuple[str, ...], where: str) -> None:

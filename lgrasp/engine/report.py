@@ -1,166 +1,43 @@
-"""What a job did, in numbers: counted shard by shard from the files, so memory does not grow with the rows."""
+"""What every job reports, and where reports are written."""
 
 import json
 import os
 import resource
 import sys
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from lgrasp.dataset.files import new_file
-from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.folder import check_folder
-from lgrasp.engine.registry import STAGES
-from lgrasp.engine.shard import add_counts
+from lgrasp.engine.run import Outcome
 from lgrasp.errors import OutputError
-from lgrasp.grasp.duplicates import near_pairs
-from lgrasp.jobs.generate import Job, Outcome
-
-SEED_FSWO = 0.15
-"""Squared frictionless residual below which the published system counts a grasp."""
-
-_TALLY_THREADS = 4
-_SURVIVORS = {
-    "place": "kept",
-    "domain": "rich",
-    "ik": "kept",
-    "search": "sets",
-    "filter": "kept",
-    "sequence": "kept",
-    "validate": "held",
-    "refine": "tried",
-}
 
 
-@dataclass
-class _Tally:
-    """Counts over shards on disk."""
-
-    moving: np.ndarray  # (L,) which links of the hand are moved by a finger
-    rows: int = 0
-    seed_count: int = 0  # rows with >= 3 finger contacts and fswo^2 < SEED_FSWO
-    near_duplicates: int = 0  # pairs inside a shard
-    distinct_poses: int = 0
-    counts: dict[str, dict[str, int]] = field(default_factory=dict)  # survivors as the stages report them
-
-    def add(self, path: Path) -> None:
-        """Count the rows of one shard.
-
-        Raises:
-            ShardError: the file is damaged.
-        """
-        with ShardReader(path) as reader:
-            pose, q = reader.column("object_pose")[:, 0], reader.column("q")
-            self.rows += len(reader)
-            self.near_duplicates += len(near_pairs(pose, q))
-            self.distinct_poses += len(np.unique(reader.column("candidate")))
-            links = reader.column("contact_links")
-            fingers = (self.moving[np.maximum(links, 0)] & (links >= 0)).sum((1, 2))
-            fswo = reader.column("metrics/fswo")
-            self.seed_count += int(((fingers >= 3) & (fswo**2 < SEED_FSWO)).sum())
-            add_counts(self.counts, _stage_counts(reader.statistics))
-
-    def merge(self, other: "_Tally") -> None:
-        """Add the counts of other shards."""
-        self.rows += other.rows
-        self.seed_count += other.seed_count
-        self.near_duplicates += other.near_duplicates
-        self.distinct_poses += other.distinct_poses
-        add_counts(self.counts, other.counts)
-
-
-def _tally(paths: Iterable[Path], moving: np.ndarray) -> _Tally:
-    """Counts over some shards, a few of them in memory at a time.
-
-    Raises:
-        ShardError: a file is damaged.
-    """
-
-    def one(path: Path) -> _Tally:
-        tally = _Tally(moving)
-        tally.add(path)
-        return tally
-
-    whole = _Tally(moving)
-    with ThreadPoolExecutor(_TALLY_THREADS) as pool:
-        for tally in pool.map(one, paths):
-            whole.merge(tally)
-    return whole
-
-
-def _stage_counts(statistics: dict[str, Any]) -> dict[str, dict[str, int]]:
-    counts: dict[str, dict[str, int]] = {}
-    for key, value in statistics.items():
-        stage, _, name = key.partition("_")
-        if stage in STAGES and isinstance(value, int):
-            counts.setdefault(stage, {})[name.replace("_", " ")] = value
-    return counts
-
-
-def survivors(counts: dict[str, dict[str, int]]) -> dict[str, int]:
-    """One number per stage: poses, poses in reach, realised contacts (or sets), sets, grasps."""
-    return {
-        stage: found.get("sets" if stage == "ik" and "sets" in found else _SURVIVORS[stage], 0)
-        for stage, found in counts.items()
-    }
-
-
-def report(job: Job, outcome: Outcome) -> dict[str, Any]:
-    """The report of a job, JSON-serialisable; rates are those of the shards that this call made.
+def job_report(outcome: Outcome) -> dict[str, Any]:
+    """The report of a job, JSON-serialisable: its own numbers and what all jobs have.
 
     Returns:
-        ``grasps``, ``strict_valid_per_s``, ``seed_count_per_s`` (rows over the wall time of placement through filter),
-        ``seconds`` (thread-seconds per stage; ``wall`` of placement through filter; hand, object, field, kernels,
-        total), ``survivors`` and ``counts`` per stage, ``near_duplicates``, ``distinct_poses``, ``peak_rss_mb``,
-        ``device``, ``peak_device_mb`` and what was asked.
+        Of all jobs ``asked``, ``made``, ``present`` (rows), ``out``, ``shards`` (names of the files), ``device``,
+        ``seconds`` (``kernels``: compiling and loading; ``total``: the whole call), ``peak_rss_mb``,
+        ``peak_device_mb``, ``starved``, ``cancelled``.
     """
-    tree = outcome.inputs.hand.model.tree
-    moving = tree.body_group[tree.link_body] >= 0
-    made = _tally(outcome.written, moving)
-    present = _tally(set(outcome.paths) - set(outcome.written), moving)
-    wall = sum(r.wall for r in outcome.results)
-    counts: dict[str, dict[str, int]] = {stage: {} for stage in job.pipeline.order}
-    seconds = dict.fromkeys(job.pipeline.order, 0.0)
-    for result in outcome.results:
-        add_counts(counts, result.counts)
-        for stage, value in result.seconds.items():
-            seconds[stage] += value
-    if not outcome.results:
-        counts |= present.counts
-    inputs = outcome.inputs
-    loading = {name: inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field", "kernels")}
-    return {
-        "grasps": outcome.rows,
-        "strict_valid_per_s": made.rows / wall if wall else 0.0,
-        "seed_count_per_s": made.seed_count / wall if wall else 0.0,
-        "seconds": seconds | loading | {"wall": wall, "total": outcome.wall},
-        "survivors": survivors(counts),
-        "near_duplicates": made.near_duplicates + present.near_duplicates,
-        "distinct_poses": made.distinct_poses + present.distinct_poses,
-        "peak_rss_mb": peak_rss_mb(),
-        "device": inputs.device.name,
-        "peak_device_mb": peak_device_mb(inputs.device.alias),
-        "asked": job.rows,
+    own = outcome.job.report(outcome)
+    shared = {
+        "asked": sum(part.rows for part in outcome.parts),
         "made": outcome.made,
         "present": outcome.present,
-        "seed_count": made.seed_count + present.seed_count,
-        "counts": counts,
-        "hits": inputs.hits,
-        "hand": inputs.hand.model.name,
-        "object": inputs.object.model.name,
-        "pipeline": job.pipeline.name,
-        "seed": job.pipeline.seed,
-        "out": str(job.out),
+        "out": str(outcome.job.folder),
         "shards": [path.name for path in outcome.paths],
+        "device": outcome.device.name,
+        "peak_rss_mb": peak_rss_mb(),
+        "peak_device_mb": peak_device_mb(outcome.device.alias),
         "starved": outcome.starved,
         "cancelled": outcome.cancelled,
     }
+    seconds = {"kernels": outcome.seconds["kernels"], "total": outcome.wall}
+    return shared | own | {"seconds": own.get("seconds", {}) | seconds}
 
 
 def peak_rss_mb() -> float:

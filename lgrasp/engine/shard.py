@@ -6,7 +6,6 @@ from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import warp as wp
 
@@ -16,7 +15,6 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.graphs import Recorder
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.errors import ConfigError
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps, user_poses
 from lgrasp.stages.context import Context
@@ -34,18 +32,8 @@ class Execution:
 
     workers: int = 1
     batch: int = 0  # candidates per batch; 0: by device
-    cancelled: Callable[[], bool] = lambda: False
     rate: float = 1.0  # rows expected per candidate, until there are some: sizes the first batch on a GPU
     recorder: Recorder | None = None  # replays batches; for one worker, without a bank, one pass
-
-
-class Found(Protocol):
-    """Rows that were found, and the survivors of each stage."""
-
-    @property
-    def counts(self) -> dict[str, dict[str, int]]: ...
-
-    def __len__(self) -> int: ...
 
 
 @dataclass
@@ -59,10 +47,6 @@ class ShardResult:
     candidates: int = 0
     duplicates: int = 0
     exhausted: bool = False  # the effort bound was reached before the rows were
-    cancelled: bool = False
-
-    def __len__(self) -> int:
-        return len(self.grasps)
 
 
 def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]) -> None:
@@ -85,18 +69,6 @@ def flat_statistics(counts: dict[str, dict[str, int]], seconds: Mapping[str, flo
     for stage, found in counts.items():
         flat |= {f"{stage}_{name.replace(' ', '_')}": value for name, value in found.items()}
     return flat | {f"seconds_{stage}": value for stage, value in seconds.items()}
-
-
-def split_rows(rows: int, shard_rows: int, shard_index: int, num_shards: int) -> list[tuple[int, int]]:
-    """(shard, rows) of every shard that task ``shard_index`` of ``num_shards`` makes.
-
-    Raises:
-        ConfigError: array numbers out of range.
-    """
-    if num_shards <= 0 or not 0 <= shard_index < num_shards:
-        raise ConfigError(f"--shard-index {shard_index} --num-shards {num_shards}: need 0 <= index < number")
-    total = -(-rows // shard_rows)
-    return [(s, min(shard_rows, rows - s * shard_rows)) for s in range(shard_index, total, num_shards)]
 
 
 def _batches(
@@ -160,6 +132,22 @@ def shard_effort(pipeline: Pipeline, rows: int) -> int:
     return min(entries * BANK_CANDIDATES, _STREAM)
 
 
+def shard_context(pipeline: Pipeline, inputs: Inputs, shard: int) -> Context:
+    """What the stages of a pipeline are given in a shard."""
+    return Context(
+        inputs.hand,
+        inputs.object,
+        inputs.field,
+        inputs.device.alias,
+        pipeline.seed,
+        shard,
+        bounds=pipeline.bounds,
+        scene=inputs.scene,
+        realised=pipeline.realised,
+        kept=inputs.kept,
+    )
+
+
 def make_shard(
     pipeline: Pipeline,
     inputs: Inputs,
@@ -174,18 +162,15 @@ def make_shard(
 
     Args:
         bank_cache: keep and use candidate banks there.
-        progress: called with (rows so far, running result) after each batch.
+        progress: called with (rows so far, running result) after each batch; what it raises ends the shard.
     """
     device = inputs.device.alias
-    context = Context(
-        inputs.hand, inputs.object, inputs.field, device, pipeline.seed, shard, pipeline.bounds, inputs.scene
-    )
+    context = shard_context(pipeline, inputs, shard)
     bank = Bank(bank_cache, pipeline, inputs.keys, shard, device) if bank_cache else None
     limit = shard_effort(pipeline, rows)
     result: ShardResult | None = None
     parts: list[GraspTable] = []
     kept = KeptRows(inputs.hand.model.dofs, device)
-    stopped = False
     start = time.perf_counter()
     recorder, fixed = execution.recorder, execution.batch
     if bank is not None or pipeline.params("search").passes > 1:
@@ -221,11 +206,10 @@ def make_shard(
             parts.append(take_grasps(batch.grasps, new))
             if progress:
                 progress(kept.count, result)
-            if kept.count >= rows or (stopped := execution.cancelled()):
+            if kept.count >= rows:
                 break
     assert result is not None
     result.grasps = join_grasps(parts)
     result.wall = time.perf_counter() - start
-    result.cancelled = stopped
-    result.exhausted = kept.count < rows and not stopped
+    result.exhausted = kept.count < rows
     return result

@@ -1,25 +1,23 @@
-"""On what and where: array tasks, default folders and configs/*.yaml."""
+"""On what and where: default folders and configs/*.yaml."""
 
 import difflib
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lgrasp.config import parse_model, read_yaml
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.engine.run import Job
 from lgrasp.errors import ConfigError
-from lgrasp.jobs.generate import Job
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.sequence.sets import SequenceSets, object_sequences
+from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
 from lgrasp.object.find import MESH_SUFFIXES, find_object
 from lgrasp.paths import data_dirs
-
-if TYPE_CHECKING:
-    from lgrasp.jobs.sequence.job import SequenceJob
 
 
 class JobConfig(BaseModel):
@@ -62,30 +60,68 @@ def config_files() -> dict[str, Path]:
     return found
 
 
+def config_path(name: str) -> Path:
+    """File of a config by path or by name.
+
+    Raises:
+        ConfigError: no such config.
+    """
+    path = Path(name).expanduser()
+    if path.is_file():
+        return path
+    files = config_files()
+    if name not in files:
+        near = difflib.get_close_matches(path.stem, files, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        names = ", ".join(files) or "none"
+        raise ConfigError(f"unknown config '{name}'; {hint}known: {names}, or give the path of a YAML file")
+    return files[name]
+
+
 def load_config(name: str) -> JobConfig:
-    """A job config by path or by name.
+    """A config of grasps by path or by name.
 
     Raises:
         ConfigError: no such config, or a wrong key or value in it.
     """
-    files = config_files()
-    path = Path(name).expanduser()
-    if not path.is_file():
-        known = files.get(name)
-        if known is None:
-            near = difflib.get_close_matches(path.stem, files, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            names = ", ".join(files) or "none"
-            raise ConfigError(f"unknown config '{name}'; {hint}known: {names}, or give the path of a YAML file")
-        path = known
+    path = config_path(name)
     return parse_model(JobConfig, read_yaml(path), f"config {path}")
 
 
-def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1), resume: bool = True) -> list[Job]:
-    """One job for each pipeline, hand and object, in this order.
+KINDS = {
+    "sequence": ("lgrasp.jobs.sequence.job", "SequenceJob"),
+}
+"""Kind of a job, as key ``job`` of a config names it, and where it is; ``generate`` is :class:`JobConfig`."""
 
-    Args:
-        array: (task, number of tasks) of a job array.
+
+def load_jobs(name: str, changes: dict[str, Any], cache: Cache) -> list[Job]:
+    """The jobs of a config by path or by name, some keys replaced.
+
+    Raises:
+        ConfigError: no such config or kind of job, or a wrong key or value.
+    """
+    path = config_path(name)
+    data = read_yaml(path)
+    kind = data.pop("job", "generate")
+    if kind not in ("generate", *KINDS):
+        near = difflib.get_close_matches(str(kind), ("generate", *KINDS), n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise ConfigError(f"config {path}: unknown job '{kind}'; {hint}known: generate, {', '.join(KINDS)}")
+    if kind == "generate" or "sequences" in data:
+        config = parse_model(JobConfig, data | changes, f"config {path}")
+        return list(plan_sequences(config, cache) if config.sequences else plan_jobs(config, cache))
+    data.pop("description", None)
+    return [parse_model(job_kind(kind), data | changes | {"cache": cache}, f"config {path}")]
+
+
+def job_kind(name: str) -> type[Job]:
+    """The model of a kind of job, imported when it is asked for."""
+    module, model = KINDS[name]
+    return getattr(import_module(module), model)
+
+
+def plan_jobs(config: JobConfig, cache: Cache) -> list[GenerateJob]:
+    """One job for each pipeline, hand and object, in this order.
 
     Raises:
         ConfigError: a pipeline that cannot be used, a folder of hands or objects that does not exist.
@@ -96,7 +132,7 @@ def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1
         for hand in config.hands:
             for mesh in objects:
                 jobs.append(
-                    Job(
+                    GenerateJob(
                         hand=_urdf_in_folder(config.hand_dir, hand),
                         object=in_folder(config.object_dir, mesh),
                         rows=config.rows,
@@ -107,51 +143,43 @@ def plan_jobs(config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1
                         workers=config.workers,
                         batch=config.batch,
                         shard_rows=config.shard_rows,
-                        shard_index=array[0],
-                        num_shards=array[1],
                         reuse=config.reuse,
-                        resume=resume,
                         cache=cache,
                     )
                 )
     return jobs
 
 
-def plan_sequences(
-    config: JobConfig, cache: Cache, *, array: tuple[int, int] = (0, 1), resume: bool = True
-) -> "list[SequenceJob]":
-    """One job for each pipeline, hand and sequence of objects; tasks of an array share the sequences.
+def plan_sequences(config: JobConfig, cache: Cache) -> list[Job]:
+    """One job for each pipeline, hand and sequence of objects.
 
     Raises:
         ConfigError: a config without ``sequences``, a pipeline or a folder that cannot be used, too few objects.
     """
-    from lgrasp.jobs.sequence.job import SequenceJob, sequence_name  # heavier than all the rest
-
     sets = config.sequences
     if sets is None:
         raise ConfigError("the config has no sequences")
     drawn = object_sequences(_objects(config), sets, config.seed or 0)
     changes = {name: value for name, value in (("method", sets.method), ("policy", sets.policy)) if value}
-    jobs = [
-        SequenceJob(
+    kind: Any = job_kind("sequence")
+    return [
+        kind(
             hand=_urdf_in_folder(config.hand_dir, hand),
             objects=tuple(in_folder(config.object_dir, mesh) for mesh in sequence),
             rows=config.rows,
             pipeline=pipeline.with_params("sequence", **changes) if changes else pipeline,
             out=out / sequence_name(Path(hand).stem, sequence),
-            size=sets.size,
+            scale=sets.scale,
             physics=sets.physics,
             device=config.device,
             workers=config.workers,
             shard_rows=min(config.shard_rows, 1000),
-            resume=resume,
             cache=cache,
         )
         for pipeline, out in _pipelines(config)
         for hand in config.hands
         for sequence in drawn
     ]
-    return jobs[array[0] :: array[1]]
 
 
 def _pipelines(config: JobConfig) -> Iterator[tuple[Pipeline, Path]]:
@@ -192,27 +220,6 @@ def in_folder(folder: Path | None, mesh: str) -> str:
     here = folder.expanduser()
     found = next((p for p in (here / mesh, *(here / f"{mesh}{s}" for s in MESH_SUFFIXES)) if p.is_file()), None)
     return mesh if found is None else str(found)
-
-
-def array_task(
-    index: int | None = None, number: int | None = None, environment: Mapping[str, str] | None = None
-) -> tuple[int, int]:
-    """(task, number of tasks) of an array: as given, else those of a SLURM job array, else (0, 1).
-
-    Raises:
-        ConfigError: a SLURM variable is no integer.
-    """
-    if index is not None or number is not None:
-        return index or 0, 1 if number is None else number
-    env = os.environ if environment is None else environment
-    if "SLURM_ARRAY_TASK_ID" not in env or "SLURM_ARRAY_TASK_COUNT" not in env:
-        return 0, 1
-    try:
-        task, count = int(env["SLURM_ARRAY_TASK_ID"]), int(env["SLURM_ARRAY_TASK_COUNT"])
-        first, step = int(env.get("SLURM_ARRAY_TASK_MIN", 0)), int(env.get("SLURM_ARRAY_TASK_STEP", 1))
-    except ValueError as error:
-        raise ConfigError(f"SLURM_ARRAY_TASK_*: {error}; give --shard-index and --num-shards") from None
-    return (task - first) // max(step, 1), count
 
 
 def default_out(hand: str, mesh: str, physics: str | None = None) -> Path:

@@ -131,7 +131,8 @@ def describe_pipeline(name: str) -> dict[str, Any]:
         ConfigError: no such pipeline, or a wrong one.
     """
     pipeline = load_pipeline(name)
-    parts = [("bounds", pipeline.bounds), ("object", pipeline.object), ("field", pipeline.field), *pipeline.stages]
+    sections = ((part.name, params) for part, params in pipeline.sections)
+    parts = [("bounds", pipeline.bounds), ("object", pipeline.object), ("field", pipeline.field), *sections]
     rows: list[tuple[str, str, Any, str]] = [
         ("", "seed", pipeline.seed, "Base seed of all stages."),
         ("", "effort", pipeline.effort, "Candidates tried per row asked before giving up."),

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.engine.cache import content_key
-from lgrasp.engine.fit import fit_params
+from lgrasp.engine.batch import run_stage
+from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import InputKeys, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
+from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import (
     CandidateTable,
@@ -28,11 +29,10 @@ from lgrasp.grasp.tables import (
     set_arrays,
     set_table,
 )
-from lgrasp.jobs.generate import Job
 from lgrasp.jobs.hands import hand_source
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
-from lgrasp.stages.context import Context
+from lgrasp.runtime.meter import Meter
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,18 @@ class StageRun:
     path: Path
 
 
-def run_stage(
-    job: Job,
+def run_up_to(
     last: str,
+    pipeline: Pipeline,
+    hand: str,
+    mesh: str,
     first: int,
     count: int,
     shard: int,
+    cache: Cache,
+    *,
+    scale: float = 1.0,
+    device: str = "auto",
     report: Callable[[str, float], None] | None = None,
 ) -> list[StageRun]:
     """Tables of the stages up to ``last`` for candidates ``first .. first + count - 1`` of a shard's stream.
@@ -59,7 +65,8 @@ def run_stage(
     Nothing is computed when the table of ``last`` is in the cache; else the latest one that is there is the start.
 
     Args:
-        job: names hand, object, pipeline, device and cache; the rest of it is not used.
+        hand, mesh: name or path.
+        scale: factor from the mesh's unit to metres.
         report: called with (what, share) while inputs are loaded.
 
     Raises:
@@ -67,9 +74,8 @@ def run_stage(
     """
     if first < 0 or count < 1 or shard < 0:
         raise ConfigError(f"--first {first} --candidates {count} --shard-index {shard}: need 0, 1 and 0 or more")
-    pipeline, cache = job.pipeline, job.cache
-    device = resolve_device(job.device)
-    keys = input_keys(hand_source(job.hand), job.object, job.scale, pipeline.object, pipeline.field)
+    used = resolve_device(device)
+    keys = input_keys(hand_source(hand), mesh, scale, pipeline.object, pipeline.field)
     stages = pipeline.order[: pipeline.order.index(last) + 1]
     files = _stage_keys(pipeline, keys, stages, first, count, shard)
     found = {stage: arrays for stage in stages if (arrays := cache.load(stage, files[stage])) is not None}
@@ -81,18 +87,16 @@ def run_stage(
     done = max((i for i, stage in enumerate(stages) if stage in found), default=-1) + 1
     if done == len(stages):
         return runs
-    inputs = load_inputs(cache, keys, job.scale, pipeline.object, pipeline.field, device, report)
-    context = Context(inputs.hand, inputs.object, inputs.field, device.alias, pipeline.seed, shard, pipeline.bounds)
-    table: Any = _table(found[stages[done - 1]], device.alias) if done else (first, count)
-    load_kernels(device.alias, kernel_modules("lgrasp.stages."), report)
+    inputs = load_inputs(cache, keys, scale, pipeline.object, pipeline.field, used, report)
+    context = shard_context(pipeline, inputs, shard)
+    table: Any = _table(found[stages[done - 1]], used.alias) if done else (first, count)
+    load_kernels(used.alias, kernel_modules("lgrasp.stages."), report)
     runs = [run for run in runs if run.stage in stages[:done]]
     for stage in stages[done:]:
         start = time.perf_counter()
-        options = {"realised": "ik" in stages[: stages.index(stage)]} if stage == "search" else {}
-        table, counts = STAGES[stage].run(
-            table, fit_params(stage, pipeline.params(stage), inputs.hand.model), context, **options
-        )
-        counted = dict(counts)
+        meter = Meter(used.alias)
+        table = run_stage(stage, table, pipeline, context, meter)
+        counted = meter.counts[stage]
         seconds = time.perf_counter() - start
         cache.store(stage, files[stage], _arrays(table) | {"counts": np.asarray(json.dumps(counted))})
         runs.append(StageRun(stage, False, counted, seconds, cache.path(stage, files[stage])))

@@ -7,11 +7,8 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 from lgrasp.engine.bank import BANK_CANDIDATES, Bank
-from lgrasp.engine.folder import check_folder, shard_path
-from lgrasp.engine.inputs import input_keys, run_key
-from lgrasp.jobs.generate import Job, find_present, job_shards
-from lgrasp.jobs.hands import hand_source
-from lgrasp.runtime.device import resolve_device
+from lgrasp.engine.run import Job, look
+from lgrasp.jobs.generate import GenerateJob
 
 
 class PlanLine(NamedTuple):
@@ -24,46 +21,45 @@ class PlanLine(NamedTuple):
     file: str
 
 
-def plan(job: Job) -> list[PlanLine]:
+def preview(job: Job, *, array: tuple[int, int] = (0, 1), resume: bool = True) -> list[PlanLine]:
     """The artifacts of a job in the order in which it would make them.
 
     Raises:
-        LgraspError: bad input, as :func:`generate` would raise it before computing.
+        LgraspError: bad input, as :func:`lgrasp.engine.run.run` would raise it before computing.
     """
-    shards = job_shards(job)
     with _no_kernel_folder():
-        resolve_device(job.device)
-    pipeline = job.pipeline
-    keys = input_keys(hand_source(job.hand), job.object, job.scale, pipeline.object, pipeline.field)
-    assert keys.mesh is not None
-    check_folder(job.out)
-    key = run_key(pipeline.describe(), keys, job.shard_rows)
-    lines = [
-        _cached(job, "hand", keys.source.name, keys.hand, "build"),
-        _cached(job, "object", keys.mesh.stem, keys.object, "preprocess"),
-        _cached(job, "field", keys.source.name, keys.field, f"build ({pipeline.field.index})"),
-    ]
-    files = {s: shard_path(job.out, keys.source.name, keys.mesh.stem, s) for s, _ in shards}
-    present = find_present(job, files, key)
-    for shard, rows in shards:
-        path = files[shard]
-        if shard in present:
-            found = present[shard]
-            lines.append(PlanLine("shard", str(shard), "present", f"nothing, {found:,} rows are there", str(path)))
+        _, parts, present = look(job, array=array, resume=resume)
+    lines = _inputs(job) if isinstance(job, GenerateJob) else []
+    for part in parts:
+        number, file = str(part.number), str(part.file)
+        if part.number in present:
+            lines.append(
+                PlanLine("shard", number, "present", f"nothing, {present[part.number]:,} rows are there", file)
+            )
             continue
-        if job.reuse:
-            lines.append(_banks(job, Bank(job.cache, pipeline, keys, shard, "cpu")))
-        what = f"{rows:,} rows" + (", replacing the file" if path.exists() else "")
-        lines.append(PlanLine("shard", str(shard), "missing", what, str(path)))
+        if isinstance(job, GenerateJob) and job.reuse:
+            lines.append(_banks(job, Bank(job.cache, job.pipeline, job.keys, part.number, "cpu")))
+        what = f"{part.rows:,} {job.unit}" + (", replacing the file" if part.file.exists() else "")
+        lines.append(PlanLine("shard", number, "missing", what, file))
     return lines
 
 
-def _cached(job: Job, kind: str, name: str, key: str, verb: str) -> PlanLine:
+def _inputs(job: GenerateJob) -> list[PlanLine]:
+    keys = job.keys
+    assert keys.mesh is not None
+    return [
+        _cached(job, "hand", keys.source.name, keys.hand, "build"),
+        _cached(job, "object", keys.mesh.stem, keys.object, "preprocess"),
+        _cached(job, "field", keys.source.name, keys.field, f"build ({job.pipeline.field.index})"),
+    ]
+
+
+def _cached(job: GenerateJob, kind: str, name: str, key: str, verb: str) -> PlanLine:
     hit = job.cache.has(kind, key)
     return PlanLine(kind, name, "hit" if hit else "miss", "load" if hit else verb, str(job.cache.path(kind, key)))
 
 
-def _banks(job: Job, bank: Bank) -> PlanLine:
+def _banks(job: GenerateJob, bank: Bank) -> PlanLine:
     count = 0
     while bank.has(count * BANK_CANDIDATES, BANK_CANDIDATES):
         count += 1

@@ -1,9 +1,11 @@
 """What every stage is given beside its inputs and parameters."""
 
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
 from dataclasses import field as with_default
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
@@ -17,6 +19,22 @@ from lgrasp.seeding import stage_seed
 if TYPE_CHECKING:
     from lgrasp.hand.opposition.spaces import Space
     from lgrasp.simulate.scene import Scene
+
+
+class Keeper:
+    """What stages keep from batch to batch: the latest of each kind, made once by whichever thread comes first."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._made: dict[str, tuple[Hashable, Any]] = {}
+
+    def get(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
+        """The object of a kind that was made for a key."""
+        with self._lock:
+            if self._made.get(kind, (None,))[0] != key:
+                self._made.pop(kind, None)
+                self._made[kind] = key, make()
+            return self._made[kind][1]
 
 
 @dataclass(frozen=True)
@@ -38,12 +56,22 @@ class Context:
     """Opposition space that grasps must use; hand and field are then those of the space."""
     holding: HeldArrays | None = None
     """What the hand holds already, and what of it may not move; None: nothing."""
+    realised: bool = True
+    """Are the candidates that search combines realised already (ik comes before search)?"""
+    salt: int = 0
+    """Number of the pass over these candidates."""
+    kept: Keeper = with_default(default_factory=Keeper, repr=False, compare=False)
+    """What stages keep from batch to batch of a job."""
     seeds: dict[tuple[str, int], wp.array] = with_default(default_factory=dict, repr=False, compare=False)
 
     @cached_property
     def held(self) -> HeldArrays:
         """What the hand holds already, of no rows but one if nothing."""
         return self.holding or hold_nothing(self.hand)
+
+    def with_salt(self, salt: int) -> "Context":
+        """The same in another pass."""
+        return self if salt == self.salt else replace(self, salt=salt, holding=self.held)
 
     def seed(self, stage: str, salt: int = 0) -> wp.array:
         """31-bit seed of a stage in this shard, (1,) i32 on the device."""

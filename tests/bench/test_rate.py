@@ -36,8 +36,8 @@ def runs(monkeypatch):
     """The jobs that a benchmark runs, with what came out."""
     seen = []
 
-    def watched(job):
-        outcome = generate(job)
+    def watched(job, **options):
+        outcome = generate(job, **options)
         seen.append((job, outcome))
         return outcome
 
@@ -49,7 +49,7 @@ def test_yield_goes_from_run_to_run(job, runs):
     with Bench() as several:
         results = several.measure([job(object="tiny", rows=40), job(object="tiny", rows=20)], repeat=2)
     trials = [(trial.rows, trial.rate) for trial, _ in runs]
-    after = [outcome.rate for _, outcome in runs]
+    after = [outcome.job.measured_rate for _, outcome in runs]
     # two probes, then the jobs in turns; each begins with what the run before of the same job measured
     assert trials[:2] == [(4, 1.0), (2, 1.0)]
     assert trials[2:] == [(40, after[0]), (20, after[1]), (40, after[2]), (20, after[3])]
@@ -62,7 +62,7 @@ def test_inputs_are_made_once(job, runs):
     with Bench() as several:
         first = several.measure([job(object="tiny", rows=10)], 1)
         second = several.measure([job(object="tiny", rows=10)], 1)
-    assert [all(outcome.inputs.hits.values()) for _, outcome in runs] == [False, True, True, True]
+    assert [all(outcome.job.inputs.hits.values()) for _, outcome in runs] == [False, True, True, True]
     assert first[0]["build_seconds"] == second[0]["build_seconds"]
     assert first[0]["load_seconds"]["field"] < first[0]["build_seconds"]["field"]
 

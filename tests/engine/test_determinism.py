@@ -116,7 +116,7 @@ def test_seeds_and_shards_differ(swift, inputs):
 def test_shards_do_not_depend_on_their_number(run, grasps, tmp_path):
     run(rows=60, shard_rows=20, out=tmp_path / "three")
     run(rows=40, shard_rows=20, out=tmp_path / "two")
-    run(rows=60, shard_rows=20, shard_index=1, num_shards=3, out=tmp_path / "task")
+    run(rows=60, shard_rows=20, array=(1, 3), out=tmp_path / "task")
     three = sorted((tmp_path / "three").glob("*.h5"))
     two = sorted((tmp_path / "two").glob("*.h5"))
     (task,) = (tmp_path / "task").glob("*.h5")

@@ -7,6 +7,7 @@ import pytest
 
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.batch import run_batch
+from lgrasp.engine.events import CancelledError
 from lgrasp.engine.shard import Execution, make_shard
 
 
@@ -66,7 +67,7 @@ def test_error_in_a_batch(swift, inputs, watched):
     assert caught.value
 
 
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, CancelledError])
 def test_error_while_reporting(swift, inputs, watched, error):
     def report(rows, result):
         raise error
@@ -76,14 +77,6 @@ def test_error_while_reporting(swift, inputs, watched, error):
     assert watched.running == 0  # although the traceback keeps the frames alive
     assert threads() == 0
     assert caught.tb
-
-
-def test_cancelled(swift, inputs, watched):
-    result = make_shard(swift, inputs, 0, 10_000, Execution(2, 64, lambda: len(watched.begun) > 2))
-    assert result.cancelled
-    assert not result.exhausted
-    assert watched.running == 0
-    assert threads() == 0
 
 
 def test_progress(swift, inputs):

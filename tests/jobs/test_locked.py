@@ -6,7 +6,7 @@ from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.hand.find import find_hand
-from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.judge.run import judge
 
 
@@ -14,7 +14,8 @@ def test_locked_joints_are_in_the_shard(tmp_path):
     name = "shadow"
     pipeline = load_pipeline("swift")
     pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 20_000})})
-    outcome = generate(Job(name, "sphere", 12, pipeline, tmp_path / "out", cache=Cache(tmp_path / "cache")))
+    given = {"pipeline": pipeline, "out": tmp_path / "out", "cache": Cache(tmp_path / "cache")}
+    outcome = generate(GenerateJob(hand=name, object="sphere", rows=12, **given))
     shard = read_shard(outcome.paths[0])
     names = list(shard.hand.joint_names)
     locked = find_hand(name).spec.locked

@@ -8,7 +8,7 @@ import pytest
 from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
-from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.generate import GenerateJob, generate
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "hands" / "allegro"
 
@@ -17,12 +17,12 @@ REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "hands" / "al
 def test_a_cached_hand_may_move(tmp_path):
     pipeline = load_pipeline("swift")
     pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 20_000})})
-    cache = Cache(tmp_path / "cache")
+    given = {"object": "sphere", "rows": 5, "pipeline": pipeline, "cache": Cache(tmp_path / "cache")}
     shutil.copytree(REAL, tmp_path / "before")
-    first = generate(Job(str(tmp_path / "before/allegro.urdf"), "sphere", 5, pipeline, tmp_path / "a", cache=cache))
+    first = generate(GenerateJob(**given, hand=str(tmp_path / "before/allegro.urdf"), out=tmp_path / "a"))
     shutil.move(tmp_path / "before", tmp_path / "after")
-    second = generate(Job(str(tmp_path / "after/allegro.urdf"), "sphere", 5, pipeline, tmp_path / "b", cache=cache))
-    assert second.inputs.hits["hand"]
+    second = generate(GenerateJob(**given, hand=str(tmp_path / "after/allegro.urdf"), out=tmp_path / "b"))
+    assert second.job.inputs.hits["hand"]
     meshes = read_shard(first.paths[0]).hand.meshes
     assert meshes
     assert read_shard(second.paths[0]).hand.meshes == meshes

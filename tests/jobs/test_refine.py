@@ -15,7 +15,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import GRASP_FIELDS
-from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.refine.shards import RefinedShard, Refinement, refine_shards
 from lgrasp.judge.run import judge
 from lgrasp.stages.refine.params import RefineParams
@@ -29,7 +29,7 @@ def source(swift: Pipeline, cache_root: Path, tmp_path_factory: pytest.TempPathF
     """A shard of 40 valid grasps of which every second hand was moved by millimetres, with verdicts of a simulator."""
     folder = tmp_path_factory.mktemp("source")
     made = generate(
-        Job(
+        GenerateJob(
             hand="allegro",
             object="mug",
             rows=ROWS,

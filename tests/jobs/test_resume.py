@@ -15,19 +15,21 @@ import pytest
 from lgrasp.dataset.files import hold_file
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import Events
 from lgrasp.errors import ConfigError, OutputError
-from lgrasp.jobs.generate import Job, Listener, generate
+from lgrasp.jobs.generate import GenerateJob, generate
 
 CHILD = """
 import os, signal, sys
 from pathlib import Path
 from lgrasp.engine.cache import Cache
-from lgrasp.jobs.generate import Job, Listener, generate
+from lgrasp.engine.events import Events
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.field.params import FieldParams
 
-class Say(Listener):
-    def started(self, inputs, shards, present):
+class Say(Events):
+    def started(self, parts, present):
         print("started", flush=True)
 
 out, cache, rows, shard_rows, index, number = sys.argv[1:7]
@@ -37,9 +39,10 @@ if sys.argv[7:] == ["die"]:  # with all bytes written, before the file has its n
     )
 pipeline = load_pipeline("swift").model_copy(update={"field": FieldParams(records=20_000)})
 generate(
-    Job("allegro", "mug", int(rows), pipeline, Path(out), device="cpu", workers=1, shard_rows=int(shard_rows),
-        shard_index=int(index), num_shards=int(number), cache=Cache(cache)),
+    GenerateJob(hand="allegro", object="mug", rows=int(rows), pipeline=pipeline, out=out, device="cpu", workers=1,
+        shard_rows=int(shard_rows), cache=Cache(cache)),
     Say(),
+    array=(int(index), int(number)),
 )
 """
 
@@ -67,7 +70,8 @@ def warnings_of(cache_root):
 @pytest.fixture(scope="module")
 def uninterrupted(swift, cache_root, tmp_path_factory):
     folder = tmp_path_factory.mktemp("uninterrupted")
-    generate(Job("allegro", "mug", 80, swift, folder, shard_rows=20, device="cpu", cache=Cache(cache_root)))
+    cache = Cache(cache_root)
+    generate(GenerateJob(object="mug", rows=80, pipeline=swift, out=folder, shard_rows=20, device="cpu", cache=cache))
     return folder
 
 
@@ -218,8 +222,7 @@ class TestStarving:
                 shard_rows=1000,
                 pipeline=poor,
                 out=tmp_path / "array",
-                shard_index=task,
-                num_shards=3,
+                array=(task, 3),
             )
         assert len(raw_grasps(tmp_path / "single")) == 3
         assert raw_grasps(tmp_path / "single") == raw_grasps(tmp_path / "array")
@@ -233,11 +236,11 @@ class TestStarving:
 
 
 def test_cancelled_run_keeps_whole_shards(job, whole, raw_grasps, tmp_path):
-    class Stop(Listener):
+    class Stop(Events):
         batches = 0
 
-        def advanced(self, shard, rows, result):
-            self.batches += shard == 1
+        def advanced(self, part, done, note=""):
+            self.batches += part.number == 1
 
         def cancelled(self):
             return self.batches > 0
@@ -251,7 +254,7 @@ def test_cancelled_run_keeps_whole_shards(job, whole, raw_grasps, tmp_path):
 
 
 def test_cancelled_before_the_first_batch(job, tmp_path):
-    class Stop(Listener):
+    class Stop(Events):
         def cancelled(self):
             return True
 
@@ -345,21 +348,21 @@ def test_bad_input_leaves_no_folder(job, tmp_path):
         {"rows": 0},
         {"rows": -5},
         {"shard_rows": 0},
-        {"num_shards": 0},
-        {"shard_index": 1},
-        {"shard_index": -1, "num_shards": 2},
+        {"array": (0, 0)},
+        {"array": (1, 1)},
+        {"array": (-1, 2)},
         {"workers": -1},
         {"batch": -1},
     ],
 )
-def test_numbers_out_of_range(job, changes):
+def test_numbers_out_of_range(run, changes):
     with pytest.raises(ConfigError) as caught:
-        generate(job(**changes))
+        run(**changes)
     assert "\n" not in str(caught.value)
 
 
 def test_task_without_a_shard(run, tmp_path):
-    outcome = run(rows=20, shard_index=3, num_shards=4)
+    outcome = run(rows=20, array=(3, 4))
     assert (outcome.paths, outcome.rows, outcome.starved) == ([], 0, False)
     assert not (tmp_path / "out").exists()
 
@@ -373,13 +376,13 @@ def test_long_names(run, tmp_path):
 
 
 def test_memory_does_not_grow_with_the_shards(job):
-    class Watch(Listener):
+    class Watch(Events):
         def __init__(self):
             self.tables = []
             self.alive = []
 
-        def wrote(self, shard, path, result):
-            self.tables.append(weakref.ref(result.grasps))
+        def wrote(self, part, made):
+            self.tables.append(weakref.ref(made.contents))
             self.alive.append(sum(table() is not None for table in self.tables))
 
     watch = Watch()

@@ -7,13 +7,14 @@ import pytest
 
 from lgrasp.dataset import read_shard, validate_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import Events
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run
 from lgrasp.errors import OutputError
 from lgrasp.grasp.sequences import SequenceTable
-from lgrasp.jobs.generate import Listener
 from lgrasp.jobs.sequence import round as round_module
 from lgrasp.jobs.sequence.inputs import load_sequence_inputs, sequence_keys
-from lgrasp.jobs.sequence.job import SequenceJob, generate_sequences
+from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.sequence.round import run_round
 from lgrasp.jobs.sequence.shard import make_sequences
 from lgrasp.jobs.sequence.size import Size
@@ -134,12 +135,13 @@ def test_first_rows_of_a_longer_run(pipeline, inputs):
 @pytest.fixture
 def job(pipeline, cache_root, tmp_path):
     cache = Cache(cache_root, pytest.fail)
-    own = SequenceJob("allegro", OBJECTS, 8, pipeline, tmp_path / "out", SIZE, device="cpu", shard_rows=4, cache=cache)
-    return lambda **changes: replace(own, **changes)
+    given = {"objects": OBJECTS, "rows": 8, "pipeline": pipeline, "out": tmp_path / "out", "scale": "0.06:0.08"}
+    own = SequenceJob(**given, device="cpu", shard_rows=4, cache=cache)
+    return own.changed
 
 
 def test_files(job):
-    outcome = generate_sequences(job())
+    outcome = run(job())
     assert [path.name for path in outcome.paths] == [f"allegro-sphere-mug-0000{s}.h5" for s in (0, 1)]
     for path in outcome.paths:
         assert validate_shard(path) == []
@@ -153,27 +155,27 @@ def test_files(job):
 
 
 def test_array_tasks_and_resume_give_the_same_files(job, tmp_path):
-    whole = {p.name: read_shard(p).grasps for p in generate_sequences(job()).paths}
+    whole = {p.name: read_shard(p).grasps for p in run(job()).paths}
     parts = tmp_path / "parts"
     for task in (0, 1):
-        generate_sequences(job(out=parts, shard_index=task, num_shards=2))
-    assert generate_sequences(job(out=parts)).made == 0
+        run(job(out=parts), array=(task, 2))
+    assert run(job(out=parts)).made == 0
     for path in parts.glob("*.h5"):
         np.testing.assert_array_equal(read_shard(path).grasps.q, whole[path.name].q)
 
 
 def test_other_run_is_not_overwritten(job):
-    generate_sequences(job(rows=4))
+    run(job(rows=4))
     with pytest.raises(OutputError, match="another run"):
-        generate_sequences(job(rows=4, objects=("sphere", "mug"), size=Size(0.06, 0.07)))
+        run(job(rows=4, objects=("sphere", "mug"), scale="0.06:0.07"))
 
 
 def test_stop(job):
-    class Stop(Listener):
+    class Stop(Events):
         def cancelled(self):
             return True
 
-    outcome = generate_sequences(job(), Stop())
+    outcome = run(job(), Stop())
     assert outcome.cancelled
     assert not outcome.paths
 
@@ -181,7 +183,7 @@ def test_stop(job):
 def test_physics_between_steps(pipeline, inputs, job):
     """Rows that do not hold are not gone on from: every row of the file holds, and so do those before it."""
     pytest.importorskip("mujoco")
-    outcome = generate_sequences(job(rows=4, physics="seq6"))
+    outcome = run(job(rows=4, physics="seq6"))
     rows = read_shard(outcome.paths[0]).grasps
     assert rows.physics["seq6_holds"].all()
     assert rows.physics["seq6_object_touches"].shape == rows.object_index.shape

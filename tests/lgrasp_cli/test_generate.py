@@ -8,8 +8,8 @@ import time
 import pytest
 
 from lgrasp.dataset import read_shard, validate_shard
+from lgrasp.engine.run import array_task
 from lgrasp.errors import ConfigError
-from lgrasp.jobs.config import array_task
 
 KEYS = {
     "grasps",

@@ -18,8 +18,8 @@ PIPELINE = {
         {"ik": {}},
         {"search": {"contacts": [2], "threshold": 0.15, "restarts": 16, "moves": 4, "per_pose": 1}},
         {"filter": {"draws": 1}},
-        {"sequence": {"width": 16, "wave": 64, "waves": 2}},
     ],
+    "sequence": {"width": 16, "wave": 64, "waves": 2},
 }
 
 
@@ -126,7 +126,7 @@ def test_too_many_sets(cli, tmp_path, sets, words):
 
 
 def test_sequences_are_drawn_with_a_seed():
-    from lgrasp.jobs.sequence.sets import SequenceSets, object_sequences
+    from lgrasp.jobs.sets import SequenceSets, object_sequences
 
     pool = [f"o{i}" for i in range(12)]
     sets = SequenceSets(sets=20, length=4, permutations=3)

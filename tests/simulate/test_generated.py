@@ -8,7 +8,7 @@ import pytest
 
 from lgrasp.dataset import GraspRows, ShardReader, read_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
 from lgrasp.simulate.scene import Scene, scene_of_shard
@@ -23,7 +23,8 @@ ROWS = 24
 def path(swift, cache_root, tmp_path_factory) -> Path:
     """A shard of the shipped Allegro and ball."""
     out = tmp_path_factory.mktemp("ball")
-    job = Job("allegro", "sphere", ROWS, swift, out, device="cpu", workers=1, cache=Cache(cache_root, pytest.fail))
+    cache = Cache(cache_root, pytest.fail)
+    job = GenerateJob(object="sphere", rows=ROWS, pipeline=swift, out=out, device="cpu", workers=1, cache=cache)
     return generate(job).paths[0]
 
 

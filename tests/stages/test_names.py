@@ -18,13 +18,14 @@ def folders(path: Path) -> set[str]:
 
 
 def test_folders():
-    assert folders(ROOT / "lgrasp" / "stages") == set(STAGES)
-    assert folders(ROOT / "tests" / "stages") == set(STAGES)
+    packages = {stage.package for stage in STAGES.values()}
+    assert packages == {f"lgrasp.stages.{name}" for name in folders(ROOT / "lgrasp" / "stages")}
+    assert folders(ROOT / "tests" / "stages") == folders(ROOT / "lgrasp" / "stages")
     assert all({*order, *OPTIONAL} == set(STAGES) for order in ORDERS)
     for name, stage in STAGES.items():
         assert stage.name == name
-        assert stage.run.__module__ == f"lgrasp.stages.{name}.stage"
-        assert stage.params.__module__ == f"lgrasp.stages.{name}.params"
+        assert stage.run.__module__ == f"{stage.package}.stage"
+        assert stage.params.__module__ == f"{stage.package}.params"
 
 
 @pytest.mark.parametrize("name", sorted(pipeline_files()))

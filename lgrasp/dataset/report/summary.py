@@ -8,8 +8,7 @@ from lgrasp.dataset.report.gather import HandRows, ObjectRows
 from lgrasp.dataset.report.held import held_numbers
 from lgrasp.dataset.report.posture import principal_postures
 from lgrasp.dataset.report.survey import Head
-from lgrasp.engine.registry import STAGES
-from lgrasp.engine.report import survivors
+from lgrasp.dataset.survivors import SURVIVORS, stage_counts, survivors
 
 
 def summary(heads: Sequence[Head], remarks: list[str], hands: Mapping[tuple[str, str], HandRows]) -> dict[str, Any]:
@@ -48,20 +47,15 @@ def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, 
 def _run(pipeline: str, heads: list[Head]) -> dict[str, Any]:
     """What one pipeline counted on its way, over all shards."""
     statistics = sum_statistics([head.statistics for head in heads])
-    counts: dict[str, dict[str, int]] = {}
-    seconds: dict[str, float] = {}
-    for name, value in statistics.items():
-        first, _, rest = name.partition("_")
-        if first == "seconds" and not isinstance(value, str):
-            seconds[rest] = float(value)
-        elif first in STAGES and isinstance(value, int):
-            counts.setdefault(first, {})[rest.replace("_", " ")] = value
+    counts = stage_counts(statistics)
+    timed = {name: value for name, value in statistics.items() if name.startswith("seconds_")}
+    seconds = {n.removeprefix("seconds_"): float(value) for n, value in timed.items() if not isinstance(value, str)}
     return {
         "pipeline": pipeline,
         "rows": sum(head.rows for head in heads),
         "seeds": sorted({head.seed for head in heads}),
         "device": str(statistics.get("device", "")),
-        "survivors": survivors({stage: counts[stage] for stage in heads[0].stages or STAGES if stage in counts}),
+        "survivors": survivors({stage: counts[stage] for stage in heads[0].stages or SURVIVORS if stage in counts}),
         "counts": counts,
         "seconds": seconds,
     }

@@ -9,13 +9,13 @@ import numpy as np
 import trimesh
 
 from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.survivors import survivors
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.report import survivors
 from lgrasp.errors import OutputError
 from lgrasp.grasp.records import Shard
-from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.hand_check.diagnose import diagnose, hand_findings
 from lgrasp.jobs.hand_check.pictures import draw_grasps, draw_hand, draw_palmar, draw_spaces, draw_workspace
 from lgrasp.jobs.hand_check.space_check import SpaceCheck, check_spaces, longest_sequence
@@ -92,7 +92,7 @@ def check_hand(
     with tempfile.TemporaryDirectory(prefix="lgrasp-check-") as folder:
         for name, mesh in check_objects(Path(folder)).items():
             say(f"{name} of 5 cm")
-            job = Job(
+            job = GenerateJob(
                 hand=hand,
                 object=str(mesh),
                 rows=rows,
@@ -104,7 +104,7 @@ def check_hand(
                 cache=cache,
             )
             outcome = generate(job)
-            inputs = outcome.inputs
+            inputs = job.inputs
             if result is None:
                 model = inputs.hand.model
                 result = HandCheck(model.name, inputs.keys.source.note, list(model.notes))

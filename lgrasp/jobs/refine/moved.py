@@ -9,9 +9,9 @@ import torch
 
 from lgrasp.dataset import GraspRows, pose_matrix
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays, join_grasps
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.jobs.refine.rows import shard_rows
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.check import check_grasps
@@ -96,7 +96,8 @@ def move_rows(
     first_energy, last_energy = np.concatenate(before, 1), np.concatenate(after, 1)
     terms = {f"energy_{name}": values for name, values in zip(Energies._fields, last_energy, strict=True)}
     extra = {"energy": last_energy.sum(0), **terms, "valid": valid, "refined": take}
-    made = shard_rows(table, hand.model, obj, {name: np.asarray(v, np.float32) for name, v in extra.items()})
+    extra = {name: np.asarray(values, np.float32) for name, values in extra.items()}
+    made = grasp_rows(press(table), hand.model.tree, obj.center, extra=extra)
     made = replace(made, candidate=rows.candidate)
     if stored:
         made = _kept(rows, made, take | outside)

@@ -13,10 +13,10 @@ from lgrasp.dataset import ObjectRecord, Shard, ShardHeader, write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.folder import check_folder, clean_folder, shard_path
 from lgrasp.errors import ConfigError, OutputError
+from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
-from lgrasp.jobs.refine.rows import shard_rows
 from lgrasp.jobs.shard_inputs import named_hand, named_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.planner import Planner, PlanParams, cloud_params
@@ -94,7 +94,7 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
     check_folder(out)
     if path.exists() and not job.force:
         raise OutputError(f"{path} exists; choose another folder with --out, or --force to replace it")
-    clean_folder(path)
+    clean_folder([path])
     palmar = seen_palmar(source, hand, device.alias)
     params = job.params if job.cloud is None else cloud_params(job.params)
     planner = Planner(upload_hand(hand, device.alias), model, stand_off, params, palmar, around)
@@ -117,7 +117,7 @@ def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None
         record = hand_record(hand, mesh_blobs(source.urdf))
         statistics = {"device": device.name, "seconds_wall": seconds}
         statistics |= {f"plan_{name.replace(' ', '_').replace('-', '_')}": n for name, n in counts.items()}
-        rows = shard_rows(grasps, hand, model)
+        rows = grasp_rows(press(grasps), hand.tree, model.center)
         write_shard(
             path,
             Shard(header=header, hand=record, objects=[_record(model, job.cloud)], grasps=rows, statistics=statistics),

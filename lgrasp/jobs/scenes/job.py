@@ -91,8 +91,7 @@ def make_scenes(job: SceneJob, listener: SceneListener | None = None) -> SceneOu
     stock = load_stock(config, job.cache, device, listener.loading)
     described = _described(config, stock)
     files = {index: shard_path(config.out, stock.record.name, "scene", index) for index in numbers}
-    for path in list(files.values())[:1]:
-        clean_folder(path)
+    clean_folder(list(files.values()))
     present = _present(files, described["run_key"], job.cache.warn) if job.resume else set()
     listener.loading("kernels")
     load_kernels(device.alias, kernel_modules("lgrasp.scenes."))

@@ -20,7 +20,7 @@ _COLUMNS = ("q", "q_pregrasp", "q_squeeze", "candidate")
 
 
 @dataclass
-class Part:
+class Grasped:
     """An object of some shards and its columns, shard by shard."""
 
     record: ObjectRecord
@@ -34,15 +34,15 @@ class Part:
         return {name: np.concatenate([columns[name] for columns in self.columns]) for name in self.columns[0]}
 
 
-def read_parts(paths: Sequence[Path]) -> dict[tuple[str, str], Part]:
+def read_parts(paths: Sequence[Path]) -> dict[tuple[str, str], Grasped]:
     """Objects by id and hash of their mesh as grasped, all with grasps of one hand.
 
     Raises:
         ShardError: a file is no shard of single objects, of point clouds, has a row that is not finite, or is of
             another hand than the others; two objects have one id.
     """
-    found: dict[tuple[str, str], Part] = {}
-    first: tuple[Part, Path] | None = None
+    found: dict[tuple[str, str], Grasped] = {}
+    first: tuple[Grasped, Path] | None = None
     for path in paths:
         with ShardReader(path) as reader:
             if reader.space_names is not None or len(reader.object_ids) != 1:
@@ -61,7 +61,7 @@ def read_parts(paths: Sequence[Path]) -> dict[tuple[str, str], Part]:
                 f"{path}: its grasps are of hand '{attributes['hand']}' (hash {attributes['hand_sha256'][:12]}), those "
                 f"of {first[1]} of '{hand.name}' (hash {hand.sha256[:12]}); name shards of one hand"
             )
-        part = found.setdefault((record.id, mesh_hash(record)), Part(record, hand, config, []))
+        part = found.setdefault((record.id, mesh_hash(record)), Grasped(record, hand, config, []))
         first = first or (part, path)
         part.columns.append(columns)
     ids = [key[0] for key in found]
@@ -82,7 +82,9 @@ def _check_finite(path: Path, columns: dict[str, np.ndarray]) -> None:
             )
 
 
-def load_hand(parts: Collection[Part], name: str | None, cache: Cache, device: Device) -> tuple[HandModel, HandRecord]:
+def load_hand(
+    parts: Collection[Grasped], name: str | None, cache: Cache, device: Device
+) -> tuple[HandModel, HandRecord]:
     """The hand of some shards, made from them; ``name``, where one is given, must be of the same hand.
 
     Raises:

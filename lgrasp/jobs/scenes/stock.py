@@ -15,10 +15,10 @@ from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.scenes.config import SceneConfig
-from lgrasp.jobs.scenes.shards import Part, load_hand, read_parts
+from lgrasp.jobs.scenes.shards import Grasped, load_hand, read_parts
 from lgrasp.jobs.shard_inputs import mesh_hash, object_of_shard
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.find import find_object
@@ -85,7 +85,7 @@ def _generated(config: SceneConfig, cache: Cache, device: Device, report: Callab
     _check_meshes(config)
     for name in config.objects:
         report(f"grasps of {Path(name).stem}")
-        job = Job(
+        job = GenerateJob(
             hand=hand,
             object=name,
             rows=config.stock,
@@ -116,7 +116,7 @@ def _source_hash(name: str) -> str:
     return hashlib.sha256(find_object(name).read_bytes()).hexdigest()
 
 
-def _check_objects(config: SceneConfig, found: Iterable[Part], wanted: list[str]) -> None:
+def _check_objects(config: SceneConfig, found: Iterable[Grasped], wanted: list[str]) -> None:
     """Raises ConfigError where the shards lack an object that is asked for, by the hash of its file."""
     there = {part.record.sha256: part.record.id for part in found}
     for name, source in zip(config.objects, wanted, strict=True):

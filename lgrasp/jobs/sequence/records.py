@@ -4,13 +4,10 @@ import numpy as np
 
 from lgrasp.dataset import GraspRows
 from lgrasp.grasp.records import ObjectRecord, SequenceRows
+from lgrasp.grasp.rows import CONTACTS, METRIC_UNITS, POSTURES, row_numbers, step_columns, used_width
 from lgrasp.grasp.sequences import SequenceTable
-from lgrasp.grasp.tables import user_poses
-from lgrasp.jobs.generate import METRIC_UNITS
 from lgrasp.jobs.records import object_record
 from lgrasp.jobs.sequence.inputs import SequenceInputs
-
-_ROUND_BITS, _SHARD_BITS = np.uint64(24), np.uint64(40)
 
 
 def object_records(inputs: SequenceInputs) -> list[ObjectRecord]:
@@ -38,20 +35,15 @@ def sequence_rows(
     last = np.arange(len(steps)), steps - 1
     metrics = {name: np.concatenate([t.metrics[name] for t in levels]) for name in levels[0].metrics}
     physics = {name: np.concatenate([t.physics[name] for t in levels]) for name in levels[0].physics}
-    candidate = np.concatenate([table.candidate for table in levels]).astype(np.uint64)
+    candidate = np.concatenate([table.candidate for table in levels])
     links = columns["contact_links"]
-    width = max(1, int((links >= 0).sum(2).max(initial=1)))
+    width = used_width(links)
     return GraspRows(
-        q=columns["q"][last],
-        q_pregrasp=columns["q_pregrasp"][last],
-        q_squeeze=columns["q_squeeze"][last],
+        **{name: columns[name][last] for name in POSTURES},
         object_pose=columns["object_pose"],
         object_index=columns["object_index"],
-        contact_points=columns["contact_points"][:, :, :width],
-        contact_normals=columns["contact_normals"][:, :, :width],
-        contact_links=links[:, :, :width],
-        contact_forces=columns["contact_forces"][:, :, :width],
-        candidate=(np.uint64(shard) << _SHARD_BITS) + candidate,
+        **{name: columns[name][:, :, :width] for name in CONTACTS},
+        candidate=row_numbers(shard, candidate),
         metrics=metrics | {"contacts": (links >= 0).sum((1, 2)).astype(np.float32)},
         metric_units=METRIC_UNITS,
         physics=physics,
@@ -71,29 +63,18 @@ def sequence_rows(
 def _level(table: SequenceTable, inputs: SequenceInputs, slots: int) -> dict[str, np.ndarray]:
     """Columns of rows of equally many objects, absent slots filled."""
     tree, n = inputs.hand.tree, table.steps
-    centers = np.array([obj.model.center for obj in inputs.objects[:n]])
     ids = inputs.object_ids
     number = np.array([sorted(set(ids)).index(name) for name in ids[:n]], np.int32)
-    poses = [user_poses(table.pose[:, s], centers[s]) for s in range(n)]
-
-    def listed(values: np.ndarray) -> np.ndarray:
-        return np.stack([tree.listed_values(values[:, s]) for s in range(n)], 1)
-
+    postures, contacts = ({name: getattr(table, name) for name in names} for names in (POSTURES, CONTACTS))
+    centers = np.array([obj.model.center for obj in inputs.objects[:n]])
     held = np.zeros((len(table), n, len(tree.locked_names)), bool)
-    columns = {
-        "q": (listed(table.q), np.nan),
-        "q_pregrasp": (listed(table.q_pregrasp), np.nan),
-        "q_squeeze": (listed(table.q_squeeze), np.nan),
-        "object_pose": (np.stack(poses, 1), np.nan),
-        "object_index": (np.broadcast_to(number, (len(table), n)), -1),
-        "contact_points": (table.contact_points + centers[:, None].astype(np.float32), np.nan),
-        "contact_normals": (table.contact_normals, np.nan),
-        "contact_links": (table.contact_links.astype(np.int16), -1),
-        "contact_forces": (table.contact_forces, np.nan),
-        "space": (table.space.astype(np.int16), -1),
-        "free_joints": (np.concatenate([table.free, held, table.free[:, :, tree.coupled_column]], 2), False),
+    columns = step_columns(tree, postures, table.pose, contacts, centers) | {
+        "object_index": np.broadcast_to(number, (len(table), n)),
+        "space": table.space.astype(np.int16),
+        "free_joints": np.concatenate([table.free, held, table.free[:, :, tree.coupled_column]], 2),
     }
-    return {name: _padded(values, slots, fill) for name, (values, fill) in columns.items()}
+    empty = {"f": np.nan, "i": -1, "b": False}
+    return {name: _padded(values, slots, empty[values.dtype.kind]) for name, values in columns.items()}
 
 
 def _padded(values: np.ndarray, slots: int, fill: float) -> np.ndarray:

@@ -1,28 +1,29 @@
 """What a job of sequences did, in numbers; and why an object was not held."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.engine.report import peak_device_mb, peak_rss_mb
+from lgrasp.engine.run import Outcome
 from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.jobs.bottleneck import starving_stage
-from lgrasp.jobs.sequence.job import SequenceJob, SequenceOutcome, sequence_shards
-from lgrasp.jobs.sequence.shard import add_spaces
+from lgrasp.jobs.sequence.inputs import SequenceInputs
+from lgrasp.jobs.sequence.shard import SequenceResult, add_spaces
 
 
-def report(job: SequenceJob, outcome: SequenceOutcome) -> dict[str, Any]:
-    """The report of a job, JSON-serialisable.
+def sequence_report(job: Any, outcome: Outcome) -> dict[str, Any]:
+    """The numbers of a :class:`~lgrasp.jobs.sequence.job.SequenceJob`, JSON-serialisable.
 
     Returns:
         ``sequences`` (whole ones on disk), ``asked``, ``reached`` (rows found by number of objects), ``spaces``
         (survivors by step, space and stage), ``penetration`` (median and largest [mm], all rows), ``seconds`` (``wall``
         of the sequences, thread-seconds per stage, loading, total), ``per_s`` and what was asked.
     """
-    inputs, params = outcome.inputs, job.pipeline.params("sequence")
+    inputs, params = job.inputs, job.pipeline.params("sequence")
     steps = len(inputs.objects)
-    reached, spaces = [0] * steps, _spaces(outcome)
+    reached, spaces = [0] * steps, _spaces(inputs, outcome.results)
     counts: dict[str, dict[str, int]] = {}
     seconds: dict[str, float] = {}
     for result in outcome.results:
@@ -36,17 +37,14 @@ def report(job: SequenceJob, outcome: SequenceOutcome) -> dict[str, Any]:
             depth.append(reader.column("metrics/penetration"))
     depth = np.concatenate(depth[1:] or depth)
     wall = sum(result.wall for result in outcome.results)
-    loading = {name: inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field", "kernels")}
+    loading = {name: inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field")}
     return {
         "sequences": outcome.rows,
-        "asked": sum(rows for _, rows in sequence_shards(job)),
-        "made": outcome.made,
-        "present": outcome.present,
         "reached": reached,
         "spaces": spaces,
         "counts": counts,
         "penetration": [1e3 * float(np.median(depth)), 1e3 * float(depth.max())],
-        "seconds": seconds | loading | {"wall": wall, "total": outcome.wall},
+        "seconds": seconds | loading | {"wall": wall},
         "per_s": outcome.made / wall if wall else 0.0,
         "hits": inputs.hits,
         "hand": inputs.hand.name,
@@ -57,25 +55,17 @@ def report(job: SequenceJob, outcome: SequenceOutcome) -> dict[str, Any]:
         "policy": params.policy,
         "physics": job.physics,
         "seed": job.pipeline.seed,
-        "out": str(job.out),
-        "shards": [path.name for path in outcome.paths],
-        "device": inputs.device.name,
-        "peak_rss_mb": peak_rss_mb(),
-        "peak_device_mb": peak_device_mb(inputs.device.alias),
-        "starved": outcome.starved,
-        "cancelled": outcome.cancelled,
     }
 
 
-def unheld(outcome: SequenceOutcome) -> str:
+def unheld(inputs: SequenceInputs, results: Sequence[SequenceResult]) -> str:
     """Which object no opposition space could hold, and why: one line."""
-    inputs = outcome.inputs
-    reached = next((r.reached for r in outcome.results), [])
+    reached = next((r.reached for r in results), [])
     step = next((s for s, found in enumerate(reached) if found == 0), len(reached))
     step = min(step, len(inputs.objects) - 1)
     model, path = inputs.objects[step].model, inputs.keys.meshes[step]
     sides = " x ".join(f"{1e3 * side:.0f}" for side in model.extents)
-    reasons = {space: starving_stage(counts) for space, counts in _spaces(outcome)[step].items()}
+    reasons = {space: starving_stage(counts) for space, counts in _spaces(inputs, results)[step].items()}
     why = "; ".join(f"{space}: stage {stage}, {words}" for space, (stage, words) in reasons.items())
     return (
         f"object {step + 1} ({path}, {sides} mm) is held by no opposition space of hand '{inputs.hand.name}'"
@@ -84,9 +74,9 @@ def unheld(outcome: SequenceOutcome) -> str:
     )
 
 
-def _spaces(outcome: SequenceOutcome) -> list[dict[str, dict[str, dict[str, int]]]]:
+def _spaces(inputs: SequenceInputs, results: Sequence[SequenceResult]) -> list[dict[str, dict[str, dict[str, int]]]]:
     """Survivors by step, space and stage over all shards made."""
-    total: list[dict[str, dict[str, dict[str, int]]]] = [{} for _ in outcome.inputs.objects]
-    for result in outcome.results:
+    total: list[dict[str, dict[str, dict[str, int]]]] = [{} for _ in inputs.objects]
+    for result in results:
         add_spaces(total, result.spaces)
     return total

@@ -10,7 +10,6 @@ import numpy as np
 from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts, add_seconds
-from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.held import hold
 from lgrasp.grasp.sequences import SequenceTable, empty_sequences, join_sequences, take_sequences
 from lgrasp.grasp.tables import GraspTable, join_grasps, sort_grasps
@@ -53,14 +52,14 @@ def run_round(
     shard: int,
     number: int,
     workers: int,
-    cancelled: Callable[[], bool] = lambda: False,
+    check: Callable[[], None] = lambda: None,
     verdicts: Verdicts | None = None,
 ) -> Round:
     """Sequences of round ``number`` of a shard: a pure function of its arguments but the number of threads.
 
     Args:
         workers: threads.
-        cancelled: asked before each step; the round then ends early.
+        check: called before each step; what it raises ends the round.
         verdicts: simulates the rows of each step; only those that hold go on.
     """
     params, model = pipeline.params("sequence"), inputs.hand
@@ -68,7 +67,8 @@ def run_round(
     rows = empty_sequences(params.width, model.dofs, model.groups + 1)
     result = Round()
     with ThreadPoolExecutor(workers) as pool:
-        while rows.steps < len(inputs.objects) and len(rows) and not cancelled():
+        while rows.steps < len(inputs.objects) and len(rows):
+            check()
             result.spaces.append({})
             start = time.perf_counter()
             rows = _step(pipeline, inputs, rows, seed, pool, result)
@@ -136,7 +136,7 @@ class _Search:
             return
         name, size = self._inputs.spaces[number].name, self._params.wave
         seed = stage_seed(self._seed, self._rows.steps, name, wave)
-        context = _context(self._pipeline.bounds, self._inputs, take_sequences(self._rows, chosen), number, size, seed)
+        context = _context(self._pipeline, self._inputs, take_sequences(self._rows, chosen), number, size, seed)
         grasps, meters = _from_field(self._pipeline, context, len(chosen) * size, self._pool)
         self._take(grasps, meters, chosen, number, size, wave * size)
 
@@ -169,9 +169,7 @@ class _Search:
         for number in np.unique(space[able]):
             own = np.flatnonzero(space[able] == number)
             part = replace(grasps, **{f.name: getattr(grasps, f.name)[own] for f in fields(grasps)})
-            context = _context(
-                self._pipeline.bounds, inputs, take_sequences(rows, able[own]), int(number), 1, self._seed
-            )
+            context = _context(self._pipeline, inputs, take_sequences(rows, able[own]), int(number), 1, self._seed)
             meter = Meter(context.device)
             sets = optimised_sets(part, free[own], context)
             table = run_stage("filter", sets, self._pipeline, context, meter)
@@ -195,7 +193,7 @@ class _Search:
         grasps = sort_grasps(join_grasps(self._found[number]))
         place = np.searchsorted(rows, grasps.index // tries) * tries + grasps.index % tries
         before = take_sequences(self._rows, rows)
-        context = _context(self._pipeline.bounds, self._inputs, before, number, tries, self._seed)
+        context = _context(self._pipeline, self._inputs, before, number, tries, self._seed)
         table, counts = grow((before, number, replace(grasps, index=place)), self._params, context)
         self._result.add(self._inputs.spaces[number].name, {"sequence": counts})
         parent = rows[table.parent]
@@ -203,14 +201,25 @@ class _Search:
 
 
 def _context(
-    bounds: GraspBounds, inputs: SequenceInputs, before: SequenceTable, number: int, tries: int, seed: int
+    pipeline: Pipeline, inputs: SequenceInputs, before: SequenceTable, number: int, tries: int, seed: int
 ) -> Context:
     """What stages are given to go on from some sequences with an opposition space."""
     space, view, step = inputs.spaces[number], inputs.views[number], before.steps
     posture, frozen = before.posture(inputs.hand.tree), before.used | ~space.joints
     holding = hold(view.hand, posture, frozen, inputs.objects[:step], before.pose, tries=tries)
     alias = inputs.device.alias
-    return Context(view.hand, inputs.objects[step], view.field, alias, seed, 0, bounds, space=space, holding=holding)
+    return Context(
+        view.hand,
+        inputs.objects[step],
+        view.field,
+        alias,
+        seed,
+        0,
+        pipeline.bounds,
+        space=space,
+        holding=holding,
+        realised=pipeline.realised,
+    )
 
 
 def _from_field(

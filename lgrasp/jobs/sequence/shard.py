@@ -30,7 +30,6 @@ class SequenceResult:
     rounds: int = 0
     duplicates: int = 0
     exhausted: bool = False
-    cancelled: bool = False
 
     def __len__(self) -> int:
         """Whole sequences."""
@@ -71,7 +70,7 @@ def make_sequences(
     rows: int,
     workers: int,
     *,
-    cancelled: Callable[[], bool] = lambda: False,
+    check: Callable[[], None] = lambda: None,
     progress: Callable[[int, SequenceResult], None] | None = None,
     verdicts: Verdicts | None = None,
 ) -> SequenceResult:
@@ -79,7 +78,8 @@ def make_sequences(
 
     Args:
         workers: threads; they do not change the rows.
-        progress: called with (sequences so far, running result) after each round.
+        check: called before each step of a round; what it raises ends the shard.
+        progress: called with (sequences so far, running result) after each round; what it raises ends the shard.
         verdicts: see :func:`run_round`.
     """
     result = SequenceResult()
@@ -88,10 +88,7 @@ def make_sequences(
     parts: list[list[SequenceTable]] = []
     start = time.perf_counter()
     while kept.count < rows and not result.exhausted:
-        found = run_round(pipeline, inputs, shard, result.rounds, workers, cancelled, verdicts)
-        if cancelled():
-            result.cancelled = True
-            break
+        found = run_round(pipeline, inputs, shard, result.rounds, workers, check, verdicts)
         result.add(found)
         if len(found.levels) == objects:
             last = found.levels[-1]

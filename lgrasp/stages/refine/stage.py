@@ -1,7 +1,5 @@
 """refine: finished grasps -> the same, moved by a local search wherever that makes them better."""
 
-import threading
-
 import numpy as np
 
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
@@ -15,9 +13,6 @@ from lgrasp.stages.context import Context
 from lgrasp.stages.refine.params import RefineParams
 
 VERSION = 3
-
-_making = threading.Lock()
-_made: dict[tuple[object, ...], Descent] = {}  # the latest
 
 
 def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
@@ -47,12 +42,12 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
 def _descent(search: LocalSearch, context: Context) -> Descent:
     """The local search of a job: made by the first batch, used by all."""
     key = (context.hand.model.sha256, context.object.model.sha256, context.object.model.scale, search, context.device)
-    with _making:
-        if key not in _made:
-            _made.clear()
-            target = upload_target(context.object.model, None, context.device)
-            _made[key] = Descent(context.hand, target, search, hand_surface(context.hand.model))
-        return _made[key]
+
+    def make() -> Descent:
+        target = upload_target(context.object.model, None, context.device)
+        return Descent(context.hand, target, search, hand_surface(context.hand.model))
+
+    return context.kept.get("refine", key, make)
 
 
 def _replaced(old: GraspTable, new: GraspTable, rows: np.ndarray) -> GraspTable:

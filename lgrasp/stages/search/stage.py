@@ -26,19 +26,16 @@ _CPU_LANES = 2
 _GPU_LANES = 10
 
 
-def run(
-    inputs: CandidateTable, params: SearchParams, context: Context, *, realised: bool = True, salt: int = 0
-) -> tuple[ContactSets, Tally]:
+def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple[ContactSets, Tally]:
     """Block-wise zeroth-order search at every pose (Alg. 2).
 
-    Args:
-        realised: combine realised contacts only, and keep fingers apart; else candidates as drawn.
-        salt: number of the pass over these candidates.
+    Combines realised contacts only, and keeps fingers apart, where ik came before (``context.realised``); else
+    candidates as drawn.
 
     Returns:
         Sets in (pose, slot) order, and counts ``poses``, ``yielding`` (poses with a set), ``sets``.
     """
-    d = context.device
+    d, realised = context.device, context.realised
     n, groups, keep = inputs.surface.shape
     if groups > MAX_GROUPS or keep > MAX_KEEP:
         raise ConfigError(
@@ -65,7 +62,7 @@ def run(
             inputs=[
                 groups,
                 context.object.struct,
-                context.seed("search", salt),
+                context.seed("search", context.salt),
                 first,
                 contacts,
                 kinds,
@@ -135,7 +132,7 @@ def run(
     wp.launch(
         take_sets,
         dim=n,
-        inputs=[upto, inputs.poses.rows, salt * params.per_pose, found, sets, score],
+        inputs=[upto, inputs.poses.rows, context.salt * params.per_pose, found, sets, score],
         outputs=[table.pose, table.slot, table.chosen, table.score, table.rows, tally.device],
         device=d,
     )

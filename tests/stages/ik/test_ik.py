@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from lgrasp.engine.batch import run_stages
+from lgrasp.engine.shard import shard_context
 from lgrasp.grasp.tables import candidate_arrays, set_arrays
-from lgrasp.stages.context import Context
 from lgrasp.stages.ik.stage import run
 
 
@@ -87,7 +87,7 @@ def test_finger_is_clear(realised, inputs, mesh, swift):
 
 def test_only_chosen_candidates_of_sets(lightning, load):
     source = load(pipeline=lightning)
-    context = Context(source.hand, source.object, source.field, "cpu", 0, 0)
+    context = shard_context(lightning, source, 0)
     sets = run_stages(lightning, context, 0, 600, "search")
     before = set_arrays(sets)
     before = {name: values.copy() for name, values in before.items()}

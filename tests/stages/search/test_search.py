@@ -123,7 +123,7 @@ def test_fingers_do_not_meet(found, inputs, solids, link_poses, finger_posture):
 
 def test_later_passes_draw_others(tables, context, swift):
     params = swift.params("search")
-    first, second = (set_arrays(run(tables.ik, params, context, salt=s)[0]) for s in (0, 1))
+    first, second = (set_arrays(run(tables.ik, params, context.with_salt(s))[0]) for s in (0, 1))
     assert second["slot"].min() >= params.per_pose
     rows = [{(int(p), tuple(c)) for p, c in zip(a["pose"], a["chosen"], strict=True)} for a in (first, second)]
     assert len(rows[1] - rows[0]) > 10

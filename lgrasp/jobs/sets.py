@@ -3,12 +3,12 @@
 import itertools
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from lgrasp.errors import ConfigError
-from lgrasp.jobs.sequence.size import Size, parse_size
 from lgrasp.seeding import stage_seed
 
 
@@ -29,15 +29,6 @@ class SequenceSets(BaseModel):
     @classmethod
     def _as_text(cls, value: object) -> str:
         return str(value)
-
-    @property
-    def size(self) -> Size:
-        """The scale as numbers.
-
-        Raises:
-            ConfigError: neither a factor nor a range.
-        """
-        return parse_size(self.scale)
 
 
 def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list[tuple[str, ...]]:
@@ -69,3 +60,8 @@ def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list
             drawn[tuple(rng.permutation(members).tolist())] = None
         out += [tuple(pool[i] for i in order) for order in drawn]
     return out
+
+
+def sequence_name(hand: str, objects: tuple[str, ...]) -> str:
+    """HAND-OBJECT-OBJECT..., for files and folders."""
+    return "-".join([hand, *(Path(name).stem for name in objects)])

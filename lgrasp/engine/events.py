@@ -1,0 +1,76 @@
+"""Parts of a job, what came of them, and what a job tells while it makes them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+class CancelledError(Exception):
+    """The user asked a job to stop; the part being made is dropped, whole parts stay."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One file that a job makes, independent of its other parts."""
+
+    number: int
+    file: Path
+    rows: int = 0
+    """Rows (or scenes, or steps) that are asked, or that the source holds; 0: not known before."""
+    source: Path | None = None
+    """What it is made of, where that is a file."""
+
+
+@dataclass
+class Made:
+    """What came of one part."""
+
+    rows: int
+    contents: Any = None
+    """What is to be written; forgotten when it is on disk. None: there is nothing to write."""
+    result: Any = None
+    """What the report needs of it; kept until the job ends."""
+
+
+class Events:
+    """What a job tells while it runs, and asks; every method may be overridden."""
+
+    def loading(self, what: str, share: float = 0.0) -> None:
+        """An input is being loaded or made."""
+
+    def started(self, parts: Sequence[Part], present: Mapping[int, int]) -> None:
+        """Inputs are ready; ``present`` are the rows of the parts, by number, that are on disk already."""
+
+    def advanced(self, part: Part, done: int, note: str = "") -> None:
+        """``done`` rows of a part are made so far."""
+
+    def wrote(self, part: Part, made: Made) -> None:
+        """A part is on disk."""
+
+    def cancelled(self) -> bool:
+        """Should the job stop?"""
+        return False
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How the maker of a part tells how far it is; a call ends the part if the job is to stop."""
+
+    events: Events
+    part: Part
+
+    def __call__(self, done: int, note: str = "") -> None:
+        """Tell the rows done so far.
+
+        Raises:
+            CancelledError: the job is to stop, and rows are missing.
+        """
+        self.events.advanced(self.part, done, note)
+        if not 0 < self.part.rows <= done:
+            self.check()
+
+    def check(self) -> None:
+        """Raises CancelledError if the job is to stop."""
+        if self.events.cancelled():
+            raise CancelledError

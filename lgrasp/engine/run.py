@@ -1,0 +1,329 @@
+"""The one loop of all jobs: device, folder, what is there already, kernels, parts one after another, report."""
+
+import os
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
+
+from lgrasp.dataset import write_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import CancelledError, Events, Made, Part, Progress
+from lgrasp.engine.folder import check_folder, clean_folder, present_parts
+from lgrasp.errors import ConfigError, LgraspError
+from lgrasp.runtime.device import Device, resolve_device
+from lgrasp.runtime.kernels import kernel_modules, load_kernels
+
+
+class Job(BaseModel, ABC):
+    """Something that makes files, part by part: what is asked, and how one part is made.
+
+    The fields are the keys of a config (``lgrasp run``). What is loaded for the parts is private to the job.
+    """
+
+    model_config = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+
+    unit: ClassVar[str] = "grasps"
+    """What is counted."""
+    asks: ClassVar[bool] = False
+    """Are rows asked that may not be found? Then a part without any ends the job."""
+    kernels: ClassVar[str] = "lgrasp.stages."
+    """Prefix of the modules whose kernels the parts launch; empty: none."""
+
+    device: str = "auto"
+    workers: int = Field(0, description="Threads or processes; 0: by device.")
+    cache: Cache = Field(default_factory=Cache, exclude=True, repr=False)
+    _device: Device = PrivateAttr()
+
+    @property
+    def title(self) -> str:
+        """What the job is, in a few words."""
+        return str(self.folder)
+
+    @property
+    @abstractmethod
+    def folder(self) -> Path:
+        """Where the files go."""
+
+    @abstractmethod
+    def key(self) -> str:
+        """Content key of all that decides the parts; stored in each of them."""
+
+    @abstractmethod
+    def parts(self) -> list[Part]:
+        """Every part, numbered from 0, of all tasks of an array.
+
+        Raises:
+            LgraspError: an option is out of range, or an input is not found.
+        """
+
+    def present(self, parts: Sequence[Part]) -> dict[int, int]:
+        """Rows of the parts that are on disk and may stay, by number.
+
+        Raises:
+            OutputError: a file belongs to another run.
+        """
+        return present_parts(parts, self.key(), self.effort, self.cache.warn)
+
+    def effort(self, rows: int) -> int:
+        """Candidates that a part of some rows may try; one that tried them all stays, though rows are missing."""
+        return 0
+
+    def load(self, events: Events, missing: bool) -> None:
+        """Load what the parts are made from, onto ``self.device_used``.
+
+        Args:
+            missing: are there parts to make?
+        """
+
+    @abstractmethod
+    def make(self, part: Part, progress: Progress) -> Made:
+        """Make one part: a pure function of what is asked and of its number."""
+
+    def write(self, part: Part, contents: Any) -> None:
+        """Put a part on disk, whole or not at all."""
+        write_shard(part.file, contents)
+
+    @abstractmethod
+    def report(self, outcome: "Outcome") -> dict[str, Any]:
+        """What came of it in numbers, JSON-serialisable; :func:`lgrasp.engine.report.job_report` adds the rest."""
+
+    def shortfall(self, outcome: "Outcome") -> LgraspError | None:
+        """What to say of an outcome that is less than was asked."""
+        return None
+
+    def at_once(self) -> int:
+        """Parts that are made at a time."""
+        return 1
+
+    def changed(self, **changes: Any) -> Self:
+        """A copy with other fields; nothing is loaded in it."""
+        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | changes)
+
+    @property
+    def device_used(self) -> Device:
+        """The device, once the job has begun."""
+        return self._device
+
+    def threads(self) -> int:
+        """Workers as asked, else one per core, or one on a GPU."""
+        return self.workers or (1 if self._device.is_cuda else os.cpu_count() or 1)
+
+
+@dataclass
+class Outcome:
+    """What a call of :func:`run` did."""
+
+    job: Any
+    """The job, with what it loaded."""
+    device: Device
+    parts: list[Part]
+    """Those of this task."""
+    on_disk: dict[int, int]
+    """Rows that were there already, by number of the part."""
+    made_parts: list[tuple[Part, Made]] = field(default_factory=list)
+    """Those that this call wrote."""
+    results: list[Any] = field(default_factory=list)
+    """Result of each part that this call made, those with nothing to write included."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Of loading kernels, making parts and the whole call [s]."""
+    starved: bool = False
+    cancelled: bool = False
+
+    @property
+    def written(self) -> list[Path]:
+        """Files that this call made."""
+        return [part.file for part, _ in self.made_parts]
+
+    @property
+    def paths(self) -> list[Path]:
+        """Files of this task that are on disk."""
+        made = {part.number for part, _ in self.made_parts}
+        return [part.file for part in self.parts if part.number in self.on_disk or part.number in made]
+
+    @property
+    def made(self) -> int:
+        """Rows made by this call."""
+        return sum(made.rows for _, made in self.made_parts)
+
+    @property
+    def present(self) -> int:
+        """Rows that were there already."""
+        return sum(self.on_disk.values())
+
+    @property
+    def rows(self) -> int:
+        """Rows on disk of this task's parts."""
+        return self.made + self.present
+
+    @property
+    def wall(self) -> float:
+        """Of the whole call [s]."""
+        return self.seconds["total"]
+
+
+def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 1), resume: bool = True) -> Outcome:
+    """Make the missing parts of a job.
+
+    Args:
+        array: (task, number of tasks) of a job array; a task makes every so manieth part.
+        resume: keep whole parts of the same run.
+
+    Raises:
+        LgraspError: bad input, unwritable output, or files of another run in the output folder.
+    """
+    events = events or Events()
+    start = time.perf_counter()
+    device, parts, present = look(job, array=array, resume=resume)
+    clean_folder([part.file for part in parts])
+    missing = [part for part in parts if part.number not in present]
+    job.load(events, bool(missing))
+    outcome = Outcome(job, device, parts, present)
+    begin = time.perf_counter()
+    if missing and job.kernels:
+        load_kernels(device.alias, kernel_modules(job.kernels), events.loading)
+    outcome.seconds["kernels"] = time.perf_counter() - begin
+    events.started(parts, present)
+    begin = time.perf_counter()
+    try:
+        _make_parts(job, events, outcome)
+    except CancelledError:
+        outcome.cancelled = True
+    outcome.seconds["parts"] = time.perf_counter() - begin
+    outcome.seconds["total"] = time.perf_counter() - start
+    return outcome
+
+
+def look(job: Job, *, array: tuple[int, int], resume: bool) -> tuple[Device, list[Part], dict[int, int]]:
+    """The device, the parts of this task, and the rows of those that are there; nothing is written.
+
+    Raises:
+        LgraspError: as :func:`run`, before anything is loaded.
+    """
+    parts = own_parts(job.parts(), array)
+    job._device = resolve_device(job.device)
+    check_folder(job.folder)
+    return job.device_used, parts, job.present(parts) if resume else {}
+
+
+def own_parts(parts: Sequence[Part], array: tuple[int, int]) -> list[Part]:
+    """The parts of a task of an array.
+
+    Raises:
+        ConfigError: array numbers out of range.
+    """
+    index, number = array
+    if number <= 0 or not 0 <= index < number:
+        raise ConfigError(f"--shard-index {index} --num-shards {number}: need 0 <= index < number")
+    return list(parts[index::number])
+
+
+def array_task(
+    index: int | None = None, number: int | None = None, environment: Mapping[str, str] | None = None
+) -> tuple[int, int]:
+    """(task, number of tasks) of an array: as given, else those of a SLURM job array, else (0, 1).
+
+    Raises:
+        ConfigError: a SLURM variable is no integer.
+    """
+    if index is not None or number is not None:
+        return index or 0, 1 if number is None else number
+    env = os.environ if environment is None else environment
+    if "SLURM_ARRAY_TASK_ID" not in env or "SLURM_ARRAY_TASK_COUNT" not in env:
+        return 0, 1
+    try:
+        task, count = int(env["SLURM_ARRAY_TASK_ID"]), int(env["SLURM_ARRAY_TASK_COUNT"])
+        first, step = int(env.get("SLURM_ARRAY_TASK_MIN", 0)), int(env.get("SLURM_ARRAY_TASK_STEP", 1))
+    except ValueError as error:
+        raise ConfigError(f"SLURM_ARRAY_TASK_*: {error}; give --shard-index and --num-shards") from None
+    return (task - first) // max(step, 1), count
+
+
+def _make_parts(job: Job, events: Events, outcome: Outcome) -> None:
+    """Make what is missing, in order; one part is written while the next is made."""
+
+    def written(part: Part, made: Made) -> None:
+        outcome.made_parts.append((part, made))
+        events.wrote(part, made)
+        made.contents = None  # memory must not grow with the parts
+
+    def make(part: Part) -> Made:
+        progress = Progress(events, part)
+        progress.check()
+        return job.make(part, progress)
+
+    present = outcome.on_disk
+    with _Writer(job, written) as writer:
+        for part, made in _in_order(make, outcome.parts, present, job.at_once()):
+            rows = present[part.number] if made is None else made.rows
+            outcome.starved |= job.asks and rows < part.rows
+            if made is not None:
+                outcome.results.append(made.result)
+                if made.contents is not None:
+                    writer.put(part, made)
+            if job.asks and rows == 0:  # nor will the next parts give any
+                break
+
+
+def _in_order(make, parts: list[Part], present: Mapping[int, int], at_once: int) -> Iterator[tuple[Part, Made | None]]:
+    """Each part with what came of it, None for those that are there; ``at_once`` of them are made at a time."""
+    if at_once == 1:
+        for part in parts:
+            yield part, None if part.number in present else make(part)
+        return
+    rest = iter(parts)
+    waiting: deque[tuple[Part, Future[Made] | None]] = deque()
+    with ThreadPoolExecutor(at_once) as pool:
+        try:
+            while True:
+                while len(waiting) < at_once and (part := next(rest, None)) is not None:
+                    waiting.append((part, None if part.number in present else pool.submit(make, part)))
+                if not waiting:
+                    return
+                part, future = waiting.popleft()
+                yield part, future.result() if future else None
+        finally:
+            for _, future in waiting:
+                if future:
+                    future.cancel()
+
+
+class _Writer:
+    """A context that writes parts on another thread, one at a time and in order.
+
+    Args:
+        written: called on the caller's thread with (part, made) when a part is on disk.
+    """
+
+    def __init__(self, job: Job, written) -> None:
+        self._job, self._written = job, written
+        self._pool = ThreadPoolExecutor(1)
+        self._pending: tuple[Part, Made, Future[None]] | None = None
+
+    def put(self, part: Part, made: Made) -> None:
+        """Wait for the part before, then begin to write this one."""
+        self._settle()
+        self._pending = (part, made, self._pool.submit(self._job.write, part, made.contents))
+
+    def _settle(self) -> None:
+        if self._pending is not None:
+            part, made, future = self._pending
+            self._pending = None
+            future.result()
+            self._written(part, made)
+
+    def __enter__(self) -> "_Writer":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if kind is None or issubclass(kind, CancelledError):
+                self._settle()
+        finally:
+            self._pool.shutdown(wait=True)

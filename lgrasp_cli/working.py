@@ -1,0 +1,162 @@
+"""What all commands that make files share: their options, and how a job is run, reported and concluded."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+
+from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache, warn
+
+if TYPE_CHECKING:
+    from lgrasp.engine.cache import Cache
+    from lgrasp.engine.run import Job, Outcome
+
+_OPTIONS: dict[str, tuple[Any, Any]] = {
+    "device": (Annotated[str | None, typer.Option(help="auto, cpu or cuda:N.", show_default=False)], None),
+    "workers": (
+        Annotated[int | None, typer.Option(min=0, help="Threads or processes; 0: by device.", show_default=False)],
+        None,
+    ),
+    "shard_index": (
+        Annotated[
+            int | None,
+            typer.Option(
+                help="Task of an array: makes every NUMth file; default: SLURM_ARRAY_TASK_ID.", show_default=False
+            ),
+        ],
+        None,
+    ),
+    "num_shards": (
+        Annotated[
+            int | None, typer.Option(help="Tasks of the array; default: SLURM_ARRAY_TASK_COUNT.", show_default=False)
+        ],
+        None,
+    ),
+    "overwrite": (
+        Annotated[bool, typer.Option("--overwrite", help="Replace files that are there; else whole ones stay.")],
+        False,
+    ),
+    "rebuild": (Annotated[bool, typer.Option("--rebuild", help="Make what is cached anew.")], False),
+    "resume": (Annotated[bool, typer.Option("--resume/--no-resume", hidden=True)], True),
+    "force": (Annotated[bool, typer.Option("--force", hidden=True)], False),
+    "json_path": (JsonPath, None),
+    "cache_dir": (CacheDir, None),
+    "quiet": (Quiet, False),
+}
+
+
+@dataclass(frozen=True)
+class How:
+    """How a job is run, as the options say."""
+
+    cache: "Cache"
+    device: str | None
+    workers: int | None
+    array: tuple[int, int]
+    overwrite: bool
+    json_path: str | None
+    quiet: bool
+
+    def rotated(self, number: int) -> "How":
+        """The same for one of several jobs: tasks of an array begin to share the parts of each with another task."""
+        index, tasks = self.array
+        return replace(self, array=((index - number) % max(tasks, 1) if 0 <= index < tasks else index, tasks))
+
+    def job(self, kind: "type[Job]", where: str, **given: Any) -> "Job":
+        """A job of some kind; options that are None are left to its defaults.
+
+        Raises:
+            ConfigError: a value out of range.
+        """
+        from lgrasp.config import parse_model
+
+        asked = given | {"device": self.device, "workers": self.workers, "cache": self.cache}
+        return parse_model(kind, {name: value for name, value in asked.items() if value is not None}, where)
+
+    def run(self, job: "Job", show: Callable[[dict[str, Any]], None]) -> None:
+        """Run a job with progress, report it, and leave with its exit code if it fell short.
+
+        Args:
+            show: prints the report on standard output.
+        """
+        check_report(self.json_path)
+        data, outcome = run_job(job, self)
+        from lgrasp_cli.tables import print_report
+
+        print_report(data, self.json_path, None if self.quiet else lambda: show(data))
+        conclude(data, outcome)
+
+
+def working(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose argument ``how`` is a :class:`How`: it gets the options that all jobs share."""
+    own = inspect.signature(command)
+    hints = get_type_hints(command, include_extras=True)
+    kept = [p.replace(annotation=hints[p.name]) for p in own.parameters.values() if p.name != "how"]
+    shared = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in _OPTIONS.items()
+    ]
+
+    def run(**given: Any) -> None:
+        options = {name: given.pop(name) for name in _OPTIONS}
+        command(**given, how=_how(**options))
+
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    as_keywords = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in kept]
+    run.__signature__ = inspect.Signature([*as_keywords, *shared])  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in (*as_keywords, *shared)}
+    return run
+
+
+def _how(
+    *,
+    shard_index: int | None,
+    num_shards: int | None,
+    overwrite: bool,
+    rebuild: bool,
+    resume: bool,
+    force: bool,
+    cache_dir: Path | None,
+    **rest: Any,
+) -> How:
+    if not resume:
+        warn("--no-resume is now called --overwrite; the old name works in this release only")
+    if force:
+        warn(
+            "--force is now --overwrite (files that are there) and --rebuild (the cache); it works in this release only"
+        )
+    cache = open_cache(cache_dir, fresh=rebuild or force)
+    from lgrasp.engine.run import array_task
+
+    return How(cache, array=array_task(shard_index, num_shards), overwrite=overwrite or force or not resume, **rest)
+
+
+def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "Outcome"]:
+    """Run a job with progress; its report and outcome."""
+    from lgrasp.engine.report import job_report
+    from lgrasp.engine.run import run
+    from lgrasp_cli.progress import Bar, JobProgress, interruptible
+
+    with Bar(quiet=how.quiet) as bar:
+        progress = JobProgress(bar, job.unit)
+        with interruptible(progress):
+            outcome = run(job, progress, array=how.array, resume=not how.overwrite)
+    return job_report(outcome), outcome
+
+
+def conclude(data: dict[str, Any], outcome: "Outcome") -> None:
+    """Leave with the exit code of a job that fell short.
+
+    Raises:
+        LgraspError: less came out than was asked.
+    """
+    if outcome.cancelled:
+        files = f"{len(outcome.paths)} whole file{'' if len(outcome.paths) == 1 else 's'}"
+        typer.echo(f"interrupted: {files} in {data['out']}; the same command goes on", err=True)
+        raise typer.Exit(130)
+    error = outcome.job.shortfall(outcome)
+    if error:
+        raise error
