@@ -10,7 +10,6 @@ import numpy as np
 from lgrasp.bench.page import Page, Table, caveats, load_published, number, over, times
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts
-from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.opposition.spaces import consumed
 from lgrasp.jobs.records import make_scene, mesh_blobs
@@ -94,7 +93,7 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
             entry.seconds += sum(found.walls[step : step + 1])
             entry.total += sum(found.walls[: step + 1])
         for step, table in enumerate(seen):
-            objects[step].add(table, found.levels[step], inputs, int(_strict(table, bounds).sum()))
+            objects[step].add(table, found.levels[step], inputs, int(bounds.met_by(table.metrics).sum()))
     begun = jobs[0].pipeline.params("sequence").width
     return {"begun": begun, "spaces": spaces, "objects": [entry.summary() for entry in objects]}
 
@@ -106,13 +105,6 @@ def _as_published(pipeline: Pipeline) -> Pipeline:
     return pipeline.with_bounds(
         max_penetration=0.01, min_self_distance=0.0, max_gap=0.01, max_normal_angle=60.0, max_gswo=1.0
     )
-
-
-def _strict(table: SequenceTable, bounds: GraspBounds) -> np.ndarray:
-    """Rows within the bounds in every step, (N,) bool."""
-    m = table.metrics
-    near = (m["gap"] <= bounds.max_gap) & (m["normal_error"] <= np.radians(bounds.max_normal_angle))
-    return near & (m["penetration"] <= bounds.max_penetration) & (m["gswo"] <= bounds.max_gswo)
 
 
 def _watched(simulate: Verdicts, seen: list[SequenceTable]) -> Verdicts:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from pydantic import Field, ValidationInfo, model_validator
 
 from lgrasp.config import Params
@@ -79,6 +80,22 @@ class GraspBounds(Params):
         """A copy with some numbers replaced and checked; with another profile, that one's numbers and the changes."""
         kept = {} if "profile" in changes else self.model_dump()
         return GraspBounds.model_validate(kept | changes)
+
+    def met_by(self, metrics: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Rows whose stored metrics are within the bounds, (N,) bool; the metrics must have this friction or less.
+
+        Raises:
+            KeyError: a metric is missing.
+        """
+        limits = {
+            "gap": self.max_gap,
+            "normal_error": np.radians(self.max_normal_angle),
+            "penetration": self.max_penetration,
+            "gswo": self.max_gswo,
+        }
+        if self.max_unresisted_load < 1:
+            limits["unresisted_load"] = self.max_unresisted_load
+        return np.logical_and.reduce([metrics[name] <= np.float32(limit) for name, limit in limits.items()])
 
     def describe(self) -> dict[str, Any]:
         """As shards store them: the profile, and every number."""
