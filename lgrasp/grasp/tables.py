@@ -5,11 +5,15 @@ waits for its number of rows.
 """
 
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import warp as wp
 
+from lgrasp.grasp.structs import Candidates, Poses, Sets
 from lgrasp.math.kinematics import MAX_DOFS, vec_dof
+from lgrasp.runtime.structs import make_struct
 
 _FAMILIES = ("metrics", "physics")  # columns of a GraspTable that come by name
 
@@ -26,6 +30,11 @@ class PoseTable:
     anchor: wp.array  # (P, G) i32 object contact point that each group can surely touch about, -1 unknown
     rows: wp.array  # (1,) i32 how many of the P rows are in use: the first ones
 
+    @cached_property
+    def struct(self) -> Any:
+        """The table as kernels read it."""
+        return make_struct(Poses, self)
+
     def __len__(self) -> int:
         """Rows in use; waits for the device."""
         return int(self.rows.numpy()[0])
@@ -39,8 +48,13 @@ class CandidateTable:
     count: wp.array  # (P, G) i32 candidates drawn
     surface: wp.array  # (P, G, M) i32 object contact point
     record: wp.array  # (P, G, M) i32 contact vector of the field
-    state: wp.array  # (P, G, M) i32: 0 = as drawn, 1 = realised, -1 = failed
+    state: wp.array  # (P, G, M) i32 State
     q: wp.array  # (P, G, M) vec_dof: joint seed, or the realised posture [rad or m]
+
+    @cached_property
+    def struct(self) -> Any:
+        """The table as kernels read it."""
+        return make_struct(Candidates, self, poses=self.poses.struct)
 
 
 @dataclass(frozen=True)
@@ -53,6 +67,11 @@ class ContactSets:
     chosen: wp.array  # (S, G) i32 candidate of each group, -1 = unused
     score: wp.array  # (S,) f32 norm of the frictionless residual
     rows: wp.array  # (1,) i32 how many of the S rows are in use: the first ones
+
+    @cached_property
+    def struct(self) -> Any:
+        """The table as kernels read it."""
+        return make_struct(Sets, self)
 
     def __len__(self) -> int:
         """Rows in use; waits for the device."""

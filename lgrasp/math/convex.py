@@ -113,6 +113,27 @@ def _closest_on_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 
 @wp.func
+def _face(a: wp.vec3, b: wp.vec3, c: wp.vec3, mask: wp.int32):
+    """The points that a mask keeps (a 1, b 2, c 4), moved to the front, and how many they are."""
+    x = a
+    y = b
+    n = int(0)
+    if (mask & 1) != 0:
+        n = 1
+    if (mask & 2) != 0:
+        if n == 0:
+            x = b
+        n += 1
+    if (mask & 4) != 0:
+        if n == 0:
+            x = c
+        elif n == 1:
+            y = c
+        n += 1
+    return x, y, c, n
+
+
+@wp.func
 def pieces_clear(c: Pieces, i: wp.int32, j: wp.int32, T: wp.transform, margin: wp.float32):
     """Are pieces i and j farther apart than margin [m]? T takes j's body frame to i's. GJK on true convex sets.
 
@@ -164,27 +185,7 @@ def pieces_clear(c: Pieces, i: wp.int32, j: wp.int32, T: wp.transform, margin: w
             r = _closest_on_triangle(a, b, d)
             m = int(r[3])
             v = wp.vec3(r[0], r[1], r[2])
-            n = 0
-            p = a
-            q = b
-            s = d
-            if (m & 1) != 0:
-                a = p
-                n = 1
-            if (m & 2) != 0:
-                if n == 0:
-                    a = q
-                else:
-                    b = q
-                n += 1
-            if (m & 4) != 0:
-                if n == 0:
-                    a = s
-                elif n == 1:
-                    b = s
-                else:
-                    d = s
-                n += 1
+            a, b, d, n = _face(a, b, d, m)
         else:
             e = w
             # the closest of the three faces that hold the new point; inside all of them: overlap
@@ -225,24 +226,7 @@ def pieces_clear(c: Pieces, i: wp.int32, j: wp.int32, T: wp.transform, margin: w
                         x2 = s
             if inside == 1:
                 break
-            n = 0
-            if (m & 1) != 0:
-                a = x0
-                n = 1
-            if (m & 2) != 0:
-                if n == 0:
-                    a = x1
-                else:
-                    b = x1
-                n += 1
-            if (m & 4) != 0:
-                if n == 0:
-                    a = x2
-                elif n == 1:
-                    b = x2
-                else:
-                    d = x2
-                n += 1
+            a, b, d, n = _face(x0, x1, x2, m)
         if wp.length(v) < 1.0e-5:
             break
     return verdict == 1

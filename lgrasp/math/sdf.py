@@ -35,82 +35,77 @@ def sdf_part(
 
 
 @wp.func
+def _clamped(s: Sdf, x: wp.vec3):
+    """Grid coordinates x, moved into the grid."""
+    return wp.vec3(
+        wp.clamp(x[0], 0.0, float(s.nx) - 1.001),
+        wp.clamp(x[1], 0.0, float(s.ny) - 1.001),
+        wp.clamp(x[2], 0.0, float(s.nz) - 1.001),
+    )
+
+
+@wp.func
+def _edges(s: Sdf, c: wp.vec3):
+    """Of the cell at grid coordinates c: values at the low ends of its four edges along z, their rises [m], and where
+    in the cell c lies.
+
+    Edges by (x, y): (0, 0), (0, 1), (1, 0), (1, 1).
+    """
+    i = int(c[0])
+    j = int(c[1])
+    k = int(c[2])
+    a = s.first + (i * s.ny + j) * s.nz + k
+    b = a + s.nz
+    e = a + s.ny * s.nz
+    d = e + s.nz
+    low = wp.vec4(s.values[a], s.values[b], s.values[e], s.values[d])
+    high = wp.vec4(s.values[a + 1], s.values[b + 1], s.values[e + 1], s.values[d + 1])
+    return low, high - low, wp.vec3(c[0] - float(i), c[1] - float(j), c[2] - float(k))
+
+
+@wp.func
 def sdf_value(s: Sdf, p: wp.vec3):
     """Signed distance at p [m]; beyond the grid a lower bound of the distance."""
     x = (p - s.origin) * s.inv_cell
-    cx = wp.clamp(x[0], 0.0, float(s.nx) - 1.001)
-    cy = wp.clamp(x[1], 0.0, float(s.ny) - 1.001)
-    cz = wp.clamp(x[2], 0.0, float(s.nz) - 1.001)
-    i = int(cx)
-    j = int(cy)
-    k = int(cz)
-    fx = cx - float(i)
-    fy = cy - float(j)
-    fz = cz - float(k)
-    a = s.first + (i * s.ny + j) * s.nz + k
-    b = a + s.nz
-    c = a + s.ny * s.nz
-    d = c + s.nz
-    v00 = s.values[a] + (s.values[a + 1] - s.values[a]) * fz
-    v01 = s.values[b] + (s.values[b + 1] - s.values[b]) * fz
-    v10 = s.values[c] + (s.values[c + 1] - s.values[c]) * fz
-    v11 = s.values[d] + (s.values[d + 1] - s.values[d]) * fz
-    v0 = v00 + (v01 - v00) * fy
-    v1 = v10 + (v11 - v10) * fy
-    v = v0 + (v1 - v0) * fx
-    ox = x[0] - cx
-    oy = x[1] - cy
-    oz = x[2] - cz
-    o2 = ox * ox + oy * oy + oz * oz
+    c = _clamped(s, x)
+    low, rise, f = _edges(s, c)
+    v = low + rise * f[2]
+    v0 = v[0] + (v[1] - v[0]) * f[1]
+    v1 = v[2] + (v[3] - v[2]) * f[1]
+    d = v0 + (v1 - v0) * f[0]
+    o = x - c
+    o2 = o[0] * o[0] + o[1] * o[1] + o[2] * o[2]
     if o2 > 0.0:
         # the surface is inside the grid, so it is no nearer than this
         o2 = o2 / (s.inv_cell * s.inv_cell)
-        v = wp.sqrt(o2 + wp.max(v, 0.0) * wp.max(v, 0.0))
-    return v
+        d = wp.sqrt(o2 + wp.max(d, 0.0) * wp.max(d, 0.0))
+    return d
 
 
 @wp.func
 def sdf_gradient(s: Sdf, p: wp.vec3):
     """Unit gradient (3) and signed distance [m] at p, as a vec4 (gx, gy, gz, distance); p is clamped into the grid."""
     x = (p - s.origin) * s.inv_cell
-    cx = wp.clamp(x[0], 0.0, float(s.nx) - 1.001)
-    cy = wp.clamp(x[1], 0.0, float(s.ny) - 1.001)
-    cz = wp.clamp(x[2], 0.0, float(s.nz) - 1.001)
-    i = int(cx)
-    j = int(cy)
-    k = int(cz)
-    fx = cx - float(i)
-    fy = cy - float(j)
-    fz = cz - float(k)
-    a = s.first + (i * s.ny + j) * s.nz + k
-    b = a + s.nz
-    c = a + s.ny * s.nz
-    d = c + s.nz
-    d00 = s.values[a + 1] - s.values[a]
-    d01 = s.values[b + 1] - s.values[b]
-    d10 = s.values[c + 1] - s.values[c]
-    d11 = s.values[d + 1] - s.values[d]
-    v00 = s.values[a] + d00 * fz
-    v01 = s.values[b] + d01 * fz
-    v10 = s.values[c] + d10 * fz
-    v11 = s.values[d] + d11 * fz
-    v0 = v00 + (v01 - v00) * fy
-    v1 = v10 + (v11 - v10) * fy
-    v = v0 + (v1 - v0) * fx
-    gx = v1 - v0
-    gy = (v01 - v00) * (1.0 - fx) + (v11 - v10) * fx
-    d0 = d00 + (d01 - d00) * fy
-    d1 = d10 + (d11 - d10) * fy
-    gz = d0 + (d1 - d0) * fx
-    g = wp.vec3(gx, gy, gz)
+    c = _clamped(s, x)
+    low, rise, f = _edges(s, c)
+    v = low + rise * f[2]
+    v0 = v[0] + (v[1] - v[0]) * f[1]
+    v1 = v[2] + (v[3] - v[2]) * f[1]
+    d = v0 + (v1 - v0) * f[0]
+    r0 = rise[0] + (rise[1] - rise[0]) * f[1]
+    r1 = rise[2] + (rise[3] - rise[2]) * f[1]
+    g = wp.vec3(
+        v1 - v0,
+        (v[1] - v[0]) * (1.0 - f[0]) + (v[3] - v[2]) * f[0],
+        r0 + (r1 - r0) * f[0],
+    )
     n = wp.length(g)
     if n > 1.0e-12:
         g = g / n
-    ox = wp.vec3(x[0] - cx, x[1] - cy, x[2] - cz) / s.inv_cell
-    o = wp.length(ox)
-    if o > 0.0:
+    o = (x - c) / s.inv_cell
+    if wp.length(o) > 0.0:
         # beyond the grid: the surface seen from the clamped point
-        e = ox + g * v
+        e = o + g * d
         h = wp.length(e)
         return wp.vec4(e[0] / h, e[1] / h, e[2] / h, h)
-    return wp.vec4(g[0], g[1], g[2], v)
+    return wp.vec4(g[0], g[1], g[2], d)

@@ -1,6 +1,7 @@
 """Survivors of a stage, counted on its device and read when somebody asks."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from enum import IntEnum
 
 import numpy as np
 import warp as wp
@@ -29,8 +30,10 @@ class Tally(Mapping[str, int]):
         return len(self.names)
 
 
-def empty_tally(names: Sequence[str], device: str) -> Tally:
-    """A tally of zeros."""
+def empty_tally(names: Sequence[str] | type[IntEnum], device: str) -> Tally:
+    """A tally of zeros; an enumeration counts its members, named in lower case."""
+    if isinstance(names, type):
+        names = [member.name.lower() for member in names]
     return Tally(names, wp.zeros(len(names), dtype=wp.int32, device=device))
 
 

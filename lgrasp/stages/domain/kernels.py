@@ -1,163 +1,182 @@
-"""Kernels of the domain stage: one per index of the contact field."""
+"""Kernels of the domain stage: contact domains (Lightning Grasp, 5.3) from either index of the contact field."""
+
+from enum import IntEnum
+from typing import Any
 
 import warp as wp
 
 from lgrasp.field.arrays import Boxes, Field, boxes_pick, field_has, field_pick, field_seed
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
+from lgrasp.grasp.structs import Candidates
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_NEAR = wp.constant(16.0)  # contact points before and after one that count as near it
+_NEIGHBOURS = wp.constant(16.0)  # contact points before and after one, in order, that lie near it
 
 
-@wp.kernel
-def draw_domains(
-    hand: Hand,
-    field: Field,
-    obj: Object,
-    seed: wp.array(dtype=wp.int32),
-    attempts: wp.int32,
-    keep: wp.int32,
-    cosine: wp.float32,
-    rows: wp.array(dtype=wp.int32),
-    index: wp.array(dtype=wp.int32),
-    pose: wp.array(dtype=wp.transform),
-    setting: wp.array(dtype=wp.int32),
-    anchor: wp.array2d(dtype=wp.int32),
-    count_out: wp.array2d(dtype=wp.int32),
-    surface_out: wp.array3d(dtype=wp.int32),
-    record_out: wp.array3d(dtype=wp.int32),
-    q_out: wp.array3d(dtype=vec_dof),
-):
-    """Contact domain of each (pose, group): surface points that a contact vector of the group meets."""
-    row, g = wp.tid()
-    if row >= rows[0]:
-        return
-    slot = setting[row] * hand.kin.groups + g
-    state = wp.rand_init(seed[0], index[row] * hand.kin.groups + g)
-    T = pose[row]
-    R = wp.transform_get_rotation(T)
-    t = wp.transform_get_translation(T)
-    n = int(0)
-    for a in range(attempts):
-        near = anchor[row, g]
-        if n > 0:
-            near = surface_out[row, g, a % n]
-        i = int(0)
-        if a < attempts // 2 or near < 0:
-            i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
-        else:
-            # few were found all over the surface: look about those
-            i = wp.clamp(near + int(wp.randf(state) * (2.0 * _NEAR + 1.0)) - int(_NEAR), 0, obj.contacts - 1)
-        p = wp.quat_rotate(R, obj.contact_points[i]) + t
-        normal = -wp.quat_rotate(R, obj.contact_normals[i])
-        row_in_field = field_has(field, slot, p, normal)
-        if row_in_field >= 0:
-            pick = field_pick(field, slot, row_in_field, p, normal, wp.rand_init(wp.randi(state)))
-            if float(pick[1]) * 0.0001 >= cosine:
-                surface_out[row, g, n] = i
-                record_out[row, g, n] = pick[0]
-                q_out[row, g, n] = field_seed(field, hand.kin, slot, pick[0])
-                n += 1
-                if n == keep:
-                    break
-    count_out[row, g] = n
+class DomainCount(IntEnum):
+    """What the stage counts."""
+
+    POSES = 0
+    RICH = 1
+    CANDIDATES = 2
 
 
-@wp.kernel
-def draw_domains_bvh(
-    hand: Hand,
+@wp.struct
+class DomainValues:
+    """DomainParams as kernels read them."""
+
+    attempts: wp.int32
+    keep: wp.int32
+    cosine: wp.float32  # least, of hand and object normal
+    fingers: wp.int32
+
+
+@wp.func
+def _voxel_row(field: Field, slot: wp.int32, p: wp.vec3, normal: wp.vec3):
+    return field_has(field, slot, p, normal)
+
+
+@wp.func
+def _any_row(field: Field, slot: wp.int32, p: wp.vec3, normal: wp.vec3):
+    return int(0)
+
+
+@wp.func
+def _from_voxel(
     field: Field,
     boxes: Boxes,
-    obj: Object,
-    seed: wp.array(dtype=wp.int32),
-    attempts: wp.int32,
-    keep: wp.int32,
+    slot: wp.int32,
+    row: wp.int32,
+    p: wp.vec3,
+    normal: wp.vec3,
     cosine: wp.float32,
-    rows: wp.array(dtype=wp.int32),
-    index: wp.array(dtype=wp.int32),
-    pose: wp.array(dtype=wp.transform),
-    setting: wp.array(dtype=wp.int32),
-    anchor: wp.array2d(dtype=wp.int32),
-    count_out: wp.array2d(dtype=wp.int32),
-    surface_out: wp.array3d(dtype=wp.int32),
-    record_out: wp.array3d(dtype=wp.int32),
-    q_out: wp.array3d(dtype=vec_dof),
+    state: wp.uint32,
 ):
-    """The same domains from the published index: every patch of the group is asked, a hit one is picked at random."""
-    row, g = wp.tid()
-    if row >= rows[0]:
-        return
-    slot = setting[row] * hand.kin.groups + g
-    state = wp.rand_init(seed[0], index[row] * hand.kin.groups + g)
-    T = pose[row]
-    n = int(0)
-    for _a in range(attempts):
-        i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
-        p = wp.transform_point(T, obj.contact_points[i])
-        normal = -wp.transform_vector(T, obj.contact_normals[i])
-        r = boxes_pick(boxes, field, slot, p, normal, cosine, wp.rand_init(wp.randi(state)))
-        if r >= 0:
-            surface_out[row, g, n] = i
-            record_out[row, g, n] = r
-            q_out[row, g, n] = field_seed(field, hand.kin, slot, r)
-            n += 1
-            if n == keep:
-                break
-    count_out[row, g] = n
+    pick = field_pick(field, slot, row, p, normal, state)
+    if float(pick[1]) * 0.0001 < cosine:
+        return int(-1)
+    return pick[0]
+
+
+@wp.func
+def _from_boxes(
+    field: Field,
+    boxes: Boxes,
+    slot: wp.int32,
+    row: wp.int32,
+    p: wp.vec3,
+    normal: wp.vec3,
+    cosine: wp.float32,
+    state: wp.uint32,
+):
+    return boxes_pick(boxes, field, slot, p, normal, cosine, state)
+
+
+def _drawing(row_at: Any, pick_at: Any, looks_near: bool) -> Any:
+    """The drawing kernel for one index: which row of it holds a place, and which contact vector there is taken."""
+
+    @wp.kernel
+    def draw_domains(
+        hand: Hand,
+        field: Field,
+        boxes: Boxes,
+        obj: Object,
+        params: DomainValues,
+        seed: wp.array(dtype=wp.int32),
+        candidates_out: Candidates,
+    ):
+        """Contact domain of each (pose, group): surface points that a contact vector of the group meets.
+
+        Args:
+            seed: of the stage, (1,).
+        """
+        row, g = wp.tid()
+        poses = candidates_out.poses
+        if row >= poses.rows[0]:
+            return
+        slot = poses.setting[row] * hand.kin.groups + g
+        state = wp.rand_init(seed[0], poses.index[row] * hand.kin.groups + g)
+        R = wp.transform_get_rotation(poses.pose[row])
+        t = wp.transform_get_translation(poses.pose[row])
+        n = int(0)
+        for a in range(params.attempts):
+            near = int(-1)
+            if wp.static(looks_near):
+                near = poses.anchor[row, g]
+                if n > 0:
+                    near = candidates_out.surface[row, g, a % n]
+            i = int(0)
+            if a < params.attempts // 2 or near < 0:
+                i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+            else:
+                # few were found all over the surface: look about those
+                move = int(wp.randf(state) * (2.0 * _NEIGHBOURS + 1.0)) - int(_NEIGHBOURS)
+                i = wp.clamp(near + move, 0, obj.contacts - 1)
+            p = wp.quat_rotate(R, obj.contact_points[i]) + t
+            normal = -wp.quat_rotate(R, obj.contact_normals[i])
+            at = row_at(field, slot, p, normal)
+            if at >= 0:
+                own = wp.rand_init(wp.randi(state))
+                record = pick_at(field, boxes, slot, at, p, normal, params.cosine, own)
+                if record >= 0:
+                    candidates_out.surface[row, g, n] = i
+                    candidates_out.record[row, g, n] = record
+                    candidates_out.q[row, g, n] = field_seed(field, hand.kin, slot, record)
+                    n += 1
+                    if n == params.keep:
+                        break
+        candidates_out.count[row, g] = n
+
+    return draw_domains
+
+
+draw_domains = {
+    "voxel": _drawing(_voxel_row, _from_voxel, True),
+    "bvh": _drawing(_any_row, _from_boxes, False),
+}
+"""Kernels by index. ``bvh``, as published, asks every patch of the group about points from all over the surface."""
 
 
 @wp.kernel
-def keep_frozen(
-    hand: Hand,
-    held: Held,
-    rows: wp.array(dtype=wp.int32),
-    index: wp.array(dtype=wp.int32),
-    count_out: wp.array2d(dtype=wp.int32),
-    q_out: wp.array3d(dtype=vec_dof),
-):
+def keep_frozen(hand: Hand, held: Held, candidates_out: Candidates):
     """Groups that must stay as they are lose their candidates; seeds of others take over what is frozen."""
     row, g = wp.tid()
-    if row >= rows[0]:
+    if row >= candidates_out.poses.rows[0]:
         return
-    h = index[row] // held.tries
+    h = candidates_out.poses.index[row] // held.tries
     if group_fixed(hand, held, h, g):
-        count_out[row, g] = 0
-    for m in range(count_out[row, g]):
-        q_out[row, g, m] = with_frozen(hand, held, h, g, q_out[row, g, m])
+        candidates_out.count[row, g] = 0
+    for m in range(candidates_out.count[row, g]):
+        candidates_out.q[row, g, m] = with_frozen(hand, held, h, g, candidates_out.q[row, g, m])
 
 
 @wp.kernel
-def drop_poor(
-    fingers: wp.int32,
-    rows: wp.array(dtype=wp.int32),
-    palm_point: wp.array(dtype=wp.int32),
-    count_out: wp.array2d(dtype=wp.int32),
-    counts_out: wp.array(dtype=wp.int32),
-):
+def drop_poor(params: DomainValues, candidates_out: Candidates, counts_out: wp.array(dtype=wp.int32)):
     """Poses where too few fingers (and the palm) can touch lose their candidates.
 
-    ``counts_out`` grows by the poses, the rich ones and the candidates of those.
+    Args:
+        counts_out: DomainCount, (3,).
     """
     row = wp.tid()
-    if row >= rows[0]:
+    if row >= candidates_out.poses.rows[0]:
         return
     touching = int(0)
-    if palm_point[row] >= 0:
+    if candidates_out.poses.palm_point[row] >= 0:
         touching = 1
+    groups = candidates_out.count.shape[1]
     candidates = int(0)
-    for g in range(count_out.shape[1]):
-        if count_out[row, g] > 0:
+    for g in range(groups):
+        if candidates_out.count[row, g] > 0:
             touching += 1
-            candidates += count_out[row, g]
-    wp.atomic_add(counts_out, 0, 1)
-    if touching >= fingers:
-        wp.atomic_add(counts_out, 1, 1)
-        wp.atomic_add(counts_out, 2, candidates)
+            candidates += candidates_out.count[row, g]
+    wp.atomic_add(counts_out, DomainCount.POSES, 1)
+    if touching >= params.fingers:
+        wp.atomic_add(counts_out, DomainCount.RICH, 1)
+        wp.atomic_add(counts_out, DomainCount.CANDIDATES, candidates)
     else:
-        for g in range(count_out.shape[1]):
-            count_out[row, g] = 0
+        for g in range(groups):
+            candidates_out.count[row, g] = 0

@@ -1,12 +1,12 @@
 """Parameters of the domain stage."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from lgrasp.config import Params
 
 
-class DomainParams(BaseModel):
+class DomainParams(Params):
     """How contact domains are drawn."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     attempts: int = Field(128, ge=1, le=65536, description="Surface points looked up per pose and finger.")
     keep: int = Field(16, ge=1, le=64, description="Most contacts kept per pose and finger.")

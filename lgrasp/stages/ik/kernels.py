@@ -1,10 +1,13 @@
 """Kernels of the ik stage: contacts are realised finger by finger; of sets the whole ones are kept."""
 
+from enum import IntEnum
+
 import warp as wp
 
 from lgrasp.field.arrays import Field
 from lgrasp.grasp.collision import body_clear
 from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
+from lgrasp.grasp.structs import Candidates, Sets, State
 from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
@@ -14,7 +17,36 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
+_EARLY_GAP = wp.constant(0.25)  # share of the allowed gap at which iteration stops, if the normals agree as well
+
 mat_dof = wp.types.matrix((MAX_DOFS, MAX_DOFS), wp.float32)
+
+
+class IkCount(IntEnum):
+    """What the stage counts; SETS of contact sets only."""
+
+    TRIED = 0
+    REACHED = 1
+    KEPT = 2
+    SETS = 3
+
+
+@wp.struct
+class IkValues:
+    """IkParams as kernels read them."""
+
+    iterations: wp.int32
+    lever: wp.float32  # [m]
+    normal_weight: wp.float32
+    damping: wp.float32
+    step: wp.float32  # [rad or m]
+    contact_indentation: wp.float32  # [m]
+    gap: wp.float32  # [m]
+    cosine: wp.float32  # least, of the normals
+    allowed_penetration: wp.float32  # [m]
+    min_object_distance: wp.float32  # [m]
+    min_self_distance: wp.float32  # [m]
+    check_collision: wp.int32
 
 
 @wp.func
@@ -50,56 +82,45 @@ def realise_contacts(
     hand: Hand,
     field: Field,
     obj: Object,
-    iterations: wp.int32,
-    lever: wp.float32,
-    weight: wp.float32,
-    damping: wp.float32,
-    max_step: wp.float32,
-    max_gap: wp.float32,
-    touch: wp.float32,
-    cosine: wp.float32,
-    slack: wp.float32,
-    clearance: wp.int32,
-    tries: wp.int32,
-    frozen: wp.array2d(dtype=wp.int32),
-    index: wp.array(dtype=wp.int32),
-    pose: wp.array(dtype=wp.transform),
-    count: wp.array2d(dtype=wp.int32),
-    surface: wp.array3d(dtype=wp.int32),
-    record: wp.array3d(dtype=wp.int32),
+    held: Held,
+    params: IkValues,
     wanted: wp.array3d(dtype=wp.int32),
-    q_out: wp.array3d(dtype=vec_dof),
-    state_out: wp.array3d(dtype=wp.int32),
+    candidates_out: Candidates,
     counts_out: wp.array(dtype=wp.int32),
 ):
-    """Joint positions that put a candidate's contact on the object (eq. 7), and whether they do.
+    """Joint positions that put a candidate's contact on the object, and whether they do (Lightning Grasp, eq. 7, 5.5).
 
-    ``q_out`` holds the seed on entry; its ``frozen`` dofs do not move (:class:`Held`). Candidates with ``wanted`` 0 are
-    left alone. ``counts_out`` grows by those tried,
-    reached and kept.
+    Steps dq := argmin |J1 dq - e1|^2 + w^2 |J2 dq - e2|^2 + damping |dq|^2, where e1 = p_o - p and
+    e2 = e1 + lever (n_o - n), p and n are the hand's contact, n_o the inward normal of the object's, and p_o lies
+    ``contact_indentation`` in the object. After each, p slides to the point of the link nearest to the object's.
+    ``candidates_out.q`` holds the seed on entry; its frozen dofs (:class:`Held`) do not move.
+
+    Args:
+        wanted: 0 leaves a candidate alone, (P, G, M).
+        counts_out: IkCount, (3,) or (4,).
     """
     row, g, m = wp.tid()
-    if m >= count[row, g] or wanted[row, g, m] == 0:
+    if m >= candidates_out.count[row, g] or wanted[row, g, m] == 0:
         return
-    T = pose[row]
-    s = surface[row, g, m]
+    T = candidates_out.poses.pose[row]
+    s = candidates_out.surface[row, g, m]
     target = wp.transform_point(T, obj.contact_points[s])
     normal = -wp.transform_vector(T, obj.contact_normals[s])
-    c = field.point[record[row, g, m]]
+    c = field.point[candidates_out.record[row, g, m]]
     grid = hand.contacts.grid[c]
     sdf = hand_grid(hand.contacts, grid)
     j0 = hand.kin.joint_first[g]
     body = hand.contacts.body[c] - 1 - j0
     dofs = hand.kin.dof_free[g]
-    still = frozen[index[row] // tries, g]
-    q = q_out[row, g, m]
+    still = held.frozen[candidates_out.poses.index[row] // held.tries, g]
+    q = candidates_out.q[row, g, m]
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     point = hand.contacts.points[c]
     out = hand.contacts.normals[c]
     gap = float(1.0)
     dot = float(0.0)
-    w2 = weight * weight
-    for it in range(iterations + 1):
+    w2 = params.normal_weight * params.normal_weight
+    for it in range(params.iterations + 1):
         group_forward(hand.kin, g, q, X, 0)
         B = X[body]
         if it > 0:
@@ -111,13 +132,14 @@ def realise_contacts(
             gap = e[3]
         n = wp.transform_vector(B, out)
         dot = wp.dot(n, normal)
-        if it > 0 and wp.abs(gap + touch) < 0.25 * max_gap and dot > 0.5 * (1.0 + cosine):
+        difference = wp.abs(gap + params.contact_indentation)
+        if it > 0 and difference < _EARLY_GAP * params.gap and dot > 0.5 * (1.0 + params.cosine):
             break
-        if it == iterations:
+        if it == params.iterations:
             break
         p = wp.transform_point(B, point)
-        e1 = target + normal * touch - p
-        e2 = e1 + (normal - n) * lever
+        e1 = target + normal * params.contact_indentation - p
+        e2 = e1 + (normal - n) * params.lever
         A = mat_dof()
         b = vec_dof()
         J1 = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
@@ -126,7 +148,7 @@ def realise_contacts(
         while j >= 0:
             d = hand.kin.joint_dof[j0 + j]
             J1[d] = J1[d] + point_column(hand.kin, j0 + j, X[j], p)
-            J2[d] = J2[d] + point_column(hand.kin, j0 + j, X[j], p + n * lever)
+            J2[d] = J2[d] + point_column(hand.kin, j0 + j, X[j], p + n * params.lever)
             j = hand.kin.joint_parent[j0 + j]
         for a in range(dofs):
             if ((still >> a) & 1) == 1:
@@ -135,133 +157,120 @@ def realise_contacts(
             b[a] = wp.dot(J1[a], e1) + w2 * wp.dot(J2[a], e2)
             for k in range(a + 1):
                 A[a, k] = wp.dot(J1[a], J1[k]) + w2 * wp.dot(J2[a], J2[k])
-            A[a, a] = A[a, a] + damping
+            A[a, a] = A[a, a] + params.damping
         step = _solve(A, b, dofs)
         for a in range(dofs):
-            q[a] = q[a] + wp.clamp(step[a], -max_step, max_step)
+            q[a] = q[a] + wp.clamp(step[a], -params.step, params.step)
         q = clamp_dofs(hand.kin, g, q)
-    ok = int(1)
-    if wp.abs(gap + touch) > max_gap or dot < cosine:
-        ok = -1
-    if ok == 1:
+    state = int(State.REALISED)
+    if wp.abs(gap + params.contact_indentation) > params.gap or dot < params.cosine:
+        state = State.MISSED
+    if state == State.REALISED:
         for r in range(hand.contacts.rule_first[grid], hand.contacts.rule_first[grid + 1]):
             f = hand.contacts.rules[r]
             if f[0] * out[0] + f[1] * out[1] + f[2] * out[2] > f[3]:
-                ok = -1
-    if ok == 1 and clearance == 1:
+                state = State.MISSED
+    if state == State.REALISED and params.check_collision == 1:
         T_object = wp.transform_inverse(T)
         # the touching body first: it fails most often
         joints = hand.kin.joint_first[g + 1] - j0
         for k in range(joints):
             j = (body + joints - k) % joints
-            if ok == 1 and not body_clear(hand, obj, 1 + j0 + j, T_object * X[j], slack):
-                ok = -2
-    q_out[row, g, m] = q
-    state_out[row, g, m] = ok
-    wp.atomic_add(counts_out, 0, 1)
-    if ok != -1:
-        wp.atomic_add(counts_out, 1, 1)
-    if ok == 1:
-        wp.atomic_add(counts_out, 2, 1)
+            T = T_object * X[j]
+            if state == State.REALISED and not body_clear(hand, obj, 1 + j0 + j, T, params.allowed_penetration):
+                state = State.BLOCKED
+    candidates_out.q[row, g, m] = q
+    candidates_out.state[row, g, m] = state
+    wp.atomic_add(counts_out, IkCount.TRIED, 1)
+    if state != State.MISSED:
+        wp.atomic_add(counts_out, IkCount.REACHED, 1)
+    if state == State.REALISED:
+        wp.atomic_add(counts_out, IkCount.KEPT, 1)
 
 
 @wp.kernel
 def avoid_held(
-    hand: Hand,
-    held: Held,
-    margin: wp.float32,
-    self_margin: wp.float32,
-    index: wp.array(dtype=wp.int32),
-    count: wp.array2d(dtype=wp.int32),
-    q: wp.array3d(dtype=vec_dof),
-    state_out: wp.array3d(dtype=wp.int32),
-    counts_out: wp.array(dtype=wp.int32),
+    hand: Hand, held: Held, params: IkValues, candidates_out: Candidates, counts_out: wp.array(dtype=wp.int32)
 ):
-    """Realised candidates whose finger meets a held object, or a finger that stays as it is, fail."""
+    """Realised candidates whose finger meets a held object, or a finger that stays as it is, are blocked.
+
+    Args:
+        counts_out: IkCount, (3,) or (4,).
+    """
     row, g, m = wp.tid()
-    if m >= count[row, g] or state_out[row, g, m] != 1:
+    if m >= candidates_out.count[row, g] or candidates_out.state[row, g, m] != State.REALISED:
         return
-    h = index[row] // held.tries
+    h = candidates_out.poses.index[row] // held.tries
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     Y = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    j0 = group_forward(hand.kin, g, q[row, g, m], X, 0)
-    ok = int(1)
+    j0 = group_forward(hand.kin, g, candidates_out.q[row, g, m], X, 0)
+    clear = bool(True)
     for j in range(hand.kin.joint_first[g + 1] - j0):
-        if ok == 1 and not body_clear_of_held(hand, held, h, 1 + j0 + j, X[j], margin):
-            ok = 0
+        if clear:
+            clear = body_clear_of_held(hand, held, h, 1 + j0 + j, X[j], params.min_object_distance)
     for f in range(hand.kin.groups):
-        if ok == 1 and f != g and group_fixed(hand, held, h, f):
+        if clear and f != g and group_fixed(hand, held, h, f):
             group_forward(hand.kin, f, held.posture[h, f], Y, 0)
             if f < g:
-                if not group_pairs_clear(hand, f + 1, g + 1, Y, 0, X, 0, self_margin):
-                    ok = 0
-            elif not group_pairs_clear(hand, g + 1, f + 1, X, 0, Y, 0, self_margin):
-                ok = 0
-    if ok == 0:
-        state_out[row, g, m] = -2
-        wp.atomic_sub(counts_out, 2, 1)
+                clear = group_pairs_clear(hand, f + 1, g + 1, Y, 0, X, 0, params.min_self_distance)
+            else:
+                clear = group_pairs_clear(hand, g + 1, f + 1, X, 0, Y, 0, params.min_self_distance)
+    if not clear:
+        candidates_out.state[row, g, m] = State.BLOCKED
+        wp.atomic_sub(counts_out, IkCount.KEPT, 1)
 
 
 @wp.kernel
-def mark_chosen(
-    rows: wp.array(dtype=wp.int32),
-    pose: wp.array(dtype=wp.int32),
-    chosen: wp.array2d(dtype=wp.int32),
-    wanted_out: wp.array3d(dtype=wp.int32),
-):
-    """1 at every candidate that a set has chosen."""
+def mark_chosen(sets: Sets, wanted_out: wp.array3d(dtype=wp.int32)):
+    """1 at every candidate that a set has chosen.
+
+    Args:
+        wanted_out: (P, G, M), zeros on entry.
+    """
     i = wp.tid()
-    if i >= rows[0]:
+    if i >= sets.rows[0]:
         return
-    for g in range(chosen.shape[1]):
-        if chosen[i, g] >= 0:
-            wanted_out[pose[i], g, chosen[i, g]] = 1
+    for g in range(sets.chosen.shape[1]):
+        if sets.chosen[i, g] >= 0:
+            wanted_out[sets.pose[i], g, sets.chosen[i, g]] = 1
 
 
 @wp.kernel
-def flag_realised(
-    rows: wp.array(dtype=wp.int32),
-    pose: wp.array(dtype=wp.int32),
-    chosen: wp.array2d(dtype=wp.int32),
-    state: wp.array3d(dtype=wp.int32),
-    whole_out: wp.array(dtype=wp.int32),
-):
-    """1 for sets whose every contact was realised."""
+def flag_realised(sets: Sets, candidates: Candidates, whole_out: wp.array(dtype=wp.int32)):
+    """1 for sets whose every contact was realised, else 0.
+
+    Args:
+        whole_out: (S,).
+    """
     i = wp.tid()
     whole_out[i] = 0
-    if i >= rows[0]:
+    if i >= sets.rows[0]:
         return
-    for g in range(chosen.shape[1]):
-        if chosen[i, g] >= 0 and state[pose[i], g, wp.max(chosen[i, g], 0)] != 1:
+    for g in range(sets.chosen.shape[1]):
+        m = sets.chosen[i, g]
+        if m >= 0 and candidates.state[sets.pose[i], g, wp.max(m, 0)] != State.REALISED:
             return
     whole_out[i] = 1
 
 
 @wp.kernel
-def take_realised(
-    upto: wp.array(dtype=wp.int32),
-    pose: wp.array(dtype=wp.int32),
-    slot: wp.array(dtype=wp.int32),
-    chosen: wp.array2d(dtype=wp.int32),
-    score: wp.array(dtype=wp.float32),
-    pose_out: wp.array(dtype=wp.int32),
-    slot_out: wp.array(dtype=wp.int32),
-    chosen_out: wp.array2d(dtype=wp.int32),
-    score_out: wp.array(dtype=wp.float32),
-    rows_out: wp.array(dtype=wp.int32),
-    counts_out: wp.array(dtype=wp.int32),
-):
-    """The whole sets, ``upto[s]`` of them among the first ``s + 1``."""
+def take_realised(upto: wp.array(dtype=wp.int32), sets: Sets, whole_out: Sets, counts_out: wp.array(dtype=wp.int32)):
+    """The whole sets.
+
+    Args:
+        upto: how many of the first ``s + 1`` sets are whole, (S,).
+        counts_out: IkCount, (4,).
+    """
     s = wp.tid()
     if s == upto.shape[0] - 1:
-        rows_out[0] = upto[s]
-        counts_out[3] = upto[s]
+        whole_out.rows[0] = upto[s]
+        counts_out[int(IkCount.SETS)] = upto[s]
     before = int(0)
     if s > 0:
         before = upto[s - 1]
     if upto[s] > before:
-        pose_out[before] = pose[s]
-        slot_out[before] = slot[s]
-        score_out[before] = score[s]
-        for g in range(chosen.shape[1]):
-            chosen_out[before, g] = chosen[s, g]
+        whole_out.pose[before] = sets.pose[s]
+        whole_out.slot[before] = sets.slot[s]
+        whole_out.score[before] = sets.score[s]
+        for g in range(sets.chosen.shape[1]):
+            whole_out.chosen[before, g] = sets.chosen[s, g]

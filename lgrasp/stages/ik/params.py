@@ -1,22 +1,40 @@
 """Parameters of the ik stage."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from typing import ClassVar
+
+from pydantic import Field
+
+from lgrasp.config import Params
 
 
-class IkParams(BaseModel):
+class IkParams(Params):
     """Two-point damped least squares on the contact; lengths in metres."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    RENAMED: ClassVar = {
+        "touch": "contact_indentation",
+        "slack": "allowed_penetration",
+        "apart": "min_object_distance",
+        "self_margin": "min_self_distance",
+        "clearance": "check_collision",
+    }
 
     iterations: int = Field(3, ge=1, le=200, description="Damped least-squares steps.")
     lever: float = Field(0.01, gt=0, le=0.1, description="Distance of the second point along the normal.")
     normal_weight: float = Field(0.15, gt=0, le=10, description="Weight of the second point.")
     damping: float = Field(2e-6, gt=0, le=1, description="Damping of the least squares.")
     step: float = Field(0.3, gt=0, le=3, description="Largest joint change in one step [rad or m].")
-    touch: float = Field(0.0003, ge=0, le=0.002, description="How far the finger aims to press in at the contact.")
+    contact_indentation: float = Field(
+        0.0003, ge=0, le=0.002, description="How far the finger aims to press in at the contact."
+    )
     gap: float = Field(0.001, gt=0, le=0.01, description="Largest difference from that.")
     angle: float = Field(15.0, gt=0, le=60, description="Largest angle of the normals at the contact [deg].")
-    slack: float = Field(0.0005, ge=0, le=0.01, description="Penetration of inner spheres that is forgiven.")
-    apart: float = Field(0.0003, ge=0, le=0.05, description="Least distance of the finger from objects held.")
-    self_margin: float = Field(0.0003, ge=0, le=0.01, description="Least distance from fingers that hold an object.")
-    clearance: bool = Field(True, description="Also require the whole finger to be clear of the object.")
+    allowed_penetration: float = Field(
+        0.0005, ge=0, le=0.01, description="Penetration of a finger's inner spheres that is allowed."
+    )
+    min_object_distance: float = Field(
+        0.0003, ge=0, le=0.05, description="Least distance of the finger from objects held."
+    )
+    min_self_distance: float = Field(
+        0.0003, ge=0, le=0.01, description="Least distance from fingers that hold an object."
+    )
+    check_collision: bool = Field(True, description="Also require the whole finger to be clear of the object.")

@@ -6,12 +6,23 @@ import warp as wp
 
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.runtime.scan import running_sums
+from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.ik.kernels import avoid_held, flag_realised, mark_chosen, realise_contacts, take_realised
+from lgrasp.stages.ik.kernels import (
+    IkCount,
+    IkValues,
+    avoid_held,
+    flag_realised,
+    mark_chosen,
+    realise_contacts,
+    take_realised,
+)
 from lgrasp.stages.ik.params import IkParams
 
 VERSION = 2
+
+_CANDIDATE_COUNTS = ("tried", "reached", "kept")  # the first of IkCount
 
 
 def run(
@@ -28,18 +39,17 @@ def run(
     """
     d = context.device
     if isinstance(inputs, CandidateTable):
-        tally = empty_tally(("tried", "reached", "kept"), d)
+        tally = empty_tally(_CANDIDATE_COUNTS, d)
         wanted = wp.full(inputs.surface.shape, 1, dtype=wp.int32, device=d)
         _realise(inputs, wanted, params, context, tally)
         return inputs, tally
-    tally = empty_tally(("tried", "reached", "kept", "sets"), d)
+    tally = empty_tally(IkCount, d)
     table, n = inputs.candidates, inputs.pose.shape[0]
     wanted = wp.zeros(table.surface.shape, dtype=wp.int32, device=d)
-    wp.launch(mark_chosen, dim=n, inputs=[inputs.rows, inputs.pose, inputs.chosen], outputs=[wanted], device=d)
+    wp.launch(mark_chosen, n, [inputs.struct], [wanted], device=d)
     _realise(table, wanted, params, context, tally)
     upto = wp.empty(n, dtype=wp.int32, device=d)
-    flagged = [inputs.rows, inputs.pose, inputs.chosen, table.state]
-    wp.launch(flag_realised, dim=n, inputs=flagged, outputs=[upto], device=d)
+    wp.launch(flag_realised, n, [inputs.struct, table.struct], [upto], device=d)
     running_sums(upto)
     kept = ContactSets(
         candidates=table,
@@ -49,59 +59,15 @@ def run(
         score=wp.empty_like(inputs.score),
         rows=wp.zeros(1, dtype=wp.int32, device=d),
     )
-    wp.launch(
-        take_realised,
-        dim=n,
-        inputs=[upto, inputs.pose, inputs.slot, inputs.chosen, inputs.score],
-        outputs=[kept.pose, kept.slot, kept.chosen, kept.score, kept.rows, tally.device],
-        device=d,
-    )
+    wp.launch(take_realised, n, [upto, inputs.struct], [kept.struct, tally.device], device=d)
     return kept, tally
 
 
 def _realise(table: CandidateTable, wanted: wp.array, params: IkParams, context: Context, tally: Tally) -> None:
-    wp.launch(
-        realise_contacts,
-        dim=table.surface.shape,
-        inputs=[
-            context.hand.struct,
-            context.field.struct,
-            context.object.struct,
-            params.iterations,
-            params.lever,
-            params.normal_weight,
-            params.damping,
-            params.step,
-            params.gap,
-            params.touch,
-            math.cos(math.radians(params.angle)),
-            params.slack,
-            int(params.clearance),
-            context.held.struct.tries,
-            context.held.struct.frozen,
-            table.poses.index,
-            table.poses.pose,
-            table.count,
-            table.surface,
-            table.record,
-            wanted,
-        ],
-        outputs=[table.q, table.state, tally.device],
-        device=context.device,
-    )
+    hand, field, obj, held = context.hand.struct, context.field.struct, context.object.struct, context.held.struct
+    values = make_struct(IkValues, params, cosine=math.cos(math.radians(params.angle)))
+    outputs = [table.struct, tally.device]
+    asked = [hand, field, obj, held, values, wanted]
+    wp.launch(realise_contacts, table.surface.shape, asked, outputs, device=context.device)
     if context.space:
-        wp.launch(
-            avoid_held,
-            dim=table.surface.shape,
-            inputs=[
-                context.hand.struct,
-                context.held.struct,
-                params.apart,
-                params.self_margin,
-                table.poses.index,
-                table.count,
-                table.q,
-            ],
-            outputs=[table.state, tally.device],
-            device=context.device,
-        )
+        wp.launch(avoid_held, table.surface.shape, [hand, held, values], outputs, device=context.device)

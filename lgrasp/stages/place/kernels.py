@@ -1,10 +1,13 @@
-"""Kernels of the place stage: poses are proposed, the best is chosen, the rest is dropped."""
+"""Kernels of the place stage (Lightning Grasp, 5.2): poses are proposed, the best is chosen, the rest is dropped."""
+
+from enum import IntEnum
 
 import numpy as np
 import warp as wp
 
 from lgrasp.field.arrays import Field, field_has, field_pair, field_seed
 from lgrasp.grasp.collision import body_clear, body_depth
+from lgrasp.grasp.structs import Poses
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward
 from lgrasp.math.transforms import random_rotation, rotation_between
@@ -13,18 +16,64 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_HITS = wp.constant(6)  # rated contacts per group
-_MAX_RATED = wp.constant(48)
-_STRIDE = wp.constant(7919)  # between the seeds of a candidate's proposals
-_PINCHES = wp.constant(32)  # draws of two opposite points and two opposed contact vectors
-_PALM_COS = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched object's normal to the palm's
-_PINCH_SLACK = wp.constant(0.002)  # [m] difference of their distances
+_MAX_GROUP_HITS = wp.constant(6)  # rated contacts per group
+_MAX_HITS = wp.constant(48)  # rated contacts of a pose
+_OPPOSED_COSINE = wp.constant(0.766)  # cos 40 deg, of an inward normal to the line between two contacts
+SEED_STRIDE = wp.constant(7919)
+"""Between the seeds of a candidate's proposals."""
+_PINCH_DRAWS = wp.constant(32)  # of two opposite points and two opposed contact vectors
+_PINCH_TOLERANCE = wp.constant(0.002)  # [m] difference of their distances
+_PINCH_ROLL_SIGMA = wp.constant(0.3)  # [rad] about the roll that brings the first normals together
+_PINCH_MIN_SINE = wp.constant(0.1)  # of a normal to the line; below that any roll is as good
+_PALM_COSINE = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched object's normal to the palm's
+
+
+class PlaceCount(IntEnum):
+    """What the stage counts."""
+
+    TRIED = 0
+    BLOCKED = 1
+    KEPT = 2
+
+
+class Rating(IntEnum):
+    """Ratings that are no number of opposed contacts."""
+
+    HOPELESS = 0  # the hand can hold nothing there
+    CLEAR = 1  # of static links; not rated further, or one opposed pair
+    BLOCKED = -1  # by static links
+
+
+@wp.struct
+class PlaceValues:
+    """PlaceParams as kernels read them."""
+
+    canonical: wp.float32  # share of all proposals, as the next two
+    pinch: wp.float32
+    palm: wp.float32
+    samples: wp.int32
+    max_com_distance: wp.float32  # [m]
+    allowed_penetration: wp.float32  # [m]
+    spins: wp.int32
+    min_object_distance: wp.float32  # [m]
+
+
+@wp.struct
+class ProposedPoses:
+    """B proposals for each of N candidates."""
+
+    pose: wp.array2d(dtype=wp.transform)  # (N, B) T_hand_object of the internal frame [m]
+    palm_point: wp.array2d(dtype=wp.int32)  # (N, B) hand contact point on ``surface``, -1 none
+    surface: wp.array2d(dtype=wp.int32)  # (N, B) object contact point that placed it
+    setting: wp.array2d(dtype=wp.int32)  # (N, B) setting of the hand's shared joints
+    anchor: wp.array3d(dtype=wp.int32)  # (N, B, G) object contact point that the group can touch, -1 unknown
+    rating: wp.array2d(dtype=wp.int32)  # (N, B) opposed pairs of contacts, or a Rating
 
 
 @wp.func
 def _aligned(p: wp.vec3, n: wp.vec3, point: wp.vec3, normal: wp.vec3, state: wp.uint32):
     """Pose that puts object point on p with opposite normals, and a random roll about the normal."""
-    roll = wp.quat_from_axis_angle(n, wp.randf(state, 0.0, 6.2831853))
+    roll = wp.quat_from_axis_angle(n, wp.randf(state, 0.0, wp.TAU))
     R = roll * rotation_between(normal, -n)
     return wp.transform(p - wp.quat_rotate(R, point), R)
 
@@ -40,14 +89,14 @@ def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int3
     """
     G = hand.kin.groups
     T = wp.transform_identity()
-    for _t in range(_PINCHES):
+    for _t in range(_PINCH_DRAWS):
         i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
         j = obj.contact_opposite[i]
         if j < 0:
             continue
         line = obj.contact_points[j] - obj.contact_points[i]
         width = wp.length(line)
-        pair = field_pair(field, width, _PINCH_SLACK, wp.randf(state))
+        pair = field_pair(field, width, _PINCH_TOLERANCE, wp.randf(state))
         if pair < 0:
             continue
         a = field.pair_point[pair, 0]
@@ -60,9 +109,9 @@ def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int3
         side = wp.cross(have, axis)
         x = wp.dot(want - axis * wp.dot(want, axis), have - axis * wp.dot(have, axis))
         y = wp.dot(wp.cross(have, want), axis)
-        angle = wp.atan2(y, x) + 0.3 * wp.randn(state)
-        if wp.length(side) < 0.1 or wp.length(wp.cross(want, axis)) < 0.1:
-            angle = wp.randf(state, 0.0, 6.2831853)
+        angle = wp.atan2(y, x) + _PINCH_ROLL_SIGMA * wp.randn(state)
+        if wp.length(side) < _PINCH_MIN_SINE or wp.length(wp.cross(want, axis)) < _PINCH_MIN_SINE:
+            angle = wp.randf(state, 0.0, wp.TAU)
         R = wp.quat_from_axis_angle(axis, angle) * R
         middle = 0.5 * (obj.contact_points[i] + obj.contact_points[j])
         T = wp.transform(0.5 * (a + b) - wp.quat_rotate(R, middle), R)
@@ -75,7 +124,7 @@ def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int3
             continue
         across = -wp.quat_rotate(R, obj.contact_normals[j])
         if palm >= 0:
-            if wp.dot(hand.contacts.normals[palm], across) < _PALM_COS:
+            if wp.dot(hand.contacts.normals[palm], across) < _PALM_COSINE:
                 continue
         elif field_has(field, slot[1], wp.transform_point(T, obj.contact_points[j]), across) < 0:
             continue
@@ -88,34 +137,33 @@ def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int3
 
 
 @wp.func
-def rate_pose(
+def _rate(
     hand: Hand,
     field: Field,
     obj: Object,
+    params: PlaceValues,
     T: wp.transform,
     setting: wp.int32,
     palm: wp.int32,
-    samples: wp.int32,
-    reach: wp.float32,
     anchor: wp.array(dtype=wp.int32),
     state: wp.uint32,
 ):
     """How many pairs of reachable contacts of different groups oppose each other about the centre of mass.
 
     A pair counts when each contact's inward normal is within 40 degrees of the line to the other, and the line passes
-    the centre of mass within ``reach`` [m]. ``anchor`` holds an object contact point that each group can touch, or gets
-    one.
+    the centre of mass within ``max_com_distance``. ``anchor`` holds an object contact point that each group can touch,
+    or gets one.
     """
     com = wp.transform_point(T, obj.com)
-    points = wp.zeros(shape=(_MAX_RATED,), dtype=wp.vec3)
-    normals = wp.zeros(shape=(_MAX_RATED,), dtype=wp.vec3)
-    owner = wp.zeros(shape=(_MAX_RATED,), dtype=wp.int32)
+    points = wp.zeros(shape=(_MAX_HITS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(_MAX_HITS,), dtype=wp.vec3)
+    owner = wp.zeros(shape=(_MAX_HITS,), dtype=wp.int32)
     m = int(0)
     R = wp.transform_get_rotation(T)
     t = wp.transform_get_translation(T)
     for g in range(hand.kin.groups):
         hits = int(0)
-        for s in range(samples):
+        for s in range(params.samples):
             i = anchor[g]
             if s > 0 or i < 0:
                 i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
@@ -129,7 +177,7 @@ def rate_pose(
                 hits += 1
                 if anchor[g] < 0:
                     anchor[g] = i
-                if hits == _HITS or m == _MAX_RATED - 1:
+                if hits == _MAX_GROUP_HITS or m == _MAX_HITS - 1:
                     break
     if palm >= 0:
         points[m] = hand.contacts.points[palm]
@@ -144,10 +192,10 @@ def rate_pose(
                 a = wp.dot(d, normals[i])
                 b = -wp.dot(d, normals[j])
                 # hand normals point into the object, so towards each other
-                limit = 0.766 * wp.length(d)
+                limit = _OPPOSED_COSINE * wp.length(d)
                 if a > limit and b > limit:
                     u = wp.clamp(wp.dot(com - points[i], d) / wp.dot(d, d), 0.0, 1.0)
-                    if wp.length(com - points[i] - d * u) < reach:
+                    if wp.length(com - points[i] - d * u) < params.max_com_distance:
                         rating += 1
     return rating
 
@@ -157,27 +205,21 @@ def propose_poses(
     hand: Hand,
     field: Field,
     obj: Object,
+    params: PlaceValues,
     seed: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
-    canonical: wp.float32,
-    pinch: wp.float32,
-    palm_share: wp.float32,
-    samples: wp.int32,
-    reach: wp.float32,
-    clearance: wp.float32,
-    pose_out: wp.array2d(dtype=wp.transform),
-    palm_point_out: wp.array2d(dtype=wp.int32),
-    surface_out: wp.array2d(dtype=wp.int32),
-    setting_out: wp.array2d(dtype=wp.int32),
-    anchor_out: wp.array3d(dtype=wp.int32),
-    rating_out: wp.array2d(dtype=wp.int32),
+    proposals_out: ProposedPoses,
 ):
-    """One of several poses per candidate, and its rating; -1: not clear of static links, 0: it can hold nothing.
+    """One of several poses per candidate, and its rating.
 
     Functions get random states of their own: one handed over is a copy, so that its numbers would come again here.
+
+    Args:
+        seed: of the stage, (1,).
+        first: candidate of row 0, (1,).
     """
     row, b = wp.tid()
-    state = wp.rand_init(seed[0] + b * _STRIDE, first[0] + row)
+    state = wp.rand_init(seed[0] + b * SEED_STRIDE, first[0] + row)
     G = hand.kin.groups
     palm0 = hand.contacts.first[G]
     palms = hand.contacts.first[G + 1] - palm0
@@ -193,17 +235,17 @@ def propose_poses(
     if hand.kin.settings > 1:
         setting = wp.min(int(wp.randf(state) * float(hand.kin.settings)), hand.kin.settings - 1)
     T = wp.transform_identity()
-    rating = int(-1)
-    if u < canonical:
+    rating = int(Rating.BLOCKED)
+    if u < params.canonical:
         x = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
         p = hand.box_low + wp.cw_mul(x, hand.box_high - hand.box_low)
         R = random_rotation(wp.rand_init(wp.randi(state)))
         T = wp.transform(p - wp.quat_rotate(R, point), R)
-    elif u < canonical + pinch:
+    elif u < params.canonical + params.pinch:
         T, setting, palm, i = _pinch(hand, field, obj, anchor, wp.rand_init(wp.randi(state)))
         if setting < 0:
-            rating = 0
-    elif u < canonical + pinch + palm_share and palms > 0:
+            rating = Rating.HOPELESS
+    elif u < params.canonical + params.pinch + params.palm and palms > 0:
         palm = palm0 + wp.min(int(wp.randf(state) * float(palms)), palms - 1)
         n = hand.contacts.normals[palm]
         T = _aligned(hand.contacts.points[palm], n, point, normal, wp.rand_init(wp.randi(state)))
@@ -223,66 +265,72 @@ def propose_poses(
             T = _aligned(p, n, point, normal, wp.rand_init(wp.randi(state)))
             anchor[g] = i
         else:
-            rating = 0
-    if rating < 0 and body_clear(hand, obj, 0, wp.transform_inverse(T), clearance):
-        rating = 1
-        if samples > 0:
-            own = wp.rand_init(wp.randi(state))
-            rating = rate_pose(hand, field, obj, T, setting, palm, samples, reach, anchor, own)
-    pose_out[row, b] = T
-    palm_point_out[row, b] = palm
-    surface_out[row, b] = i
-    setting_out[row, b] = setting
+            rating = Rating.HOPELESS
+    T_object = wp.transform_inverse(T)
+    if rating != Rating.HOPELESS and body_clear(hand, obj, 0, T_object, params.allowed_penetration):
+        rating = Rating.CLEAR
+        if params.samples > 0:
+            rating = _rate(hand, field, obj, params, T, setting, palm, anchor, wp.rand_init(wp.randi(state)))
+    proposals_out.pose[row, b] = T
+    proposals_out.palm_point[row, b] = palm
+    proposals_out.surface[row, b] = i
+    proposals_out.setting[row, b] = setting
     for k in range(G):
-        anchor_out[row, b, k] = anchor[k]
-    rating_out[row, b] = rating
+        proposals_out.anchor[row, b, k] = anchor[k]
+    proposals_out.rating[row, b] = rating
 
 
 @wp.kernel
 def choose_poses(
     hand: Hand,
     obj: Object,
-    clearance: wp.float32,
-    pose: wp.array2d(dtype=wp.transform),
-    rating: wp.array2d(dtype=wp.int32),
+    params: PlaceValues,
+    proposals: ProposedPoses,
     chosen_out: wp.array(dtype=wp.int32),
     kept_out: wp.array(dtype=wp.int32),
     counts_out: wp.array(dtype=wp.int32),
 ):
     """The best rated proposal of each candidate that is clear of static links to the last point, if there is one.
 
-    ``counts_out`` grows by those tried, blocked and kept.
+    Args:
+        chosen_out: the proposal, -1 none, (N,).
+        kept_out: 1 if there is one, (N,).
+        counts_out: PlaceCount, (3,).
     """
     row = wp.tid()
+    choices = proposals.rating.shape[1]
     chosen = int(-1)
-    best = int(-1)
-    for b in range(rating.shape[1]):
-        if rating[row, b] == 0:
-            best = 0
+    best = int(Rating.BLOCKED)
+    for b in range(choices):
+        if proposals.rating[row, b] == Rating.HOPELESS:
+            best = Rating.HOPELESS
     ceiling = int(1 << 30)
     after = int(-1)
-    for _try in range(rating.shape[1]):
+    for _try in range(choices):
         # the next in order of ratings, earlier proposals first
         pick = int(-1)
-        for b in range(rating.shape[1]):
-            r = rating[row, b]
-            if r > 0 and (r < ceiling or (r == ceiling and b > after)) and (pick < 0 or r > rating[row, pick]):
+        highest = int(Rating.HOPELESS)
+        for b in range(choices):
+            r = proposals.rating[row, b]
+            if r > highest and (r < ceiling or (r == ceiling and b > after)):
                 pick = b
+                highest = r
         if pick < 0:
             break
-        ceiling = rating[row, pick]
+        ceiling = highest
         after = pick
-        if body_depth(hand, obj, 0, wp.transform_inverse(pose[row, pick]), clearance) <= clearance:
+        T_object = wp.transform_inverse(proposals.pose[row, pick])
+        if body_depth(hand, obj, 0, T_object, params.allowed_penetration) <= params.allowed_penetration:
             chosen = pick
             best = ceiling
             break
     chosen_out[row] = chosen
-    kept_out[row] = wp.where(best > 0, 1, 0)
-    wp.atomic_add(counts_out, 0, 1)
-    if best < 0:
-        wp.atomic_add(counts_out, 1, 1)
-    if best > 0:
-        wp.atomic_add(counts_out, 2, 1)
+    kept_out[row] = wp.where(chosen >= 0, 1, 0)
+    wp.atomic_add(counts_out, PlaceCount.TRIED, 1)
+    if best == Rating.BLOCKED:
+        wp.atomic_add(counts_out, PlaceCount.BLOCKED, 1)
+    if chosen >= 0:
+        wp.atomic_add(counts_out, PlaceCount.KEPT, 1)
 
 
 @wp.kernel
@@ -290,31 +338,28 @@ def take_poses(
     upto: wp.array(dtype=wp.int32),
     chosen: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.transform),
-    palm_point: wp.array2d(dtype=wp.int32),
-    surface: wp.array2d(dtype=wp.int32),
-    setting: wp.array2d(dtype=wp.int32),
-    anchor: wp.array3d(dtype=wp.int32),
-    index_out: wp.array(dtype=wp.int32),
-    pose_out: wp.array(dtype=wp.transform),
-    palm_point_out: wp.array(dtype=wp.int32),
-    palm_surface_out: wp.array(dtype=wp.int32),
-    setting_out: wp.array(dtype=wp.int32),
-    anchor_out: wp.array2d(dtype=wp.int32),
-    rows_out: wp.array(dtype=wp.int32),
+    proposals: ProposedPoses,
+    poses_out: Poses,
 ):
-    """Rows of the PoseTable: the chosen proposals, ``upto[row]`` of them among the first ``row + 1`` candidates."""
+    """Rows of the PoseTable: the chosen proposals.
+
+    Args:
+        upto: chosen ones among the first ``row + 1`` candidates, (N,).
+        chosen: the proposal, -1 none, (N,).
+        first: candidate of row 0, (1,).
+    """
     row = wp.tid()
     if row == upto.shape[0] - 1:
-        rows_out[0] = upto[row]
+        poses_out.rows[0] = upto[row]
     b = chosen[row]
     if b < 0:
         return
     i = upto[row] - 1
-    index_out[i] = first[0] + row
-    pose_out[i] = pose[row, b]
-    palm_point_out[i] = palm_point[row, b]
-    palm_surface_out[i] = wp.where(palm_point[row, b] >= 0, surface[row, b], -1)
-    setting_out[i] = setting[row, b]
-    for k in range(anchor.shape[2]):
-        anchor_out[i, k] = anchor[row, b, k]
+    palm_point = proposals.palm_point[row, b]
+    poses_out.index[i] = first[0] + row
+    poses_out.pose[i] = proposals.pose[row, b]
+    poses_out.palm_point[i] = palm_point
+    poses_out.palm_surface[i] = wp.where(palm_point >= 0, proposals.surface[row, b], -1)
+    poses_out.setting[i] = proposals.setting[row, b]
+    for k in range(proposals.anchor.shape[2]):
+        poses_out.anchor[i, k] = proposals.anchor[row, b, k]

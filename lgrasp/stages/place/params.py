@@ -1,12 +1,23 @@
 """Parameters of the place stage."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from typing import ClassVar
+
+from pydantic import Field
+
+from lgrasp.config import Params
+
+NO_BOUND = 10.0
+"""[m] farther from the centre of mass than any line between two contacts."""
 
 
-class PlaceParams(BaseModel):
+class PlaceParams(Params):
     """Where objects are put; weights need not sum to 1."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    RENAMED: ClassVar = {
+        "reach": "max_com_distance",
+        "clearance": "allowed_penetration",
+        "apart": "min_object_distance",
+    }
 
     canonical: float = Field(
         0.6, ge=0, description="Weight of surface point to point of the canonical box, any rotation."
@@ -22,14 +33,19 @@ class PlaceParams(BaseModel):
         8, ge=1, le=256, description="Poses tried per candidate; the one with the richest contacts stays."
     )
     samples: int = Field(24, ge=0, le=256, description="Surface points per finger that rate a pose; 0: no rating.")
-    reach: float = Field(
-        10.0,
+    max_com_distance: float = Field(
+        NO_BOUND,
         gt=0,
-        le=10,
-        description="Contacts rate a pose when the line between two passes this near the centre of mass [m].",
+        le=NO_BOUND,
+        description="Contacts rate a pose when the line between two passes this near the centre of mass [m]; "
+        "10, farther than any object is large, bounds nothing.",
     )
-    clearance: float = Field(0.0005, ge=0, le=0.01, description="Penetration of static links that is forgiven [m].")
+    allowed_penetration: float = Field(
+        0.0005, ge=0, le=0.01, description="Penetration of static links that is allowed [m]."
+    )
     spins: int = Field(
         16, ge=1, le=360, description="Rolls about the contact normal tried for two points in an opposition space."
     )
-    apart: float = Field(0.0005, ge=0, le=0.05, description="Least distance of the object from objects held [m].")
+    min_object_distance: float = Field(
+        0.0005, ge=0, le=0.05, description="Least distance of the object from objects held [m]."
+    )

@@ -5,9 +5,17 @@ import warp as wp
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import PoseTable
 from lgrasp.runtime.scan import running_sums
+from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
+from lgrasp.stages.place.kernels import (
+    PlaceCount,
+    PlaceValues,
+    ProposedPoses,
+    choose_poses,
+    propose_poses,
+    take_poses,
+)
 from lgrasp.stages.place.opposed_kernels import propose_opposed
 from lgrasp.stages.place.params import PlaceParams
 
@@ -17,7 +25,7 @@ VERSION = 5
 def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Context) -> tuple[PoseTable, Tally]:
     """Poses of candidates ``first .. first + count - 1`` of the shard's stream.
 
-    In an opposition space all of them are between its two sides, and the weights are of no account.
+    In an opposition space all of them are between its two sides, and the weights play no part.
 
     Args:
         inputs: ``first`` (a number, or an array (1,) i32 on the device) and ``count``.
@@ -35,30 +43,23 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     d = context.device
     if not isinstance(first, wp.array):
         first = wp.full(1, first, dtype=wp.int32, device=d)
-    hand, obj = context.hand.struct, context.object.struct
+    hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
     groups, shape = context.hand.model.groups, (count, params.proposals)
-    pose = wp.empty(shape, dtype=wp.transform, device=d)
-    palm_point, surface, setting, rating = (wp.empty(shape, dtype=wp.int32, device=d) for _ in range(4))
-    anchor = wp.empty((*shape, groups), dtype=wp.int32, device=d)
+    proposals = ProposedPoses()
+    proposals.pose = wp.empty(shape, dtype=wp.transform, device=d)
+    for name in ("palm_point", "surface", "setting", "rating"):
+        setattr(proposals, name, wp.empty(shape, dtype=wp.int32, device=d))
+    proposals.anchor = wp.empty((*shape, groups), dtype=wp.int32, device=d)
+    shares = {name: getattr(params, name) / total for name in ("canonical", "pinch", "palm")}
+    values = make_struct(PlaceValues, params, **shares)
+    asked = [values, context.seed("place"), first]
     if context.space:
-        kernel = propose_opposed
-        how = [*context.space.groups, params.spins, params.reach, params.clearance, params.apart]
-        asked = [hand, context.field.struct, obj, context.held.struct, context.seed("place"), first, *how]
-    else:
-        kernel = propose_poses
-        weights = [params.canonical / total, params.pinch / total, params.palm / total]
-        how = [*weights, params.samples, params.reach, params.clearance]
-        asked = [hand, context.field.struct, obj, context.seed("place"), first, *how]
-    wp.launch(kernel, shape, asked, [pose, palm_point, surface, setting, anchor, rating], device=d)
+        asked = [context.held.struct, values, wp.vec2i(*context.space.groups), *asked[1:]]
+    kernel = propose_opposed if context.space else propose_poses
+    wp.launch(kernel, shape, [hand, field, obj, *asked], [proposals], device=d)
     chosen, upto = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(2))
-    tally = empty_tally(("tried", "blocked", "kept"), d)
-    wp.launch(
-        choose_poses,
-        dim=count,
-        inputs=[hand, obj, params.clearance, pose, rating],
-        outputs=[chosen, upto, tally.device],
-        device=d,
-    )
+    tally = empty_tally(PlaceCount, d)
+    wp.launch(choose_poses, count, [hand, obj, values, proposals], [chosen, upto, tally.device], device=d)
     running_sums(upto)
     table = PoseTable(
         index=wp.empty(count, dtype=wp.int32, device=d),
@@ -69,12 +70,5 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
         anchor=wp.empty((count, groups), dtype=wp.int32, device=d),
         rows=wp.zeros(1, dtype=wp.int32, device=d),
     )
-    columns = [table.index, table.pose, table.palm_point, table.palm_surface, table.setting, table.anchor, table.rows]
-    wp.launch(
-        take_poses,
-        dim=count,
-        inputs=[upto, chosen, first, pose, palm_point, surface, setting, anchor],
-        outputs=columns,
-        device=d,
-    )
+    wp.launch(take_poses, count, [upto, chosen, first, proposals], [table.struct], device=d)
     return table, tally

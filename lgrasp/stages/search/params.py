@@ -2,16 +2,20 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from lgrasp.config import Params
+
+MAX_KEEP = 64
+"""Most candidates per pose and group."""
 MAX_KINDS = 16
 """Most entries of ``contacts``."""
+MAX_RESTARTS = 4096
+"""Most starts per pose."""
 
 
-class SearchParams(BaseModel):
+class SearchParams(Params):
     """How contacts are combined into sets that balance."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     contacts: tuple[int, ...] = Field(
         (3, 3, 3, 3, 4),
@@ -27,7 +31,7 @@ class SearchParams(BaseModel):
         6 / 7, gt=0, le=1, description="Largest gswo residual of a set, in round cones, over bounds.max_gswo."
     )
     least_force: float = Field(0.03, ge=0, le=0.5, description="Smallest share of the normal force on a contact.")
-    restarts: int = Field(20, ge=1, le=4096, description="Random starts per pose.")
+    restarts: int = Field(20, ge=1, le=MAX_RESTARTS, description="Random starts per pose.")
     moves: int = Field(12, ge=0, le=1000, description="Replacements of one contact per start and round.")
     rounds: int = Field(
         2,
