@@ -6,6 +6,7 @@ import pytest
 
 from lgrasp import notices
 from lgrasp.config import Params, parse_model
+from lgrasp.engine.registry import STAGES
 from lgrasp.errors import ConfigError
 
 
@@ -45,3 +46,13 @@ def test_both_keys_fail(said):
 def test_unknown_key_names_the_nearest(said):
     with pytest.raises(ConfigError, match="did you mean 'allowed_penetration'"):
         parse_model(Stage, {"allowed_penetrations": 0.002}, "here")
+
+
+def test_stages_read_their_old_names(said):
+    for stage in STAGES.values():
+        fields = stage.params.model_fields
+        for old, new in getattr(stage.params, "RENAMED", {}).items():
+            assert old not in fields
+            read = parse_model(stage.params, {old: fields[new].default}, "old file")
+            assert read == stage.params()
+            assert f"old file: '{old}' is now called '{new}'; the old name works in this release only" in said

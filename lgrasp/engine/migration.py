@@ -30,6 +30,8 @@ _CHECKS = _MEASURES | {
     "stiffness": "squeeze_stiffness",
 }
 BOUNDS_OF_STAGES: dict[str, dict[str, str]] = {
+    "place": {"clearance": "allowed_penetration", "apart": "min_object_distance"},
+    "ik": {"slack": "allowed_penetration", "self_margin": "min_self_distance"},
     "search": _MEASURES | {"margin": "min_self_distance"},
     "refine": _CHECKS,
     "filter": _CHECKS,

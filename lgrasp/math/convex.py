@@ -13,14 +13,14 @@ class Pieces:
     """
 
     body_first: wp.array(dtype=wp.int32)  # (bodies + 1,)
-    body_sphere: wp.array(dtype=wp.vec4)  # bounding sphere (x, y, z, r) of a whole body; r < 0: empty
+    body_sphere: wp.array(dtype=wp.vec4)  # (bodies,) bounding sphere x, y, z, r [m]; r < 0: empty
     vertex_first: wp.array(dtype=wp.int32)  # (pieces + 1,)
-    vertices: wp.array(dtype=wp.vec3)
+    vertices: wp.array(dtype=wp.vec3)  # (vertices of all pieces,) [m]
     plane_first: wp.array(dtype=wp.int32)  # (pieces + 1,)
-    planes: wp.array(dtype=wp.vec4)  # outward normal and offset: n . x <= d
-    sphere: wp.array(dtype=wp.vec4)  # bounding sphere of each piece
-    radius: wp.array(dtype=wp.float32)
-    body: wp.array(dtype=wp.int32)
+    planes: wp.array(dtype=wp.vec4)  # (planes of all pieces,) outward normal and offset [m]: n . x <= d
+    sphere: wp.array(dtype=wp.vec4)  # (pieces,) bounding sphere [m]
+    radius: wp.array(dtype=wp.float32)  # (pieces,) [m]
+    body: wp.array(dtype=wp.int32)  # (pieces,)
 
 
 @wp.func

@@ -18,7 +18,7 @@ vec_dof = wp.types.vector(MAX_DOFS, wp.float32)
 
 @wp.struct
 class Kinematics:
-    """Joints in group order, parents before children; joint j moves body j.
+    """J joints with D dofs in group order, parents before children; joint j moves body j.
 
     ``joint_parent`` is an index inside the group, -1 for the static base. A joint's coordinate is
     ``mult * q[dof] + offset`` with ``dof`` an index inside the group, so mimic joints need no special case.
@@ -27,19 +27,19 @@ class Kinematics:
     groups: wp.int32
     joint_first: wp.array(dtype=wp.int32)  # (groups + 1,)
     dof_first: wp.array(dtype=wp.int32)  # (groups + 1,)
-    joint_parent: wp.array(dtype=wp.int32)
-    joint_dof: wp.array(dtype=wp.int32)
-    joint_mult: wp.array(dtype=wp.float32)
-    joint_offset: wp.array(dtype=wp.float32)
-    joint_axis: wp.array(dtype=wp.vec3)
-    joint_prismatic: wp.array(dtype=wp.int32)
-    joint_origin: wp.array(dtype=wp.transform)
-    dof_lower: wp.array(dtype=wp.float32)
-    dof_upper: wp.array(dtype=wp.float32)
-    dof_index: wp.array(dtype=wp.int32)  # column of q that a group's dof is
+    joint_parent: wp.array(dtype=wp.int32)  # (J,)
+    joint_dof: wp.array(dtype=wp.int32)  # (J,)
+    joint_mult: wp.array(dtype=wp.float32)  # (J,)
+    joint_offset: wp.array(dtype=wp.float32)  # (J,) [rad or m]
+    joint_axis: wp.array(dtype=wp.vec3)  # (J,) unit, in the joint's frame
+    joint_prismatic: wp.array(dtype=wp.int32)  # (J,) 1: slides
+    joint_origin: wp.array(dtype=wp.transform)  # (J,) T_parent_joint at coordinate 0 [m]
+    dof_lower: wp.array(dtype=wp.float32)  # (D,) [rad or m]
+    dof_upper: wp.array(dtype=wp.float32)  # (D,) [rad or m]
+    dof_index: wp.array(dtype=wp.int32)  # (D,) column of q that a group's dof is
     dof_free: wp.array(dtype=wp.int32)  # (groups,) dofs that the group moves itself; shared ones come after
     settings: wp.int32  # number of combinations of values of the shared joints
-    dof_setting: wp.array2d(dtype=wp.float32)  # (settings, dofs) open posture with the shared joints in place
+    dof_setting: wp.array2d(dtype=wp.float32)  # (settings, D) open posture with the shared joints in place
 
 
 @wp.func

@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 class Sdf:
     """A grid of signed distances [m], negative inside; x slowest, z fastest; several grids may share one array."""
 
-    values: wp.array(dtype=wp.float32)
+    values: wp.array(dtype=wp.float32)  # (cells of all grids,) [m]
     first: wp.int32
     nx: wp.int32
     ny: wp.int32

@@ -13,7 +13,7 @@ PIPELINE = {
     "name": "small",
     "field": {"records": 20000},
     "stages": [
-        {"place": {"reach": 0.02, "proposals": 1}},
+        {"place": {"max_com_distance": 0.02, "proposals": 1}},
         {"domain": {"attempts": 48, "keep": 4}},
         {"ik": {}},
         {"search": {"contacts": [2], "threshold": 0.15, "restarts": 16, "moves": 4, "per_pose": 1}},

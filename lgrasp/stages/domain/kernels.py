@@ -81,12 +81,14 @@ def _drawing(row_at: Any, pick_at: Any, looks_near: bool) -> Any:
 
     @wp.kernel
     def draw_domains(
+        # in
         hand: Hand,
         field: Field,
         boxes: Boxes,
         obj: Object,
         params: DomainValues,
         seed: wp.array(dtype=wp.int32),
+        # out
         candidates_out: Candidates,
     ):
         """Contact domain of each (pose, group): surface points that a contact vector of the group meets.
@@ -142,7 +144,13 @@ draw_domains = {
 
 
 @wp.kernel
-def keep_frozen(hand: Hand, held: Held, candidates_out: Candidates):
+def keep_frozen(
+    # in
+    hand: Hand,
+    held: Held,
+    # out
+    candidates_out: Candidates,
+):
     """Groups that must stay as they are lose their candidates; seeds of others take over what is frozen."""
     row, g = wp.tid()
     if row >= candidates_out.poses.rows[0]:
@@ -155,7 +163,13 @@ def keep_frozen(hand: Hand, held: Held, candidates_out: Candidates):
 
 
 @wp.kernel
-def drop_poor(params: DomainValues, candidates_out: Candidates, counts_out: wp.array(dtype=wp.int32)):
+def drop_poor(
+    # in
+    params: DomainValues,
+    # out
+    candidates_out: Candidates,
+    counts_out: wp.array(dtype=wp.int32),
+):
     """Poses where too few fingers (and the palm) can touch lose their candidates.
 
     Args:

@@ -33,7 +33,7 @@ class IkCount(IntEnum):
 
 @wp.struct
 class IkValues:
-    """IkParams as kernels read them."""
+    """IkParams and GraspBounds as kernels read them."""
 
     iterations: wp.int32
     lever: wp.float32  # [m]
@@ -43,10 +43,10 @@ class IkValues:
     contact_indentation: wp.float32  # [m]
     gap: wp.float32  # [m]
     cosine: wp.float32  # least, of the normals
-    allowed_penetration: wp.float32  # [m]
-    min_object_distance: wp.float32  # [m]
-    min_self_distance: wp.float32  # [m]
+    min_held_distance: wp.float32  # [m]
     check_collision: wp.int32
+    allowed_penetration: wp.float32  # [m] of inner spheres
+    min_self_distance: wp.float32  # [m]
 
 
 @wp.func
@@ -79,12 +79,14 @@ def _solve(A: mat_dof, b: vec_dof, n: wp.int32):
 
 @wp.kernel
 def realise_contacts(
+    # in
     hand: Hand,
     field: Field,
     obj: Object,
     held: Held,
     params: IkValues,
     wanted: wp.array3d(dtype=wp.int32),
+    # out
     candidates_out: Candidates,
     counts_out: wp.array(dtype=wp.int32),
 ):
@@ -190,7 +192,13 @@ def realise_contacts(
 
 @wp.kernel
 def avoid_held(
-    hand: Hand, held: Held, params: IkValues, candidates_out: Candidates, counts_out: wp.array(dtype=wp.int32)
+    # in
+    hand: Hand,
+    held: Held,
+    params: IkValues,
+    # out
+    candidates_out: Candidates,
+    counts_out: wp.array(dtype=wp.int32),
 ):
     """Realised candidates whose finger meets a held object, or a finger that stays as it is, are blocked.
 
@@ -207,7 +215,7 @@ def avoid_held(
     clear = bool(True)
     for j in range(hand.kin.joint_first[g + 1] - j0):
         if clear:
-            clear = body_clear_of_held(hand, held, h, 1 + j0 + j, X[j], params.min_object_distance)
+            clear = body_clear_of_held(hand, held, h, 1 + j0 + j, X[j], params.min_held_distance)
     for f in range(hand.kin.groups):
         if clear and f != g and group_fixed(hand, held, h, f):
             group_forward(hand.kin, f, held.posture[h, f], Y, 0)
@@ -221,7 +229,12 @@ def avoid_held(
 
 
 @wp.kernel
-def mark_chosen(sets: Sets, wanted_out: wp.array3d(dtype=wp.int32)):
+def mark_chosen(
+    # in
+    sets: Sets,
+    # out
+    wanted_out: wp.array3d(dtype=wp.int32),
+):
     """1 at every candidate that a set has chosen.
 
     Args:
@@ -236,7 +249,13 @@ def mark_chosen(sets: Sets, wanted_out: wp.array3d(dtype=wp.int32)):
 
 
 @wp.kernel
-def flag_realised(sets: Sets, candidates: Candidates, whole_out: wp.array(dtype=wp.int32)):
+def flag_realised(
+    # in
+    sets: Sets,
+    candidates: Candidates,
+    # out
+    whole_out: wp.array(dtype=wp.int32),
+):
     """1 for sets whose every contact was realised, else 0.
 
     Args:
@@ -254,7 +273,14 @@ def flag_realised(sets: Sets, candidates: Candidates, whole_out: wp.array(dtype=
 
 
 @wp.kernel
-def take_realised(upto: wp.array(dtype=wp.int32), sets: Sets, whole_out: Sets, counts_out: wp.array(dtype=wp.int32)):
+def take_realised(
+    # in
+    upto: wp.array(dtype=wp.int32),
+    sets: Sets,
+    # out
+    whole_out: Sets,
+    counts_out: wp.array(dtype=wp.int32),
+):
     """The whole sets.
 
     Args:

@@ -12,9 +12,7 @@ class IkParams(Params):
 
     RENAMED: ClassVar = {
         "touch": "contact_indentation",
-        "slack": "allowed_penetration",
-        "apart": "min_object_distance",
-        "self_margin": "min_self_distance",
+        "apart": "min_held_distance",
         "clearance": "check_collision",
     }
 
@@ -28,13 +26,7 @@ class IkParams(Params):
     )
     gap: float = Field(0.001, gt=0, le=0.01, description="Largest difference from that.")
     angle: float = Field(15.0, gt=0, le=60, description="Largest angle of the normals at the contact [deg].")
-    allowed_penetration: float = Field(
-        0.0005, ge=0, le=0.01, description="Penetration of a finger's inner spheres that is allowed."
-    )
-    min_object_distance: float = Field(
+    min_held_distance: float = Field(
         0.0003, ge=0, le=0.05, description="Least distance of the finger from objects held."
-    )
-    min_self_distance: float = Field(
-        0.0003, ge=0, le=0.01, description="Least distance from fingers that hold an object."
     )
     check_collision: bool = Field(True, description="Also require the whole finger to be clear of the object.")

@@ -46,7 +46,7 @@ class Rating(IntEnum):
 
 @wp.struct
 class PlaceValues:
-    """PlaceParams as kernels read them."""
+    """PlaceParams and GraspBounds as kernels read them."""
 
     canonical: wp.float32  # share of all proposals, as the next two
     pinch: wp.float32
@@ -202,12 +202,14 @@ def _rate(
 
 @wp.kernel
 def propose_poses(
+    # in
     hand: Hand,
     field: Field,
     obj: Object,
     params: PlaceValues,
     seed: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
+    # out
     proposals_out: ProposedPoses,
 ):
     """One of several poses per candidate, and its rating.
@@ -282,10 +284,12 @@ def propose_poses(
 
 @wp.kernel
 def choose_poses(
+    # in
     hand: Hand,
     obj: Object,
     params: PlaceValues,
     proposals: ProposedPoses,
+    # out
     chosen_out: wp.array(dtype=wp.int32),
     kept_out: wp.array(dtype=wp.int32),
     counts_out: wp.array(dtype=wp.int32),
@@ -335,10 +339,12 @@ def choose_poses(
 
 @wp.kernel
 def take_poses(
+    # in
     upto: wp.array(dtype=wp.int32),
     chosen: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
     proposals: ProposedPoses,
+    # out
     poses_out: Poses,
 ):
     """Rows of the PoseTable: the chosen proposals.

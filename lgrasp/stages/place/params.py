@@ -13,11 +13,7 @@ NO_BOUND = 10.0
 class PlaceParams(Params):
     """Where objects are put; weights need not sum to 1."""
 
-    RENAMED: ClassVar = {
-        "reach": "max_com_distance",
-        "clearance": "allowed_penetration",
-        "apart": "min_object_distance",
-    }
+    RENAMED: ClassVar = {"reach": "max_com_distance"}
 
     canonical: float = Field(
         0.6, ge=0, description="Weight of surface point to point of the canonical box, any rotation."
@@ -40,12 +36,6 @@ class PlaceParams(Params):
         description="Contacts rate a pose when the line between two passes this near the centre of mass [m]; "
         "10, farther than any object is large, bounds nothing.",
     )
-    allowed_penetration: float = Field(
-        0.0005, ge=0, le=0.01, description="Penetration of static links that is allowed [m]."
-    )
     spins: int = Field(
         16, ge=1, le=360, description="Rolls about the contact normal tried for two points in an opposition space."
-    )
-    min_object_distance: float = Field(
-        0.0005, ge=0, le=0.05, description="Least distance of the object from objects held [m]."
     )

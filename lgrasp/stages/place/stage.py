@@ -51,7 +51,7 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
         setattr(proposals, name, wp.empty(shape, dtype=wp.int32, device=d))
     proposals.anchor = wp.empty((*shape, groups), dtype=wp.int32, device=d)
     shares = {name: getattr(params, name) / total for name in ("canonical", "pinch", "palm")}
-    values = make_struct(PlaceValues, params, **shares)
+    values = make_struct(PlaceValues, params, context.bounds, **shares)
     asked = [values, context.seed("place"), first]
     if context.space:
         asked = [context.held.struct, values, wp.vec2i(*context.space.groups), *asked[1:]]

@@ -118,7 +118,13 @@ def _with_friction(
 
 
 @wp.kernel
-def list_usable(state: wp.int32, candidates: Candidates, usable_out: Usable):
+def list_usable(
+    # in
+    state: wp.int32,
+    candidates: Candidates,
+    # out
+    usable_out: Usable,
+):
     """Candidates of each (pose, group) in one State."""
     row, g = wp.tid()
     n = int(0)
@@ -141,6 +147,7 @@ def _starts(measure: Any) -> Any:
 
     @wp.kernel
     def try_starts(
+        # in
         obj: Object,
         params: SearchValues,
         seed: wp.array(dtype=wp.int32),
@@ -148,6 +155,7 @@ def _starts(measure: Any) -> Any:
         candidates: Candidates,
         usable: Usable,
         found: FoundSets,
+        # out
         tried_out: TriedSets,
     ):
         """One thread per (pose, start): finger contacts (and the palm's) with small residual (Alg. 2 for eq. 6).
@@ -262,7 +270,13 @@ try_starts = {"fswo": _starts(_frictionless), "gswo": _starts(_with_friction)}
 
 
 @wp.kernel
-def list_hits(tried: TriedSets, number_out: wp.array(dtype=wp.int32), hits_out: wp.array(dtype=wp.int32)):
+def list_hits(
+    # in
+    tried: TriedSets,
+    # out
+    number_out: wp.array(dtype=wp.int32),
+    hits_out: wp.array(dtype=wp.int32),
+):
     """The starts that found a set, in any order.
 
     Args:
@@ -276,6 +290,7 @@ def list_hits(tried: TriedSets, number_out: wp.array(dtype=wp.int32), hits_out: 
 
 @wp.kernel
 def check_starts(
+    # in
     number: wp.array(dtype=wp.int32),
     hits: wp.array(dtype=wp.int32),
     hand: Hand,
@@ -283,6 +298,7 @@ def check_starts(
     params: SearchValues,
     realised: wp.int32,
     candidates: Candidates,
+    # out
     tried_out: TriedSets,
 ):
     """Scores of hits go below 0 when friction does not balance them or lets go of the object, or when fingers meet.
@@ -365,7 +381,14 @@ def _repeats(
 
 
 @wp.kernel
-def keep_sets(params: SearchValues, candidates: Candidates, tried: TriedSets, found_out: FoundSets):
+def keep_sets(
+    # in
+    params: SearchValues,
+    candidates: Candidates,
+    tried: TriedSets,
+    # out
+    found_out: FoundSets,
+):
     """One thread per pose: the first ``per_pose`` sets in the order of the starts, without near-repetitions."""
     row = wp.tid()
     n = found_out.number[row]
@@ -385,10 +408,12 @@ def keep_sets(params: SearchValues, candidates: Candidates, tried: TriedSets, fo
 
 @wp.kernel
 def take_sets(
+    # in
     upto: wp.array(dtype=wp.int32),
     candidates: Candidates,
     slot: wp.int32,
     found: FoundSets,
+    # out
     sets_out: Sets,
     counts_out: wp.array(dtype=wp.int32),
 ):

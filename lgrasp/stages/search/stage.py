@@ -97,11 +97,8 @@ def _values(params: SearchParams, bounds: GraspBounds) -> Any:
     return make_struct(
         SearchValues,
         params,
+        bounds,
         contacts=vec_kinds(*params.contacts, *[0] * (MAX_KINDS - kinds)),
         kinds=kinds,
-        friction=bounds.friction,
-        torque_scale=bounds.torque_scale,
         max_gswo=params.gswo_share * bounds.max_gswo,
-        max_unresisted_load=bounds.max_unresisted_load,
-        min_self_distance=bounds.min_self_distance,
     )

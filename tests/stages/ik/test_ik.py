@@ -82,7 +82,7 @@ def test_finger_is_clear(realised, inputs, mesh, swift):
             if near.any():
                 distance = -trimesh.proximity.signed_distance(mesh, p[near])
                 worst = max(worst, float((radius[near] - distance).max()))
-    assert worst < swift.params("ik").slack + 3e-4
+    assert worst < swift.bounds.allowed_penetration + 3e-4
 
 
 def test_only_chosen_candidates_of_sets(lightning, load):

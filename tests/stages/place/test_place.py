@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import ConfigError
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.tables import pose_arrays
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.params import PlaceParams
@@ -41,7 +42,7 @@ def test_palm_is_free(context, tables, solids, mesh, pose_matrices, inputs):
     names = inputs.hand.model.tree.joint_names
     zero = solids.forward(solids.resolve_joints({n: np.zeros(1) for n in names}, 1), 1)
     depth = np.max(hand_in_object(static, JudgedObject(mesh), T @ zero), axis=0)
-    assert depth.max() < PlaceParams().clearance + 5e-4
+    assert depth.max() < GraspBounds().allowed_penetration + 5e-4
 
 
 def test_kept_candidates_are_what_the_kernel_kept(context):
