@@ -44,7 +44,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     Returns:
         Sets in (pose, slot) order, and counts ``poses``, ``yielding`` (poses with a set), ``sets``.
     """
-    d, realised = context.device, context.realised
+    d = context.device
     n, groups, keep = inputs.surface.shape
     if groups > MAX_GROUPS or keep > MAX_KEEP:
         raise ConfigError(
