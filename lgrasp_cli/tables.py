@@ -67,9 +67,11 @@ def job_report(data: dict[str, Any]) -> list[tuple[str, str]]:
         ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it placement through filter"),
     ]
     if made:
+        pairs += [("strict-valid", f"{data['strict_valid_per_s']:,.0f} /s ({data['strict']:,})")]
+        if data["strict"] < data["grasps"]:
+            pairs += [("by own bounds", f"{data['grasps_per_s']:,.0f} /s ({data['grasps']:,})")]
         pairs += [
-            ("strict-valid", f"{data['strict_valid_per_s']:,.0f} /s"),
-            ("seed count", f"{data['seed_count_per_s']:,.0f} /s ({data['seed_count']:,})"),
+            ("published count", f"{data['published_count_per_s']:,.0f} /s ({data['published_count']:,})"),
         ]
     pairs += [
         ("survivors", "  ".join(f"{name} {data['survivors'][name]:,}" for name in stages)),

@@ -241,7 +241,17 @@ def _hand_tables(table: Table, hand: str) -> list[Texts]:
         mean = next(mean for mean in table["means"] if mean["hand"] == hand)
         rows.append(_rates("trimmed mean", mean["strict_valid_per_s"], mean, published))
     runs = [(cell["object"], name, cell["pipelines"][name]) for cell in cells for name in names]
-    behind = ("object", "pipeline", "grasps", "range/s", "seed/s", "near-dup", "poses", "survivors")
+    behind = (
+        "object",
+        "pipeline",
+        "grasps",
+        "strict",
+        "range/s",
+        "published count/s",
+        "near-dup",
+        "poses",
+        "survivors",
+    )
     stages = sorted({stage for *_, run in runs for stage in run["counts"]})
     seconds = ("object", "pipeline", *stages, "wall s", "object s", "field s", "load s", "MB")
     return [
@@ -262,8 +272,9 @@ def _behind(mesh: str, name: str, run: dict[str, Any]) -> tuple[str, ...]:
         mesh,
         name,
         number(run["grasps"]) + (" starved" if run["starved"] else ""),
+        number(run["strict"]),
         f"{strict['min']:,.0f}-{strict['max']:,.0f}",
-        number(run["seed_count_per_s"]["median"]),
+        number(run["published_count_per_s"]["median"]),
         number(run["near_duplicates"]),
         number(run["distinct_poses"]),
         "  ".join(f"{stage} {count:,}" for stage, count in run["survivors"].items()),

@@ -12,7 +12,7 @@ from lgrasp.engine.report import job_report
 from lgrasp.engine.run import Outcome
 from lgrasp.jobs.generate import GenerateJob, generate
 
-_MEASURED = ("strict_valid_per_s", "seed_count_per_s")
+_MEASURED = ("strict_valid_per_s", "published_count_per_s")
 _INPUTS = ("object", "field")
 _PROBE_ROWS = 256  # and at most a tenth of the rows
 Progress = Callable[[str], None]
@@ -52,9 +52,9 @@ class Bench:
             progress: called with one line before each run.
 
         Returns:
-            For each job ``pipeline``, ``hand``, ``object``, ``grasps``, ``device``; each rate as ``median``, ``min``,
-            ``max``; ``seconds`` and ``survivors`` of the middle run; ``build_seconds`` and ``load_seconds`` of
-            object and field; ``near_duplicates``, ``distinct_poses``, ``starved``, ``peak_rss_mb``.
+            For each job ``pipeline``, ``hand``, ``object``, ``grasps``, ``strict``, ``profile``, ``device``; each rate
+            as ``median``, ``min``, ``max``; ``seconds`` and ``survivors`` of the middle run;
+            ``build_seconds`` and ``load_seconds`` of object and field; ``near_duplicates``, ``distinct_poses``, ``starved``, ``peak_rss_mb``.
 
         Raises:
             LgraspError: bad input.
@@ -90,7 +90,7 @@ class Bench:
 
 def _summary(runs: list[dict[str, Any]], built: dict[str, dict[str, float]]) -> dict[str, Any]:
     middle = sorted(runs, key=lambda data: data["strict_valid_per_s"])[len(runs) // 2]
-    same = ("pipeline", "hand", "object", "grasps", "device", "survivors", "counts")
+    same = ("pipeline", "hand", "object", "grasps", "strict", "profile", "device", "survivors", "counts")
     last = ("near_duplicates", "distinct_poses", "starved", "peak_device_mb")
     return {
         **{name: middle[name] for name in same},

@@ -81,21 +81,24 @@ class GraspBounds(Params):
         kept = {} if "profile" in changes else self.model_dump()
         return GraspBounds.model_validate(kept | changes)
 
+    @property
+    def limits(self) -> dict[str, float]:
+        """Largest value of each stored metric that is bounded."""
+        limits = {
+            "gap": self.max_gap,
+            "normal_error": float(np.radians(self.max_normal_angle)),
+            "penetration": self.max_penetration,
+            "gswo": self.max_gswo,
+        }
+        return limits | ({"unresisted_load": self.max_unresisted_load} if self.max_unresisted_load < 1 else {})
+
     def met_by(self, metrics: Mapping[str, np.ndarray]) -> np.ndarray:
         """Rows whose stored metrics are within the bounds, (N,) bool; the metrics must have this friction or less.
 
         Raises:
             KeyError: a metric is missing.
         """
-        limits = {
-            "gap": self.max_gap,
-            "normal_error": np.radians(self.max_normal_angle),
-            "penetration": self.max_penetration,
-            "gswo": self.max_gswo,
-        }
-        if self.max_unresisted_load < 1:
-            limits["unresisted_load"] = self.max_unresisted_load
-        return np.logical_and.reduce([metrics[name] <= np.float32(limit) for name, limit in limits.items()])
+        return np.logical_and.reduce([metrics[name] <= np.float32(limit) for name, limit in self.limits.items()])
 
     def describe(self) -> dict[str, Any]:
         """As shards store them: the profile, and every number."""

@@ -12,6 +12,7 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.survivors import stage_counts, survivors
 from lgrasp.engine.run import Outcome
 from lgrasp.engine.shard import add_counts, add_seconds
+from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.duplicates import near_pairs
 
 PUBLISHED_FSWO = 0.15
@@ -26,7 +27,8 @@ class _Tally:
 
     moving: np.ndarray  # (L,) which links of the hand are moved by a finger
     rows: int = 0
-    seed_count: int = 0  # rows with >= 3 finger contacts and fswo^2 < PUBLISHED_FSWO
+    strict: int = 0  # rows within the strict bounds, by their metrics
+    published_count: int = 0  # rows with >= 3 finger contacts and fswo^2 < PUBLISHED_FSWO
     near_duplicates: int = 0  # pairs inside a shard
     distinct_poses: int = 0
     counts: dict[str, dict[str, int]] = field(default_factory=dict)  # survivors as the stages report them
@@ -40,21 +42,31 @@ class _Tally:
         with ShardReader(path) as reader:
             pose, q = reader.column("object_pose")[:, 0], reader.column("q")
             self.rows += len(reader)
+            self.strict += _strict_rows(reader)
             self.near_duplicates += len(near_pairs(pose, q))
             self.distinct_poses += len(np.unique(reader.column("candidate")))
             links = reader.column("contact_links")
             fingers = (self.moving[np.maximum(links, 0)] & (links >= 0)).sum((1, 2))
             fswo = reader.column("metrics/fswo")
-            self.seed_count += int(((fingers >= 3) & (fswo**2 < PUBLISHED_FSWO)).sum())
+            self.published_count += int(((fingers >= 3) & (fswo**2 < PUBLISHED_FSWO)).sum())
             add_counts(self.counts, stage_counts(reader.statistics))
 
     def merge(self, other: "_Tally") -> None:
         """Add the counts of other shards."""
         self.rows += other.rows
-        self.seed_count += other.seed_count
+        self.strict += other.strict
+        self.published_count += other.published_count
         self.near_duplicates += other.near_duplicates
         self.distinct_poses += other.distinct_poses
         add_counts(self.counts, other.counts)
+
+
+def _strict_rows(reader: ShardReader) -> int:
+    """Rows within the strict bounds; none where friction was taken to be higher, since forces were balanced with it."""
+    strict = GraspBounds()
+    if stored_bounds(reader.header.config).friction > strict.friction:
+        return 0
+    return int(strict.met_by({name: reader.column(f"metrics/{name}") for name in strict.limits}).sum())
 
 
 def _tally(paths: Iterable[Path], moving: np.ndarray) -> _Tally:
@@ -80,7 +92,9 @@ def generated_report(job: Any, outcome: Outcome) -> dict[str, Any]:
     """The numbers of a :class:`~lgrasp.jobs.generate.GenerateJob`; rates are those of the shards that this call made.
 
     Returns:
-        ``grasps``, ``strict_valid_per_s``, ``seed_count_per_s`` (rows over the wall time of placement through filter),
+        ``grasps``, ``strict`` (those within the strict bounds) and ``profile`` (of the bounds that all are within);
+        ``grasps_per_s``, ``strict_valid_per_s``, ``published_count_per_s`` (over the wall time of placement through
+        filter),
         ``seconds`` (thread-seconds per stage; ``wall`` of placement through filter; hand, object, field),
         ``survivors`` and ``counts`` per stage, ``near_duplicates``, ``distinct_poses`` and what was asked.
     """
@@ -99,8 +113,11 @@ def generated_report(job: Any, outcome: Outcome) -> dict[str, Any]:
         counts |= present.counts
     return {
         "grasps": outcome.rows,
-        "strict_valid_per_s": made.rows / wall if wall else 0.0,
-        "seed_count_per_s": made.seed_count / wall if wall else 0.0,
+        "strict": made.strict + present.strict,
+        "profile": job.pipeline.bounds.profile,
+        "grasps_per_s": made.rows / wall if wall else 0.0,
+        "strict_valid_per_s": made.strict / wall if wall else 0.0,
+        "published_count_per_s": made.published_count / wall if wall else 0.0,
         "seconds": seconds
         | {name: inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field")}
         | {"wall": wall},
@@ -108,7 +125,7 @@ def generated_report(job: Any, outcome: Outcome) -> dict[str, Any]:
         "near_duplicates": made.near_duplicates + present.near_duplicates,
         "distinct_poses": made.distinct_poses + present.distinct_poses,
         "asked": job.rows,
-        "seed_count": made.seed_count + present.seed_count,
+        "published_count": made.published_count + present.published_count,
         "counts": counts,
         "hits": inputs.hits,
         "hand": inputs.hand.model.name,

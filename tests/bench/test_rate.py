@@ -117,8 +117,9 @@ def cell(mesh, swift, lightning, hand="allegro", error=""):
 
 RUN = {
     "grasps": 10,
+    "strict": 10,
     "starved": False,
-    "seed_count_per_s": spread(1.0),
+    "published_count_per_s": spread(1.0),
     "near_duplicates": 0,
     "distinct_poses": 5,
     "survivors": {"place": 3},

@@ -179,7 +179,7 @@ def test_bench_table1(table1, tmp_path):
         assert {name: run["grasps"] for name, run in runs.items()} == {"quick": 10, "slow": 1}
         rates = {name: run["strict_valid_per_s"]["median"] for name, run in runs.items()}
         assert cell["ratio"]["quick"] == rates["quick"] / rates["slow"]
-        wanted = {"survivors", "seconds", "build_seconds", "near_duplicates", "distinct_poses", "seed_count_per_s"}
+        wanted = {"survivors", "seconds", "build_seconds", "near_duplicates", "distinct_poses", "published_count_per_s"}
         assert all(wanted <= set(run) for run in runs.values())
     tiny, capsule = table["cells"]
     assert tiny["published_per_s"] is None

@@ -14,7 +14,7 @@ from lgrasp.errors import ConfigError
 KEYS = {
     "grasps",
     "strict_valid_per_s",
-    "seed_count_per_s",
+    "published_count_per_s",
     "seconds",
     "survivors",
     "near_duplicates",
@@ -38,7 +38,7 @@ def test_report(generate, tmp_path):
     assert data["grasps"] == data["made"] == 20
     assert 0 < data["distinct_poses"] <= 20
     assert data["near_duplicates"] == 0
-    assert 0 < data["seed_count"] <= 20
+    assert 0 < data["published_count"] <= 20
     assert data["strict_valid_per_s"] == pytest.approx(20 / data["seconds"]["wall"])
     assert data["peak_rss_mb"] > 50
     assert data["peak_device_mb"] == 0
@@ -46,6 +46,20 @@ def test_report(generate, tmp_path):
     assert [p.name for p in paths] == data["shards"]
     assert [len(read_shard(p).grasps) for p in paths] == [8, 8, 4]
     assert not [line for p in paths for line in validate_shard(p)]
+
+
+def test_rows_of_looser_bounds_are_not_strict(generate):
+    loose = ("--set", "bounds.max_gap=0.01", "--set", "bounds.max_penetration=0.008")
+    data = json.loads(generate(*loose, "--json", "-").out)
+    assert data["strict"] < data["grasps"] == 20
+    assert data["strict_valid_per_s"] == pytest.approx(data["strict"] / data["seconds"]["wall"])
+    assert data["grasps_per_s"] == pytest.approx(20 / data["seconds"]["wall"])
+    assert "by own bounds" in generate(*loose, "--overwrite").out
+
+
+def test_rows_of_higher_friction_are_not_strict(generate):
+    """Their forces were balanced with it, so nothing stored says what they would do with less."""
+    assert json.loads(generate("--set", "bounds.friction=0.8", "--json", "-").out)["strict"] == 0
 
 
 def test_report_on_standard_output(generate):
