@@ -230,7 +230,7 @@ def link_distance(solids) -> Callable[[int, np.ndarray], np.ndarray]:
 
 
 @pytest.fixture(scope="session")
-def pose_matrices() -> Callable[[np.ndarray], np.ndarray]:
+def device_matrix() -> Callable[[np.ndarray], np.ndarray]:
     """(n, 7) x y z, qx qy qz qw -> (n, 4, 4)."""
 
     def matrices(pose: np.ndarray) -> np.ndarray:

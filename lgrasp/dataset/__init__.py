@@ -6,9 +6,10 @@ from lgrasp.dataset.files import find_shards
 from lgrasp.dataset.info import describe
 from lgrasp.dataset.manifest import write_manifest
 from lgrasp.dataset.merge import merge_shards
-from lgrasp.dataset.reader import ShardReader, iter_grasps, pose_matrix, read_shard
+from lgrasp.dataset.reader import ShardReader, iter_grasps, read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 from lgrasp.grasp.schema import FORMAT_VERSION
 

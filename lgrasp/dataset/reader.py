@@ -248,23 +248,3 @@ def iter_grasps(path: str | os.PathLike[str]) -> Iterator[GraspRows]:
     with ShardReader(path) as reader:
         for _, rows in reader.blocks():
             yield rows
-
-
-def pose_matrix(pose: np.ndarray) -> np.ndarray:
-    """Homogeneous transforms of poses.
-
-    Args:
-        pose: x y z [m] qw qx qy qz, shape [..., 7]; quaternions of any positive length. NaN gives NaN.
-
-    Returns:
-        ``T_base_object``, shape [..., 4, 4], dtype of ``pose``.
-    """
-    pose = np.asarray(pose)
-    w, x, y, z = np.moveaxis(pose[..., 3:] / np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True), -1, 0)
-    T = np.zeros((*pose.shape[:-1], 4, 4), dtype=pose.dtype)
-    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    T[..., 2, 0], T[..., 2, 1], T[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    T[..., :3, 3] = pose[..., :3]
-    T[..., 3, 3] = 1
-    return T

@@ -15,8 +15,9 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.graphs import Recorder
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
+from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
-from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps, user_poses
+from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.stages.context import Context
 
 _LEAST_EFFORT = 65_536

@@ -1,9 +1,16 @@
-"""Poses as other formats write them: inverses, products, Euler angles. All in float64.
+"""Poses as rows of seven numbers: the only place that knows the order of a quaternion.
 
-A pose is x y z [m] qw qx qy qz, shape [..., 7]; a quaternion is qw qx qy qz, unit, qw >= 0, shape [..., 4].
+Stored: x y z [m] qw qx qy qz, shape [..., 7], unit, qw >= 0, as in files; products and inverses are float64.
+Device: x y z [m] qx qy qz qw, as in a Warp transform; functions for it begin with ``device_``.
+Poses in torch are R, t pairs: :mod:`lgrasp.geometry.rotations`.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:  # scipy is slow to load
+    from scipy.spatial.transform import Rotation
 
 
 def canonical(quaternion: np.ndarray) -> np.ndarray:
@@ -26,6 +33,26 @@ def inverse(pose: np.ndarray) -> np.ndarray:
     """``T^-1``, shape [..., 7]."""
     q = canonical(pose[..., 3:]) * [1, -1, -1, -1]
     return np.concatenate([-_rotate(q, np.asarray(pose[..., :3], np.float64)), q], -1)
+
+
+def pose_matrix(pose: np.ndarray) -> np.ndarray:
+    """Homogeneous transforms of poses.
+
+    Args:
+        pose: x y z [m] qw qx qy qz, shape [..., 7]; quaternions of any positive length. NaN gives NaN.
+
+    Returns:
+        Shape [..., 4, 4], dtype of ``pose``.
+    """
+    pose = np.asarray(pose)
+    w, x, y, z = np.moveaxis(pose[..., 3:] / np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True), -1, 0)
+    T = np.zeros((*pose.shape[:-1], 4, 4), dtype=pose.dtype)
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    T[..., 2, 0], T[..., 2, 1], T[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    T[..., :3, 3] = pose[..., :3]
+    T[..., 3, 3] = 1
+    return T
 
 
 def pose_from_matrix(T: np.ndarray) -> np.ndarray:
@@ -60,6 +87,74 @@ def quaternion_from_euler(angles: np.ndarray) -> np.ndarray:
     w, x = ca * cb * cc + sa * sb * sc, sa * cb * cc - ca * sb * sc
     y, z = ca * sb * cc + sa * cb * sc, ca * cb * sc - sa * sb * cc
     return canonical(np.stack([w, x, y, z], -1))
+
+
+def device_pose(position: np.ndarray, rotation: "Rotation") -> np.ndarray:
+    """Device poses, shape [n, 7], of positions, shape [n, 3], and rotations, n of them."""
+    return np.concatenate([position, rotation.as_quat()], 1)
+
+
+def device_rotation(pose: np.ndarray) -> "Rotation":
+    """Rotations of device poses, shape [n, 7]."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(pose[:, 3:])
+
+
+def device_from_stored(pose: np.ndarray) -> np.ndarray:
+    """Device poses, shape [n, 7], float32, of stored ones."""
+    return np.ascontiguousarray(np.asarray(pose)[:, [0, 1, 2, 4, 5, 6, 3]], np.float32)
+
+
+def device_from_matrix(T: np.ndarray) -> np.ndarray:
+    """Device poses, shape [n, 7], float32, of homogeneous transforms, shape [n, 4, 4]."""
+    from scipy.spatial.transform import Rotation
+
+    return device_pose(T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3])).astype(np.float32)
+
+
+def device_matrix(pose: np.ndarray) -> np.ndarray:
+    """Homogeneous transforms, shape [n, 4, 4], float64, of device poses, shape [n, 7]."""
+    T = np.broadcast_to(np.eye(4), (len(pose), 4, 4)).copy()
+    T[:, :3, :3] = device_rotation(pose).as_matrix()
+    T[:, :3, 3] = pose[:, :3]
+    return T
+
+
+def device_inverse(pose: np.ndarray) -> np.ndarray:
+    """``T^-1`` of device poses, shape [n, 7], float32."""
+    back = device_rotation(pose).inv()
+    return device_pose(-back.apply(pose[:, :3]), back).astype(np.float32)
+
+
+def user_poses(pose: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """T_hand_object of the object's user frame, stored as in shards, shape [n, 7], float32.
+
+    Args:
+        pose: T_hand_object of the object's internal frame, device pose, shape [n, 7].
+        center: origin of the internal frame in the user's frame [m], shape [3].
+    """
+    x, y, z, w = pose[:, 3:].T.astype(float)
+    scale = np.where(w < 0, -1.0, 1.0) / np.sqrt(x * x + y * y + z * z + w * w)
+    w, x, y, z = w * scale, x * scale, y * scale, z * scale
+    a, b, c = map(float, center)
+    # R(q) center = center + 2 v x (v x center + w center)
+    i, j, k = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
+    out = np.empty((len(pose), 7), np.float32)
+    out[:, 0] = pose[:, 0] - (a + 2 * (y * k - z * j))
+    out[:, 1] = pose[:, 1] - (b + 2 * (z * i - x * k))
+    out[:, 2] = pose[:, 2] - (c + 2 * (x * j - y * i))
+    out[:, 3], out[:, 4], out[:, 5], out[:, 6] = w, x, y, z
+    return out
+
+
+def shortest_rotation(z: np.ndarray) -> "Rotation":
+    """The shortest rotations that turn the third axis to unit vectors, shape [n, 3]."""
+    from scipy.spatial.transform import Rotation
+
+    q = np.stack([-z[:, 1], z[:, 0], np.zeros(len(z)), 1 + z[:, 2]], 1)
+    q[q[:, 3] < 1e-9] = [1.0, 0, 0, 0]
+    return Rotation.from_quat(q)
 
 
 def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -99,3 +99,19 @@ def quaternion_from_matrix(R: torch.Tensor) -> torch.Tensor:
     q = torch.take_along_dim(rows, largest[..., None], -2)[..., 0, :]
     q = q / q.norm(dim=-1, keepdim=True)
     return torch.where(q[..., 3:] < 0, -q, q)
+
+
+def motion_from_pose(pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """R (..., 3, 3) and t (..., 3) [m] of device poses (..., 7): x y z qx qy qz qw."""
+    return matrix_from_quaternion(pose[..., 3:]), pose[..., :3]
+
+
+def pose_from_motion(R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    """Device poses (..., 7) of rotations (..., 3, 3) and positions (..., 3) [m]."""
+    return torch.cat([t, quaternion_from_matrix(R)], -1)
+
+
+def inverse_motion(R: torch.Tensor, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The inverse of x -> R x + t, of the same shapes."""
+    back = R.mT
+    return back, -(back @ t[..., None])[..., 0]

@@ -58,7 +58,7 @@ def hold(
         q: joint positions [rad or m], (H, K).
         frozen: joints that must not move, (H, K) bool.
         objects: the n objects that every row holds.
-        pose: their poses in the hand frame, internal frames, x y z qx qy qz qw, (H, n, 7).
+        pose: their poses in the hand frame, internal frames, device poses (H, n, 7).
         tries: candidates that go on from each row.
         any_setting: shared joints may still take any of their values; else they have those of q.
     """

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.records import GraspRows
-from lgrasp.grasp.tables import GraspTable, user_poses
+from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.tree import Tree
 
 METRIC_UNITS = {"penetration": "m", "self_penetration": "m", "gap": "m", "normal_error": "rad"}

@@ -26,7 +26,7 @@ class SequenceTable:
     q: np.ndarray  # (N, n, K) f32
     q_pregrasp: np.ndarray  # (N, n, K)
     q_squeeze: np.ndarray  # (N, n, K)
-    pose: np.ndarray  # (N, n, 7) f32 T_hand_object of the internal frames: x y z, qx qy qz qw
+    pose: np.ndarray  # (N, n, 7) f32 T_hand_object of the internal frames, device poses
     contact_points: np.ndarray  # (N, n, C, 3) objects' internal frames, NaN padding
     contact_normals: np.ndarray  # (N, n, C, 3)
     contact_links: np.ndarray  # (N, n, C) i32, -1 padding

@@ -87,7 +87,7 @@ class GraspTable:
     q: np.ndarray  # (N, K) f32
     q_pregrasp: np.ndarray  # (N, K)
     q_squeeze: np.ndarray  # (N, K)
-    pose: np.ndarray  # (N, 7) f32 T_hand_object of the internal frame: x y z, qx qy qz qw
+    pose: np.ndarray  # (N, 7) f32 T_hand_object of the internal frame, device pose
     contact_points: np.ndarray  # (N, C, 3) object's internal frame, NaN padding
     contact_normals: np.ndarray  # (N, C, 3) outward object normal
     contact_links: np.ndarray  # (N, C) i32 index in link_names, -1 padding
@@ -100,7 +100,7 @@ class GraspTable:
 
 
 def pose_arrays(table: PoseTable) -> dict[str, np.ndarray]:
-    """The rows in use of a PoseTable as NumPy arrays; ``pose`` is (P, 7) x y z, qx qy qz qw."""
+    """The rows in use of a PoseTable as NumPy arrays; ``pose`` holds device poses (P, 7)."""
     n = len(table)
     return {
         "index": table.index.numpy()[:n],
@@ -200,27 +200,6 @@ def sort_grasps(table: GraspTable) -> GraspTable:
     """The rows in candidate order."""
     order = np.argsort(table.index, kind="stable")
     return grasps_from_arrays({name: values[order] for name, values in grasp_arrays(table).items()})
-
-
-def user_poses(pose: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """T_hand_object of the object's user frame as written to shards: x y z [m], qw qx qy qz with qw >= 0, (N, 7) f32.
-
-    Args:
-        pose: of the object's internal frame, x y z, qx qy qz qw, (N, 7).
-        center: origin of the internal frame in the user's frame [m], (3,).
-    """
-    x, y, z, w = pose[:, 3:].T.astype(float)
-    scale = np.where(w < 0, -1.0, 1.0) / np.sqrt(x * x + y * y + z * z + w * w)
-    w, x, y, z = w * scale, x * scale, y * scale, z * scale
-    a, b, c = map(float, center)
-    # R(q) center = center + 2 v x (v x center + w center)
-    i, j, k = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
-    out = np.empty((len(pose), 7), np.float32)
-    out[:, 0] = pose[:, 0] - (a + 2 * (y * k - z * j))
-    out[:, 1] = pose[:, 1] - (b + 2 * (z * i - x * k))
-    out[:, 2] = pose[:, 2] - (c + 2 * (x * j - y * i))
-    out[:, 3], out[:, 4], out[:, 5], out[:, 6] = w, x, y, z
-    return out
 
 
 def join_grasps(tables: list[GraspTable]) -> GraspTable:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from lgrasp.geometry.poses import device_from_matrix
 from lgrasp.hand.model import HandModel
 from lgrasp.math.convex import Pieces
 from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_forward, point_column, vec_dof
@@ -80,13 +81,6 @@ class HandArrays:
     meshes: tuple[wp.Mesh, ...]
 
 
-def _quaternions(T: np.ndarray) -> np.ndarray:
-    """(n, 7) Warp transforms (x y z, qx qy qz qw) of (n, 4, 4) matrices."""
-    from scipy.spatial.transform import Rotation
-
-    return np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()]).astype(np.float32)
-
-
 def upload_hand(model: HandModel, device: str) -> HandArrays:
     """Copy a hand to a device."""
     start()
@@ -105,7 +99,7 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
     kin.joint_offset = put(t.joint_offset, wp.float32)
     kin.joint_axis = put(t.joint_axis, wp.vec3)
     kin.joint_prismatic = put(t.joint_prismatic, wp.int32)
-    kin.joint_origin = put(_quaternions(t.T_parent_joint), wp.transform)
+    kin.joint_origin = put(device_from_matrix(t.T_parent_joint), wp.transform)
     kin.dof_lower = put(t.joint_lower[t.dof_index], wp.float32)
     kin.dof_upper = put(t.joint_upper[t.dof_index], wp.float32)
     kin.dof_index = put(t.dof_index, wp.int32)
@@ -232,23 +226,13 @@ def _point_jacobians(
 
 
 def body_poses(hand: HandArrays, q: np.ndarray) -> np.ndarray:
-    """T_base_body of every body as (N, B, 7) [x y z, qx qy qz qw] for postures q (N, K)."""
+    """T_base_body of every body as device poses (N, B, 7) for postures q (N, K)."""
     q = np.ascontiguousarray(q, np.float32)
     bodies = len(hand.model.tree.joint_dof) + 1
     out = wp.empty((len(q), bodies), dtype=wp.transform, device=hand.device)
     queries = wp.array(q, dtype=wp.float32, device=hand.device)
     wp.launch(_body_poses, dim=len(q), inputs=[hand.struct.kin, queries], outputs=[out], device=hand.device)
     return out.numpy().reshape(len(q), bodies, 7)
-
-
-def pose_matrices(poses: np.ndarray) -> np.ndarray:
-    """(N, 4, 4) of Warp transforms (N, 7) [x y z, qx qy qz qw]."""
-    from scipy.spatial.transform import Rotation
-
-    T = np.broadcast_to(np.eye(4), (len(poses), 4, 4)).copy()
-    T[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
-    T[:, :3, 3] = poses[:, :3]
-    return T
 
 
 def point_jacobians(hand: HandArrays, q: np.ndarray, body: np.ndarray, point: np.ndarray) -> np.ndarray:

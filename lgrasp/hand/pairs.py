@@ -7,7 +7,8 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
+from lgrasp.geometry.poses import device_matrix
+from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.overlap import OverlapSide, overlap_arrays, overlap_depth, overlap_sides
 from lgrasp.hand.self_collision import OVERLAP
@@ -135,7 +136,7 @@ def _true_overlap(
 
     def placed(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         poses = body_poses(hand, q).astype(float)
-        return pose_matrices(poses[:, bodies[0]]), pose_matrices(poses[:, bodies[1]])
+        return device_matrix(poses[:, bodies[0]]), device_matrix(poses[:, bodies[1]])
 
     sides = overlap_sides(bodies, (meshes[pair[0]], meshes[pair[1]]), placed(q), device)
     if not sides:

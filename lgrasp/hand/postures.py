@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lgrasp.geometry.poses import device_rotation
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
@@ -23,11 +24,9 @@ class Postures:
 
 def sample_bodies(model: HandModel, q: np.ndarray, device: str = "cpu") -> Postures:
     """Body poses at postures q (N, K) and what is clear there."""
-    from scipy.spatial.transform import Rotation
-
     start()
     poses = body_poses(upload_hand(model, device), q)
-    R = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix().reshape(*poses.shape[:2], 3, 3)
+    R = device_rotation(poses.reshape(-1, 7)).as_matrix().reshape(*poses.shape[:2], 3, 3)
     clear = np.ones((len(q), model.groups), bool)
     touching: np.ndarray = np.zeros(len(q), bool)
     if len(model.pairs):

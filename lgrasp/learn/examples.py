@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from lgrasp.dataset import pose_matrix
 from lgrasp.differentiable.kinematics import BodyKinematics
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.hand.model import HandModel
 from lgrasp.learn.params import LearnParams
 from lgrasp.object.model import ObjectModel

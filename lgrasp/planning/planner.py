@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from lgrasp.geometry.poses import device_inverse
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.hand.arrays import HandArrays
@@ -19,7 +20,7 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted
 from lgrasp.refine.check import OUTCOMES, check_grasps
 from lgrasp.refine.descent import Descent
-from lgrasp.refine.hands import Hands, inverse_poses
+from lgrasp.refine.hands import Hands
 from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface
 from lgrasp.refine.volume import upload_target
@@ -205,7 +206,7 @@ class Planner:
         return check_grasps(
             self.hand,
             self._scene.object,
-            inverse_poses(pose),
+            device_inverse(pose),
             q,
             bounds,
             palmar=self.palmar,

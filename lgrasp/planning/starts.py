@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lgrasp.geometry.poses import device_pose, shortest_rotation
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.palm import palm_axis
 
@@ -16,7 +17,7 @@ GOLDEN_ANGLE = float(np.pi * (3 - np.sqrt(5)))
 def start_poses(
     model: HandModel, points: np.ndarray, normals: np.ndarray, turn: np.ndarray, stand_off: float
 ) -> np.ndarray:
-    """Bases of hands in the frame of the points, x y z [m] qx qy qz qw, (N, 7).
+    """Bases of hands in the frame of the points, device poses (N, 7).
 
     The palm faces along minus the normal, the line from its centre meets the point, and the base stands ``stand_off``
     from it along that line.
@@ -26,19 +27,12 @@ def start_poses(
     """
     centre, facing = palm_axis(model)
     roll = Rotation.from_rotvec(turn[:, None] * np.array([0, 0, 1.0]))
-    R = _towards(-normals) * roll * _towards(facing[None]).inv()
+    R = shortest_rotation(-normals) * roll * shortest_rotation(facing[None]).inv()
     lateral = centre - (centre @ facing) * facing
-    return np.concatenate([points + stand_off * normals - R.apply(lateral), R.as_quat()], 1)
+    return device_pose(points + stand_off * normals - R.apply(lateral), R)
 
 
 def tilted(normals: np.ndarray, angle: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
     """Unit vectors (N, 3) turned away by angle (N,) [rad], towards the side at azimuth (N,) [rad]."""
     side = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], 1)
-    return _towards(normals).apply(side)
-
-
-def _towards(z: np.ndarray) -> Rotation:
-    """The shortest rotations that turn the third axis to unit vectors z (N, 3)."""
-    q = np.stack([-z[:, 1], z[:, 0], np.zeros(len(z)), 1 + z[:, 2]], 1)
-    q[q[:, 3] < 1e-9] = [1.0, 0, 0, 0]
-    return Rotation.from_quat(q)
+    return shortest_rotation(normals).apply(side)

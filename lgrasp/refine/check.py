@@ -40,7 +40,7 @@ def check_grasps(
     """All rows as a table in the order given, and their outcomes (OUTCOMES), (N,).
 
     Args:
-        pose: T_hand_object of the object's internal frame, x y z [m] qx qy qz qw, (N, 7).
+        pose: T_hand_object of the object's internal frame, device poses (N, 7).
         q: joint positions within their limits [rad or m], (N, K).
         palmar: where the hand may touch; default: where hand.yaml lets it.
         around: what else the hand must not penetrate, in the object's internal frame.

@@ -5,7 +5,8 @@ import warp as wp
 
 from lgrasp.differentiable.solids import hand_solids
 from lgrasp.errors import HandError
-from lgrasp.hand.arrays import HandArrays, body_poses, pose_matrices
+from lgrasp.geometry.poses import device_matrix
+from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.hand.palm import palm_axis
 from lgrasp.refine.descent_kernels import advance, descend, penetration
 from lgrasp.refine.energy_gradient import MAX_COLUMNS, Search
@@ -189,7 +190,7 @@ class Descent:
 
 def _middle(hand: HandArrays, surface: HandSurface) -> np.ndarray:
     """Middle of the palmar points of the open hand, base frame [m], (3,)."""
-    T = pose_matrices(body_poses(hand, hand.model.tree.joint_open[None])[0])[surface.body]
+    T = device_matrix(body_poses(hand, hand.model.tree.joint_open[None])[0])[surface.body]
     x = np.einsum("lij,lpj->lpi", T[:, :3, :3], surface.points) + T[:, None, :3, 3]
     return x[surface.weight > 0].mean(0)
 

@@ -17,18 +17,10 @@ class Hands:
 
     @classmethod
     def put(cls, pose: np.ndarray, q: np.ndarray, device: str) -> "Hands":
-        """Of x y z [m] qx qy qz qw (N, 7), and joint positions (N, K)."""
+        """Of device poses (N, 7), and joint positions (N, K)."""
         poses = wp.array(np.ascontiguousarray(pose, np.float32), dtype=wp.transform, device=device)
         return cls(poses, wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=device))
 
     def numpy(self) -> tuple[np.ndarray, np.ndarray]:
         """Base (N, 7) and joint positions (N, K)."""
         return self.pose.numpy().reshape(-1, 7), self.q.numpy()
-
-
-def inverse_poses(pose: np.ndarray) -> np.ndarray:
-    """Inverses of poses x y z [m] qx qy qz qw, (N, 7)."""
-    from scipy.spatial.transform import Rotation
-
-    back = Rotation.from_quat(pose[:, 3:]).inv()
-    return np.concatenate([-back.apply(pose[:, :3]), back.as_quat()], 1).astype(np.float32)

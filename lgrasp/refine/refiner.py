@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from lgrasp.differentiable.kinematics import BodyKinematics
-from lgrasp.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
+from lgrasp.geometry.rotations import inverse_motion, motion_from_pose, pose_from_motion, so3_exp
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.model import HandModel
@@ -139,12 +139,12 @@ class Refiner(nn.Module):
         return self._descent
 
     def _put(self, pose: Pose) -> Hands:
-        base = torch.cat([pose.t, quaternion_from_matrix(pose.R)], 1)
+        base = pose_from_motion(pose.R, pose.t)
         return Hands.put(base.cpu().numpy(), pose.q.cpu().numpy(), self._fast().device)
 
     def _taken(self, at: Hands, dtype: torch.dtype) -> Pose:
         base, q = (torch.as_tensor(x, dtype=dtype, device=self._device) for x in at.numpy())
-        return Pose(matrix_from_quaternion(base[:, 3:]), base[:, :3], q)
+        return Pose(*motion_from_pose(base), q)
 
     def unrolled(
         self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, steps: int = 5, matches: Matches | None = None
@@ -247,14 +247,11 @@ class Refiner(nn.Module):
 
 
 def object_pose(pose: Pose) -> np.ndarray:
-    """T_hand_object of the object's internal frame, x y z [m] qx qy qz qw, (N, 7), of hands in that frame."""
-    R = pose.R.mT
-    t = -(R @ pose.t[..., None])[..., 0]
-    return torch.cat([t, quaternion_from_matrix(R)], 1).cpu().numpy()
+    """T_hand_object of the object's internal frame, device poses (N, 7), of hands in that frame."""
+    return pose_from_motion(*inverse_motion(pose.R, pose.t)).cpu().numpy()
 
 
 def table_pose(table: GraspTable, device: str) -> Pose:
     """Hands of grasps in the object's internal frame: inverse of :func:`object_pose`."""
-    pose = torch.as_tensor(table.pose, device=device)
-    R = matrix_from_quaternion(pose[:, 3:]).mT
-    return Pose(R, -(R @ pose[:, :3, None])[..., 0], torch.as_tensor(table.q, device=device))
+    motion = motion_from_pose(torch.as_tensor(table.pose, device=device))
+    return Pose(*inverse_motion(*motion), torch.as_tensor(table.q, device=device))

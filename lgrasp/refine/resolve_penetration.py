@@ -3,8 +3,8 @@
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from lgrasp.geometry.poses import device_rotation
 from lgrasp.hand.tree import Tree
 from lgrasp.refine.hands import Hands
 
@@ -62,7 +62,7 @@ def resolve_penetration(search: Depths, tree: Tree, back: np.ndarray, at: Hands,
             attempt(number * _STEP * _WAYS[None], np.zeros(len(_WAYS)))
     for number in range(int(_FARTHER * most / _BACK + 1e-9) + 1):
         if len(left):
-            away = Rotation.from_quat(given[left, 3:]).apply(back)
+            away = device_rotation(given[left]).apply(back)
             attempt(number * _BACK * away[:, None].repeat(len(_OPENINGS), 1), _OPENINGS)
     at.pose.assign(pose)
     at.q.assign(q)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lgrasp.geometry.poses import canonical
+from lgrasp.geometry.poses import pose_from_matrix
 from lgrasp.scenes.params import CameraParams
 
 
@@ -48,14 +48,14 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     Returns:
         x y z [m] qw qx qy qz, shape (v, 7).
     """
-    from scipy.spatial.transform import Rotation
-
     forward = target - eye
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    R = np.stack([right, np.cross(forward, right), forward], axis=-1)
-    return np.hstack([eye, canonical(Rotation.from_matrix(R).as_quat(scalar_first=True))])
+    T = np.zeros((len(eye), 4, 4))
+    T[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
+    T[:, :3, 3] = eye
+    return pose_from_matrix(T)
 
 
 def place_cameras(params: CameraParams, rng: np.random.Generator) -> np.ndarray:

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset import pose_matrix
 from lgrasp.errors import PhysicsError
-from lgrasp.geometry.poses import canonical
+from lgrasp.geometry.poses import canonical, pose_matrix
 from lgrasp.scenes.params import DropParams
 from lgrasp.simulate.assemble import add_hull
 from lgrasp.simulate.model import import_mujoco

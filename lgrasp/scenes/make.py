@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lgrasp.dataset import HandRecord, ObjectRecord, pose_matrix
+from lgrasp.dataset import HandRecord, ObjectRecord
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.scenes.camera import intrinsics_of, place_cameras

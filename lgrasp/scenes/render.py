@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.dataset import pose_matrix
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.runtime.device import start
 from lgrasp.scenes import render_kernels as kernels
 from lgrasp.scenes.camera import Intrinsics

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lgrasp.dataset import pose_matrix
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.render import Images, image_normals
 from lgrasp.scenes.schema import DEPTH_UNIT

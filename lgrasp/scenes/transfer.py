@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.geometry.poses import compose, inverse
+from lgrasp.geometry.poses import compose, device_from_stored, inverse
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.scenes import collision_kernels as kernels
@@ -67,15 +67,10 @@ def find_collisions(
             hand.struct,
             wp.array([o.struct for o in objects], dtype=Object),
             own,
-            wp.array(_warp_order(inward), dtype=wp.transform),
-            wp.array(_warp_order(np.concatenate([hand_pose, hand_pose])), dtype=wp.transform),
+            wp.array(device_from_stored(inward), dtype=wp.transform),
+            wp.array(device_from_stored(np.concatenate([hand_pose, hand_pose])), dtype=wp.transform),
             wp.array(body, dtype=wp.transform),
             limit,
         ]
         wp.launch(kernels.hand_depths, body.shape[:2], inputs, [table, obstacle])
         return Collisions(table.numpy().reshape(2, n).T.copy(), obstacle.numpy().reshape(2, n).T.copy())
-
-
-def _warp_order(pose: np.ndarray) -> np.ndarray:
-    """x y z qx qy qz qw, shape (n, 7), f32."""
-    return np.ascontiguousarray(np.asarray(pose)[:, [0, 1, 2, 4, 5, 6, 3]], np.float32)

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lgrasp.dataset import ShardReader, iter_grasps, pose_matrix, read_shard, validate_shard, write_shard
+from lgrasp.dataset import ShardReader, iter_grasps, read_shard, validate_shard, write_shard
 from lgrasp.errors import ShardError
+from lgrasp.geometry.poses import pose_matrix
 
 
 @settings(max_examples=15, deadline=None)

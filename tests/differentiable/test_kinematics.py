@@ -9,7 +9,8 @@ from support.hands import HANDS, LOCKED, hand_model, hand_source, minimal_spec
 from support.kinematics import link_poses
 
 from lgrasp.differentiable.kinematics import BodyKinematics
-from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
+from lgrasp.geometry.poses import device_matrix
+from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.model import HandModel
 
@@ -57,7 +58,7 @@ def test_poses_equal_those_of_the_kernels_and_of_pytorch_kinematics(name):
     model = hand_model(name)
     q = postures(model, 5)
     ours = matrices(BodyKinematics(model.tree, dtype=torch.float64), q)
-    warp = pose_matrices(body_poses(upload_hand(model, "cpu"), q).astype(float).reshape(-1, 7))
+    warp = device_matrix(body_poses(upload_hand(model, "cpu"), q).astype(float).reshape(-1, 7))
     np.testing.assert_allclose(ours[:, :, :3], warp.reshape(ours.shape)[:, :, :3], atol=5e-6)
     chain = pk.build_chain_from_urdf(hand_source(name)[0].read_bytes()).to(dtype=torch.float64)
     couplings = mimics(name)

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lgrasp.engine.batch import run_stages
+from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.tables import (
     candidate_arrays,
     candidate_table,
@@ -16,7 +17,6 @@ from lgrasp.grasp.tables import (
     set_arrays,
     set_table,
     take_grasps,
-    user_poses,
 )
 
 

@@ -10,8 +10,9 @@ from lgrasp.engine.batch import run_batch
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.registry import STAGES
 from lgrasp.engine.shard import Execution, make_shard
+from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import near_pairs
-from lgrasp.grasp.tables import grasp_arrays, user_poses
+from lgrasp.grasp.tables import grasp_arrays
 from lgrasp.jobs.generate import generate
 
 

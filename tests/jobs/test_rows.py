@@ -5,8 +5,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset import pose_matrix, read_shard, validate_shard
+from lgrasp.dataset import read_shard, validate_shard
 from lgrasp.engine.shard import Execution, make_shard
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.judge.run import judge
 from lgrasp.object.find import find_object
 

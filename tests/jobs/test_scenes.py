@@ -8,9 +8,10 @@ import pytest
 import trimesh
 
 from lgrasp.cloud.read import read_cloud
-from lgrasp.dataset import pose_matrix, read_shard
+from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import CloudError, ConfigError, LgraspError, OutputError, ShardError
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.jobs.scenes.config import SceneConfig, load_scene_config, scene_configs
 from lgrasp.jobs.scenes.job import SceneJob, SceneListener, SceneOutcome, make_scenes
 from lgrasp.jobs.scenes.report import describe_scenes

@@ -6,9 +6,10 @@ import torch
 
 from lgrasp.cloud.model import cloud_object
 from lgrasp.errors import HandError
+from lgrasp.geometry.poses import device_inverse
 from lgrasp.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
 from lgrasp.refine.descent import Descent
-from lgrasp.refine.hands import Hands, inverse_poses
+from lgrasp.refine.hands import Hands
 from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.refiner import Pose, Refiner
 from lgrasp.refine.surface import hand_surface
@@ -113,9 +114,9 @@ def test_energy_falls_as_with_steps_in_torch(inputs, valid, coarse):
     assert float(after.median()) < 1.2 * float(energy().detach().median())
 
 
-def test_inverse_poses():
+def test_device_inverse():
     pose = np.concatenate([np.random.default_rng(0).normal(size=(5, 3)), np.eye(4)[[0, 1, 2, 3, 3]]], 1)
-    np.testing.assert_allclose(inverse_poses(inverse_poses(pose))[:, :3], pose[:, :3], atol=1e-6)
+    np.testing.assert_allclose(device_inverse(device_inverse(pose))[:, :3], pose[:, :3], atol=1e-6)
 
 
 def test_joints_too_many_are_refused(inputs, monkeypatch):

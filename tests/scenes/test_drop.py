@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from lgrasp.dataset import pose_matrix
 from lgrasp.errors import PhysicsError
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.scenes.drop import drop
 from lgrasp.scenes.params import DropParams
 from lgrasp.simulate.solid import Solid

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from lgrasp.dataset import pose_matrix
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.runtime.device import start
 from lgrasp.scenes.camera import Intrinsics, intrinsics_of, look_at, place_cameras
 from lgrasp.scenes.params import CameraParams

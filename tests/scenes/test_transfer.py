@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from lgrasp.dataset import pose_matrix
 from lgrasp.engine.inputs import Inputs
-from lgrasp.hand.arrays import body_poses, pose_matrices
+from lgrasp.geometry.poses import device_matrix, pose_matrix
+from lgrasp.hand.arrays import body_poses
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
@@ -55,7 +55,7 @@ def test_depth_in_the_table_is_that_of_the_lowest_point(inputs: Inputs, ball):
     for column, posture in enumerate((before, q)):
         T = body_poses(hand, posture)
         for row in range(30):
-            at = pose_matrix(pose[row]) @ pose_matrices(T[row])
+            at = pose_matrix(pose[row]) @ device_matrix(T[row])
             points = np.einsum("vab,vb->va", at[body, :3, :3], model.vertices) + at[body, :3, 3]
             expected = max(0.0, -float((points[:, 2] - radius).min()))
             np.testing.assert_allclose(found.table[row, column], expected, atol=2e-6)
@@ -70,7 +70,7 @@ def test_depth_in_other_objects(inputs: Inputs, ball):
     where = random_poses(rng, n, 0.2)
     where[:, 2] += 1.0
     samples = np.repeat(np.arange(len(model.cluster_first) - 1), np.diff(model.cluster_first) * 32)
-    T = pose_matrix(pose[0]) @ pose_matrices(body_poses(hand, q[:1])[0])
+    T = pose_matrix(pose[0]) @ device_matrix(body_poses(hand, q[:1])[0])
     surface = np.einsum("vab,vb->va", T[samples, :3, :3], model.samples) + T[samples, :3, 3]
     hits = misses = 0
     for row in range(n):

@@ -8,7 +8,8 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
+from lgrasp.geometry.poses import device_matrix
+from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.opposition.spaces import hand_spaces, space_view
@@ -106,7 +107,7 @@ def test_joints_that_may_not_move_stay_bit_by_bit(case, first):
 
 
 def test_indices_name_points_of_the_two_sides_and_the_nearest_of_the_object(case, first):
-    T_body = pose_matrices(body_poses(upload_hand(case.hand, "cpu"), first.q).astype(float).reshape(-1, 7))
+    T_body = device_matrix(body_poses(upload_hand(case.hand, "cpu"), first.q).astype(float).reshape(-1, 7))
     T_body = T_body.reshape(len(first.q), -1, 4, 4)
     surface = case.objects[0].contact_points
     for row, space in enumerate(np.arange(6) % 2):
@@ -124,7 +125,7 @@ def test_indices_name_points_of_the_two_sides_and_the_nearest_of_the_object(case
 
 def test_distances_are_those_of_the_contact_points(case, first):
     """dis from the pose, the posture and the indices alone, on a true ball."""
-    T_body = pose_matrices(body_poses(upload_hand(case.hand, "cpu"), first.q).astype(float).reshape(-1, 7))
+    T_body = device_matrix(body_poses(upload_hand(case.hand, "cpu"), first.q).astype(float).reshape(-1, 7))
     T_body = T_body.reshape(len(first.q), -1, 4, 4)
     for row, space in enumerate(np.arange(6) % 2):
         view = case.views[space]
@@ -154,7 +155,7 @@ def test_touching_points_are_among_the_best_pairs(case):
     assert len(touching)
     view, (first, second) = case.views[1], case.spaces[1].groups
     ball = case.objects[0]
-    T_body = pose_matrices(body_poses(upload_hand(case.hand, "cpu"), result.q).astype(float).reshape(-1, 7))
+    T_body = device_matrix(body_poses(upload_hand(case.hand, "cpu"), result.q).astype(float).reshape(-1, 7))
     T_body = T_body.reshape(len(result.q), -1, 4, 4)
     radius = np.linalg.norm(ball.obstacle_points - ball.com, axis=1).max()
     for row in touching:

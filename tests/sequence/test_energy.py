@@ -7,8 +7,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support.hands import hand_model
 
+from lgrasp.geometry.poses import device_matrix
 from lgrasp.geometry.rotations import se3_exp
-from lgrasp.hand.arrays import body_poses, pose_matrices, upload_hand
+from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
@@ -124,7 +125,7 @@ def test_torque_is_taken_about_the_centre_of_mass():
 
 def test_contact_points_ride_on_their_bodies(energy):
     rows, model = Rows(8, 1), hand_model("shipped")
-    T = pose_matrices(body_poses(upload_hand(model, "cpu"), rows.q.numpy()).astype(float).reshape(-1, 7))
+    T = device_matrix(body_poses(upload_hand(model, "cpu"), rows.q.numpy()).astype(float).reshape(-1, 7))
     T = T.reshape(8, -1, 4, 4)[np.arange(8)[:, None], rows.contacts.body.numpy()]
     p = np.einsum("nsij,nsj->nsi", T[..., :3, :3], rows.contacts.point.numpy()) + T[..., :3, 3]
     expected = np.einsum("nji,nsj->nsi", rows.R.numpy(), p - rows.t.numpy()[:, None])

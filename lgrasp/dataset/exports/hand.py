@@ -125,7 +125,7 @@ class HandFrames:
         return compose(inverse(object_pose), self.base_from_root(q))
 
     def object_in_base(self, root_pose: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """``T_base_object`` for root links in the objects' frames, both [n, 7]; q is [n, K]."""
+        """``T_hand_object`` for root links in the objects' frames, both [n, 7]; q is [n, K]."""
         return compose(self.base_from_root(q), inverse(root_pose))
 
     def all_joints(self, q: np.ndarray) -> dict[str, np.ndarray]:

@@ -26,7 +26,7 @@ class Coverage:
         """Count poses.
 
         Args:
-            T: T_base_object, shape [n, 4, 4].
+            T: T_hand_object, shape [n, 4, 4].
             middle: The object's middle in its own frame [m], shape [3].
 
         Returns:

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.reader import ShardReader, pose_matrix
+from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.report.coverage import Coverage
 from lgrasp.dataset.report.held import HeldRows, add_held
 from lgrasp.dataset.report.near import NearRows
 from lgrasp.dataset.report.physics import Verdicts, add_verdicts
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.sample import EvenSample
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 
 BLOCK_ROWS = 16_384

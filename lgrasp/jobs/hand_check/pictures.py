@@ -8,6 +8,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from lgrasp.engine.inputs import Inputs
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.records import Shard
 from lgrasp.hand.drafting.surface_visibility import Skin, link_skins
 from lgrasp.hand.geometry import thin_mesh
@@ -101,7 +102,7 @@ def draw_grasps(inputs: Inputs, samples: list[tuple[str, Shard, int]], path: Pat
         axes = figure.add_subplot(1, len(samples), i + 1, projection="3d")
         triangles, colours = _hand_triangles(inputs, shard.grasps.q[row], patches=True)
         obj = shard.objects[0]
-        pose = _matrix(shard.grasps.object_pose[row, 0])
+        pose = pose_matrix(shard.grasps.object_pose[row, 0])
         mesh = thin_mesh(trimesh.Trimesh(np.asarray(obj.vertices), np.asarray(obj.faces), process=False), _FACES)
         vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
         solid = vertices[mesh.faces]
@@ -145,15 +146,6 @@ def draw_spaces(inputs: Inputs, names: list[str], path: Path) -> Path:
         axes.set_title(name)
     figure.suptitle(f"{model.name}: opposition spaces, one side red, the other blue")
     return save_figure(figure, path)
-
-
-def _matrix(pose: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(pose[3:7], scalar_first=True).as_matrix()
-    T[:3, 3] = pose[:3]
-    return T
 
 
 def _hand_triangles(inputs: Inputs, q: np.ndarray, *, patches: bool) -> tuple[np.ndarray, np.ndarray]:

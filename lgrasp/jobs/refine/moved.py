@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from lgrasp.dataset import GraspRows, pose_matrix
+from lgrasp.dataset import GraspRows
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays, join_grasps

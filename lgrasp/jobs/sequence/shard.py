@@ -8,9 +8,9 @@ import numpy as np
 
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts, add_seconds
+from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.sequences import SequenceTable, join_sequences, take_sequences
-from lgrasp.grasp.tables import user_poses
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.jobs.sequence.round import Round, Verdicts, run_round
 

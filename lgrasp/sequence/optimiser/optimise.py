@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from lgrasp.geometry.rotations import (
-    matrix_from_quaternion,
     matrix_from_sixd,
-    quaternion_from_matrix,
+    motion_from_pose,
+    pose_from_motion,
     sixd_from_matrix,
 )
 from lgrasp.hand.model import HandModel
@@ -33,7 +33,7 @@ class Optimised:
     """Grasps of H rows, whether good or not."""
 
     pose: np.ndarray
-    """T_hand_object of the new object's internal frame: x y z [m], qx qy qz qw, (H, 7) f32."""
+    """T_hand_object of the new object's internal frame, device poses (H, 7) f32."""
     q: np.ndarray
     """Joints, those that may not move bit by bit as given, (H, K) f32."""
     hand_point: np.ndarray
@@ -70,7 +70,7 @@ def optimise(
         objects: n of them, the new one last.
         space: opposition space of each row, index in ``spaces``, (H,).
         q: posture to start from, (H, K) [rad or m]. free: joints that may move, (H, K) bool.
-        held: poses of the objects held, internal frames: x y z [m], qx qy qz qw, (H, n - 1, 7).
+        held: poses of the objects held, internal frames, device poses (H, n - 1, 7).
         seed: of each row, (H,) integers.
         rows: how many are worked on at once; no result on a CPU depends on it.
         progress: called with steps done and steps in all.
@@ -94,7 +94,7 @@ def optimise(
             energy,
             sides,
             torch.as_tensor(space[filled], dtype=torch.int64, device=device),
-            _frames(torch.as_tensor(held[filled], dtype=torch.float32, device=device)),
+            motion_from_pose(torch.as_tensor(held[filled], dtype=torch.float32, device=device)),
         )
 
         def told(step: int, before: int = number * params.iterations) -> None:
@@ -115,11 +115,6 @@ def optimise(
         parts.append([column[: len(block)].cpu().numpy() for column in columns])
     pose, joints, hand_point, object_point, energies = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Optimised(pose, np.where(free, joints, q).astype(np.float32), hand_point, object_point, energies)
-
-
-def _frames(pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """R (..., 3, 3) and t (..., 3) of poses (..., 7)."""
-    return matrix_from_quaternion(pose[..., 3:]), pose[..., :3]
 
 
 def _optimise_block(
@@ -154,7 +149,7 @@ def _optimise_block(
     surface = torch.as_tensor(objects[-1].contact_points, device=q.device)
     nearest = torch.cdist(at.reshape(-1, 3), surface).argmin(1).reshape(-1, 2)
     index = problem.sides.index(problem.space, chosen)
-    return [torch.cat([t, quaternion_from_matrix(R)], 1), q, index, nearest, terms]
+    return [pose_from_motion(R, t), q, index, nearest, terms]
 
 
 def _weights(params: OptimiserParams) -> np.ndarray:

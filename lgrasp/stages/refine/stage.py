@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from lgrasp.geometry.poses import device_inverse
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
 from lgrasp.refine.check import check_grasps, contact_width
 from lgrasp.refine.descent import Descent
-from lgrasp.refine.hands import Hands, inverse_poses
+from lgrasp.refine.hands import Hands
 from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.surface import hand_surface
 from lgrasp.refine.volume import upload_target
@@ -27,11 +28,11 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
     if len(inputs) == 0:
         return _widened(inputs, width), {"tried": 0, "passed": 0, "replaced": 0}
     tree = context.hand.model.tree
-    at = Hands.put(inverse_poses(inputs.pose), np.clip(inputs.q, tree.joint_lower, tree.joint_upper), context.device)
+    at = Hands.put(device_inverse(inputs.pose), np.clip(inputs.q, tree.joint_lower, tree.joint_upper), context.device)
     _descent(params, context).run(at)
     pose, q = at.numpy()
     table, outcome = check_grasps(
-        context.hand, context.object, inverse_poses(pose), q, context.bounds, index=inputs.index
+        context.hand, context.object, device_inverse(pose), q, context.bounds, index=inputs.index
     )
     passed = outcome == 0
     better = passed & (table.metrics["unresisted_load"] < inputs.metrics["unresisted_load"])

@@ -12,8 +12,8 @@ import yaml
 import yourdfpy
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset import pose_matrix
 from lgrasp.dataset.exports import FORMATS, export_shards, read_grasps
+from lgrasp.geometry.poses import pose_matrix
 
 SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp"]
 HANDS = ["allegro", "schunk_svh", "barrett", "shadow"]

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from lxml import etree
 
-from lgrasp.dataset import pose_matrix
 from lgrasp.dataset.exports import FORMATS, export_shards, read_grasps
 from lgrasp.dataset.exports.where import Condition, parse_condition
 from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
+from lgrasp.geometry.poses import pose_matrix
 
 SINGLE = [name for name, form in FORMATS.items() if form.single]
 

@@ -24,13 +24,13 @@ def test_counts_and_poor_poses(context, tables):
             np.testing.assert_array_equal(values, arrays[name])
 
 
-def test_fingers_touch_near_the_surface_point(context, tables, inputs, finger_posture, link_poses, pose_matrices):
+def test_fingers_touch_near_the_surface_point(context, tables, inputs, finger_posture, link_poses, device_matrix):
     """The seed posture puts its contact vector into the voxel of the surface point, along its normal."""
     table = run(tables.place, DomainParams(), context)[0]
     arrays, hand, obj, field = candidate_arrays(table), inputs.hand.model, inputs.object.model, inputs.field.model
     row, group, slot = np.nonzero(np.arange(arrays["q"].shape[2]) < arrays["count"][:, :, None])
     assert len(row) > 500
-    T = pose_matrices(arrays["poses.pose"])[row]
+    T = device_matrix(arrays["poses.pose"])[row]
     surface, record = arrays["surface"][row, group, slot], arrays["record"][row, group, slot]
     target = np.einsum("nij,nj->ni", T[:, :3, :3], obj.contact_points[surface]) + T[:, :3, 3]
     inward = -np.einsum("nij,nj->ni", T[:, :3, :3], obj.contact_normals[surface])

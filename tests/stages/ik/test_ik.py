@@ -11,12 +11,12 @@ from lgrasp.stages.ik.stage import run
 
 
 @pytest.fixture(scope="module")
-def realised(tables, inputs, finger_posture, link_poses, pose_matrices):
+def realised(tables, inputs, finger_posture, link_poses, device_matrix):
     """(postures' link poses, contact link, target and inward object normal in the base frame, row, group)."""
     arrays, hand, obj = candidate_arrays(tables.ik), inputs.hand.model, inputs.object.model
     row, group, slot = np.nonzero(arrays["state"] == 1)
     assert len(row) > 200
-    T = pose_matrices(arrays["poses.pose"])[row]
+    T = device_matrix(arrays["poses.pose"])[row]
     surface = arrays["surface"][row, group, slot]
     target = np.einsum("nij,nj->ni", T[:, :3, :3], obj.contact_points[surface]) + T[:, :3, 3]
     inward = -np.einsum("nij,nj->ni", T[:, :3, :3], obj.contact_normals[surface])

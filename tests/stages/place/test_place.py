@@ -30,7 +30,7 @@ def test_counts_and_order(context):
     np.testing.assert_allclose(np.linalg.norm(arrays["pose"][:, 3:], axis=1), 1.0, atol=1e-5)
 
 
-def test_palm_is_free(context, tables, solids, mesh, pose_matrices, inputs):
+def test_palm_is_free(context, tables, solids, mesh, device_matrix, inputs):
     """Dense points of the palm in the object and of the object in the palm's solids."""
     from lgrasp.judge.collision import JudgedObject, hand_in_object
 
@@ -38,7 +38,7 @@ def test_palm_is_free(context, tables, solids, mesh, pose_matrices, inputs):
     static = copy(solids)
     static.solids = [s for s in solids.solids if tree.link_body[s.link] == 0]
     assert static.solids
-    T = np.linalg.inv(pose_matrices(pose_arrays(tables.place)["pose"][:50]))[:, None]
+    T = np.linalg.inv(device_matrix(pose_arrays(tables.place)["pose"][:50]))[:, None]
     names = inputs.hand.model.tree.joint_names
     zero = solids.forward(solids.resolve_joints({n: np.zeros(1) for n in names}, 1), 1)
     depth = np.max(hand_in_object(static, JudgedObject(mesh), T @ zero), axis=0)

@@ -43,12 +43,12 @@ def test_other_rows_are_as_they_were(refined):
     assert (refined.after.contact_links[same, links:] == -1).all()
 
 
-def test_contacts_touch_the_links_they_name(refined, link_poses, link_distance, pose_matrices):
+def test_contacts_touch_the_links_they_name(refined, link_poses, link_distance, device_matrix):
     """An independent reader of the URDF finds every contact of a replaced row on its link."""
     after = refined.after
     rows, slots = np.nonzero((after.contact_links >= 0) & refined.changed[:, None])
     T_link = link_poses(after.q)
-    T_object = pose_matrices(after.pose.astype(float))
+    T_object = device_matrix(after.pose.astype(float))
     for row, slot in zip(rows, slots, strict=True):
         p = T_object[row] @ np.append(after.contact_points[row, slot], 1)
         link = int(after.contact_links[row, slot])

@@ -56,9 +56,9 @@ def test_chosen_candidates_are_realised(found):
             assert arrays["candidates.state"][p, g, c] == 1
 
 
-def test_residuals(found, inputs, pose_matrices):
+def test_residuals(found, inputs, device_matrix):
     arrays, _, params = found
-    T = pose_matrices(arrays["candidates.poses.pose"])
+    T = device_matrix(arrays["candidates.poses.pose"])
     for i in range(len(arrays["pose"])):
         arms, normals = contacts(arrays, inputs.object.model, i, T)
         exact = residual(arms, normals, 0.0, 0, BOUNDS.torque_scale)
@@ -70,9 +70,9 @@ def test_residuals(found, inputs, pose_matrices):
         )
 
 
-def test_every_contact_carries_its_share(found, inputs, pose_matrices):
+def test_every_contact_carries_its_share(found, inputs, device_matrix):
     arrays, _, params = found
-    T = pose_matrices(arrays["candidates.poses.pose"])
+    T = device_matrix(arrays["candidates.poses.pose"])
     for i in range(len(arrays["pose"])):
         arms, normals = contacts(arrays, inputs.object.model, i, T)
         W = wrenches(arms, cone_forces(normals, 0.0, 0), BOUNDS.torque_scale).T
@@ -129,12 +129,12 @@ def test_later_passes_draw_others(tables, context, swift):
     assert len(rows[1] - rows[0]) > 10
 
 
-def test_gswo_score(tables, context, swift, inputs, pose_matrices):
+def test_gswo_score(tables, context, swift, inputs, device_matrix):
     """With friction in the score more sets count as balanced; each still meets the bound."""
     params = swift.params("search").model_copy(update={"score": "gswo"})
     arrays = set_arrays(run(tables.ik, params, context)[0])
     assert len(arrays["pose"]) > 50
-    T = pose_matrices(arrays["candidates.poses.pose"])
+    T = device_matrix(arrays["candidates.poses.pose"])
     for i in range(0, len(arrays["pose"]), 3):
         arms, normals = contacts(arrays, inputs.object.model, i, T)
         assert (
