@@ -1,4 +1,4 @@
-"""A ContactField on a device and its query: is there a contact vector at this point along this normal, and which?"""
+"""A ContactField on a device, and what kernels ask of it: is there a contact vector here along this normal?"""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.math.kinematics import Kinematics, vec_dof
 from lgrasp.math.transforms import decode_normal, normal_bin
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import filled
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -61,26 +62,8 @@ class FieldArrays:
 
 def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArrays:
     """Copy the field of a hand to a device; trees are built when the field has boxes."""
-
-    def put(a: np.ndarray, dtype) -> wp.array:
-        return wp.array(np.ascontiguousarray(a), dtype=dtype, device=device)
-
-    field = Field()
-    field.cell = model.cell
-    field.inv_cell = 1.0 / model.cell
-    field.origin = put(model.origin, wp.vec3)
-    field.shape = put(model.shape, wp.vec3i)
-    field.cell_first = put(model.cell_first, wp.int32)
-    field.start = put(model.start, wp.int32)
-    field.mask = put(model.mask, wp.uint64)
-    field.point = put(model.point, wp.int32)
-    field.offset = put(model.offset, wp.int32)
-    field.normal = put(model.normal, wp.uint16)
-    field.posture = put(model.posture, wp.uint8)
-    field.pair_point = put(model.pair_point, wp.vec3)
-    field.pair_normal = put(model.pair_normal, wp.vec3)
-    field.pair_slot = put(model.pair_slot, wp.vec2i)
-    field.pair_width = put(model.pair_width, wp.float32)
+    same = {name: getattr(model, name) for name in Field.vars if name != "inv_cell"}
+    field = filled(Field, same, device=device, inv_cell=1.0 / model.cell)
     if len(model.box) == 0:
         return FieldArrays(model, device, field)
     trees, ids = [], []
@@ -88,16 +71,17 @@ def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArra
         if a == b:
             ids.append(0)
             continue
-        trees.append(wp.Bvh(put(model.box[a:b], wp.vec3), put(model.box[a:b] + np.float32(model.box_edge), wp.vec3)))
+        ends = (model.box[a:b], model.box[a:b] + np.float32(model.box_edge))
+        trees.append(wp.Bvh(*(wp.array(end, dtype=wp.vec3, device=device) for end in ends)))
         ids.append(trees[-1].id)
-    boxes = Boxes()
     settings = np.arange(len(hand.tree.settings))[:, None] * hand.patches
-    slot_first = np.append(settings + hand.patch_first[:-2], len(settings) * hand.patches)
-    boxes.slot_first = put(slot_first, wp.int32)
-    boxes.tree = put(np.array(ids, np.uint64), wp.uint64)
-    boxes.patch_first = put(model.patch_first, wp.int32)
-    boxes.leaf_first = put(model.leaf_first, wp.int32)
-    boxes.leaf_record = put(model.leaf_record, wp.int32)
+    boxes = filled(
+        Boxes,
+        {name: getattr(model, name) for name in ("patch_first", "leaf_first", "leaf_record")},
+        device=device,
+        slot_first=np.append(settings + hand.patch_first[:-2], len(settings) * hand.patches),
+        tree=np.array(ids, np.uint64),
+    )
     return FieldArrays(model, device, field, boxes, tuple(trees))
 
 
@@ -206,76 +190,3 @@ def field_seed(f: Field, h: Kinematics, slot: wp.int32, record: wp.int32):
         low = h.dof_lower[first + d]
         q[d] = low + (h.dof_upper[first + d] - low) * float(int(f.posture[record, d])) / 255.0
     return q
-
-
-@wp.kernel
-def _query_voxels(
-    f: Field,
-    seed: wp.int32,
-    cosine: wp.float32,
-    slot: wp.array(dtype=wp.int32),
-    point: wp.array(dtype=wp.vec3),
-    normal: wp.array(dtype=wp.vec3),
-    record_out: wp.array(dtype=wp.int32),
-):
-    i = wp.tid()
-    record_out[i] = -1
-    row = field_has(f, slot[i], point[i], normal[i])
-    if row >= 0:
-        pick = field_pick(f, slot[i], row, point[i], normal[i], wp.rand_init(seed, i))
-        if float(pick[1]) * 0.0001 >= cosine:
-            record_out[i] = pick[0]
-
-
-@wp.kernel
-def _query_boxes(
-    b: Boxes,
-    f: Field,
-    seed: wp.int32,
-    cosine: wp.float32,
-    slot: wp.array(dtype=wp.int32),
-    point: wp.array(dtype=wp.vec3),
-    normal: wp.array(dtype=wp.vec3),
-    record_out: wp.array(dtype=wp.int32),
-):
-    i = wp.tid()
-    record_out[i] = boxes_pick(b, f, slot[i], point[i], normal[i], cosine, wp.rand_init(seed, i))
-
-
-def query_field(
-    field: FieldArrays,
-    slot: np.ndarray,
-    point: np.ndarray,
-    normal: np.ndarray,
-    *,
-    angle: float,
-    index: str = "voxel",
-    seed: int = 0,
-) -> np.ndarray:
-    """Which contact vector of its slot meets each query? One interface for both indices.
-
-    Args:
-        slot: (N,), ``setting * groups + group``; the group itself for a hand without shared joints.
-        point: base frame [m], (N, 3). normal: unit hand normal wanted, (N, 3).
-        angle: largest angle between wanted and found normal [rad].
-        index: ``voxel``, or ``bvh`` for a field that was built with it.
-
-    Returns:
-        Row of the field, -1 where none, (N,) i32.
-    """
-    d = field.device
-    out = wp.empty(len(point), dtype=wp.int32, device=d)
-    queries = [
-        seed,
-        float(np.cos(angle)),
-        wp.array(np.asarray(slot, np.int32), dtype=wp.int32, device=d),
-        wp.array(np.asarray(point, np.float32), dtype=wp.vec3, device=d),
-        wp.array(np.asarray(normal, np.float32), dtype=wp.vec3, device=d),
-    ]
-    if index == "bvh":
-        if field.boxes is None:
-            raise ValueError("the field has no boxes; build it with index 'bvh'")
-        wp.launch(_query_boxes, len(point), [field.boxes, field.struct, *queries], [out], device=d)
-    else:
-        wp.launch(_query_voxels, len(point), [field.struct, *queries], [out], device=d)
-    return out.numpy()

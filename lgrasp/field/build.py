@@ -7,7 +7,7 @@ import warp as wp
 
 from lgrasp.errors import HandError
 from lgrasp.field.boxes import box_index
-from lgrasp.field.kernels import contact_vectors, sample_postures
+from lgrasp.field.kernels import Vectors, contact_vectors, sample_postures
 from lgrasp.field.model import ContactField
 from lgrasp.field.opposed import opposed_pairs
 from lgrasp.field.params import FieldParams
@@ -138,19 +138,17 @@ def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, 
     good = np.flatnonzero(clear.numpy())
     count = min(records, room) if len(good) else 0
     chosen = np.resize(np.repeat(good, _PER_POSTURE), count).astype(np.int32)
-    kinds = (wp.int32, wp.vec3, wp.int32, wp.int32, wp.vec3)
-    out = [wp.empty(count, dtype=t, device=device) for t in kinds]
+    kinds = {"point": wp.int32, "position": wp.vec3, "bin": wp.int32, "normal": wp.int32, "direction": wp.vec3}
+    columns = {name: wp.empty(count, dtype=kind, device=device) for name, kind in kinds.items()}
+    vectors = Vectors()
+    for name, column in columns.items():
+        setattr(vectors, name, column)
     indices = wp.array(chosen, dtype=wp.int32, device=device)
     if count:
         inputs = [hand.struct, group, setting, seed + 500_009, posture, indices]
-        wp.launch(contact_vectors, count, inputs, out, device=device)
-    point, position, bins, normal, direction = (a.numpy() for a in out)
+        wp.launch(contact_vectors, count, inputs, [vectors], device=device)
     return {
-        "point": point,
-        "position": position.reshape(-1, 3),
-        "bin": bins,
-        "normal": normal,
-        "direction": direction.reshape(-1, 3),
+        **{name: column.numpy() for name, column in columns.items()},
         "posture": posture.numpy()[chosen],
         "clear": np.asarray(len(good) / postures, np.float32),
     }

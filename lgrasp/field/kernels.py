@@ -11,6 +11,17 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 wp.set_module_options(KERNEL_OPTIONS)
 
 
+@wp.struct
+class Vectors:
+    """Contact vectors, one a row."""
+
+    point: wp.array(dtype=wp.int32)  # contact point, (N,)
+    position: wp.array(dtype=wp.vec3)  # of it [m], base frame, (N,)
+    bin: wp.array(dtype=wp.int32)  # of the normal, (N,)
+    normal: wp.array(dtype=wp.int32)  # packed, (N,)
+    direction: wp.array(dtype=wp.vec3)  # the normal as it is, (N,)
+
+
 @wp.func
 def _shared_values(hand: Hand, group: wp.int32, setting: wp.int32):
     """The group's dofs with the shared joints at their values, its own at 0."""
@@ -28,10 +39,15 @@ def sample_postures(
     setting: wp.int32,
     seed: wp.int32,
     margin: wp.float32,
+    # out
     posture_out: wp.array2d(dtype=wp.uint8),
     clear_out: wp.array(dtype=wp.int32),
 ):
-    """Uniform postures of one group, 8 bits a joint, and whether it is clear of the static base and of itself."""
+    """Uniform postures of one group, and whether it keeps ``margin`` [m] to the static base and to itself.
+
+    Args:
+        posture_out: (N, D), 8 bits a joint over its range. clear_out: (N,), 1 where it does.
+    """
     i = wp.tid()
     state = wp.rand_init(seed, i)
     first = hand.kin.dof_first[group]
@@ -60,13 +76,15 @@ def contact_vectors(
     seed: wp.int32,
     posture: wp.array2d(dtype=wp.uint8),
     chosen: wp.array(dtype=wp.int32),
-    point_out: wp.array(dtype=wp.int32),
-    position_out: wp.array(dtype=wp.vec3),
-    bin_out: wp.array(dtype=wp.int32),
-    normal_out: wp.array(dtype=wp.int32),
-    direction_out: wp.array(dtype=wp.vec3),
+    # out
+    vectors_out: Vectors,
 ):
-    """Contact vector of a random contact point at each chosen posture (CF, Def. 4.1)."""
+    """Contact vector of a random contact point at each chosen posture (CF, Def. 4.1).
+
+    Args:
+        posture: (N, D), as :func:`sample_postures` draws them. chosen: rows of it, (M,).
+        vectors_out: M rows.
+    """
     i = wp.tid()
     state = wp.rand_init(seed, i)
     first = hand.kin.dof_first[group]
@@ -82,8 +100,8 @@ def contact_vectors(
     )
     T = X[hand.contacts.body[c] - 1 - j0]
     n = wp.transform_vector(T, hand.contacts.normals[c])
-    point_out[i] = c
-    position_out[i] = wp.transform_point(T, hand.contacts.points[c])
-    bin_out[i] = normal_bin(n)
-    normal_out[i] = encode_normal(n)
-    direction_out[i] = n
+    vectors_out.point[i] = c
+    vectors_out.position[i] = wp.transform_point(T, hand.contacts.points[c])
+    vectors_out.bin[i] = normal_bin(n)
+    vectors_out.normal[i] = encode_normal(n)
+    vectors_out.direction[i] = n

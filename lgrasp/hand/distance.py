@@ -4,25 +4,8 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from lgrasp.runtime.device import KERNEL_OPTIONS, start
-
-wp.set_module_options(KERNEL_OPTIONS)
-
-
-@wp.kernel
-def _mesh_distance(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), distance_out: wp.array(dtype=wp.float32)):
-    i = wp.tid()
-    q = wp.mesh_query_point_sign_normal(mesh, points[i], 1.0)
-    p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
-    distance_out[i] = q.sign * wp.length(points[i] - p)
-
-
-@wp.kernel
-def _winding_distance(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), distance_out: wp.array(dtype=wp.float32)):
-    i = wp.tid()
-    q = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0)
-    p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
-    distance_out[i] = q.sign * wp.length(points[i] - p)
+from lgrasp.hand.mesh_kernels import mesh_distance, winding_distance
+from lgrasp.runtime.device import start
 
 
 def signed_distance(
@@ -41,6 +24,6 @@ def signed_distance(
     )
     out = wp.empty(len(points), dtype=wp.float32, device=device)
     queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
-    kernel = _winding_distance if winding else _mesh_distance
+    kernel = winding_distance if winding else mesh_distance
     wp.launch(kernel, dim=len(points), inputs=[handle.id, queries], outputs=[out], device=device)
     return out.numpy()

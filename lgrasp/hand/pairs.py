@@ -11,33 +11,15 @@ from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.overlap import OverlapSide, overlap_arrays, overlap_depth, overlap_sides
+from lgrasp.hand.pair_kernels import mark_touching
 from lgrasp.hand.self_collision import OVERLAP
-from lgrasp.math.convex import Pieces, pieces_clear
-from lgrasp.runtime.device import KERNEL_OPTIONS, start
-
-wp.set_module_options(KERNEL_OPTIONS)
+from lgrasp.runtime.device import start
 
 _POSTURES = 256
 _EVERY = 2000  # postures in which a pair must touch to count as touching always
 _NEARLY = 0.95  # of all postures
 _HOPELESS = 0.98
 _TOUCH = 5.0e-5  # [m] that distance grids may err
-
-
-@wp.kernel
-def _pieces_touch(
-    pieces: Pieces,
-    pose: wp.array2d(dtype=wp.transform),
-    pairs: wp.array(dtype=wp.vec2i),
-    margin: wp.float32,
-    touch_out: wp.array2d(dtype=wp.int32),
-):
-    row, k = wp.tid()
-    i = pairs[k][0]
-    j = pairs[k][1]
-    T = wp.transform_inverse(pose[row, pieces.body[i]]) * pose[row, pieces.body[j]]
-    if not pieces_clear(pieces, i, j, T, margin):
-        touch_out[row, k] = 1
 
 
 def pieces_touch(
@@ -54,7 +36,7 @@ def pieces_touch(
         wp.array(np.asarray(pairs, np.int32), dtype=wp.vec2i, device=device),
         float(margin),
     ]
-    wp.launch(_pieces_touch, dim=(len(q), len(pairs)), inputs=inputs, outputs=[out], device=device)
+    wp.launch(mark_touching, dim=(len(q), len(pairs)), inputs=inputs, outputs=[out], device=device)
     return out.numpy().astype(bool)
 
 

@@ -82,3 +82,13 @@ def clamp_dofs(h: Kinematics, g: wp.int32, q: vec_dof):
     for d in range(h.dof_first[g + 1] - first):
         r[d] = wp.clamp(q[d], h.dof_lower[first + d], h.dof_upper[first + d])
     return r
+
+
+@wp.func
+def group_dofs(h: Kinematics, g: wp.int32, q: wp.array2d(dtype=wp.float32), row: wp.int32):
+    """The group's part of row ``row`` of q (N, K)."""
+    v = vec_dof()
+    first = h.dof_first[g]
+    for d in range(h.dof_first[g + 1] - first):
+        v[d] = q[row, h.dof_index[first + d]]
+    return v

@@ -8,6 +8,7 @@ import warp as wp
 from lgrasp.math.sdf import Sdf
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import filled
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -39,25 +40,27 @@ class ObjectArrays:
 
 def upload_object(model: ObjectModel, device: str) -> ObjectArrays:
     """Copy an object to a device."""
-
-    def put(a: np.ndarray, dtype) -> wp.array:
-        return wp.array(np.ascontiguousarray(a), dtype=dtype, device=device)
-
-    s = Sdf()
-    s.values = put(model.sdf.ravel(), wp.float32)
-    s.first = 0
-    s.nx, s.ny, s.nz = (int(n) for n in model.sdf.shape)
-    s.origin = wp.vec3(*map(float, model.sdf_origin))
-    s.inv_cell = 1.0 / float(model.sdf_cell)
-    obj = Object()
-    obj.sdf = s
-    obj.contact_points = put(model.contact_points, wp.vec3)
-    obj.contact_normals = put(model.contact_normals, wp.vec3)
-    obj.contact_opposite = put(model.contact_opposite, wp.int32)
-    obj.contacts = len(model.contact_points)
-    obj.obstacles = put(model.obstacle_points, wp.vec3)
-    obj.cluster_sphere = put(np.column_stack([model.cluster_center, model.cluster_radius]), wp.vec4)
-    obj.clusters = len(model.cluster_radius)
-    obj.com = wp.vec3(*map(float, model.com))
-    obj.radius = float(np.linalg.norm(model.obstacle_points - model.com, axis=1).max())
+    nx, ny, nz = map(int, model.sdf.shape)
+    sdf = filled(
+        Sdf,
+        device=device,
+        values=model.sdf.ravel(),
+        first=0,
+        nx=nx,
+        ny=ny,
+        nz=nz,
+        origin=model.sdf_origin,
+        inv_cell=1.0 / float(model.sdf_cell),
+    )
+    obj = filled(
+        Object,
+        {name: getattr(model, name) for name in ("contact_points", "contact_normals", "contact_opposite", "com")},
+        device=device,
+        sdf=sdf,
+        contacts=len(model.contact_points),
+        obstacles=model.obstacle_points,
+        cluster_sphere=np.column_stack([model.cluster_center, model.cluster_radius]),
+        clusters=len(model.cluster_radius),
+        radius=float(np.linalg.norm(model.obstacle_points - model.com, axis=1).max()),
+    )
     return ObjectArrays(model, device, obj)

@@ -4,9 +4,9 @@ import warp as wp
 
 from lgrasp.grasp.collision import body_apart, body_depth
 from lgrasp.grasp.control import press_contact, shift_contact
-from lgrasp.hand.arrays import Hand, group_dofs
+from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear, overlap_depth
-from lgrasp.math.kinematics import MAX_BODIES, MAX_JOINTS, group_forward, vec_dof
+from lgrasp.math.kinematics import MAX_BODIES, MAX_JOINTS, group_dofs, group_forward, vec_dof
 from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted
 from lgrasp.math.quality import epsilon_bound
 from lgrasp.math.sdf import sdf_gradient, sdf_value

@@ -5,8 +5,7 @@ Rows are hands; everything is frozen until it is matched anew (:mod:`lgrasp.refi
 
 import warp as wp
 
-from lgrasp.hand.arrays import group_dofs
-from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_forward
+from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_dofs, group_forward
 from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_part, sdf_value
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS

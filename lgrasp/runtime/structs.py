@@ -1,6 +1,10 @@
-"""Filling of Warp structs."""
+"""Warp structs: filled from objects with the same names, or copied to a device from NumPy arrays."""
 
+from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
+import warp as wp
 
 
 def make_struct(kind: Any, *sources: object, **values: Any) -> Any:
@@ -16,4 +20,21 @@ def make_struct(kind: Any, *sources: object, **values: Any) -> Any:
             source = next(source for source in sources if hasattr(source, name))
             values[name] = getattr(source, name)
         setattr(struct, name, values[name])
+    return struct
+
+
+def upload_struct(kind: Any, device: str, values: Mapping[str, Any]) -> Any:
+    """A Warp struct whose fields are copied to a device with the types that it declares.
+
+    Args:
+        values: by field: arrays for arrays, three numbers for a vec3, numbers, structs; fields left out are zero.
+    """
+    struct = kind()
+    for name, value in values.items():
+        declared = kind.vars[name].type
+        if isinstance(declared, wp.array):
+            value = wp.array(np.ascontiguousarray(value), dtype=declared.dtype, device=device)
+        elif wp.types.type_is_vector(declared):
+            value = declared(*map(float, value))
+        setattr(struct, name, value)
     return struct

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import warp as wp
 from support.directions import decode, normal_bin
+from support.field import query_field
 from support.hands import hand_model, hand_source, minimal_spec
 from support.kinematics import link_poses
 
 from lgrasp.errors import HandError
-from lgrasp.field.arrays import Field, field_has, field_pick, field_seed, query_field, upload_field
+from lgrasp.field.arrays import Field, field_has, field_pick, field_seed, upload_field
 from lgrasp.field.build import build_field
 from lgrasp.field.model import ContactField
 from lgrasp.field.params import FieldParams

@@ -7,12 +7,11 @@ import trimesh
 import warp as wp
 
 from lgrasp.hand.geometry import geometry_mesh
+from lgrasp.hand.mesh_kernels import first_hits
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import Postures
 from lgrasp.hand.urdf import Urdf
-from lgrasp.runtime.device import KERNEL_OPTIONS, start
-
-wp.set_module_options(KERNEL_OPTIONS)
+from lgrasp.runtime.device import start
 
 _POINTS = 400
 _VIEWS = 32
@@ -62,22 +61,6 @@ def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     return joined
 
 
-@wp.kernel
-def _first_hits(
-    mesh: wp.uint64,
-    origin: wp.vec3,
-    target: wp.array(dtype=wp.vec3),
-    slack: wp.float32,
-    free_out: wp.array(dtype=wp.int32),
-):
-    """Is the way from the origin to each target free?"""
-    i = wp.tid()
-    way = target[i] - origin
-    length = wp.length(way)
-    hit = wp.mesh_query_ray(mesh, origin, way / length, length - slack)
-    free_out[i] = wp.where(hit.result, 0, 1)
-
-
 def see_skins(skins: list[Skin], postures: Postures, tips: dict[int, np.ndarray], device: str = "cpu") -> list[Skin]:
     """The skins with the share of postures at which the mean fingertip sees each point.
 
@@ -111,9 +94,7 @@ def see_skins(skins: list[Skin], postures: Postures, tips: dict[int, np.ndarray]
         facing = np.einsum("ni,ni->n", np.einsum("nij,nj->ni", R[point_body], normals), eye - target) > 0
         free = wp.empty(len(target), dtype=wp.int32, device=device)
         targets = wp.array(target.astype(np.float32), dtype=wp.vec3, device=device)
-        wp.launch(
-            _first_hits, len(target), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device
-        )
+        wp.launch(first_hits, len(target), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device)
         seen += facing & (free.numpy() == 1)
     parts = np.split(seen / len(chosen), np.cumsum([len(s.points) for s in skins])[:-1])
     return [

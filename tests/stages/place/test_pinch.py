@@ -3,8 +3,8 @@
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.field import query_field
 
-from lgrasp.field.arrays import query_field
 from lgrasp.grasp.tables import pose_arrays
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
