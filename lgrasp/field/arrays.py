@@ -10,7 +10,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.math.kinematics import Kinematics, vec_dof
 from lgrasp.math.transforms import decode_normal, normal_bin
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.runtime.structs import filled
+from lgrasp.runtime.structs import upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -63,7 +63,7 @@ class FieldArrays:
 def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArrays:
     """Copy the field of a hand to a device; trees are built when the field has boxes."""
     same = {name: getattr(model, name) for name in Field.vars if name != "inv_cell"}
-    field = filled(Field, same, device=device, inv_cell=1.0 / model.cell)
+    field = upload_struct(Field, device, same | {"inv_cell": 1.0 / model.cell})
     if len(model.box) == 0:
         return FieldArrays(model, device, field)
     trees, ids = [], []
@@ -75,13 +75,9 @@ def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArra
         trees.append(wp.Bvh(*(wp.array(end, dtype=wp.vec3, device=device) for end in ends)))
         ids.append(trees[-1].id)
     settings = np.arange(len(hand.tree.settings))[:, None] * hand.patches
-    boxes = filled(
-        Boxes,
-        {name: getattr(model, name) for name in ("patch_first", "leaf_first", "leaf_record")},
-        device=device,
-        slot_first=np.append(settings + hand.patch_first[:-2], len(settings) * hand.patches),
-        tree=np.array(ids, np.uint64),
-    )
+    arrays = {name: getattr(model, name) for name in ("patch_first", "leaf_first", "leaf_record")}
+    arrays["slot_first"] = np.append(settings + hand.patch_first[:-2], len(settings) * hand.patches)
+    boxes = upload_struct(Boxes, device, arrays | {"tree": np.array(ids, np.uint64)})
     return FieldArrays(model, device, field, boxes, tuple(trees))
 
 

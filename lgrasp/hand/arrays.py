@@ -1,7 +1,6 @@
 """A HandModel on a device, as Warp structs; forward kinematics and Jacobians of whole postures."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import warp as wp
@@ -13,7 +12,7 @@ from lgrasp.math.convex import Pieces
 from lgrasp.math.kinematics import Kinematics
 from lgrasp.math.sdf import sdf_part
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
-from lgrasp.runtime.structs import filled
+from lgrasp.runtime.structs import upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -95,54 +94,39 @@ class HandArrays:
 def upload_hand(model: HandModel, device: str) -> HandArrays:
     """Copy a hand to a device."""
     start()
-    put, t = partial(filled, device=device), model.tree
-    kin = put(
-        Kinematics,
-        {name: getattr(t, name) for name in _SAME_IN_TREE},
-        groups=t.groups,
-        joint_origin=device_from_matrix(t.T_parent_joint),
-        dof_lower=t.joint_lower[t.dof_index],
-        dof_upper=t.joint_upper[t.dof_index],
-        settings=len(t.settings),
-        dof_setting=t.settings[:, t.dof_index],
-    )
-    pieces = put(
-        Pieces,
-        {name: getattr(model, name) for name in ("body_sphere", "vertex_first", "vertices", "plane_first", "planes")},
-        body_first=model.piece_first,
-        sphere=model.piece_sphere,
-        radius=model.piece_radius,
-        body=model.piece_body,
-    )
+    t = model.tree
+    kin = {name: getattr(t, name) for name in _SAME_IN_TREE} | {
+        "groups": t.groups,
+        "joint_origin": device_from_matrix(t.T_parent_joint),
+        "dof_lower": t.joint_lower[t.dof_index],
+        "dof_upper": t.joint_upper[t.dof_index],
+        "settings": len(t.settings),
+        "dof_setting": t.settings[:, t.dof_index],
+    }
     meshes = _link_meshes(model, device)
-    contacts = put(
-        Contacts,
-        {name: getattr(model, f"contact_{name}") for name in ("first", "points", "normals", "body", "link", "grid")},
-        **_grids(model, ""),
-        grid_link=model.grid_link,
-        rule_first=model.rule_first,
-        rules=model.rules,
-        mesh=np.array([m.id for m in meshes], np.uint64),
-    )
-    overlaps = put(
-        Overlaps,
-        {name: getattr(model, f"overlap_{name}") for name in ("first", "sides", "points")},
-        **_grids(model, "overlap_"),
-    )
+    contacts = {name: getattr(model, f"contact_{name}") for name in ("first", "points", "normals", "body", "link")}
+    contacts |= {name: getattr(model, name) for name in ("grid_link", "rule_first", "rules")}
+    contacts |= {"grid": model.contact_grid, "mesh": np.array([m.id for m in meshes], np.uint64)}
+    overlaps = {name: getattr(model, f"overlap_{name}") for name in ("first", "sides", "points")}
     grid_of = {int(link): i for i, link in enumerate(model.grid_link)}
-    hand = put(
-        Hand,
-        {name: getattr(model, name) for name in _SAME_IN_HAND},
-        kin=kin,
-        pieces=pieces,
-        contacts=contacts,
-        body_group=t.body_group,
-        piece_grid=np.array([grid_of.get(int(link), -1) for link in model.piece_link], np.int32),
-        overlaps=overlaps,
-        box_low=model.canonical_box[0],
-        box_high=model.canonical_box[1],
-    )
-    return HandArrays(model, device, hand, meshes)
+    hand = {name: getattr(model, name) for name in _SAME_IN_HAND} | {
+        "kin": upload_struct(Kinematics, device, kin),
+        "pieces": upload_struct(Pieces, device, _pieces(model)),
+        "contacts": upload_struct(Contacts, device, contacts | _grids(model, "")),
+        "body_group": t.body_group,
+        "piece_grid": np.array([grid_of.get(int(link), -1) for link in model.piece_link], np.int32),
+        "overlaps": upload_struct(Overlaps, device, overlaps | _grids(model, "overlap_")),
+        "box_low": model.canonical_box[0],
+        "box_high": model.canonical_box[1],
+    }
+    return HandArrays(model, device, upload_struct(Hand, device, hand), meshes)
+
+
+def _pieces(model: HandModel) -> dict[str, np.ndarray]:
+    """Convex pieces of a HandModel, as their struct names them."""
+    same = ("body_sphere", "vertex_first", "vertices", "plane_first", "planes")
+    others = {"sphere": model.piece_sphere, "radius": model.piece_radius, "body": model.piece_body}
+    return {name: getattr(model, name) for name in same} | others | {"body_first": model.piece_first}
 
 
 def _grids(model: HandModel, prefix: str) -> dict[str, np.ndarray]:

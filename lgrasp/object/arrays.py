@@ -8,7 +8,7 @@ import warp as wp
 from lgrasp.math.sdf import Sdf
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.runtime.structs import filled
+from lgrasp.runtime.structs import upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -41,26 +41,15 @@ class ObjectArrays:
 def upload_object(model: ObjectModel, device: str) -> ObjectArrays:
     """Copy an object to a device."""
     nx, ny, nz = map(int, model.sdf.shape)
-    sdf = filled(
-        Sdf,
-        device=device,
-        values=model.sdf.ravel(),
-        first=0,
-        nx=nx,
-        ny=ny,
-        nz=nz,
-        origin=model.sdf_origin,
-        inv_cell=1.0 / float(model.sdf_cell),
-    )
-    obj = filled(
-        Object,
-        {name: getattr(model, name) for name in ("contact_points", "contact_normals", "contact_opposite", "com")},
-        device=device,
-        sdf=sdf,
-        contacts=len(model.contact_points),
-        obstacles=model.obstacle_points,
-        cluster_sphere=np.column_stack([model.cluster_center, model.cluster_radius]),
-        clusters=len(model.cluster_radius),
-        radius=float(np.linalg.norm(model.obstacle_points - model.com, axis=1).max()),
-    )
-    return ObjectArrays(model, device, obj)
+    grid = {"values": model.sdf.ravel(), "origin": model.sdf_origin, "inv_cell": 1.0 / float(model.sdf_cell)}
+    same = {name: getattr(model, name) for name in ("contact_points", "contact_normals", "contact_opposite", "com")}
+    others = {
+        "sdf": upload_struct(Sdf, device, {**grid, "first": 0, "nx": nx, "ny": ny, "nz": nz}),
+        "contacts": len(model.contact_points),
+        "obstacles": model.obstacle_points,
+        "cluster_sphere": np.column_stack([model.cluster_center, model.cluster_radius]),
+        "clusters": len(model.cluster_radius),
+        "radius": float(np.linalg.norm(model.obstacle_points - model.com, axis=1).max()),
+    }
+    struct = upload_struct(Object, device, same | others)
+    return ObjectArrays(model, device, struct)
