@@ -89,7 +89,7 @@ class GenerateJob(Job):
                 f"pipeline '{self.pipeline.name}' is for several objects: lgrasp sequence OBJECT OBJECT ..."
             )
         if "validate" in self.pipeline.order:
-            from lgrasp.simulate.model import import_mujoco
+            from lgrasp.simulate.builder import import_mujoco
 
             import_mujoco()
         assert self.keys.mesh is not None

@@ -17,8 +17,8 @@ from lgrasp.engine.folder import check_folder
 from lgrasp.errors import ConfigError, OutputError, ShardError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.runtime.device import resolve_device
+from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.columns import COLUMNS, OBJECT_COLUMNS
-from lgrasp.simulate.model import import_mujoco
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.run import protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of_shard

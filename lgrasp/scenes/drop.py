@@ -9,11 +9,10 @@ import numpy as np
 from lgrasp.errors import PhysicsError
 from lgrasp.geometry.poses import canonical, pose_matrix
 from lgrasp.scenes.params import DropParams
-from lgrasp.simulate.assemble import add_hull
-from lgrasp.simulate.model import import_mujoco
+from lgrasp.simulate.builder import add_solid, import_mujoco, set_contact, set_options
+from lgrasp.simulate.protocol import DENSITY, Physics
 from lgrasp.simulate.solid import Solid
 
-_DENSITY = 500.0  # [kg/m^3]
 _STILL = (2.0e-3, 0.02)  # [m/s], [rad/s] below which an object lies still
 _QUIET = 0.2  # [s] for which it must
 _THICK = 0.1  # [m] of the table
@@ -66,27 +65,15 @@ def drop(solids: Sequence[Solid], table: float, params: DropParams, rng: np.rand
 
 def _model(mujoco: Any, solids: Sequence[Solid], table: float, params: DropParams) -> Any:
     spec = mujoco.MjSpec()
-    option = spec.option
-    option.timestep = params.timestep
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = 5.0
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    physics = Physics(timestep=params.timestep, friction=params.friction, torsion=0.005, impratio=5.0, noslip=0)
+    set_options(mujoco, spec, physics, weightless=False)
     half = 0.5 * table
     top = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[half, half, 0.5 * _THICK])
     top.pos = [0, 0, -0.5 * _THICK]
     for k, solid in enumerate(solids):
-        body = spec.worldbody.add_body(name=f"object {k}")
-        body.add_freejoint()
-        for number, vertices in enumerate(solid.pieces):
-            add_hull(mujoco, spec, body, vertices, f"object {k} {number}")
-        body.mass = _DENSITY * solid.volume
-        body.ipos = solid.center
-        body.fullinertia = _DENSITY * solid.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        body.explicitinertial = True
+        add_solid(mujoco, spec, f"object {k}", solid, DENSITY * solid.volume, DENSITY * solid.inertia)
     for geom in spec.geoms:
-        # rolling resistance, so that balls come to rest
-        geom.condim, geom.friction = 6, [params.friction, 0.005, 0.001]
+        set_contact(geom, physics, 6, rolling=0.001)  # so that balls come to rest
         geom.solref = [2.5 * params.timestep, 1.0]
     return spec.compile()
 

@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull
 
 from lgrasp.errors import PhysicsError
 from lgrasp.hand.geometry import Piece
-from lgrasp.simulate.protocol import Load, Protocol
+from lgrasp.simulate.builder import add_drive, add_hull, add_solid, set_contact, set_joint, set_options
+from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import HandSolids
 from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.urdf import bare_urdf, joint_ends
@@ -18,7 +19,6 @@ OBJECT = "lgrasp object"
 
 _POSTURES = 200
 _NEARLY = 0.95  # of all postures; links that touch so often are left to touch
-_LEAST_MASS, _LEAST_INERTIA = 1.0e-3, 1.0e-7  # [kg], [kg m^2] of links whose URDF gives less
 
 
 def assemble(
@@ -40,32 +40,23 @@ def assemble(
     """
     loads = [protocol.load(solid.volume) for solid in objects]
     spec = mujoco.MjSpec.from_string(bare_urdf(hand.urdf, held))
-    _set_options(mujoco, spec, protocol)
+    set_options(mujoco, spec, protocol)
     _add_pieces(mujoco, spec, hand)
-    _add_drives(mujoco, spec, protocol, max(load.stiffness for load in loads))
+    followers = {equality.name1 for equality in spec.equalities}
+    for joint in spec.joints:
+        set_joint(mujoco, joint, protocol)
+        if joint.name not in followers:
+            add_drive(mujoco, spec, joint, protocol, max(load.stiffness for load in loads))
     for number, (solid, load) in enumerate(zip(objects, loads, strict=True)):
-        _add_object(mujoco, spec, f"{OBJECT} {number}", solid, load)
-    for geom in spec.geoms:  # the larger condim of a pair counts: links slide on links without friction
-        geom.friction = [protocol.friction, protocol.torsion, 1.0e-4]
-        geom.condim = 4 if geom.parent.name.startswith(OBJECT) else 1
+        inertia = solid.inertia * (load.mass / solid.volume)
+        add_solid(mujoco, spec, f"{OBJECT} {number}", solid, load.mass, inertia)
+    for geom in spec.geoms:  # links slide on links without friction
+        set_contact(geom, protocol, 4 if geom.parent.name.startswith(OBJECT) else 1)
     _exclude_neighbours(spec, hand)
     model = spec.compile()
     for a, b in _always_touching(mujoco, model):
         spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
     return spec
-
-
-def _set_options(mujoco: Any, spec: Any, protocol: Protocol) -> None:
-    option = spec.option
-    option.timestep = protocol.timestep
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.gravity = [0, 0, 0]
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.noslip_iterations = protocol.noslip
-    option.impratio = protocol.impratio
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    spec.compiler.boundmass = _LEAST_MASS
-    spec.compiler.boundinertia = _LEAST_INERTIA
 
 
 def _add_pieces(mujoco: Any, spec: Any, hand: HandSolids) -> None:
@@ -97,43 +88,6 @@ def _inflated(piece: Piece) -> np.ndarray:
     for face in hull.simplices.T:
         np.add.at(normals, face, hull.equations[:, :3])
     return piece.vertices + piece.radius * normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-9)[:, None]
-
-
-def add_hull(mujoco: Any, spec: Any, body: Any, vertices: np.ndarray, name: str) -> None:
-    """Give a body of a MjSpec the convex hull of vertices (V, 3) [m] to collide with; a sliver is left out."""
-    try:
-        ConvexHull(vertices)
-    except QhullError:
-        return
-    mesh = spec.add_mesh(name=name, uservert=np.asarray(vertices, float).ravel())
-    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
-
-
-def _add_drives(mujoco: Any, spec: Any, protocol: Protocol, stiffness: float) -> None:
-    """Position control of every joint that follows no other."""
-    followers = {e.name1 for e in spec.equalities}
-    for joint in spec.joints:
-        sliding = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
-        scale = protocol.lever**-2 if sliding else 1.0
-        joint.armature = protocol.armature * scale
-        joint.damping = np.zeros_like(joint.damping)
-        joint.frictionloss = 0.0
-        if joint.name not in followers:
-            drive = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            drive.set_to_position(kp=stiffness * scale, dampratio=protocol.damping_ratio)
-
-
-def _add_object(mujoco: Any, spec: Any, name: str, solid: Solid, load: Load) -> None:
-    body = spec.worldbody.add_body(name=name)
-    body.add_freejoint()
-    for number, vertices in enumerate(solid.pieces):
-        add_hull(mujoco, spec, body, vertices, f"{name} {number}")
-    inertia = solid.inertia * (load.mass / solid.volume)
-    body.mass = load.mass
-    body.ipos = solid.center
-    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    body.explicitinertial = True
 
 
 def _exclude_neighbours(spec: Any, hand: HandSolids) -> None:

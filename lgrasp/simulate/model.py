@@ -9,6 +9,7 @@ import numpy as np
 
 from lgrasp.errors import PhysicsError
 from lgrasp.simulate.assemble import OBJECT, assemble
+from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import HandSolids, Scene
 from lgrasp.simulate.solid import Solid
@@ -53,19 +54,6 @@ class Model:
     def controls(self, q: np.ndarray) -> np.ndarray:
         """Targets of the drives at joint positions q (..., K)."""
         return np.where(self.columns >= 0, q[..., self.columns], 0.0)
-
-
-def import_mujoco() -> Any:
-    """The module mujoco.
-
-    Raises:
-        PhysicsError: it is not installed.
-    """
-    try:
-        import mujoco
-    except ImportError:
-        raise PhysicsError('physics needs MuJoCo, which is not installed: pip install "lgrasp[sim]"') from None
-    return mujoco
 
 
 def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequence[int] = (0,)) -> Model:

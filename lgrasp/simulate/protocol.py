@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from lgrasp.errors import ConfigError
+from lgrasp.math.constants import DRIVE_STIFFNESS, SLIDING_ARM
 
 if TYPE_CHECKING:
     import numpy as np
@@ -13,6 +14,9 @@ if TYPE_CHECKING:
 
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Directions of the load in the hand's base frame, in the order of the columns."""
+
+DENSITY = 500.0
+"""Of objects that are weighed [kg/m^3]."""
 
 _GRAVITY = 9.8  # [m/s^2]
 
@@ -30,25 +34,30 @@ class Load(BaseModel):
     """Of the position control of revolute joints [N m/rad]."""
 
 
-class Protocol(BaseModel):
-    """Close the hand on free objects, then pull them in six directions; they must stay in the hand."""
+class Physics(BaseModel):
+    """How bodies touch, and the steps of time."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", description="Columns are named physics/NAME_...")
     timestep: float = Field(default=0.004, gt=0, le=0.02, description="[s]")
     friction: float = Field(default=0.6, gt=0, le=5, description="Sliding friction of every contact.")
     torsion: float = Field(default=0.02, ge=0, le=1, description="Torsional friction of every contact [m].")
     impratio: float = Field(default=10.0, ge=1, description="Stiffness of friction against that of contact normals.")
     noslip: int = Field(default=2, ge=0, description="Iterations of the solver that takes the creep out of friction.")
+
+
+class Protocol(Physics):
+    """Close the hand on free objects, then pull them in six directions; they must stay in the hand."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", description="Columns are named physics/NAME_...")
     stiffness: float = Field(
-        default=5.0, gt=0, description="Of position control, per newton of load if scaled [N m/rad]."
+        default=DRIVE_STIFFNESS, gt=0, description="Of position control, per newton of load if scaled [N m/rad]."
     )
     stiffness_range: tuple[float, float] | None = Field(
         default=None, description="Stiffness is scaled with the load and kept in this range; none: it is not scaled."
     )
     lever: float = Field(
-        default=0.1, gt=0, description="A sliding joint is as stiff as a revolute one at this arm [m]."
+        default=SLIDING_ARM, gt=0, description="A sliding joint is as stiff as a revolute one at this arm [m]."
     )
     damping_ratio: float = Field(default=1.0, gt=0, description="Of the position control; 1 is critical.")
     armature: float = Field(
@@ -58,7 +67,7 @@ class Protocol(BaseModel):
     force: float = Field(default=1.0, gt=0, description="The pull [N], if kind is force.")
     mass: float = Field(default=0.1, gt=0, description="Of the object [kg], if kind is force.")
     density: float = Field(
-        default=500.0, gt=0, description="Of the object, if kind is weight, which then pulls [kg/m^3]."
+        default=DENSITY, gt=0, description="Of the object, if kind is weight, which then pulls [kg/m^3]."
     )
     start: Literal["pregrasp", "grasp"] = Field(
         default="pregrasp", description="Where the hand is when the simulation starts."

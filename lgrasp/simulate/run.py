@@ -10,9 +10,10 @@ import numpy as np
 
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
+from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.columns import stack_verdicts
 from lgrasp.simulate.groups import group_rows
-from lgrasp.simulate.model import Model, build_model, import_mujoco
+from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.trial import Trial

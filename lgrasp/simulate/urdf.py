@@ -9,8 +9,7 @@ from lxml import etree
 from scipy.spatial.transform import Rotation
 
 from lgrasp.hand.urdf import parse_robot
-
-_COMPILER = {"strippath": "false", "discardvisual": "true", "balanceinertia": "true", "fusestatic": "false"}
+from lgrasp.simulate.builder import set_compiler
 
 
 def joint_ends(text: str) -> dict[str, tuple[str, str]]:
@@ -46,9 +45,7 @@ def bare_urdf(text: str, held: Mapping[str, float]) -> str:
     for link in tree.iterfind("link"):
         for element in [*link.iterfind("visual"), *link.iterfind("collision")]:
             link.remove(element)
-    for element in list(tree.iterfind("mujoco")):
-        tree.remove(element)
-    etree.SubElement(etree.SubElement(tree, "mujoco"), "compiler", _COMPILER)
+    set_compiler(tree)
     for joint in tree.iterfind("joint"):
         if joint.get("name") in held and joint.get("type") != "fixed":
             _weld(joint, held[joint.get("name", "")])

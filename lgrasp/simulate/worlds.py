@@ -8,7 +8,8 @@ import warp as wp
 
 from lgrasp.errors import PhysicsError
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.simulate.model import Model, import_mujoco
+from lgrasp.simulate.builder import import_mujoco
+from lgrasp.simulate.model import Model
 from lgrasp.simulate.verdict import CHUNK, WILD, links_touching
 
 wp.set_module_options(KERNEL_OPTIONS)

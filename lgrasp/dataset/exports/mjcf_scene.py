@@ -8,18 +8,13 @@ from lxml import etree
 
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.errors import PhysicsError
+from lgrasp.simulate.builder import add_drive, import_mujoco, set_compiler, set_contact, set_joint, set_options
+from lgrasp.simulate.protocol import PROTOCOLS
 
 if TYPE_CHECKING:
     import mujoco
 
-_COMPILER = {"strippath": "false", "discardvisual": "true", "balanceinertia": "true", "fusestatic": "false"}
-_COMPILER |= {"meshdir": "../"}  # of the export, seen from the scenes
-_TIMESTEP = 0.004  # [s]
-_STIFFNESS, _ARMATURE = 5.0, 2.0e-4  # of the drives of revolute joints [N m/rad], [kg m^2]
-_LEVER = 0.1  # a sliding joint is like a revolute one at this arm [m]
-_LEAST_MASS, _LEAST_INERTIA = 1.0e-3, 1.0e-7  # [kg], [kg m^2] of links whose URDF gives less
-_OBJECT_MASS = 0.1  # [kg]
-_FRICTION = (0.6, 0.02, 0.0001)
+_AS = PROTOCOLS["fc"]  # the scenes are as this one simulates
 _DEEP = 0.001  # links of the hand that overlap more at the grasp do so because hulls stand for meshes [m]
 
 
@@ -61,10 +56,7 @@ class MjcfScene:
     """
 
     def __init__(self, hand: Mapping[str, bytes], frames: HandFrames, objects: Sequence[SceneObject]) -> None:
-        try:
-            import mujoco
-        except ImportError:
-            raise PhysicsError('mjcf needs MuJoCo, which is not installed: pip install "lgrasp[sim]"') from None
+        mujoco = import_mujoco("mjcf")
         self._mujoco = mujoco
         self._objects = [f"object_{place}_{item.code}" for place, item in enumerate(objects)]
         files = dict(hand)
@@ -72,9 +64,11 @@ class MjcfScene:
             files |= {item.mesh: item.text, **item.pieces}
         try:
             spec = _hand_spec(mujoco, files)
+            _add_drives(mujoco, spec, frames.joint_names)
             for name, item in zip(self._objects, objects, strict=True):
                 _add_object(mujoco, spec, name, item)
-            _finish(mujoco, spec, frames.joint_names)
+            for geom in spec.geoms:
+                set_contact(geom, _AS, 4 if geom.parent.name in self._objects else 1)
             self._model = spec.compile()
             self._xml = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:
@@ -130,10 +124,10 @@ def _hand_spec(mujoco, files: dict[str, bytes]) -> "mujoco.MjSpec":
     robot = etree.fromstring(files["hand/hand.urdf"])
     for mesh in robot.iter("mesh"):
         mesh.set("filename", f"hand/{mesh.get('filename')}")
-    for old in robot.findall("mujoco"):
-        robot.remove(old)
-    etree.SubElement(etree.SubElement(robot, "mujoco"), "compiler", _COMPILER)
-    return mujoco.MjSpec.from_string(etree.tostring(robot, encoding="unicode"), assets=files)
+    set_compiler(robot, meshdir="../")  # of the export, seen from the scenes
+    spec = mujoco.MjSpec.from_string(etree.tostring(robot, encoding="unicode"), assets=files)
+    set_options(mujoco, spec, _AS)
+    return spec
 
 
 def _add_object(mujoco, spec: "mujoco.MjSpec", name: str, item: SceneObject) -> None:
@@ -143,36 +137,22 @@ def _add_object(mujoco, spec: "mujoco.MjSpec", name: str, item: SceneObject) -> 
     spec.add_mesh(name=name, file=item.mesh)
     shape = {"type": mujoco.mjtGeom.mjGEOM_MESH}
     if not item.pieces:
-        body.add_geom(name=name, meshname=name, mass=_OBJECT_MASS, **shape)
+        body.add_geom(name=name, meshname=name, mass=_AS.mass, **shape)
         return
     body.add_geom(name=name, meshname=name, mass=0, contype=0, conaffinity=0, group=2, **shape)
     for number, (file, volume) in enumerate(zip(item.pieces, item.volumes, strict=True)):
         piece = f"{name}_{number}"
         spec.add_mesh(name=piece, file=file)
-        mass = _OBJECT_MASS * volume / sum(item.volumes)
+        mass = _AS.mass * volume / sum(item.volumes)
         body.add_geom(name=piece, meshname=piece, mass=mass, group=3, **shape)
 
 
-def _finish(mujoco, spec: "mujoco.MjSpec", joint_names: Sequence[str]) -> None:
-    """No gravity, friction, position actuators on the joints of q."""
-    spec.option.timestep = _TIMESTEP
-    spec.option.gravity = [0, 0, 0]
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio, spec.option.noslip_iterations = 10, 2
-    spec.compiler.boundmass, spec.compiler.boundinertia = _LEAST_MASS, _LEAST_INERTIA
-    for geom in spec.geoms:
-        geom.friction, geom.condim = _FRICTION, 4
+def _add_drives(mujoco, spec: "mujoco.MjSpec", joint_names: Sequence[str]) -> None:
+    """Position control of the joints of q; controls come in their order."""
     for joint in spec.joints:
-        if joint.type != mujoco.mjtJoint.mjJNT_FREE:
-            joint.armature = _ARMATURE / _lever(mujoco, joint) ** 2
-    for name in joint_names:  # controls come in the order of q
-        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=_STIFFNESS / _lever(mujoco, spec.joint(name)) ** 2, dampratio=1.0)
-
-
-def _lever(mujoco, joint: "mujoco.MjsJoint") -> float:
-    return _LEVER if joint.type == mujoco.mjtJoint.mjJNT_SLIDE else 1.0
+        set_joint(mujoco, joint, _AS)
+    for name in joint_names:
+        add_drive(mujoco, spec, spec.joint(name), _AS, _AS.stiffness)
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:

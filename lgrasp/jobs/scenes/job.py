@@ -21,7 +21,7 @@ from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.scenes.make import make_scene
 from lgrasp.scenes.reader import SceneReader, check_scene
 from lgrasp.scenes.writer import write_scene
-from lgrasp.simulate.model import import_mujoco
+from lgrasp.simulate.builder import import_mujoco
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from lgrasp.jobs.sequence.round import Verdicts
 from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_rounds
 from lgrasp.jobs.sequence.size import parse_size
 from lgrasp.jobs.sets import sequence_name
-from lgrasp.simulate.model import import_mujoco
+from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import protocol_text, verdicts
 

@@ -1,0 +1,105 @@
+"""What every MuJoCo scene of ours is built of: options, contacts, drives and free bodies."""
+
+from typing import Any
+
+import numpy as np
+from lxml import etree
+from scipy.spatial import ConvexHull, QhullError
+
+from lgrasp.errors import PhysicsError
+from lgrasp.math.constants import LEAST_INERTIA, LEAST_MASS
+from lgrasp.simulate.protocol import Physics, Protocol
+from lgrasp.simulate.solid import Solid
+
+ROLLING = 1.0e-4
+"""Rolling friction [m]; contacts of dimension 4 have none."""
+
+_COMPILER = {"strippath": "false", "discardvisual": "true", "balanceinertia": "true", "fusestatic": "false"}
+
+
+def import_mujoco(what: str = "physics") -> Any:
+    """The module mujoco; ``what`` needs it.
+
+    Raises:
+        PhysicsError: it is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError:
+        raise PhysicsError(f'{what} needs MuJoCo, which is not installed: pip install "lgrasp[sim]"') from None
+    return mujoco
+
+
+def set_compiler(robot: etree._Element, **more: str) -> None:
+    """Replace what a URDF tells MuJoCo's compiler by what all our scenes tell it, and ``more``."""
+    for element in list(robot.iterfind("mujoco")):
+        robot.remove(element)
+    etree.SubElement(etree.SubElement(robot, "mujoco"), "compiler", _COMPILER | more)
+
+
+def set_options(mujoco: Any, spec: Any, physics: Physics, *, weightless: bool = True) -> None:
+    """Time step, integrator and contact solver of an MjSpec, and the least mass and inertia of its bodies."""
+    option = spec.option
+    option.timestep = physics.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.noslip_iterations = physics.noslip
+    option.impratio = physics.impratio
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if weightless:
+        option.gravity = [0, 0, 0]
+    spec.compiler.boundmass = LEAST_MASS
+    spec.compiler.boundinertia = LEAST_INERTIA
+
+
+def set_contact(geom: Any, physics: Physics, dimension: int, rolling: float = ROLLING) -> None:
+    """How a geom touches: friction of ``dimension`` 1 (none), 4 (slides, twists) or 6 (rolls); of two geoms the larger
+    dimension counts."""
+    geom.friction = [physics.friction, physics.torsion, rolling]
+    geom.condim = dimension
+
+
+def set_joint(mujoco: Any, joint: Any, protocol: Protocol) -> None:
+    """Inertia of a joint's drive; no friction or damping of its own."""
+    joint.armature = protocol.armature * _scale(mujoco, joint, protocol)
+    joint.damping = np.zeros_like(joint.damping)
+    joint.frictionloss = 0.0
+
+
+def add_drive(mujoco: Any, spec: Any, joint: Any, protocol: Protocol, stiffness: float) -> None:
+    """Position control of a joint, as stiff as given if it is revolute [N m/rad]."""
+    drive = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    drive.set_to_position(kp=stiffness * _scale(mujoco, joint, protocol), dampratio=protocol.damping_ratio)
+
+
+def _scale(mujoco: Any, joint: Any, protocol: Protocol) -> float:
+    """Stiffness or inertia of a joint over that of a revolute one."""
+    return protocol.lever**-2 if joint.type == mujoco.mjtJoint.mjJNT_SLIDE else 1.0
+
+
+def add_solid(mujoco: Any, spec: Any, name: str, solid: Solid, mass: float, inertia: np.ndarray) -> None:
+    """A free body that collides by its convex pieces.
+
+    Args:
+        mass: [kg]
+        inertia: about the centre of mass, (3, 3) [kg m^2].
+    """
+    body = spec.worldbody.add_body(name=name)
+    body.add_freejoint()
+    for number, vertices in enumerate(solid.pieces):
+        add_hull(mujoco, spec, body, vertices, f"{name} {number}")
+    body.mass = mass
+    body.ipos = solid.center
+    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    body.explicitinertial = True
+
+
+def add_hull(mujoco: Any, spec: Any, body: Any, vertices: np.ndarray, name: str) -> None:
+    """Give a body the convex hull of vertices (V, 3) [m] to collide with; a sliver is left out."""
+    try:
+        ConvexHull(vertices)
+    except QhullError:
+        return
+    mesh = spec.add_mesh(name=name, uservert=np.asarray(vertices, float).ravel())
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
