@@ -19,6 +19,7 @@ from lgrasp.simulate.verdict import (
     Verdict,
     conclude,
     links_touching,
+    moved,
 )
 
 
@@ -142,17 +143,17 @@ class Trial:
             steps = min(self._chunk, total - done)
             self._step(steps)
             done += steps
-            moved = self._moved()
-            worst = np.maximum(worst, moved)
+            now = self._moved()
+            worst = np.maximum(worst, now)
             if self._wild():
                 break
             depth = max(depth, self._deepest())
             if self._bounds.lost(worst):
                 break
-            near = self._settled_stop and self._bounds.near(before, moved, (total - done) / steps)
+            near = self._settled_stop and self._bounds.near(before, now, (total - done) / steps)
             if near and self._bounds.held(worst, self._links_touching(self._m, self._data) > 0, depth):
                 break
-            before = moved
+            before = now
         return worst, depth
 
     def _step(self, steps: int) -> None:
@@ -209,21 +210,13 @@ class Trial:
         contact = self._data.contact
         return max(0.0, -float(contact.dist[self._of_object[contact.geom].any(1)].min(initial=0.0)))
 
-    def _objects(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centre of mass (O, 3) [m] and orientation (O, 4) of the objects."""
-        poses = self._data.qpos[self._model.object_address]  # (O, 7)
-        centers = np.zeros((len(poses), 3))
-        for out, center, pose in zip(centers, self._model.centers, poses, strict=True):
-            self._lib.mju_rotVecQuat(out, center, pose[3:])
-        return poses[:, :3] + centers, poses[:, 3:]
+    def _objects(self) -> np.ndarray:
+        """Poses of the objects, (O, 7)."""
+        return self._data.qpos[self._model.object_address]
 
     def _moved(self) -> np.ndarray:
         """How far each object is from its start: displacement [m] and rotation [rad], (O, 2)."""
-        center, turn = self._objects()
-        norm = np.maximum(np.linalg.norm(turn, axis=1), 1e-12)
-        cosine = np.minimum(1.0, np.abs((turn * self._start[1]).sum(1)) / norm)
-        shift = np.linalg.norm(center - self._start[0], axis=1)
-        return np.column_stack([shift, 2 * np.arccos(cosine)])
+        return moved(self._objects(), self._start, self._model.centers)
 
     def _wild(self) -> bool:
         """Has the simulation diverged?"""

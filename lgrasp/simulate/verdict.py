@@ -152,6 +152,26 @@ def conclude(bounds: Bounds, look: Look, closed: Closed, pulls: Pulls, diverged:
     )
 
 
+def moved(pose: np.ndarray, home: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """How far objects are from where they started: displacement [m] and rotation [rad], (..., O, 2).
+
+    Args:
+        pose, home: now and at the start, (..., O, 7).
+        centers: centre of mass in each object's frame (O, 3) [m].
+    """
+    now, start = np.asarray(pose, float), np.asarray(home, float)
+    norm = np.linalg.norm(now[..., 3:], axis=-1) * np.linalg.norm(start[..., 3:], axis=-1)
+    cosine = np.abs((now[..., 3:] * start[..., 3:]).sum(-1)) / np.maximum(norm, 1e-12)
+    shift = now[..., :3] - start[..., :3] + _turned(now[..., 3:], centers) - _turned(start[..., 3:], centers)
+    return np.stack([np.linalg.norm(shift, axis=-1), 2 * np.arccos(np.minimum(cosine, 1.0))], axis=-1)
+
+
+def _turned(quaternion: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Points (O, 3) turned by quaternions (..., O, 4) whose length a simulator keeps at 1."""
+    t = 2 * np.cross(quaternion[..., 1:], point)
+    return point + quaternion[..., :1] * t + np.cross(quaternion[..., 1:], t)
+
+
 def links_touching(
     bodies: np.ndarray, objects: np.ndarray, count: int, world: np.ndarray | int = 0, worlds: int = 1
 ) -> np.ndarray:

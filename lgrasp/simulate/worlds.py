@@ -10,7 +10,7 @@ from lgrasp.errors import PhysicsError
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.model import Model
-from lgrasp.simulate.verdict import CHUNK, WILD, links_touching
+from lgrasp.simulate.verdict import CHUNK, WILD, links_touching, moved
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -111,17 +111,7 @@ class Worlds:
         Args:
             home: poses at the start, (worlds, O, 7).
         """
-        pose, center = state["qpos"][:, self._model.object_address].astype(float), self._model.centers
-        start = home.astype(float)
-
-        def middle(p: np.ndarray) -> np.ndarray:
-            t = 2 * np.cross(p[..., 4:], center)
-            return p[..., :3] + center + p[..., 3:4] * t + np.cross(p[..., 4:], t)
-
-        norm = np.linalg.norm(pose[..., 3:], axis=2) * np.linalg.norm(start[..., 3:], axis=2)
-        cosine = np.abs((pose[..., 3:] * start[..., 3:]).sum(2)) / np.maximum(norm, 1e-12)
-        turned = 2 * np.arccos(np.clip(cosine, 0, 1))
-        return np.stack([np.linalg.norm(middle(pose) - middle(start), axis=2), turned], axis=2)
+        return moved(state["qpos"][:, self._model.object_address], home, self._model.centers)
 
     @staticmethod
     def wild(state: dict[str, np.ndarray]) -> np.ndarray:

@@ -37,7 +37,8 @@ grasps/NUMBER.xml  MuJoCo scene of one grasp: mujoco.MjModel.from_xml_path(FILE)
                      in the hand from 0, in the order in which they were taken; all are where they are at the grasp of
                      the last one, which keyframe pregrasp is before.
 
-The world's frame is that of link {root}, the root link of hand/hand.urdf, which is fixed. No gravity; friction 0.6.
+The world's frame is that of link {root}, the root link of hand/hand.urdf, which is fixed. No gravity; friction 0.6,
+none between links of the hand; all numbers are those of protocol fc of lgrasp simulate.
 An object collides with the convex pieces objects/CODE/piece_NN.obj; where there are none, with the hull of its mesh,
 which fills its hollows. A mesh of the hand collides with its hull; links whose hulls overlap at the grasp are kept from
 colliding with each other.
