@@ -62,7 +62,7 @@ def prune(
     everything: Annotated[bool, typer.Option("--all", help="Everything, compiled kernels too.")] = False,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Remove entries from the cache; what is needed is made anew.
+    """Remove entries from the cache; what is needed is made again.
 
     Example: lgrasp cache prune --kind bank --older-than 7
     """

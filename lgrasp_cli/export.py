@@ -65,7 +65,7 @@ def export(
 
 
 def _cutter(cache_dir: Path | None) -> "Cut":
-    """Convex pieces of objects as ``lgrasp validate`` makes them, from the cache; what is approximated is said."""
+    """Convex pieces of objects as ``lgrasp validate`` makes them, from the cache; approximations are printed."""
     from functools import partial
 
     from lgrasp.geometry.decompose import decompose

@@ -38,7 +38,7 @@ def generate(
             help="Keep only grasps that pass this physics protocol: fc, gravity6 or gravity6_mu1.", show_default=False
         ),
     ] = None,
-    shard_rows: Annotated[int, typer.Option(help="Rows of a shard; part of what decides the rows.")] = 10_000,
+    shard_rows: Annotated[int, typer.Option(help="Rows of a shard; other values give other rows.")] = 10_000,
     reuse: Annotated[bool, typer.Option("--reuse", help="Keep the candidates in the cache for later runs.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be computed; change nothing.")] = False,
 ) -> None:

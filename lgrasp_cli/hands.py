@@ -10,7 +10,7 @@ from lgrasp_cli.options import CacheDir, Device, PipelineName, Quiet, choose_pip
 if TYPE_CHECKING:
     from lgrasp.jobs.hand_check.check import HandCheck
 
-app = typer.Typer(help="The hands there are.", no_args_is_help=True)
+app = typer.Typer(help="List, show, add and check hands.", no_args_is_help=True)
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")]
 

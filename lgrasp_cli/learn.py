@@ -50,13 +50,13 @@ def fit(
     params = parse_model(LearnParams, {k: v for k, v in given.items() if v is not None}, "learn fit")
     said = time.monotonic()
 
-    def told(phase: str, step: int, of: int, value: float) -> None:
+    def shown(phase: str, step: int, of: int, value: float) -> None:
         nonlocal said
         if not quiet and time.monotonic() - said >= _INTERVAL:
             said = time.monotonic()
             typer.echo(f"{phase} {step:,}/{of:,}  {'loss' if phase == 'poses' else 'energy'} {value:.3f}", err=True)
 
-    data = run(Fit(shards, out, params, device=device, cache=cache), told)
+    data = run(Fit(shards, out, params, device=device, cache=cache), shown)
     _report(data, json_path, quiet, _fit_pairs(data))
 
 

@@ -6,7 +6,7 @@ import typer
 
 from lgrasp_cli.options import Scale
 
-app = typer.Typer(help="The objects there are.", no_args_is_help=True)
+app = typer.Typer(help="List and show objects.", no_args_is_help=True)
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")]
 

@@ -59,7 +59,7 @@ def open_cache(folder: Path | None, *, fresh: bool = False) -> "Cache":
     """The cache of this command; compiled kernels go to the same folder.
 
     Args:
-        fresh: make every entry anew.
+        fresh: make every entry again.
     """
     import os
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(help="The pipelines there are.", no_args_is_help=True)
+app = typer.Typer(help="List and show pipelines.", no_args_is_help=True)
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")]
 

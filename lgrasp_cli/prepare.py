@@ -9,7 +9,7 @@ import typer
 from lgrasp_cli.options import CacheDir, Device, PipelineName, Scale, choose_pipeline, open_cache
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")]
-_Force = Annotated[bool, typer.Option("--force", help="Make it anew even if it is cached.")]
+_Force = Annotated[bool, typer.Option("--force", help="Make it again even if it is cached.")]
 
 
 def register(app: typer.Typer) -> None:

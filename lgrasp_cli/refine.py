@@ -49,7 +49,7 @@ def refine(
         bool, typer.Option("--coarse", help="Large steps and a long reach: for poses that are far off.")
     ] = False,
     always: Annotated[
-        bool, typer.Option("--always", help="Every row gets its refined posture, whatever the checks say.")
+        bool, typer.Option("--always", help="Store the refined posture of every row, valid or not.")
     ] = False,
     device: Device = "auto",
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,

@@ -32,9 +32,7 @@ def sequence(
     ] = "1",
     physics: Annotated[
         str | None,
-        typer.Option(
-            help="Go on only with rows that pass this physics protocol: seq6 or seq6_mu06.", show_default=False
-        ),
+        typer.Option(help="Continue only rows that pass this physics protocol: seq6 or seq6_mu06.", show_default=False),
     ] = None,
     pipeline: Annotated[
         str, typer.Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.")
@@ -45,12 +43,12 @@ def sequence(
         typer.Option("--out", help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT...", show_default=False),
     ] = None,
     seed: Seed = None,
-    shard_rows: Annotated[int, typer.Option(help="Sequences of a shard; part of what decides the rows.")] = 1000,
+    shard_rows: Annotated[int, typer.Option(help="Sequences of a shard; other values give other rows.")] = 1000,
 ) -> None:
     """Grasp several objects one after another, each with joints that hold nothing yet, and write shards.
 
     Each grasp uses one opposition space of the hand (hand.yaml); joints and objects of earlier grasps stay in place.
-    The shards hold the whole sequences and the rows of fewer objects that these go on from. Exit code 3 when fewer
+    The shards hold the whole sequences and the rows of fewer objects that these continue. Exit code 3 when fewer
     than asked were found; what was found is kept.
 
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10

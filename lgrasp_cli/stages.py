@@ -46,7 +46,7 @@ def _verb(stage: str):
         contacts: Contacts = None,
         scale: Scale = 1.0,
         device: Device = "auto",
-        force: Annotated[bool, typer.Option("--force", help="Run every stage anew.")] = False,
+        force: Annotated[bool, typer.Option("--force", help="Run every stage again.")] = False,
         cache_dir: CacheDir = None,
         as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
     ) -> None:

@@ -38,7 +38,7 @@ def validate(
         str, typer.Option(help="cpu, or cuda:N for many at a time with MuJoCo Warp (extra gpu-sim).")
     ] = "cpu",
     all_directions: Annotated[
-        bool, typer.Option("--all-directions", help="Go on after the first direction in which an object is lost.")
+        bool, typer.Option("--all-directions", help="Continue after the first direction in which an object is lost.")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Keep results that are there.")] = True,
     json_path: JsonPath = None,

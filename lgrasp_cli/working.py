@@ -39,7 +39,7 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
         Annotated[bool, typer.Option("--overwrite", help="Replace files that are there; else whole ones stay.")],
         False,
     ),
-    "rebuild": (Annotated[bool, typer.Option("--rebuild", help="Make what is cached anew.")], False),
+    "rebuild": (Annotated[bool, typer.Option("--rebuild", help="Make what is cached again.")], False),
     "resume": (Annotated[bool, typer.Option("--resume/--no-resume", hidden=True)], True),
     "force": (Annotated[bool, typer.Option("--force", hidden=True)], False),
     "json_path": (JsonPath, None),
@@ -155,7 +155,7 @@ def conclude(data: dict[str, Any], outcome: "Outcome") -> None:
     """
     if outcome.cancelled:
         files = f"{len(outcome.paths)} whole file{'' if len(outcome.paths) == 1 else 's'}"
-        typer.echo(f"interrupted: {files} in {data['out']}; the same command goes on", err=True)
+        typer.echo(f"interrupted: {files} in {data['out']}; the same command continues", err=True)
         raise typer.Exit(130)
     error = outcome.job.shortfall(outcome)
     if error:

@@ -53,8 +53,8 @@ class Bench:
 
         Returns:
             For each job ``pipeline``, ``hand``, ``object``, ``grasps``, ``strict``, ``profile``, ``device``; each rate
-            as ``median``, ``min``, ``max``; ``seconds`` and ``survivors`` of the middle run;
-            ``build_seconds`` and ``load_seconds`` of object and field; ``near_duplicates``, ``distinct_poses``, ``starved``, ``peak_rss_mb``.
+            as ``median``, ``min``, ``max``; ``seconds`` and ``survivors`` of the middle run; ``build_seconds`` and
+            ``load_seconds`` of object and field; ``near_duplicates``, ``distinct_poses``, ``starved``, ``peak_rss_mb``.
 
         Raises:
             LgraspError: bad input.

@@ -115,6 +115,6 @@ def test_ctrl_c_leaves_whole_scenes(process, config, cli, tmp_path):
     running.send_signal(signal.SIGINT)
     _, err = running.communicate(timeout=60)
     assert running.returncode == 130, err
-    assert "the same command goes on" in err
+    assert "the same command continues" in err
     assert cli("scenes", "check", "out").code == 0
     assert not list((tmp_path / "out").glob("*.tmp"))
