@@ -15,7 +15,7 @@ HEAVY = ("torch", "warp", "trimesh", "yourdfpy", "h5py", "scipy", "numpy", "coac
 DATA = ("hands", "objects", "pipelines", "configs")
 
 ORDER = (
-    ("errors", "paths", "notices", "config", "seeding"),
+    ("errors", "paths", "notices", "config", "seeding", "face"),
     ("geometry", "math", "runtime"),
     ("hand", "object"),
     ("cloud", "differentiable", "field"),
@@ -26,13 +26,13 @@ ORDER = (
     ("sequence", "learn"),
     ("engine",),
     ("jobs",),
-    ("bench",),
+    ("bench", "api"),
 )
 """Rooms of lgrasp from the lowest floor up; a room imports rooms of its own floor or below, without a cycle."""
 
 FLOOR = {room: floor for floor, rooms in enumerate(ORDER) for room in rooms}
 ALONE = {"judge"}
-"""Rooms that import nothing of lgrasp and are imported by the command line only."""
+"""Rooms that import nothing of lgrasp and are imported by the command line and the root only."""
 
 
 def module_name(path: Path) -> str:

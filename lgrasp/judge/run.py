@@ -1,8 +1,10 @@
 """Judges shards: files, folders of them, all of their rows or some."""
 
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +21,7 @@ EPSILON_ROWS = 128
 
 
 def judge(
-    shards: Sequence[str | Path] | str | Path,
+    shards: Any,
     *,
     urdf: str | Path | None = None,
     mesh: str | Path | Mapping[str, str | Path] | None = None,
@@ -29,7 +31,7 @@ def judge(
     """Judge every row of grasp shards by the strict bounds.
 
     Args:
-        shards: shard files of format 1, or folders that hold some at any depth.
+        shards: shard files of format 1, or folders that hold some at any depth; or what writes one file by ``save``.
         urdf: original URDF in place of the stored one; its meshes are looked up beside it.
         mesh: original object mesh in place of the stored one (times the stored scale), or meshes by object id.
         rows: judge only this many rows, drawn at random with a fixed seed; duplicates and poses are of all rows.
@@ -38,6 +40,10 @@ def judge(
     Raises:
         JudgeError: nothing to judge, or a file that cannot be judged.
     """
+    if hasattr(shards, "save"):
+        with tempfile.TemporaryDirectory() as folder:
+            shards.save(path := Path(folder) / "grasps.h5")
+            return judge(path, urdf=urdf, mesh=mesh, rows=rows, progress=progress)
     paths = find_shards([shards] if isinstance(shards, str | Path) else shards)
     if rows is not None and rows < 1:
         raise JudgeError(f"rows {rows}: at least 1")

@@ -8,6 +8,7 @@ from lgrasp.cloud.model import cloud_object
 from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_inverse
 from lgrasp.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
+import lgrasp.refine.descent as descent_module
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.params import LocalSearch
@@ -120,6 +121,6 @@ def test_device_inverse():
 
 
 def test_joints_too_many_are_refused(inputs, monkeypatch):
-    monkeypatch.setattr("lgrasp.refine.descent.MAX_COLUMNS", 15)
+    monkeypatch.setattr(descent_module, "MAX_COLUMNS", 15)
     with pytest.raises(HandError, match="16 joints; the local search takes 15"):
         both(inputs, SEARCH)

@@ -1,0 +1,336 @@
+"""The functions of ``import lgrasp as lg``: hand and object in, grasps in memory out; no file but where ``out`` says."""
+
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.cloud.read import Cloud
+from lgrasp.cloud.read import read_cloud as _read_cloud
+from lgrasp.dataset.files import find_shards
+from lgrasp.dataset.merge import merge_shards
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.errors import ConfigError, StarvedError
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
+from lgrasp.hand.model import HandModel
+from lgrasp.jobs.listing import list_hands, list_objects, list_pipelines
+from lgrasp.jobs.shard_inputs import named_hand, named_object
+from lgrasp.object.model import ObjectModel
+from lgrasp.runtime.device import resolve_device
+
+Name = str | Path
+Hand = HandModel
+Object = ObjectModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grasps(GraspRows):
+    """Grasps in memory, with the hand and the objects that they are of; ``grasps[mask]`` are some of them."""
+
+    hand: HandRecord
+    objects: Sequence[ObjectRecord]
+    """Sorted by ``id``; ``object_index`` counts in them."""
+    header: ShardHeader
+    """Pipeline, seed and config that regenerate the rows."""
+    statistics: dict[str, int | float | str] = field(default_factory=dict)
+
+    @classmethod
+    def of_shard(cls, shard: Shard) -> "Grasps":
+        """The rows of a shard."""
+        rows = {f.name: getattr(shard.grasps, f.name) for f in fields(GraspRows)}
+        return cls(
+            **rows, hand=shard.hand, objects=shard.objects, header=shard.header, statistics=dict(shard.statistics)
+        )
+
+    @property
+    def shard(self) -> Shard:
+        """The same as :func:`write_shard` takes it."""
+        rows = GraspRows(**{f.name: getattr(self, f.name) for f in fields(GraspRows)})
+        return Shard(
+            header=self.header, hand=self.hand, objects=self.objects, grasps=rows, statistics=dict(self.statistics)
+        )
+
+    def save(self, path: Name) -> Path:
+        """Write one shard file.
+
+        Raises:
+            LgraspError: it cannot be written, or the rows do not conform.
+        """
+        write_shard(path, self.shard)
+        return Path(path)
+
+    def __getitem__(self, rows: slice | np.ndarray | Sequence[int]) -> "Grasps":
+        if self.sequence is not None:
+            raise ConfigError("rows of sequences extend other rows of their file; take what you need from the columns")
+        chosen = np.arange(len(self))[rows if isinstance(rows, slice) else np.asarray(rows)].reshape(-1)
+        changed: dict[str, Any] = {}
+        for name, values in self.columns().items():
+            group, slash, member = name.partition("/")
+            place = changed.setdefault(group, {}) if slash else changed
+            place[member if slash else name] = values[chosen]
+        return replace(self, **changed)
+
+
+def generate(
+    hand: Name = "allegro",
+    object: Name = "mug",
+    n: int = 1000,
+    *,
+    pipeline: Name | Pipeline = "robust",
+    seed: int | None = None,
+    scale: float = 1.0,
+    device: str = "auto",
+    workers: int = 0,
+    out: Name | None = None,
+) -> Grasps:
+    """Grasps of one object by one hand, each checked; fewer than asked, with a warning, where the search finds no more.
+
+    Args:
+        hand: name, URDF, or folder with hand.yaml.
+        object: name or mesh file.
+        pipeline: name, YAML file, or what :func:`load_pipeline` gives.
+        scale: from the mesh's unit to metres.
+        workers: threads; 0: one per core.
+        out: folder for shards; none: no file.
+
+    Raises:
+        LgraspError: the hand, the object or an option cannot be used; StarvedError where no grasp is found.
+    """
+    from lgrasp.jobs.generate import Job
+    from lgrasp.jobs.generate import generate as run
+
+    with _folder(out) as folder:
+        chosen = _pipeline(pipeline, seed)
+        rows = {} if out is not None else {"shard_rows": max(n, 1)}
+        job = Job(str(hand), str(object), n, chosen, folder, scale=scale, device=device, workers=workers, **rows)
+        return _made(run(job).paths, n)
+
+
+def sequence(
+    hand: Name,
+    objects: Sequence[Name],
+    n: int = 256,
+    *,
+    pipeline: Name | Pipeline = "sequence",
+    seed: int | None = None,
+    scale: str | float = 1.0,
+    device: str = "auto",
+    workers: int = 0,
+    out: Name | None = None,
+) -> Grasps:
+    """Grasps of several objects that a hand takes one after another; rows of fewer objects come before those of more.
+
+    Args:
+        n: whole sequences.
+        scale: factor to metres, or a range of the longest side [m] such as ``"0.06:0.10"``.
+        out: folder for shards; none: no file.
+
+    Raises:
+        LgraspError: as :func:`generate`.
+    """
+    from lgrasp.jobs.sequence.job import SequenceJob, generate_sequences
+    from lgrasp.jobs.sequence.size import parse_size
+
+    with _folder(out) as folder:
+        chosen = _pipeline(pipeline, seed)
+        rows = {} if out is not None else {"shard_rows": max(n, 1)}
+        names = tuple(map(str, objects))
+        size = parse_size(str(scale))
+        job = SequenceJob(str(hand), names, n, chosen, folder, size, device=device, workers=workers, **rows)
+        return _made(generate_sequences(job).paths)
+
+
+def plan(
+    hand: Name,
+    object: Name | Cloud,
+    *,
+    starts: int = 80,
+    scale: float = 1.0,
+    device: str = "auto",
+    out: Name | None = None,
+) -> Grasps:
+    """Grasps of an object or a point cloud by local search, one a start where one passes the checks of a plan.
+
+    Args:
+        object: name, mesh file, or a cloud of :func:`read_cloud`.
+        out: folder for the shard; none: no file.
+
+    Raises:
+        LgraspError: hand, object or cloud cannot be used; StarvedError where no start gives a grasp.
+    """
+    from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
+
+    what: dict[str, Any] = {"cloud": object} if isinstance(object, Cloud) else {"object": str(object), "scale": scale}
+    with _folder(out) as folder:
+        done = plan_grasps(PlanJob(hand=str(hand), out=folder, starts=starts, device=device, **what))
+        return _made([done.path] if done.path else [])
+
+
+def refine(
+    grasps: Grasps | Name,
+    *,
+    coarse: bool = False,
+    bounds: Any = None,
+    device: str = "auto",
+    out: Name | None = None,
+    **params: int,
+) -> Grasps:
+    """Grasps moved by a local search to where hand and object fit better, and checked again.
+
+    Args:
+        grasps: grasps, a shard, or a folder of shards.
+        coarse: poses are off by centimetres, as those of a network.
+        bounds: :class:`GraspBounds` that rows must pass; default: the strict ones.
+        params: ``matching_rounds``, ``gradient_steps``.
+        out: folder for shards; none: no file.
+
+    Raises:
+        LgraspError: grasps that cannot be refined, or an option out of range.
+    """
+    from lgrasp.jobs.refine.settings import refine_params
+    from lgrasp.jobs.refine.shards import Refinement, refine_shards
+
+    chosen = {} if bounds is None else {"bounds": bounds}
+    with _files(grasps) as files, _folder(out) as folder:
+        job = Refinement(files, folder, params=refine_params(coarse=coarse, **params), device=device, **chosen)
+        return _made([done.path for done in refine_shards(job)])
+
+
+def simulate(
+    grasps: Grasps | Name,
+    protocol: str = "fc",
+    *,
+    all_directions: bool = False,
+    device: str = "cpu",
+    threads: int = 0,
+    out: Name | None = None,
+) -> Grasps:
+    """The same grasps with verdicts of MuJoCo in ``physics``, such as ``fc_holds``.
+
+    Args:
+        grasps: grasps, a shard, or a folder of shards.
+        protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06.
+        all_directions: go on after a direction in which a grasp does not hold.
+        out: folder for shards; none: no file.
+
+    Raises:
+        LgraspError: no such protocol, or grasps that cannot be simulated.
+    """
+    from lgrasp.jobs.simulate import Validation, validate_shards
+    from lgrasp.simulate.protocol import find_protocol
+
+    found = find_protocol(protocol)
+    with _files(grasps) as files, _folder(out) as folder:
+        job = Validation(files, found, folder, threads, device, all_directions)
+        return _made([done.path for done in validate_shards(job)])
+
+
+def open(path: Name) -> Grasps:
+    """The grasps of a shard, or of all shards of one run in a folder.
+
+    Raises:
+        LgraspError: no shard there, one that is damaged, or shards of several hands, objects or runs.
+    """
+    return _made(find_shards([Path(path)]))
+
+
+def read_cloud(path: Name, mask: Name | None = None, label: int | None = None, **options: Any) -> Cloud:
+    """A point cloud of a file (.ply, .npy, .npz, ... or a scene of this project), with its target.
+
+    Args:
+        mask: file with a label for each point; default: those in the cloud's own file.
+        label: which points are the target.
+        options: ``scale``, ``viewpoint`` (x y z from where it was seen), ``scene``.
+
+    Raises:
+        CloudError: the cloud cannot be used.
+    """
+    from lgrasp.scenes.reader import scene_cloud
+
+    return _read_cloud(path, mask, label, read_scene=scene_cloud, **options)
+
+
+def load_hand(name: Name, device: str = "cpu") -> Hand:
+    """A hand by name, URDF, folder with hand.yaml, or shard.
+
+    Raises:
+        LgraspError: there is no such hand, or it cannot be used.
+    """
+    return named_hand(Cache(), str(name), resolve_device(device))[1]
+
+
+def load_object(name: Name, scale: float = 1.0, device: str = "cpu") -> Object:
+    """An object by name or mesh file, or that of a shard.
+
+    Raises:
+        LgraspError: there is no such object, or it cannot be used.
+    """
+    return named_object(Cache(), str(name), scale, resolve_device(device))
+
+
+def hands() -> dict[str, str]:
+    """Known hands and what they are."""
+    return {entry["name"]: entry["description"] for entry in list_hands()}
+
+
+def objects() -> dict[str, str]:
+    """Named objects and what they are."""
+    return {entry["name"]: entry["description"] for entry in list_objects()}
+
+
+def pipelines() -> dict[str, str]:
+    """Pipelines and what they are for."""
+    return {entry["name"]: entry["description"] for entry in list_pipelines()}
+
+
+def _pipeline(pipeline: Name | Pipeline, seed: int | None) -> Pipeline:
+    found = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(str(pipeline))
+    if seed is not None and not 0 <= seed < 2**63:
+        raise ConfigError(f"seed {seed}: need 0 <= seed < 2^63")
+    return found if seed is None else found.model_copy(update={"seed": seed})
+
+
+@contextmanager
+def _folder(out: Name | None) -> Iterator[Path]:
+    """A folder for files that stay, or one that goes."""
+    if out is not None:
+        yield Path(out)
+        return
+    with tempfile.TemporaryDirectory(prefix="lgrasp-") as folder:
+        yield Path(folder) / "shards"
+
+
+@contextmanager
+def _files(grasps: Grasps | Name) -> Iterator[list[Path]]:
+    """Shards or folders of them that hold grasps."""
+    if not isinstance(grasps, Grasps):
+        yield [Path(grasps)]
+        return
+    with _folder(None) as folder:
+        folder.mkdir()
+        yield [grasps.save(folder / f"{grasps.hand.name}-{grasps.objects[0].id}-00000.h5")]
+
+
+def _made(paths: Sequence[Path], asked: int = 0) -> Grasps:
+    """Rows of the files of one run."""
+    if not paths:
+        raise StarvedError("no grasp found")
+    if len(paths) == 1:
+        shard = read_shard(paths[0])
+    else:
+        with _folder(None) as folder:
+            folder.mkdir()
+            merge_shards(list(paths), folder / "all.h5")
+            shard = read_shard(folder / "all.h5")
+    found = Grasps.of_shard(shard)
+    if len(found) < asked:
+        warnings.warn(f"{len(found):,} of {asked:,} grasps found", stacklevel=3)
+    return found
