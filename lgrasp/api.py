@@ -1,4 +1,4 @@
-"""The functions of ``import lgrasp as lg``: hand and object in, grasps in memory out; no file but where ``out`` says."""
+"""The functions of ``import lgrasp as lg``: hand and object in, grasps in memory out; no file without ``out``."""
 
 import tempfile
 import warnings
@@ -18,6 +18,7 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.engine.run import run
 from lgrasp.errors import ConfigError, StarvedError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 from lgrasp.hand.model import HandModel
@@ -25,6 +26,7 @@ from lgrasp.jobs.listing import list_hands, list_objects, list_pipelines
 from lgrasp.jobs.shard_inputs import named_hand, named_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.device import resolve_device
+from lgrasp.simulate.protocol import Protocol, find_protocol
 
 Name = str | Path
 Hand = HandModel
@@ -104,14 +106,11 @@ def generate(
     Raises:
         LgraspError: the hand, the object or an option cannot be used; StarvedError where no grasp is found.
     """
-    from lgrasp.jobs.generate import Job
-    from lgrasp.jobs.generate import generate as run
+    from lgrasp.jobs.generate import GenerateJob
 
     with _folder(out) as folder:
-        chosen = _pipeline(pipeline, seed)
-        rows = {} if out is not None else {"shard_rows": max(n, 1)}
-        job = Job(str(hand), str(object), n, chosen, folder, scale=scale, device=device, workers=workers, **rows)
-        return _made(run(job).paths, n)
+        what = _asked(hand, n, pipeline, seed, device, workers, folder, out is None)
+        return _made(run(GenerateJob(object=str(object), scale=scale, **what)).paths, n)
 
 
 def sequence(
@@ -136,16 +135,11 @@ def sequence(
     Raises:
         LgraspError: as :func:`generate`.
     """
-    from lgrasp.jobs.sequence.job import SequenceJob, generate_sequences
-    from lgrasp.jobs.sequence.size import parse_size
+    from lgrasp.jobs.sequence.job import SequenceJob
 
     with _folder(out) as folder:
-        chosen = _pipeline(pipeline, seed)
-        rows = {} if out is not None else {"shard_rows": max(n, 1)}
-        names = tuple(map(str, objects))
-        size = parse_size(str(scale))
-        job = SequenceJob(str(hand), names, n, chosen, folder, size, device=device, workers=workers, **rows)
-        return _made(generate_sequences(job).paths)
+        what = _asked(hand, n, pipeline, seed, device, workers, folder, out is None)
+        return _made(run(SequenceJob(objects=tuple(map(str, objects)), scale=str(scale), **what)).paths)
 
 
 def plan(
@@ -206,7 +200,7 @@ def refine(
 
 def simulate(
     grasps: Grasps | Name,
-    protocol: str = "fc",
+    protocol: str | Protocol = "fc",
     *,
     all_directions: bool = False,
     device: str = "cpu",
@@ -217,7 +211,7 @@ def simulate(
 
     Args:
         grasps: grasps, a shard, or a folder of shards.
-        protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06.
+        protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06; or one with numbers of its own.
         all_directions: go on after a direction in which a grasp does not hold.
         out: folder for shards; none: no file.
 
@@ -225,9 +219,8 @@ def simulate(
         LgraspError: no such protocol, or grasps that cannot be simulated.
     """
     from lgrasp.jobs.simulate import Validation, validate_shards
-    from lgrasp.simulate.protocol import find_protocol
 
-    found = find_protocol(protocol)
+    found = find_protocol(protocol) if isinstance(protocol, str) else protocol
     with _files(grasps) as files, _folder(out) as folder:
         job = Validation(files, found, folder, threads, device, all_directions)
         return _made([done.path for done in validate_shards(job)])
@@ -291,11 +284,17 @@ def pipelines() -> dict[str, str]:
     return {entry["name"]: entry["description"] for entry in list_pipelines()}
 
 
-def _pipeline(pipeline: Name | Pipeline, seed: int | None) -> Pipeline:
-    found = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(str(pipeline))
+def _asked(
+    hand: Name, n: int, pipeline: Name | Pipeline, seed: int | None, device: str, workers: int, out: Path, whole: bool
+) -> dict[str, Any]:
+    """What jobs that search have in common; ``whole``: all rows in one shard."""
+    chosen = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(str(pipeline))
     if seed is not None and not 0 <= seed < 2**63:
         raise ConfigError(f"seed {seed}: need 0 <= seed < 2^63")
-    return found if seed is None else found.model_copy(update={"seed": seed})
+    if seed is not None:
+        chosen = chosen.model_copy(update={"seed": seed})
+    what = {"hand": str(hand), "rows": n, "pipeline": chosen, "device": device, "workers": workers, "out": out}
+    return what | ({"shard_rows": max(n, 1)} if whole else {})
 
 
 @contextmanager

@@ -43,11 +43,14 @@ def command(
     """
     from lgrasp.judge.bounds import JudgeError
 
-    meshes = dict(m.split("=", 1) if "=" in m else ("", m) for m in mesh or ())
+    meshes: dict[str, str | Path] = {}
+    for given in mesh or ():
+        name, sign, file = given.partition("=")
+        meshes |= {name: file} if sign else {"": given}
     try:
         from lgrasp.judge.run import judge
 
-        report = judge(shards, urdf=urdf, mesh=meshes or None, rows=rows, progress=None if quiet else Progress())
+        report = judge(shards, urdf=urdf, mesh=meshes or None, rows=rows, progress=None if quiet else _Progress())
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         if json_path and json_path != "-":
             Path(json_path).write_text(text + "\n", encoding="utf-8")
@@ -64,7 +67,7 @@ def command(
     raise typer.Exit(0 if report.passed else 1)
 
 
-class Progress:
+class _Progress:
     """Rows judged so far on standard error: rewritten on a terminal, else a line every ten seconds."""
 
     def __init__(self) -> None:

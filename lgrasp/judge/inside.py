@@ -90,4 +90,4 @@ class Inside:
         """Which of the points (n, 3) have a winding number above one half, (n,)."""
         if self.closed:
             return self.lines[0].count(points)[0] > 0.5
-        return np.mean([sum(line.count(points)) for line in self.lines], axis=0) > 1.0
+        return np.mean([np.add(*line.count(points)) for line in self.lines], axis=0) > 1.0

@@ -203,9 +203,20 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
     if isinstance(told, dict) and isinstance(told.get("bounds"), dict):
         claims["profile"] = str(told["bounds"].get("profile"))
     shard = JudgedShard(
-        path, hand, hand_key, joint_names, link_names, *map(list, zip(*objects, strict=True)),
-        grasps, steps, metrics, kept, claims, [],
-    )  # fmt: skip
+        path=path,
+        hand=hand,
+        hand_key=hand_key,
+        joint_names=joint_names,
+        link_names=link_names,
+        objects=[obj for obj, _ in objects],
+        object_keys=[key for _, key in objects],
+        grasps=grasps,
+        steps=steps,
+        metrics=metrics,
+        kept_invalid=kept,
+        claims=claims,
+        notes=[],
+    )
     shard.notes = _notes(shard, f["hand"], ids)
     return shard
 

@@ -8,7 +8,7 @@ from lgrasp.cloud.model import cloud_object
 from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_inverse
 from lgrasp.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, so3_exp
-import lgrasp.refine.descent as descent_module
+from lgrasp.refine import descent as descent_module
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.params import LocalSearch
