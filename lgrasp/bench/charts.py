@@ -1,7 +1,6 @@
 """A benchmark table as bars, without a display."""
 
 import io
-import math
 from pathlib import Path
 from typing import Any
 
@@ -45,14 +44,12 @@ def draw_table(table: dict[str, Any], path: Path) -> None:
     hands = [mean["hand"] for mean in table["means"]]
     across = min(2, max(1, len(hands)))
     down = max(1, -(-len(hands) // across))
-    lowest = min(_lowest(cell) for cell in table["cells"])
     figure = Figure(figsize=(1.6 + 6.4 * across, 1.2 + 3.6 * down), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     for i, hand in enumerate(hands):
         axes = figure.add_subplot(down, across, i + 1)
         _draw_hand(axes, table, [cell for cell in table["cells"] if cell["hand"] == hand and not cell["error"]])
         axes.set_title(hand)
-        axes.set_ylim(bottom=10 ** math.floor(math.log10(lowest)))
     settings = table["settings"]
     figure.suptitle(f"strict-valid grasps per second, {settings['device']}, median of {settings['repeat']}")
     if hands:
@@ -62,12 +59,6 @@ def draw_table(table: dict[str, Any], path: Path) -> None:
     figure.savefig(data, format="png")
     with new_file(path) as file:
         file.write(data.getvalue())
-
-
-def _lowest(cell: dict[str, Any]) -> float:
-    """The lowest rate above zero in a cell, measured or published; 1 if there is none."""
-    rates = [run["strict_valid_per_s"]["min"] for run in cell["pipelines"].values()]
-    return min((rate for rate in [*rates, cell["published_per_s"]] if rate), default=1.0)
 
 
 def _draw_hand(axes: Any, table: dict[str, Any], cells: list[dict[str, Any]]) -> None:
