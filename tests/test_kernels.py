@@ -9,23 +9,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 MOST_ARGUMENTS = 10
 NOT_YET = (
-    "lgrasp/field/arrays",
-    "lgrasp/field/kernels",
     "lgrasp/grasp/near_kernels",
-    "lgrasp/hand/arrays",
-    "lgrasp/hand/distance",
-    "lgrasp/hand/drafting/surface_visibility",
-    "lgrasp/hand/pairs",
-    "lgrasp/object/arrays",
-    "lgrasp/object/kernels",
     "lgrasp/refine/check_kernels",
-    "lgrasp/refine/descent_kernels",
-    "lgrasp/refine/energy_gradient",
-    "lgrasp/refine/match_kernels",
-    "lgrasp/refine/volume",
-    "lgrasp/scenes/collision_kernels",
-    "lgrasp/scenes/render_kernels",
-    "lgrasp/sequence/room",
     "lgrasp/simulate/worlds",
     "lgrasp/stages/filter/control_kernels",
     "lgrasp/stages/filter/object_kernels",

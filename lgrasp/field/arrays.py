@@ -23,19 +23,19 @@ class Field:
 
     cell: wp.float32
     inv_cell: wp.float32
-    origin: wp.array(dtype=wp.vec3)
-    shape: wp.array(dtype=wp.vec3i)
-    cell_first: wp.array(dtype=wp.int32)
-    start: wp.array(dtype=wp.int32)
-    mask: wp.array(dtype=wp.uint64)
-    point: wp.array(dtype=wp.int32)
-    offset: wp.array(dtype=wp.int32)
-    normal: wp.array(dtype=wp.uint16)
-    posture: wp.array2d(dtype=wp.uint8)
-    pair_point: wp.array2d(dtype=wp.vec3)
-    pair_normal: wp.array2d(dtype=wp.vec3)
-    pair_slot: wp.array(dtype=wp.vec2i)
-    pair_width: wp.array(dtype=wp.float32)
+    origin: wp.array(dtype=wp.vec3)  # (slots,) [m]
+    shape: wp.array(dtype=wp.vec3i)  # (slots,)
+    cell_first: wp.array(dtype=wp.int32)  # (slots + 1,)
+    start: wp.array(dtype=wp.int32)  # (64 cells + 1,)
+    mask: wp.array(dtype=wp.uint64)  # (cells,)
+    point: wp.array(dtype=wp.int32)  # (records,)
+    offset: wp.array(dtype=wp.int32)  # (records,)
+    normal: wp.array(dtype=wp.uint16)  # (records,)
+    posture: wp.array2d(dtype=wp.uint8)  # (records, D)
+    pair_point: wp.array2d(dtype=wp.vec3)  # (pairs, 2) [m]
+    pair_normal: wp.array2d(dtype=wp.vec3)  # (pairs, 2)
+    pair_slot: wp.array(dtype=wp.vec2i)  # (pairs,)
+    pair_width: wp.array(dtype=wp.float32)  # (pairs,) [m], rising
 
 
 @wp.struct
@@ -43,10 +43,10 @@ class Boxes:
     """Published index of a ContactField: one bounding-volume hierarchy per patch over its occupied boxes."""
 
     slot_first: wp.array(dtype=wp.int32)  # (slots + 1,) patches of each slot
-    tree: wp.array(dtype=wp.uint64)  # one wp.Bvh per patch
-    patch_first: wp.array(dtype=wp.int32)
-    leaf_first: wp.array(dtype=wp.int32)
-    leaf_record: wp.array(dtype=wp.int32)
+    tree: wp.array(dtype=wp.uint64)  # (patches,) one wp.Bvh each
+    patch_first: wp.array(dtype=wp.int32)  # (patches + 1,)
+    leaf_first: wp.array(dtype=wp.int32)  # (leaves + 1,)
+    leaf_record: wp.array(dtype=wp.int32)  # (records,)
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ wp.set_module_options(KERNEL_OPTIONS)
 class Vectors:
     """Contact vectors, one a row."""
 
-    point: wp.array(dtype=wp.int32)  # contact point, (N,)
-    position: wp.array(dtype=wp.vec3)  # of it [m], base frame, (N,)
-    bin: wp.array(dtype=wp.int32)  # of the normal, (N,)
-    normal: wp.array(dtype=wp.int32)  # packed, (N,)
-    direction: wp.array(dtype=wp.vec3)  # the normal as it is, (N,)
+    point: wp.array(dtype=wp.int32)  # (M,) contact point
+    position: wp.array(dtype=wp.vec3)  # (M,) of it [m], base frame
+    bin: wp.array(dtype=wp.int32)  # (M,) of the normal
+    normal: wp.array(dtype=wp.int32)  # (M,) packed
+    direction: wp.array(dtype=wp.vec3)  # (M,) the normal as it is
 
 
 @wp.func
@@ -46,7 +46,8 @@ def sample_postures(
     """Uniform postures of one group, and whether it keeps ``margin`` [m] to the static base and to itself.
 
     Args:
-        posture_out: (N, D), 8 bits a joint over its range. clear_out: (N,), 1 where it does.
+        posture_out: 8 bits a joint over its range, (N, D).
+        clear_out: 1 where it does, (N,).
     """
     i = wp.tid()
     state = wp.rand_init(seed, i)
@@ -82,8 +83,8 @@ def contact_vectors(
     """Contact vector of a random contact point at each chosen posture (CF, Def. 4.1).
 
     Args:
-        posture: (N, D), as :func:`sample_postures` draws them. chosen: rows of it, (M,).
-        vectors_out: M rows.
+        posture: as :func:`sample_postures` draws them, (N, D).
+        chosen: rows of ``posture``, (M,).
     """
     i = wp.tid()
     state = wp.rand_init(seed, i)

@@ -21,35 +21,35 @@ wp.set_module_options(KERNEL_OPTIONS)
 class Contacts:
     """Contact surfaces of a HandModel (same names, same meaning)."""
 
-    first: wp.array(dtype=wp.int32)
-    points: wp.array(dtype=wp.vec3)
-    normals: wp.array(dtype=wp.vec3)
-    body: wp.array(dtype=wp.int32)
-    link: wp.array(dtype=wp.int32)
-    grid: wp.array(dtype=wp.int32)
-    grid_first: wp.array(dtype=wp.int32)
-    grid_shape: wp.array(dtype=wp.vec3i)
-    grid_origin: wp.array(dtype=wp.vec3)
-    grid_inv_cell: wp.array(dtype=wp.float32)
-    grid_values: wp.array(dtype=wp.float32)
-    grid_link: wp.array(dtype=wp.int32)
-    rule_first: wp.array(dtype=wp.int32)
-    rules: wp.array(dtype=wp.vec4)
-    mesh: wp.array(dtype=wp.uint64)
+    first: wp.array(dtype=wp.int32)  # (G + 2,)
+    points: wp.array(dtype=wp.vec3)  # (C,)
+    normals: wp.array(dtype=wp.vec3)  # (C,)
+    body: wp.array(dtype=wp.int32)  # (C,)
+    link: wp.array(dtype=wp.int32)  # (C,)
+    grid: wp.array(dtype=wp.int32)  # (C,)
+    grid_first: wp.array(dtype=wp.int32)  # (L + 1,)
+    grid_shape: wp.array(dtype=wp.vec3i)  # (L,)
+    grid_origin: wp.array(dtype=wp.vec3)  # (L,) [m]
+    grid_inv_cell: wp.array(dtype=wp.float32)  # (L,) [1/m]
+    grid_values: wp.array(dtype=wp.float32)  # (cells of all grids,) [m]
+    grid_link: wp.array(dtype=wp.int32)  # (L,)
+    rule_first: wp.array(dtype=wp.int32)  # (L + 1,)
+    rules: wp.array(dtype=wp.vec4)  # (R,)
+    mesh: wp.array(dtype=wp.uint64)  # (L,)
 
 
 @wp.struct
 class Overlaps:
     """Link pairs tested on their true surfaces (names of a HandModel without ``overlap_``)."""
 
-    first: wp.array(dtype=wp.int32)
-    sides: wp.array(dtype=wp.vec4i)
-    points: wp.array(dtype=wp.vec3)
-    grid_first: wp.array(dtype=wp.int32)
-    grid_shape: wp.array(dtype=wp.vec3i)
-    grid_origin: wp.array(dtype=wp.vec3)
-    grid_inv_cell: wp.array(dtype=wp.float32)
-    grid_values: wp.array(dtype=wp.float32)
+    first: wp.array(dtype=wp.int32)  # ((G + 1)^2 + 1,)
+    sides: wp.array(dtype=wp.vec4i)  # (S,)
+    points: wp.array(dtype=wp.vec3)  # (P,) [m]
+    grid_first: wp.array(dtype=wp.int32)  # (S + 1,)
+    grid_shape: wp.array(dtype=wp.vec3i)  # (S,)
+    grid_origin: wp.array(dtype=wp.vec3)  # (S,) [m]
+    grid_inv_cell: wp.array(dtype=wp.float32)  # (S,) [1/m]
+    grid_values: wp.array(dtype=wp.float32)  # (cells of all grids,) [m]
 
 
 @wp.struct
@@ -59,15 +59,15 @@ class Hand:
     kin: Kinematics
     pieces: Pieces
     contacts: Contacts
-    sphere_first: wp.array(dtype=wp.int32)
-    spheres: wp.array(dtype=wp.vec4)
-    cluster_first: wp.array(dtype=wp.int32)
-    cluster_sphere: wp.array(dtype=wp.vec4)
-    samples: wp.array(dtype=wp.vec3)
-    body_group: wp.array(dtype=wp.int32)  # group of each body, -1 for the base
-    piece_grid: wp.array(dtype=wp.int32)  # distance grid of the piece's link, -1 when it is no contact link
-    pair_first: wp.array(dtype=wp.int32)
-    pairs: wp.array(dtype=wp.vec2i)
+    sphere_first: wp.array(dtype=wp.int32)  # (B + 1,)
+    spheres: wp.array(dtype=wp.vec4)  # (S,)
+    cluster_first: wp.array(dtype=wp.int32)  # (B + 1,)
+    cluster_sphere: wp.array(dtype=wp.vec4)  # (C,)
+    samples: wp.array(dtype=wp.vec3)  # (C * CLUSTER_SIZE,) [m]
+    body_group: wp.array(dtype=wp.int32)  # (B,) group of each body, -1 for the base
+    piece_grid: wp.array(dtype=wp.int32)  # (P,) distance grid of the piece's link, -1 when it is no contact link
+    pair_first: wp.array(dtype=wp.int32)  # ((G + 1)^2 + 1,)
+    pairs: wp.array(dtype=wp.vec2i)  # (Q,)
     overlaps: Overlaps
     box_low: wp.vec3
     box_high: wp.vec3

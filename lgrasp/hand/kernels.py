@@ -18,7 +18,8 @@ def place_bodies(
     """Bodies of postures in the base frame; launched over postures.
 
     Args:
-        q: (N, K) [rad or m]. pose_out: T_base_body, (N, B).
+        q: [rad or m], (N, K).
+        pose_out: T_base_body, (N, B).
     """
     row = wp.tid()
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
@@ -42,8 +43,11 @@ def move_points(
     """Derivatives of the base positions of points by the joints, added up; launched over points.
 
     Args:
-        pose: T_base_body, (N, B). body_group: (B,). body: of each point, (N,). point: body's frame [m], (N,).
-        jacobian_out: (N, 3, K) [m/rad or m/m], zero before.
+        pose: T_base_body, (N, B).
+        body_group: group of each body, (B,).
+        body: of each point, (N,).
+        point: body's frame [m], (N,).
+        jacobian_out: [m/rad or m/m], (N, 3, K), zero before.
     """
     row = wp.tid()
     b = body[row]

@@ -17,7 +17,8 @@ def mesh_distance(
     """Distances (n,) [m] of points (n,) [m] within 1 m of a mesh, negative inside by the nearest face's normal.
 
     Args:
-        points: (n,) [m]. distance_out: (n,) [m].
+        points: [m], (n,).
+        distance_out: [m], (n,).
     """
     i = wp.tid()
     q = wp.mesh_query_point_sign_normal(mesh, points[i], 1.0)
@@ -35,7 +36,8 @@ def winding_distance(
     """As :func:`mesh_distance`, inside and outside by winding numbers, which bear holes.
 
     Args:
-        points: (n,) [m]. distance_out: (n,) [m].
+        points: [m], (n,).
+        distance_out: [m], (n,).
     """
     i = wp.tid()
     q = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0)
@@ -55,7 +57,8 @@ def first_hits(
     """Is the way from the origin to each target free, the last ``slack`` [m] left out?
 
     Args:
-        target: (n,) [m]. free_out: (n,), 1 where it is.
+        target: [m], (n,).
+        free_out: 1 where it is, (n,).
     """
     i = wp.tid()
     way = target[i] - origin

@@ -20,7 +20,9 @@ def mark_touching(
     """Pairs of pieces that are within ``margin`` [m] of each other; launched over (posture, pair).
 
     Args:
-        pose: T_base_body, (N, B). pairs: two pieces each, (Q,). touch_out: (N, Q), set to 1 where they are.
+        pose: T_base_body, (N, B).
+        pairs: two pieces each, (Q,).
+        touch_out: set to 1 where they are, (N, Q).
     """
     row, k = wp.tid()
     i = pairs[k][0]

@@ -18,12 +18,12 @@ class Object:
     """All of an object that kernels read; internal frame (bounding-box centre at the origin) [m]."""
 
     sdf: Sdf
-    contact_points: wp.array(dtype=wp.vec3)
-    contact_normals: wp.array(dtype=wp.vec3)
-    contact_opposite: wp.array(dtype=wp.int32)
+    contact_points: wp.array(dtype=wp.vec3)  # (C,)
+    contact_normals: wp.array(dtype=wp.vec3)  # (C,)
+    contact_opposite: wp.array(dtype=wp.int32)  # (C,)
     contacts: wp.int32
-    obstacles: wp.array(dtype=wp.vec3)  # CLUSTER_SIZE per cluster
-    cluster_sphere: wp.array(dtype=wp.vec4)
+    obstacles: wp.array(dtype=wp.vec3)  # (clusters * CLUSTER_SIZE,)
+    cluster_sphere: wp.array(dtype=wp.vec4)  # (clusters,)
     clusters: wp.int32
     com: wp.vec3
     radius: wp.float32  # largest distance of the surface from the centre of mass

@@ -14,9 +14,16 @@ def draw_opposite(
     normals: wp.array(dtype=wp.vec3),
     cosine: float,
     seed: int,
+    # out
     opposite_out: wp.array(dtype=wp.int32),
 ):
-    """One of the points that face point i: both outward normals within the cone of the line between the two."""
+    """One of the points that face point i: both outward normals within the cone of the line between the two.
+
+    Args:
+        points: surface points [m], (n,).
+        normals: outward unit normals, (n,).
+        opposite_out: index of a point, -1 where none faces it, (n,).
+    """
     i = wp.tid()
     state = wp.rand_init(seed, i)
     chosen = int(-1)
@@ -38,9 +45,15 @@ def nearest_face_band(
     cell: float,
     dims: wp.vec3i,
     band: float,
+    # out
     key_out: wp.array(dtype=wp.uint64),
 ):
-    """Every triangle offers itself to the cells within ``band`` of it; a cell keeps the smallest (distance², face)."""
+    """Every triangle offers itself to the cells within ``band`` of it; a cell keeps the smallest (distance², face).
+
+    Args:
+        corners: corners of every face [m], (f, 3).
+        key_out: bits of distance² over the face, one a cell, (cells,).
+    """
     f = wp.tid()
     a = corners[f, 0]
     b = corners[f, 1]
@@ -84,9 +97,16 @@ def lattice_crossings(
     origin: wp.vec3d,
     cell: wp.float64,
     dims: wp.vec3i,
+    # out
     step_out: wp.array3d(dtype=wp.int32),
 ):
-    """Steps of the winding number along every z column of cells: +1 where it enters the object, -1 where it leaves."""
+    """Steps of the winding number along every z column of cells: +1 where it enters the object, -1 where it leaves.
+
+    Args:
+        vertices: [m], (v,).
+        faces: (f, 3).
+        step_out: (nx, ny, nz), zero before.
+    """
     f = wp.tid()
     ia = faces[f, 0]
     ib = faces[f, 1]
@@ -127,9 +147,15 @@ def winding_sign(
     cell: float,
     dims: wp.vec3i,
     reach: float,
+    # out
     inside_out: wp.array(dtype=wp.int32),
 ):
-    """1 where the generalised winding number of an open mesh says inside, at the given cells only."""
+    """1 where the generalised winding number of an open mesh says inside, at the given cells only.
+
+    Args:
+        band_cells: flat index of each cell, (n,).
+        inside_out: (n,).
+    """
     t = wp.tid()
     at = band_cells[t]
     k = at % dims[2]
@@ -151,9 +177,16 @@ def far_distance(
     cell: float,
     dims: wp.vec3i,
     exact: float,
+    # out
     distance_out: wp.array(dtype=float),
 ):
-    """Unsigned distance of every cell to the nearest of the faces that it and its six neighbours were handed."""
+    """Unsigned distance of every cell to the nearest of the faces that it and its six neighbours were handed.
+
+    Args:
+        corners: corners of every face [m], (f, 3).
+        nearest_face: face that each cell was handed, (cells,).
+        distance_out: [m], (cells,).
+    """
     at = wp.tid()
     k = at % dims[2]
     j = (at / dims[2]) % dims[1]
@@ -184,12 +217,22 @@ def fold_spread(
     point_face: wp.array(dtype=wp.int32),
     radius: float,
     queue: wp.array2d(dtype=wp.int32),
+    # out
     dot_out: wp.array(dtype=float),
 ):
     """Smallest dot product of a point's normal with the faces reached over the surface within ``radius``.
 
     Walks breadth-first over edge neighbours (``queue`` holds the visited faces of a point, its width bounds the walk),
     so the far side of a thin wall does not count. An open edge within the radius gives -1.
+
+    Args:
+        corners: corners of every face [m], (f, 3).
+        neighbours: face across each edge, -1 for none, (f, 3).
+        points: [m], (n,).
+        normals: outward unit normals, (n,).
+        point_face: face that each point lies on, (n,).
+        queue: scratch, (n, most faces of a walk).
+        dot_out: (n,).
     """
     t = wp.tid()
     p = points[t]

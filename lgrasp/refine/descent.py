@@ -8,7 +8,7 @@ from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.hand.palm import palm_axis
-from lgrasp.refine.descent_kernels import advance, descend, penetration
+from lgrasp.refine.descent_kernels import Moments, Progress, advance, descend, penetration
 from lgrasp.refine.energy_gradient import MAX_COLUMNS, Search
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.match_kernels import (
@@ -27,6 +27,7 @@ from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
 from lgrasp.refine.resolve_penetration import resolve_penetration
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
+from lgrasp.runtime.structs import make_struct, upload_struct
 
 _ADVANCES = 30
 _ROWS = 32  # hands of a block of threads: few hands spread over many processors
@@ -73,19 +74,18 @@ class Descent:
             return
         if first == 0 and p.max_exit_distance > 0:
             resolve_penetration(self, self._hand.model.tree, self._back, at, p.max_exit_distance)
-        first_moment, second_moment = self._moments(rows), self._moments(rows)
-        m, body = self._matches(rows), self._body(rows)
+        moments, m, body = self._moments(rows), self._matches(rows), self._body(rows)
         for i in range(first, rounds):
             self._match(at, m, body, p.reach * (p.reach_end / p.reach) ** (i / whole))
-            self._descend(at, m, (i - first) * p.gradient_steps, first, whole, False, first_moment, second_moment)
+            self._descend(at, m, (i - first) * p.gradient_steps, first, whole, False, moments)
 
     def gradient(self, at: Hands) -> np.ndarray:
         """Derivatives of E* by translation [1/m], rotation about the hand's middle [1/rad] and joints, (N, 6 + K)."""
         rows = at.pose.shape[0]
-        m, body, out = self._matches(rows), self._body(rows), self._moments(rows)
+        m, body, moments = self._matches(rows), self._body(rows), self._moments(rows)
         self._match(at, m, body, self.params.reach)
-        self._descend(at, m, 0, 0, 1, True, out, self._moments(rows))
-        return out.numpy()
+        self._descend(at, m, 0, 0, 1, True, moments)
+        return moments.first.numpy()
 
     def advanced(self, at: Hands, direction: np.ndarray, travel: np.ndarray, clearance: float) -> None:
         """Move hands straight until a point of theirs is ``clearance`` [m] from anything, or by ``travel`` (N,) [m].
@@ -146,8 +146,10 @@ class Descent:
         m.link_deep, m.link_plane = room(pairs * LINK_DEEPEST, wp.vec3), room(pairs * LINK_DEEPEST, wp.vec4)
         return m
 
-    def _moments(self, rows: int) -> wp.array:
-        return wp.zeros((rows, 6 + self._hand.model.dofs), dtype=wp.float32, device=self.device)
+    def _moments(self, rows: int) -> "Moments":
+        shape = (rows, 6 + self._hand.model.dofs)
+        zeros = (wp.zeros(shape, dtype=wp.float32, device=self.device) for _ in range(2))
+        return make_struct(Moments, **dict(zip(("first", "second"), zeros, strict=True)))
 
     def _body(self, rows: int) -> wp.array:
         return wp.empty((rows, self._bodies), dtype=wp.transform, device=self.device)
@@ -174,10 +176,12 @@ class Descent:
         wp.launch(match_solids, dim=(solids.body.shape[0], rows), inputs=inputs, device=d)
 
     def _descend(
-        self, at: Hands, m: "Correspondences", taken: int, first: int, whole: int, gradient: bool, *moments: wp.array
+        self, at: Hands, m: "Correspondences", taken: int, first: int, whole: int, gradient: bool, moments: "Moments"
     ) -> None:
         inputs = [self._hand.struct.kin, self._points, self._solids, self._target.own, self._search, m]
-        inputs += [taken, first * self.params.gradient_steps, float(whole), int(gradient), *moments]
+        skipped = first * self.params.gradient_steps
+        progress = make_struct(Progress, taken=taken, skipped=skipped, whole=float(whole), gradient=int(gradient))
+        inputs += [progress, moments]
         wp.launch(
             descend,
             dim=at.pose.shape[0],
@@ -196,49 +200,30 @@ def _middle(hand: HandArrays, surface: HandSurface) -> np.ndarray:
 
 
 def _points(surface: HandSurface, device: str) -> "Points":
-    def put(a: np.ndarray, dtype: type) -> wp.array:
-        return wp.array(np.ascontiguousarray(a), dtype=dtype, device=device)
-
-    p = Points()
-    p.block = BLOCK
-    p.body = put(surface.body.astype(np.int32), wp.int32)
-    p.points = put(surface.points.reshape(-1, 3).astype(np.float32), wp.vec3)
-    p.normals = put(surface.normals.reshape(-1, 3).astype(np.float32), wp.vec3)
-    p.weight = put(surface.weight.ravel().astype(np.float32), wp.float32)
-    p.palmar = put(np.flatnonzero(surface.weight.ravel() > 0).astype(np.int32), wp.int32)
-    return p
-
-
-_latest: dict[tuple[str, str], "Solids"] = {}  # of the latest hand: objects come and go
+    weight = surface.weight.ravel()
+    arrays = {
+        "block": BLOCK,
+        "body": surface.body,
+        "points": surface.points.reshape(-1, 3),
+        "normals": surface.normals.reshape(-1, 3),
+        "weight": weight,
+        "palmar": np.flatnonzero(weight > 0),
+    }
+    return upload_struct(Points, device, arrays)
 
 
 def _solids(hand: HandArrays) -> "Solids":
-    key = (hand.model.sha256, hand.device)
-    made = _latest.get(key)
-    if made is None:
-        made = _made_solids(hand)
-        _latest.clear()
-        _latest[key] = made
-    return made
-
-
-def _made_solids(hand: HandArrays) -> "Solids":
     found = hand_solids(hand.model, LINK_POINTS)
-    solids, device = found.solids, hand.device
-
-    def put(a: np.ndarray, dtype: type, kind: type = np.float32) -> wp.array:
-        return wp.array(np.ascontiguousarray(a, kind), dtype=dtype, device=device)
-
-    grids = [x.grid for x in solids]
-    sizes = [g.values.size for g in grids]
-    s = Solids()
-    s.body = put(found.body, wp.int32, np.int32)
-    s.ball = put(np.stack([x.ball for x in solids]), wp.vec4)
-    s.grid_first = put(np.cumsum([0, *sizes[:-1]]), wp.int32, np.int32)
-    s.grid_shape = put(np.array([g.values.shape for g in grids]), wp.vec3i, np.int32)
-    s.grid_origin = put(np.array([g.origin for g in grids]), wp.vec3)
-    s.grid_inv_cell = put(1.0 / np.array([g.cell for g in grids]), wp.float32)
-    s.grid_values = put(np.concatenate([g.values.ravel() for g in grids]), wp.float32)
-    s.points = put(np.stack([link_probes(x.points) for x in solids]), wp.vec3)
-    s.pairs = put(np.concatenate([found.pairs, found.pairs[:, ::-1]]).reshape(-1, 2), wp.vec2i, np.int32)
-    return s
+    grids = [x.grid for x in found.solids]
+    arrays = {
+        "body": found.body,
+        "ball": np.stack([x.ball for x in found.solids]),
+        "grid_first": np.cumsum([0, *[g.values.size for g in grids[:-1]]]),
+        "grid_shape": np.array([g.values.shape for g in grids]),
+        "grid_origin": np.array([g.origin for g in grids]),
+        "grid_inv_cell": 1.0 / np.array([g.cell for g in grids]),
+        "grid_values": np.concatenate([g.values.ravel() for g in grids]),
+        "points": np.stack([link_probes(x.points) for x in found.solids]),
+        "pairs": np.concatenate([found.pairs, found.pairs[:, ::-1]]).reshape(-1, 2),
+    }
+    return upload_struct(Solids, hand.device, arrays)

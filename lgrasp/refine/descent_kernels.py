@@ -16,10 +16,27 @@ _BODIES = MAX_BODIES + 1
 _CLOSE = 1.0e-5  # [m] an advance that is shorter is the last
 
 
+@wp.struct
+class Progress:
+    """Where in a search a launch is, and whether it moves anything."""
+
+    taken: wp.int32  # steps before these
+    skipped: wp.int32  # further steps that sizes fall by
+    whole: wp.float32  # rounds of matching along which sizes fall
+    gradient: wp.int32  # 1: take no step, leave the derivatives by translation, rotation and joints in the first moment
+
+
+@wp.struct
+class Moments:
+    """Moments of the gradient by translation, rotation and joints."""
+
+    first: wp.array2d(dtype=wp.float32)  # (N, 6 + K)
+    second: wp.array2d(dtype=wp.float32)  # (N, 6 + K)
+
+
 @wp.func
 def _moved(
-    first: wp.array2d(dtype=wp.float32),
-    second: wp.array2d(dtype=wp.float32),
+    moments: Moments,
     row: wp.int32,
     k: wp.int32,
     g: wp.float32,
@@ -28,12 +45,12 @@ def _moved(
     s: Search,
 ):
     """Share of the largest step, down, of coordinate k: adam's, or that of sgd with momentum."""
-    mean = s.momentum * first[row, k] + (1.0 - s.momentum) * g
-    first[row, k] = mean
+    mean = s.momentum * moments.first[row, k] + (1.0 - s.momentum) * g
+    moments.first[row, k] = mean
     if s.sgd == 1:
         return -mean
-    root = _SECOND * second[row, k] + (1.0 - _SECOND) * square
-    second[row, k] = root
+    root = _SECOND * moments.second[row, k] + (1.0 - _SECOND) * square
+    moments.second[row, k] = root
     mean = mean / (1.0 - wp.pow(s.momentum, float(step)))
     root = wp.sqrt(root / (1.0 - wp.pow(_SECOND, float(step))))
     return -wp.clamp(mean / (root + _TINY), -1.0, 1.0)
@@ -41,8 +58,7 @@ def _moved(
 
 @wp.func
 def _three_moved(
-    first: wp.array2d(dtype=wp.float32),
-    second: wp.array2d(dtype=wp.float32),
+    moments: Moments,
     row: wp.int32,
     k: wp.int32,
     g: wp.vec3,
@@ -55,9 +71,9 @@ def _three_moved(
     if s.sgd == 1:
         v = v / wp.max(wp.length(v), 1.0)
     return wp.vec3(
-        _moved(first, second, row, k, v[0], square, step, s),
-        _moved(first, second, row, k + 1, v[1], square, step, s),
-        _moved(first, second, row, k + 2, v[2], square, step, s),
+        _moved(moments, row, k, v[0], square, step, s),
+        _moved(moments, row, k + 1, v[1], square, step, s),
+        _moved(moments, row, k + 2, v[2], square, step, s),
     )
 
 
@@ -69,21 +85,16 @@ def descend(
     own: Volume,
     s: Search,
     m: Correspondences,
-    taken: wp.int32,
-    skipped: wp.int32,
-    whole: wp.float32,
-    gradient: wp.int32,
-    first: wp.array2d(dtype=wp.float32),
-    second: wp.array2d(dtype=wp.float32),
+    progress: Progress,
+    moments: Moments,
     pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),
 ):
     """``gradient_steps`` steps of hands, in place; launched over hands.
 
     Args:
-        taken: steps before these. skipped: further ones that sizes fall by. whole: rounds along which they fall.
-        first, second: moments of the gradient.
-        gradient: 1: take no step, leave the derivatives by translation, rotation and joints in ``first``.
+        pose: T_object_hand, moved in place, (N,).
+        q: [rad or m], moved in place, (N, K).
     """
     row = wp.tid()
     X = wp.zeros(shape=(_BODIES,), dtype=wp.transform)
@@ -107,17 +118,19 @@ def descend(
         centre = wp.transform_point(T, s.middle)
         by_shift = F[0]
         by_turn = M[0] - wp.cross(centre, by_shift)
-        if gradient == 1:
+        if progress.gradient == 1:
             for e in range(3):
-                first[row, e] = by_shift[e]
-                first[row, 3 + e] = by_turn[e]
+                moments.first[row, e] = by_shift[e]
+                moments.first[row, 3 + e] = by_turn[e]
             for c in range(q.shape[1]):
-                first[row, 6 + c] = by_q[c]
+                moments.first[row, 6 + c] = by_q[c]
             return
-        step = taken + k + 1
-        size = wp.pow(s.decay, float(skipped + taken + k) / (float(s.gradient_steps) * whole))
-        translation = s.max_translation_step * size * _three_moved(first, second, row, 0, by_shift, step, s)
-        rotation = s.max_rotation_step * size * _three_moved(first, second, row, 3, by_turn, step, s)
+        step = progress.taken + k + 1
+        size = wp.pow(
+            s.decay, float(progress.skipped + progress.taken + k) / (float(s.gradient_steps) * progress.whole)
+        )
+        translation = s.max_translation_step * size * _three_moved(moments, row, 0, by_shift, step, s)
+        rotation = s.max_rotation_step * size * _three_moved(moments, row, 3, by_turn, step, s)
         scale = float(1.0)
         if s.sgd == 1:
             norm = float(0.0)
@@ -126,7 +139,7 @@ def descend(
             scale = 1.0 / wp.max(wp.sqrt(norm), 1.0)
         for c in range(q.shape[1]):
             slope = by_q[c] * scale
-            x = q[row, c] + s.max_joint_step * size * _moved(first, second, row, 6 + c, slope, slope * slope, step, s)
+            x = q[row, c] + s.max_joint_step * size * _moved(moments, row, 6 + c, slope, slope * slope, step, s)
             q[row, c] = wp.clamp(x, s.lower[c], s.upper[c])
         angle = wp.length(rotation)
         r = wp.quat_identity()
@@ -150,7 +163,14 @@ def advance(
     body: wp.array2d(dtype=wp.transform),
     pose: wp.array(dtype=wp.transform),
 ):
-    """Hands moved straight until a point of theirs is ``clearance`` from anything; launched over hands."""
+    """Hands moved straight until a point of theirs is ``clearance`` from anything; launched over hands.
+
+    Args:
+        direction: unit vectors, object frame, (N,).
+        travel: how far at most [m], (N,).
+        body: T_object_body, (N, B).
+        pose: T_object_hand, moved in place, (N,).
+    """
     row = wp.tid()
     gone = float(0.0)
     way = direction[row]
@@ -177,9 +197,15 @@ def penetration(
     points: Points,
     solids: Solids,
     body: wp.array2d(dtype=wp.transform),
+    # out
     penetration_out: wp.array(dtype=wp.float32),
 ):
-    """Depth of the deepest point of hands in anything, or of that in them, at their matches [m]; over hands."""
+    """Depth of the deepest point of hands in anything, or of that in them, at their matches [m]; over hands.
+
+    Args:
+        body: T_object_body, (N, B).
+        penetration_out: [m], (N,).
+    """
     row = wp.tid()
     deep = float(-1.0e9)
     for i in range(m.block.shape[1]):

@@ -50,9 +50,9 @@ class Search:
     middle: wp.vec3  # what hands are turned about, base frame [m]
     com: wp.vec3
     radius: wp.float32
-    lower: wp.array(dtype=wp.float32)
-    upper: wp.array(dtype=wp.float32)
-    near: wp.array(dtype=wp.float32)  # distance from a limit within which it repels
+    lower: wp.array(dtype=wp.float32)  # (K,) [rad or m]
+    upper: wp.array(dtype=wp.float32)  # (K,) [rad or m]
+    near: wp.array(dtype=wp.float32)  # (K,) distance from a limit within which it repels [rad or m]
 
 
 @wp.func

@@ -28,11 +28,11 @@ _veci_deep = wp.types.vector(DEEPEST, wp.int32)
 class Points:
     """Points of a hand's surface, in blocks that ride on one body (:class:`lgrasp.refine.surface.HandSurface`)."""
 
-    body: wp.array(dtype=wp.int32)  # of each block
-    points: wp.array(dtype=wp.vec3)  # body's frame [m]
-    normals: wp.array(dtype=wp.vec3)
-    weight: wp.array(dtype=wp.float32)
-    palmar: wp.array(dtype=wp.int32)  # points with weight
+    body: wp.array(dtype=wp.int32)  # (L,) of each block
+    points: wp.array(dtype=wp.vec3)  # (L * block,) body's frame [m]
+    normals: wp.array(dtype=wp.vec3)  # (L * block,)
+    weight: wp.array(dtype=wp.float32)  # (L * block,)
+    palmar: wp.array(dtype=wp.int32)  # (W,) points with weight
     block: wp.int32  # points of a block
 
 
@@ -40,30 +40,30 @@ class Points:
 class Solids:
     """Links with their distance grids, and the pairs of them that must stay apart, both ways."""
 
-    body: wp.array(dtype=wp.int32)
-    ball: wp.array(dtype=wp.vec4)  # body's frame [m]
-    grid_first: wp.array(dtype=wp.int32)
-    grid_shape: wp.array(dtype=wp.vec3i)
-    grid_origin: wp.array(dtype=wp.vec3)
-    grid_inv_cell: wp.array(dtype=wp.float32)
-    grid_values: wp.array(dtype=wp.float32)
-    points: wp.array2d(dtype=wp.vec3)  # that other links are probed with, body's frame [m]
-    pairs: wp.array(dtype=wp.vec2i)
+    body: wp.array(dtype=wp.int32)  # (S,)
+    ball: wp.array(dtype=wp.vec4)  # (S,) body's frame [m]
+    grid_first: wp.array(dtype=wp.int32)  # (S,)
+    grid_shape: wp.array(dtype=wp.vec3i)  # (S,)
+    grid_origin: wp.array(dtype=wp.vec3)  # (S,) [m]
+    grid_inv_cell: wp.array(dtype=wp.float32)  # (S,) [1/m]
+    grid_values: wp.array(dtype=wp.float32)  # (cells of all grids,) [m]
+    points: wp.array2d(dtype=wp.vec3)  # (S, 32) that other links are probed with, body's frame [m]
+    pairs: wp.array(dtype=wp.vec2i)  # (Q,)
 
 
 @wp.struct
 class Correspondences:
     """What hands are matched to; a plane (n, o) has the signed distance n . x - o [m]."""
 
-    plane: wp.array2d(dtype=wp.vec4)  # of each point, object's frame
-    pull: wp.array2d(dtype=wp.float32)  # weight of each point, 0 where it does not pull
-    block: wp.array2d(dtype=wp.vec4)  # plane that each point is kept beyond
-    distance: wp.array2d(dtype=wp.float32)  # of each point from the object [m]
-    contacts: wp.array2d(dtype=wp.int32)  # points that make the net wrench
-    deep: wp.array2d(dtype=wp.vec3)  # points of the object, its frame [m]
-    deep_plane: wp.array2d(dtype=wp.vec4)  # of the link, body's frame
-    link_deep: wp.array2d(dtype=wp.vec3)  # points of links, their bodies' frames [m]
-    link_plane: wp.array2d(dtype=wp.vec4)  # of the other link, its body's frame
+    plane: wp.array2d(dtype=wp.vec4)  # (N, P) of each point, object's frame
+    pull: wp.array2d(dtype=wp.float32)  # (N, P) weight of each point, 0 where it does not pull
+    block: wp.array2d(dtype=wp.vec4)  # (N, P) plane that each point is kept beyond
+    distance: wp.array2d(dtype=wp.float32)  # (N, P) of each point from the object [m]
+    contacts: wp.array2d(dtype=wp.int32)  # (N, contacts) points that make the net wrench
+    deep: wp.array2d(dtype=wp.vec3)  # (N, S * DEEPEST) points of the object, its frame [m]
+    deep_plane: wp.array2d(dtype=wp.vec4)  # (N, S * DEEPEST) of the link, body's frame
+    link_deep: wp.array2d(dtype=wp.vec3)  # (N, Q * LINK_DEEPEST) points of links, their bodies' frames [m]
+    link_plane: wp.array2d(dtype=wp.vec4)  # (N, Q * LINK_DEEPEST) of the other link, its body's frame
 
 
 @wp.kernel
@@ -71,9 +71,16 @@ def place_bodies(
     h: Kinematics,
     pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),
+    # out
     body_out: wp.array2d(dtype=wp.transform),
 ):
-    """Bodies of hands in the object's frame; launched over hands."""
+    """Bodies of hands in the object's frame; launched over hands.
+
+    Args:
+        pose: T_object_hand, (N,).
+        q: [rad or m], (N, K).
+        body_out: T_object_body, (N, B).
+    """
     row = wp.tid()
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     T = pose[row]
@@ -102,7 +109,11 @@ def match_points(
     body: wp.array2d(dtype=wp.transform),
     m: Correspondences,
 ):
-    """Planes, pulls and distances of points; launched over (block, hand)."""
+    """Planes, pulls and distances of points; launched over (block, hand).
+
+    Args:
+        body: T_object_body, (N, B).
+    """
     block, row = wp.tid()
     T = body[row, points.body[block]]
     first = block * points.block
@@ -139,7 +150,11 @@ def match_points(
 def choose_contacts(
     points: Points, nearest: wp.int32, count: wp.int32, body: wp.array2d(dtype=wp.transform), m: Correspondences
 ):
-    """Farthest points among the ``nearest`` nearest palmar ones, the nearest first; launched over hands."""
+    """Farthest points among the ``nearest`` nearest palmar ones, the nearest first; launched over hands.
+
+    Args:
+        body: T_object_body, (N, B).
+    """
     row = wp.tid()
     best = int(0)
     low = float(_FAR)
@@ -203,7 +218,12 @@ def match_solids(
     body: wp.array2d(dtype=wp.transform),
     m: Correspondences,
 ):
-    """The deepest points of the object in each link; launched over (link, hand)."""
+    """The deepest points of the object in each link; launched over (link, hand).
+
+    Args:
+        cloud: points of the surface of all that hands are kept out of, object frame [m], (C,).
+        body: T_object_body, (N, B).
+    """
     i, row = wp.tid()
     T = body[row, s.body[i]]
     back = wp.transform_inverse(T)
@@ -234,7 +254,11 @@ def match_solids(
 
 @wp.kernel
 def match_links(s: Solids, margin: wp.float32, body: wp.array2d(dtype=wp.transform), m: Correspondences):
-    """The deepest points of the first link of each pair in the second; launched over (pair, hand)."""
+    """The deepest points of the first link of each pair in the second; launched over (pair, hand).
+
+    Args:
+        body: T_object_body, (N, B).
+    """
     pair, row = wp.tid()
     a = s.pairs[pair][0]
     b = s.pairs[pair][1]

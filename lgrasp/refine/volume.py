@@ -17,7 +17,7 @@ _CLOUD = 512
 class Volume:
     """Slope (3) and value [m] of a distance grid at its nodes, x slowest, z fastest."""
 
-    nodes: wp.array(dtype=wp.vec4)
+    nodes: wp.array(dtype=wp.vec4)  # (nx ny nz,)
     nx: wp.int32
     ny: wp.int32
     nz: wp.int32

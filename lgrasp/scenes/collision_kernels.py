@@ -36,12 +36,21 @@ def hand_depths(
     T_scene_hand: wp.array(dtype=wp.transform),
     body: wp.array2d(dtype=wp.transform),
     limit: wp.float32,
+    # out
     table_out: wp.array(dtype=wp.float32),
     object_out: wp.array(dtype=wp.float32),
 ):
     """One thread per (hand, body): how deep a hand sinks into z < 0 and into all objects but ``own`` [m].
 
     Depths above ``limit`` may be given too small, but not below it.
+
+    Args:
+        objects: (M,).
+        T_object_scene: of each object, (M,).
+        T_scene_hand: of each hand, (N,).
+        body: T_hand_body, (N, B).
+        table_out: [m], (N,), zero before.
+        object_out: [m], (N,), zero before.
     """
     i, b = wp.tid()
     T = T_scene_hand[i] * body[i, b]

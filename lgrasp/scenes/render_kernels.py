@@ -15,10 +15,18 @@ def cast_rays(
     centre: wp.vec2,
     far: wp.float32,
     camera: wp.array(dtype=wp.transform),
+    # out
     depth_out: wp.array3d(dtype=wp.float32),
     label_out: wp.array3d(dtype=wp.int32),
 ):
-    """One thread per (view, row, column): depth [m] and label of the first face hit; 0 and -1 where there is none."""
+    """One thread per (view, row, column): depth [m] and label of the first face hit; 0 and -1 where there is none.
+
+    Args:
+        face_label: label of each face, (F,).
+        camera: T_scene_camera, (V,).
+        depth_out: [m], (V, rows, columns).
+        label_out: (V, rows, columns).
+    """
     v, i, j = wp.tid()
     way = wp.vec3((float(j) - centre[0]) / focal[0], (float(i) - centre[1]) / focal[1], 1.0)
     length = wp.length(way)
@@ -38,12 +46,17 @@ def fit_normals(
     point: wp.array3d(dtype=wp.vec3),
     window: wp.int32,
     step: wp.float32,
+    # out
     normal_out: wp.array3d(dtype=wp.vec3),
 ):
     """One thread per (view, row, column): normal of the plane through the pixels around, turned to the camera.
 
     Of the window only points count whose depth differs by less than ``step`` times the depth per pixel in between. Zero
     where fewer than six do, or where they lie on a line.
+
+    Args:
+        point: camera frame [m], zero where nothing was seen, (V, rows, columns).
+        normal_out: camera frame, (V, rows, columns).
     """
     v, i, j = wp.tid()
     p = point[v, i, j]

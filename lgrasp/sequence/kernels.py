@@ -31,8 +31,10 @@ def count_clear(
     """One thread per (grasp, group): postures of a group that counts in which it is clear of all objects.
 
     Args:
-        row: of ``held`` that each grasp goes on from, (M,). pose: T_hand_object, (M,).
-        counts: 1 for groups that count, (H, G), by row of ``held``. clear_out: postures, (M,), zero before.
+        row: of ``held`` that each grasp goes on from, (M,).
+        pose: T_hand_object, (M,).
+        counts: 1 for groups that count, by row of ``held``, (H, G).
+        clear_out: postures, (M,), zero before.
     """
     i, g = wp.tid()
     if counts[row[i], g] == 0:
