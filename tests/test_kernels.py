@@ -10,12 +10,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MOST_ARGUMENTS = 10
 NOT_YET = (
     "lgrasp/grasp/near_kernels",
-    "lgrasp/refine/check_kernels",
     "lgrasp/simulate/worlds",
-    "lgrasp/stages/filter/control_kernels",
-    "lgrasp/stages/filter/object_kernels",
-    "lgrasp/stages/filter/posture_kernels",
-    "lgrasp/stages/filter/quality_kernels",
 )
 """Modules whose kernels are still to be given structs."""
 

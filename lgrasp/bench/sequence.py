@@ -77,7 +77,7 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
         meshes = mesh_blobs(keys.source.urdf)
         scene = make_scene(cache, inputs.hand, object_records(inputs), meshes, device.alias)
         inputs = replace(inputs, scene=scene)
-        load_kernels(device.alias, kernel_modules("lgrasp.stages."))
+        load_kernels(device.alias, kernel_modules("lgrasp.stages.", "lgrasp.grasp."))
         assert job.physics
         params = pipeline.params("sequence")
         if progress:

@@ -33,8 +33,8 @@ class Job(BaseModel, ABC):
     """What is counted."""
     asks: ClassVar[bool] = False
     """Are rows asked that may not be found? Then a part without any ends the job."""
-    kernels: ClassVar[str] = "lgrasp.stages."
-    """Prefix of the modules whose kernels the parts launch; empty: none."""
+    kernels: ClassVar[tuple[str, ...]] = ("lgrasp.stages.", "lgrasp.grasp.")
+    """Prefixes of the modules whose kernels the parts launch; empty: none."""
 
     device: str = "auto"
     workers: int = Field(0, description="Threads or processes; 0: by device.")
@@ -187,7 +187,7 @@ def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 
     outcome = Outcome(job, device, parts, present)
     begin = time.perf_counter()
     if missing and job.kernels:
-        load_kernels(device.alias, kernel_modules(job.kernels), events.loading)
+        load_kernels(device.alias, kernel_modules(*job.kernels), events.loading)
     outcome.seconds["kernels"] = time.perf_counter() - begin
     events.started(parts, present)
     begin = time.perf_counter()

@@ -196,6 +196,16 @@ def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:
     return grasps_from_arrays({name: values[rows] for name, values in grasp_arrays(table).items()})
 
 
+def choose_grasps(old: GraspTable, new: GraspTable, into: np.ndarray, rows: np.ndarray) -> GraspTable:
+    """``old`` with rows ``into`` (n,) taken from rows ``rows`` (n,) of ``new``; slots stay."""
+    made = grasp_arrays(old)
+    for name, values in grasp_arrays(new).items():
+        if name != "slot":
+            made[name] = made[name].copy()
+            made[name][into] = values[rows]
+    return grasps_from_arrays(made)
+
+
 def sort_grasps(table: GraspTable) -> GraspTable:
     """The rows in candidate order."""
     order = np.argsort(table.index, kind="stable")

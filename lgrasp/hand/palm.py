@@ -1,4 +1,6 @@
-"""Where the palm of a hand is, and what it faces."""
+"""The palmar side of a hand: where it may touch, where its palm is, and what that faces."""
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -6,6 +8,24 @@ from lgrasp.errors import HandError
 from lgrasp.hand.model import HandModel
 
 _MIN_AXIS = 0.01  # [m] between the middle of the first joints and that of the canonical box
+
+
+class Palmar(NamedTuple):
+    """Where a hand may touch: n points of its palmar side, those of one link together."""
+
+    link: np.ndarray
+    """Index in ``link_names``, (n,)."""
+    body: np.ndarray
+    """Body that the link rides on, (n,)."""
+    points: np.ndarray
+    """In the body's frame [m], (n, 3)."""
+    normals: np.ndarray
+    """Outward, (n, 3)."""
+
+
+def ruled_palmar(model: HandModel) -> Palmar:
+    """The palmar side where hand.yaml lets a hand touch."""
+    return Palmar(model.contact_link, model.contact_body, model.contact_points, model.contact_normals)
 
 
 def palm_axis(model: HandModel) -> tuple[np.ndarray, np.ndarray]:

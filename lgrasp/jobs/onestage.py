@@ -90,7 +90,7 @@ def run_up_to(
     inputs = load_inputs(cache, keys, scale, pipeline.object, pipeline.field, used, report)
     context = shard_context(pipeline, inputs, shard)
     table: Any = _table(found[stages[done - 1]], used.alias) if done else (first, count)
-    load_kernels(used.alias, kernel_modules("lgrasp.stages."), report)
+    load_kernels(used.alias, kernel_modules("lgrasp.stages.", "lgrasp.grasp."), report)
     runs = [run for run in runs if run.stage in stages[:done]]
     for stage in stages[done:]:
         start = time.perf_counter()

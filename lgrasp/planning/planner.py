@@ -12,17 +12,19 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lgrasp.geometry.poses import device_inverse
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.check import check_grasps
+from lgrasp.grasp.find_contacts import find_contacts
+from lgrasp.grasp.outcomes import REASONS
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.palm import palm_axis
+from lgrasp.hand.palm import Palmar, palm_axis
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted
-from lgrasp.refine.check import OUTCOMES, check_grasps
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.params import LocalSearch
-from lgrasp.refine.surface import DISTAL, OTHER, Palmar, farthest_points, hand_surface
+from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface
 from lgrasp.refine.volume import upload_target
 
 _CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
@@ -126,7 +128,7 @@ class Planner:
         device = self.hand.device
         points = farthest_points(self.model.contact_points.astype(float), count)
         some, workers = (_CPU_STARTS, os.cpu_count() or 1) if device == "cpu" else (_GPU_STARTS, 1)
-        counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *OUTCOMES], 0)
+        counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *REASONS], 0)
         tables = []
         with ThreadPoolExecutor(workers) as pool:
             firsts, search = range(0, count, some), self._scene.search
@@ -137,7 +139,7 @@ class Planner:
                     tried = len(points[first : first + some])
                     counts["starts"] += tried
                     counts["colliding"] += tried - len(outcome)
-                    for code, name in enumerate(OUTCOMES):
+                    for code, name in enumerate(REASONS):
                         counts[name] += int((outcome == code).sum())
                     tables.append(take_grasps(table, np.flatnonzero(outcome == 0)))
                     if progress:
@@ -203,16 +205,9 @@ class Planner:
 
     def _checked(self, at: Hands, start: np.ndarray, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray]:
         pose, q = at.numpy()
-        return check_grasps(
-            self.hand,
-            self._scene.object,
-            device_inverse(pose),
-            q,
-            bounds,
-            palmar=self.palmar,
-            around=self._scene.around,
-            index=start,
-        )
+        back, obj = device_inverse(pose), self._scene.object
+        contacts = find_contacts(self.hand, obj, back, q, bounds, self.palmar)
+        return check_grasps(self.hand, obj, back, q, contacts, bounds, around=self._scene.around, index=start)
 
 
 @dataclass(frozen=True)

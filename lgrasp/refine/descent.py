@@ -57,19 +57,19 @@ class Descent:
         self._search = self._settings(surface)
         self._back = -palm_axis(model)[1]
 
-    def run(self, at: Hands, *, rounds: int | None = None, first: int = 0) -> None:
+    def run(self, at: Hands, *, rounds: int | None = None, first: int = 0, whole: int = 0) -> None:
         """Move hands in place: match and take ``gradient_steps`` steps, in rounds ``first`` to ``rounds``.
 
         Hands deep in the object are first moved out, straight along the shortest of some ways or by opening, within
         ``max_exit_distance``: through a thin wall the gradient leads to either side.
 
         Args:
-            rounds: default: the parameters' ``matching_rounds``. Sizes and reach fall along these or the parameters'
-                rounds, whichever are more.
+            rounds: default: the parameters' ``matching_rounds``.
+            whole: rounds along which sizes and reach fall; default: these or the parameters', whichever are more.
         """
         p = self.params
         rounds = p.matching_rounds if rounds is None else rounds
-        whole, rows = max(rounds, p.matching_rounds), at.pose.shape[0]
+        whole, rows = whole or max(rounds, p.matching_rounds), at.pose.shape[0]
         if rows == 0 or rounds <= first:
             return
         if first == 0 and p.max_exit_distance > 0:

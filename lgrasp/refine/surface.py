@@ -1,12 +1,12 @@
 """Points of a hand's surface for the local search, with weights: palmar points pull, all of them are kept out."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.palm import Palmar, ruled_palmar
 
 BLOCK = 24
 """Points are in blocks of this many, each on one body."""
@@ -34,24 +34,6 @@ class HandSurface:
     """Outward unit normals, zero where the weight is zero, (L, BLOCK, 3)."""
     weight: np.ndarray
     """How strongly each point is drawn to the object, 0 for points that are only kept out, (L, BLOCK)."""
-
-
-class Palmar(NamedTuple):
-    """Where a hand may touch: n points of its palmar side, those of one link together."""
-
-    link: np.ndarray
-    """Index in ``link_names``, (n,)."""
-    body: np.ndarray
-    """Body that the link rides on, (n,)."""
-    points: np.ndarray
-    """In the body's frame [m], (n, 3)."""
-    normals: np.ndarray
-    """Outward, (n, 3)."""
-
-
-def ruled_palmar(model: HandModel) -> Palmar:
-    """The palmar side where hand.yaml lets a hand touch."""
-    return Palmar(model.contact_link, model.contact_body, model.contact_points, model.contact_normals)
 
 
 def farthest_points(points: np.ndarray, count: int, *, first: int = 0) -> np.ndarray:

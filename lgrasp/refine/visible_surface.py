@@ -5,9 +5,10 @@ import numpy as np
 from lgrasp.hand.drafting.surface_visibility import Skin, link_skins, see_skins
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.palm import Palmar
 from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.refine.surface import Palmar, last_bodies
+from lgrasp.refine.surface import last_bodies
 
 _POSTURES = 64
 _SEEN = 0.3  # share of postures

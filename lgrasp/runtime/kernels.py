@@ -19,12 +19,12 @@ def import_all() -> None:
             importlib.import_module(found.name)
 
 
-def kernel_modules(prefix: str = "lgrasp.") -> list[str]:
-    """Names of the imported modules below ``prefix`` that hold kernels, sorted."""
+def kernel_modules(*prefixes: str) -> list[str]:
+    """Names of the imported modules below any of ``prefixes`` (default: all of lgrasp) that hold kernels, sorted."""
     return sorted(
         name
         for name, module in list(sys.modules.items())
-        if name.startswith(prefix)
+        if name.startswith(prefixes or "lgrasp.")
         and any(isinstance(x, wp.Kernel) and x.func.__module__ == name for x in vars(module).values())
     )
 

@@ -13,6 +13,7 @@ from support.solids import ELL, YOU, prism
 from lgrasp.errors import DecomposeError
 from lgrasp.field.kernels import sample_postures
 from lgrasp.geometry.decompose import decompose
+from lgrasp.grasp.check_kernels import self_overlap
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.geometry import convex_pieces, is_dented
@@ -20,7 +21,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.self_collision import OVERLAP
 from lgrasp.hand.urdf import Geometry, Urdf, read_urdf
 from lgrasp.runtime.device import start
-from lgrasp.stages.filter.quality_kernels import self_overlap
 
 FINGER = """<robot name="slot">
 <link name="base"><collision><geometry><mesh filename="slot.stl"/></geometry></collision></link>

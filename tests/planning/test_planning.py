@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from lgrasp.grasp.outcomes import REASONS
 from lgrasp.planning.planner import Planner, PlanParams
-from lgrasp.refine.check import OUTCOMES
 from lgrasp.refine.params import LocalSearch
 
 QUICK = PlanParams(
@@ -24,7 +24,7 @@ def planned(planner):
 
 def test_every_start_is_accounted_for(planned):
     counts = planned.counts
-    assert counts["starts"] == 8 == counts["colliding"] + sum(counts[name] for name in OUTCOMES)
+    assert counts["starts"] == 8 == counts["colliding"] + sum(counts[name] for name in REASONS)
     assert counts["kept"] == len(planned.grasps) == len(set(planned.grasps.index)) > 0
 
 

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import upload_hand
-from lgrasp.hand.palm import palm_axis
+from lgrasp.hand.palm import palm_axis, ruled_palmar
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.object.find import find_object
 from lgrasp.object.preprocess import preprocess_object
 from lgrasp.planning.planner import Planner, PlanParams
 from lgrasp.planning.starts import start_poses, tilted
-from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface, ruled_palmar
+from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface
 from lgrasp.runtime.device import resolve_device
 
 

@@ -6,7 +6,8 @@ import torch
 
 from lgrasp.geometry.rotations import so3_exp
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.refine.check import check_grasps
+from lgrasp.grasp.check import check_grasps
+from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.refine.refiner import Pose, object_pose
 
 
@@ -69,7 +70,9 @@ def test_penetration_is_left(make, valid, inputs):
     deep = refiner.max_penetration(*into) > 0.004
     assert deep.sum() > 40
     found = refiner(*(x[deep] for x in into)).pose
-    table, _ = check_grasps(inputs.hand, inputs.object, object_pose(found), found.q.numpy(), GraspBounds())
+    pose, q, bounds = object_pose(found), found.q.numpy(), GraspBounds()
+    contacts = find_contacts(inputs.hand, inputs.object, pose, q, bounds)
+    table, _ = check_grasps(inputs.hand, inputs.object, pose, q, contacts, bounds)
     assert np.quantile(table.metrics["penetration"], 0.9) < 0.001
 
 

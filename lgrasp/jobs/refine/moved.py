@@ -10,12 +10,13 @@ import torch
 from lgrasp.dataset import GraspRows
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.check import check_grasps
+from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays, join_grasps
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.object.arrays import upload_object
+from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
-from lgrasp.refine.check import check_grasps
 from lgrasp.refine.energy import Energies
 from lgrasp.refine.refiner import Pose, Refiner, object_pose
 from lgrasp.stages.refine.params import RefineParams
@@ -74,10 +75,8 @@ def move_rows(
         given = _hands(rows, part, hand, obj)
         refined = refiner(*given)
         index = np.arange(len(rows))[part]
-        old, old_outcome = check_grasps(hand, arrays, object_pose(given), given.q.cpu().numpy(), bounds, index=index)
-        new, new_outcome = check_grasps(
-            hand, arrays, object_pose(refined.pose), refined.pose.q.cpu().numpy(), bounds, index=index
-        )
+        old, old_outcome = _checked(hand, arrays, given, bounds, index)
+        new, new_outcome = _checked(hand, arrays, refined.pose, bounds, index)
         good, was = new_outcome == 0, old_outcome == 0
         least = (
             old.metrics["unresisted_load"] if known is None else np.fmin(old.metrics["unresisted_load"], known[part])
@@ -105,6 +104,13 @@ def move_rows(
     was = np.concatenate([ok[0] for ok in oks])
     means = float(first_energy.sum(0).mean()), float(last_energy.sum(0).mean())
     return Moved(made, means, (int(was.sum()), int(valid.sum())), int(outside.sum()), far)
+
+
+def _checked(
+    hand: HandArrays, obj: ObjectArrays, at: Pose, bounds: GraspBounds, index: np.ndarray
+) -> tuple[GraspTable, np.ndarray]:
+    pose, q = object_pose(at), at.q.cpu().numpy()
+    return check_grasps(hand, obj, pose, q, find_contacts(hand, obj, pose, q, bounds), bounds, index=index)
 
 
 def _outside(rows: GraspRows, hand: HandArrays) -> np.ndarray:

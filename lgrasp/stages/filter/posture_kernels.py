@@ -1,128 +1,108 @@
-"""Kernels that put the hand into a set's posture: used fingers first, unused ones after."""
+"""Kernels that put the hand into a set's posture: touching fingers first, the others after."""
 
 import warp as wp
 
 from lgrasp.field.arrays import Field, field_seed
+from lgrasp.grasp.check_kernels import contact_fit, hand_pairs_clear
+from lgrasp.grasp.check_structs import Findings, Limits, Places, Postures
 from lgrasp.grasp.collision import body_clear
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
+from lgrasp.grasp.outcomes import CONTACT, KEPT, OBJECT_COLLISION, SELF_COLLISION, UNUSED_FINGER
 from lgrasp.hand.arrays import Hand
-from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.kinematics import clamp_dofs, group_forward, vec_dof
-from lgrasp.math.triangles import least_facing
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_DOUBT = wp.constant(3.0e-5)  # [m]
 
+@wp.struct
+class Sets:
+    """Candidates that sets choose from: P poses, groups G, M candidates of each."""
 
-@wp.func
-def _group_pairs_clear(hand: Hand, a: wp.int32, b: wp.int32, X: wp.array(dtype=wp.transform), margin: wp.float32):
-    """Pairs of groups a <= b (0 = base, g + 1 = group g) of a whole hand, X[j] = pose of body 1 + j."""
-    at = int(0)
-    if a > 0:
-        at = hand.kin.joint_first[a - 1]
-    return group_pairs_clear(hand, a, b, X, at, X, hand.kin.joint_first[b - 1], margin)
+    palm_point: wp.array(dtype=wp.int32)  # (P,) place on the hand that touches without a finger, -1 none
+    palm_surface: wp.array(dtype=wp.int32)  # (P,) place on the object
+    setting: wp.array(dtype=wp.int32)  # (P,) setting of the hand's shared joints
+    surface: wp.array3d(dtype=wp.int32)  # (P, G, M) place on the object
+    record: wp.array3d(dtype=wp.int32)  # (P, G, M) record of the field
+    q: wp.array3d(dtype=vec_dof)  # (P, G, M) [rad or m]
 
 
 @wp.kernel
-def place_used(
+def place_touching(
     hand: Hand,
     field: Field,
-    obj: Object,
     held: Held,
-    margin: wp.float32,
-    max_gap: wp.float32,
-    cosine: wp.float32,
-    index: wp.array(dtype=wp.int32),
-    pose: wp.array(dtype=wp.transform),
-    palm_point: wp.array(dtype=wp.int32),
-    palm_surface: wp.array(dtype=wp.int32),
-    surface: wp.array3d(dtype=wp.int32),
-    record: wp.array3d(dtype=wp.int32),
-    q: wp.array3d(dtype=vec_dof),
-    set_pose: wp.array(dtype=wp.int32),
-    chosen: wp.array2d(dtype=wp.int32),
-    outcome_out: wp.array(dtype=wp.int32),
-    body_out: wp.array2d(dtype=wp.transform),
-    posture_out: wp.array2d(dtype=vec_dof),
-    contact_out: wp.array2d(dtype=wp.int32),
-    contact_surface_out: wp.array2d(dtype=wp.int32),
-    gap_out: wp.array(dtype=wp.float32),
-    dot_out: wp.array(dtype=wp.float32),
+    limits: Limits,
+    places: Places,
+    sets: Sets,
+    at_out: Postures,
+    found_out: Findings,
 ):
     """Postures and bodies of the touching fingers; contacts on the links' true meshes; collisions among these fingers.
 
     Contacts come in group order, that of the palm (or of a finger that stays as it is) last; unused places hold -1.
     """
     i = wp.tid()
-    row = set_pose[i]
-    h = index[row] // held.tries
+    row = at_out.of[i]
+    h = at_out.index[row] // held.tries
     G = hand.kin.groups
-    X = body_out[i]
+    X = at_out.body[i]
     for g in range(G):
         if group_fixed(hand, held, h, g):
-            posture_out[i, g] = held.posture[h, g]
+            at_out.posture[i, g] = held.posture[h, g]
             group_forward(hand.kin, g, held.posture[h, g], X, hand.kin.joint_first[g])
-    T = pose[row]
+    T = at_out.pose[row]
     k = int(0)
     gap = float(0.0)
-    dot = float(1.0)
+    facing = float(1.0)
     least = float(1.0)
     for g in range(G + 1):
-        contact_out[i, g] = -1
-        contact_surface_out[i, g] = -1
+        at_out.contact[i, g] = -1
+        at_out.surface[i, g] = -1
     for g in range(G + 1):
         s = int(-1)
         c = int(-1)
         B = wp.transform_identity()
         if g == G:
-            if palm_point[row] >= 0:
-                s = palm_surface[row]
-                c = palm_point[row]
-                if hand.contacts.body[c] > 0:
-                    B = X[hand.contacts.body[c] - 1]
-        elif chosen[i, g] >= 0:
-            x = clamp_dofs(hand.kin, g, q[row, g, chosen[i, g]])
-            posture_out[i, g] = x
+            if sets.palm_point[row] >= 0:
+                s = sets.palm_surface[row]
+                c = sets.palm_point[row]
+                if places.body[c] > 0:
+                    B = X[places.body[c] - 1]
+        elif at_out.chosen[i, g] >= 0:
+            m = at_out.chosen[i, g]
+            x = clamp_dofs(hand.kin, g, sets.q[row, g, m])
+            at_out.posture[i, g] = x
             group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
-            s = surface[row, g, chosen[i, g]]
-            c = field.point[record[row, g, chosen[i, g]]]
-            B = X[hand.contacts.body[c] - 1]
+            s = sets.surface[row, g, m]
+            c = field.point[sets.record[row, g, m]]
+            B = X[places.body[c] - 1]
         if s >= 0:
-            local = wp.transform_point(wp.transform_inverse(B), wp.transform_point(T, obj.contact_points[s]))
-            inward = -wp.transform_vector(T, obj.contact_normals[s])
-            mesh = hand.contacts.mesh[hand.contacts.grid[c]]
-            hit = wp.mesh_query_point_no_sign(mesh, local, 0.05)
-            d = float(1.0)
-            a = float(-1.0)
-            if hit.result:
-                d = wp.length(local - wp.mesh_eval_position(mesh, hit.face, hit.u, hit.v))
-                a = wp.dot(inward, wp.transform_vector(B, wp.mesh_eval_face_normal(mesh, hit.face)))
-                # beside an edge rounding decides which facet is nearest, so all of them must do
-                turned = wp.transform_vector(wp.transform_inverse(B), inward)
-                least = wp.min(least, least_facing(mesh, local, d + _DOUBT, turned))
-            gap = wp.max(gap, d)
-            dot = wp.min(dot, a)
-            contact_out[i, k] = c
-            contact_surface_out[i, k] = s
+            p = wp.transform_point(T, places.points[s])
+            inward = -wp.transform_vector(T, places.normals[s])
+            fit = contact_fit(hand, places.grid[c], B, p, inward)
+            gap = wp.max(gap, fit[0])
+            facing = wp.min(facing, fit[1])
+            least = wp.min(least, fit[2])
+            at_out.contact[i, k] = c
+            at_out.surface[i, k] = s
             k += 1
-    gap_out[i] = gap
-    dot_out[i] = dot
-    if gap > max_gap or wp.min(dot, least) < cosine:
-        outcome_out[i] = 4
+    found_out.gap[i] = gap
+    found_out.facing[i] = facing
+    if gap > limits.max_gap or wp.min(facing, least) < limits.min_cosine:
+        found_out.outcome[i] = CONTACT
         return
     for g in range(G):
-        if chosen[i, g] >= 0:
-            clear = _group_pairs_clear(hand, 0, g + 1, X, margin)
+        if at_out.chosen[i, g] >= 0:
+            clear = hand_pairs_clear(hand, 0, g + 1, X, limits.min_self_distance)
             for f in range(G):
-                if clear and (f == g or (chosen[i, f] >= 0 and f < g) or group_fixed(hand, held, h, f)):
-                    clear = _group_pairs_clear(hand, wp.min(f, g) + 1, wp.max(f, g) + 1, X, margin)
+                if clear and (f == g or (at_out.chosen[i, f] >= 0 and f < g) or group_fixed(hand, held, h, f)):
+                    clear = hand_pairs_clear(hand, wp.min(f, g) + 1, wp.max(f, g) + 1, X, limits.min_self_distance)
             if not clear:
-                outcome_out[i] = 2
+                found_out.outcome[i] = SELF_COLLISION
                 return
-    outcome_out[i] = 0
+    found_out.outcome[i] = KEPT
 
 
 @wp.kernel
@@ -131,41 +111,32 @@ def fill_unused(
     field: Field,
     obj: Object,
     held: Held,
+    limits: Limits,
     seed: wp.array(dtype=wp.int32),
-    max_depth: wp.float32,
     draws: wp.int32,
-    slack: wp.float32,
-    margin: wp.float32,
-    index: wp.array(dtype=wp.int32),
-    pose: wp.array(dtype=wp.transform),
-    setting: wp.array(dtype=wp.int32),
-    set_pose: wp.array(dtype=wp.int32),
-    set_slot: wp.array(dtype=wp.int32),
-    chosen: wp.array2d(dtype=wp.int32),
-    depth: wp.array(dtype=wp.float32),
-    outcome_out: wp.array(dtype=wp.int32),
-    body_out: wp.array2d(dtype=wp.transform),
-    posture_out: wp.array2d(dtype=vec_dof),
+    sets: Sets,
+    at_out: Postures,
+    found_out: Findings,
 ):
     """Postures of fingers without contact: random ones of the field, drawn ever closer to the open posture.
 
     A posture is taken when it is clear of the object, the palm and the fingers placed before.
     """
     i = wp.tid()
-    if outcome_out[i] != 0:
+    if found_out.outcome[i] != KEPT:
         return
-    if depth[i] > max_depth:
-        outcome_out[i] = 3
+    if found_out.penetration[i] > limits.max_penetration:
+        found_out.outcome[i] = OBJECT_COLLISION
         return
-    row = set_pose[i]
+    row = at_out.of[i]
     G = hand.kin.groups
-    h = index[row] // held.tries
-    state = wp.rand_init(seed[0], index[row] * 64 + set_slot[i])
-    T_object = wp.transform_inverse(pose[row])
-    X = body_out[i]
+    h = at_out.index[row] // held.tries
+    state = wp.rand_init(seed[0], at_out.index[row] * 64 + at_out.slot[i])
+    T_object = wp.transform_inverse(at_out.pose[row])
+    X = at_out.body[i]
     for g in range(G):
-        if chosen[i, g] < 0 and not group_fixed(hand, held, h, g):
-            slot = setting[row] * G + g
+        if at_out.chosen[i, g] < 0 and not group_fixed(hand, held, h, g):
+            slot = sets.setting[row] * G + g
             r0 = field.start[field.cell_first[slot] * 64]
             r1 = field.start[field.cell_first[slot + 1] * 64]
             first = hand.kin.dof_first[g]
@@ -175,7 +146,7 @@ def fill_unused(
                 share = 1.0 - float(t + 1) / float(draws)
                 x = vec_dof()
                 for d in range(dofs):
-                    x[d] = hand.kin.dof_setting[setting[row], first + d]
+                    x[d] = hand.kin.dof_setting[sets.setting[row], first + d]
                 if r1 > r0:
                     r = r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1)
                     drawn = field_seed(field, hand.kin, slot, r)
@@ -185,23 +156,23 @@ def fill_unused(
                 group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
                 clear = int(1)
                 for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-                    if clear == 1 and not body_clear(hand, obj, 1 + k, T_object * X[k], slack):
+                    if clear == 1 and not body_clear(hand, obj, 1 + k, T_object * X[k], limits.allowed_penetration):
                         clear = 0
-                if clear == 1 and not _group_pairs_clear(hand, 0, g + 1, X, margin):
+                if clear == 1 and not hand_pairs_clear(hand, 0, g + 1, X, limits.min_self_distance):
                     clear = 0
-                if clear == 1 and not _group_pairs_clear(hand, g + 1, g + 1, X, margin):
+                if clear == 1 and not hand_pairs_clear(hand, g + 1, g + 1, X, limits.min_self_distance):
                     clear = 0
                 for f in range(G):
                     # used fingers, those that stay, and unused ones that are placed already
-                    if f != g and (chosen[i, f] >= 0 or f < g or group_fixed(hand, held, h, f)):
+                    if f != g and (at_out.chosen[i, f] >= 0 or f < g or group_fixed(hand, held, h, f)):
                         a = wp.min(g, f) + 1
                         b = wp.max(g, f) + 1
-                        if clear == 1 and not _group_pairs_clear(hand, a, b, X, margin):
+                        if clear == 1 and not hand_pairs_clear(hand, a, b, X, limits.min_self_distance):
                             clear = 0
                 if clear == 1:
-                    posture_out[i, g] = x
+                    at_out.posture[i, g] = x
                     found = 1
                     break
             if found == 0:
-                outcome_out[i] = 1
+                found_out.outcome[i] = UNUSED_FINGER
                 return

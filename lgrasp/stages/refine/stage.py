@@ -3,8 +3,9 @@
 import numpy as np
 
 from lgrasp.geometry.poses import device_inverse
+from lgrasp.grasp.check import check_grasps
+from lgrasp.grasp.find_contacts import contact_width, find_contacts
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
-from lgrasp.refine.check import check_grasps, contact_width
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.params import LocalSearch
@@ -31,9 +32,9 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
     at = Hands.put(device_inverse(inputs.pose), np.clip(inputs.q, tree.joint_lower, tree.joint_upper), context.device)
     _descent(params, context).run(at)
     pose, q = at.numpy()
-    table, outcome = check_grasps(
-        context.hand, context.object, device_inverse(pose), q, context.bounds, index=inputs.index
-    )
+    pose, bounds = device_inverse(pose), context.bounds
+    contacts = find_contacts(context.hand, context.object, pose, q, bounds)
+    table, outcome = check_grasps(context.hand, context.object, pose, q, contacts, bounds, index=inputs.index)
     passed = outcome == 0
     better = passed & (table.metrics["unresisted_load"] < inputs.metrics["unresisted_load"])
     counts = {"tried": len(inputs), "passed": int(passed.sum()), "replaced": int(better.sum())}

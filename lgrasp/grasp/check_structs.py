@@ -1,0 +1,113 @@
+"""What the kernels of the checks are given: bounds, hands before an object, their contacts, and what is found."""
+
+import math
+
+import warp as wp
+
+from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.math.kinematics import vec_dof
+
+
+@wp.struct
+class Limits:
+    """:class:`~lgrasp.grasp.bounds.GraspBounds` on a device; lengths in metres, angles by their cosines."""
+
+    max_gap: wp.float32
+    min_cosine: wp.float32  # of opposed normals
+    min_spread_cosine: wp.float32  # of the object's normals about a contact
+    max_penetration: wp.float32
+    allowed_penetration: wp.float32
+    min_self_distance: wp.float32
+    min_object_distance: wp.float32
+    friction: wp.float32
+    torque_scale: wp.float32
+    max_gswo: wp.float32
+    max_unresisted_load: wp.float32
+    pregrasp_distance: wp.float32
+    min_pregrasp_distance: wp.float32
+    squeeze_force: wp.float32
+    squeeze_stiffness: wp.float32
+    deepest: wp.float32  # penetrations above this are not told from each other
+    whole: wp.int32  # 1: rows that failed are measured to the end
+
+
+@wp.struct
+class Postures:
+    """n hands before an object: groups G, bodies B, joints K; at most C contacts each."""
+
+    pose: wp.array(dtype=wp.transform)  # (P,) T_hand_object of the internal frame
+    index: wp.array(dtype=wp.int32)  # (P,) candidate, which tells what the hand holds already
+    of: wp.array(dtype=wp.int32)  # (n,) pose of each
+    slot: wp.array(dtype=wp.int32)  # (n,)
+    chosen: wp.array2d(dtype=wp.int32)  # (n, G) -1: the group does not touch the object
+    body: wp.array2d(dtype=wp.transform)  # (n, B - 1) T_hand_body of all but the base
+    posture: wp.array2d(dtype=vec_dof)  # (n, G) [rad or m]
+    contact: wp.array2d(dtype=wp.int32)  # (n, C) place on the hand, -1 none
+    surface: wp.array2d(dtype=wp.int32)  # (n, C) place on the object, -1 none
+
+
+@wp.struct
+class Places:
+    """Where contacts may be: h places on the hand, o on the object."""
+
+    link: wp.array(dtype=wp.int32)  # (h,) index in link_names
+    body: wp.array(dtype=wp.int32)  # (h,)
+    grid: wp.array(dtype=wp.int32)  # (h,) mesh of the link, -1 none
+    points: wp.array(dtype=wp.vec3)  # (o,) object's internal frame [m]
+    normals: wp.array(dtype=wp.vec3)  # (o,) outward
+
+
+@wp.struct
+class Findings:
+    """What is found of n hands."""
+
+    outcome: wp.array(dtype=wp.int32)  # (n,) Outcome
+    numbers: wp.array2d(dtype=wp.float32)  # (6, n) MEASURED
+    gap: wp.array(dtype=wp.float32)  # its rows
+    facing: wp.array(dtype=wp.float32)
+    fswo: wp.array(dtype=wp.float32)
+    gswo: wp.array(dtype=wp.float32)
+    unresisted_load: wp.array(dtype=wp.float32)
+    penetration: wp.array(dtype=wp.float32)
+    force: wp.array2d(dtype=wp.vec3)  # (n, C) object's frame, normal parts add up to 1
+
+
+@wp.struct
+class Packed:
+    """Rows as they are stored, m of them."""
+
+    pose: wp.array(dtype=wp.transform)  # (m,)
+    point: wp.array2d(dtype=wp.vec3)  # (m, C) NaN where there is no contact
+    normal: wp.array2d(dtype=wp.vec3)  # (m, C)
+    force: wp.array2d(dtype=wp.vec3)  # (m, C)
+    link: wp.array2d(dtype=wp.int32)  # (m, C) -1 where there is no contact
+    index: wp.array(dtype=wp.int32)  # (m,)
+    slot: wp.array(dtype=wp.int32)  # (m,)
+    numbers: wp.array2d(dtype=wp.float32)  # (6, m)
+
+
+def device_limits(bounds: GraspBounds, *, deepest: float | None = None) -> Limits:
+    """Bounds for kernels.
+
+    Args:
+        deepest: measure every row to the end, penetrations up to this [m]; None: a row's first failure ends it.
+    """
+    s = Limits()
+    for name in Limits.vars:
+        if name in GraspBounds.model_fields:
+            setattr(s, name, getattr(bounds, name))
+    s.min_cosine = math.cos(math.radians(bounds.max_normal_angle))
+    s.min_spread_cosine = math.cos(math.radians(bounds.max_normal_spread))
+    s.deepest = bounds.max_penetration if deepest is None else deepest
+    s.whole = int(deepest is not None)
+    return s
+
+
+def new_findings(n: int, width: int, device: str) -> Findings:
+    """Room for what is found of n hands with ``width`` contacts at most."""
+    f = Findings()
+    f.outcome = wp.zeros(n, dtype=wp.int32, device=device)
+    f.numbers = wp.zeros((6, max(n, 1)), dtype=wp.float32, device=device)
+    f.gap, f.facing, f.fswo, f.gswo, f.unresisted_load, f.penetration = (f.numbers[i] for i in range(6))
+    f.force = wp.zeros((n, width), dtype=wp.vec3, device=device)
+    return f

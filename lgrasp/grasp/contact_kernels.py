@@ -1,0 +1,137 @@
+"""Kernels that find where hands in a posture touch an object: the nearest allowed point of each link."""
+
+import warp as wp
+
+from lgrasp.grasp.check_kernels import contact_fit
+from lgrasp.grasp.check_structs import Limits
+from lgrasp.hand.arrays import Hand
+from lgrasp.math.kinematics import MAX_JOINTS, group_dofs, group_forward
+from lgrasp.math.sdf import sdf_gradient, sdf_value
+from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_BESIDE = wp.constant(0.006)  # [m] from a contact point of the object whose normal stands for that of its surface
+_MAX_RUNS = wp.constant(64)
+_MAX_GROUPS = wp.constant(16)
+_SECOND = wp.constant(1.0e3)  # [m] by which a group's second contact comes after all first ones
+
+
+@wp.struct
+class PalmarRuns:
+    """Points of a hand that may touch, those of one link together: r runs of points."""
+
+    points: wp.array(dtype=wp.vec3)  # (p,) body's frame [m]
+    normals: wp.array(dtype=wp.vec3)  # (p,) outward
+    first: wp.array(dtype=wp.int32)  # (r + 1,)
+    body: wp.array(dtype=wp.int32)  # (r,)
+    link: wp.array(dtype=wp.int32)  # (r,) index in link_names
+    grid: wp.array(dtype=wp.int32)  # (r,) mesh of the link, -1 none
+
+
+@wp.struct
+class RunContacts:
+    """What is found of n hands, run by run."""
+
+    gap: wp.array2d(dtype=wp.float32)  # (n, r) [m], -1 without contact
+    point: wp.array2d(dtype=wp.vec3)  # (n, r) on the object, its internal frame [m]
+    normal: wp.array2d(dtype=wp.vec3)  # (n, r) outward
+
+
+@wp.kernel
+def link_contacts(
+    hand: Hand,
+    obj: Object,
+    limits: Limits,
+    runs: PalmarRuns,
+    pose: wp.array(dtype=wp.transform),
+    q: wp.array2d(dtype=wp.float32),
+    found_out: RunContacts,
+):
+    """One thread per (run, hand): its nearest point that faces the object within the limits, if there is one.
+
+    The contact on the object is the foot of the perpendicular; its normal is that of the contact point beside it.
+    pose (n,) is T_hand_object, q (n, K) [rad or m].
+    """
+    s, i = wp.tid()
+    found_out.gap[i, s] = -1.0
+    T_object = wp.transform_inverse(pose[i])
+    g = hand.body_group[runs.body[s]]
+    B = wp.transform_identity()
+    if g >= 0:
+        X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+        first = group_forward(hand.kin, g, group_dofs(hand.kin, g, q, i), X, 0)
+        B = X[runs.body[s] - 1 - first]
+    T = T_object * B
+    best = limits.max_gap
+    c = int(-1)
+    for k in range(runs.first[s], runs.first[s + 1]):
+        p = wp.transform_point(T, runs.points[k])
+        d = wp.abs(sdf_value(obj.sdf, p))
+        if d < best:
+            e = sdf_gradient(obj.sdf, p)
+            n = wp.vec3(e[0], e[1], e[2])
+            if wp.dot(n, wp.transform_vector(T, runs.normals[k])) < -limits.min_cosine:
+                best = d
+                c = k
+    if c < 0:
+        return
+    p = wp.transform_point(T, runs.points[c])
+    e = sdf_gradient(obj.sdf, p)
+    n = wp.vec3(e[0], e[1], e[2])
+    foot = p - n * e[3]
+    beside = int(-1)
+    near = float(_BESIDE)
+    for k in range(obj.contacts):
+        far = wp.length(obj.contact_points[k] - foot)
+        if far < near:
+            near = far
+            beside = k
+    if beside < 0:
+        return
+    m = obj.contact_normals[beside]
+    facing = -wp.dot(m, wp.transform_vector(T, runs.normals[c]))
+    if runs.grid[s] >= 0:
+        fit = contact_fit(hand, runs.grid[s], T, foot, -m)
+        best = fit[0]
+        facing = wp.min(fit[1], fit[2])
+    if wp.dot(m, n) > limits.min_spread_cosine and facing > limits.min_cosine and best < limits.max_gap:
+        found_out.gap[i, s] = best
+        found_out.point[i, s] = foot
+        found_out.normal[i, s] = m
+
+
+@wp.kernel
+def choose_contacts(
+    hand: Hand,
+    runs: PalmarRuns,
+    found: RunContacts,
+    link_out: wp.array2d(dtype=wp.int32),
+    point_out: wp.array(dtype=wp.vec3),
+    normal_out: wp.array(dtype=wp.vec3),
+):
+    """The contacts that are kept, C at most: the nearest of each group (palm included) first, then of the others.
+
+    link_out is (n, C), -1 for none; point_out and normal_out are (n * C,).
+    """
+    i = wp.tid()
+    taken = wp.zeros(shape=(_MAX_RUNS,), dtype=wp.int32)
+    has = wp.zeros(shape=(_MAX_GROUPS,), dtype=wp.int32)
+    width = link_out.shape[1]
+    for k in range(width):
+        best = int(-1)
+        least = float(1.0e30)
+        for s in range(found.gap.shape[1]):
+            if found.gap[i, s] >= 0.0 and taken[s] == 0:
+                worth = found.gap[i, s] + _SECOND * float(has[hand.body_group[runs.body[s]] + 1])
+                if worth < least:
+                    least = worth
+                    best = s
+        link_out[i, k] = -1
+        if best >= 0:
+            taken[best] = 1
+            has[hand.body_group[runs.body[best]] + 1] = 1
+            link_out[i, k] = runs.link[best]
+            point_out[i * width + k] = found.point[i, best]
+            normal_out[i * width + k] = found.normal[i, best]

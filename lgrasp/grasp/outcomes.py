@@ -1,0 +1,35 @@
+"""What becomes of a grasp that is checked, and the numbers kept of it."""
+
+from enum import IntEnum
+
+import warp as wp
+
+
+class Outcome(IntEnum):
+    """The first check that a row failed."""
+
+    KEPT = 0
+    UNUSED_FINGER = 1
+    SELF_COLLISION = 2
+    OBJECT_COLLISION = 3
+    CONTACT = 4
+    BALANCE = 5
+    UNRESISTED_LOAD = 6
+
+
+KEPT = wp.constant(int(Outcome.KEPT))
+UNUSED_FINGER = wp.constant(int(Outcome.UNUSED_FINGER))
+SELF_COLLISION = wp.constant(int(Outcome.SELF_COLLISION))
+OBJECT_COLLISION = wp.constant(int(Outcome.OBJECT_COLLISION))
+CONTACT = wp.constant(int(Outcome.CONTACT))
+BALANCE = wp.constant(int(Outcome.BALANCE))
+UNRESISTED_LOAD = wp.constant(int(Outcome.UNRESISTED_LOAD))
+
+REASONS = ("kept", "unused finger", "self-collision", "object collision", "contact", "balance", "unresisted load")
+"""Outcomes in words, by code."""
+
+MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
+"""Rows of the numbers that the checks leave on the device; ``facing`` is the least cosine of opposed normals."""
+
+METRICS = ("fswo", "gswo", "unresisted_load", "epsilon", "penetration", "self_penetration", "gap", "normal_error")
+"""Columns of the metrics table."""

@@ -1,0 +1,162 @@
+"""Kernels that measure how a grasp's contacts balance, resist loads and hold: residuals, forces, epsilon."""
+
+import warp as wp
+
+from lgrasp.grasp.check_structs import Findings, Limits, Places, Postures
+from lgrasp.grasp.outcomes import BALANCE, KEPT, OBJECT_COLLISION
+from lgrasp.math.constants import BALANCED, CONE_EDGES
+from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted
+from lgrasp.math.quality import epsilon_bound
+from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_EDGES = wp.constant(CONE_EDGES)
+_BALANCED = wp.constant(BALANCED)
+_NARROWER = wp.constant(2)  # cones tried before the full one
+_SLACK = wp.constant(1.0e-3)  # by which their residual may be larger
+
+
+@wp.func
+def _contacts(
+    places: Places,
+    surfaces: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+):
+    """Points and inward normals of a hand's contacts in the object's frame; returns their number."""
+    k = int(0)
+    for c in range(surfaces.shape[0]):
+        if surfaces[c] >= 0:
+            points[k] = places.points[surfaces[c]]
+            normals[k] = -places.normals[surfaces[c]]
+            k += 1
+    return k
+
+
+@wp.func
+def _balanced(
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    friction: wp.float32,
+    edges: wp.int32,
+    torque_scale: wp.float32,
+    stop: wp.float32,
+    forces: wp.array(dtype=wp.vec3),
+):
+    """:func:`balance` about the contacts' centroid."""
+    centroid = wp.vec3(0.0)
+    for c in range(k):
+        centroid = centroid + points[c]
+    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    for c in range(k):
+        arms[c] = points[c] - centroid / float(k)
+    return balance(arms, normals, k, friction, edges, torque_scale, stop, forces)
+
+
+@wp.kernel
+def balance_grasps(limits: Limits, places: Places, at: Postures, found_out: Findings):
+    """FSWO (eq. 1), GSWO (eq. 2, pyramids) and its forces, object frame."""
+    i = wp.tid()
+    if found_out.outcome[i] == KEPT and found_out.penetration[i] > limits.max_penetration:
+        found_out.outcome[i] = OBJECT_COLLISION
+    if found_out.outcome[i] != KEPT and limits.whole == 0:
+        return
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    k = _contacts(places, at.surface[i], points, normals)
+    if k < 2:
+        found_out.fswo[i] = 1.0
+        found_out.gswo[i] = 1.0
+        return
+    found_out.fswo[i] = _balanced(points, normals, k, 0.0, 0, limits.torque_scale, 0.0, forces)
+    gswo = _balanced(points, normals, k, limits.friction, _EDGES, limits.torque_scale, _BALANCED, forces)
+    found_out.gswo[i] = gswo
+    if gswo > limits.max_gswo:
+        if found_out.outcome[i] == KEPT:
+            found_out.outcome[i] = BALANCE
+        if limits.whole == 0:
+            return
+    for c in range(k):
+        found_out.force[i, c] = forces[c]
+
+
+@wp.kernel
+def resist_loads(obj: Object, limits: Limits, places: Places, at: Postures, found_out: Findings):
+    """One thread per (direction, hand): ``unresisted_load`` grows to the worst direction's."""
+    direction, i = wp.tid()
+    most = limits.max_unresisted_load
+    if limits.whole == 1:
+        most = 1.0
+    worst = found_out.unresisted_load[i]
+    if worst > most or (found_out.outcome[i] != KEPT and limits.whole == 0):
+        return
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    k = _contacts(places, at.surface[i], points, normals)
+    if k < 2:
+        wp.atomic_max(found_out.unresisted_load, i, 1.0)
+        return
+    for c in range(k):
+        points[c] = points[c] - obj.com
+    turn = wp.quat_inverse(wp.transform_get_rotation(at.pose[at.of[i]]))
+    load = unresisted(points, normals, k, limits.friction, turn, direction, worst, most)
+    wp.atomic_max(found_out.unresisted_load, i, load)
+
+
+@wp.kernel
+def center_forces(
+    limits: Limits,
+    places: Places,
+    at: Postures,
+    rows: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    found_out: Findings,
+):
+    """Balancing forces of the rows kept in the narrowest of a few round cones that balances as well."""
+    i = wp.tid()
+    if i >= rows[0]:
+        return
+    s = row[i]
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    k = _contacts(places, at.surface[s], points, normals)
+    if k < 2:
+        return
+    goal = found_out.gswo[s] + _SLACK
+    for step in range(_NARROWER):
+        mu = limits.friction * (float(step) + 1.0) / float(_NARROWER + 1)
+        if _balanced(points, normals, k, mu, 0, limits.torque_scale, goal - 0.5 * _SLACK, forces) <= goal:
+            for c in range(k):
+                found_out.force[s, c] = forces[c]
+            break
+
+
+@wp.kernel
+def grasp_epsilon(
+    obj: Object,
+    seed: wp.array(dtype=wp.int32),
+    limits: Limits,
+    places: Places,
+    at: Postures,
+    rows: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    epsilon_out: wp.array(dtype=wp.float32),
+):
+    """Ferrari-Canny bound of the rows kept, (m,), about the object's centre of mass."""
+    i = wp.tid()
+    if i >= rows[0]:
+        return
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    k = _contacts(places, at.surface[row[i]], points, normals)
+    if k < 2:
+        epsilon_out[i] = 0.0
+        return
+    for c in range(k):
+        points[c] = points[c] - obj.com
+    epsilon_out[i] = epsilon_bound(points, normals, k, limits.friction, obj.radius, wp.rand_init(seed[0]))
