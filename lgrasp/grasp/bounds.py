@@ -31,39 +31,54 @@ class GraspBounds(Params):
     Lengths in metres, angles in degrees. A pipeline declares them once, under ``bounds``; no stage has its own.
     """
 
-    profile: str = Field("strict", description="Where numbers that are not given come from: strict or plan.")
-    max_gap: float = Field(0.0013, gt=0, le=0.02, description="Largest distance of link and object at a contact.")
+    profile: str = Field(default="strict", description="Where numbers that are not given come from: strict or plan.")
+    max_gap: float = Field(
+        default=0.0013, gt=0, le=0.02, description="Largest distance of link and object at a contact."
+    )
     max_normal_angle: float = Field(
-        17.0, gt=0, le=90, description="Largest angle of the normals of link and object at a contact [deg]."
+        default=17.0, gt=0, le=90, description="Largest angle of the normals of link and object at a contact [deg]."
     )
     max_normal_spread: float = Field(
-        20.0, gt=0, le=180, description="Largest angle of the object's normals about a contact that is searched [deg]."
+        default=20.0,
+        gt=0,
+        le=180,
+        description="Largest angle of the object's normals about a contact [deg].",
     )
-    max_penetration: float = Field(0.0008, ge=0, le=0.02, description="Largest penetration of hand and object.")
+    max_penetration: float = Field(default=0.0008, ge=0, le=0.02, description="Largest penetration of hand and object.")
     allowed_penetration: float = Field(
-        0.0005, ge=0, le=0.01, description="Penetration of a finger's inner spheres that quick tests forgive."
+        default=0.0005, ge=0, le=0.01, description="Penetration of a finger's inner spheres that quick tests forgive."
     )
-    min_self_distance: float = Field(0.0003, ge=0, le=0.01, description="Least distance of links that do not touch.")
+    min_self_distance: float = Field(
+        default=0.0003, ge=0, le=0.01, description="Least distance of links that do not touch."
+    )
     min_object_distance: float = Field(
-        0.0005, ge=0, le=0.05, description="Least distance of the object from objects held."
+        default=0.0005, ge=0, le=0.05, description="Least distance of the object from objects held."
     )
-    friction: float = Field(0.5, gt=0, le=2, description="Friction coefficient of every measure.")
-    torque_scale: float = Field(10.0, gt=0, le=1000, description="Weight of torque against force in fswo, gswo [1/m].")
-    max_gswo: float = Field(0.035, gt=0, le=10, description="Largest residual of gswo (norm).")
+    friction: float = Field(default=0.5, gt=0, le=2, description="Friction coefficient of every measure.")
+    torque_scale: float = Field(
+        default=10.0, gt=0, le=1000, description="Weight of torque against force in fswo, gswo [1/m]."
+    )
+    max_gswo: float = Field(default=0.035, gt=0, le=10, description="Largest residual of gswo (norm).")
     max_unresisted_load: float = Field(
-        1.0, gt=0, le=1, description="Largest part of a unit force that is not resisted; 1 asks for nothing."
+        default=1.0, gt=0, le=1, description="Largest part of a unit force that is not resisted; 1 asks for nothing."
     )
     pregrasp_distance: float = Field(
-        0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the contact normals."
+        default=0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the contact normals."
     )
     min_pregrasp_distance: float = Field(
-        0.001, ge=0, le=0.05, description="Least distance of touching fingers and object in q_pregrasp."
+        default=0.001, ge=0, le=0.05, description="Least distance of touching fingers and object in q_pregrasp."
     )
     squeeze_force: float = Field(
-        15.0, ge=0, le=1000, description="Normal forces of all contacts together that q_squeeze presses with [N]."
+        default=15.0,
+        ge=0,
+        le=1000,
+        description="Normal forces together that q_squeeze presses with [N].",
     )
     squeeze_stiffness: float = Field(
-        DRIVE_STIFFNESS, gt=0, le=1e6, description="Of the position control that q_squeeze is meant for [N m/rad]."
+        default=DRIVE_STIFFNESS,
+        gt=0,
+        le=1e6,
+        description="Position control that q_squeeze is meant for [N m/rad].",
     )
 
     @model_validator(mode="before")

@@ -68,7 +68,7 @@ class Check:
         wp.launch(measure_held_penetration, (self.bodies, len(self)), inputs, [self.found], device=self.hand.device)
 
     def decide(self) -> tuple[Tally, wp.array]:
-        """The remaining checks, those of the contacts' forces: hands by outcome, and for each hand whether it passed."""
+        """The remaining checks, of the contacts' forces: hands by outcome, and for each hand whether it passed."""
         d, n = self.hand.device, len(self)
         wp.launch(balance_grasps, n, [self.limits, self.places, self.at], [self.found], device=d)
         inputs = [self.obj.struct, self.limits, self.places, self.at]

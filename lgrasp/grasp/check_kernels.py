@@ -1,4 +1,4 @@
-"""Kernels of the checks: contacts on the links' true meshes, parts of the hand apart, penetration, and rows that pass."""
+"""Kernels of the checks: contacts on the links' true meshes, parts of the hand apart, penetration, rows that pass."""
 
 import warp as wp
 
@@ -68,7 +68,10 @@ def check_postures(
     """One thread per hand: its bodies, the fit of its contacts, and whether it is clear of itself.
 
     Reads pose, contact and surface of ``at_out``; writes the rest of it, and outcome, gap and facing of ``found_out``,
-    of which gap and facing go on from what is there. q is (n, K) [rad or m].
+    of which gap and facing go on from what is there.
+
+    Args:
+        q: (n, K) joint positions [rad or m].
     """
     i = wp.tid()
     G = hand.kin.groups
@@ -114,13 +117,12 @@ def check_postures(
         outcome = CONTACT
     for b in range(G):
         for a in range(b + 2):
-            fixed = int(0)
-            if group_fixed(hand, held, h, b):
-                if a == 0 or group_fixed(hand, held, h, a - 1):
-                    fixed = int(1)
-            if outcome == KEPT and fixed == 0:
-                if not hand_pairs_clear(hand, a, b + 1, X, limits.min_self_distance):
-                    outcome = SELF_COLLISION
+            other = wp.max(a - 1, 0)
+            fixed = group_fixed(hand, held, h, b) and (a == 0 or group_fixed(hand, held, h, other))
+            if fixed or outcome != KEPT:
+                continue
+            if not hand_pairs_clear(hand, a, b + 1, X, limits.min_self_distance):
+                outcome = SELF_COLLISION
     found_out.outcome[i] = outcome
 
 
@@ -196,7 +198,12 @@ def count_outcomes(
     kept_out: wp.array(dtype=wp.int32),
     counts_out: wp.array(dtype=wp.int32),
 ):
-    """1 for hands that passed, the load included, (n,); ``counts_out`` grows by the hands of each outcome."""
+    """1 for hands that passed, the load included, (n,); ``counts_out`` grows by the hands of each outcome.
+
+    Args:
+        kept_out: (n,) 1 for hands that passed.
+        counts_out: (reasons,) grows by the hands of each outcome.
+    """
     i = wp.tid()
     if found_out.outcome[i] == KEPT and found_out.unresisted_load[i] > limits.max_unresisted_load:
         found_out.outcome[i] = UNRESISTED_LOAD
@@ -206,7 +213,12 @@ def count_outcomes(
 
 @wp.kernel
 def list_kept(found: Findings, upto: wp.array(dtype=wp.int32), row_out: wp.array(dtype=wp.int32)):
-    """The hands that passed, (n,), ``upto[i]`` of them among the first ``i + 1``."""
+    """The hands that passed, (n,), ``upto[i]`` of them among the first ``i + 1``.
+
+    Args:
+        upto: (n,) hands that passed among the first i + 1.
+        row_out: (n,) the hands that passed, first.
+    """
     i = wp.tid()
     if found.outcome[i] == KEPT:
         row_out[upto[i] - 1] = i
@@ -222,7 +234,11 @@ def self_overlap(
 ):
     """Overlap [m] of links in the rows kept, (m,): of pairs that nearly always touch; all others are apart.
 
-    body (n, B - 1) is T_hand_body.
+    Args:
+        body: (n, B - 1) T_hand_body.
+        rows: (1,) how many of ``row`` are in use.
+        row: (m,) hand of each row.
+        depth_out: (m,) overlap [m].
     """
     i = wp.tid()
     if i >= rows[0]:
@@ -239,7 +255,12 @@ def pack_rows(
     row: wp.array(dtype=wp.int32),
     packed_out: Packed,
 ):
-    """Pose, contacts and numbers of the rows kept, as they are stored."""
+    """Pose, contacts and numbers of the rows kept, as they are stored.
+
+    Args:
+        rows: (1,) how many of ``row`` are in use.
+        row: (m,) hand of each row.
+    """
     i = wp.tid()
     if i >= rows[0]:
         return

@@ -63,12 +63,12 @@ class Findings:
 
     outcome: wp.array(dtype=wp.int32)  # (n,) Outcome
     numbers: wp.array2d(dtype=wp.float32)  # (6, n) MEASURED
-    gap: wp.array(dtype=wp.float32)  # its rows
-    facing: wp.array(dtype=wp.float32)
-    fswo: wp.array(dtype=wp.float32)
-    gswo: wp.array(dtype=wp.float32)
-    unresisted_load: wp.array(dtype=wp.float32)
-    penetration: wp.array(dtype=wp.float32)
+    gap: wp.array(dtype=wp.float32)  # (n,) its rows, by name
+    facing: wp.array(dtype=wp.float32)  # (n,)
+    fswo: wp.array(dtype=wp.float32)  # (n,)
+    gswo: wp.array(dtype=wp.float32)  # (n,)
+    unresisted_load: wp.array(dtype=wp.float32)  # (n,)
+    penetration: wp.array(dtype=wp.float32)  # (n,)
     force: wp.array2d(dtype=wp.vec3)  # (n, C) object's frame, normal parts add up to 1
 
 

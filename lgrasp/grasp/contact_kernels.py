@@ -52,7 +52,10 @@ def link_contacts(
     """One thread per (run, hand): its nearest point that faces the object within the limits, if there is one.
 
     The contact on the object is the foot of the perpendicular; its normal is that of the contact point beside it.
-    pose (n,) is T_hand_object, q (n, K) [rad or m].
+
+    Args:
+        pose: (n,) T_hand_object.
+        q: (n, K) joint positions [rad or m].
     """
     s, i = wp.tid()
     found_out.gap[i, s] = -1.0
@@ -113,7 +116,10 @@ def choose_contacts(
 ):
     """The contacts that are kept, C at most: the nearest of each group (palm included) first, then of the others.
 
-    link_out is (n, C), -1 for none; point_out and normal_out are (n * C,).
+    Args:
+        link_out: (n, C) index in link_names, -1 none.
+        point_out: (n * C,) on the object [m].
+        normal_out: (n * C,) outward.
     """
     i = wp.tid()
     taken = wp.zeros(shape=(_MAX_RUNS,), dtype=wp.int32)

@@ -32,8 +32,14 @@ def control_poses(
 ):
     """One thread per (row kept, group): q, q that presses, and the posture with its first contact off the object.
 
-    The squeeze presses with the balancing forces, ``squeeze_force`` [N] in all along the normals. q_out and squeeze_out
-    are (m, K), opened_out (m, G) [rad or m].
+    The squeeze presses with the balancing forces, ``squeeze_force`` [N] in all along the normals.
+
+    Args:
+        rows: (1,) how many of ``row`` are in use.
+        row: (m,) hand of each row.
+        q_out: (m, K) [rad or m].
+        squeeze_out: (m, K) [rad or m].
+        opened_out: (m, G) [rad or m].
     """
     i, g = wp.tid()
     if i >= rows[0]:
@@ -84,6 +90,12 @@ def open_poses(
     """The touching fingers as far open as leaves them apart from the objects and the rest of the hand, (m, K).
 
     Shares of the way from q to ``opened`` are tried from all of it down; q itself when none is clear.
+
+    Args:
+        opened: (m, G) [rad or m].
+        rows: (1,) how many of ``row`` are in use.
+        row: (m,) hand of each row.
+        pregrasp_out: (m, K) [rad or m].
     """
     i = wp.tid()
     if i >= rows[0]:
@@ -109,12 +121,7 @@ def open_poses(
                         clear = 0
         for b in range(G):
             for a in range(b + 2):
-                moves = int(0)
-                if at.chosen[s, b] >= 0:
-                    moves = 1
-                if a > 0:
-                    if at.chosen[s, a - 1] >= 0:
-                        moves = 1
+                moves = wp.where(at.chosen[s, b] >= 0 or (a > 0 and at.chosen[s, wp.max(a - 1, 0)] >= 0), 1, 0)
                 if clear * moves == 1 and not hand_pairs_clear(hand, a, b + 1, X, limits.min_self_distance):
                     clear = 0
         if clear == 1:

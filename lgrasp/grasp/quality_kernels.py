@@ -116,7 +116,12 @@ def center_forces(
     row: wp.array(dtype=wp.int32),
     found_out: Findings,
 ):
-    """Balancing forces of the rows kept in the narrowest of a few round cones that balances as well."""
+    """Balancing forces of the rows kept in the narrowest of a few round cones that balances as well.
+
+    Args:
+        rows: (1,) how many of ``row`` are in use.
+        row: (m,) hand of each row.
+    """
     i = wp.tid()
     if i >= rows[0]:
         return
@@ -147,7 +152,14 @@ def grasp_epsilon(
     row: wp.array(dtype=wp.int32),
     epsilon_out: wp.array(dtype=wp.float32),
 ):
-    """Ferrari-Canny bound of the rows kept, (m,), about the object's centre of mass."""
+    """Ferrari-Canny bound of the rows kept, (m,), about the object's centre of mass.
+
+    Args:
+        seed: (1,) random seed.
+        rows: (1,) how many of ``row`` are in use.
+        row: (m,) hand of each row.
+        epsilon_out: (m,) the bound.
+    """
     i = wp.tid()
     if i >= rows[0]:
         return

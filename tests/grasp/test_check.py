@@ -11,6 +11,7 @@ from lgrasp.field.params import FieldParams
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.outcomes import METRICS, REASONS, Outcome
+from lgrasp.hand.find import find_hand
 from lgrasp.runtime.device import resolve_device
 from lgrasp.stages.context import Context
 
@@ -33,7 +34,7 @@ def rechecked(context: Context, table, bounds: GraspBounds):
 def test_every_row_of_a_pipeline_passes(hand, pipeline, cache_root):
     found = load_pipeline(pipeline)
     found = found.model_copy(update={"field": FieldParams(records=20_000, index=found.field.index)})
-    keys = input_keys(hand, OBJECTS[hand], 1.0, found.object, found.field)
+    keys = input_keys(find_hand(hand), OBJECTS[hand], 1.0, found.object, found.field)
     inputs = load_inputs(Cache(cache_root, pytest.fail), keys, 1.0, found.object, found.field, resolve_device("cpu"))
     context = Context(inputs.hand, inputs.object, inputs.field, "cpu", 0, 0, found.bounds)
     table = run_stages(found, context, 0, PIPELINES[pipeline], found.order[-1])

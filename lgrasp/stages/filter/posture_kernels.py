@@ -121,6 +121,9 @@ def fill_unused(
     """Postures of fingers without contact: random ones of the field, drawn ever closer to the open posture.
 
     A posture is taken when it is clear of the object, the palm and the fingers placed before.
+
+    Args:
+        seed: (1,) random seed.
     """
     i = wp.tid()
     if found_out.outcome[i] != KEPT:

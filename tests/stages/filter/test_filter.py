@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from support.wrench import residual
 
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.outcomes import REASONS
 from lgrasp.grasp.tables import set_arrays, set_table
-from lgrasp.stages.filter.stage import REASONS, run
+from lgrasp.stages.filter.stage import run
 
 
 @pytest.fixture(scope="module")
