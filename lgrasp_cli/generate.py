@@ -5,7 +5,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lgrasp_cli.options import Contacts, Hand, Mesh, PipelineName, Scale, Seed, Settings, choose_pipeline
+from lgrasp_cli.options import (
+    Contacts,
+    Hand,
+    Mesh,
+    Physics,
+    PipelineName,
+    Scale,
+    Seed,
+    Settings,
+    choose_pipeline,
+    choose_protocol,
+)
 from lgrasp_cli.working import How, working
 
 if TYPE_CHECKING:
@@ -32,12 +43,13 @@ def generate(
     contacts: Contacts = None,
     scale: Scale = 1.0,
     batch: Annotated[int, typer.Option(min=0, help="Candidates per batch; 0: by device.")] = 0,
-    physics: Annotated[
+    simulate: Annotated[
         str | None,
         typer.Option(
-            help="Keep only grasps that pass this physics protocol: fc, gravity6 or gravity6_mu1.", show_default=False
+            help="Keep only grasps that hold when simulated: protocol fc, gravity6 or gravity6_mu1.", show_default=False
         ),
     ] = None,
+    physics: Physics = None,
     shard_rows: Annotated[int, typer.Option(help="Rows of a shard; other values give other rows.")] = 10_000,
     reuse: Annotated[bool, typer.Option("--reuse", help="Keep the candidates in the cache for later runs.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be computed; change nothing.")] = False,
@@ -52,15 +64,15 @@ def generate(
     from lgrasp.jobs.generate import GenerateJob
     from lgrasp_cli.tables import job_report, print_pairs
 
-    chosen = choose_pipeline(pipeline, seed, contacts, settings)
+    chosen, protocol = choose_pipeline(pipeline, seed, contacts, settings), choose_protocol(simulate, physics)
     job = how.job(
         GenerateJob,
         "generate",
         hand=hand,
         object=mesh,
         rows=rows,
-        pipeline=chosen.with_physics(physics) if physics else chosen,
-        out=out or default_out(hand, mesh, physics),
+        pipeline=chosen.with_simulation(protocol) if protocol else chosen,
+        out=out or default_out(hand, mesh, protocol),
         scale=scale,
         batch=batch,
         shard_rows=shard_rows,

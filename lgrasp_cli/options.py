@@ -15,6 +15,8 @@ PipelineName = Annotated[str, typer.Option("--pipeline", "-p", help="Name of a p
 Seed = Annotated[int | None, typer.Option(help="Base seed; default: the pipeline's.", show_default=False)]
 Scale = Annotated[float, typer.Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda:N.")]
+Physics = Annotated[str | None, typer.Option("--physics", hidden=True)]
+"""The name of ``--simulate`` in the release before."""
 CacheDir = Annotated[
     Path | None,
     typer.Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.", show_default=False),
@@ -82,6 +84,15 @@ def parse_contacts(text: str) -> tuple[int, ...]:
     if not all(part.isdecimal() and 2 <= int(part) <= 5 for part in parts):
         raise ConfigError(f"--contacts '{text}': give numbers of fingers from 2 to 5, separated by commas, such as 3,4")
     return tuple(int(part) for part in parts)
+
+
+def choose_protocol(simulate: str | None, physics: str | None) -> str | None:
+    """The protocol to simulate, by its option or by the option's old name, which says so."""
+    if physics is not None:
+        from lgrasp.notices import notice
+
+        notice("--physics is now --simulate; the old name works in this release only")
+    return simulate or physics
 
 
 def choose_pipeline(

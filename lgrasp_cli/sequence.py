@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import Hand, Seed, Settings, choose_pipeline
+from lgrasp_cli.options import Hand, Physics, Seed, Settings, choose_pipeline, choose_protocol
 from lgrasp_cli.working import How, working
 
 
@@ -30,10 +30,13 @@ def sequence(
     scale: Annotated[
         str, typer.Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")
     ] = "1",
-    physics: Annotated[
+    simulate: Annotated[
         str | None,
-        typer.Option(help="Continue only rows that pass this physics protocol: seq6 or seq6_mu06.", show_default=False),
+        typer.Option(
+            help="Continue only rows that hold when simulated: protocol seq6 or seq6_mu06.", show_default=False
+        ),
     ] = None,
+    physics: Physics = None,
     pipeline: Annotated[
         str, typer.Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.")
     ] = "sequence",
@@ -69,7 +72,7 @@ def sequence(
         pipeline=chosen,
         out=out or Path("grasps") / sequence_name(hand_source(hand).name, tuple(objects)),
         scale=scale,
-        physics=physics,
+        physics=choose_protocol(simulate, physics),
         shard_rows=shard_rows,
     )
     how.run(job, _show)

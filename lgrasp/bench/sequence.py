@@ -120,7 +120,7 @@ def _watched(simulate: Verdicts, seen: list[SequenceTable]) -> Verdicts:
 def _count_spaces(spaces: dict[str, dict[str, int]], found: Round) -> None:
     for step in found.spaces:
         for name, counts in step.items():
-            grown, simulated_ = counts.get("sequence", {}), counts.get("validate", {})
+            grown, simulated_ = counts.get("sequence", {}), counts.get("simulate", {})
             more = {
                 "tried": grown.get("sequences", 0),
                 "found": simulated_.get("tried", 0),

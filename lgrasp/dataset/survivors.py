@@ -14,9 +14,12 @@ SURVIVORS = {
     "filter": "kept",
     "refine": "tried",
     "sequence": "kept",
-    "validate": "held",
+    "simulate": "held",
 }
 """The count of a stage that says how many came through."""
+
+_OLD_NAMES = {"validate": "simulate"}
+"""Stages as shards of 0.1 name them."""
 
 
 def survivors(counts: Counts) -> dict[str, int]:
@@ -32,6 +35,7 @@ def stage_counts(statistics: Mapping[str, Any]) -> Counts:
     counts: Counts = {}
     for key, value in statistics.items():
         stage, _, name = key.partition("_")
+        stage = _OLD_NAMES.get(stage, stage)
         if stage in SURVIVORS and isinstance(value, int):
             counts.setdefault(stage, {})[name.replace("_", " ")] = value
     return counts

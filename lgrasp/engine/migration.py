@@ -10,6 +10,9 @@ from lgrasp.notices import notice
 ALIASES = {"firm": "robust"}
 """Old name of a pipeline -> its name."""
 
+STAGE_ALIASES = {"validate": "simulate"}
+"""Old name of a stage -> its name."""
+
 _MEASURES = {
     "friction": "friction",
     "torque_scale": "torque_scale",
@@ -37,6 +40,13 @@ BOUNDS_OF_STAGES: dict[str, dict[str, str]] = {
     "filter": _CHECKS,
 }
 """Stage -> key that it had -> key under ``bounds``; where two stages differ, what the later line says holds."""
+
+
+def stage_name(name: str, where: str) -> str:
+    """The name of a stage that may be given by its old one, with a notice then."""
+    if name in STAGE_ALIASES:
+        notice(f"{where}: stage '{name}' is now '{STAGE_ALIASES[name]}'; the old name works in this release only")
+    return STAGE_ALIASES.get(name, name)
 
 
 def move_to_bounds(

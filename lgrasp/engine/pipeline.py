@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny
 
 from lgrasp.config import apply_settings, parse_model, read_yaml
-from lgrasp.engine.migration import ALIASES, move_to_bounds
+from lgrasp.engine.migration import ALIASES, move_to_bounds, stage_name
 from lgrasp.engine.registry import SEQUENCE, STAGES, Stage, check_order
 from lgrasp.errors import ConfigError
 from lgrasp.field.params import FieldParams
@@ -103,15 +103,15 @@ class Pipeline(BaseModel):
             }
         )
 
-    def with_physics(self, protocol: str) -> "Pipeline":
-        """A copy that keeps only grasps which pass a physics protocol.
+    def with_simulation(self, protocol: str) -> "Pipeline":
+        """A copy that keeps only grasps which hold under a protocol of :mod:`lgrasp.simulate.protocol`.
 
         Raises:
             ConfigError: no such protocol.
         """
-        params = parse_model(STAGES["validate"].params, {"protocol": protocol}, "--physics")
-        stages = tuple((name, own) for name, own in self.stages if name != "validate")
-        return self.model_copy(update={"stages": (*stages, ("validate", params))})
+        params = parse_model(STAGES["simulate"].params, {"protocol": protocol}, "--simulate")
+        stages = tuple((name, own) for name, own in self.stages if name != "simulate")
+        return self.model_copy(update={"stages": (*stages, ("simulate", params))})
 
     def describe(self) -> dict[str, Any]:
         """JSON-serialisable description, the same for equal pipelines; execution settings are not in it."""
@@ -155,7 +155,8 @@ def load_pipeline(name: str) -> Pipeline:
     declared = declared.model_copy(update=move_to_bounds(declared.bounds, declared.stages, f"pipeline {path}"))
     stages, sequence = [], declared.sequence
     for entry in declared.stages:
-        for stage, params in entry.items():
+        for given, params in entry.items():
+            stage = stage_name(given, f"pipeline {path}")
             if stage == SEQUENCE.name:
                 notice(
                     f"pipeline {path}: write 'sequence:' beside 'stages:'; in the list it works in this release only"

@@ -46,7 +46,7 @@ STAGES: dict[str, Stage] = {
     "search": Stage("search", "lgrasp.stages.search", "SearchParams"),
     "filter": Stage("filter", "lgrasp.stages.filter", "FilterParams"),
     "refine": Stage("refine", "lgrasp.stages.refine", "RefineParams"),
-    "validate": Stage("validate", "lgrasp.stages.simulate", "ValidateParams"),
+    "simulate": Stage("simulate", "lgrasp.stages.simulate", "SimulateParams"),
 }
 
 SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
@@ -55,10 +55,10 @@ SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
 ORDERS = (("place", "domain", "ik", "search", "filter"), ("place", "domain", "search", "ik", "filter"))
 """Accepted orders: contacts realised before they are combined, or (the published order) after."""
 
-OPTIONAL = ("refine", "validate")
+OPTIONAL = ("refine", "simulate")
 """Stages that may follow, in this order: grasps are refined, simulated."""
 
-_ENDS = ((), ("refine",), ("validate",), ("refine", "validate"))
+_ENDS = ((), ("refine",), ("simulate",), ("refine", "simulate"))
 
 
 def check_order(names: tuple[str, ...], where: str) -> None:

@@ -25,6 +25,7 @@ from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.jobs.generated import generated_report
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs, object_record
+from lgrasp.runtime.device import resolve_device
 
 
 class GenerateJob(Job):
@@ -88,10 +89,10 @@ class GenerateJob(Job):
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}' is for several objects: lgrasp sequence OBJECT OBJECT ..."
             )
-        if "validate" in self.pipeline.order:
-            from lgrasp.simulate.builder import import_mujoco
+        if "simulate" in self.pipeline.order:
+            from lgrasp.simulate.run import check_installed
 
-            import_mujoco()
+            check_installed(resolve_device(self.device).alias)
         assert self.keys.mesh is not None
         return shard_parts(self.out, self.keys.source.name, self.keys.mesh.stem, self.rows, self.shard_rows)
 
@@ -102,7 +103,7 @@ class GenerateJob(Job):
         pipeline, device = self.pipeline, self.device_used
         inputs = load_inputs(self.cache, self.keys, self.scale, pipeline.object, pipeline.field, device, events.loading)
         self._meshes = mesh_blobs(self.keys.source.urdf)
-        if missing and "validate" in pipeline.order:
+        if missing and "simulate" in pipeline.order:
             events.loading("scene")
             objects = [object_record(inputs.object.model)]
             scene = make_scene(self.cache, inputs.hand.model, objects, self._meshes, device.alias)
@@ -127,7 +128,7 @@ class GenerateJob(Job):
             bank_cache=self.cache if self.reuse else None,
             progress=tell,
         )
-        kept = result.counts.get("validate", {}).get("held", result.counts.get("filter", {}).get("kept", 0))
+        kept = result.counts.get("simulate", {}).get("held", result.counts.get("filter", {}).get("kept", 0))
         self._rate = max(kept / result.candidates, 1e-3)
         contents = self._shard(part, result)
         found = len(result.grasps)
@@ -185,7 +186,8 @@ class GenerateJob(Job):
         from lgrasp.simulate.protocol import find_protocol
         from lgrasp.simulate.run import protocol_text
 
-        return protocol_text(self.inputs.scene, find_protocol(self.pipeline.params("validate").protocol))
+        protocol = find_protocol(self.pipeline.params("simulate").protocol)
+        return protocol_text(self.inputs.scene, protocol, device=self.device_used.alias)
 
 
 def check_size(rows: int, shard_rows: int, workers: int) -> None:

@@ -30,6 +30,22 @@ def import_mujoco(what: str = "physics") -> Any:
     return mujoco
 
 
+def import_mujoco_warp() -> Any:
+    """The module mujoco_warp.
+
+    Raises:
+        PhysicsError: it is not installed.
+    """
+    try:
+        import mujoco_warp
+    except ImportError:
+        raise PhysicsError(
+            'physics on a GPU needs MuJoCo Warp, which is not installed: pip install "lgrasp[sim,gpu-sim]" '
+            "(or run on the CPU: --device cpu)"
+        ) from None
+    return mujoco_warp
+
+
 def set_compiler(robot: etree._Element, **more: str) -> None:
     """Replace what a URDF tells MuJoCo's compiler by what all our scenes tell it, and ``more``."""
     for element in list(robot.iterfind("mujoco")):

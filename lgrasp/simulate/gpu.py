@@ -1,5 +1,6 @@
 """Verdicts of many grasps at once with MuJoCo Warp: worlds side by side on one device."""
 
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -36,7 +37,7 @@ class _Closing:
 class WorldTrials:
     """The same trials as :class:`Trial`, many at a time on one device.
 
-    A grasp whose world needs more contacts than there is room for is judged by :class:`Trial` instead.
+    Its kernels are compiled when it is made; one thread at a time runs it. A grasp whose world needs more contacts than there is room for is judged by :class:`Trial` instead.
 
     Args:
         device: Warp device.
@@ -59,7 +60,7 @@ class WorldTrials:
         self._few = Worlds(model, max(1, worlds // 8), device)
         self._threads, self._all, self._settled_stop = threads, all_directions, settled_stop
         self._spare = Trial(model, all_directions=all_directions, settled_stop=settled_stop)
-        self._bounds = Bounds(model.protocol)
+        self._bounds, self._one = Bounds(model.protocol), threading.Lock()
         self._base = self._spare.base_rotation()
 
     @property
@@ -70,10 +71,11 @@ class WorldTrials:
     def run(self, rows: GraspRows, progress: Callable[[int, int], None] | None = None) -> list[Verdict]:
         """The verdicts of all rows."""
         found: list[Verdict] = []
-        for first in range(0, len(rows), self._sim.worlds):
-            found += self._block(rows, np.arange(first, min(first + self._sim.worlds, len(rows))))
-            if progress:
-                progress(len(found), sum(verdict.holds for verdict in found))
+        with self._one:
+            for first in range(0, len(rows), self._sim.worlds):
+                found += self._block(rows, np.arange(first, min(first + self._sim.worlds, len(rows))))
+                if progress:
+                    progress(len(found), sum(verdict.holds for verdict in found))
         return found
 
     def _block(self, rows: GraspRows, index: np.ndarray) -> list[Verdict]:

@@ -18,9 +18,9 @@ from lgrasp.simulate.urdf import welded_joints
 _NEAR = 1.0e-3  # [m]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Model:
-    """A hand and O objects of a scene, compiled; K columns of q, J joints of the hand in MuJoCo."""
+    """A hand and O objects of a scene, compiled, itself only; K columns of q, J joints of the hand in MuJoCo."""
 
     mujoco: Any
     """MjModel"""

@@ -2,15 +2,17 @@
 
 import queue
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
-from lgrasp.simulate.builder import import_mujoco
+from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.columns import stack_verdicts
 from lgrasp.simulate.groups import group_rows
 from lgrasp.simulate.model import Model, build_model
@@ -18,6 +20,11 @@ from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import Verdict
+
+if TYPE_CHECKING:
+    from lgrasp.simulate.gpu import WorldTrials
+
+Keep = Callable[[str, Hashable, Callable[[], Any]], Any]
 
 _HELD_TOLERANCE = 1.0e-4  # [rad or m]
 _LEAST_WORLDS, _MOST_WORLDS = 256, 8192  # on a GPU
@@ -33,6 +40,8 @@ def verdicts(
     all_directions: bool = False,
     settled_stop: bool = True,
     device: str = "cpu",
+    keep: Keep | None = None,
+    prepared: Callable[[float], None] | None = None,
 ) -> dict[str, np.ndarray]:
     """Simulate every grasp: columns PROTOCOL_... of :data:`lgrasp.simulate.COLUMNS`, and of
     :data:`lgrasp.simulate.OBJECT_COLUMNS` where rows have several slots or the protocol's success is to touch.
@@ -49,6 +58,9 @@ def verdicts(
         all_directions: go on after the first direction in which an object is lost.
         settled_stop: end a direction when the objects have come to rest well inside their bounds.
         device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0).
+        keep: called with (kind, key, make), gives what it made for the key before, or makes it: what a GPU is given
+            then serves further calls.
+        prepared: called with the seconds that models and, on a GPU, kernels took to be made.
 
     Raises:
         PhysicsError: MuJoCo is missing or refuses the scene, or a row has an object that the scene lacks.
@@ -63,20 +75,41 @@ def verdicts(
             progress(before[0] + done, before[1] + held)
 
     for group in group_rows(rows, len(scene.objects)):
+        begin = time.perf_counter()
         model = build_model(scene, protocol, rows.q[0], group.objects)
         _check_held(model, group.rows)
-        if device == "cpu":
+        worlds = None if device == "cpu" else _worlds(model, device, len(group.rows), threads, options, keep)
+        if prepared:
+            prepared(time.perf_counter() - begin)
+        if worlds is None:
             some = _on_threads(model, group.rows, threads, advanced, options)
         else:
-            from lgrasp.simulate.gpu import WorldTrials
-
-            worlds = min(max(len(group.rows), _LEAST_WORLDS), _MOST_WORLDS)
-            some = WorldTrials(model, device, worlds=worlds, threads=threads, **options).run(group.rows, advanced)
+            some = worlds.run(group.rows, advanced)
         slots[group.index] = group.slots
         for row, verdict in zip(group.index, some, strict=True):
             found[row] = verdict
         before = [before[0] + len(some), before[1] + sum(verdict.holds for verdict in some)]
     return stack_verdicts(protocol, [verdict for verdict in found if verdict is not None], slots)
+
+
+def check_installed(device: str) -> None:
+    """Raises PhysicsError unless there is a simulator for a device."""
+    import_mujoco()
+    if device != "cpu":
+        import_mujoco_warp()
+
+
+def _worlds(
+    model: Model, device: str, rows: int, threads: int, options: dict[str, bool], keep: Keep | None
+) -> "WorldTrials":
+    """As many worlds as there are rows, or those made before; their kernels are compiled."""
+    from lgrasp.simulate.gpu import WorldTrials
+
+    def make() -> WorldTrials:
+        worlds = min(max(rows, _LEAST_WORLDS), _MOST_WORLDS)
+        return WorldTrials(model, device, worlds=worlds, threads=threads, **options)
+
+    return keep("simulate", (model, device, *options.items()), make) if keep else make()
 
 
 def _on_threads(

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from lgrasp.errors import PhysicsError
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.simulate.builder import import_mujoco
+from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.verdict import CHUNK, WILD, links_touching, moved
 
@@ -42,13 +41,7 @@ class Worlds:
     """W copies of one scene; their state is set and read as NumPy arrays, and stepped a chunk at a time."""
 
     def __init__(self, model: Model, worlds: int, device: str) -> None:
-        mujoco = import_mujoco()
-        try:
-            import mujoco_warp
-        except ImportError:
-            raise PhysicsError(
-                'physics on a GPU needs MuJoCo Warp, which is not installed: pip install "lgrasp[sim,gpu-sim]"'
-            ) from None
+        mujoco, mujoco_warp = import_mujoco(), import_mujoco_warp()
         self._lib: Any = mujoco_warp
         self._model, self._device, self.worlds = model, wp.get_device(device), worlds
         m = copy(model.mujoco)
@@ -67,17 +60,23 @@ class Worlds:
         self._graph: Any = None
         self._full = sum(int(mujoco_warp.OverflowType[name]) for name in _FULL)
         self.steps = 0
+        self._compile()
+
+    def _compile(self) -> None:
+        """Compile what a step needs, and record it on a GPU; the state stays."""
+        saved = self.state()
+        with wp.ScopedDevice(self._device):
+            self._one_step()
+            if self._device.is_cuda:
+                with wp.ScopedCapture() as capture:
+                    self._one_step()
+                self._graph = capture.graph
+        self.restore(saved)
+        self._d.overflow.zero_()
 
     def advance(self) -> None:
         """Step every world through one chunk."""
         with wp.ScopedDevice(self._device):
-            if self._graph is None and self._device.is_cuda:
-                saved = self.state()
-                self._one_step()  # compiles what is needed
-                self.restore(saved)
-                with wp.ScopedCapture() as capture:
-                    self._one_step()
-                self._graph = capture.graph
             for _ in range(self.chunk):
                 if self._graph is None:
                     self._one_step()

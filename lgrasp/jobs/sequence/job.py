@@ -26,9 +26,10 @@ from lgrasp.jobs.sequence.round import Verdicts
 from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_rounds
 from lgrasp.jobs.sequence.size import parse_size
 from lgrasp.jobs.sets import sequence_name
-from lgrasp.simulate.builder import import_mujoco
+from lgrasp.runtime.device import resolve_device
 from lgrasp.simulate.protocol import find_protocol
-from lgrasp.simulate.run import protocol_text, verdicts
+from lgrasp.simulate.run import check_installed, protocol_text, verdicts
+from lgrasp.stages.context import Keeper
 
 
 class SequenceJob(Job):
@@ -84,7 +85,7 @@ class SequenceJob(Job):
             )
         if self.physics:
             find_protocol(self.physics)
-            import_mujoco()
+            check_installed(resolve_device(self.device).alias)
         name = sequence_name("", self.objects)[1:]
         return shard_parts(self.out, self.keys.source.name, name, self.rows, self.shard_rows)
 
@@ -161,7 +162,9 @@ class SequenceJob(Job):
             "seconds_wall": result.wall,
             **{f"found_{step}": found for step, found in enumerate(result.reached, 1)},
         }
-        protocol = protocol_text(inputs.scene, find_protocol(physics)) if physics and inputs.scene else ""
+        protocol = ""
+        if physics and inputs.scene:
+            protocol = protocol_text(inputs.scene, find_protocol(physics), device=inputs.device.alias)
         return Shard(
             header=header,
             hand=hand_record(inputs.hand, self._meshes),
@@ -175,10 +178,11 @@ def simulated(inputs: SequenceInputs, physics: str) -> Verdicts:
     """A function that simulates the rows of the last of some levels, on all cores."""
     protocol, scene = find_protocol(physics), inputs.scene
     assert scene is not None
+    kept = Keeper()
 
     def run(levels: list[SequenceTable]) -> dict[str, np.ndarray]:
         last = replace(levels[-1], physics={})
         rows = sequence_rows([last], inputs, 0, objects=len(inputs.objects))
-        return verdicts(scene, rows, protocol, threads=os.cpu_count() or 1)
+        return verdicts(scene, rows, protocol, threads=os.cpu_count() or 1, device=inputs.device.alias, keep=kept.get)
 
     return run

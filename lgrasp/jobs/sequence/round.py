@@ -244,5 +244,5 @@ def _that_hold(
         own = rows.space[:, -1] == number
         if own.any():
             counts = {"tried": int(own.sum()), "held": int(holds[own].sum())}
-            result.add(space.name, {"validate": counts})
+            result.add(space.name, {"simulate": counts})
     return take_sequences(rows, np.flatnonzero(holds), physics=columns)

@@ -1,16 +1,16 @@
-"""Parameters of the validate stage."""
+"""Parameters of the simulate stage."""
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from lgrasp.simulate.protocol import PROTOCOLS
 
 
-class ValidateParams(BaseModel):
-    """Which physics protocol a grasp must pass."""
+class SimulateParams(BaseModel):
+    """Under which protocol a grasp must hold."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    protocol: str = Field("fc", description="Named protocol that every grasp must pass.")
+    protocol: str = Field("fc", description="Named protocol under which every grasp must hold.")
 
     @field_validator("protocol")
     @classmethod

@@ -1,4 +1,4 @@
-"""validate: finished grasps -> those that hold their object in a physics simulation, with the verdicts."""
+"""simulate: finished grasps -> those that hold their object in a physics simulation, with the verdicts."""
 
 import os
 from dataclasses import replace
@@ -11,13 +11,13 @@ from lgrasp.grasp.tables import GraspTable, take_grasps
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts
 from lgrasp.stages.context import Context
-from lgrasp.stages.simulate.params import ValidateParams
+from lgrasp.stages.simulate.params import SimulateParams
 
-VERSION = 1
+VERSION = 2
 """Raised also whenever a named protocol's numbers or the simulated scene change."""
 
 
-def run(inputs: GraspTable, params: ValidateParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
+def run(inputs: GraspTable, params: SimulateParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
     """Simulate every grasp and keep those that hold, in their order.
 
     Returns:
@@ -25,15 +25,14 @@ def run(inputs: GraspTable, params: ValidateParams, context: Context) -> tuple[G
         diverged.
 
     Raises:
-        PhysicsError: MuJoCo is missing or refuses the scene.
+        PhysicsError: MuJoCo (on a GPU, MuJoCo Warp) is missing or refuses the scene.
     """
     if context.scene is None:
-        raise PhysicsError("stage validate needs a scene")
+        raise PhysicsError("stage simulate needs a scene")
     protocol = find_protocol(params.protocol)
-    # batches run side by side on the CPU
-    threads = 1 if context.device == "cpu" else os.cpu_count() or 1
+    threads = 1 if context.device == "cpu" else os.cpu_count() or 1  # on the CPU, batches run side by side
     rows = grasp_rows(inputs, context.hand.model.tree, context.object.model.center)
-    found = verdicts(context.scene, rows, protocol, threads=threads)
+    found = verdicts(context.scene, rows, protocol, threads=threads, device=context.device, keep=context.kept.get)
     holds = found[f"{protocol.name}_holds"]
     counts = {
         "tried": len(inputs),

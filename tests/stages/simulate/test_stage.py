@@ -17,7 +17,7 @@ from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
 from lgrasp.simulate.scene import scene_of_shard
 from lgrasp.stages.context import Context
-from lgrasp.stages.simulate.params import ValidateParams
+from lgrasp.stages.simulate.params import SimulateParams
 from lgrasp.stages.simulate.stage import run
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
@@ -42,7 +42,7 @@ def test_keeps_what_holds(grasps, context):
     spoiled = np.arange(len(grasps)) % 2 == 1
     squeeze = np.where(spoiled[:, None], grasps.q_pregrasp, grasps.q_squeeze)
     q = np.where(spoiled[:, None], grasps.q_pregrasp, grasps.q)
-    kept, counts = run(replace(grasps, q=q, q_squeeze=squeeze), ValidateParams(), context)
+    kept, counts = run(replace(grasps, q=q, q_squeeze=squeeze), SimulateParams(), context)
     assert counts["tried"] == len(grasps)
     assert 0 < counts["held"] == len(kept) <= (~spoiled).sum()
     assert set(kept.physics) == {f"fc_{name}" for name in COLUMNS}
@@ -57,21 +57,21 @@ def test_keeps_what_holds(grasps, context):
 
 def test_no_grasps(grasps, context):
     none = {name: values[:0] for name, values in grasp_arrays(grasps).items() if not name.startswith("metrics.")}
-    kept, counts = run(GraspTable(**none, metrics={}), ValidateParams(), context)
+    kept, counts = run(GraspTable(**none, metrics={}), SimulateParams(), context)
     assert len(kept) == counts["tried"] == 0
     assert kept.physics["fc_holds"].dtype == bool
 
 
 def test_needs_a_scene_and_a_known_protocol(grasps, context, swift):
     with pytest.raises(PhysicsError, match="scene"):
-        run(grasps, ValidateParams(), replace(context, scene=None))
+        run(grasps, SimulateParams(), replace(context, scene=None))
     with pytest.raises(ConfigError, match="unknown protocol 'fd'; choose fc"):
-        swift.with_physics("fd")
+        swift.with_simulation("fd")
 
 
 def test_generated_rows_hold(job, swift, tmp_path, raw_grasps):
     """The shard holds what simulating it again gives; batches and threads change nothing; its folder is its own."""
-    checked = swift.with_physics("gravity6")
+    checked = swift.with_simulation("gravity6")
     kwargs = {"object": "sphere", "rows": 8, "shard_rows": 8, "batch": 16}
     outcome = generate(job(**kwargs, pipeline=checked))
     shard = read_shard(outcome.paths[0])
@@ -81,7 +81,7 @@ def test_generated_rows_hold(job, swift, tmp_path, raw_grasps):
     again = verdicts(scene_of_shard(shard), shard.grasps, PROTOCOLS["gravity6"])
     for name, values in again.items():
         np.testing.assert_array_equal(physics[name], values, err_msg=name)
-    assert shard.statistics["validate_tried"] >= shard.statistics["validate_held"] >= 8
+    assert shard.statistics["simulate_tried"] >= shard.statistics["simulate_held"] >= 8
     other = generate(job(**kwargs | {"batch": 7, "workers": 2, "out": tmp_path / "other"}, pipeline=checked))
     assert raw_grasps(other.paths[0].parent) == raw_grasps(outcome.paths[0].parent)
     with pytest.raises(OutputError, match="another run"):
