@@ -32,9 +32,7 @@ def sequence(
     ] = "1",
     simulate: Annotated[
         str | None,
-        typer.Option(
-            help="Continue only rows that hold when simulated: protocol seq6 or seq6_mu06.", show_default=False
-        ),
+        typer.Option(help="Continue only rows that hold when simulated: seq6 or seq6_mu06.", show_default=False),
     ] = None,
     physics: Physics = None,
     pipeline: Annotated[

@@ -37,7 +37,8 @@ class _Closing:
 class WorldTrials:
     """The same trials as :class:`Trial`, many at a time on one device.
 
-    Its kernels are compiled when it is made; one thread at a time runs it. A grasp whose world needs more contacts than there is room for is judged by :class:`Trial` instead.
+    Its kernels are compiled when it is made; one thread at a time runs it. A grasp whose world needs more contacts than
+    there is room for is judged by :class:`Trial` instead.
 
     Args:
         device: Warp device.

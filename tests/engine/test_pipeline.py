@@ -8,6 +8,7 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
+from lgrasp import notices
 from lgrasp.engine.inputs import input_keys, run_key
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.engine.registry import ORDERS, STAGES
@@ -195,3 +196,16 @@ def test_version_of_a_stage_is_in_the_key(swift, monkeypatch):
     before = swift.describe()
     monkeypatch.setattr("lgrasp.stages.ik.stage.VERSION", STAGES["ik"].version + 1)
     assert swift.describe() != before
+
+
+def test_a_stage_is_read_by_its_old_name(tmp_path, monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(notices, "_listeners", [said.append])
+    text = pipeline_files()["swift"].read_text()
+    (tmp_path / "old.yaml").write_text(f"{text.rstrip()}\n  - validate: {{protocol: gravity6}}\n")
+    (tmp_path / "new.yaml").write_text(f"{text.rstrip()}\n  - simulate: {{protocol: gravity6}}\n")
+    old = load_pipeline(str(tmp_path / "old.yaml"))
+    assert ["stage 'validate' is now 'simulate'" in line for line in said] == [True]
+    assert old == load_pipeline(str(tmp_path / "new.yaml")) == load_pipeline("swift").with_simulation("gravity6")
+    assert len(said) == 1

@@ -208,3 +208,12 @@ def test_closed_pipe_is_quiet(process):
 def test_debug_shows_the_traceback(process, monkeypatch):
     monkeypatch.setitem(os.environ, "LGRASP_DEBUG", "1")
     assert "Traceback" not in process("hands", "show", "nobody").communicate(timeout=30)[1]
+
+
+def test_physics_is_the_old_name_of_simulate(generate):
+    result = generate("--physics", "fd")
+    assert result.code == 2
+    notice, error = result.err.splitlines()
+    assert "--physics is now --simulate" in notice
+    assert "unknown protocol 'fd'" in error
+    assert generate("--simulate", "fd").error() == error

@@ -49,7 +49,7 @@ def sequence(cli, small, tmp_path):
         (["mug", "sphere", "--scale", "0.1:0.05"], "0.06:0.10"),
         (["mug", "sphere", "--scale", "big"], "0.06:0.10"),
         (["mug", "sphere", "-n", "0"], "at least 1"),
-        (["mug", "sphere", "--physics", "fcc"], "seq6"),
+        (["mug", "sphere", "--simulate", "fcc"], "seq6"),
         (["mug", "sphere", "box", "capsule", "bowl", "--scale", "0.05:0.06"], "take at most 4"),
         (["mug", "sphere", "--num-shards", "0"], "--num-shards 0"),
     ],

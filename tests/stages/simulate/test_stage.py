@@ -1,11 +1,13 @@
 """Keeps the grasps that hold, and their verdicts."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lgrasp.dataset import read_shard
+from lgrasp.dataset.survivors import stage_counts
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, OutputError, PhysicsError
@@ -14,7 +16,7 @@ from lgrasp.jobs.generate import generate
 from lgrasp.jobs.records import make_scene, mesh_blobs, object_record
 from lgrasp.simulate.columns import COLUMNS
 from lgrasp.simulate.protocol import PROTOCOLS
-from lgrasp.simulate.run import verdicts
+from lgrasp.simulate.run import check_installed, verdicts
 from lgrasp.simulate.scene import scene_of_shard
 from lgrasp.stages.context import Context
 from lgrasp.stages.simulate.params import SimulateParams
@@ -86,3 +88,32 @@ def test_generated_rows_hold(job, swift, tmp_path, raw_grasps):
     assert raw_grasps(other.paths[0].parent) == raw_grasps(outcome.paths[0].parent)
     with pytest.raises(OutputError, match="another run"):
         generate(job(**kwargs))
+
+
+def test_shards_of_0_1_name_the_stage_otherwise():
+    assert stage_counts({"validate_tried": 5, "validate_held": 3, "simulate_tried": 2, "seconds_validate": 1.0}) == {
+        "simulate": {"tried": 2, "held": 3}
+    }
+
+
+def test_simulates_where_the_job_runs(grasps, context, monkeypatch):
+    """A GPU's job is simulated on that GPU, with what an earlier batch has left there."""
+    asked = []
+
+    def simulated(scene, rows, protocol, *, threads, device, keep):
+        asked.append((device, keep("simulate", device, object)))
+        return {f"{protocol.name}_{name}": np.zeros(len(rows)) for name in COLUMNS}
+
+    monkeypatch.setattr("lgrasp.stages.simulate.stage.verdicts", simulated)
+    there = replace(context, device="cuda:3")
+    for _ in range(2):
+        run(grasps, SimulateParams(), there)
+    assert asked[0] == asked[1]
+    assert asked[0][0] == "cuda:3"
+
+
+def test_a_gpu_needs_a_simulator_of_its_own(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
+    check_installed("cpu")
+    with pytest.raises(PhysicsError, match="--device cpu"):
+        check_installed("cuda:0")
