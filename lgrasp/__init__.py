@@ -25,12 +25,13 @@ if TYPE_CHECKING:
     )
     from lgrasp.dataset.exports import export_shards, read_grasps
     from lgrasp.dataset.merge import merge_shards
-    from lgrasp.dataset.reader import ShardReader, pose_matrix, read_shard
+    from lgrasp.dataset.reader import ShardReader, read_shard
     from lgrasp.dataset.torch_dataset import GraspDataset
     from lgrasp.dataset.validate import validate_shard
     from lgrasp.dataset.writer import write_shard
     from lgrasp.engine.pipeline import load_pipeline
     from lgrasp.errors import LgraspError
+    from lgrasp.geometry.poses import pose_matrix
     from lgrasp.grasp.bounds import GraspBounds
     from lgrasp.grasp.records import Shard
     from lgrasp.jobs.learn.job import load_predictor
@@ -100,12 +101,13 @@ _HOMES = {
     ),
     "lgrasp.dataset.exports": ("export_shards", "read_grasps"),
     "lgrasp.dataset.merge": ("merge_shards",),
-    "lgrasp.dataset.reader": ("ShardReader", "pose_matrix", "read_shard"),
+    "lgrasp.dataset.reader": ("ShardReader", "read_shard"),
     "lgrasp.dataset.torch_dataset": ("GraspDataset",),
     "lgrasp.dataset.validate": ("validate_shard",),
     "lgrasp.dataset.writer": ("write_shard",),
     "lgrasp.engine.pipeline": ("load_pipeline",),
     "lgrasp.errors": ("LgraspError",),
+    "lgrasp.geometry.poses": ("pose_matrix",),
     "lgrasp.grasp.bounds": ("GraspBounds",),
     "lgrasp.grasp.records": ("Shard",),
     "lgrasp.jobs.learn.job": ("load_predictor",),
