@@ -33,16 +33,16 @@ class GenerateJob(Job):
 
     asks: ClassVar[bool] = True
 
-    hand: str = Field("allegro", description="Name or path.")
+    hand: str = Field(default="allegro", description="Name or path.")
     object: str = Field(description="Name or mesh file.")
-    rows: int = Field(1000, description="Grasps asked.")
+    rows: int = Field(default=1000, description="Grasps asked.")
     pipeline: Pipeline
     out: Path = Field(description="Folder of the shards.")
-    scale: float = Field(1.0, gt=0, description="Factor from the mesh's unit to metres.")
-    batch: int = Field(0, description="Candidates per batch; 0: by device.")
-    rate: float = Field(1.0, description="Rows expected per candidate by the first shard; never changes rows.")
-    shard_rows: int = Field(10_000, description="Rows of a shard; part of what decides the rows.")
-    reuse: bool = Field(False, description="Keep the candidates in the cache for later runs.")
+    scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
+    batch: int = Field(default=0, description="Candidates per batch; 0: by device.")
+    rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
+    shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
+    reuse: bool = Field(default=False, description="Keep the candidates in the cache for later runs.")
     _keys: InputKeys | None = PrivateAttr(None)
     _inputs: Inputs | None = PrivateAttr(None)
     _meshes: dict[str, bytes] = PrivateAttr(default_factory=dict)

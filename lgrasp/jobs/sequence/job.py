@@ -38,14 +38,16 @@ class SequenceJob(Job):
     unit: ClassVar[str] = "sequences"
     asks: ClassVar[bool] = True
 
-    hand: str = Field("allegro", description="Name or path.")
+    hand: str = Field(default="allegro", description="Name or path.")
     objects: tuple[str, ...] = Field(description="Names or mesh files, in the order in which they are grasped.")
-    rows: int = Field(256, description="Whole sequences asked.")
+    rows: int = Field(default=256, description="Whole sequences asked.")
     pipeline: Pipeline
     out: Path = Field(description="Folder of the shards.")
-    scale: str = Field("1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")
-    physics: str | None = Field(None, description="Protocol that the rows of every step must pass before they go on.")
-    shard_rows: int = Field(1000, description="Sequences of a shard; part of what decides the rows.")
+    scale: str = Field(default="1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")
+    physics: str | None = Field(
+        default=None, description="Protocol that the rows of every step must pass before they go on."
+    )
+    shard_rows: int = Field(default=1000, description="Sequences of a shard; part of what decides the rows.")
     _keys: SequenceKeys | None = PrivateAttr(None)
     _inputs: SequenceInputs | None = PrivateAttr(None)
     _meshes: dict[str, bytes] = PrivateAttr(default_factory=dict)
