@@ -33,7 +33,7 @@ Hand = HandModel
 Object = ObjectModel
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Grasps(GraspRows):
     """Grasps in memory, with the hand and the objects that they are of; ``grasps[mask]`` are some of them."""
 
@@ -68,6 +68,10 @@ class Grasps(GraspRows):
         """
         write_shard(path, self.shard)
         return Path(path)
+
+    def __repr__(self) -> str:
+        names = ", ".join(record.name for record in self.objects)
+        return f"<{len(self):,} grasps of {names} by {self.hand.name}, pipeline {self.header.pipeline}>"
 
     def __getitem__(self, rows: slice | np.ndarray | Sequence[int]) -> "Grasps":
         if self.sequence is not None:
@@ -330,6 +334,8 @@ def _made(paths: Sequence[Path], asked: int = 0) -> Grasps:
             merge_shards(list(paths), folder / "all.h5")
             shard = read_shard(folder / "all.h5")
     found = Grasps.of_shard(shard)
+    if not len(found):
+        raise StarvedError("no grasp found")
     if len(found) < asked:
         warnings.warn(f"{len(found):,} of {asked:,} grasps found", stacklevel=3)
     return found

@@ -61,9 +61,10 @@ def test_pages_import_from_the_root_only(page):
                 assert node.attr in lg.__all__
 
 
-def test_page_of_python_runs(tmp_path, monkeypatch):
+def test_page_of_python_runs(tmp_path, monkeypatch, cache_root):
     """Its blocks one after another, each printing what the page says."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LGRASP_CACHE_DIR", str(cache_root))
     blocks = BLOCK.findall((ROOT / "docs" / "guides" / "python.md").read_text(encoding="utf-8"))
     names: dict = {}
     said = None

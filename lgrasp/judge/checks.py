@@ -37,7 +37,6 @@ VALUES = (
     "object_in_link_mm",
     "link_in_object_mm",
     "residual_stored_normals",
-    "residual_round_cone",
     "residual_frictionless",
     "force_balance",
     "force_normal_sum_error",
@@ -46,8 +45,6 @@ VALUES = (
     "links_in_contact",
     "epsilon",
 )
-ROUND_EDGES = 48
-"""Close to the round cone: what a pyramid turned about its normal could reach at best."""
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -61,7 +58,6 @@ class RowChecks:
     Attributes:
         values: recomputed numbers by name, (n,) each, NaN where not judged.
         failed: by check, (n,) each. Rows that are not finite or whose indices are wrong fail only that.
-        solver_gap: largest optimality gap of the wrench problems.
         self_pairs: pairs of links with self-penetration beyond the bound, and their rows.
     """
 
@@ -70,7 +66,6 @@ class RowChecks:
         self.g = {k: v[rows] for k, v in shard.grasps.items()}
         self.values = {k: np.full(n, np.nan) for k in VALUES}
         self.failed = {k: np.zeros(n, bool) for k in CHECKS}
-        self.solver_gap = 0.0
         self.self_pairs: dict[str, int] = {}
         self._form()
         bad = self.failed["finite"] | self.failed["indices"]
@@ -86,7 +81,7 @@ class RowChecks:
             self._penetration(T_links, T_objects)
             self._contacts(T_links, T_objects)
             for row in good:
-                self._wrenches(row, epsilon)
+                self._wrenches(int(row), epsilon)
         if shard.steps:
             touching = self.link_of, self.used
             self.failed["frozen"] = check_frozen(shard, rows, self.index, *touching) & ~bad
@@ -96,7 +91,7 @@ class RowChecks:
         """Numbers of the good rows, in the unit of the check's bound."""
         name, bound = CHECKS[check]
         self.values[name][self.good] = value
-        self.failed[check][self.good] = ~(value <= bound)
+        self.failed[check][self.good] = np.logical_not(value <= bound)
 
     def _form(self) -> None:
         """Finite numbers, unit quaternions and indices that exist."""
@@ -232,7 +227,7 @@ class RowChecks:
             links.append(self.link_of[row, o, used])
             points, stored = (np.asarray(self.g[k], float)[row, o, used] for k in ("contact_points", "contact_normals"))
             inward = -self.normals[row, o, used]
-            numbers = self._residuals(points, inward, -stored) if used.any() else {"residual": math.inf}
+            numbers = _residuals(points, inward, -stored) if used.any() else {"residual": math.inf}
             if used.any() and "contact_forces" in self.g:
                 names = ("force_balance", "force_normal_sum_error", "force_cone_excess")
                 forces = np.asarray(self.g["contact_forces"], float)[row, o, used]
@@ -249,13 +244,12 @@ class RowChecks:
         self.values["contacts"][row] = sum(len(x) for x in links)
         self.values["links_in_contact"][row] = len(np.unique(np.concatenate(links)))
 
-    def _residuals(self, points: np.ndarray, inward: np.ndarray, given: np.ndarray) -> dict[str, float]:
-        norm, gap = wrench_residual(points, inward)
-        self.solver_gap = max(self.solver_gap, gap)
-        given = given / np.maximum(np.linalg.norm(given, axis=1, keepdims=True), 1e-12)
-        return {
-            "residual": norm,
-            "residual_round_cone": wrench_residual(points, inward, edges=ROUND_EDGES)[0],
-            "residual_frictionless": wrench_residual(points, inward, mu=0.0)[0],
-            "residual_stored_normals": wrench_residual(points, given)[0],
-        }
+
+def _residuals(points: np.ndarray, inward: np.ndarray, given: np.ndarray) -> dict[str, float]:
+    """Of the mesh's normals, with and without friction, and of the normals given."""
+    given = given / np.maximum(np.linalg.norm(given, axis=1, keepdims=True), 1e-12)
+    return {
+        "residual": wrench_residual(points, inward)[0],
+        "residual_frictionless": wrench_residual(points, inward, mu=0.0)[0],
+        "residual_stored_normals": wrench_residual(points, given)[0],
+    }

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.judge.bounds import CONE_EDGES, RESIDUAL
 from lgrasp.judge.checks import CHECKS
 from lgrasp.judge.duplicates import Repeats
 
@@ -34,7 +33,6 @@ class ShardVerdict:
     metrics: dict[str, np.ndarray]
     held: np.ndarray
     self_pairs: dict[str, int]
-    solver_gap: float
     claims: dict[str, str]
     notes: list[str]
 
@@ -91,18 +89,12 @@ class Report:
         self.kept_invalid = np.concatenate([s.kept_invalid for s in shards])
         self.held = np.concatenate([s.held for s in shards])
         self.rows, self.total_rows = len(self.valid), sum(s.total_rows for s in shards)
-        self.solver_gap = max(s.solver_gap for s in shards)
         self.notes = list(dict.fromkeys(n for s in shards for n in s.notes))
-        turned = int((self.failed["residual"] & (self.values["residual_round_cone"] <= RESIDUAL)).sum())
-        if turned:
-            self.notes.append(
-                f"{turned} rows fail the residual with {CONE_EDGES} edges but pass it with the round cone"
-            )
 
     @property
     def passed(self) -> bool:
-        """Whether every judged row that the files do not call invalid themselves is strictly valid."""
-        return bool(self.valid[~self.kept_invalid].all())
+        """Whether there are judged rows that the files do not call invalid themselves, and all are strictly valid."""
+        return self.valid_share == 1.0
 
     @property
     def valid_share(self) -> float:
@@ -166,7 +158,6 @@ class Report:
             "near_duplicate_share": self.repeats.combined / max(self.total_rows, 1),
             "distinct_object_poses": self.repeats.distinct_poses,
             "by_objects": self.by_objects,
-            "solver_gap": self.solver_gap,
             "self_penetration_pairs": self.self_pairs,
             "notes": self.notes,
             "seconds": self.seconds,

@@ -88,7 +88,6 @@ def _judge_shard(shard: JudgedShard, rows: np.ndarray, step: Callable[[int], obj
         metrics=metric_errors(shard, rows, values),
         held=(np.asarray(shard.grasps["object_index"])[rows] >= 0).sum(axis=1),
         self_pairs=self_pairs,
-        solver_gap=max((b.solver_gap for b in blocks), default=0.0),
         claims=shard.claims,
         notes=shard.notes,
     )

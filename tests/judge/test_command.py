@@ -61,6 +61,8 @@ def test_rows_that_the_file_calls_invalid_count_apart(tmp_path):
     assert "kept as invalid: 2, of which 1 pass" in result.stdout
     assert "1 of 1 judged rows (100.00 %)" in result.stdout
     assert judge(path).valid.tolist() == [True, False, True]
+    none = write_shard(tmp_path / "none.h5", rows[:1], {"valid": ([0], "1")})
+    assert run(none).exit_code == 1  # nothing that the file stands for
 
 
 def test_it_stands_alone(tmp_path):

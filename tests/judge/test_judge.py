@@ -58,7 +58,6 @@ def test_valid_row_passes_with_exact_numbers(tmp_path: Path) -> None:
     assert report.values["force_balance"] == pytest.approx([0.0, 0.0], abs=1e-6)
     assert report.values["force_normal_sum_error"] == pytest.approx([0.0, 0.0], abs=1e-6)
     assert report.values["contacts"].tolist() == [2, 2]
-    assert report.solver_gap < 1e-12
     deviations = {name: d["max"] for name, d in report.metrics.items()}
     assert deviations["gswo"] < 1e-6
     assert deviations["penetration [mm]"] == pytest.approx(0.0, abs=1e-3)

@@ -1,0 +1,94 @@
+"""The verbs of ``import lgrasp as lg`` one after another, in memory and in files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lgrasp as lg
+from lgrasp.api import _made
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(cache_root):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LGRASP_CACHE_DIR", str(cache_root))
+        yield
+
+
+@pytest.fixture(scope="module")
+def grasps(_cache):
+    return lg.generate("allegro", "mug", 12, pipeline="swift", device="cpu", seed=3)
+
+
+def test_rows_in_memory_are_those_on_disk(grasps, tmp_path):
+    assert (len(grasps), len(grasps.q), grasps.header.seed) == (12, 12, 3)
+    pipeline = lg.load_pipeline("swift").model_copy(update={"seed": 3})
+    written = lg.generate("allegro", "mug", 12, pipeline=pipeline, device="cpu", out=tmp_path / "mug")
+    for name, values in grasps.columns().items():
+        np.testing.assert_array_equal(values, written.columns()[name], err_msg=name)
+    (file,) = (tmp_path / "mug").glob("*.h5")
+    assert lg.validate_shard(file) == []
+    assert len(lg.open(file)) == len(lg.open(tmp_path / "mug")) == 12
+
+
+def test_some_of_the_rows(grasps, tmp_path):
+    some = grasps[grasps.metrics["gap"] < np.median(grasps.metrics["gap"])]
+    assert len(some) == 6
+    assert (some.metrics["gap"] < np.median(grasps.metrics["gap"])).all()
+    assert repr(some) == "<6 grasps of mug by allegro, pipeline swift>"
+    np.testing.assert_array_equal(grasps[[3, 1]].metrics["gap"], grasps.metrics["gap"][[3, 1]])
+    assert len(grasps[2:5]) == 3
+    read = lg.read_shard(some.save(tmp_path / "some.h5"))
+    assert len(read.grasps) == 6
+    np.testing.assert_array_equal(read.grasps.contact_links, some.contact_links)
+
+
+def test_refine_simulate_judge(grasps):
+    some = grasps[:3]
+    refined = lg.refine(some, matching_rounds=1)
+    assert refined.hand.sha256 == some.hand.sha256
+    assert 0 < len(refined) <= 3
+    assert lg.judge(some).passed
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
+    held = lg.simulate(some, "fc")
+    np.testing.assert_array_equal(held.q, some.q)
+    assert held.physics["fc_holds"].shape == (3,)
+
+
+def test_plan():
+    assert 0 < len(lg.plan("allegro", "mug", starts=6, device="cpu")) <= 6
+
+
+def test_sequence():
+    pipeline = lg.load_pipeline("sequence")
+    pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 20_000})})
+    pipeline = pipeline.with_params("sequence", width=24, wave=64, waves=3)
+    taken = lg.sequence("allegro", ["sphere", "mug"], 2, pipeline=pipeline, scale="0.06:0.08", device="cpu")
+    assert sorted(o.name for o in taken.objects) == ["mug", "sphere"]
+    assert (taken.object_index[-1] >= 0).all()
+    with pytest.raises(lg.LgraspError, match="sequences"):
+        taken[:1]
+
+
+def test_fewer_than_asked(grasps, tmp_path):
+    with pytest.warns(UserWarning, match="12 of 20 grasps found"):
+        assert len(_made([grasps.save(tmp_path / "few.h5")], 20)) == 12
+    for nothing in ([], [grasps[:0].save(tmp_path / "none.h5")]):
+        with pytest.raises(lg.LgraspError, match="no grasp found"):
+            _made(nothing)
+
+
+def test_what_there_is():
+    assert "allegro" in lg.hands()
+    assert "mug" in lg.objects()
+    assert {"robust", "swift"} <= set(lg.pipelines())
+    assert isinstance(lg.load_hand("allegro"), lg.Hand)
+    assert isinstance(lg.load_object("mug"), lg.Object)
+
+
+def test_nothing_stays_behind(grasps, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    lg.judge(grasps[:1])
+    assert list(Path(tmp_path).iterdir()) == []
