@@ -13,7 +13,7 @@ NEAR_JOINT = 0.1  # [rad or m]
 _REACH = NEAR_DISTANCE * 1.001  # of the grid look-ups, which only propose pairs
 
 
-def near_pairs(pose: np.ndarray, q: np.ndarray) -> np.ndarray:
+def near_pairs(pose: np.ndarray, q: np.ndarray, device: str = "cpu") -> np.ndarray:
     """Index pairs (i < j), shape (n, 2), of rows that are near-duplicates of each other, sorted.
 
     Args:
@@ -23,7 +23,7 @@ def near_pairs(pose: np.ndarray, q: np.ndarray) -> np.ndarray:
     if len(pose) < 2:
         return np.zeros((0, 2), int)
     start()
-    pairs = _NearRows("cpu").before(pose, q, 0)
+    pairs = _NearRows(device).before(pose, q, 0)
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 

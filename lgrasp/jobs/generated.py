@@ -26,6 +26,7 @@ class _Tally:
     """Counts over shards on disk."""
 
     moving: np.ndarray  # (L,) which links of the hand are moved by a finger
+    device: str  # where near-duplicates are looked for
     rows: int = 0
     strict: int = 0  # rows within the strict bounds, by their metrics
     published_count: int = 0  # rows with >= 3 finger contacts and fswo^2 < PUBLISHED_FSWO
@@ -43,7 +44,7 @@ class _Tally:
             pose, q = reader.column("object_pose")[:, 0], reader.column("q")
             self.rows += len(reader)
             self.strict += _strict_rows(reader)
-            self.near_duplicates += len(near_pairs(pose, q))
+            self.near_duplicates += len(near_pairs(pose, q, self.device))
             self.distinct_poses += len(np.unique(reader.column("candidate")))
             links = reader.column("contact_links")
             fingers = (self.moving[np.maximum(links, 0)] & (links >= 0)).sum((1, 2))
@@ -69,7 +70,7 @@ def _strict_rows(reader: ShardReader) -> int:
     return int(strict.met_by({name: reader.column(f"metrics/{name}") for name in strict.limits}).sum())
 
 
-def _tally(paths: Iterable[Path], moving: np.ndarray) -> _Tally:
+def _tally(paths: Iterable[Path], moving: np.ndarray, device: str) -> _Tally:
     """Counts over some shards, a few of them in memory at a time.
 
     Raises:
@@ -77,11 +78,11 @@ def _tally(paths: Iterable[Path], moving: np.ndarray) -> _Tally:
     """
 
     def one(path: Path) -> _Tally:
-        tally = _Tally(moving)
+        tally = _Tally(moving, device)
         tally.add(path)
         return tally
 
-    whole = _Tally(moving)
+    whole = _Tally(moving, device)
     with ThreadPoolExecutor(_TALLY_THREADS) as pool:
         for tally in pool.map(one, paths):
             whole.merge(tally)
@@ -101,8 +102,8 @@ def generated_report(job: Any, outcome: Outcome) -> dict[str, Any]:
     inputs, order = job.inputs, job.pipeline.order
     tree = inputs.hand.model.tree
     moving = tree.body_group[tree.link_body] >= 0
-    made = _tally(outcome.written, moving)
-    present = _tally(set(outcome.paths) - set(outcome.written), moving)
+    made = _tally(outcome.written, moving, inputs.device.alias)
+    present = _tally(set(outcome.paths) - set(outcome.written), moving, inputs.device.alias)
     wall = sum(r.wall for r in outcome.results)
     counts: dict[str, dict[str, int]] = {stage: {} for stage in order}
     seconds = dict.fromkeys(order, 0.0)
