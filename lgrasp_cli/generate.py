@@ -51,7 +51,18 @@ def generate(
     ] = None,
     physics: Physics = None,
     shard_rows: Annotated[int, typer.Option(help="Rows of a shard; other values give other rows.")] = 10_000,
-    reuse: Annotated[bool, typer.Option("--reuse", help="Keep the candidates in the cache for later runs.")] = False,
+    passes: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=64,
+            help="Searches of the poses that yielded: faster, fewer poses; default: the pipeline's, or 8 with --reuse.",
+            show_default=False,
+        ),
+    ] = None,
+    reuse: Annotated[
+        bool, typer.Option("--reuse", help="Keep how far shards came: a later run with a larger -n goes on there.")
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be computed; change nothing.")] = False,
 ) -> None:
     """Generate grasps of an object and write them as shards.
@@ -60,11 +71,13 @@ def generate(
 
     Example: lgrasp generate --object mug.obj -n 10000
     """
+    from lgrasp.engine.bank import with_passes
     from lgrasp.jobs.config import default_out
     from lgrasp.jobs.generate import GenerateJob
     from lgrasp_cli.tables import job_report, print_pairs
 
     chosen, protocol = choose_pipeline(pipeline, seed, contacts, settings), choose_protocol(simulate, physics)
+    chosen = with_passes(chosen, passes, reuse)
     job = how.job(
         GenerateJob,
         "generate",

@@ -1,4 +1,4 @@
-"""The candidate bank: contacts of a batch of poses, kept on disk so that later runs need not make them again."""
+"""The bank: how far a shard has come, kept so that a later run that asks for more rows goes on from there."""
 
 import json
 from dataclasses import dataclass
@@ -8,17 +8,31 @@ import numpy as np
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import InputKeys
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.grasp.tables import CandidateTable, candidate_arrays, candidate_table
+from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
 
-BANK_CANDIDATES = 1024
-"""Candidates of one bank entry; the batch size of a run that keeps banks."""
-BANK_VERSION = 2
+BANK_VERSION = 3
 """Raised whenever the arrays of an entry change meaning; the versions of the stages are in the key too."""
+REUSE_PASSES = 8
+"""Passes of a run that keeps a bank, unless it or its pipeline says otherwise."""
+_ABOUT = "about"  # member with the numbers
+
+
+@dataclass(frozen=True)
+class Account:
+    """A shard so far: the first ``kept`` rows are its own, later ones were found with the last and not looked at."""
+
+    grasps: GraspTable
+    kept: int
+    candidates: int  # tried: the next batch begins there
+    duplicates: int
+    counts: dict[str, dict[str, int]]
+    seconds: dict[str, float]  # thread-seconds per stage
+    wall: float  # [s]
 
 
 @dataclass(frozen=True)
 class Bank:
-    """Bank entries of one shard's stream."""
+    """The account of one shard in the cache. With it or without, a shard has the same rows."""
 
     cache: Cache
     pipeline: Pipeline
@@ -26,33 +40,43 @@ class Bank:
     shard: int
     device: str
 
-    def key(self, first: int, count: int) -> str:
-        """Content key of the candidates ``first .. first + count - 1``: the stages before search and their inputs."""
-        described = self.pipeline.describe()["stages"][: self.pipeline.order.index("search")]
+    @property
+    def key(self) -> str:
+        """Content key: all that decides the rows of the shard, and the kind of device, which rounds its own way."""
         return content_key(
             "bank",
             BANK_VERSION,
-            stages=described,
-            seed=self.pipeline.seed,
+            pipeline=self.pipeline.describe(),
             inputs=[self.keys.hand, self.keys.object, self.keys.field],
             shard=self.shard,
-            candidates=[first, count],
+            device=self.device.partition(":")[0],
         )
 
-    def has(self, first: int, count: int) -> bool:
-        return self.cache.has("bank", self.key(first, count))
-
-    def load(self, first: int, count: int) -> tuple[CandidateTable, dict[str, dict[str, int]]] | None:
-        """The banked candidates on the device and the survivors per stage when they were made, or None."""
-        arrays = self.cache.load("bank", self.key(first, count))
+    def load(self, rows: int) -> Account | None:
+        """The account, or None when there is none that a shard of ``rows`` rows can go on from; damage is said."""
+        arrays = self.cache.load("bank", self.key)
         if arrays is None:
             return None
         try:
-            return candidate_table(arrays, self.device), json.loads(str(arrays["counts"]))
-        except (KeyError, ValueError, RuntimeError):
-            self.cache.warn(f"bank {self.cache.path('bank', self.key(first, count))} is damaged; it is made anew")
+            about = json.loads(str(arrays.pop(_ABOUT)))
+            account = Account(grasps_from_arrays(arrays), **about)
+        except (KeyError, ValueError, TypeError):
+            self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; it is made anew")
             return None
+        return account if account.kept <= rows else None
 
-    def store(self, first: int, count: int, table: CandidateTable, counts: dict[str, dict[str, int]]) -> None:
-        arrays = candidate_arrays(table) | {"counts": np.asarray(json.dumps(counts))}
-        self.cache.store("bank", self.key(first, count), arrays)
+    def store(self, account: Account) -> None:
+        """Keep the account, in place of an earlier one."""
+        about = {name: value for name, value in vars(account).items() if name != "grasps"}
+        self.cache.store("bank", self.key, grasp_arrays(account.grasps) | {_ABOUT: np.asarray(json.dumps(about))})
+
+
+def with_passes(pipeline: Pipeline, passes: int | None, reuse: bool = False) -> Pipeline:
+    """The pipeline with some passes over its candidates: those given, else REUSE_PASSES where a bank is kept.
+
+    Raises:
+        ConfigError: passes out of range.
+    """
+    if passes is None and (not reuse or pipeline.params("search").passes > 1):
+        return pipeline
+    return pipeline.with_params("search", passes=passes or REUSE_PASSES)

@@ -1,18 +1,28 @@
 """One batch of candidates through the stages of a pipeline."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from lgrasp.engine.bank import Bank
 from lgrasp.engine.fit import fit_params
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
-from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, select_poses
+from lgrasp.grasp.tables import CandidateTable, GraspTable, join_grasps, reorder_grasps, select_poses
 from lgrasp.runtime.meter import Meter
 from lgrasp.stages.context import Context
+
+if TYPE_CHECKING:
+    from lgrasp.engine.graphs import GraphCache
+
+PASS_BLOCK = 64
+"""Candidates that later passes search again before the next ones are begun: it decides the order of the rows."""
+PASS_SHIFT = 32
+"""Bits of the number of a candidate below that of its pass."""
+PASS_BITS = np.uint64(0xFF << PASS_SHIFT)
+"""Bits of the pass in the column ``candidate`` of a shard; the rest is the pose."""
 
 
 @dataclass
@@ -44,49 +54,51 @@ def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, mete
     return table
 
 
-def finish_batch(pipeline: Pipeline, context: Context, sets: ContactSets, meter: Meter) -> BatchResult:
-    """What a batch gives whose stages up to search have been run."""
-    table: Any = sets
-    for stage in pipeline.order[pipeline.order.index("search") + 1 :]:
-        table = run_stage(stage, table, pipeline, context, meter)
-    return BatchResult(table, meter.counts, meter.seconds)
-
-
-def run_batch(pipeline: Pipeline, context: Context, first: int, count: int, bank: Bank | None = None) -> BatchResult:
+def run_batch(
+    pipeline: Pipeline, context: Context, first: int, count: int, graphs: "GraphCache | None" = None
+) -> BatchResult:
     """Grasps of candidates ``first .. first + count - 1`` of a shard's stream.
 
     A pure function of its arguments, and of the batch alone: cutting the stream into other batches gives the same rows
-    in the same order, as long as there is one pass. Later passes search the batch's candidates again, best-yielding
-    poses first, so with several passes the order of the rows depends on the cut.
+    in the same order. With several passes the poses that yielded are searched again, in every block of PASS_BLOCK
+    candidates after one another and the best-yielding first; batches are then whole blocks. Rows of pass p have
+    ``p << PASS_SHIFT`` added to the number of their candidate.
 
     Args:
-        bank: where the candidates before search are kept between runs; None keeps nothing.
+        graphs: replays the stages up to search; None launches them one by one.
     """
-    meter = Meter(context.device)
-    at = pipeline.order.index("search")
-    banked = bank.load(first, count) if bank else None
-    if banked:
-        table, counts = banked
-        for stage, own in counts.items():
-            meter.add(stage, own)
+    if graphs:
+        sets, meter = graphs.run(context, first, count)
     else:
-        table = run_stages(pipeline, context, first, count, pipeline.order[at - 1], meter)
-        if bank:
-            bank.store(first, count, table, meter.counts)
-    parts = []
+        meter = Meter(context.device)
+        sets = run_stages(pipeline, context, first, count, "search", meter)
+    grasps = _run_through(pipeline.order[pipeline.order.index("search") + 1 :], sets, pipeline, context, meter)
     passes = pipeline.params("search").passes
-    for salt in range(passes):
-        result: Any = table
-        for stage in pipeline.order[at:]:
-            result = run_stage(stage, result, pipeline, context.with_salt(salt), meter)
-        parts.append(result)
-        if salt == 0 and passes > 1:
-            table = _richest(table, result, context)
-    return BatchResult(join_grasps(parts), meter.counts, meter.seconds)
+    if passes > 1:
+        table = _yielding(sets.candidates, grasps, context.device)
+        again = pipeline.order[pipeline.order.index("search") :]
+        parts = [grasps]
+        for salt in range(1, passes):
+            found = _run_through(again, table, pipeline, context.with_salt(salt), meter)
+            parts.append(replace(found, index=found.index + (salt << PASS_SHIFT)))
+        grasps = _by_blocks(join_grasps(parts))
+    return BatchResult(grasps, meter.counts, meter.seconds)
 
 
-def _richest(table: CandidateTable, grasps: GraspTable, context: Context) -> CandidateTable:
-    """The poses that gave grasps, those that gave most first."""
+def _run_through(stages: Sequence[str], table: Any, pipeline: Pipeline, context: Context, meter: Meter) -> GraspTable:
+    for stage in stages:
+        table = run_stage(stage, table, pipeline, context, meter)
+    return table
+
+
+def _yielding(table: CandidateTable, grasps: GraspTable, device: str) -> CandidateTable:
+    """The poses that gave grasps: block by block, those that gave most first."""
     index, number = np.unique(grasps.index, return_counts=True)
     row = np.searchsorted(table.poses.index.numpy()[: len(table.poses)], index)
-    return select_poses(table, row[np.argsort(-number, kind="stable")], context.device)
+    return select_poses(table, row[np.lexsort((-number, index // PASS_BLOCK))], device)
+
+
+def _by_blocks(grasps: GraspTable) -> GraspTable:
+    """Rows in the order of their blocks, within a block as they are: pass by pass."""
+    block = (grasps.index & ((1 << PASS_SHIFT) - 1)) // PASS_BLOCK
+    return reorder_grasps(grasps, np.argsort(block, kind="stable"))

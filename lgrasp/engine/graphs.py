@@ -1,4 +1,4 @@
-"""Batches of one size recorded as a graph: what is launched before a batch's size is known is launched as one."""
+"""CUDA graphs of batches: what is launched before the number of survivors is known is launched as one."""
 
 import threading
 from dataclasses import dataclass, replace
@@ -12,13 +12,16 @@ from lgrasp.runtime.meter import Meter
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
 
-_WORTH = 3  # times that a size has come before it is recorded, which takes as long as several batches
-_KEPT = 2  # recordings: each holds the tables of a batch
-_CLOSE = (0.99, 1.03)  # of the candidates wanted: sizes that serve as well
+_LAUNCHED_FIRST = 3
+"""Batches of one size that are launched step by step; capturing a graph takes as long as several of them."""
+_MOST_GRAPHS = 2
+"""Graphs kept at a time: each holds the tables of a batch."""
+_SAME_SIZE = (0.99, 1.03)
+"""Share of the candidates wanted that a size may be and serve as well."""
 
 
 @dataclass(frozen=True)
-class _Recording:
+class _CapturedGraph:
     graph: wp.Graph
     first: wp.array  # (1,) i32
     seeds: dict[tuple[str, int], wp.array]
@@ -26,50 +29,50 @@ class _Recording:
     sets: ContactSets
 
 
-class Recorder:
+class GraphCache:
     """Place through search of one pipeline, hand and object, for one thread.
 
-    A size that comes again and again is recorded; from then on it is replayed, with the seeds of the shard and the
-    first candidate of the batch put where the recording reads them. The tables of a replay are overwritten by the next.
+    A size that comes again and again is captured; from then on it is replayed, with the seeds of the shard and the
+    first candidate of the batch put where the graph reads them. The tables of a replay are overwritten by the next.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
-        self.recording = threading.Lock()
-        """Held while a batch is recorded: whoever else uses the device must hold it too."""
+        self.capturing = threading.Lock()
+        """Held while a graph is captured: whoever else uses the device must hold it too."""
         self._times: dict[int, int] = {}  # by size, the latest last
-        self._recordings: dict[int, _Recording] = {}
+        self._graphs: dict[int, _CapturedGraph] = {}
 
     def size(self, wanted: int) -> int:
         """Candidates for a batch that should have about ``wanted``: a size that was there before, if one is close."""
-        low, high = (wanted * share for share in _CLOSE)
+        low, high = (wanted * share for share in _SAME_SIZE)
         return next((n for n in reversed(self._times) if low <= n <= high), wanted)
 
     def run(self, context: Context, first: int, count: int) -> tuple[ContactSets, Meter]:
         """The sets of candidates ``first .. first + count - 1``, and their counts and seconds."""
         self._times[count] = self._times.pop(count, 0) + 1
-        if self._times[count] <= _WORTH:
+        if self._times[count] <= _LAUNCHED_FIRST:
             meter = Meter(context.device)
             return run_stages(self._pipeline, context, first, count, "search", meter), meter
-        if count not in self._recordings:
-            while len(self._recordings) >= _KEPT:
-                del self._recordings[min(self._recordings, key=list(self._times).index)]
-            self._recordings[count] = self._record(context, count)
-        recording = self._recordings[count]
-        recording.first.fill_(first)
-        for (stage, salt), seed in recording.seeds.items():
+        if count not in self._graphs:
+            while len(self._graphs) >= _MOST_GRAPHS:
+                del self._graphs[min(self._graphs, key=list(self._times).index)]
+            self._graphs[count] = self._capture(context, count)
+        captured = self._graphs[count]
+        captured.first.fill_(first)
+        for (stage, salt), seed in captured.seeds.items():
             seed.fill_(stage_seed(context.base_seed, context.shard, stage, salt))
-        wp.capture_launch(recording.graph)
-        return recording.sets, recording.meter.again()
+        wp.capture_launch(captured.graph)
+        return captured.sets, captured.meter.again()
 
-    def _record(self, context: Context, count: int) -> _Recording:
+    def _capture(self, context: Context, count: int) -> _CapturedGraph:
         device = context.device
         own = replace(context, seeds={}, holding=context.held)
         for stage in self._pipeline.order[: self._pipeline.order.index("search") + 1]:
             own.seed(stage)
         first = wp.zeros(1, dtype=wp.int32, device=device)
         meter = Meter(device)
-        with self.recording, wp.ScopedCapture(device=device) as capture:
+        with self.capturing, wp.ScopedCapture(device=device) as capture:
             sets = run_stages(self._pipeline, own, first, count, "search", meter)
         assert capture.graph is not None
-        return _Recording(capture.graph, first, own.seeds, meter, sets)
+        return _CapturedGraph(capture.graph, first, own.seeds, meter, sets)

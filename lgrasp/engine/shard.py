@@ -4,25 +4,30 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
 import warp as wp
 
-from lgrasp.engine.bank import BANK_CANDIDATES, Bank
-from lgrasp.engine.batch import BatchResult, finish_batch, run_batch
+from lgrasp.engine.bank import Account, Bank
+from lgrasp.engine.batch import PASS_BLOCK, BatchResult, run_batch
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.graphs import Recorder
+from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
-from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
+from lgrasp.grasp.tables import GraspTable, join_grasps, no_grasps, take_grasps
 from lgrasp.stages.context import Context
 
-_LEAST_EFFORT = 65_536
-_CPU_BATCH, _PHYSICS_BATCH = 256, 32  # rows of a simulation are dear
-_GPU_LEAST, _GPU_WHOLE, _GPU_MOST = 2_048, 16_384, 65_536
+_LEAST_EFFORT = 65_536  # candidates that any shard may try
+_EFFORT_STEP = 1024  # candidates: what a shard may try is a multiple of it
+_CPU_BATCH, _CPU_LARGEST = 256, 512  # candidates of a batch; the second with several passes
+_PHYSICS_BATCH = 32  # candidates, when their grasps are simulated on the CPU, which takes long
+_GPU_SMALLEST, _GPU_LARGEST = 2_048, 65_536  # candidates of a batch
+_GPU_WHOLE = 16_384  # candidates: a batch of more is cut in two
 _GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
 _STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
@@ -34,7 +39,7 @@ class Execution:
     workers: int = 1
     batch: int = 0  # candidates per batch; 0: by device
     rate: float = 1.0  # rows expected per candidate, until there are some: sizes the first batch on a GPU
-    recorder: Recorder | None = None  # replays batches; for one worker, without a bank, one pass
+    graphs: GraphCache | None = None  # replays batches; for one worker
 
 
 @dataclass
@@ -73,7 +78,7 @@ def flat_statistics(counts: dict[str, dict[str, int]], seconds: Mapping[str, flo
 
 
 def _batches(
-    run: Callable[[int, int], BatchResult], workers: int, limit: int, size: Callable[[int], int]
+    run: Callable[[int, int], BatchResult], workers: int, first: int, limit: int, size: Callable[[int], int]
 ) -> Generator[tuple[int, BatchResult]]:
     """Results of consecutive batches, in order; ``workers`` of them are worked on at a time.
 
@@ -81,10 +86,10 @@ def _batches(
 
     Args:
         run: makes the batch of candidates ``first .. first + count - 1`` from (first, count).
+        first: candidate that the first batch begins with.
         limit: candidates there may be.
         size: candidates of the next batch, given how many are being worked on; 0: those should do.
     """
-    first = 0
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[tuple[int, Future[BatchResult]]] = deque()
         try:
@@ -108,29 +113,46 @@ def _batches(
 def _most_candidates(device: str, groups: int) -> int:
     """Candidates that a batch may have on a GPU: two batches take at most half of the free memory."""
     free = wp.get_device(device).free_memory
-    return int(min(max(free / 4 / (_GROUP_BYTES * groups), _GPU_LEAST), _GPU_MOST))
+    return int(min(max(free / 4 / (_GROUP_BYTES * groups), _GPU_SMALLEST), _GPU_LARGEST))
 
 
-def _batch_size(device: str, missing: int, rate: float, running: int, most: int = _GPU_MOST) -> int:
-    """Candidates of a batch when ``running`` others are worked on.
+def _batch_size(
+    device: str,
+    missing: int,
+    rate: float,
+    running: int,
+    most: int = _GPU_LARGEST,
+    *,
+    passes: int = 1,
+    share: int = 1,
+) -> int:
+    """Candidates of a batch when ``running`` others are worked on; 0 when those should give the missing rows.
 
-    On a GPU as many as should give the missing rows, up to ``most``, and none when those running should. Many are cut
-    in two, so that the rows of one part are taken over while the other is worked on.
+    On a GPU as many as should give them, up to ``most``. Many are cut in two, so that the rows of one part are taken
+    over while the other is worked on.
+
+    Args:
+        rate: rows expected per candidate.
+        share: workers among which a CPU divides what is missing; 0: the rate is a guess, which must leave none idle.
     """
-    if device == "cpu":
-        return _CPU_BATCH
-    if running >= missing / rate > 0:
+    if running >= missing / rate > 0 and (share or device != "cpu"):
         return 0
+    if device == "cpu" and passes == 1:
+        return _CPU_BATCH
+    if device == "cpu":
+        # a batch makes many rows: shares of what is missing keep the workers busy to the end and little in vain
+        needed = (missing / rate - running) / share if share else 0
+        return int(min(max(needed, PASS_BLOCK), _CPU_LARGEST))
     needed = 1.05 * missing / rate + 256 - running
     if not running and needed > _GPU_WHOLE:
         needed /= 2
-    return int(min(max(needed, _GPU_LEAST), most))
+    return int(min(max(needed, _GPU_SMALLEST), most))
 
 
 def shard_effort(pipeline: Pipeline, rows: int) -> int:
-    """Candidates that a shard of ``rows`` rows may try: whole bank entries."""
-    entries = -(-max(_LEAST_EFFORT, rows * pipeline.effort) // BANK_CANDIDATES)
-    return min(entries * BANK_CANDIDATES, _STREAM)
+    """Candidates that a shard of ``rows`` rows may try."""
+    steps = -(-max(_LEAST_EFFORT, rows * pipeline.effort) // _EFFORT_STEP)
+    return min(steps * _EFFORT_STEP, _STREAM)
 
 
 def shard_context(pipeline: Pipeline, inputs: Inputs, shard: int) -> Context:
@@ -162,55 +184,102 @@ def make_shard(
     """The first ``rows`` grasps of a shard's candidate stream, near-duplicates left out.
 
     Args:
-        bank_cache: keep and use candidate banks there.
+        bank_cache: go on from the shard's bank there, and keep how far it came; counts and seconds are then those of
+            all runs together.
         progress: called with (rows so far, running result) after each batch; what it raises ends the shard.
     """
     device = inputs.device.alias
     context = shard_context(pipeline, inputs, shard)
     bank = Bank(bank_cache, pipeline, inputs.keys, shard, device) if bank_cache else None
-    limit = shard_effort(pipeline, rows)
-    result: ShardResult | None = None
-    parts: list[GraspTable] = []
-    kept = KeptRows(inputs.hand.model.dofs, device)
-    start = time.perf_counter()
-    recorder, fixed = execution.recorder, execution.batch
-    if bank is not None or pipeline.params("search").passes > 1:
-        # later passes go over the poses of one batch, so its size decides the order of the rows
-        fixed = BANK_CANDIDATES
-    elif not fixed and context.scene and device == "cpu":
-        fixed = _PHYSICS_BATCH
-    most = _GPU_MOST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups)
+    graphs = execution.graphs
+    found = _Rows(inputs, rows, graphs.capturing if graphs else nullcontext())
+    result = found.result
+    if bank and (account := bank.load(rows)):
+        found.restore(account)
+    earlier, start = result.wall, time.perf_counter()
+    fixed, passes = _fixed_batch(context, execution), pipeline.params("search").passes
+    most = _GPU_LARGEST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups)
 
     def size(running: int) -> int:
         # going by those so far
-        rate = kept.count / result.candidates if result and kept.count else execution.rate
-        wanted = fixed or _batch_size(device, rows - kept.count, rate, running, most)
-        return recorder.size(wanted) if recorder and not fixed and wanted else wanted
+        rate, missing = found.count / result.candidates if found.count else execution.rate, rows - found.count
+        share = execution.workers if found.count else 0
+        wanted = fixed or _batch_size(device, missing, rate, running, most, passes=passes, share=share)
+        if graphs and not fixed and wanted:
+            wanted = graphs.size(wanted)
+        return wanted if passes == 1 else -(-wanted // PASS_BLOCK) * PASS_BLOCK
 
     def run(first: int, count: int) -> BatchResult:
-        if recorder is None:
-            return run_batch(pipeline, context, first, count, bank)
-        return finish_batch(pipeline, context, *recorder.run(context, first, count))
+        return run_batch(pipeline, context, first, count, graphs)
 
-    with closing(_batches(run, execution.workers, limit, size)) as batches:
+    limit = shard_effort(pipeline, rows) if found.count < rows else 0
+    with closing(_batches(run, execution.workers, result.candidates, limit, size)) as batches:
         for count, batch in batches:
-            if result is None:
-                result = ShardResult(batch.grasps)
             result.candidates += count
             add_counts(result.counts, batch.counts)
             add_seconds(result.seconds, batch.seconds)
-            # near-duplicates are defined on poses as they are written
-            pose = user_poses(batch.grasps.pose, inputs.object.model.center)
-            with recorder.recording if recorder else nullcontext():
-                new, duplicates = kept.add(pose, batch.grasps.q, rows - kept.count)
-            result.duplicates += duplicates
-            parts.append(take_grasps(batch.grasps, new))
+            found.add(batch.grasps)
             if progress:
-                progress(kept.count, result)
-            if kept.count >= rows:
+                progress(found.count, result)
+            if found.count >= rows:
                 break
-    assert result is not None
-    result.grasps = join_grasps(parts)
-    result.wall = time.perf_counter() - start
-    result.exhausted = kept.count < rows
+    result.grasps = join_grasps(found.parts)
+    result.wall = earlier + time.perf_counter() - start
+    result.exhausted = found.count < rows
+    if bank:
+        bank.store(found.account())
     return result
+
+
+def _fixed_batch(context: Context, execution: Execution) -> int:
+    """Candidates of every batch; 0: as many as seem best."""
+    if execution.batch == 0 and context.scene and context.device == "cpu":
+        return _PHYSICS_BATCH
+    return execution.batch
+
+
+class _Rows:
+    """Rows of a shard as they come in: near-duplicates are left out, rows beyond those asked are set aside."""
+
+    def __init__(self, inputs: Inputs, rows: int, lock: AbstractContextManager[Any]) -> None:
+        self.parts: list[GraspTable] = []
+        self.result = ShardResult(no_grasps())
+        self._kept = KeptRows(inputs.hand.model.dofs, inputs.device.alias)
+        self._center = inputs.object.model.center
+        self._rows = rows
+        self._lock = lock  # held while the device is used
+        self._aside: GraspTable | None = None
+
+    @property
+    def count(self) -> int:
+        return self._kept.count
+
+    def add(self, grasps: GraspTable) -> None:
+        """Take over what is new of further rows, until there are those asked."""
+        if self.count >= self._rows:
+            self._aside = grasps
+            return
+        # near-duplicates are defined on poses as they are written
+        pose = user_poses(grasps.pose, self._center)
+        with self._lock:
+            new, duplicates = self._kept.add(pose, grasps.q, self._rows - self.count)
+        self.result.duplicates += duplicates
+        self.parts.append(take_grasps(grasps, new))
+        self._aside = take_grasps(grasps, np.arange(len(new) + duplicates, len(grasps)))
+
+    def restore(self, account: Account) -> None:
+        """Begin with what an earlier run found."""
+        table = account.grasps
+        own = take_grasps(table, np.arange(account.kept))
+        self._kept.restore(user_poses(own.pose, self._center), own.q)
+        self.parts.append(own)
+        result = self.result
+        result.counts, result.seconds, result.wall = account.counts, account.seconds, account.wall
+        result.candidates, result.duplicates = account.candidates, account.duplicates
+        self.add(take_grasps(table, np.arange(account.kept, len(table))))
+
+    def account(self) -> Account:
+        """How far the shard has come."""
+        r = self.result
+        table = join_grasps([r.grasps, self._aside] if self._aside else [r.grasps])
+        return Account(table, self.count, r.candidates, r.duplicates, r.counts, r.seconds, r.wall)

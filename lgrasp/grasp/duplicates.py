@@ -51,6 +51,11 @@ class KeptRows:
         self._q = np.zeros((0, joints), np.float32)
         self.count = 0
 
+    def restore(self, pose: np.ndarray, q: np.ndarray) -> None:
+        """Begin with rows that were kept before: poses (N, 7) and joints (N, K)."""
+        self._pose, self._q = np.array(pose, np.float32), np.array(q, np.float32)
+        self.count = len(pose)
+
     def add(self, pose: np.ndarray, q: np.ndarray, room: int) -> tuple[np.ndarray, int]:
         """Keep what is new among further rows (see :func:`near_pairs`), up to ``room`` rows.
 

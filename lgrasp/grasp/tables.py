@@ -167,8 +167,17 @@ def trim_sets(table: ContactSets) -> ContactSets:
 
 
 def select_poses(table: CandidateTable, rows: np.ndarray, device: str) -> CandidateTable:
-    """The candidates of some poses, in the order given."""
-    return candidate_table({name: values[rows] for name, values in candidate_arrays(table).items()}, device)
+    """The candidates of some poses, in the order given; copied on the device."""
+    chosen = wp.array(rows, dtype=wp.int32, device=device)
+
+    def take(values: wp.array) -> wp.array:
+        if len(rows) == 0:
+            return wp.empty((0, *values.shape[1:]), dtype=values.dtype, device=device)
+        return wp.indexedarray(values, [chosen] + [None] * (values.ndim - 1)).contiguous()
+
+    poses = {f.name: take(getattr(table.poses, f.name)) for f in fields(PoseTable) if f.name != "rows"}
+    own = {name: take(getattr(table, name)) for name in ("count", "surface", "record", "state", "q")}
+    return CandidateTable(PoseTable(rows=wp.full(1, len(rows), dtype=wp.int32, device=device), **poses), **own)
 
 
 def grasp_arrays(table: GraspTable) -> dict[str, np.ndarray]:
@@ -187,6 +196,11 @@ def grasps_from_arrays(arrays: dict[str, np.ndarray]) -> GraspTable:
         family, dot, member = name.partition(".")
         (families[family] if dot else own)[member or name] = values
     return GraspTable(**own, metrics=families["metrics"], physics=families["physics"])
+
+
+def no_grasps() -> GraspTable:
+    """A GraspTable before anything is known of its columns."""
+    return grasps_from_arrays({f.name: np.zeros(0) for f in fields(GraspTable) if f.name not in _FAMILIES})
 
 
 def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:
@@ -208,7 +222,11 @@ def choose_grasps(old: GraspTable, new: GraspTable, into: np.ndarray, rows: np.n
 
 def sort_grasps(table: GraspTable) -> GraspTable:
     """The rows in candidate order."""
-    order = np.argsort(table.index, kind="stable")
+    return reorder_grasps(table, np.argsort(table.index, kind="stable"))
+
+
+def reorder_grasps(table: GraspTable, order: np.ndarray) -> GraspTable:
+    """The rows in another order, (N,)."""
     return grasps_from_arrays({name: values[order] for name, values in grasp_arrays(table).items()})
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lgrasp.config import parse_model, read_yaml
+from lgrasp.engine.bank import with_passes
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.engine.run import Job
@@ -41,6 +42,7 @@ class JobConfig(BaseModel):
     workers: int = Field(0, ge=0)
     batch: int = Field(0, ge=0)
     shard_rows: int = Field(10_000, ge=1)
+    passes: int | None = Field(None, ge=1, le=64, description="Replaces the pipelines' own search.passes.")
     reuse: bool = False
     sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn of them.")
 
@@ -136,7 +138,7 @@ def plan_jobs(config: JobConfig, cache: Cache) -> list[GenerateJob]:
                         hand=_urdf_in_folder(config.hand_dir, hand),
                         object=in_folder(config.object_dir, mesh),
                         rows=config.rows,
-                        pipeline=pipeline,
+                        pipeline=with_passes(pipeline, config.passes, config.reuse),
                         out=out / f"{Path(hand).stem}-{Path(mesh).stem}",
                         scale=config.scale,
                         device=config.device,

@@ -13,7 +13,7 @@ from lgrasp.dataset import Shard, ShardHeader
 from lgrasp.dataset.survivors import survivors
 from lgrasp.engine.events import Events, Made, Part, Progress
 from lgrasp.engine.folder import shard_path
-from lgrasp.engine.graphs import Recorder
+from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.run import Job, Outcome, run
@@ -42,11 +42,11 @@ class GenerateJob(Job):
     batch: int = Field(default=0, description="Candidates per batch; 0: by device.")
     rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
     shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
-    reuse: bool = Field(default=False, description="Keep the candidates in the cache for later runs.")
+    reuse: bool = Field(default=False, description="Keep how far shards came; later runs go on there.")
     _keys: InputKeys | None = PrivateAttr(None)
     _inputs: Inputs | None = PrivateAttr(None)
     _meshes: dict[str, bytes] = PrivateAttr(default_factory=dict)
-    _recorder: Recorder | None = PrivateAttr(None)
+    _graphs: GraphCache | None = PrivateAttr(None)
     _rate: float = PrivateAttr(1.0)
 
     @property
@@ -108,8 +108,7 @@ class GenerateJob(Job):
             objects = [object_record(inputs.object.model)]
             scene = make_scene(self.cache, inputs.hand.model, objects, self._meshes, device.alias)
             inputs = replace(inputs, scene=scene)
-        replayed = device.is_cuda and self.threads() == 1 and not self.reuse and pipeline.params("search").passes == 1
-        self._recorder = Recorder(pipeline) if replayed else None
+        self._graphs = GraphCache(pipeline) if device.is_cuda and self.threads() == 1 else None
         self._inputs, self._rate = inputs, self.rate
 
     def make(self, part: Part, progress: Progress) -> Made:
@@ -124,7 +123,7 @@ class GenerateJob(Job):
             self.inputs,
             part.number,
             part.rows,
-            Execution(self.threads(), self.batch, self._rate, self._recorder),
+            Execution(self.threads(), self.batch, self._rate, self._graphs),
             bank_cache=self.cache if self.reuse else None,
             progress=tell,
         )

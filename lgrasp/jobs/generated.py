@@ -10,6 +10,7 @@ import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.survivors import stage_counts, survivors
+from lgrasp.engine.batch import PASS_BITS
 from lgrasp.engine.run import Outcome
 from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
@@ -45,7 +46,7 @@ class _Tally:
             self.rows += len(reader)
             self.strict += _strict_rows(reader)
             self.near_duplicates += len(near_pairs(pose, q, self.device))
-            self.distinct_poses += len(np.unique(reader.column("candidate")))
+            self.distinct_poses += len(np.unique(reader.column("candidate") & ~PASS_BITS))
             links = reader.column("contact_links")
             fingers = (self.moving[np.maximum(links, 0)] & (links >= 0)).sum((1, 2))
             fswo = reader.column("metrics/fswo")

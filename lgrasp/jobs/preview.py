@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from lgrasp.engine.bank import BANK_CANDIDATES, Bank
+from lgrasp.engine.bank import Bank
 from lgrasp.engine.run import Job, look
 from lgrasp.jobs.generate import GenerateJob
 
@@ -28,7 +28,7 @@ def preview(job: Job, *, array: tuple[int, int] = (0, 1), resume: bool = True) -
         LgraspError: bad input, as :func:`lgrasp.engine.run.run` would raise it before computing.
     """
     with _no_kernel_folder():
-        _, parts, present = look(job, array=array, resume=resume)
+        device, parts, present = look(job, array=array, resume=resume)
     lines = _inputs(job) if isinstance(job, GenerateJob) else []
     for part in parts:
         number, file = str(part.number), str(part.file)
@@ -38,7 +38,8 @@ def preview(job: Job, *, array: tuple[int, int] = (0, 1), resume: bool = True) -
             )
             continue
         if isinstance(job, GenerateJob) and job.reuse:
-            lines.append(_banks(job, Bank(job.cache, job.pipeline, job.keys, part.number, "cpu")))
+            bank = Bank(job.cache, job.pipeline, job.keys, part.number, device.alias)
+            lines.append(_cached(job, "bank", number, bank.key, "keep how far the shard comes"))
         what = f"{part.rows:,} {job.unit}" + (", replacing the file" if part.file.exists() else "")
         lines.append(PlanLine("shard", number, "missing", what, file))
     return lines
@@ -57,14 +58,6 @@ def _inputs(job: GenerateJob) -> list[PlanLine]:
 def _cached(job: GenerateJob, kind: str, name: str, key: str, verb: str) -> PlanLine:
     hit = job.cache.has(kind, key)
     return PlanLine(kind, name, "hit" if hit else "miss", "load" if hit else verb, str(job.cache.path(kind, key)))
-
-
-def _banks(job: GenerateJob, bank: Bank) -> PlanLine:
-    count = 0
-    while bank.has(count * BANK_CANDIDATES, BANK_CANDIDATES):
-        count += 1
-    todo = f"use {count} x {BANK_CANDIDATES} candidates, make more as needed" if count else "make as needed"
-    return PlanLine("bank", str(bank.shard), "hit" if count else "miss", todo, str(job.cache.root / "bank"))
 
 
 @contextmanager

@@ -49,7 +49,7 @@ def test_expected_rows_per_candidate(swift, inputs, monkeypatch, rate):
     expected = grasp_arrays(make_shard(swift, inputs, 0, 60, Execution(1, 512)).grasps)
     size, sizes = shard_module._batch_size, []
 
-    def as_on_a_gpu(device, missing, rate, running, most):
+    def as_on_a_gpu(device, missing, rate, running, most, **_):
         sizes.append(size("cuda:0", missing, rate, running, most))
         return sizes[-1]
 

@@ -1,19 +1,26 @@
-"""Candidate banks and several passes over them."""
+"""Several passes over the same candidates, and shards that go on from a bank."""
 
 import shutil
 
 import numpy as np
 import pytest
 
-from lgrasp.engine.bank import BANK_CANDIDATES, Bank
-from lgrasp.engine.batch import run_batch
+from lgrasp.engine.bank import REUSE_PASSES, Bank, with_passes
+from lgrasp.engine.batch import PASS_BLOCK, PASS_SHIFT, run_batch
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.registry import STAGES
 from lgrasp.engine.shard import Execution, make_shard
+from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.tables import grasp_arrays
-from lgrasp.jobs.generate import generate
+
+PASSES = 4
+
+
+@pytest.fixture(scope="module")
+def several(swift):
+    return swift.with_params("search", passes=PASSES)
 
 
 @pytest.fixture
@@ -26,7 +33,7 @@ def cache(inputs, cache_root, tmp_path):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Stage -> number of launches, counted where batches run them."""
+    """Stage -> number of launches."""
     counted = dict.fromkeys(STAGES, 0)
 
     def count(name, run):
@@ -46,78 +53,107 @@ def assert_same(a, b):
         np.testing.assert_array_equal(values, grasp_arrays(b)[name], err_msg=name)
 
 
+def rows_of(grasps):
+    """What a row was made of: pass and candidate, and the set among those of its pose."""
+    return list(zip(grasps.index.tolist(), grasps.slot.tolist(), strict=True))
+
+
 @pytest.mark.parametrize("name", ["swift", "lightning"])
-def test_bank_hit_changes_nothing(name, request, load, cache, calls):
-    pipeline = request.getfixturevalue(name).with_params("search", passes=2)
+def test_going_on_gives_the_rows_of_a_run_without_a_break(name, request, load, cache, calls):
+    pipeline = request.getfixturevalue(name).with_params("search", passes=3)
     source = load(pipeline=pipeline)
-    rows = 40 if name == "swift" else 8
-    plain = make_shard(pipeline, source, 0, rows, Execution())
-    made = make_shard(pipeline, source, 0, rows, Execution(), bank_cache=cache)
-    banks = list((cache.root / "bank").iterdir())
-    assert banks
+    few, many = (40, 400) if name == "swift" else (4, 12)
+    whole = make_shard(pipeline, source, 0, many, Execution(1, 256))
+    begun = make_shard(pipeline, source, 0, few, Execution(1, 256), bank_cache=cache)
     before = dict(calls)
-    hit = make_shard(pipeline, source, 0, rows, Execution(), bank_cache=cache)
-    assert (calls["place"], calls["domain"]) == (before["place"], before["domain"])
-    for other in (made, hit):
-        assert_same(plain.grasps, other.grasps)
-        assert other.counts == plain.counts
-        assert (other.candidates, other.duplicates) == (plain.candidates, plain.duplicates)
-    assert set(hit.seconds) == set(pipeline.order[pipeline.order.index("search") :])
+    grown = make_shard(pipeline, source, 0, many, Execution(2, 256), bank_cache=cache)
+    assert_same(whole.grasps, grown.grasps)
+    assert grown.counts == whole.counts
+    assert (grown.candidates, grown.duplicates) == (whole.candidates, whole.duplicates)
+    # of the candidates tried before none was made again; workers may have begun up to three batches too many
+    assert begun.candidates >= 256
+    assert calls["place"] - before["place"] <= (whole.candidates - begun.candidates) // 256 + 3
+    assert_same(begun.grasps, make_shard(pipeline, source, 0, few, Execution(1)).grasps)
+    assert_same(whole.grasps, make_shard(pipeline, source, 0, many, Execution(1), bank_cache=cache).grasps)
 
 
-def test_other_search_reads_the_same_bank(job, swift, cache, calls, tmp_path):
-    generate(job(rows=20, reuse=True, cache=cache, out=tmp_path / "a"))
-    placed = calls["place"]
-    assert placed > 0
-    other = swift.with_params("search", restarts=12).with_params("filter", draws=5)
-    generate(job(rows=20, reuse=True, cache=cache, pipeline=other, out=tmp_path / "b"))
-    assert calls["place"] == placed
-    assert calls["search"] > 0
-    earlier = swift.with_params("ik", gap=0.0009)
-    generate(job(rows=20, reuse=True, cache=cache, pipeline=earlier, out=tmp_path / "c"))
-    assert calls["place"] > placed
+def test_a_second_run_makes_only_what_is_missing(several, inputs, cache, calls):
+    first = make_shard(several, inputs, 0, 100, Execution(1, 1024), bank_cache=cache)
+    made = dict(calls)
+    assert first.counts["filter"]["kept"] > 120
+    # rows found with the last ones are there already
+    second = make_shard(several, inputs, 0, 110, Execution(1, 1024), bank_cache=cache)
+    assert calls == made
+    third = make_shard(several, inputs, 0, 600, Execution(1, 1024), bank_cache=cache)
+    assert third.candidates > second.candidates == first.candidates
+    pose = user_poses(third.grasps.pose, inputs.object.model.center)
+    assert len(near_pairs(pose, third.grasps.q)) == 0
+    rows = rows_of(third.grasps)
+    assert len(set(rows)) == len(rows) == 600
+    assert rows[:110] == rows_of(second.grasps)
+
+
+def test_fewer_rows_than_the_bank_has(several, inputs, cache):
+    make_shard(several, inputs, 0, 200, Execution(1), bank_cache=cache)
+    few = make_shard(several, inputs, 0, 20, Execution(1), bank_cache=cache)
+    assert_same(few.grasps, make_shard(several, inputs, 0, 20, Execution(1)).grasps)
 
 
 def test_bank_keys(swift, inputs, cache):
-    def key(pipeline=swift, shard=0, first=0, device="cpu"):
-        return Bank(cache, pipeline, inputs.keys, shard, device).key(first, BANK_CANDIDATES)
+    def key(pipeline=swift, shard=0, device="cpu"):
+        return Bank(cache, pipeline, inputs.keys, shard, device).key
 
-    assert key() == key(swift.with_params("search", threshold=0.2)) == key(device="cuda:0")
+    assert key(device="cuda:0") == key(device="cuda:1")
     different = [
         key(),
+        key(swift.with_params("search", threshold=0.2)),
+        key(swift.with_params("search", passes=2)),
         key(swift.with_params("place", proposals=2)),
-        key(swift.with_params("ik", gap=0.0011)),
         key(swift.model_copy(update={"seed": 1})),
         key(shard=1),
-        key(first=BANK_CANDIDATES),
+        key(device="cuda:0"),
     ]
     assert len(set(different)) == len(different)
 
 
+@pytest.mark.parametrize("arrays", [{"other": np.zeros(3)}, {"about": np.asarray("[]")}, {"about": np.asarray("{}")}])
+def test_damaged_bank_is_a_miss(several, inputs, cache, arrays):
+    lines: list[str] = []
+    own = Cache(cache.root, lines.append)
+    plain = make_shard(several, inputs, 0, 20, Execution())
+    own.store("bank", Bank(own, several, inputs.keys, 0, "cpu").key, arrays)
+    assert_same(plain.grasps, make_shard(several, inputs, 0, 20, Execution(), bank_cache=own).grasps)
+    assert len(lines) == 1
+    assert "damaged" in lines[0]
+
+
 def test_later_passes_add_new_rows_best_poses_first(swift, context):
-    one = run_batch(swift, context, 0, BANK_CANDIDATES).grasps
-    many = run_batch(swift.with_params("search", passes=3), context, 0, BANK_CANDIDATES).grasps
+    one = run_batch(swift, context, 0, PASS_BLOCK).grasps
+    many = run_batch(swift.with_params("search", passes=3), context, 0, PASS_BLOCK).grasps
     n = len(one)
     assert len(many) > 1.2 * n
     first = {name: values[:n] for name, values in grasp_arrays(many).items()}
     for name, values in grasp_arrays(one).items():
         np.testing.assert_array_equal(values, first[name], err_msg=name)
-    # of the second pass
-    index, number = np.unique(one.index, return_counts=True)
-    found = dict(zip(index.tolist(), number.tolist(), strict=True))
-    later = many.index[n:]
-    per_pose = swift.params("search").per_pose
-    second = later[many.slot[n:] < 2 * per_pose]
-    yields = [found[int(i)] for i in second]
-    assert yields == sorted(yields, reverse=True)
-    assert set(many.slot // per_pose) == {0, 1, 2}
-    pairs = list(zip(many.index.tolist(), many.slot.tolist(), strict=True))
-    assert len(set(pairs)) == len(pairs)
+    salt, candidate = many.index >> PASS_SHIFT, many.index & ((1 << PASS_SHIFT) - 1)
+    assert salt.tolist() == sorted(salt.tolist())
+    assert set(salt) == {0, 1, 2}
+    found = dict(zip(*np.unique(one.index, return_counts=True), strict=True))
+    for later in (1, 2):
+        yields = [found[i] for i in candidate[salt == later]]
+        assert yields == sorted(yields, reverse=True)
+    assert len(set(rows_of(many))) == len(many)
 
 
-def test_passes_leave_no_near_duplicates(swift, inputs):
-    result = make_shard(swift.with_params("search", passes=4), inputs, 0, 3000, Execution())
-    assert len(result.grasps) == 3000
+@pytest.mark.parametrize(("workers", "batch"), [(1, 1), (2, 300), (2, 1024)])
+def test_passes_do_not_depend_on_the_batches(several, inputs, workers, batch):
+    plain = make_shard(several, inputs, 0, 300, Execution(1))
+    assert_same(plain.grasps, make_shard(several, inputs, 0, 300, Execution(workers, batch)).grasps)
+
+
+def test_passes_leave_no_near_duplicates(several, inputs):
+    result = make_shard(several, inputs, 0, 1500, Execution(2))
+    assert len(result.grasps) == 1500
     written = user_poses(result.grasps.pose, inputs.object.model.center)
     assert len(near_pairs(written, result.grasps.q)) == 0
     assert result.duplicates > 0
@@ -125,15 +161,25 @@ def test_passes_leave_no_near_duplicates(swift, inputs):
 
 def test_passes_over_nothing(swift, context):
     pipeline = swift.with_params("search", passes=2, threshold=1e-9)
-    assert len(run_batch(pipeline, context, 0, 64).grasps) == 0
+    assert len(run_batch(pipeline, context, 0, PASS_BLOCK).grasps) == 0
 
 
-def test_bank_of_an_older_layout(swift, inputs, cache, tmp_path):
-    """Entries that hold other arrays than expected count as damaged."""
-    lines: list[str] = []
-    own = Cache(cache.root, lines.append)
-    plain = make_shard(swift, inputs, 0, 20, Execution())
-    bank = Bank(own, swift, inputs.keys, 0, "cpu")
-    own.store("bank", bank.key(0, BANK_CANDIDATES), {"other": np.zeros(3)})
-    assert_same(plain.grasps, make_shard(swift, inputs, 0, 20, Execution(), bank_cache=own).grasps)
-    assert len(lines) == 1
+def test_how_many_passes(swift, several):
+    assert with_passes(swift, None) == swift
+    assert with_passes(swift, None, reuse=True).params("search").passes == REUSE_PASSES
+    assert with_passes(several, None, reuse=True) == several
+    assert with_passes(several, 1, reuse=True).params("search").passes == 1
+    with pytest.raises(ConfigError, match="passes"):
+        with_passes(swift, 65)
+
+
+def test_a_folder_that_grows(run, several, grasps, tmp_path):
+    """Twice with more rows asked, and once: the same file."""
+    common = {"pipeline": several, "shard_rows": 1000}
+    run(rows=50, reuse=True, out=tmp_path / "a", **common)
+    run(rows=600, reuse=True, out=tmp_path / "a", **common)
+    run(rows=600, out=tmp_path / "b", **common)
+    twice, once = grasps(tmp_path / "a"), grasps(tmp_path / "b")
+    assert twice.keys() == once.keys()
+    for name, values in once.items():
+        np.testing.assert_array_equal(twice[name], values, err_msg=name)

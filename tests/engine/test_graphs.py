@@ -1,17 +1,17 @@
-"""Recorded batches give the rows of batches launched step by step."""
+"""Replayed batches give the rows of batches launched step by step."""
 
 import numpy as np
 
-from lgrasp.engine.graphs import Recorder
+from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.shard import Execution, make_shard
 from lgrasp.grasp.tables import grasp_arrays
 
 
 def test_rows_and_counts_are_the_same(swift, inputs):
-    recorder = Recorder(swift)
+    graphs = GraphCache(swift)
     for shard in (0, 1):
         plain = make_shard(swift, inputs, shard, 400, Execution(1, 128))
-        replayed = make_shard(swift, inputs, shard, 400, Execution(1, 128, recorder=recorder))
+        replayed = make_shard(swift, inputs, shard, 400, Execution(1, 128, graphs=graphs))
         assert replayed.counts == plain.counts
         expected, given = grasp_arrays(plain.grasps), grasp_arrays(replayed.grasps)
         for name, values in expected.items():
@@ -19,11 +19,11 @@ def test_rows_and_counts_are_the_same(swift, inputs):
 
 
 def test_two_sizes_take_turns(swift, context):
-    recorder = Recorder(swift)
+    graphs = GraphCache(swift)
     for turn in range(12):
         first, count = 64 * turn, (40, 64, 50)[turn % (2 if turn < 8 else 3)]
-        sets, meter = recorder.run(context, first, count)
-        expected, plain = Recorder(swift).run(context, first, count)
+        sets, meter = graphs.run(context, first, count)
+        expected, plain = GraphCache(swift).run(context, first, count)
         assert meter.counts == plain.counts
         n = len(expected)
         assert len(sets) == n
@@ -32,6 +32,6 @@ def test_two_sizes_take_turns(swift, context):
 
 
 def test_close_sizes_are_used_again(swift, context):
-    recorder = Recorder(swift)
-    recorder.run(context, 0, 200)
-    assert [recorder.size(n) for n in (190, 195, 200, 202, 205)] == [190, 200, 200, 200, 205]
+    graphs = GraphCache(swift)
+    graphs.run(context, 0, 200)
+    assert [graphs.size(n) for n in (190, 195, 200, 202, 205)] == [190, 200, 200, 200, 205]
