@@ -54,7 +54,7 @@ class Events:
 
 
 @dataclass(frozen=True)
-class Progress:
+class PartProgress:
     """How the maker of a part tells how far it is; a call ends the part if the job is to stop."""
 
     events: Events

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 from lgrasp.dataset import write_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.events import CancelledError, Events, Made, Part, Progress
+from lgrasp.engine.events import CancelledError, Events, Made, Part, PartProgress
 from lgrasp.engine.folder import check_folder, clean_folder, present_parts
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.runtime.device import Device, resolve_device
@@ -83,7 +83,7 @@ class Job(BaseModel, ABC):
         """
 
     @abstractmethod
-    def make(self, part: Part, progress: Progress) -> Made:
+    def make(self, part: Part, progress: PartProgress) -> Made:
         """Make one part: a pure function of what is asked and of its number."""
 
     def write(self, part: Part, contents: Any) -> None:
@@ -254,7 +254,7 @@ def _make_parts(job: Job, events: Events, outcome: Outcome) -> None:
         made.contents = None  # memory must not grow with the parts
 
     def make(part: Part) -> Made:
-        progress = Progress(events, part)
+        progress = PartProgress(events, part)
         progress.check()
         return job.make(part, progress)
 

@@ -11,7 +11,7 @@ from pydantic import Field, PrivateAttr
 
 from lgrasp.dataset import Shard, ShardHeader
 from lgrasp.dataset.survivors import survivors
-from lgrasp.engine.events import Events, Made, Part, Progress
+from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
@@ -111,7 +111,7 @@ class GenerateJob(Job):
         self._graphs = GraphCache(pipeline) if device.is_cuda and self.threads() == 1 else None
         self._inputs, self._rate = inputs, self.rate
 
-    def make(self, part: Part, progress: Progress) -> Made:
+    def make(self, part: Part, progress: PartProgress) -> Made:
         start = time.monotonic()
 
         def tell(rows: int, result: ShardResult) -> None:

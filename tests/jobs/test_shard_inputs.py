@@ -12,7 +12,7 @@ import pytest
 from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import HandError, ShardError
-from lgrasp.jobs.generate import Job, generate
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
 from lgrasp.jobs.refine.shards import Refinement, refine_shards
@@ -32,8 +32,8 @@ def made(swift, cache_root: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     (folder / "hand" / "hand.yaml").unlink()
     (urdf,) = (folder / "hand").glob("*.urdf")
     urdf.write_text(urdf.read_text().replace("</robot>", "  <!-- mine -->\n</robot>"))
-    job = Job(str(urdf), "mug", 12, swift, folder / "out", device="cpu", workers=1, batch=128, cache=Cache(cache_root))
-    path = generate(job).paths[0]
+    given = {"pipeline": swift, "out": folder / "out", "device": "cpu", "workers": 1, "cache": Cache(cache_root)}
+    path = generate(GenerateJob(hand=str(urdf), object="mug", rows=12, batch=128, **given)).paths[0]
     shutil.rmtree(folder / "hand")
     return path
 
@@ -65,26 +65,26 @@ def test_a_named_hand_must_be_that_of_the_shard(made: Path, cache_root: Path, tm
         refine_shards(job)
 
 
-def test_the_hand_is_the_one_that_was_generated_with(job: Callable[..., Job], cache_root: Path):
+def test_the_hand_is_the_one_that_was_generated_with(job: Callable[..., GenerateJob], cache_root: Path):
     outcome = generate(job(rows=5))
     shard = read_shard(outcome.paths[0])
     source, model = hand_of_shard(Cache(cache_root, pytest.fail), shard.hand, shard.header.config, CPU)
     assert source.spec == hand_source("allegro").spec
-    same(model, outcome.inputs.hand.model)
+    same(model, outcome.job.inputs.hand.model)
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real Allegro with mesh fingertips is not here")
 def test_meshes_come_from_the_shard(swift, cache_root: Path, tmp_path: Path):
     """Its URDF names them as package://...; the folder is gone and nothing is in the cache."""
     shutil.copytree(REAL, tmp_path / "before")
-    job = Job(str(tmp_path / "before/allegro.urdf"), "sphere", 5, swift, tmp_path / "a", cache=Cache(cache_root))
-    outcome = generate(job)
+    given = {"pipeline": swift, "out": tmp_path / "a", "cache": Cache(cache_root)}
+    outcome = generate(GenerateJob(hand=str(tmp_path / "before/allegro.urdf"), object="sphere", rows=5, **given))
     shutil.rmtree(tmp_path / "before")
     shard = read_shard(outcome.paths[0])
     assert shard.hand.meshes
     fresh = Cache(tmp_path / "cache", pytest.fail)
     _, model = hand_of_shard(fresh, shard.hand, shard.header.config, CPU)
-    same(model, outcome.inputs.hand.model)
+    same(model, outcome.job.inputs.hand.model)
     lost = replace(shard.hand, meshes=dict(list(shard.hand.meshes.items())[1:]))
     with pytest.raises(ShardError, match="is not in the shard"):
         hand_of_shard(fresh, lost, shard.header.config, CPU)
@@ -109,7 +109,7 @@ def test_older_shards_take_the_rules_of_a_known_hand_and_say_so(made: Path, cach
     assert "known hand 'allegro'" in line
 
 
-def test_older_shards_of_an_installed_hand_need_no_words(job: Callable[..., Job], cache_root: Path):
+def test_older_shards_of_an_installed_hand_need_no_words(job: Callable[..., GenerateJob], cache_root: Path):
     old = without_rules(read_shard(generate(job(rows=5)).paths[0]))
     source, _ = hand_of_shard(Cache(cache_root, pytest.fail), old.hand, old.header.config, CPU)
     assert source.spec == hand_source("allegro").spec

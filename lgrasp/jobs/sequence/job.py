@@ -11,7 +11,7 @@ from pydantic import Field, PrivateAttr
 
 from lgrasp.dataset import Shard, ShardHeader
 from lgrasp.dataset.survivors import survivors
-from lgrasp.engine.events import Events, Made, Part, Progress
+from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.run import Job, Outcome
 from lgrasp.engine.shard import flat_statistics
@@ -104,7 +104,7 @@ class SequenceJob(Job):
             inputs = replace(inputs, scene=scene)
         self._inputs = inputs
 
-    def make(self, part: Part, progress: Progress) -> Made:
+    def make(self, part: Part, progress: PartProgress) -> Made:
         start = time.monotonic()
 
         def tell(rows: int, result: SequenceResult) -> None:
