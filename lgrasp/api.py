@@ -164,12 +164,11 @@ def plan(
     Raises:
         LgraspError: hand, object or cloud cannot be used; StarvedError where no start gives a grasp.
     """
-    from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
+    from lgrasp.jobs.refine.plan import PlanJob
 
     what: dict[str, Any] = {"cloud": object} if isinstance(object, Cloud) else {"object": str(object), "scale": scale}
     with _folder(out) as folder:
-        done = plan_grasps(PlanJob(hand=str(hand), out=folder, starts=starts, device=device, **what))
-        return _made([done.path] if done.path else [])
+        return _made(run(PlanJob(hand=str(hand), out=folder, starts=starts, device=device, **what)).paths)
 
 
 def refine(
@@ -194,12 +193,12 @@ def refine(
         LgraspError: grasps that cannot be refined, or an option out of range.
     """
     from lgrasp.jobs.refine.settings import refine_params
-    from lgrasp.jobs.refine.shards import Refinement, refine_shards
+    from lgrasp.jobs.refine.shards import RefineJob
 
     chosen = {} if bounds is None else {"bounds": bounds}
     with _files(grasps) as files, _folder(out) as folder:
-        job = Refinement(files, folder, params=refine_params(coarse=coarse, **params), device=device, **chosen)
-        return _made([done.path for done in refine_shards(job)])
+        chosen |= {"params": refine_params(coarse=coarse, **params), "device": device}
+        return _made(run(RefineJob(shards=tuple(files), out=folder, **chosen)).paths)
 
 
 def simulate(
@@ -222,12 +221,12 @@ def simulate(
     Raises:
         LgraspError: no such protocol, or grasps that cannot be simulated.
     """
-    from lgrasp.jobs.simulate import Validation, validate_shards
+    from lgrasp.jobs.simulate import SimulateJob
 
     found = find_protocol(protocol) if isinstance(protocol, str) else protocol
     with _files(grasps) as files, _folder(out) as folder:
-        job = Validation(files, found, folder, threads, device, all_directions)
-        return _made([done.path for done in validate_shards(job)])
+        what: dict[str, Any] = {"workers": threads, "device": device, "all_directions": all_directions}
+        return _made(run(SimulateJob(shards=tuple(files), protocol=found, out=folder, **what)).paths)
 
 
 def open(path: Name) -> Grasps:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lgrasp_cli.options import JsonPath, Quiet, check_report, warn
+from lgrasp_cli.working import How, working
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -85,8 +86,10 @@ def merge(
 
 
 @app.command()
+@working
 def metrics(
     paths: _Paths,
+    how: How,
     add: Annotated[str, typer.Option(help="Metrics, separated by commas: volume, epsilon_exact.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the new shards.", show_default=False)],
     settings: Annotated[
@@ -98,8 +101,6 @@ def metrics(
             show_default=False,
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(min=0, help="Processes; 0: all cores.")] = 0,
-    quiet: Quiet = False,
 ) -> None:
     """Copy shards and add quality metrics to the copies; those that are in --out already are kept.
 
@@ -107,22 +108,17 @@ def metrics(
 
     Example: lgrasp dataset metrics grasps/allegro-mug --add volume,epsilon_exact -o grasps/measured
     """
-    import time
+    from lgrasp.jobs.metrics import MetricsJob
 
-    from lgrasp.dataset.metrics import add_metrics
-    from lgrasp.engine.folder import check_folder
-    from lgrasp_cli.counting import counting
+    names = tuple(name.strip() for name in add.split(","))
+    job = how.job(MetricsJob, "dataset metrics", shards=paths, out=out, add=names, settings=settings)
+    how.run(job, _show_metrics)
 
-    check_folder(out)
-    start = time.monotonic()
-    with counting("measured", quiet=quiet) as progress:
-        names = [name.strip() for name in add.split(",")]
-        added = add_metrics(paths, out, names, settings=settings or (), workers=workers, progress=progress)
-    if not quiet:
-        kept = len(added.files) - added.written
-        there = f"; {kept} there already" if kept else ""
-        per_second = added.rows / max(time.monotonic() - start, 1e-9)
-        typer.echo(f"{out}: {_counted(added.written, 'shard')}, {added.rows:,} rows, {per_second:,.0f} rows/s{there}")
+
+def _show_metrics(data: dict[str, Any]) -> None:
+    there = f"; {data['present']:,} rows there already" if data["present"] else ""
+    made = f"{_counted(len(data['shards']), 'shard')}, {data['rows']:,} rows, {data['rows_per_s']:,.0f} rows/s"
+    typer.echo(f"{data['out']}: {made}{there}")
 
 
 @app.command()

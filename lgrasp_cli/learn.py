@@ -1,23 +1,23 @@
 """``lgrasp learn``: a small network that guesses grasps from partial clouds, trained through the refiner."""
 
-import time
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from lgrasp_cli.options import CacheDir, Device, JsonPath, Quiet, check_report, open_cache
+from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Coarse grasps from partial clouds by a small network.", no_args_is_help=True)
-
-_INTERVAL = 10.0  # [s] between lines of progress
 
 _Shards = Annotated[list[Path], typer.Argument(help="Shard files, or folders of them.", show_default=False)]
 
 
 @app.command()
+@working
 def fit(
     shards: _Shards,
+    how: How,
     out: Annotated[Path, typer.Option("--out", "-o", help="File of the predictor.")] = Path("coarse.pt"),
     steps: Annotated[int | None, typer.Option(help="Steps on poses alone; default: 1500.", show_default=False)] = None,
     joint_steps: Annotated[
@@ -28,10 +28,6 @@ def fit(
     ] = None,
     batch: Annotated[int | None, typer.Option(help="Seeds of a step; default: 64.", show_default=False)] = None,
     seed: Annotated[int, typer.Option(help="Of clouds, weights and batches.")] = 0,
-    device: Device = "auto",
-    json_path: JsonPath = None,
-    cache_dir: CacheDir = None,
-    quiet: Quiet = False,
 ) -> None:
     """Train a predictor on the grasps of shards, first on poses, then through unrolled steps of the refiner.
 
@@ -39,25 +35,15 @@ def fit(
 
     Example: lgrasp learn fit grasps --out coarse.pt
     """
-    check_report(json_path)
-    cache = open_cache(cache_dir)
     from lgrasp.config import parse_model
-    from lgrasp.jobs.learn.job import Fit
-    from lgrasp.jobs.learn.job import fit as run
+    from lgrasp.jobs.learn.job import FitJob
     from lgrasp.learn.params import LearnParams
+    from lgrasp_cli.tables import print_pairs
 
     given = {"steps": steps, "joint_steps": joint_steps, "unrolled": unrolled, "batch": batch, "seed": seed}
     params = parse_model(LearnParams, {k: v for k, v in given.items() if v is not None}, "learn fit")
-    said = time.monotonic()
-
-    def shown(phase: str, step: int, of: int, value: float) -> None:
-        nonlocal said
-        if not quiet and time.monotonic() - said >= _INTERVAL:
-            said = time.monotonic()
-            typer.echo(f"{phase} {step:,}/{of:,}  {'loss' if phase == 'poses' else 'energy'} {value:.3f}", err=True)
-
-    data = run(Fit(shards, out, params, device=device, cache=cache), shown)
-    _report(data, json_path, quiet, _fit_pairs(data))
+    job = how.job(FitJob, "learn fit", shards=shards, out=out, params=params)
+    how.run(job, lambda data: print_pairs(_fit_pairs(data)))
 
 
 @app.command(name="eval")
@@ -78,6 +64,7 @@ def evaluate(
     check_report(json_path)
     cache = open_cache(cache_dir)
     from lgrasp.jobs.learn.job import evaluate as run
+    from lgrasp_cli.tables import print_pairs, print_report
 
     data = run(predictor, shards, cache, clouds=clouds, seed=seed, device=device)
     pairs = [
@@ -89,7 +76,7 @@ def evaluate(
         (f"{steps}-step", f"{energy:.4f}  ({data['coarse'] / energy:.1f}x lower)")
         for steps, energy in zip(data["rounds"], data["refined"], strict=True)
     ]
-    _report(data, json_path, quiet, pairs)
+    print_report(data, json_path, None if quiet else lambda: print_pairs(pairs))
 
 
 def _fit_pairs(data: dict[str, Any]) -> list[tuple[str, str]]:
@@ -112,9 +99,3 @@ def _fit_pairs(data: dict[str, Any]) -> list[tuple[str, str]]:
         lowered = data["lowered"]
         pairs.append(("lowered by", f"{lowered['coarse']:.1%}, after the unrolled steps {lowered['unrolled']:.1%}"))
     return pairs
-
-
-def _report(data: dict[str, Any], json_path: str | None, quiet: bool, pairs: list[tuple[str, str]]) -> None:
-    from lgrasp_cli.tables import print_pairs, print_report
-
-    print_report(data, json_path, None if quiet else lambda: print_pairs(pairs))

@@ -1,9 +1,11 @@
 """While a job runs: one stream of progress on standard error, Ctrl-C to stop at the end of what is being made."""
 
+import signal
 import sys
+import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -14,6 +16,7 @@ from lgrasp_cli.interrupt import on_interrupt, stop_now
 if TYPE_CHECKING:
     from lgrasp.engine.events import Made, Part
 
+_PATIENCE = 5.0  # [s] that a job may take to leave what it is making
 _PLAIN_INTERVAL = 10.0  # [s] between lines when standard error is no terminal
 
 
@@ -92,13 +95,24 @@ class JobProgress(Events):
         return self.stop
 
 
-def interruptible(progress: JobProgress) -> AbstractContextManager[None]:
-    """The first Ctrl-C (or SIGTERM) ends the job as soon as it can, the second at once; whole files stay."""
+@contextmanager
+def interruptible(progress: JobProgress) -> Iterator[None]:
+    """The first Ctrl-C (or SIGTERM) ends the job as soon as it can, the second, or five seconds, at once.
+
+    Whole files stay, what is being made is dropped.
+    """
+    waiting = threading.Timer(_PATIENCE, signal.raise_signal, (signal.SIGINT,))
+    waiting.daemon = True
 
     def stop() -> None:
         if progress.stop or not progress.running:
             stop_now()
         progress.stop = True
+        waiting.start()
         say("stopping as soon as what is being made can be left; Ctrl-C again stops at once")
 
-    return on_interrupt(stop)
+    with on_interrupt(stop):
+        try:
+            yield
+        finally:
+            waiting.cancel()

@@ -1,24 +1,19 @@
 """``lgrasp scenes``: tables with objects, what depth cameras see of them, and grasps that fit in."""
 
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache
-
-if TYPE_CHECKING:
-    from lgrasp.jobs.scenes.config import SceneConfig
-    from lgrasp.jobs.scenes.job import SceneOutcome
+from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Tables with objects: point clouds, masks and grasps that fit in.", no_args_is_help=True)
 
-_INTERVAL = 10.0  # [s] between lines of progress
-
 
 @app.command()
+@working
 def make(
+    how: How,
     objects: Annotated[
         list[str] | None,
         typer.Argument(help="Names or mesh files of objects; or one config of scenes.", show_default=False),
@@ -48,31 +43,15 @@ def make(
         float | None, typer.Option(help="Factor from the meshes' unit to metres.", show_default=False)
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Base seed; default: 0.", show_default=False)] = None,
-    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda:N; default: auto.", show_default=False)] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Scenes made at once; default: one a core (1 on a GPU).", show_default=False)
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Keep whole scenes of the same run.")] = True,
-    shard_index: Annotated[
-        int | None, typer.Option(help="Task of an array; default: SLURM_ARRAY_TASK_ID.", show_default=False)
-    ] = None,
-    num_shards: Annotated[
-        int | None, typer.Option(help="Tasks of the array; default: SLURM_ARRAY_TASK_COUNT.", show_default=False)
-    ] = None,
-    json_path: JsonPath = None,
-    cache_dir: CacheDir = None,
-    quiet: Quiet = False,
 ) -> None:
     """Drop objects on a table, look at them with depth cameras, bring in grasps and write one file a scene.
 
     Grasps come from shards (--grasps), or are generated first into OUT/grasps. Those whose hand would run into the
-    table or other objects are marked. A scene depends on its number and the seed only.
+    table or other objects are told from those that fit. A scene depends on its number and the seed only.
 
     Example: lgrasp scenes make mug bowl bottle box sphere hammer --hand allegro -n 100 --out scenes
     """
-    cache = open_cache(cache_dir)
-    from lgrasp.engine.run import array_task
-    from lgrasp.jobs.scenes.job import SceneJob, scene_numbers
+    from lgrasp.jobs.scenes.job import SceneJob
 
     changes = {
         "hand": hand,
@@ -83,23 +62,8 @@ def make(
         "stock": stock,
         "scale": scale,
         "seed": seed,
-        "device": device,
-        "workers": workers,
     }
-    config = _config(objects or [], changes, on_table, views)
-    index, number = array_task(shard_index, num_shards)
-    check_report(json_path)
-    job = SceneJob(config, shard_index=index, num_shards=number, resume=resume, cache=cache)
-    outcome = _run(job, len(scene_numbers(job)), quiet=quiet)
-    from lgrasp.jobs.scenes.report import report
-
-    data = report(outcome, len(scene_numbers(job)), config.out)
-    from lgrasp_cli.tables import print_report
-
-    print_report(data, json_path, None if quiet else lambda: _show(data))
-    if outcome.cancelled:
-        typer.echo(f"interrupted: {len(outcome.paths)} scenes in {config.out}; the same command continues", err=True)
-        raise typer.Exit(130)
+    how.run(how.job(SceneJob, "scenes make", **_config(objects or [], changes, on_table, views)), _show)
 
 
 @app.command()
@@ -147,65 +111,24 @@ def info(
         _print(data, [("scenes", f"{data['scenes']:,}")])
 
 
-def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, views: int | None) -> "SceneConfig":
+def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, views: int | None) -> dict[str, Any]:
     """The config that is named, or one of the objects, with what the command line replaces."""
-    from lgrasp.config import parse_model
     from lgrasp.errors import ConfigError
-    from lgrasp.jobs.scenes.config import SceneConfig, load_scene_config, scene_configs
+    from lgrasp.jobs.scenes.config import read_scene_config, scene_configs
 
     config = next((name for name in objects if name.endswith((".yaml", ".yml"))), None)
     if config and len(objects) > 1:
         raise ConfigError(f"{', '.join(objects)}: the config {config} is named alone, or objects without it")
     data: dict[str, Any] = {"objects": objects}
     if len(objects) == 1 and (objects[0].endswith((".yaml", ".yml")) or objects[0] in scene_configs()):
-        data = load_scene_config(objects[0]).model_dump()
+        data = read_scene_config(objects[0])
     data |= {name: value for name, value in changes.items() if value is not None}
     scene = data.setdefault("scene", {})
     if on_table is not None:
         scene["objects"] = on_table
     if views is not None:
         scene.setdefault("camera", {})["views"] = views
-    return parse_model(SceneConfig, data, "scenes make")
-
-
-def _run(job: Any, asked: int, *, quiet: bool) -> "SceneOutcome":
-    """Make the scenes with a line of progress every ten seconds; Ctrl-C ends the job after the running ones."""
-    from lgrasp.jobs.scenes.job import SceneListener, make_scenes
-    from lgrasp_cli.interrupt import on_interrupt, stop_now
-
-    class Progress(SceneListener):
-        running = stop = False
-        done = 0
-        said = time.monotonic()
-
-        def _say(self, line: str) -> None:
-            if not quiet and time.monotonic() - self.said >= _INTERVAL:
-                self.said = time.monotonic()
-                typer.echo(line, err=True)
-
-        def loading(self, what: str) -> None:
-            self._say(f"loading {what}")
-
-        def started(self, scenes: int, present: int) -> None:
-            self.running, self.done = True, present
-
-        def wrote(self, index: int, path: Path) -> None:
-            self.done += 1
-            self._say(f"scenes {self.done:,}/{asked:,}")
-
-        def cancelled(self) -> bool:
-            return self.stop
-
-    listener = Progress()
-
-    def stop() -> None:
-        if listener.stop or not listener.running:
-            stop_now()
-        listener.stop = True
-        typer.echo("stopping after the running scenes; Ctrl-C again stops at once", err=True)
-
-    with on_interrupt(stop):
-        return make_scenes(job, listener)
+    return data
 
 
 def _show(data: dict[str, Any]) -> None:
@@ -215,7 +138,7 @@ def _show(data: dict[str, Any]) -> None:
         ("scenes", f"{data['scenes']:,} of {data['asked']:,} asked{extra}"),
         ("where", data["out"]),
         ("hand", data["hand"]),
-        ("wall", f"{data['seconds']:.2f} s{speed}"),
+        ("wall", f"{data['seconds']['scenes']:.2f} s{speed}"),
     ]
     _print(data, head)
 

@@ -8,17 +8,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import trimesh
 
 from lgrasp.config import apply_settings
-from lgrasp.dataset.extend import check_shard, extend_shard
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.tree import shard_tree
 from lgrasp.dataset.validate import validate_shard
-from lgrasp.errors import ConfigError, OutputError
+from lgrasp.errors import OutputError
 from lgrasp.grasp.bounds import stored_bounds
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
@@ -26,76 +24,26 @@ from lgrasp.grasp.wrench_space import wrench_spaces
 METRICS = {"epsilon_exact": "", "volume": ""}
 """Units of the metrics that can be added (docs/reference/metrics.md defines them)."""
 
-_TASK_ROWS = 32
+TASK_ROWS = 32
 _ROW = ("candidate", "q", "contact_points")  # what tells rows apart
 _Map = Callable[..., Iterable[np.ndarray]]
 
 
-class Added(NamedTuple):
-    """What :func:`add_metrics` did."""
-
-    files: list[Path]
-    """Shards with the metrics, written now or before."""
-    written: int
-    """How many of them were written now."""
-    rows: int
-    """Rows of those."""
-
-
-def add_metrics(
-    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-    out: Path,
-    names: Sequence[str],
-    *,
-    settings: Sequence[str] = (),
-    workers: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-) -> Added:
-    """Copies of shards with more metrics, in a new folder; copies that are there already and whole are kept.
-
-    Args:
-        paths: Shard files or folders; what lies in subfolders of a folder goes to such subfolders of ``out``.
-        out: Folder of the copies.
-        names: Some of ``METRICS``.
-        settings: ``bounds.KEY=VALUE`` each, in place of what the rows of a shard passed.
-        workers: Processes; 0 is one per core, 1 computes in this process.
-        progress: Called with (rows done, rows in all) now and then.
-
-    Raises:
-        ConfigError: A name that is not in ``METRICS``.
-        ShardError: A shard cannot be read or does not conform.
-        OutputError: ``out`` cannot be written, holds the shards themselves, or a file of other rows.
-    """
-    unknown = [name for name in names if name not in METRICS]
-    if unknown or not names:
-        raise ConfigError(f"unknown metric '{''.join(unknown[:1])}'; known: {', '.join(METRICS)}")
-    _check_apart(paths, out)
-    sources = shard_tree(paths, leave_out=out)
-    total = sum(_length(path) for path in sources.values())
-    workers = workers or os.cpu_count() or 1
-    written = rows = done = 0
-
-    def report(now: int) -> None:
-        if progress:
-            progress(done + now, total)
-
-    with _process_map(workers) as each:
-        for place, source in sources.items():
-            n = _length(source)
-            if settings or not _is_extended(out / place, source, names):
-                check_shard(source)
-                columns = _measure(source, settings, each, 8 * workers * _TASK_ROWS, report)
-                extend_shard(source, out / place, {name: columns[name] for name in names}, METRICS)
-                written, rows = written + 1, rows + n
-            done += n
-            report(0)
-    return Added([out / place for place in sources], written, rows)
-
-
-def _measure(
+def measure_shard(
     path: Path, settings: Sequence[str], each: _Map, step: int, report: Callable[[int], None]
 ) -> dict[str, np.ndarray]:
-    """All metrics of a shard by name, each shape [N], ``step`` rows at a time; then ``report(rows done)`` is called."""
+    """All metrics of a shard by name, each shape [N].
+
+    Args:
+        path: The shard.
+        settings: ``bounds.KEY=VALUE`` each, in place of what the rows passed.
+        each: As of :func:`row_metrics`.
+        step: Rows at a time.
+        report: Called with rows done.
+
+    Raises:
+        ShardError: The shard is damaged.
+    """
     with ShardReader(path) as reader:
         frames = [mass_frame(record) for record in reader.objects()]
         bounds = stored_bounds(reader.header.config)
@@ -122,7 +70,7 @@ def row_metrics(
     for o, present in enumerate(rows.object_index.T):
         for i, (center, radius) in enumerate(frames):
             chosen = np.flatnonzero(present == i)
-            for part in (chosen[at : at + _TASK_ROWS] for at in range(0, len(chosen), _TASK_ROWS)):
+            for part in (chosen[at : at + TASK_ROWS] for at in range(0, len(chosen), TASK_ROWS)):
                 contacts = rows.contact_points[part, o], -rows.contact_normals[part, o]
                 tasks.append((part, *contacts, center, radius, friction))
     table = np.full((len(rows), len(METRICS)), np.inf)
@@ -142,19 +90,7 @@ def mass_frame(record: ObjectRecord) -> tuple[np.ndarray, float]:
     return center, float(np.linalg.norm(mesh.triangles.reshape(-1, 3) - center, axis=1).max())
 
 
-def _check_apart(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], out: Path) -> None:
-    given = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
-    for folder in (path if path.is_dir() else path.parent for path in given):
-        if folder.resolve() == out.resolve():
-            raise OutputError(f"--out {out} is the folder of the shards themselves; choose another")
-
-
-def _length(path: Path) -> int:
-    with ShardReader(path) as reader:
-        return len(reader)
-
-
-def _is_extended(target: Path, source: Path, names: Sequence[str]) -> bool:
+def is_extended(target: Path, source: Path, names: Sequence[str]) -> bool:
     """Is there a whole copy of a shard with the metrics already?
 
     Raises:
@@ -166,7 +102,7 @@ def _is_extended(target: Path, source: Path, names: Sequence[str]) -> bool:
         if _identity(old) != _identity(new) or not all(
             np.array_equal(old.column(name), new.column(name), equal_nan=name != "candidate") for name in _ROW
         ):
-            raise OutputError(f"{target} holds other rows than {source}; choose another --out")
+            raise OutputError(f"{target} holds other rows than {source}; choose another --out, or --overwrite")
         return all(f"metrics/{name}" in new.columns for name in names)
 
 
@@ -175,7 +111,7 @@ def _identity(reader: ShardReader) -> dict[str, Any]:
 
 
 @contextmanager
-def _process_map(workers: int) -> Iterator[_Map]:
+def process_map(workers: int) -> Iterator[_Map]:
     """A map over processes, or the plain one for a single worker."""
     if workers == 1:
         yield map

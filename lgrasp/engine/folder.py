@@ -98,7 +98,7 @@ def _check_run(path: Path, found: _Found | None, key: str) -> None:
     if found is not None and found.key != key:
         raise OutputError(
             f"{path} belongs to another run (other hand, object, pipeline, seed or --shard-rows); "
-            "choose another --out, or --no-resume to replace it"
+            "choose another --out, or --overwrite to replace it"
         )
 
 

@@ -40,6 +40,7 @@ class Job(BaseModel, ABC):
     workers: int = Field(0, description="Threads or processes; 0: by device.")
     cache: Cache = Field(default_factory=Cache, exclude=True, repr=False)
     _device: Device = PrivateAttr()
+    _events: Events = PrivateAttr(default_factory=Events)
 
     @property
     def title(self) -> str:
@@ -70,6 +71,10 @@ class Job(BaseModel, ABC):
             OutputError: a file belongs to another run.
         """
         return present_parts(parts, self.key(), self.effort, self.cache.warn)
+
+    def clean(self, parts: Sequence[Part]) -> None:
+        """Remove what killed processes left while writing parts; files being written stay."""
+        clean_folder([part.file for part in parts])
 
     def effort(self, rows: int) -> int:
         """Candidates that a part of some rows may try; one that tried them all stays, though rows are missing."""
@@ -105,6 +110,14 @@ class Job(BaseModel, ABC):
     def changed(self, **changes: Any) -> Self:
         """A copy with other fields; nothing is loaded in it."""
         return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | changes)
+
+    def close(self) -> None:
+        """Let go of what was opened for the parts; called when the job ends in any way."""
+
+    @property
+    def events(self) -> Events:
+        """Who listens, for what is loaded when it is first asked for."""
+        return self._events
 
     @property
     def device_used(self) -> Device:
@@ -178,10 +191,10 @@ def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 
     Raises:
         LgraspError: bad input, unwritable output, or files of another run in the output folder.
     """
-    events = events or Events()
+    job._events = events = events or Events()
     start = time.perf_counter()
     device, parts, present = look(job, array=array, resume=resume)
-    clean_folder([part.file for part in parts])
+    job.clean(parts)
     missing = [part for part in parts if part.number not in present]
     job.load(events, bool(missing))
     outcome = Outcome(job, device, parts, present)
@@ -195,6 +208,8 @@ def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 
         _make_parts(job, events, outcome)
     except CancelledError:
         outcome.cancelled = True
+    finally:
+        job.close()
     outcome.seconds["parts"] = time.perf_counter() - begin
     outcome.seconds["total"] = time.perf_counter() - start
     return outcome
@@ -206,8 +221,8 @@ def look(job: Job, *, array: tuple[int, int], resume: bool) -> tuple[Device, lis
     Raises:
         LgraspError: as :func:`run`, before anything is loaded.
     """
-    parts = own_parts(job.parts(), array)
     job._device = resolve_device(job.device)
+    parts = own_parts(job.parts(), array)
     check_folder(job.folder)
     return job.device_used, parts, job.present(parts) if resume else {}
 

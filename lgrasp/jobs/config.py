@@ -92,6 +92,13 @@ def load_config(name: str) -> JobConfig:
 
 KINDS = {
     "sequence": ("lgrasp.jobs.sequence.job", "SequenceJob"),
+    "refine": ("lgrasp.jobs.refine.shards", "RefineJob"),
+    "plan": ("lgrasp.jobs.refine.plan", "PlanJob"),
+    "simulate": ("lgrasp.jobs.simulate", "SimulateJob"),
+    "scenes": ("lgrasp.jobs.scenes.job", "SceneJob"),
+    "learn": ("lgrasp.jobs.learn.job", "FitJob"),
+    "metrics": ("lgrasp.jobs.metrics", "MetricsJob"),
+    "export": ("lgrasp.jobs.export", "ExportJob"),
 }
 """Kind of a job, as key ``job`` of a config names it, and where it is; ``generate`` is :class:`JobConfig`."""
 

@@ -2,24 +2,25 @@
 
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import Field, PrivateAttr, field_validator
 
-from lgrasp.dataset import GraspRows, Shard, find_shards, read_shard, write_shard
-from lgrasp.dataset.files import remove_leftovers
-from lgrasp.engine.cache import Cache
-from lgrasp.engine.folder import check_folder
-from lgrasp.errors import ConfigError, OutputError, ShardError
+from lgrasp.dataset import Shard, read_shard
+from lgrasp.engine.cache import content_key
+from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.run import Outcome
+from lgrasp.engine.shard_job import ShardJob
+from lgrasp.errors import ConfigError
 from lgrasp.geometry.decompose import decompose
-from lgrasp.runtime.device import resolve_device
 from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.columns import COLUMNS, OBJECT_COLUMNS
-from lgrasp.simulate.protocol import Protocol
+from lgrasp.simulate.protocol import Protocol, find_protocol
 from lgrasp.simulate.run import protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of_shard
 from lgrasp.simulate.solid import Solid
@@ -27,18 +28,84 @@ from lgrasp.simulate.solid import Solid
 _CONTACTS = 2  # links that it takes to hold anything
 
 
-@dataclass(frozen=True)
-class Validation:
-    """What is simulated and where it goes."""
+class SimulateJob(ShardJob):
+    """Verdicts of a physics simulation beside the rows of shards."""
 
-    shards: Sequence[Path]  # files, or folders of *.h5 files
-    protocol: Protocol
-    out: Path | None = None  # folder; none: that of the shards with -PROTOCOL added
-    threads: int = 0  # 0: all cores
+    protocol: Protocol = Field(description="Named protocol.")
+    out: Path | None = Field(None, description="Folder; default: that of the shards with -PROTOCOL added.")
     device: str = "cpu"
-    all_directions: bool = False
-    resume: bool = True
-    cache: Cache = field(default_factory=Cache)
+    all_directions: bool = Field(False, description="Go on after the first direction in which an object is lost.")
+    _said: set[str] = PrivateAttr(default_factory=set)
+    _scene: tuple[tuple[str, ...], Scene] | None = PrivateAttr(None)  # the latest
+
+    @field_validator("protocol", mode="before")
+    @classmethod
+    def _named(cls, value: object) -> object:
+        return find_protocol(value) if isinstance(value, str) else value
+
+    @property
+    def folder(self) -> Path:
+        if self.out is not None:
+            return self.out
+        folders = {(path if path.is_dir() else path.parent).absolute() for path in self.shards}
+        if len(folders) > 1:
+            raise ConfigError(f"the shards lie in {len(folders)} folders; name one for the results with --out")
+        parent = folders.pop()
+        return parent.with_name(f"{parent.name}-{self.protocol.name}")
+
+    def key(self) -> str:
+        described = self.protocol.model_dump(mode="json")
+        return content_key("simulate", 1, protocol=described, all_directions=self.all_directions, device=self._kind())
+
+    def parts(self) -> list[Part]:
+        import_mujoco()
+        return super().parts()
+
+    def make(self, part: Part, progress: PartProgress) -> Made:
+        assert part.source is not None
+        shard = read_shard(part.source)
+        scene = self._scene_of(shard)
+        device = self.device_used.alias
+        text = protocol_text(scene, self.protocol, all_directions=self.all_directions, device=device)
+        begin = time.perf_counter()
+        found = verdicts(
+            scene,
+            shard.grasps,
+            self.protocol,
+            threads=self.workers or os.cpu_count() or 1,
+            progress=lambda done, held: progress(
+                done, f"{held:,} hold  {done / max(time.perf_counter() - begin, 1e-9):.1f}/s"
+            ),
+            all_directions=self.all_directions,
+            device=device,
+        )
+        seconds = time.perf_counter() - begin
+        shard = _with_verdicts(shard, self.protocol, found, text, seconds)
+        return Made(len(shard.grasps), self.marked(part, shard, {}), seconds)
+
+    def report(self, outcome: Outcome) -> dict[str, Any]:
+        """``protocol``; ``results``: see :func:`summary`; ``notes`` on objects that are approximated."""
+        seconds = {part.file: made.result for part, made in outcome.made_parts}
+        done = []
+        for path in outcome.paths:
+            shard = read_shard(path)
+            done.append(_validated(path, shard, self._scene_of(shard), self.protocol, seconds.get(path, 0.0)))
+        return {"protocol": self.protocol.model_dump(mode="json"), "results": summary(done, self.protocol)}
+
+    def _kind(self) -> str:
+        return "gpu" if self.device_used.is_cuda else "cpu"
+
+    def _scene_of(self, shard: Shard) -> Scene:
+        """What is simulated of a shard: hand and objects cut into convex pieces."""
+        key = (shard.hand.sha256, *(f"{record.sha256} {record.scale}" for record in shard.objects))
+        if self._scene is None or self._scene[0] != key:
+            scene = scene_of_shard(shard, partial(decompose, store=self.cache), self.device_used.alias)
+            for line in (f"object {solid.name}: {note}" for solid in scene.objects for note in solid.notes):
+                if line not in self._said:
+                    self._said.add(line)
+                    self.cache.warn(line)
+            self._scene = key, scene
+        return self._scene[1]
 
 
 @dataclass(frozen=True)
@@ -51,110 +118,6 @@ class Validated:
     object_index: np.ndarray  # (N, O) position in them, -1 absent
     columns: dict[str, np.ndarray]  # of the protocol, without its name
     seconds: float  # 0: the shard was there already
-
-
-def validate_shards(
-    job: Validation,
-    started: Callable[[Path, int], None] | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    preparing: Callable[[Path], None] | None = None,
-) -> list[Validated]:
-    """Simulate the rows of shards; what is done already in the output folder stays.
-
-    Args:
-        started: called with (shard, rows) before its simulation.
-        progress: called with (rows done, rows held); what it raises ends the job, whole shards stay.
-        preparing: called with a shard before its hand and objects are cut into convex pieces.
-
-    Raises:
-        ShardError: a shard cannot be read.
-        OutputError: the output cannot be written, or holds other shards.
-        PhysicsError: MuJoCo is missing or refuses a hand.
-    """
-    import_mujoco()
-    device = resolve_device(job.device).alias
-    sources = find_shards(job.shards)
-    targets = _targets(sources, job)
-    cut = partial(decompose, store=job.cache)
-    scenes: dict[tuple[str, ...], Scene] = {}
-    done = []
-    for source, target in targets.items():
-        shard = read_shard(source)
-        key = (shard.hand.sha256, *(record.sha256 for record in shard.objects), *(str(o.scale) for o in shard.objects))
-        if key not in scenes:
-            if preparing:
-                preparing(source)
-            scenes = {key: scene_of_shard(shard, cut, device)}
-        scene = scenes[key]
-        text = protocol_text(scene, job.protocol, all_directions=job.all_directions, device=device)
-        seconds = 0.0
-        if not (job.resume and _is_done(target, shard.grasps, job.protocol, text, job.cache.warn)):
-            if started:
-                started(source, len(shard.grasps))
-            begin = time.perf_counter()
-            found = verdicts(
-                scene,
-                shard.grasps,
-                job.protocol,
-                threads=job.threads or os.cpu_count() or 1,
-                progress=progress,
-                all_directions=job.all_directions,
-                device=device,
-            )
-            seconds = time.perf_counter() - begin
-            shard = _with_verdicts(shard, job.protocol, found, text, seconds)
-            write_shard(target, shard)
-        else:
-            shard = read_shard(target)
-        done.append(_validated(target, shard, scene, job.protocol, seconds))
-    return done
-
-
-def _targets(sources: list[Path], job: Validation) -> dict[Path, Path]:
-    """Source -> file to write.
-
-    Raises:
-        ConfigError: no folder follows from the sources.
-        OutputError: the folder is not writable, or two files would get one name.
-    """
-    folders = {path.parent for path in sources}
-    if job.out is None and len(folders) > 1:
-        raise ConfigError(f"the shards lie in {len(folders)} folders; name one for the results with --out")
-    parent = folders.pop()
-    out = job.out or parent.absolute().with_name(f"{parent.absolute().name}-{job.protocol.name}")
-    targets = {path: out / path.name for path in sources}
-    if len(set(targets.values())) < len(sources):
-        raise OutputError(f"two of the shards have the same name and cannot both go to {out}")
-    for source, target in targets.items():
-        if target.exists() and target.samefile(source):
-            raise OutputError(f"{source} would be overwritten; choose another folder with --out")
-    check_folder(out)
-    remove_leftovers(out, "*.h5.tmp")
-    return targets
-
-
-def _is_done(target: Path, rows: GraspRows, protocol: Protocol, text: str, warn: Callable[[str], None]) -> bool:
-    """Does a file hold these rows with verdicts of this protocol?
-
-    Raises:
-        OutputError: it holds something else.
-    """
-    if not target.exists():
-        return False
-    try:
-        found = read_shard(target).grasps
-    except ShardError as error:
-        warn(f"{error}; it is made anew")
-        return False
-    same = found.physics_protocols.get(f"{protocol.name}_holds") == text and all(
-        np.array_equal(getattr(found, name), getattr(rows, name), equal_nan=True)
-        for name in ("q", "q_pregrasp", "q_squeeze", "object_pose")
-    )
-    if not same:
-        raise OutputError(
-            f"{target} holds other grasps or another protocol; choose another --out, or --no-resume to replace it"
-        )
-    return True
 
 
 def _with_verdicts(

@@ -11,11 +11,30 @@ from support.wrench import cone_forces, epsilon, residual, wrenches
 from typer.testing import CliRunner
 
 from lgrasp.dataset import read_shard, validate_shard, write_shard
-from lgrasp.dataset.metrics import add_metrics, mass_frame, row_metrics
+from lgrasp.dataset.metrics import mass_frame, row_metrics
+from lgrasp.engine.events import Events
+from lgrasp.engine.run import Outcome, run
 from lgrasp.errors import ConfigError, OutputError, ShardError
+from lgrasp.jobs.metrics import MetricsJob
 from lgrasp_cli.dataset import app
 
 BOTH = ("volume", "epsilon_exact")
+
+
+def add_metrics(paths, out, names, events=None, **options) -> Outcome:
+    given = paths if isinstance(paths, list) else [paths]
+    return run(MetricsJob(shards=given, out=out, add=names, device="cpu", **options), events)
+
+
+class Watch(Events):
+    """Rows done of all parts."""
+
+    def __init__(self):
+        self.done, self.seen = {}, []
+
+    def advanced(self, part, done, note=""):
+        self.done[part.number] = done
+        self.seen.append(sum(self.done.values()))
 
 
 def grip(shard, o=0):
@@ -73,7 +92,7 @@ def test_all_else_stays(tmp_path, make_shard, same_rows):
         file["mine/numbers"] = np.arange(3)
         del file.attrs["text_sha256"]
     added = add_metrics(tmp_path / "in", tmp_path / "out", ["volume"], workers=1)
-    assert (added.files, added.written, added.rows) == ([tmp_path / "out" / "a.h5"], 1, 70)
+    assert (added.paths, added.written, added.made) == ([tmp_path / "out" / "a.h5"],) * 2 + (70,)
     assert validate_shard(tmp_path / "out" / "a.h5") == []
     new = read_shard(tmp_path / "out" / "a.h5")
     assert new.grasps.metric_units["volume"] == ""
@@ -94,11 +113,11 @@ def test_all_else_stays(tmp_path, make_shard, same_rows):
 def test_processes_change_nothing(tmp_path, make_shard):
     for i in range(3):
         write_shard(tmp_path / "in" / f"{i}.h5", make_shard([50, 0, 3][i], contacts=5, shard_index=i))
-    seen = []
-    add_metrics(tmp_path / "in", tmp_path / "one", BOTH, workers=1, progress=lambda *now: seen.append(now))
+    watch = Watch()
+    add_metrics(tmp_path / "in", tmp_path / "one", BOTH, watch, workers=1)
     add_metrics(tmp_path / "in", tmp_path / "two", BOTH, workers=2)
-    assert seen[-1] == (53, 53)
-    assert seen == sorted(seen)
+    assert watch.seen[-1] == 53
+    assert watch.seen == sorted(watch.seen)
     for i in range(3):
         assert (tmp_path / "one" / f"{i}.h5").read_bytes() == (tmp_path / "two" / f"{i}.h5").read_bytes()
 
@@ -134,16 +153,16 @@ def test_resume(tmp_path, make_shard):
     for i in range(3):
         write_shard(tmp_path / "in" / "sub" / f"{i}.h5", make_shard(4, shard_index=i))
     out = tmp_path / "in" / "out"  # inside the folder, and yet no input of its own
-    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1).written == 3
+    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1).made == 12
     times = {path: path.stat().st_mtime_ns for path in out.rglob("*.h5")}
     assert [path.relative_to(out).as_posix() for path in sorted(times)] == ["sub/0.h5", "sub/1.h5", "sub/2.h5"]
     whole = (out / "sub" / "1.h5").read_bytes()
     (out / "sub" / "1.h5").write_bytes(whole[:-50])
     (out / "sub" / "2.h5").unlink()
-    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1)[1:] == (2, 8)
+    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1).made == 8
     assert (out / "sub" / "1.h5").read_bytes() == whole
     assert (out / "sub" / "0.h5").stat().st_mtime_ns == times[out / "sub" / "0.h5"]
-    assert add_metrics(tmp_path / "in", out, BOTH, workers=1).written == 3  # one more metric
+    assert add_metrics(tmp_path / "in", out, BOTH, workers=1).made == 12  # one more metric
     write_shard(tmp_path / "in" / "sub" / "0.h5", make_shard(4, seed=9))
     with pytest.raises(OutputError, match=r"0\.h5 holds other rows than .*choose another --out"):
         add_metrics(tmp_path / "in", out, BOTH, workers=1)
@@ -172,6 +191,6 @@ def test_command(tmp_path, make_shard):
     write_shard(tmp_path / "in" / "0.h5", make_shard(4))
     arguments = ["metrics", str(tmp_path / "in"), "--add", "volume, epsilon_exact", "-o", str(tmp_path / "out")]
     assert "1 shard, 4 rows" in CliRunner().invoke(app, [*arguments, "--workers", "1"]).stdout
-    assert "0 shards, 0 rows, 0 rows/s; 1 there already" in CliRunner().invoke(app, arguments).stdout
+    assert "0 rows, 0 rows/s; 4 rows there already" in CliRunner().invoke(app, arguments).stdout
     assert CliRunner().invoke(app, [*arguments, "--quiet"]).stdout == ""
     assert set(read_shard(tmp_path / "out" / "0.h5").grasps.metrics) >= set(BOTH)

@@ -12,9 +12,11 @@ from typer.testing import CliRunner
 
 from lgrasp.dataset import GraspDataset, ShardReader, describe, merge_shards, read_shard, validate_shard, write_shard
 from lgrasp.dataset.checks import row_problems
-from lgrasp.dataset.metrics import METRICS, add_metrics
+from lgrasp.dataset.metrics import METRICS
+from lgrasp.engine.run import run
 from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import SEQUENCE_DATASETS
+from lgrasp.jobs.metrics import MetricsJob
 from lgrasp_cli.dataset import app
 
 COUNTS = (4, 5, 3)
@@ -289,7 +291,7 @@ def test_info_of_single_objects(tmp_path, make_shard):
 
 def test_added_metrics_are_of_the_worst_object(path, tmp_path, make_sequence, same_rows):
     """A row is never better than its parent, and what is copied stays as it is."""
-    add_metrics(path, tmp_path / "more", list(METRICS), workers=1)
+    run(MetricsJob(shards=[path], out=tmp_path / "more", add=tuple(METRICS), device="cpu", workers=1))
     assert validate_shard(tmp_path / "more" / "s.h5") == []
     grasps = read_shard(tmp_path / "more" / "s.h5").grasps
     parent = grasps.sequence.parent

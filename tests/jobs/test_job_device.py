@@ -9,14 +9,14 @@ import warp as wp
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.run import run
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import sample_bodies
 from lgrasp.jobs.hand_check.pictures import draw_palmar
 from lgrasp.jobs.hand_check.space_check import check_spaces
-from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
-from lgrasp.jobs.scenes.config import SceneConfig
-from lgrasp.jobs.scenes.job import SceneJob, make_scenes
+from lgrasp.jobs.refine.plan import PlanJob
+from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.runtime.device import Device, start
 
 OTHER = "other"
@@ -55,8 +55,8 @@ def cold(tmp_path: Path) -> Cache:
 
 
 def test_plan(on_cpu, cold, tmp_path):
-    outcome = plan_grasps(PlanJob(hand="barrett", object="sphere", starts=3, out=tmp_path / "out", cache=cold))
-    assert len(outcome.grasps)
+    outcome = run(PlanJob(hand="barrett", object="sphere", starts=3, out=tmp_path / "out", cache=cold))
+    assert outcome.rows
     assert on_cpu == []
 
 
@@ -64,7 +64,7 @@ def test_scenes(on_cpu, cold, tmp_path):
     pipeline = Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml"
     small = {"objects": 1, "camera": {"width": 40, "height": 30, "views": 1}}
     given = {"objects": ["tiny"], "pipeline": str(pipeline), "stock": 3, "scenes": 1, "workers": 1, "scene": small}
-    made = make_scenes(SceneJob(SceneConfig.model_validate(given | {"out": tmp_path / "out"}), cache=cold))
+    made = run(SceneJob(**given, out=tmp_path / "out", cache=cold))
     assert len(made.written) == 1
     assert on_cpu == []
 

@@ -12,8 +12,9 @@ from support.jaws import mesh_record
 from lgrasp.cloud.read import Cloud
 from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.run import Outcome, run
 from lgrasp.errors import ConfigError, ObjectError, OutputError
-from lgrasp.jobs.refine.plan import PlanJob, PlanOutcome, plan_grasps
+from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.judge.report import Report
 from lgrasp.judge.run import judge
 from lgrasp.object.find import find_object
@@ -25,10 +26,10 @@ RADIUS, STARTS = 0.035, 12
 
 
 @pytest.fixture(scope="module")
-def plan(cache_root: Path) -> Callable[..., PlanOutcome]:
+def plan(cache_root: Path) -> Callable[..., Outcome]:
     """plan(folder, **changes): plans of the Barrett hand."""
 
-    def plan(out: Path, **changes) -> PlanOutcome:
+    def plan(out: Path, **changes) -> Outcome:
         job = {
             "hand": "barrett",
             "out": out,
@@ -36,7 +37,7 @@ def plan(cache_root: Path) -> Callable[..., PlanOutcome]:
             "device": "cpu",
             "cache": Cache(cache_root, pytest.fail),
         }
-        return plan_grasps(PlanJob(**job | changes))
+        return run(PlanJob(**job | changes))
 
     return plan
 
@@ -44,7 +45,7 @@ def plan(cache_root: Path) -> Callable[..., PlanOutcome]:
 @pytest.fixture(scope="module")
 def mug(plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A shard of plans."""
-    return plan(tmp_path_factory.mktemp("mug"), object="mug").path
+    return plan(tmp_path_factory.mktemp("mug"), object="mug").paths[0]
 
 
 def ball_on_table() -> Cloud:
@@ -62,7 +63,7 @@ def ball_on_table() -> Cloud:
 @pytest.fixture(scope="module")
 def ball(plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A shard of plans of that ball."""
-    return plan(tmp_path_factory.mktemp("ball"), cloud=ball_on_table(), cloud_name="ball").path
+    return plan(tmp_path_factory.mktemp("ball"), cloud=ball_on_table()).paths[0]
 
 
 def judged(shard: Shard, folder: Path, mesh: trimesh.Trimesh) -> Report:
@@ -103,13 +104,13 @@ def test_rows_say_where_they_come_from(mug):
 
 
 def test_the_same_job_gives_the_same_bytes(mug, plan, tmp_path, raw_grasps):
-    again = plan(tmp_path, object="mug").path
+    again = plan(tmp_path, object="mug").paths[0]
     assert raw_grasps(again.parent) == raw_grasps(mug.parent)
 
 
 def test_a_start_does_not_depend_on_the_others(mug, plan, tmp_path):
     many = read_shard(mug).grasps
-    few = read_shard(plan(tmp_path, object="mug", starts=5).path).grasps
+    few = read_shard(plan(tmp_path, object="mug", starts=5).paths[0]).grasps
     first = many.candidate < 5
     np.testing.assert_array_equal(few.candidate, many.candidate[first])
     np.testing.assert_array_equal(few.q, many.q[first])
@@ -145,15 +146,16 @@ def test_without_a_plan_there_is_no_file(plan, tmp_path):
     n = np.asarray(trimesh.creation.icosphere(subdivisions=4).vertices)
     cloud = Cloud((0.8 * n).astype("f4"), n.astype("f4"), None, np.ones(len(n), bool), ())
     outcome = plan(tmp_path / "out", cloud=cloud, starts=2)
-    assert outcome.path is None
-    assert len(outcome.grasps) == outcome.counts["kept"] == 0
+    assert not outcome.paths
+    assert outcome.rows == outcome.results[0]["counts"]["kept"] == 0
     assert not (tmp_path / "out").exists()
 
 
 def test_what_is_there_is_replaced_only_if_asked(mug, plan):
     before = mug.read_bytes()
-    with pytest.raises(OutputError, match="--force"):
-        plan(mug.parent, object="mug")
+    assert plan(mug.parent, object="mug").present == len(read_shard(mug).grasps)
+    with pytest.raises(OutputError, match="--overwrite"):
+        plan(mug.parent, object="mug", starts=5)
     assert mug.read_bytes() == before
 
 

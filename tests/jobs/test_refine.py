@@ -13,10 +13,11 @@ from support.wrench import unresisted
 from lgrasp.dataset import GraspRows, Shard, read_shard, validate_shard, write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.run import run
 from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.jobs.generate import GenerateJob, generate
-from lgrasp.jobs.refine.shards import RefinedShard, Refinement, refine_shards
+from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.judge.run import judge
 from lgrasp.stages.refine.params import RefineParams
 
@@ -66,32 +67,41 @@ def spoil(rows: GraspRows, shard: Shard) -> GraspRows:
 
 
 @pytest.fixture(scope="module")
-def refine(cache_root: Path) -> Callable[..., RefinedShard]:
+def refine(cache_root: Path) -> Callable[..., Path]:
     """refine(source, folder, **changes): the one shard that comes of it."""
 
-    def refine(source: Path, out: Path, **changes) -> RefinedShard:
+    def refine(source: Path, out: Path, **changes) -> Path:
         cache = Cache(cache_root, pytest.fail)
-        (done,) = refine_shards(Refinement(sources=[source], out=out, device="cpu", cache=cache, **changes))
+        (done,) = run(RefineJob(shards=[source], out=out, device="cpu", cache=cache, **changes)).paths
         return done
 
     return refine
 
 
 @pytest.fixture(scope="module")
-def done(refine, source, tmp_path_factory: pytest.TempPathFactory) -> RefinedShard:
+def done(refine, source, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return refine(source, tmp_path_factory.mktemp("refined"))
 
 
-def both(source: Path, done: RefinedShard) -> tuple[GraspRows, GraspRows, np.ndarray]:
+def both(source: Path, done: Path) -> tuple[GraspRows, GraspRows, np.ndarray]:
     """Rows before and after, and which of them were replaced."""
-    before, after = read_shard(source).grasps, read_shard(done.path).grasps
+    before, after = read_shard(source).grasps, read_shard(done).grasps
     return before, after, after.metrics["refined"] == 1
 
 
+def numbers(done: Path) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Valid rows before and after, and mean energies, as the shard tells."""
+    shard = read_shard(done)
+    before, metrics = shard.statistics, shard.grasps.metrics
+    valid = float(before["refine_valid_before"]), float(metrics["valid"].sum())
+    energy = float(before["refine_energy_before"]) / len(shard.grasps), float(metrics["energy"].mean())
+    return valid, energy
+
+
 def test_rows_keep_their_places_and_ids(source, done):
-    assert validate_shard(done.path) == []
-    assert done.path.name == source.name
-    before, after = read_shard(source), read_shard(done.path)
+    assert validate_shard(done) == []
+    assert done.name == source.name
+    before, after = read_shard(source), read_shard(done)
     np.testing.assert_array_equal(after.grasps.candidate, before.grasps.candidate)
     assert len(after.grasps) == ROWS
     assert after.hand.sha256 == before.hand.sha256
@@ -121,19 +131,19 @@ def test_rows_that_stay_are_as_they_were(source, done):
 
 def test_replaced_rows_pass_the_judge(source, done):
     _, after, replaced = both(source, done)
-    report = judge(done.path)
+    report, (valid, _) = judge(done), numbers(done)
     assert report.valid[replaced].all(), report
     assert (after.metrics["valid"][replaced] == 1).all()
     assert not judge(source).valid[SPOILT].any()
     assert replaced[SPOILT].sum() >= 4  # a part of the spoilt grasps is valid again
-    assert done.moved.valid[1] >= done.moved.valid[0] + replaced[SPOILT].sum()
+    assert valid[1] >= valid[0] + replaced[SPOILT].sum()
 
 
 def test_a_valid_row_is_replaced_by_one_that_resists_pulls_better(source, done, refine, tmp_path):
     before, after, replaced = both(source, done)
     still = refine(source, tmp_path, params=RefineParams(matching_rounds=0))
     assert not both(source, still)[2].any()
-    improved = replaced & (read_shard(still.path).grasps.metrics["valid"] == 1)
+    improved = replaced & (read_shard(still).grasps.metrics["valid"] == 1)
     assert improved.sum() >= 4
     assert (after.metrics["unresisted_load"][improved] < before.metrics["unresisted_load"][improved]).all()
     mesh = read_shard(source).objects[0]
@@ -153,27 +163,29 @@ def unheld(rows: GraspRows, row: int, centre: np.ndarray) -> float:
 def test_energies_are_those_of_the_postures_stored(source, done, refine, tmp_path):
     """Refined by nothing, the refined rows have the energies that were told of them."""
     _, after, _ = both(source, done)
-    still = refine(done.path, tmp_path, params=RefineParams(matching_rounds=0))
-    np.testing.assert_allclose(read_shard(still.path).grasps.metrics["energy"], after.metrics["energy"], rtol=1e-3)
-    assert done.moved.energy[1] < done.moved.energy[0]
+    still = refine(done, tmp_path, params=RefineParams(matching_rounds=0))
+    np.testing.assert_allclose(read_shard(still).grasps.metrics["energy"], after.metrics["energy"], rtol=1e-3)
+    _, energy = numbers(done)
+    assert energy[1] < energy[0]
 
 
 def test_always_moves_every_row(source, refine, tmp_path):
     done = refine(source, tmp_path, always=True)
     before, after, replaced = both(source, done)
     assert replaced.all()
-    assert validate_shard(done.path) == []
+    assert validate_shard(done) == []
     assert (np.abs(after.q - before.q).max(1) > 1e-6).all()
-    assert done.moved.energy[1] < 0.5 * done.moved.energy[0]
+    _, energy = numbers(done)
+    assert energy[1] < 0.5 * energy[0]
     # of those that the checks pass the judge finds none bad, and they are told from the others
     valid = after.metrics["valid"] == 1
     assert 0 < valid.sum() < ROWS
-    assert judge(done.path).valid[valid].all()
+    assert judge(done).valid[valid].all()
 
 
 def test_the_same_job_gives_the_same_bytes(source, done, refine, tmp_path, raw_grasps):
     again = refine(source, tmp_path)
-    assert raw_grasps(again.path.parent) == raw_grasps(done.path.parent)
+    assert raw_grasps(again.parent) == raw_grasps(done.parent)
 
 
 def test_a_row_does_not_depend_on_the_others(source, done, refine, tmp_path):
@@ -182,7 +194,7 @@ def test_a_row_does_not_depend_on_the_others(source, done, refine, tmp_path):
     rows = shard.grasps
     part = replace(rows, **{name: getattr(rows, name)[some] for name in GRASP_FIELDS}, metrics={}, physics={})
     write_shard(tmp_path / "part.h5", replace(shard, grasps=part))
-    after = read_shard(done.path).grasps
+    after = read_shard(done).grasps
     found = read_shard(refine(tmp_path / "part.h5", tmp_path / "out").path).grasps
     np.testing.assert_array_equal(found.metrics["refined"], after.metrics["refined"][some])
     np.testing.assert_allclose(found.q, after.q[some], atol=1e-5)
@@ -197,6 +209,6 @@ def test_shards_without_rows_are_left_out(source, cache_root, tmp_path):
     told: list[str] = []
     cache = Cache(cache_root, told.append)
     with pytest.raises(ShardError, match="no grasps to refine"):
-        refine_shards(Refinement(sources=[tmp_path / "none.h5"], out=tmp_path / "out", device="cpu", cache=cache))
-    assert told == [f"{tmp_path / 'none.h5'} holds no grasps; it is left out"]
+        run(RefineJob(shards=[tmp_path / "none.h5"], out=tmp_path / "out", device="cpu", cache=cache))
+    assert not told
     assert not (tmp_path / "out").exists()

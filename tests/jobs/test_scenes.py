@@ -10,10 +10,11 @@ import trimesh
 from lgrasp.cloud.read import read_cloud
 from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import Events
+from lgrasp.engine.run import Outcome, run
 from lgrasp.errors import CloudError, ConfigError, LgraspError, OutputError, ShardError
-from lgrasp.geometry.poses import pose_matrix
-from lgrasp.jobs.scenes.config import SceneConfig, load_scene_config, scene_configs
-from lgrasp.jobs.scenes.job import SceneJob, SceneListener, SceneOutcome, make_scenes
+from lgrasp.jobs.scenes.config import read_scene_config, scene_configs
+from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.jobs.scenes.report import describe_scenes
 from lgrasp.scenes.reader import SceneReader, check_scene, read_scene, scene_cloud
 from lgrasp.scenes.writer import write_scene
@@ -27,7 +28,7 @@ SCENES = 3
 def make(cache_root: Path):
     """make(out, task=(0, 1), **changes): run a small job on the CPU."""
 
-    def make(out: Path, task=(0, 1), listener=None, *, resume=True, **changes) -> SceneOutcome:
+    def make(out: Path, task=(0, 1), listener=None, *, resume=True, **changes) -> Outcome:
         data = {
             "hand": "allegro",
             "objects": OBJECTS,
@@ -39,9 +40,8 @@ def make(cache_root: Path):
             "workers": 1,
             "scene": {"objects": 4, "grasps": 10, "colliding": 5, "camera": {"width": 120, "height": 90}},
         }
-        config = SceneConfig.model_validate(data | changes)
-        job = SceneJob(config, task[0], task[1], resume, Cache(cache_root))
-        return make_scenes(job, listener)
+        job = SceneJob(**data | changes, cache=Cache(cache_root))
+        return run(job, listener, array=task, resume=resume)
 
     return make
 
@@ -151,16 +151,14 @@ def test_array_tasks_and_threads_give_the_same_scenes(folder, make, tmp_path):
         assert contents(a) == contents(b)
 
 
-class _Stops(SceneListener):
-    """Cancels after the first scene."""
+class _Stops(Events):
+    """Cancels before the second scene."""
 
-    count = 0
-
-    def wrote(self, index: int, path: Path) -> None:
-        self.count += 1
+    asked = 0
 
     def cancelled(self) -> bool:
-        return self.count > 0
+        self.asked += 1
+        return self.asked > 1
 
 
 def test_resume_keeps_whole_scenes_and_makes_damaged_ones_anew(folder, make, tmp_path):
@@ -255,6 +253,6 @@ def test_bad_input_is_one_line(folder, make, tmp_path, changes, words):
 
 def test_configs():
     assert "table" in scene_configs()
-    assert all(load_scene_config(name).objects for name in scene_configs())
+    assert all(read_scene_config(name)["objects"] for name in scene_configs())
     with pytest.raises(ConfigError, match="did you mean 'table'"):
-        load_scene_config("tabel")
+        read_scene_config("tabel")

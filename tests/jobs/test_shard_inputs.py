@@ -11,11 +11,12 @@ import pytest
 
 from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.run import run
 from lgrasp.errors import HandError, ShardError
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.refine.plan import PlanJob, plan_grasps
-from lgrasp.jobs.refine.shards import Refinement, refine_shards
+from lgrasp.jobs.refine.plan import PlanJob
+from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, named_object, object_of_shard
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import resolve_device
@@ -54,15 +55,15 @@ def test_rows_are_refined_with_the_hand_in_their_shard(made: Path, cache_root: P
     shard = read_shard(made)
     assert shard.hand.name == "allegro"
     cache = Cache(cache_root, pytest.fail)
-    (done,) = refine_shards(Refinement([made], tmp_path / "out", device="cpu", cache=cache))
-    assert validate_shard(done.path) == []
-    assert read_shard(done.path).hand.sha256 == shard.hand.sha256
+    (done,) = run(RefineJob(shards=[made], out=tmp_path / "out", device="cpu", cache=cache)).paths
+    assert validate_shard(done) == []
+    assert read_shard(done).hand.sha256 == shard.hand.sha256
 
 
 def test_a_named_hand_must_be_that_of_the_shard(made: Path, cache_root: Path, tmp_path: Path):
-    job = Refinement([made], tmp_path / "out", hand="allegro", device="cpu", cache=Cache(cache_root))
+    job = RefineJob(shards=[made], out=tmp_path / "out", hand="allegro", device="cpu", cache=Cache(cache_root))
     with pytest.raises(HandError, match="leave --hand out, the hand is in the shard"):
-        refine_shards(job)
+        run(job)
 
 
 def test_the_hand_is_the_one_that_was_generated_with(job: Callable[..., GenerateJob], cache_root: Path):
@@ -123,11 +124,10 @@ def test_rules_that_fit_nothing_are_an_error(made: Path, cache_root: Path):
 
 def test_plans_take_hand_and_object_from_a_shard(made: Path, cache_root: Path, tmp_path: Path):
     cache = Cache(cache_root, pytest.fail)
-    done = plan_grasps(
+    (path,) = run(
         PlanJob(hand=str(made), object=str(made), out=tmp_path / "plans", starts=12, device="cpu", cache=cache)
-    )
-    assert done.path is not None
-    plan, shard = read_shard(done.path), read_shard(made)
+    ).paths
+    plan, shard = read_shard(path), read_shard(made)
     assert plan.hand == replace(shard.hand, joint_lower=plan.hand.joint_lower, joint_upper=plan.hand.joint_upper)
     np.testing.assert_array_equal(plan.objects[0].faces, shard.objects[0].faces)
     np.testing.assert_allclose(plan.objects[0].vertices, shard.objects[0].vertices, atol=1e-7)

@@ -32,13 +32,16 @@ def test_object(cli, tmp_path):
     assert found.code == 0, found
     data = json.loads(found.out)
     assert data["grasps"] == data["counts"]["kept"] > 0
-    assert validate_shard(data["out"]) == []
-    shard = read_shard(data["out"])
+    (path,) = (tmp_path / "out" / name for name in data["shards"])
+    assert validate_shard(path) == []
+    shard = read_shard(path)
     assert shard.header.pipeline == "plan"
     assert shard.hand.name == "barrett"
     assert shard.header.config["stand_off"] == 0.15
-    line = cli("plan", "--object", "sphere", *QUICK, "--out", tmp_path / "out").error()
-    assert "--force" in line
+    again = cli("plan", "--object", "sphere", *QUICK, "--out", tmp_path / "out", "--json", "-")
+    assert json.loads(again.out)["present"] == data["grasps"]
+    line = cli("plan", "--object", "sphere", *QUICK, "--stand-off", 0.1, "--out", tmp_path / "out").error()
+    assert "--overwrite" in line
 
 
 def test_cloud_is_stored(cli, cloud, tmp_path):

@@ -119,6 +119,7 @@ def test_interruption_leaves_whole_shards(process, grasps, tmp_path):
         time.sleep(0.05)
     running.send_signal(signal.SIGINT)
     _, errors = running.communicate(timeout=30)
-    assert (running.returncode, errors.splitlines()[-1]) == (130, "interrupted")
+    assert running.returncode == 130
+    assert errors.splitlines()[-1].startswith("interrupted")
     assert sorted(path.name for path in out.iterdir()) == ["jaws-cube-00000.h5", "jaws-cube-00001.h5"]
     assert not any(map(validate_shard, out.iterdir()))

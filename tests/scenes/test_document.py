@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 
 from lgrasp.cloud.files import CLOUD_SUFFIXES
-from lgrasp.jobs.scenes.config import SceneConfig
+from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
 
 TEXT = (Path(__file__).parents[2] / "docs" / "guides" / "scenes.md").read_text(encoding="utf-8")
@@ -30,8 +30,8 @@ def test_every_attribute():
 
 def test_every_key_with_its_default():
     (block,) = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)
-    shown = yaml.safe_load(block) | {"description": "", "objects": [], "hand": None}
-    assert SceneConfig.model_validate(shown) == SceneConfig.model_validate({})
+    shown = yaml.safe_load(block) | {"objects": [], "hand": None}
+    assert SceneJob(**shown).model_dump() == SceneJob().model_dump()
 
 
 def test_every_suffix_of_clouds():

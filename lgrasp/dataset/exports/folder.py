@@ -50,7 +50,9 @@ def object_text(item: ExportObject) -> str:
     return export_obj(mesh, include_normals=False, include_texture=False, header=header, digits=9)
 
 
-def write_index(out: Path, plan: Plan, frames: HandFrames, layout: str, conditions: Sequence[str]) -> None:
+def write_index(
+    out: Path, plan: Plan, frames: HandFrames, layout: str, conditions: Sequence[str], run_key: str = ""
+) -> None:
     """Write ``export.json``; an export without it is not whole.
 
     Raises:
@@ -64,6 +66,7 @@ def write_index(out: Path, plan: Plan, frames: HandFrames, layout: str, conditio
         "rows": plan.rows,
         "shards": [path.name for path in plan.shards],
         "where": list(conditions),
+        "run_key": run_key,
         "hand": {
             "name": plan.hand.name,
             "sha256": plan.hand.sha256,

@@ -74,6 +74,7 @@ def export_shards(
     limit: int | None = None,
     cut: Cut | None = None,
     advance: Callable[[int, int], None] | None = None,
+    run_key: str = "",
 ) -> Exported:
     """Write grasps of shards, all of one hand, into a folder in the format of another program.
 
@@ -89,6 +90,7 @@ def export_shards(
         limit: Most rows.
         cut: Convex pieces of an object, for formats that simulate; without it the hull of its mesh collides.
         advance: Called with rows done and rows in all.
+        run_key: Kept in ``export.json``, to tell a later run that the export is its own.
 
     Raises:
         ConfigError: An unknown format, a condition that cannot be read, or a limit below 1.
@@ -117,7 +119,7 @@ def export_shards(
     write_assets(out, plan)
     write_file(out / "README.txt", readme(plan, frames, form.notes, said))
     write(out, count)
-    write_index(out, plan, frames, to, said)
+    write_index(out, plan, frames, to, said, run_key)
     return Exported(plan.rows, tuple(item.code for item in plan.objects))
 
 

@@ -4,18 +4,20 @@ import copy
 import io
 import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from pydantic import Field, PrivateAttr
 
 from lgrasp.dataset.files import new_file
 from lgrasp.dataset.tree import shard_tree
-from lgrasp.engine.cache import Cache
-from lgrasp.engine.folder import check_folder
+from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.run import Job, Outcome
+from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
@@ -34,62 +36,87 @@ _FORMAT, _VERSION = "lgrasp-coarse", 1
 _LEAST = 16  # grasps to learn from
 
 
-@dataclass(frozen=True)
-class Fit:
-    """What is trained on what."""
-
-    shards: Sequence[Path]
-    out: Path
-    params: LearnParams
-    hand: str | None = None  # default: that of the shards
-    device: str = "auto"
-    cache: Cache = field(default_factory=Cache)
-
-
-def fit(job: Fit, told: Callable[[str, int, int, float], None] | None = None) -> dict[str, Any]:
-    """Train a predictor and write it; its report.
+class FitJob(Job):
+    """A predictor of coarse grasps, trained on the grasps of shards: one file.
 
     The report compares mean energies on clouds that were not trained on: of the predictor trained on poses alone
     (``frozen``), of the same trained on poses as many steps more (``longer``), and of the jointly trained one
     (``joint``).
-
-    Args:
-        told: called with (phase, step, steps, value): the loss on poses, then the energy of joint training.
-
-    Raises:
-        LgraspError: shards or hand cannot be used, or the file cannot be written.
     """
-    p, say = job.params, told or (lambda phase, step, steps, value: None)
-    check_folder(job.out.parent)
-    if job.out.is_dir():
-        raise OutputError(f"{job.out} is a folder; name a file with --out, such as coarse.pt")
-    device = resolve_device(job.device).alias
-    hand, train, held_out = _examples(job.shards, job.hand, p, job.cache, device)
-    grasps = sum(len(e.q) for e in train)
-    if grasps < _LEAST:
-        raise ConfigError(
-            f"{', '.join(map(str, job.shards))}: {grasps} grasps; at least {_LEAST} are needed to learn from"
-        )
-    trainer = Trainer(hand, train, p, device=device)
-    start = time.perf_counter()
-    trainer.fit_poses(p.steps, p.rate, lambda step, loss: say("poses", step, p.steps, loss))
-    seconds = {"poses": time.perf_counter() - start}
-    report: dict[str, Any] = {"hand": hand.name, "objects": [e.model.name for e in train], "out": str(job.out)}
-    report["frozen"] = _numbers(measure(trainer, held_out))
-    if p.joint_steps:
-        before = copy.deepcopy(trainer.net.state_dict())
-        trainer.fit_poses(p.joint_steps, p.joint_rate)
-        report["longer"] = _numbers(measure(trainer, held_out))
-        trainer.net.load_state_dict(before)
+
+    unit: ClassVar[str] = "steps"
+    kernels: ClassVar[str] = ""
+
+    shards: tuple[Path, ...] = Field(description="Shard files, or folders of them at any depth.")
+    out: Path = Field(Path("coarse.pt"), description="File of the predictor.")
+    params: LearnParams = Field(default_factory=lambda: LearnParams.model_validate({}))
+    hand: str | None = Field(None, description="Default: that of the shards.")
+    _key: str | None = PrivateAttr(None)
+
+    @property
+    def folder(self) -> Path:
+        return self.out.parent
+
+    def key(self) -> str:
+        if self._key is None:
+            rows = [rows_digest(path) for path in shard_tree(self.shards).values()]
+            described = self.params.model_dump(mode="json")
+            self._key = content_key("predictor", _VERSION, rows=rows, params=described, hand=self.hand)
+        return self._key
+
+    def parts(self) -> list[Part]:
+        if self.out.is_dir():
+            raise OutputError(f"{self.out} is a folder; name a file with --out, such as coarse.pt")
+        return [Part(0, self.out, self.params.steps + self.params.joint_steps)]
+
+    def present(self, parts: Sequence[Part]) -> dict[int, int]:
+        if not parts or not self.out.exists():
+            return {}
+        _, about = load_predictor(self.out)
+        if about.get("run_key") != self.key():
+            raise OutputError(
+                f"{self.out} is a predictor of another run (other shards or parameters); choose another --out, or "
+                "--overwrite to replace it"
+            )
+        return {0: parts[0].rows}
+
+    def make(self, part: Part, progress: PartProgress) -> Made:
+        p, device = self.params, self.device_used.alias
+        hand, train, held_out = _examples(self.shards, self.hand, p, self.cache, device)
+        grasps = sum(len(e.q) for e in train)
+        if grasps < _LEAST:
+            raise ConfigError(
+                f"{', '.join(map(str, self.shards))}: {grasps} grasps; at least {_LEAST} are needed to learn from"
+            )
+        trainer = Trainer(hand, train, p, device=device)
         start = time.perf_counter()
-        trainer.fit_jointly(lambda step, energy: say("jointly", step, p.joint_steps, energy))
-        seconds["joint"] = time.perf_counter() - start
-        report["joint"] = _numbers(measure(trainer, held_out))
-        report["lowered"] = {
-            name: 1.0 - report["joint"][name] / report["frozen"][name] for name in ("coarse", "unrolled")
-        }
-    _save(job.out, trainer, hand)
-    return report | {"seconds": seconds, "params": p.model_dump(mode="json")}
+        trainer.fit_poses(p.steps, p.rate, lambda step, loss: progress(step, f"on poses, loss {loss:.3f}"))
+        seconds = {"poses": time.perf_counter() - start}
+        report: dict[str, Any] = {"hand": hand.name, "objects": [e.model.name for e in train]}
+        report["frozen"] = _numbers(measure(trainer, held_out))
+        if p.joint_steps:
+            before = copy.deepcopy(trainer.net.state_dict())
+            trainer.fit_poses(p.joint_steps, p.joint_rate)
+            report["longer"] = _numbers(measure(trainer, held_out))
+            trainer.net.load_state_dict(before)
+            start = time.perf_counter()
+            trainer.fit_jointly(lambda step, energy: progress(p.steps + step, f"jointly, energy {energy:.3f}"))
+            seconds["joint"] = time.perf_counter() - start
+            report["joint"] = _numbers(measure(trainer, held_out))
+            report["lowered"] = {
+                name: 1.0 - report["joint"][name] / report["frozen"][name] for name in ("coarse", "unrolled")
+            }
+        report |= {"seconds": seconds, "params": p.model_dump(mode="json")}
+        return Made(part.rows, _bytes(trainer, hand, self.key(), report))
+
+    def write(self, part: Part, contents: Any) -> None:
+        with new_file(part.file) as file:
+            file.write(contents)
+
+    def report(self, outcome: Outcome) -> dict[str, Any]:
+        if not outcome.paths:
+            return {}
+        return load_predictor(self.out)[1]["report"] | {"out": str(self.out)}
 
 
 def evaluate(
@@ -118,7 +145,7 @@ def evaluate(
 
 
 def load_predictor(path: Path) -> tuple[CoarseNet, dict[str, Any]]:
-    """A predictor on the CPU, and what its file says: ``hand``, ``hand_sha256``, ``params``.
+    """A predictor on the CPU, and what its file says: ``hand``, ``hand_sha256``, ``params``, ``report``, ``run_key``.
 
     Raises:
         ConfigError: no such file, or no predictor.
@@ -128,6 +155,7 @@ def load_predictor(path: Path) -> tuple[CoarseNet, dict[str, Any]]:
         if saved["format"] != _FORMAT or saved["version"] != _VERSION:
             raise ValueError(f"format {saved['format']!r}, version {saved['version']!r}")
         about = {name: saved[name] for name in ("format", "version", "hand", "hand_sha256")}
+        about |= {"run_key": saved.get("run_key"), "report": json.loads(saved.get("report", "{}"))}
         about["params"], state = json.loads(saved["params"]), saved["state"]
         net = CoarseNet(state["lower"], state["upper"], LearnParams.model_validate(about["params"]))
         net.load_state_dict(state)
@@ -166,10 +194,11 @@ def _examples(
     return hand, *sets
 
 
-def _save(path: Path, trainer: Trainer, hand: HandModel) -> None:
+def _bytes(trainer: Trainer, hand: HandModel, key: str, report: dict[str, Any]) -> bytes:
+    """The file of a predictor."""
     data = io.BytesIO()
     state = {name: values.cpu() for name, values in trainer.net.state_dict().items()}
-    about = {"format": _FORMAT, "version": _VERSION, "hand": hand.name, "hand_sha256": hand.sha256}
-    torch.save(about | {"params": trainer.params.model_dump_json(), "state": state}, data)
-    with new_file(path) as file:
-        file.write(data.getvalue())
+    about = {"format": _FORMAT, "version": _VERSION, "hand": hand.name, "hand_sha256": hand.sha256, "run_key": key}
+    about |= {"params": trainer.params.model_dump_json(), "report": json.dumps(report), "state": state}
+    torch.save(about, data)
+    return data.getvalue()

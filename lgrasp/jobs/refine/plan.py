@@ -1,128 +1,218 @@
 """The job of ``lgrasp plan``: a hand before an object or a cloud -> one shard of grasps."""
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
+from pydantic import Field, InstanceOf, PrivateAttr
 
 from lgrasp.cloud.model import cloud_object
-from lgrasp.cloud.read import Cloud
-from lgrasp.dataset import ObjectRecord, Shard, ShardHeader, write_shard
-from lgrasp.engine.cache import Cache
-from lgrasp.engine.folder import check_folder, clean_folder, shard_path
-from lgrasp.errors import ConfigError, OutputError
+from lgrasp.cloud.read import Cloud, read_cloud
+from lgrasp.dataset import ObjectRecord, Shard, ShardHeader
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.engine.cache import content_key
+from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.folder import shard_path
+from lgrasp.engine.run import Job, Outcome
+from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.rows import grasp_rows, press
-from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
+from lgrasp.hand.find import HandSource
+from lgrasp.hand.model import HandModel
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
-from lgrasp.jobs.shard_inputs import named_hand, named_object
+from lgrasp.jobs.shard_inputs import mesh_hash, named_hand, named_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.planner import Planner, PlanParams, cloud_params
 from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.visible_surface import seen_palmar
-from lgrasp.runtime.device import resolve_device
+from lgrasp.scenes.reader import scene_cloud
 
-_REACH = 0.3  # [m] what is farther from the target than this is no hand's business
+VERSION = 1
+"""Raised whenever plans change for the same parameters."""
+
+_REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way
 _LEAST_AROUND = 50
 _FARTHEST = 1.0  # [m] of a base from a start
 
 
-@dataclass(frozen=True)
-class PlanJob:
-    """On what and where; an object or a cloud."""
-
-    hand: str
-    out: Path | None = None  # none: plans/HAND-OBJECT
-    starts: int = 80
-    object: str | None = None
-    scale: float = 1.0
-    cloud: Cloud | None = None
-    cloud_name: str = "cloud"
-    stand_off: float | None = None  # [m]; none: the hand's
-    params: PlanParams = field(default_factory=PlanParams)
-    device: str = "auto"
-    force: bool = False
-    cache: Cache = field(default_factory=Cache)
-
-
-@dataclass(frozen=True)
-class PlanOutcome:
-    """What came of it."""
-
-    path: Path | None  # none: no plan passed, no file
-    hand: str
-    object: ObjectModel
-    grasps: GraspTable
-    counts: dict[str, int]
-    seconds: float  # of the planning
-
-
-def plan_grasps(job: PlanJob, progress: Callable[[int, int], None] | None = None) -> PlanOutcome:
-    """Plan grasps and write those that passed every check, a row a start, as one shard.
+class PlanJob(Job):
+    """Plans of grasps of an object or of a cloud: one shard of those that passed every check, a row a start.
 
     Of a cloud the shard has the target's points as they were given, with their normals, as an object without faces.
-
-    Args:
-        progress: called with (starts done, plans); what it raises ends the job, and no file is written.
-
-    Raises:
-        ConfigError: neither or both of object and cloud, no start, a distance or weights out of range.
-        OutputError: the shard exists already, or its folder cannot be written.
-        LgraspError: hand, object or cloud cannot be used.
     """
-    if (job.object is None) == (job.cloud is None):
-        raise ConfigError("plan needs an object or a cloud, one of the two")
-    if job.starts < 1:
-        raise ConfigError(f"--starts {job.starts}: at least 1")
-    if job.stand_off is not None and not 0 < job.stand_off <= _FARTHEST:
-        raise ConfigError(f"--stand-off {job.stand_off:g}: more than 0 and at most {_FARTHEST:g} m is accepted")
-    if not job.params.distal + job.params.other > 0:
-        raise ConfigError("--distal 0 --other 0: nothing pulls the hand to the object; give one of them a weight")
-    device = resolve_device(job.device)
-    source, hand = named_hand(job.cache, job.hand, device)
-    stand_off = job.stand_off or source.spec.stand_off or STAND_OFF
-    around = None
-    if job.cloud is not None:
-        model, around = _cloud_models(job.cloud, job.cloud_name)
-    else:
-        assert job.object is not None
-        model = named_object(job.cache, job.object, job.scale, device)
-    out = job.out or Path("plans") / f"{hand.name}-{model.name}"
-    path = shard_path(out, hand.name, model.name, 0)
-    check_folder(out)
-    if path.exists() and not job.force:
-        raise OutputError(f"{path} exists; choose another folder with --out, or --force to replace it")
-    clean_folder([path])
-    palmar = seen_palmar(source, hand, device.alias)
-    params = job.params if job.cloud is None else cloud_params(job.params)
-    planner = Planner(upload_hand(hand, device.alias), model, stand_off, params, palmar, around)
-    begin = time.perf_counter()
-    grasps, counts = planner.run(job.starts, progress)
-    seconds = time.perf_counter() - begin
-    if len(grasps):
+
+    unit: ClassVar[str] = "starts"
+    kernels: ClassVar[str] = ""
+
+    hand: str = Field("barrett", description="Name, path, or a shard (its hand).")
+    out: Path | None = Field(None, description="Folder of the plans; default: plans/HAND-OBJECT.")
+    starts: int = Field(80, description="Points of the surface that are tried.")
+    object: str | None = Field(None, description="Name, mesh file, or a shard of one object.")
+    scale: float = Field(1.0, gt=0, description="Factor from the unit of the mesh or cloud to metres.")
+    cloud: Path | InstanceOf[Cloud] | None = Field(
+        None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene."
+    )
+    mask: Path | None = Field(None, description="Labels of the cloud's points (.npy, .npz).")
+    label: int | None = Field(None, description="Which points are to be grasped.")
+    viewpoint: tuple[float, float, float] | None = Field(None, description="Where the cloud was seen from [m].")
+    stand_off: float | None = Field(None, description="Of the hand's base from a start [m]; default: the hand's.")
+    params: PlanParams = Field(default_factory=PlanParams)
+    _cloud: Cloud | None = PrivateAttr(None)
+    _found: tuple[HandSource, HandModel, ObjectModel, ObjectModel | None] | None = PrivateAttr(None)
+
+    @property
+    def title(self) -> str:
+        return f"{Path(self.hand).stem} {self.name}"
+
+    @property
+    def name(self) -> str:
+        """Of what is grasped."""
+        if self.object is not None:
+            return Path(self.object).stem
+        name = "cloud" if isinstance(self.cloud, Cloud) else Path(str(self.cloud)).stem
+        return name if self.label is None else f"{name}-{self.label}"
+
+    @property
+    def folder(self) -> Path:
+        source, _, model, _ = self._models()
+        return self.out or Path("plans") / f"{source.name}-{model.name}"
+
+    def key(self) -> str:
+        _, hand, model, around = self._models()
+        record = self._record()
+        normals = None if record.normals is None else np.asarray(record.normals, np.float32).tobytes().hex()
+        rest = None if around is None else np.asarray(around.contact_points, np.float32).tobytes().hex()
+        return content_key(
+            "plan",
+            VERSION,
+            hand=hand.sha256,
+            object=[model.name, mesh_hash(record), normals, rest],
+            starts=self.starts,
+            stand_off=self._stand_off(),
+            params=self._params().model_dump(mode="json"),
+        )
+
+    def parts(self) -> list[Part]:
+        if (self.object is None) == (self.cloud is None):
+            raise ConfigError("give --object (a mesh or a name) or --cloud (a file of points), one of the two")
+        if self.cloud is None and not (self.mask is self.label is self.viewpoint is None):
+            raise ConfigError("--mask, --label and --viewpoint belong to --cloud")
+        if self.starts < 1:
+            raise ConfigError(f"--starts {self.starts}: at least 1")
+        if self.stand_off is not None and not 0 < self.stand_off <= _FARTHEST:
+            raise ConfigError(f"--stand-off {self.stand_off:g}: more than 0 and at most {_FARTHEST:g} m is accepted")
+        if not self.params.distal + self.params.other > 0:
+            raise ConfigError("--distal 0 --other 0: nothing pulls the hand to the object; give one of them a weight")
+        source, _, model, _ = self._models()
+        return [Part(0, shard_path(self.folder, source.name, model.name, 0), self.starts)]
+
+    def effort(self, rows: int) -> int:
+        return rows
+
+    def make(self, part: Part, progress: PartProgress) -> Made:
+        source, hand, model, around = self._models()
+        alias = self.device_used.alias
+        palmar = seen_palmar(source, hand, alias)
+        planner = Planner(upload_hand(hand, alias), model, self._stand_off(), self._params(), palmar, around)
+        begin = time.perf_counter()
+        grasps, counts = planner.run(self.starts, lambda done, plans: progress(done, f"{plans:,} plans"))
+        seconds = time.perf_counter() - begin
+        result = {"counts": counts, "seconds": seconds}
+        if not len(grasps):
+            return Made(0, None, result)
         header = ShardHeader(
             pipeline="plan",
             seed=0,
             shard_index=0,
             config={
-                "bounds": params.bounds.describe(),
-                "plan": params.model_dump(mode="json"),
-                "starts": job.starts,
-                "stand_off": stand_off,
+                "run_key": self.key(),
+                "bounds": self._params().bounds.describe(),
+                "plan": self._params().model_dump(mode="json"),
+                "starts": self.starts,
+                "stand_off": self._stand_off(),
                 **hand_config(source),
             },
         )
-        record = hand_record(hand, mesh_blobs(source.urdf))
-        statistics = {"device": device.name, "seconds_wall": seconds}
-        statistics |= {f"plan_{name.replace(' ', '_').replace('-', '_')}": n for name, n in counts.items()}
+        statistics = {
+            "device": self.device_used.name,
+            "seconds_wall": seconds,
+            "candidates": self.starts,
+            "exhausted": 1,
+            **{_statistic(name): n for name, n in counts.items()},
+        }
         rows = grasp_rows(press(grasps), hand.tree, model.center)
-        write_shard(
-            path,
-            Shard(header=header, hand=record, objects=[_record(model, job.cloud)], grasps=rows, statistics=statistics),
-        )
-    return PlanOutcome(path if len(grasps) else None, hand.name, model, grasps, counts, seconds)
+        record = hand_record(hand, mesh_blobs(source.urdf))
+        shard = Shard(header=header, hand=record, objects=[self._record()], grasps=rows, statistics=statistics)
+        return Made(len(rows), shard, result)
+
+    def report(self, outcome: Outcome) -> dict[str, Any]:
+        """``grasps``, ``starts``, ``counts`` (what became of the starts), medians of ``epsilon`` and
+        ``unresisted_load``, ``seconds_planning``."""
+        _, hand, model, _ = self._models()
+        data: dict[str, Any] = {"hand": hand.name, "object": model.name, "starts": self.starts, "grasps": outcome.rows}
+        data |= {"counts": {}, "seconds_planning": 0.0, "epsilon": None, "unresisted_load": None}
+        for result in outcome.results:
+            data |= {"counts": result["counts"], "seconds_planning": result["seconds"]}
+        for path in outcome.paths:
+            with ShardReader(path) as reader:
+                for name in ("epsilon", "unresisted_load"):
+                    data[name] = float(np.median(reader.column(f"metrics/{name}")))
+                statistics = reader.statistics
+            data["counts"] = {
+                name.removeprefix("plan_").replace("_", " "): n
+                for name, n in statistics.items()
+                if name.startswith("plan_")
+            }
+        return data
+
+    def shortfall(self, outcome: Outcome) -> LgraspError | None:
+        if outcome.rows or not outcome.parts:
+            return None
+        lost = "; ".join(lost_starts(result["counts"]) for result in outcome.results)
+        hint = "; do its normals point out of it (--viewpoint), are there views of all sides?" if self.cloud else ""
+        return StarvedError(f"no grasp planned from {self.starts} starts: {lost}{hint}")
+
+    def _params(self) -> PlanParams:
+        return self.params if self.cloud is None else cloud_params(self.params)
+
+    def _stand_off(self) -> float:
+        return self.stand_off or self._models()[0].spec.stand_off or STAND_OFF
+
+    def _models(self) -> tuple[HandSource, HandModel, ObjectModel, ObjectModel | None]:
+        """The hand, what is grasped, and what stands around it."""
+        if self._found is None:
+            source, hand = named_hand(self.cache, self.hand, self.device_used)
+            around = None
+            if self.cloud is not None:
+                self._cloud = self._read(self.cloud)
+                model, around = _cloud_models(self._cloud, self.name)
+            else:
+                assert self.object is not None
+                model = named_object(self.cache, self.object, self.scale, self.device_used)
+            self._found = source, hand, model, around
+        return self._found
+
+    def _read(self, cloud: Path | Cloud) -> Cloud:
+        if isinstance(cloud, Path):
+            eye = None if self.viewpoint is None else list(self.viewpoint)
+            cloud = read_cloud(cloud, self.mask, self.label, self.scale, eye, scene=False, read_scene=scene_cloud)
+            for note in cloud.notes:
+                self.cache.warn(note)
+        return cloud
+
+    def _record(self) -> ObjectRecord:
+        return _record(self._models()[2], self._cloud)
+
+
+def lost_starts(counts: dict[str, int]) -> str:
+    """What became of the starts that gave no plan, in words."""
+    return ", ".join(f"{n} {what}" for what, n in counts.items() if what not in ("starts", "kept") and n)
+
+
+def _statistic(name: str) -> str:
+    return f"plan_{name.replace(' ', '_').replace('-', '_')}"
 
 
 def _record(model: ObjectModel, cloud: Cloud | None) -> ObjectRecord:

@@ -1,122 +1,172 @@
 """The job of ``lgrasp refine``: shards, or grasps of other formats, moved by a local search and written again."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import Field, PrivateAttr
 
-from lgrasp.dataset import GraspRows, ShardHeader, read_shard, write_shard
+from lgrasp.dataset import ShardHeader, read_shard
 from lgrasp.dataset.checks import row_problems
-from lgrasp.dataset.files import remove_leftovers
-from lgrasp.dataset.tree import shard_tree
-from lgrasp.engine.cache import Cache
-from lgrasp.engine.folder import check_folder, shard_path
-from lgrasp.errors import ConfigError, HandError, OutputError, ShardError
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.engine.cache import content_key
+from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.folder import shard_path
+from lgrasp.engine.run import Outcome
+from lgrasp.engine.shard_job import ShardJob
+from lgrasp.errors import ConfigError, HandError, ShardError
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.records import Shard
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.jobs.refine.moved import Moved, move_rows
+from lgrasp.jobs.refine.moved import move_rows
 from lgrasp.jobs.refine.sources import grasp_shards
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
-from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.stages.refine.params import RefineParams
 
-
-@dataclass(frozen=True)
-class Refinement:
-    """What is refined and where it goes."""
-
-    sources: Sequence[Path]  # shards, folders of them at any depth; or one export, see ``form``
-    out: Path
-    form: str | None = None  # format of another program; none: shards
-    hand: str | None = None  # of grasps in another format; shards hold their own
-    always: bool = False  # every row takes its refined posture, whatever the checks say
-    params: RefineParams = field(default_factory=RefineParams)
-    bounds: GraspBounds = field(default_factory=GraspBounds)
-    device: str = "auto"
-    force: bool = False
-    cache: Cache = field(default_factory=Cache)
+VERSION = 1
+"""Raised whenever refined shards change for the same parameters."""
 
 
-@dataclass(frozen=True)
-class RefinedShard:
-    """One file that was written."""
+class RefineJob(ShardJob):
+    """Grasps of shards, or of an export of another program, moved by a local search and checked again."""
 
-    path: Path
-    hand: str
-    object: str
-    moved: Moved
-    seconds: float
+    shards: tuple[Path, ...] = Field(description="Shards, folders of them at any depth; or one export, see 'form'.")
+    form: str | None = Field(None, description="Format of another program; none: shards.")
+    hand: str | None = Field(None, description="Of grasps in another format; shards hold their own.")
+    always: bool = Field(False, description="Every row takes its refined posture, whatever the checks say.")
+    params: RefineParams = Field(default_factory=RefineParams)
+    bounds: GraspBounds = Field(default_factory=GraspBounds)
+    _hands: dict[str, HandArrays] = PrivateAttr(default_factory=dict)
+    _given: dict[int, Shard] = PrivateAttr(default_factory=dict)  # of an export, by number of the part
 
+    def key(self) -> str:
+        described = {
+            "params": self.params.model_dump(mode="json"),
+            "bounds": self.bounds.describe(),
+            "always": self.always,
+        }
+        return content_key("refine", VERSION, **described)
 
-def refine_shards(job: Refinement, progress: Callable[[Path, int, int], None] | None = None) -> list[RefinedShard]:
-    """Refine the rows of shards; each shard is written under its place in the output folder. One without rows is left
-    out.
+    def parts(self) -> list[Part]:
+        parts = super().parts() if self.form is None else self._parts_of_export(self.form)
+        if not any(part.rows for part in parts):
+            raise ShardError(f"{', '.join(map(str, self.shards))}: no grasps to refine")
+        return parts
 
-    Args:
-        progress: called with (shard, its rows, rows done); what it raises ends the job, whole shards stay.
+    def _parts_of_export(self, form: str) -> list[Part]:
+        """Grasps in the format of another program: a part of each object."""
+        if len(self.shards) != 1 or self.hand is None:
+            raise ConfigError(f"grasps in format {form}: give one folder or file, and their hand with --hand")
+        source, model = named_hand(self.cache, self.hand, self.device_used)
+        self._hands[model.sha256] = upload_hand(model, self.device_used.alias)
+        self._given = dict(enumerate(grasp_shards(self.shards[0], form, source, model)))
+        return [
+            Part(number, shard_path(self.out, model.name, shard.objects[0].id, 0), len(shard.grasps), self.shards[0])
+            for number, shard in self._given.items()
+        ]
 
-    Raises:
-        ShardError: a source cannot be read, holds rows of several objects or that are not finite; no rows at all.
-        HandError: the hand is unknown, or another than the one of the shard.
-        OutputError: a file would be overwritten, or the folder cannot be written.
-    """
-    device = resolve_device(job.device)
-    hands: dict[str, HandArrays] = {}
-    check_folder(job.out)
-    remove_leftovers(job.out, "*.h5.tmp")
-    done = []
-    for source, target, shard in _shards(job, hands, device):
+    def part_key(self, part: Part) -> str:
+        if self.form is None:
+            return super().part_key(part)
+        rows = self._given[part.number].grasps
+        digest = [np.asarray(values).tobytes().hex() for values in (rows.q, rows.object_pose)]
+        return content_key("part", 1, job=self.key(), rows=digest)
+
+    def make(self, part: Part, progress: PartProgress) -> Made:
+        assert part.source is not None
+        shard = read_shard(part.source) if self.form is None else self._given[part.number]
         if not len(shard.grasps):
-            job.cache.warn(f"{source} holds no grasps; it is left out")
-            continue
-        _check_rows(source, shard)
-        hand = _hand(job, source, shard, hands, device)
-        model = object_of_shard(job.cache, shard.objects[0], device)
+            self.cache.warn(f"{part.source} holds no grasps; it is left out")
+            return Made(0)
+        _check_rows(part.source, shard)
+        hand = self._hand(part.source, shard)
+        model = object_of_shard(self.cache, shard.objects[0], self.device_used)
         begin = time.perf_counter()
         moved = move_rows(
             hand,
             model,
             shard.grasps,
-            job.params,
-            job.bounds,
-            always=job.always,
-            stored=job.form is None,
-            progress=partial(progress, target, len(shard.grasps)) if progress else None,
+            self.params,
+            self.bounds,
+            always=self.always,
+            stored=self.form is None,
+            progress=progress,
         )
-        seconds = time.perf_counter() - begin
-        write_shard(target, _written(shard, moved.rows, job, seconds))
-        done.append(RefinedShard(target, shard.hand.name, shard.objects[0].name, moved, seconds))
-    if not done:
-        raise ShardError(f"{', '.join(map(str, job.sources))}: no grasps to refine")
-    return done
+        if moved.clamped:
+            self.cache.warn(
+                f"joints of {moved.clamped:,} rows were outside their limits and were clamped before the search: "
+                f"{part.source}"
+            )
+        if moved.far:
+            self.cache.warn(
+                f"the hands of {moved.far:,} rows are more than half a metre from their object, nothing draws them to "
+                f"it: {part.source}"
+            )
+        counts = {
+            "refine_tried": len(shard.grasps),
+            "refine_replaced": int(moved.rows.metrics["refined"].sum()),
+            "refine_valid_before": moved.valid[0],
+            "refine_energy_before": moved.energy[0] * len(shard.grasps),  # sums, for merged shards
+            "seconds_refine": time.perf_counter() - begin,
+        }
+        written = self.marked(part, replace(shard, header=self._header(shard), grasps=moved.rows), counts)
+        return Made(len(moved.rows), written)
+
+    def report(self, outcome: Outcome) -> dict[str, Any]:
+        """``results``: of each shard hand, object, rows, refined, valid before and after, mean energies, seconds."""
+        return {"results": [_entry(path) for path in outcome.paths]}
+
+    def _hand(self, path: Path, shard: Shard) -> HandArrays:
+        """The hand of a shard, whatever is installed under its name; ``hand`` is only compared with it."""
+        digest, device = shard.hand.sha256, self.device_used
+        if digest not in self._hands:
+            if self.hand is not None and (named := named_hand(self.cache, self.hand, device)[1]).sha256 != digest:
+                raise HandError(
+                    f"{path}: its grasps are of hand '{shard.hand.name}' (hash {digest[:12]}), not of '{named.name}' "
+                    f"(hash {named.sha256[:12]}); leave --hand out, the hand is in the shard"
+                )
+            _, model = hand_of_shard(self.cache, shard.hand, shard.header.config, device)
+            self._hands[digest] = upload_hand(model, device.alias)
+        return self._hands[digest]
+
+    def _header(self, shard: Shard) -> ShardHeader:
+        config = {
+            **shard.header.config,
+            "bounds": self.bounds.describe(),
+            "refine": self.params.model_dump(mode="json"),
+            "refine_always": self.always,
+        }
+        header = shard.header
+        return ShardHeader(
+            pipeline=header.pipeline,
+            seed=header.seed,
+            shard_index=header.shard_index,
+            config=config,
+            merged_from=header.merged_from,
+        )
 
 
-def _shards(job: Refinement, hands: dict[str, HandArrays], device: Device) -> Iterator[tuple[Path, Path, Shard]]:
-    """Where each shard to refine comes from, the file to write, and the shard."""
-    if job.form is None:
-        found = shard_tree(job.sources)
-        for place in found:
-            _check_free(job, job.out / place)
-        for place, path in found.items():
-            yield path, job.out / place, read_shard(path)
-        return
-    if len(job.sources) != 1 or job.hand is None:
-        raise ConfigError(f"grasps in format {job.form}: give one folder or file, and their hand with --hand")
-    source, model = named_hand(job.cache, job.hand, device)
-    hands[model.sha256] = upload_hand(model, device.alias)
-    for shard in grasp_shards(job.sources[0], job.form, source, model):
-        target = shard_path(job.out, model.name, shard.objects[0].id, 0)
-        _check_free(job, target)
-        yield job.sources[0], target, shard
-
-
-def _check_free(job: Refinement, target: Path) -> None:
-    if target.exists() and not job.force:
-        raise OutputError(f"{target} exists; choose another folder with --out, or --force to replace it")
+def _entry(path: Path) -> dict[str, Any]:
+    """What a refined shard says of itself."""
+    with ShardReader(path) as reader:
+        statistics, attributes = reader.statistics, reader.attributes
+        refined, valid, energy = (reader.column(f"metrics/{name}") for name in ("refined", "valid", "energy"))
+        rows, objects = len(reader), reader.object_ids
+    tried = max(int(statistics["refine_tried"]), 1)
+    return {
+        "shard": str(path),
+        "hand": str(attributes["hand"]),
+        "object": ", ".join(objects),
+        "rows": rows,
+        "refined": int(refined.sum()),
+        "valid_before": int(statistics["refine_valid_before"]),
+        "valid": int(valid.sum()),
+        "energy_before": float(statistics["refine_energy_before"]) / tried,
+        "energy": float(energy.mean()) if rows else None,
+        "seconds": float(statistics["seconds_refine"]),
+    }
 
 
 def _check_rows(path: Path, shard: Shard) -> None:
@@ -131,39 +181,3 @@ def _check_rows(path: Path, shard: Shard) -> None:
     )
     if problems:
         raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset validate' accepts them can be refined")
-
-
-def _hand(job: Refinement, path: Path, shard: Shard, hands: dict[str, HandArrays], device: Device) -> HandArrays:
-    """The hand of a shard, whatever is installed under its name; ``--hand`` is only compared with it."""
-    digest = shard.hand.sha256
-    if digest not in hands:
-        if job.hand is not None and (named := named_hand(job.cache, job.hand, device)[1]).sha256 != digest:
-            raise HandError(
-                f"{path}: its grasps are of hand '{shard.hand.name}' (hash {digest[:12]}), not of '{named.name}' (hash "
-                f"{named.sha256[:12]}); leave --hand out, the hand is in the shard"
-            )
-        _, model = hand_of_shard(job.cache, shard.hand, shard.header.config, device)
-        hands[digest] = upload_hand(model, device.alias)
-    return hands[digest]
-
-
-def _written(shard: Shard, rows: GraspRows, job: Refinement, seconds: float) -> Shard:
-    config = {
-        **shard.header.config,
-        "bounds": job.bounds.describe(),
-        "refine": job.params.model_dump(mode="json"),
-        "refine_always": job.always,
-    }
-    header = ShardHeader(
-        pipeline=shard.header.pipeline,
-        seed=shard.header.seed,
-        shard_index=shard.header.shard_index,
-        config=config,
-        merged_from=shard.header.merged_from,
-    )
-    counts = {
-        "refine_tried": len(rows),
-        "refine_replaced": int(rows.metrics["refined"].sum()),
-        "seconds_refine": seconds,
-    }
-    return replace(shard, header=header, grasps=rows, statistics={**shard.statistics, **counts})

@@ -2,21 +2,20 @@
 
 import difflib
 from pathlib import Path
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from lgrasp.config import parse_model, read_yaml
+from lgrasp.config import read_yaml
+from lgrasp.engine.run import Job
 from lgrasp.errors import ConfigError
 from lgrasp.paths import data_dirs
 from lgrasp.scenes.params import SceneParams
 
 
-class SceneConfig(BaseModel):
-    """Scenes of one hand. Paths are relative to the current folder."""
+class SceneConfig(Job):
+    """What scenes are asked of one hand. Paths are relative to the current folder."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    description: str = ""
     hand: str | None = Field(None, description="Name or path; default: that of the grasps, else allegro.")
     objects: tuple[str, ...] = Field((), description="Names or paths; default: all objects of the grasps.")
     scale: float = Field(1.0, gt=0, description="Factor from the meshes' unit to metres.")
@@ -26,7 +25,6 @@ class SceneConfig(BaseModel):
     scenes: int = Field(100, ge=1)
     seed: int = Field(0, ge=0, lt=2**63)
     out: Path = Field(Path("scenes"), description="Folder of the scenes.")
-    device: str = "auto"
     workers: int = Field(0, ge=0, description="Scenes made at once; 0: one a core.")
     scene: SceneParams = Field(default_factory=lambda: SceneParams.model_validate({}))
 
@@ -40,11 +38,11 @@ def scene_configs() -> dict[str, Path]:
     return found
 
 
-def load_scene_config(name: str) -> SceneConfig:
-    """A config by path or by name.
+def read_scene_config(name: str) -> dict[str, Any]:
+    """What a config holds, by path or by name.
 
     Raises:
-        ConfigError: no such config, or a wrong key or value in it.
+        ConfigError: no such config.
     """
     files, path = scene_configs(), Path(name).expanduser()
     if not path.is_file():
@@ -54,4 +52,7 @@ def load_scene_config(name: str) -> SceneConfig:
             names = ", ".join(files) or "none"
             raise ConfigError(f"unknown config of scenes '{name}'; {hint}known: {names}, or the path of a YAML file")
         path = files[name]
-    return parse_model(SceneConfig, read_yaml(path), f"config {path}")
+    data = read_yaml(path)
+    for key in ("description", "job"):
+        data.pop(key, None)
+    return data

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.jobs.scenes.job import SceneOutcome
 from lgrasp.scenes.reader import SceneReader
 
 _COUNTS = ("grasps_tested", "grasps_free", "grasps_into_table", "grasps_into_objects")
@@ -42,17 +41,3 @@ def describe_scenes(paths: Sequence[Path]) -> dict[str, Any]:
 
 def _nothing() -> dict[str, int]:
     return dict.fromkeys(("scenes", "points", "kept", "free", "without"), 0)
-
-
-def report(outcome: SceneOutcome, asked: int, out: Path) -> dict[str, Any]:
-    """What a job made and what its scenes hold."""
-    made = len(outcome.written)
-    return describe_scenes(outcome.paths) | {
-        "asked": asked,
-        "made": made,
-        "present": len(outcome.paths) - made,
-        "hand": outcome.hand,
-        "out": str(out),
-        "seconds": outcome.wall,
-        "scenes_per_minute": 60.0 * made / outcome.wall if made else None,
-    }

@@ -1,0 +1,94 @@
+"""Grasps in the format of another program: one folder that can be used alone, made as a whole."""
+
+import json
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from lgrasp.dataset import ObjectRecord, find_shards
+from lgrasp.dataset.exports import export_shards
+from lgrasp.dataset.exports.mjcf import Cut
+from lgrasp.engine.cache import content_key
+from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.run import Job, Outcome
+from lgrasp.engine.shard_job import rows_digest
+from lgrasp.errors import OutputError
+
+_INDEX = "export.json"  # the last file of an export: one without it is not whole
+
+
+class ExportJob(Job):
+    """Grasps of shards, all of one hand, with the hand's URDF and all meshes."""
+
+    kernels: ClassVar[str] = ""
+
+    shards: tuple[Path, ...] = Field(description="Shard files, or folders of *.h5 files.")
+    to: str = Field(description="Name of the format.")
+    out: Path = Field(description="Folder to write; empty or not there yet.")
+    limit: int | None = Field(None, description="Most grasps.")
+    where: tuple[str, ...] = Field(
+        (), description="Only rows of which these are true, such as 'metrics/epsilon > 0.01'."
+    )
+
+    @property
+    def folder(self) -> Path:
+        return self.out
+
+    def key(self) -> str:
+        rows = [rows_digest(path) for path in find_shards(self.shards)]
+        return content_key("export", 1, to=self.to, rows=rows, limit=self.limit, where=list(self.where))
+
+    def parts(self) -> list[Part]:
+        return [Part(0, self.out / _INDEX)]
+
+    def present(self, parts: Sequence[Part]) -> dict[int, int]:
+        if not parts or not parts[0].file.is_file():
+            return {}
+        try:
+            index = json.loads(parts[0].file.read_bytes())
+            known, rows = index.get("run_key"), int(index["rows"])
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return {}
+        if known != self.key():
+            raise OutputError(f"{self.out} is not empty: it holds another export; choose another --out")
+        return {0: rows}
+
+    def make(self, part: Part, progress: PartProgress) -> Made:
+        done = export_shards(
+            self.shards,
+            self.out,
+            self.to,
+            where=self.where,
+            limit=self.limit,
+            cut=self._cut() if self.to == "mjcf" else None,
+            advance=lambda done, total: progress(done, f"of {total:,}"),
+            run_key=self.key(),
+        )
+        return Made(done.rows, (), list(done.objects))
+
+    def write(self, part: Part, contents: Any) -> None:
+        """The export is on disk: its files are many, and written as they are made."""
+
+    def report(self, outcome: Outcome) -> dict[str, Any]:
+        """``grasps``, ``objects`` (their codes), ``format``."""
+        objects: list[str] = []
+        for path in outcome.paths:
+            objects = list(json.loads(path.read_bytes())["objects"])
+        return {"grasps": outcome.rows, "objects": objects, "format": self.to}
+
+    def _cut(self) -> Cut:
+        """Convex pieces of objects as the simulation makes them, from the cache; what is approximated is said."""
+        from lgrasp.geometry.decompose import decompose
+        from lgrasp.simulate.scene import object_of_record
+
+        def cut(record: ObjectRecord) -> Sequence[np.ndarray]:
+            solid = object_of_record(record, partial(decompose, store=self.cache))
+            for note in solid.notes:
+                self.cache.warn(f"object '{record.name}': {note}")
+            return solid.pieces
+
+        return cut

@@ -1,0 +1,70 @@
+"""Copies of shards with more quality metrics."""
+
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import Any, ClassVar
+
+from pydantic import Field, PrivateAttr
+
+from lgrasp.dataset.extend import check_shard, extend_shard
+from lgrasp.dataset.metrics import METRICS, TASK_ROWS, is_extended, measure_shard, process_map
+from lgrasp.engine.cache import content_key
+from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.run import Outcome
+from lgrasp.engine.shard_job import ShardJob
+from lgrasp.errors import ConfigError, OutputError
+
+
+class MetricsJob(ShardJob):
+    """Metrics that are computed from the shards alone, added to copies of them."""
+
+    unit: ClassVar[str] = "rows"
+
+    add: tuple[str, ...] = Field(description=f"Metrics: {', '.join(METRICS)}.")
+    settings: tuple[str, ...] = Field((), description="bounds.KEY=VALUE each, in place of what the rows passed.")
+    _open: ExitStack = PrivateAttr(default_factory=ExitStack)
+    _each: Any = PrivateAttr(None)
+
+    def key(self) -> str:
+        return content_key("metrics", 1, names=list(self.add), settings=list(self.settings))
+
+    def parts(self) -> list[Part]:
+        unknown = [name for name in self.add if name not in METRICS]
+        if unknown or not self.add:
+            raise ConfigError(f"unknown metric '{''.join(unknown[:1])}'; known: {', '.join(METRICS)}")
+        for folder in (path if path.is_dir() else path.parent for path in self.shards):
+            if folder.resolve() == self.out.resolve():
+                raise OutputError(f"--out {self.out} is the folder of the shards themselves; choose another")
+        return super().parts()
+
+    def present(self, parts: Sequence[Part]) -> dict[int, int]:
+        """A copy tells by its rows and metrics whether it may stay; other bounds are not seen in it."""
+        if self.settings:
+            return {}
+        return {p.number: p.rows for p in parts if p.source and is_extended(p.file, p.source, self.add)}
+
+    def make(self, part: Part, progress: PartProgress) -> Made:
+        assert part.source is not None
+        check_shard(part.source)
+        workers = self.workers or os.cpu_count() or 1
+        if self._each is None:
+            self._each = self._open.enter_context(process_map(workers))
+        columns = measure_shard(part.source, self.settings, self._each, 8 * workers * TASK_ROWS, progress)
+        return Made(part.rows, {name: columns[name] for name in self.add})
+
+    def write(self, part: Part, contents: Any) -> None:
+        assert part.source is not None
+        extend_shard(part.source, part.file, contents, METRICS)
+
+    def close(self) -> None:
+        self._open.close()
+
+    def report(self, outcome: Outcome) -> dict[str, Any]:
+        """``rows`` made, ``rows_per_s``, ``metrics``."""
+        seconds = outcome.seconds["parts"]
+        return {
+            "rows": outcome.made,
+            "rows_per_s": outcome.made / seconds if seconds else 0.0,
+            "metrics": list(self.add),
+        }
