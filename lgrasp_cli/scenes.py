@@ -47,7 +47,7 @@ def make(
     """Drop objects on a table, look at them with depth cameras, bring in grasps and write one file a scene.
 
     Grasps come from shards (--grasps), or are generated first into OUT/grasps. Those whose hand would run into the
-    table or other objects are told from those that fit. A scene depends on its number and the seed only.
+    table or other objects are marked. A scene depends on its number and the seed only.
 
     Example: lgrasp scenes make mug bowl bottle box sphere hammer --hand allegro -n 100 --out scenes
     """

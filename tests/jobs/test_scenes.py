@@ -13,6 +13,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
 from lgrasp.engine.run import Outcome, run
 from lgrasp.errors import CloudError, ConfigError, LgraspError, OutputError, ShardError
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.jobs.scenes.config import read_scene_config, scene_configs
 from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.jobs.scenes.report import describe_scenes

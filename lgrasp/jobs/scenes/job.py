@@ -47,7 +47,7 @@ class SceneJob(SceneConfig):
             return str(reader.attributes["hand"])
 
     @property
-    def stock(self) -> Stock:
+    def loaded(self) -> Stock:
         """Hand, objects and grasps; loaded, and grasps generated, when they are asked for."""
         if self._stock is None:
             self._stock = load_stock(self, self.cache, self.device_used, self.events.loading)
@@ -82,13 +82,13 @@ class SceneJob(SceneConfig):
 
     def load(self, events: Events, missing: bool) -> None:
         if missing:
-            assert self.stock.items
+            assert self.loaded.items
 
     def at_once(self) -> int:
         return self.threads()
 
     def make(self, part: Part, progress: PartProgress) -> Made:
-        begin, stock, device = time.perf_counter(), self.stock, self.device_used
+        begin, stock, device = time.perf_counter(), self.loaded, self.device_used
         scene = make_scene(stock.hand, stock.record, stock.items, self.scene, self.seed, part.number, device.alias)
         statistics = dict(scene.statistics) | {"device": device.name, "seconds": time.perf_counter() - begin}
         described = self._described() | {"run_key": self.key(), "objects": [item.record.id for item in stock.items]}
@@ -108,4 +108,4 @@ class SceneJob(SceneConfig):
 
     def _described(self) -> dict[str, Any]:
         """What decides the scenes."""
-        return {"scene": self.scene.model_dump(mode="json"), "seed": self.seed, "stock": self.stock.key}
+        return {"scene": self.scene.model_dump(mode="json"), "seed": self.seed, "stock": self.loaded.key}
