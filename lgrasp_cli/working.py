@@ -65,7 +65,7 @@ class How:
         index, tasks = self.array
         return replace(self, array=((index - number) % max(tasks, 1) if 0 <= index < tasks else index, tasks))
 
-    def job(self, kind: "type[Job]", where: str, **given: Any) -> "Job":
+    def job(self, kind: "type[Job]", where: str, /, **given: Any) -> "Job":
         """A job of some kind; options that are None are left to its defaults.
 
         Raises:

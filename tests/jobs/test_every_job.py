@@ -1,0 +1,125 @@
+"""What all jobs share: array tasks make the files of a single run, a cut run goes on, a stop leaves whole files."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import pytest
+
+from lgrasp.dataset import read_shard, write_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import Events
+from lgrasp.engine.report import job_report
+from lgrasp.engine.run import Job, run
+from lgrasp.jobs.export import ExportJob
+from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.metrics import MetricsJob
+from lgrasp.jobs.refine.plan import PlanJob
+from lgrasp.jobs.refine.shards import RefineJob
+from lgrasp.jobs.simulate import SimulateJob
+from lgrasp.simulate.protocol import find_protocol
+
+NAMES = ("generate", "refine", "plan", "simulate", "metrics", "export")
+
+
+@pytest.fixture(scope="module")
+def source(swift, cache_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of three shards of four grasps."""
+    out = tmp_path_factory.mktemp("source")
+    given = {"object": "mug", "rows": 12, "shard_rows": 4, "batch": 128, "workers": 1, "device": "cpu"}
+    generate(GenerateJob(**given, pipeline=swift, out=out, cache=Cache(cache_root)))
+    return out
+
+
+@pytest.fixture
+def jobs(swift, source: Path, cache_root: Path) -> Callable[[str, Path], Job]:
+    """jobs(name, out): a small job of each kind."""
+
+    def make(name: str, out: Path) -> Job:
+        base = {"out": out, "device": "cpu", "workers": 1, "cache": Cache(cache_root)}
+        shards = base | {"shards": (source,)}
+        if name == "simulate":
+            pytest.importorskip("mujoco")
+            return SimulateJob(**shards, protocol=find_protocol("fc"))
+        if name == "generate":
+            return GenerateJob(**base, object="mug", rows=12, shard_rows=4, batch=128, pipeline=swift)
+        if name == "plan":
+            return PlanJob(**base, object="sphere", starts=3)
+        if name == "export":
+            return ExportJob(**shards, to="dexgraspnet")
+        return RefineJob(**shards) if name == "refine" else MetricsJob(**shards, add=("volume",))
+
+    return make
+
+
+def contents(folder: Path) -> dict[str, dict[str, bytes] | bytes]:
+    """What every file holds: rows of shards, bytes of others."""
+    found: dict[str, dict[str, bytes] | bytes] = {}
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        name = path.relative_to(folder).as_posix()
+        if path.suffix != ".h5":
+            found[name] = path.read_bytes()
+            continue
+        rows: dict[str, bytes] = {}
+
+        def visit(key: str, node: object, rows: dict[str, bytes] = rows) -> None:
+            if isinstance(node, h5py.Dataset):
+                rows[key] = node[()].tobytes()
+
+        with h5py.File(path) as file:
+            file["grasps"].visititems(visit)
+        found[name] = rows
+    return found
+
+
+class Stop(Events):
+    """Stops the job before its first part."""
+
+    def cancelled(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tasks_resume_and_stop(jobs, tmp_path: Path, name: str):
+    whole = run(jobs(name, tmp_path / "whole"))
+    assert whole.rows > 0
+    expected = contents(tmp_path / "whole")
+    for task in (1, 0):
+        run(jobs(name, tmp_path / "array"), array=(task, 2))
+    assert contents(tmp_path / "array") == expected
+    again = run(jobs(name, tmp_path / "array"))
+    assert (again.made, again.present) == (0, whole.rows)
+    stopped = run(jobs(name, tmp_path / "cut"), Stop())
+    assert stopped.cancelled
+    assert not stopped.paths
+    done = run(jobs(name, tmp_path / "cut"))
+    assert not done.cancelled
+    assert contents(tmp_path / "cut") == expected
+    data = job_report(done)
+    assert json.loads(json.dumps(data)) == data
+    assert {"asked", "made", "present", "out", "shards", "device", "seconds", "starved", "cancelled"} <= set(data)
+
+
+@pytest.mark.parametrize("name", ["generate", "refine", "simulate", "metrics"])
+def test_a_lost_part_is_made_again(jobs, tmp_path: Path, name: str):
+    outcome = run(jobs(name, tmp_path))
+    expected = contents(tmp_path)
+    kept = [path.stat().st_mtime_ns for path in outcome.paths[1:]]
+    outcome.paths[0].unlink()
+    assert run(jobs(name, tmp_path)).written == [outcome.paths[0]]
+    assert contents(tmp_path) == expected
+    assert [path.stat().st_mtime_ns for path in outcome.paths[1:]] == kept
+
+
+def test_other_rows_are_another_run(jobs, source: Path, tmp_path: Path):
+    (one, *_) = sorted(source.glob("*.h5"))
+    shard = read_shard(one)
+    write_shard(tmp_path / "in" / one.name, shard)
+    job = jobs("refine", tmp_path / "out").changed(shards=(tmp_path / "in",))
+    run(job)
+    other = sorted(source.glob("*.h5"))[1]
+    write_shard(tmp_path / "in" / one.name, read_shard(other))
+    with pytest.raises(Exception, match="belongs to another run"):
+        run(job.changed())
+    assert run(job.changed(), resume=False).made == len(read_shard(other).grasps)
