@@ -1,4 +1,4 @@
-"""Copies a shard and adds numbers per grasp to the copy."""
+"""Copies a shard and adds columns and statistics to the copy."""
 
 import os
 from collections.abc import Mapping
@@ -27,34 +27,46 @@ def check_shard(path: str | os.PathLike[str]) -> None:
 def extend_shard(
     source: str | os.PathLike[str],
     out: str | os.PathLike[str],
-    metrics: Mapping[str, np.ndarray],
-    units: Mapping[str, str],
+    metrics: Mapping[str, np.ndarray] | None = None,
+    units: Mapping[str, str] | None = None,
+    *,
+    physics: Mapping[str, np.ndarray] | None = None,
+    protocol: str = "",
+    statistics: Mapping[str, int | float | str] | None = None,
 ) -> None:
-    """Write a copy of a shard, members that the format does not know included, with more ``metrics/NAME``.
+    """Write a copy of a shard, members that the format does not know included, with more ``metrics/NAME``,
+    ``physics/NAME`` and statistics.
 
-    Stored bytes are copied as they are, so memory stays bounded. A metric that is there already is replaced. The same
-    input always gives the same bytes.
+    Stored bytes are copied as they are, so memory stays bounded. What is there already under a name is replaced. The
+    same input always gives the same bytes.
 
     Args:
         source: A shard that conforms (see :func:`check_shard`); damage would be copied along.
         out: The file to write.
         metrics: Numbers by name, each shape [N].
         units: Unit by name.
+        physics: Verdicts by name, each shape [N, ...].
+        protocol: That of the verdicts.
+        statistics: Numbers or texts by name.
 
     Raises:
-        ShardError: The source cannot be read, or a metric has another number of rows.
+        ShardError: The source cannot be read, or a column has another number of rows.
         OutputError: ``out`` cannot be written.
     """
+    columns = {f"metrics/{name}": np.asarray(values, "f4") for name, values in (metrics or {}).items()}
+    columns |= {f"physics/{name}": np.asarray(values) for name, values in (physics or {}).items()}
     with new_shard_file(out) as file, open_hdf5(source) as old, reading(source):
         n = old["grasps/q"].shape[0]
-        wrong = [name for name, values in metrics.items() if np.shape(values) != (n,)]
-        if wrong:
-            raise ShardError(f"{source}: metric {wrong[0]} has shape {np.shape(metrics[wrong[0]])}, must be ({n},)")
-        _copy(old, file, {f"grasps/metrics/{name}" for name in metrics})
-        for name in sorted(metrics):
-            dataset = create_rows(file, f"metrics/{name}", (n,), np.dtype("f4"), unit=units[name])
+        for name, values in columns.items():
+            if values.shape[:1] != (n,) or (values.ndim > 1 and name.startswith("metrics/")):
+                raise ShardError(f"{source}: {name} has shape {values.shape}, must have {n} rows")
+        _copy(old, file, {f"grasps/{name}" for name in columns})
+        for name, values in sorted(columns.items()):
+            unit = (units or {}).get(name.partition("/")[2], "")
+            dataset = create_rows(file, name, values.shape, values.dtype, unit=unit, protocol=protocol)
             if n:
-                dataset[...] = metrics[name]
+                dataset[...] = values
+        file["statistics"].attrs.update(dict(statistics or {}))
         finish(file)
 
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from lgrasp.dataset.exports.folder import GRASPS, open_folder
+from lgrasp.dataset.exports.grasp_set import GraspSet, make_set, order_of
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_objects
-from lgrasp.dataset.exports.plan import Batch, Plan
-from lgrasp.dataset.exports.records import GraspSet, make_set, order_of
+from lgrasp.dataset.exports.selection import Batch, Plan
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import euler_from_quaternion, quaternion_from_euler
 

@@ -12,9 +12,9 @@ from trimesh.exchange.obj import export_obj
 
 import lgrasp
 from lgrasp.dataset.exports.files import write_file
+from lgrasp.dataset.exports.grasp_set import ReadObject
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
-from lgrasp.dataset.exports.plan import ExportObject, Plan
-from lgrasp.dataset.exports.records import ReadObject
+from lgrasp.dataset.exports.selection import ExportObject, Plan
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 

@@ -10,12 +10,12 @@ from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgr
 from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
 from lgrasp.dataset.exports.files import check_empty, write_file
 from lgrasp.dataset.exports.folder import write_assets, write_index
+from lgrasp.dataset.exports.grasp_set import GraspSet
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
-from lgrasp.dataset.exports.plan import Plan, make_plan
 from lgrasp.dataset.exports.readme import readme
-from lgrasp.dataset.exports.records import GraspSet
+from lgrasp.dataset.exports.selection import Plan, make_plan
 from lgrasp.dataset.exports.where import parse_condition
 from lgrasp.dataset.files import find_shards
 from lgrasp.errors import ConfigError

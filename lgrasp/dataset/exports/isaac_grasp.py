@@ -10,9 +10,9 @@ import yaml
 
 from lgrasp.dataset.exports.files import writing
 from lgrasp.dataset.exports.folder import GRASPS, open_folder
+from lgrasp.dataset.exports.grasp_set import GraspSet, ReadObject, make_set, order_of
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.dataset.exports.plan import Batch, Plan
-from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order_of
+from lgrasp.dataset.exports.selection import Batch, Plan
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 

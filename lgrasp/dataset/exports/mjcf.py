@@ -11,10 +11,10 @@ from trimesh.exchange.obj import export_obj
 
 from lgrasp.dataset.exports.files import write_file, write_small
 from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, object_text, open_folder
+from lgrasp.dataset.exports.grasp_set import GraspSet, ReadObject, make_set, order_of
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.mjcf_scene import Keyframe, MjcfScene, SceneObject
-from lgrasp.dataset.exports.plan import Batch, Plan
-from lgrasp.dataset.exports.records import GraspSet, ReadObject, make_set, order_of
+from lgrasp.dataset.exports.selection import Batch, Plan
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 from lgrasp.grasp.records import ObjectRecord

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from lgrasp.dataset.exports.folder import HAND, OBJECTS
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.dataset.exports.plan import Plan
+from lgrasp.dataset.exports.selection import Plan
 
 _TEXT = """\
 {rows:,} grasps of the hand {hand}, exported by lgrasp from {shards}{chosen}.

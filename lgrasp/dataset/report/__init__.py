@@ -1,5 +1,5 @@
 """``lgrasp dataset report``: what a data set holds, as one HTML page and as numbers."""
 
-from lgrasp.dataset.report.report import read_dataset, report_dataset
+from lgrasp.dataset.report.write import read_dataset, report_dataset
 
 __all__ = ["read_dataset", "report_dataset"]

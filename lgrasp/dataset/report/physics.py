@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
-"""Of the six columns of ``P_directions``."""
+from lgrasp.simulate.protocol import DIRECTIONS
 
 _HOLDS, _DIRECTIONS = "_holds", "_directions"
 
