@@ -91,7 +91,7 @@ class RowChecks:
         """Numbers of the good rows, in the unit of the check's bound."""
         name, bound = CHECKS[check]
         self.values[name][self.good] = value
-        self.failed[check][self.good] = np.logical_not(value <= bound)
+        self.failed[check][self.good[~(value <= bound)]] = True
 
     def _form(self) -> None:
         """Finite numbers, unit quaternions and indices that exist."""
@@ -115,7 +115,7 @@ class RowChecks:
         known = np.array([self.hand.index.get(name, -1) for name in names] + [-1])
         self.link_of = known[np.where((links >= 0) & (links < len(names)), links, len(names))]
         absent = (self.index >= len(self.shard.objects)).any(axis=1) | ~present.any(axis=1)
-        self.failed["indices"] = (self.used & (self.link_of < 0)).any(axis=(1, 2)) | absent
+        self.failed["indices"][:] = (self.used & (self.link_of < 0)).any(axis=(1, 2)) | absent
 
     def _joints(self) -> dict[str, np.ndarray]:
         """Limits and mimic relations; values of all joints."""
