@@ -29,6 +29,8 @@ _PHYSICS_BATCH = 32  # candidates, when their grasps are simulated on the CPU, w
 _GPU_SMALLEST, _GPU_LARGEST = 2_048, 65_536  # candidates of a batch
 _GPU_WHOLE = 16_384  # candidates: a batch of more is cut in two
 _GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
+_CONTACT_BYTES = 64  # the same for a contact of its domain
+_SET_BYTES = 32  # the same for a set of contacts
 _STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
 
@@ -110,10 +112,11 @@ def _batches(
                 future.cancel()
 
 
-def _most_candidates(device: str, groups: int) -> int:
+def _most_candidates(device: str, groups: int, pipeline: Pipeline) -> int:
     """Candidates that a batch may have on a GPU: two batches take at most half of the free memory."""
     free = wp.get_device(device).free_memory
-    return int(min(max(free / 4 / (_GROUP_BYTES * groups), _GPU_SMALLEST), _GPU_LARGEST))
+    tables = _CONTACT_BYTES * pipeline.params("domain").keep + _SET_BYTES * pipeline.params("search").per_pose
+    return int(min(max(free / 4 / (max(_GROUP_BYTES, tables) * groups), _GPU_SMALLEST), _GPU_LARGEST))
 
 
 def _batch_size(
@@ -198,7 +201,7 @@ def make_shard(
         found.restore(account)
     earlier, start = result.wall, time.perf_counter()
     fixed, passes = _fixed_batch(context, execution), pipeline.params("search").passes
-    most = _GPU_LARGEST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups)
+    most = _GPU_LARGEST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups, pipeline)
 
     def size(running: int) -> int:
         # going by those so far

@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,12 @@ class ObjectModel:
     sdf: np.ndarray
     sdf_origin: np.ndarray
     sdf_cell: float
+
+    @cached_property
+    def area(self) -> float:
+        """Of the surface [m²]."""
+        a, b, c = (self.vertices[self.faces[:, i]].astype(float) for i in range(3))
+        return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """All fields as arrays (text, flags and numbers as 0-d arrays), free of pickles, for an npz file."""

@@ -33,6 +33,7 @@ class DomainValues:
     keep: wp.int32
     cosine: wp.float32  # least, of hand and object normal
     fingers: wp.int32
+    stride: wp.int32  # coprime to the number of contact points: multiples of it visit every one
 
 
 @wp.func
@@ -105,19 +106,25 @@ def _drawing(row_at: Any, pick_at: Any, looks_near: bool) -> Any:
         R = wp.transform_get_rotation(poses.pose[row])
         t = wp.transform_get_translation(poses.pose[row])
         n = int(0)
-        for a in range(params.attempts):
-            near = int(-1)
+        i = int(0)
+        attempts = params.attempts
+        if wp.static(not looks_near):
+            # every point once at most, spread over the surface
+            i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+            attempts = wp.min(attempts, obj.contacts)
+        for a in range(attempts):
             if wp.static(looks_near):
                 near = poses.anchor[row, g]
                 if n > 0:
                     near = candidates_out.surface[row, g, a % n]
-            i = int(0)
-            if a < params.attempts // 2 or near < 0:
-                i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+                if a < attempts // 2 or near < 0:
+                    i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+                else:
+                    # few were found all over the surface: look about those
+                    move = int(wp.randf(state) * (2.0 * _NEIGHBOURS + 1.0)) - int(_NEIGHBOURS)
+                    i = wp.clamp(near + move, 0, obj.contacts - 1)
             else:
-                # few were found all over the surface: look about those
-                move = int(wp.randf(state) * (2.0 * _NEIGHBOURS + 1.0)) - int(_NEIGHBOURS)
-                i = wp.clamp(near + move, 0, obj.contacts - 1)
+                i = (i + params.stride) % obj.contacts
             p = wp.quat_rotate(R, obj.contact_points[i]) + t
             normal = -wp.quat_rotate(R, obj.contact_normals[i])
             at = row_at(field, slot, p, normal)
@@ -140,7 +147,7 @@ draw_domains = {
     "voxel": _drawing(_voxel_row, _from_voxel, True),
     "bvh": _drawing(_any_row, _from_boxes, False),
 }
-"""Kernels by index. ``bvh``, as published, asks every patch of the group about points from all over the surface."""
+"""Kernels by index. ``bvh``, as published, asks every patch of the group about points all over the surface."""
 
 
 @wp.kernel

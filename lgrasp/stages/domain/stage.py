@@ -13,7 +13,7 @@ from lgrasp.stages.context import Context
 from lgrasp.stages.domain.kernels import DomainCount, DomainValues, draw_domains, drop_poor, keep_frozen
 from lgrasp.stages.domain.params import DomainParams
 
-VERSION = 2
+VERSION = 3
 
 
 def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[CandidateTable, Tally]:
@@ -33,7 +33,8 @@ def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[Cand
         q=wp.empty((n, groups, params.keep), dtype=vec_dof, device=d),
     )
     hand, field, boxes = context.hand.struct, context.field.struct, context.field.boxes
-    values = make_struct(DomainValues, params, cosine=math.cos(math.radians(params.angle)))
+    cosine, stride = math.cos(math.radians(params.angle)), _stride(len(context.object.model.contact_points))
+    values = make_struct(DomainValues, params, cosine=cosine, stride=stride)
     wp.launch(
         draw_domains["voxel" if boxes is None else "bvh"],
         dim=(n, groups),
@@ -46,3 +47,8 @@ def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[Cand
     tally = empty_tally(DomainCount, d)
     wp.launch(drop_poor, n, [values], [table.struct, tally.device], device=d)
     return table, tally
+
+
+def _stride(points: int) -> int:
+    """A number coprime to the number of points, near its golden section: multiples of it are spread well."""
+    return next(n for n in range(max(1, round(0.618 * points)), 2 * points + 2) if math.gcd(n, points) == 1)

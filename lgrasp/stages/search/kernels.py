@@ -1,7 +1,6 @@
-"""Kernels of the search stage: block-wise zeroth-order search from many random starts, then the sets that are kept."""
+"""Kernels of the search stage about its methods: what may be combined, which sets are sound, which are kept."""
 
 from enum import IntEnum
-from typing import Any
 
 import warp as wp
 
@@ -9,18 +8,15 @@ from lgrasp.grasp.structs import Candidates, Sets
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.constants import INSCRIBED
-from lgrasp.math.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward
-from lgrasp.math.qp import MAX_CONTACTS, balance, frictionless, unresisted_load
+from lgrasp.math.kinematics import MAX_JOINTS, group_forward
+from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted_load
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.stages.search.params import MAX_KINDS, MAX_RESTARTS
+from lgrasp.stages.search.sets import FoundSets, SearchValues, TriedSets, Usable, centred, put_contact
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _INSCRIBED = wp.constant(INSCRIBED)
-_STARTS = wp.constant(MAX_RESTARTS)
-vec_set = wp.types.vector(MAX_GROUPS, wp.int32)
-vec_kinds = wp.types.vector(MAX_KINDS, wp.int32)
 
 
 class SearchCount(IntEnum):
@@ -31,95 +27,10 @@ class SearchCount(IntEnum):
     SETS = 2
 
 
-@wp.struct
-class SearchValues:
-    """SearchParams and GraspBounds as kernels read them."""
-
-    contacts: vec_kinds
-    kinds: wp.int32  # entries of ``contacts``
-    threshold: wp.float32  # of the squared residual
-    friction: wp.float32
-    max_gswo: wp.float32
-    max_unresisted_load: wp.float32
-    least_force: wp.float32
-    torque_scale: wp.float32  # [1/m]
-    moves: wp.int32
-    rounds: wp.int32
-    per_pose: wp.int32
-    min_self_distance: wp.float32  # [m]
-    separation: wp.float32  # [rad]
-
-
-@wp.struct
-class Usable:
-    """Candidates that may be combined."""
-
-    size: wp.array2d(dtype=wp.int32)  # (P, G) how many
-    candidate: wp.array3d(dtype=wp.int32)  # (P, G, M) which: the first ``size``
-
-
-@wp.struct
-class TriedSets:
-    """What L starts at each pose came to."""
-
-    chosen: wp.array3d(dtype=wp.int32)  # (P, L, G) candidate of each group, -1 unused
-    score: wp.array2d(dtype=wp.float32)  # (P, L) norm of the residual wrench, below 0: no set
-
-
-@wp.struct
-class FoundSets:
-    """Up to S sets of each pose."""
-
-    number: wp.array(dtype=wp.int32)  # (P,) how many
-    chosen: wp.array3d(dtype=wp.int32)  # (P, S, G) candidate of each group, -1 unused
-    score: wp.array2d(dtype=wp.float32)  # (P, S) norm of the residual wrench
-
-
-@wp.func
-def _arms(points: wp.array(dtype=wp.vec3), k: wp.int32, arms: wp.array(dtype=wp.vec3)):
-    """Arms of contact points about their centroid."""
-    centroid = wp.vec3(0.0)
-    for i in range(k):
-        centroid = centroid + points[i]
-    for i in range(k):
-        arms[i] = points[i] - centroid / float(k)
-    return k
-
-
-@wp.func
-def _frictionless(
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    k: wp.int32,
-    friction: wp.float32,
-    torque_scale: wp.float32,
-):
-    """(FSWO residual norm, smallest share of the normal force)."""
-    return frictionless(points, normals, k, torque_scale)
-
-
-@wp.func
-def _with_friction(
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    k: wp.int32,
-    friction: wp.float32,
-    torque_scale: wp.float32,
-):
-    """(GSWO residual norm, smallest share of the normal force)."""
-    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    _arms(points, k, arms)
-    r = balance(arms, normals, k, friction * _INSCRIBED, 0, torque_scale, 0.0, forces)
-    low = float(1.0)
-    for i in range(k):
-        low = wp.min(low, wp.dot(forces[i], normals[i]))
-    return wp.vec2(r, low)
-
-
 @wp.kernel
 def list_usable(
     # in
+    obj: Object,
     state: wp.int32,
     candidates: Candidates,
     # out
@@ -131,142 +42,10 @@ def list_usable(
     for m in range(candidates.count[row, g]):
         if candidates.state[row, g, m] == state:
             usable_out.candidate[row, g, n] = m
+            if usable_out.point.shape[2] > 0:
+                usable_out.point[row, g, n] = obj.contact_points[candidates.surface[row, g, m]]
             n += 1
     usable_out.size[row, g] = n
-
-
-@wp.func
-def _any(usable: Usable, row: wp.int32, g: wp.int32, u: wp.float32):
-    """One of the usable candidates of a group, u in [0, 1)."""
-    n = usable.size[row, g]
-    return usable.candidate[row, g, wp.min(int(u * float(n)), n - 1)]
-
-
-def _starts(measure: Any) -> Any:
-    """The search kernel for one residual; what it does not need would only take registers."""
-
-    @wp.kernel
-    def try_starts(
-        # in
-        obj: Object,
-        params: SearchValues,
-        seed: wp.array(dtype=wp.int32),
-        first: wp.int32,
-        candidates: Candidates,
-        usable: Usable,
-        found: FoundSets,
-        # out
-        tried_out: TriedSets,
-    ):
-        """One thread per (pose, start): finger contacts (and the palm's) with small residual (Alg. 2 for eq. 6).
-
-        The domains D_i are the usable candidates; one contact at a time is replaced by another of its D_i, and what
-        lowers the residual J stays. Poses that have ``per_pose`` sets already are left alone.
-
-        Args:
-            seed: of the stage, (1,).
-            first: number of start 0.
-        """
-        row, lane = wp.tid()
-        tried_out.score[row, lane] = -1.0
-        if found.number[row] >= params.per_pose:
-            return
-        G = usable.size.shape[1]
-        state = wp.rand_init(seed[0], candidates.poses.index[row] * _STARTS + first + lane)
-        available = int(0)
-        for g in range(G):
-            if usable.size[row, g] > 0:
-                available += 1
-        palm = candidates.poses.palm_surface[row]
-        k = params.contacts[wp.min(int(wp.randf(state) * float(params.kinds)), params.kinds - 1)]
-        if k > available:
-            # the palm's contact may stand in for one finger
-            if palm < 0 or k - 1 > available or available == 0:
-                return
-            k = available
-        # contacts in the object's frame, where wrench residuals are the same: chosen groups first, then the palm
-        points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-        normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-        chosen = vec_set()
-        owner = vec_set()
-        left = available
-        n = int(0)
-        for g in range(G):
-            chosen[g] = -1
-            if usable.size[row, g] > 0:
-                if wp.randf(state) * float(left) < float(k - n):
-                    m = _any(usable, row, g, wp.randf(state))
-                    chosen[g] = m
-                    owner[n] = g
-                    points[n] = obj.contact_points[candidates.surface[row, g, m]]
-                    normals[n] = -obj.contact_normals[candidates.surface[row, g, m]]
-                    n += 1
-                left -= 1
-        k = n
-        if palm >= 0:
-            points[n] = obj.contact_points[palm]
-            normals[n] = -obj.contact_normals[palm]
-            n += 1
-        goal = wp.sqrt(params.threshold)
-        score = measure(points, normals, n, params.friction, params.torque_scale)
-        # the most finger contacts a set may come to have
-        most = int(0)
-        for i in range(params.kinds):
-            most = wp.max(most, params.contacts[i])
-        most = wp.min(most, available)
-        free = int(0)  # contacts before this one stay: they were searched in an earlier round
-        for r in range(params.rounds):
-            for _m in range(params.moves):
-                if score[0] < goal and score[1] >= params.least_force:
-                    break
-                # replace the contact of one chosen group; keep what lowers the residual
-                i = free + wp.min(int(wp.randf(state) * float(k - free)), k - free - 1)
-                g = owner[i]
-                m = _any(usable, row, g, wp.randf(state))
-                old_point = points[i]
-                old_normal = normals[i]
-                points[i] = obj.contact_points[candidates.surface[row, g, m]]
-                normals[i] = -obj.contact_normals[candidates.surface[row, g, m]]
-                trial = measure(points, normals, n, params.friction, params.torque_scale)
-                if trial[0] < score[0] or (score[0] < goal and trial[0] < goal):
-                    score = trial
-                    chosen[g] = m
-                else:
-                    points[i] = old_point
-                    normals[i] = old_normal
-            if (score[0] < goal and score[1] >= params.least_force) or k >= most or r + 1 == params.rounds:
-                break
-            # the set lacks stability: add a contact of an unused finger, and search that one
-            skip = wp.min(int(wp.randf(state) * float(available - k)), available - k - 1)
-            added = int(-1)
-            for g in range(G):
-                if added < 0 and usable.size[row, g] > 0 and chosen[g] < 0:
-                    if skip == 0:
-                        added = g
-                    skip -= 1
-            if palm >= 0:
-                points[n] = points[k]
-                normals[n] = normals[k]
-            m = _any(usable, row, added, wp.randf(state))
-            chosen[added] = m
-            owner[k] = added
-            points[k] = obj.contact_points[candidates.surface[row, added, m]]
-            normals[k] = -obj.contact_normals[candidates.surface[row, added, m]]
-            free = k
-            k += 1
-            n += 1
-            score = measure(points, normals, n, params.friction, params.torque_scale)
-        if score[0] >= goal or score[1] < params.least_force:
-            return
-        for g in range(G):
-            tried_out.chosen[row, lane, g] = chosen[g]
-        tried_out.score[row, lane] = score[0]
-
-    return try_starts
-
-
-try_starts = {"fswo": _starts(_frictionless), "gswo": _starts(_with_friction)}
-"""Kernels by residual."""
 
 
 @wp.kernel
@@ -326,10 +105,8 @@ def check_starts(
         elif tried_out.chosen[row, lane, g] >= 0:
             s = candidates.surface[row, g, tried_out.chosen[row, lane, g]]
         if s >= 0:
-            points[n] = obj.contact_points[s]
-            normals[n] = -obj.contact_normals[s]
-            n += 1
-    _arms(points, n, arms)
+            n = put_contact(obj, s, n, points, normals)
+    centred(points, n, arms)
     limit = params.max_gswo
     if balance(arms, normals, n, params.friction * _INSCRIBED, 0, params.torque_scale, 0.5 * limit, forces) > limit:
         tried_out.score[row, lane] = -1.0

@@ -1,11 +1,11 @@
 """search: candidates -> sets of contacts that balance."""
 
+import math
 from typing import Any
 
 import warp as wp
 
 from lgrasp.errors import ConfigError
-from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.math.kinematics import MAX_GROUPS
@@ -14,22 +14,19 @@ from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.search.kernels import (
-    FoundSets,
     SearchCount,
-    SearchValues,
-    TriedSets,
-    Usable,
     check_starts,
     keep_sets,
     list_hits,
     list_usable,
     take_sets,
-    try_starts,
-    vec_kinds,
 )
-from lgrasp.stages.search.params import MAX_KEEP, MAX_KINDS, SearchParams
+from lgrasp.stages.search.mutate_kernels import mutate_contacts
+from lgrasp.stages.search.params import MAX_KINDS, SearchParams
+from lgrasp.stages.search.sets import FoundSets, SearchValues, TriedSets, Usable, vec_kinds
+from lgrasp.stages.search.swap_kernels import swap_contacts
 
-VERSION = 7
+VERSION = 8
 
 _CPU_STARTS = 2  # of a pose in one launch
 _GPU_STARTS = 10
@@ -46,34 +43,37 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     """
     d = context.device
     n, groups, keep = inputs.surface.shape
-    if groups > MAX_GROUPS or keep > MAX_KEEP:
-        raise ConfigError(
-            f"search: {groups} fingers with {keep} candidates; at most {MAX_GROUPS} and {MAX_KEEP} are supported"
-        )
+    if groups > MAX_GROUPS:
+        raise ConfigError(f"search: {groups} fingers; at most {MAX_GROUPS} are supported")
     found, usable, tried = FoundSets(), Usable(), TriedSets()
     found.number = wp.zeros(n, dtype=wp.int32, device=d)
     found.chosen = wp.full((n, params.per_pose, groups), -1, dtype=wp.int32, device=d)
     found.score = wp.zeros((n, params.per_pose), dtype=wp.float32, device=d)
     usable.size = wp.empty((n, groups), dtype=wp.int32, device=d)
     usable.candidate = wp.empty((n, groups, keep), dtype=wp.int32, device=d)
+    swap = params.method == "swap"
+    usable.point = wp.empty((0, 0, 0) if swap else (n, groups, keep), dtype=wp.vec3, device=d)
+    hand, obj, values = context.hand.struct, context.object.struct, _values(params, context)
     state = State.REALISED if context.realised else State.DRAWN
-    wp.launch(list_usable, (n, groups), [int(state), inputs.struct], [usable], device=d)
-    hand, obj, values = context.hand.struct, context.object.struct, _values(params, context.bounds)
+    wp.launch(list_usable, (n, groups), [obj, int(state), inputs.struct], [usable], device=d)
+    kernel = (swap_contacts if swap else mutate_contacts)[params.score]
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
-    lanes = min(params.restarts, _CPU_STARTS if d == "cpu" else _GPU_STARTS)
+    few = _CPU_STARTS if d == "cpu" else _GPU_STARTS
+    lanes = min(params.restarts, few if params.per_pose < params.restarts else params.restarts)
     tried.chosen = wp.empty((n, lanes, groups), dtype=wp.int32, device=d)
     tried.score = wp.empty((n, lanes), dtype=wp.float32, device=d)
     for first in range(0, params.restarts, lanes):
         if first + lanes > params.restarts:
             tried.score = tried.score[:, : params.restarts - first]
         asked = [obj, values, context.seed("search", context.salt), first, inputs.struct, usable, found]
-        wp.launch(try_starts[params.score], tried.score.shape, asked, [tried], device=d)
-        # the few that found a set, side by side
-        hits = wp.empty(tried.score.size, dtype=wp.int32, device=d)
-        number_of_hits = wp.zeros(1, dtype=wp.int32, device=d)
-        wp.launch(list_hits, tried.score.shape, [tried], [number_of_hits, hits], device=d)
-        asked = [number_of_hits, hits, hand, obj, values, int(context.realised), inputs.struct]
-        wp.launch(check_starts, tried.score.size, asked, [tried], device=d)
+        wp.launch(kernel, tried.score.shape, asked, [tried], device=d)
+        if swap:
+            # the few that found a set, side by side
+            hits = wp.empty(tried.score.size, dtype=wp.int32, device=d)
+            number_of_hits = wp.zeros(1, dtype=wp.int32, device=d)
+            wp.launch(list_hits, tried.score.shape, [tried], [number_of_hits, hits], device=d)
+            asked = [number_of_hits, hits, hand, obj, values, int(context.realised), inputs.struct]
+            wp.launch(check_starts, tried.score.size, asked, [tried], device=d)
         wp.launch(keep_sets, n, [values, inputs.struct, tried], [found], device=d)
     upto = wp.clone(found.number)
     running_sums(upto)
@@ -92,13 +92,14 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     return table, tally
 
 
-def _values(params: SearchParams, bounds: GraspBounds) -> Any:
-    kinds = len(params.contacts)
+def _values(params: SearchParams, context: Context) -> Any:
+    kinds, model = len(params.contacts), context.object.model
     return make_struct(
         SearchValues,
         params,
-        bounds,
+        context.bounds,
         contacts=vec_kinds(*params.contacts, *[0] * (MAX_KINDS - kinds)),
         kinds=kinds,
-        max_gswo=params.gswo_share * bounds.max_gswo,
+        max_gswo=params.gswo_share * context.bounds.max_gswo,
+        mutation_sigma=params.mutation_sigma * math.sqrt(model.area / len(model.contact_points)),
     )

@@ -1,0 +1,187 @@
+"""What all methods of the search share: the sets of contacts that they make, how one begins, and what it is worth."""
+
+import warp as wp
+
+from lgrasp.grasp.structs import Candidates
+from lgrasp.math.constants import INSCRIBED
+from lgrasp.math.kinematics import MAX_GROUPS
+from lgrasp.math.qp import MAX_CONTACTS, balance, frictionless
+from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.stages.search.params import MAX_KINDS, MAX_RESTARTS
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_MAX_STARTS = wp.constant(MAX_RESTARTS)
+_INSCRIBED = wp.constant(INSCRIBED)
+vec_set = wp.types.vector(MAX_GROUPS, wp.int32)
+vec_kinds = wp.types.vector(MAX_KINDS, wp.int32)
+
+
+@wp.struct
+class SearchValues:
+    """SearchParams and GraspBounds as kernels read them."""
+
+    contacts: vec_kinds
+    kinds: wp.int32  # entries of ``contacts``
+    threshold: wp.float32  # of the squared residual
+    friction: wp.float32
+    max_gswo: wp.float32
+    max_unresisted_load: wp.float32
+    least_force: wp.float32
+    torque_scale: wp.float32  # [1/m]
+    moves: wp.int32
+    rounds: wp.int32
+    sweeps: wp.int32
+    pivots: wp.int32
+    mutations: wp.int32
+    mutation_sigma: wp.float32  # [m]
+    per_pose: wp.int32
+    min_self_distance: wp.float32  # [m]
+    separation: wp.float32  # [rad]
+
+
+@wp.struct
+class Usable:
+    """Candidates that may be combined."""
+
+    size: wp.array2d(dtype=wp.int32)  # (P, G) how many
+    candidate: wp.array3d(dtype=wp.int32)  # (P, G, M) which: the first ``size``
+    point: wp.array3d(dtype=wp.vec3)  # (P, G, M) where they are on the object [m]; (0, 0, 0) if nobody asks
+
+
+@wp.struct
+class TriedSets:
+    """What L starts at each pose came to."""
+
+    chosen: wp.array3d(dtype=wp.int32)  # (P, L, G) candidate of each group, -1 unused
+    score: wp.array2d(dtype=wp.float32)  # (P, L) norm of the residual wrench, below 0: no set
+
+
+@wp.struct
+class FoundSets:
+    """Up to S sets of each pose."""
+
+    number: wp.array(dtype=wp.int32)  # (P,) how many
+    chosen: wp.array3d(dtype=wp.int32)  # (P, S, G) candidate of each group, -1 unused
+    score: wp.array2d(dtype=wp.float32)  # (P, S) norm of the residual wrench
+
+
+@wp.func
+def centred(points: wp.array(dtype=wp.vec3), k: wp.int32, arms: wp.array(dtype=wp.vec3)):
+    """Arms of contact points about their centroid."""
+    centroid = wp.vec3(0.0)
+    for i in range(k):
+        centroid = centroid + points[i]
+    for i in range(k):
+        arms[i] = points[i] - centroid / float(k)
+    return k
+
+
+@wp.func
+def _frictionless(
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    friction: wp.float32,
+    torque_scale: wp.float32,
+):
+    """(FSWO residual norm, smallest share of the normal force)."""
+    return frictionless(points, normals, k, torque_scale)
+
+
+@wp.func
+def _with_friction(
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    k: wp.int32,
+    friction: wp.float32,
+    torque_scale: wp.float32,
+):
+    """(GSWO residual norm, smallest share of the normal force)."""
+    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    centred(points, k, arms)
+    r = balance(arms, normals, k, friction * _INSCRIBED, 0, torque_scale, 0.0, forces)
+    low = float(1.0)
+    for i in range(k):
+        low = wp.min(low, wp.dot(forces[i], normals[i]))
+    return wp.vec2(r, low)
+
+
+MEASURES = {"fswo": _frictionless, "gswo": _with_friction}
+"""Residuals J by name."""
+
+
+@wp.func
+def any_usable(usable: Usable, row: wp.int32, g: wp.int32, u: wp.float32):
+    """One of the usable candidates of a group, u in [0, 1)."""
+    n = usable.size[row, g]
+    return usable.candidate[row, g, wp.min(int(u * float(n)), n - 1)]
+
+
+@wp.func
+def put_contact(
+    obj: Object, surface: wp.int32, i: wp.int32, points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3)
+):
+    """Make object contact point ``surface`` contact i of a set: points [m] and inward normals, local arrays."""
+    points[i] = obj.contact_points[surface]
+    normals[i] = -obj.contact_normals[surface]
+    return i + 1
+
+
+@wp.func
+def start_set(
+    obj: Object,
+    params: SearchValues,
+    candidates: Candidates,
+    usable: Usable,
+    row: wp.int32,
+    state: wp.uint32,
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+):
+    """Random contacts of random groups, in ``points`` and ``normals``: those of the groups first, then the palm's.
+
+    All in the object's frame, where wrench residuals are the same.
+
+    Returns:
+        Contacts of groups (0: too few groups can touch), all contacts, candidate of each group (-1 none), group of each
+        contact, and the random state that comes after.
+    """
+    own = state
+    G = usable.size.shape[1]
+    chosen = vec_set()
+    owner = vec_set()
+    available = int(0)
+    for g in range(G):
+        chosen[g] = -1
+        if usable.size[row, g] > 0:
+            available += 1
+    palm = candidates.poses.palm_surface[row]
+    k = params.contacts[wp.min(int(wp.randf(own) * float(params.kinds)), params.kinds - 1)]
+    if k > available:
+        # the palm's contact may stand in for one finger
+        if palm < 0 or k - 1 > available:
+            return int(0), int(0), chosen, owner, own
+        k = available
+    left = available
+    n = int(0)
+    for g in range(G):
+        if usable.size[row, g] > 0:
+            if wp.randf(own) * float(left) < float(k - n):
+                m = any_usable(usable, row, g, wp.randf(own))
+                chosen[g] = m
+                owner[n] = g
+                n = put_contact(obj, candidates.surface[row, g, m], n, points, normals)
+            left -= 1
+    k = n
+    if palm >= 0:
+        n = put_contact(obj, palm, n, points, normals)
+    return k, n, chosen, owner, own
+
+
+@wp.func
+def start_state(seed: wp.int32, index: wp.int32, start: wp.int32):
+    """Random state of one start at the pose of candidate ``index``."""
+    return wp.rand_init(seed, index * _MAX_STARTS + start)
