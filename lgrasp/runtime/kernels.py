@@ -4,8 +4,9 @@ import importlib
 import os
 import pkgutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from types import ModuleType
 
 import warp as wp
 
@@ -24,9 +25,16 @@ def kernel_modules(*prefixes: str) -> list[str]:
     return sorted(
         name
         for name, module in list(sys.modules.items())
-        if name.startswith(prefixes or "lgrasp.")
-        and any(isinstance(x, wp.Kernel) and x.func.__module__ == name for x in vars(module).values())
+        if name.startswith(prefixes or "lgrasp.") and any(kernel.func.__module__ == name for kernel in _kernels(module))
     )
+
+
+def _kernels(module: ModuleType) -> Iterator[wp.Kernel]:
+    """Kernels among the values of a module, or in a table of variants of one."""
+    for value in list(vars(module).values()):
+        for x in value.values() if isinstance(value, dict) else (value,):
+            if isinstance(x, wp.Kernel):
+                yield x
 
 
 def load_kernels(device: str, modules: list[str], progress: Callable[[str, float], None] | None = None) -> None:

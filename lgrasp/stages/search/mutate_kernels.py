@@ -54,8 +54,8 @@ def _mutating(measure: Any) -> Any:
     ):
         """One thread per (pose, start): finger contacts (and the palm's) with small residual J (Alg. 2 for eq. 6).
 
-        ``sweeps`` times, ``pivots`` contacts one after another: ``mutations`` random points about the contact, normal on
-        the tangent plane with standard deviation ``mutation_sigma``, are projected to the nearest points of the
+        ``sweeps`` times, ``pivots`` contacts one after another: of ``mutations`` random points about the contact, in
+        the tangent plane with standard deviation ``mutation_sigma``, each is projected to the nearest point of the
         contact's domain D_i; the one with the least J becomes the contact if it lowers J. Poses that have ``per_pose``
         sets already are left alone.
 
