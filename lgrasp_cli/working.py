@@ -12,7 +12,7 @@ from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cac
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
-    from lgrasp.engine.run import Job, Outcome
+    from lgrasp.engine.run import Job, JobOutcome
 
 _OPTIONS: dict[str, tuple[Any, Any]] = {
     "device": (Annotated[str | None, typer.Option(help="auto, cpu or cuda:N.", show_default=False)], None),
@@ -134,7 +134,7 @@ def _how(
     return How(cache, array=array_task(shard_index, num_shards), overwrite=overwrite or force or not resume, **rest)
 
 
-def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "Outcome"]:
+def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "JobOutcome"]:
     """Run a job with progress; its report and outcome."""
     from lgrasp.engine.report import job_report
     from lgrasp.engine.run import run
@@ -147,7 +147,7 @@ def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "Outcome"]:
     return job_report(outcome), outcome
 
 
-def conclude(data: dict[str, Any], outcome: "Outcome") -> None:
+def conclude(data: dict[str, Any], outcome: "JobOutcome") -> None:
     """Leave with the exit code of a job that fell short.
 
     Raises:

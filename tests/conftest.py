@@ -14,7 +14,7 @@ from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
-from lgrasp.engine.run import Outcome
+from lgrasp.engine.run import JobOutcome
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.generate import GenerateJob, generate
@@ -87,7 +87,7 @@ def job(swift: Pipeline, cache_root: Path, tmp_path: Path) -> Callable[..., Gene
 
 
 @pytest.fixture
-def run(job: Callable[..., GenerateJob]) -> Callable[..., Outcome]:
+def run(job: Callable[..., GenerateJob]) -> Callable[..., JobOutcome]:
     """Run a small job; keywords replace fields of :class:`GenerateJob`, ``array`` and ``resume`` say which parts."""
     return lambda array=(0, 1), resume=True, **changes: generate(job(**changes), array=array, resume=resume)
 

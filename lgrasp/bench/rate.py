@@ -9,7 +9,7 @@ from typing import Any
 
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.report import job_report
-from lgrasp.engine.run import Outcome
+from lgrasp.engine.run import JobOutcome
 from lgrasp.jobs.generate import GenerateJob, generate
 
 _MEASURED = ("strict_valid_per_s", "published_count_per_s")
@@ -77,7 +77,7 @@ class Bench:
         _, outcome = self._run(job.changed(rows=rows))
         return job.changed(rate=outcome.job.measured_rate)
 
-    def _run(self, job: GenerateJob) -> tuple[dict[str, Any], Outcome]:
+    def _run(self, job: GenerateJob) -> tuple[dict[str, Any], JobOutcome]:
         with tempfile.TemporaryDirectory(dir=self._folder.name) as out:
             outcome = generate(job.changed(out=Path(out), cache=self._cache), resume=False)
             data = job_report(outcome)

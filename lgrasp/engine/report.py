@@ -11,11 +11,11 @@ import warp as wp
 
 from lgrasp.dataset.files import new_file
 from lgrasp.engine.folder import check_folder
-from lgrasp.engine.run import Outcome
+from lgrasp.engine.run import JobOutcome
 from lgrasp.errors import OutputError
 
 
-def job_report(outcome: Outcome) -> dict[str, Any]:
+def job_report(outcome: JobOutcome) -> dict[str, Any]:
     """The report of a job, JSON-serialisable: its own numbers and what all jobs have.
 
     Returns:

@@ -96,10 +96,10 @@ class Job(BaseModel, ABC):
         write_shard(part.file, contents)
 
     @abstractmethod
-    def report(self, outcome: "Outcome") -> dict[str, Any]:
+    def report(self, outcome: "JobOutcome") -> dict[str, Any]:
         """What came of it in numbers, JSON-serialisable; :func:`lgrasp.engine.report.job_report` adds the rest."""
 
-    def shortfall(self, outcome: "Outcome") -> LgraspError | None:
+    def shortfall(self, outcome: "JobOutcome") -> LgraspError | None:
         """What to say of an outcome that is less than was asked."""
         return None
 
@@ -130,7 +130,7 @@ class Job(BaseModel, ABC):
 
 
 @dataclass
-class Outcome:
+class JobOutcome:
     """What a call of :func:`run` did."""
 
     job: Any
@@ -181,7 +181,7 @@ class Outcome:
         return self.seconds["total"]
 
 
-def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 1), resume: bool = True) -> Outcome:
+def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 1), resume: bool = True) -> JobOutcome:
     """Make the missing parts of a job.
 
     Args:
@@ -197,7 +197,7 @@ def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 
     job.clean(parts)
     missing = [part for part in parts if part.number not in present]
     job.load(events, bool(missing))
-    outcome = Outcome(job, device, parts, present)
+    outcome = JobOutcome(job, device, parts, present)
     begin = time.perf_counter()
     if missing and job.kernels:
         load_kernels(device.alias, kernel_modules(*job.kernels), events.loading)
@@ -260,7 +260,7 @@ def array_task(
     return (task - first) // max(step, 1), count
 
 
-def _make_parts(job: Job, events: Events, outcome: Outcome) -> None:
+def _make_parts(job: Job, events: Events, outcome: JobOutcome) -> None:
     """Make what is missing, in order; one part is written while the next is made."""
 
     def written(part: Part, made: Made) -> None:

@@ -14,7 +14,7 @@ from lgrasp.dataset.exports import export_shards
 from lgrasp.dataset.exports.mjcf import Cut
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
-from lgrasp.engine.run import Job, Outcome
+from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import OutputError
 
@@ -73,7 +73,7 @@ class ExportJob(Job):
     def write(self, part: Part, contents: Any) -> None:
         """The export is on disk: its files are many, and written as they are made."""
 
-    def report(self, outcome: Outcome) -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``objects`` (their codes), ``format``."""
         objects: list[str] = []
         for path in outcome.paths:

@@ -16,7 +16,7 @@ from lgrasp.engine.folder import shard_path
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.run import Job, Outcome, run
+from lgrasp.engine.run import Job, JobOutcome, run
 from lgrasp.engine.shard import Execution, ShardResult, flat_statistics, make_shard, shard_effort
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.rows import grasp_rows
@@ -134,10 +134,10 @@ class GenerateJob(Job):
         # a copy: memory must not grow with the shards
         return Made(found, contents, replace(result, grasps=take_grasps(result.grasps, np.zeros(0, int))))
 
-    def report(self, outcome: Outcome) -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         return generated_report(self, outcome)
 
-    def shortfall(self, outcome: Outcome) -> LgraspError | None:
+    def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
         if not outcome.starved:
             return None
         stage, words = starving_stage(self.report(outcome)["counts"])
@@ -207,6 +207,6 @@ def shard_parts(out: Path, hand: str, name: str, rows: int, shard_rows: int) -> 
 
 def generate(
     job: GenerateJob, events: Events | None = None, *, array: tuple[int, int] = (0, 1), resume: bool = True
-) -> Outcome:
+) -> JobOutcome:
     """Make the missing shards of a job; see :func:`lgrasp.engine.run.run`."""
     return run(job, events, array=array, resume=resume)

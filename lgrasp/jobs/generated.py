@@ -11,7 +11,7 @@ import numpy as np
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.survivors import stage_counts, survivors
 from lgrasp.engine.batch import PASS_BITS
-from lgrasp.engine.run import Outcome
+from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.duplicates import near_pairs
@@ -90,7 +90,7 @@ def _tally(paths: Iterable[Path], moving: np.ndarray, device: str) -> _Tally:
     return whole
 
 
-def generated_report(job: Any, outcome: Outcome) -> dict[str, Any]:
+def generated_report(job: Any, outcome: JobOutcome) -> dict[str, Any]:
     """The numbers of a :class:`~lgrasp.jobs.generate.GenerateJob`; rates are those of the shards that this call made.
 
     Returns:

@@ -11,7 +11,7 @@ from lgrasp.dataset.extend import check_shard, extend_shard
 from lgrasp.dataset.metrics import METRICS, TASK_ROWS, is_extended, measure_shard, process_map
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
-from lgrasp.engine.run import Outcome
+from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import ConfigError, OutputError
 
@@ -60,7 +60,7 @@ class MetricsJob(ShardJob):
     def close(self) -> None:
         self._open.close()
 
-    def report(self, outcome: Outcome) -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``rows`` made, ``rows_per_s``, ``metrics``."""
         seconds = outcome.seconds["parts"]
         return {

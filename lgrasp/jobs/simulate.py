@@ -14,7 +14,7 @@ from pydantic import Field, PrivateAttr, field_validator
 from lgrasp.dataset import Shard, read_shard
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
-from lgrasp.engine.run import Outcome
+from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.decompose import decompose
@@ -83,7 +83,7 @@ class SimulateJob(ShardJob):
         shard = _with_verdicts(shard, self.protocol, found, text, seconds)
         return Made(len(shard.grasps), self.marked(part, shard, {}), seconds)
 
-    def report(self, outcome: Outcome) -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``protocol``; ``results``: see :func:`summary`; ``notes`` on objects that are approximated."""
         seconds = {part.file: made.result for part, made in outcome.made_parts}
         done = []

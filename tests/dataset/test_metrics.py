@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from lgrasp.dataset import read_shard, validate_shard, write_shard
 from lgrasp.dataset.metrics import mass_frame, row_metrics
 from lgrasp.engine.events import Events
-from lgrasp.engine.run import Outcome, run
+from lgrasp.engine.run import JobOutcome, run
 from lgrasp.errors import ConfigError, OutputError, ShardError
 from lgrasp.jobs.metrics import MetricsJob
 from lgrasp_cli.dataset import app
@@ -21,7 +21,7 @@ from lgrasp_cli.dataset import app
 BOTH = ("volume", "epsilon_exact")
 
 
-def add_metrics(paths, out, names, events=None, **options) -> Outcome:
+def add_metrics(paths, out, names, events=None, **options) -> JobOutcome:
     given = paths if isinstance(paths, list) else [paths]
     return run(MetricsJob(shards=given, out=out, add=names, device="cpu", **options), events)
 

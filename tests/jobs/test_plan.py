@@ -12,7 +12,7 @@ from support.jaws import mesh_record
 from lgrasp.cloud.read import Cloud
 from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.run import Outcome, run
+from lgrasp.engine.run import JobOutcome, run
 from lgrasp.errors import ConfigError, ObjectError, OutputError
 from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.judge.report import Report
@@ -26,10 +26,10 @@ RADIUS, STARTS = 0.035, 12
 
 
 @pytest.fixture(scope="module")
-def plan(cache_root: Path) -> Callable[..., Outcome]:
+def plan(cache_root: Path) -> Callable[..., JobOutcome]:
     """plan(folder, **changes): plans of the Barrett hand."""
 
-    def plan(out: Path, **changes) -> Outcome:
+    def plan(out: Path, **changes) -> JobOutcome:
         job = {
             "hand": "barrett",
             "out": out,

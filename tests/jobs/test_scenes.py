@@ -11,7 +11,7 @@ from lgrasp.cloud.read import read_cloud
 from lgrasp.dataset import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
-from lgrasp.engine.run import Outcome, run
+from lgrasp.engine.run import JobOutcome, run
 from lgrasp.errors import CloudError, ConfigError, LgraspError, OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.jobs.scenes.config import read_scene_config, scene_configs
@@ -29,7 +29,7 @@ SCENES = 3
 def make(cache_root: Path):
     """make(out, task=(0, 1), **changes): run a small job on the CPU."""
 
-    def make(out: Path, task=(0, 1), listener=None, *, resume=True, **changes) -> Outcome:
+    def make(out: Path, task=(0, 1), listener=None, *, resume=True, **changes) -> JobOutcome:
         data = {
             "hand": "allegro",
             "objects": OBJECTS,

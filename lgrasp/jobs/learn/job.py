@@ -16,7 +16,7 @@ from lgrasp.dataset.files import new_file
 from lgrasp.dataset.tree import shard_tree
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.events import Made, Part, PartProgress
-from lgrasp.engine.run import Job, Outcome
+from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.hand.model import HandModel
@@ -113,7 +113,7 @@ class FitJob(Job):
         with new_file(part.file) as file:
             file.write(contents)
 
-    def report(self, outcome: Outcome) -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         if not outcome.paths:
             return {}
         return load_predictor(self.out)[1]["report"] | {"out": str(self.out)}

@@ -15,7 +15,7 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
-from lgrasp.engine.run import Job, Outcome
+from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.hand.arrays import upload_hand
@@ -147,7 +147,7 @@ class PlanJob(Job):
         shard = Shard(header=header, hand=record, objects=[self._record()], grasps=rows, statistics=statistics)
         return Made(len(rows), shard, result)
 
-    def report(self, outcome: Outcome) -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``starts``, ``counts`` (what became of the starts), medians of ``epsilon`` and
         ``unresisted_load``, ``seconds_planning``."""
         _, hand, model, _ = self._models()
@@ -167,7 +167,7 @@ class PlanJob(Job):
             }
         return data
 
-    def shortfall(self, outcome: Outcome) -> LgraspError | None:
+    def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
         if outcome.rows or not outcome.parts:
             return None
         lost = "; ".join(lost_starts(result["counts"]) for result in outcome.results)

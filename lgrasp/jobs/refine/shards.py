@@ -14,7 +14,7 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
-from lgrasp.engine.run import Outcome
+from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import ConfigError, HandError, ShardError
 from lgrasp.grasp.bounds import GraspBounds
@@ -114,7 +114,7 @@ class RefineJob(ShardJob):
         written = self.marked(part, replace(shard, header=self._header(shard), grasps=moved.rows), counts)
         return Made(len(moved.rows), written)
 
-    def report(self, outcome: Outcome) -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``results``: of each shard hand, object, rows, refined, valid before and after, mean energies, seconds."""
         return {"results": [_entry(path) for path in outcome.paths]}
 

@@ -15,7 +15,7 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.tree import shard_tree
 from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
-from lgrasp.engine.run import Outcome
+from lgrasp.engine.run import JobOutcome
 from lgrasp.errors import OutputError
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.scenes.config import SceneConfig
@@ -97,7 +97,7 @@ class SceneJob(SceneConfig):
     def write(self, part: Part, contents: Any) -> None:
         write_scene(part.file, contents)
 
-    def report(self, outcome: Outcome) -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """What the scenes hold (see :func:`describe_scenes`), ``hand`` and ``scenes_per_minute``."""
         seconds, made = outcome.seconds["parts"], len(outcome.written)
         return describe_scenes(outcome.paths) | {

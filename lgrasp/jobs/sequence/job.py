@@ -13,7 +13,7 @@ from lgrasp.dataset import Shard, ShardHeader
 from lgrasp.dataset.survivors import survivors
 from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.run import Job, Outcome
+from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard import flat_statistics
 from lgrasp.errors import ConfigError, LgraspError, ObjectError, StarvedError
 from lgrasp.grasp.sequences import SequenceTable
@@ -124,10 +124,10 @@ class SequenceJob(Job):
         contents = self._shard(part, result) if len(result) else None
         return Made(len(result), contents, replace(result, levels=[]))
 
-    def report(self, outcome: Outcome) -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         return sequence_report(self, outcome)
 
-    def shortfall(self, outcome: Outcome) -> LgraspError | None:
+    def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
         if not outcome.starved:
             return None
         if not outcome.rows:

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.engine.run import Outcome
+from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.jobs.sequence.shard import SequenceResult, add_spaces
 
 
-def sequence_report(job: Any, outcome: Outcome) -> dict[str, Any]:
+def sequence_report(job: Any, outcome: JobOutcome) -> dict[str, Any]:
     """The numbers of a :class:`~lgrasp.jobs.sequence.job.SequenceJob`, JSON-serialisable.
 
     Returns:
