@@ -1,8 +1,8 @@
 """One batch of candidates through the stages of a pipeline."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,12 +10,12 @@ import warp as wp
 from lgrasp.engine.fit import fit_params
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
-from lgrasp.grasp.tables import CandidateTable, GraspTable, join_grasps, reorder_grasps, select_poses
+from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, reorder_grasps, select_poses
 from lgrasp.runtime.meter import Meter
 from lgrasp.stages.context import Context
 
-if TYPE_CHECKING:
-    from lgrasp.engine.graphs import GraphCache
+Search = Callable[[Context, int, int], tuple[ContactSets, Meter]]
+"""(context, first candidate, number of candidates) -> what search makes of them, counted."""
 
 PASS_BLOCK = 64
 """Candidates that later passes search again before the next ones are begun: it decides the order of the rows."""
@@ -55,7 +55,7 @@ def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, mete
 
 
 def run_batch(
-    pipeline: Pipeline, context: Context, first: int, count: int, graphs: "GraphCache | None" = None
+    pipeline: Pipeline, context: Context, first: int, count: int, search: Search | None = None
 ) -> BatchResult:
     """Grasps of candidates ``first .. first + count - 1`` of a shard's stream.
 
@@ -65,10 +65,10 @@ def run_batch(
     ``p << PASS_SHIFT`` added to the number of their candidate.
 
     Args:
-        graphs: replays the stages up to search; None launches them one by one.
+        search: runs the stages up to search, such as :meth:`GraphCache.run`; None launches them one by one.
     """
-    if graphs:
-        sets, meter = graphs.run(context, first, count)
+    if search:
+        sets, meter = search(context, first, count)
     else:
         meter = Meter(context.device)
         sets = run_stages(pipeline, context, first, count, "search", meter)

@@ -213,7 +213,7 @@ def make_shard(
         return wanted if passes == 1 else -(-wanted // PASS_BLOCK) * PASS_BLOCK
 
     def run(first: int, count: int) -> BatchResult:
-        return run_batch(pipeline, context, first, count, graphs)
+        return run_batch(pipeline, context, first, count, graphs.run if graphs else None)
 
     limit = shard_effort(pipeline, rows) if found.count < rows else 0
     with closing(_batches(run, execution.workers, result.candidates, limit, size)) as batches:

@@ -108,9 +108,25 @@ def device_from_stored(pose: np.ndarray) -> np.ndarray:
 
 def device_from_matrix(T: np.ndarray) -> np.ndarray:
     """Device poses, shape [n, 7], float32, of homogeneous transforms, shape [n, 4, 4]."""
-    from scipy.spatial.transform import Rotation
+    return np.concatenate([T[:, :3, 3], _quaternions(T[:, :3, :3])], 1).astype(np.float32)
 
-    return device_pose(T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3])).astype(np.float32)
+
+def _quaternions(R: np.ndarray) -> np.ndarray:
+    """Unit quaternions qx qy qz qw, shape [n, 4], of rotation matrices, shape [n, 3, 3].
+
+    Of the four rows of the matrix 4 q q^T the one with the largest diagonal entry, so that nothing small is divided by.
+    """
+    d, trace = np.diagonal(R, axis1=1, axis2=2), np.trace(R, axis1=1, axis2=2)
+    outer = np.empty((len(R), 4, 4))
+    outer[:, :3, :3] = R + np.swapaxes(R, 1, 2)
+    outer[:, :3, 3] = outer[:, 3, :3] = np.stack(
+        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1
+    )
+    outer[:, range(3), range(3)] = 1 - trace[:, None] + 2 * d
+    outer[:, 3, 3] = 1 + trace
+    best = np.argmax(np.column_stack([d, trace]), 1)
+    q = outer[np.arange(len(R)), best]
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
 def device_matrix(pose: np.ndarray) -> np.ndarray:

@@ -73,8 +73,8 @@ def test_rows_do_not_depend_on_the_rate(run, job, grasps, tmp_path):
     known = run(rows=40, rate=0.03, out=tmp_path / "known")
     unknown = run(rows=40, out=tmp_path / "unknown")
     assert (
-        known.rate
-        == unknown.rate
+        known.job.measured_rate
+        == unknown.job.measured_rate
         == pytest.approx(known.results[-1].counts["filter"]["kept"] / known.results[-1].candidates)
     )
     assert_same(grasps(tmp_path / "known"), grasps(tmp_path / "unknown"))

@@ -25,7 +25,7 @@ def watched(monkeypatch):
     watch = Watch()
     watch.begun = []
 
-    def run(pipeline, context, first, count, graphs):
+    def run(pipeline, context, first, count, search):
         with watch.lock:
             watch.begun.append(first)
             watch.running += 1
@@ -33,7 +33,7 @@ def watched(monkeypatch):
             time.sleep(watch.pause)
             if first == watch.fail_at:
                 raise RuntimeError("out of memory")
-            return run_batch(pipeline, context, first, count, graphs)
+            return run_batch(pipeline, context, first, count, search)
         finally:
             with watch.lock:
                 watch.running -= 1

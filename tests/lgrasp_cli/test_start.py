@@ -1,5 +1,6 @@
 """Help, version and start-up cost."""
 
+import ast
 import resource
 import subprocess
 import sys
@@ -62,3 +63,34 @@ def test_help_is_quick_and_light():
         seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)  # whoever else computes
     assert result.stdout.splitlines()[-1] == "[]"
     assert min(seconds) < 0.5
+
+
+SLOW = ("scipy", "trimesh", "yourdfpy", "torch", "mujoco", "coacd", "matplotlib", "networkx", "PIL")
+
+
+def test_generating_from_the_cache_imports_nothing_slow(run, cache_root, tmp_path):
+    """With hand, object and field in the cache, what makes them is not loaded, nor stages that do not run."""
+    run(rows=1)
+    arguments = [
+        "generate",
+        "--object",
+        "mug",
+        "-n",
+        "5",
+        "--pipeline",
+        "swift",
+        "--set",
+        "field.records=20000",
+        "--device",
+        "cpu",
+        "--quiet",
+    ]
+    arguments += ["--out", str(tmp_path / "other"), "--cache-dir", str(cache_root)]
+    code = f"import sys; sys.argv = {['lgrasp', *arguments]}\nfrom lgrasp_cli.main import main\n"
+    code += f"try:\n    main()\nfinally:\n    print([m for m in {SLOW} if m in sys.modules])\n"
+    code += "    print([m for m in sys.modules if m.startswith(('lgrasp.refine.', 'lgrasp.hand.drafting'))])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    slow, others = result.stdout.splitlines()[-2:]
+    assert slow == "[]"
+    assert set(ast.literal_eval(others)) <= {"lgrasp.refine.params"}
+    assert list((tmp_path / "other").glob("*.h5"))
