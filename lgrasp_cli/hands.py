@@ -90,9 +90,10 @@ def add_hand(
 
     Example: lgrasp hands add my_hand.urdf
     """
-    from lgrasp.hand.drafting.import_urdf import add_hand as add
 
-    made = add(urdf, name=name, out=out, force=force)
+    from lgrasp.hand.drafting.import_urdf import import_urdf
+
+    made = import_urdf(urdf, name=name, out=out, force=force)
     for line in made.decisions:
         typer.echo(f"- {' '.join(line.split())}")
     typer.echo(f"\nwrote {made.folder}")

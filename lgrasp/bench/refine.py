@@ -22,6 +22,7 @@ from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.palm import ContactSurface
 from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
 from lgrasp.jobs.refine.settings import COARSE
 from lgrasp.jobs.shard_inputs import named_hand
@@ -30,8 +31,8 @@ from lgrasp.object.params import ObjectParams
 from lgrasp.planning.planner import Planner, PlanParams, cloud_params
 from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.refiner import Pose, Refiner, table_pose
-from lgrasp.refine.surface import Palmar, hand_surface
-from lgrasp.refine.visible_surface import seen_palmar
+from lgrasp.refine.surface import hand_surface
+from lgrasp.refine.visible_surface import visible_surface
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts
@@ -130,7 +131,7 @@ def _bench_hand(
     progress: Callable[[str], None],
 ) -> dict[str, Any]:
     source, model = named_hand(cache, hand, at)
-    arrays, palmar = upload_hand(model, at.alias), seen_palmar(source, model, at.alias)
+    arrays, palmar = upload_hand(model, at.alias), visible_surface(source, model, at.alias)
     record = hand_record(model, mesh_blobs(source.urdf))
     stand_off = source.spec.stand_off or STAND_OFF
     totals = {(noise, hands): _Total() for noise in (None, *noises) for hands in ("one", "best")}
@@ -196,7 +197,7 @@ def _displaced(table: GraspTable, holds: np.ndarray, device: str) -> Pose:
 
 
 def _falls(
-    hand: HandModel, palmar: Palmar, coarse: list[tuple[ObjectModel, Pose]], device: str
+    hand: HandModel, palmar: ContactSurface, coarse: list[tuple[ObjectModel, Pose]], device: str
 ) -> tuple[list[float], list[float], int]:
     """Mean energy of coarse poses, and the milliseconds of one, after STEPS outer steps; and their number."""
     surface = hand_surface(hand, palmar)

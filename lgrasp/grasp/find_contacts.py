@@ -8,7 +8,7 @@ from lgrasp.grasp.check import Contacts
 from lgrasp.grasp.check_structs import device_limits
 from lgrasp.grasp.contact_kernels import PalmarRuns, RunContacts, choose_contacts, link_contacts
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.palm import Palmar, ruled_palmar
+from lgrasp.hand.palm import ContactSurface, contact_surface
 from lgrasp.math.qp import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays
 
@@ -19,7 +19,7 @@ def find_contacts(
     pose: np.ndarray,
     q: np.ndarray,
     bounds: GraspBounds,
-    palmar: Palmar | None = None,
+    palmar: ContactSurface | None = None,
 ) -> Contacts:
     """One contact at most of each link, within the bounds of gap and normals, the nearest of each finger first.
 
@@ -28,7 +28,7 @@ def find_contacts(
         q: joint positions [rad or m], (n, K).
         palmar: where the hand may touch; default: where hand.yaml lets it.
     """
-    d, n, side = hand.device, len(q), palmar or ruled_palmar(hand.model)
+    d, n, side = hand.device, len(q), palmar or contact_surface(hand.model)
     first, width = _runs(side.link), contact_width(side.link)
 
     def put(a: np.ndarray, dtype: type) -> wp.array:

@@ -18,7 +18,7 @@ _SPACING = 8.0e-4
 _MOST_POINTS = 20_000
 _CELL = 6.0e-4
 _MOST_CELLS = 300_000
-_PAD = 3.0e-3
+_PAD_ANGLE = 3.0e-3
 _SHALLOW = 3.0e-4  # points that never get deeper than this are not kept
 
 
@@ -75,7 +75,7 @@ def _side(
     if not near.any():
         return None
     points = points[near]
-    box_low, box_high = box_low - _PAD, box_high + _PAD
+    box_low, box_high = box_low - _PAD_ANGLE, box_high + _PAD_ANGLE
     cell = max(_CELL, float(np.prod(box_high - box_low) / _MOST_CELLS) ** (1 / 3))
     holes = not all(m.is_watertight for m in grid_meshes)
     grid = box_grid(list(grid_meshes), box_low, box_high, cell, device, winding=holes)

@@ -1,4 +1,4 @@
-"""The palmar side of a hand: where it may touch, where its palm is, and what that faces."""
+"""Where a hand may touch, where its palm is, and what that faces."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from lgrasp.hand.model import HandModel
 _MIN_AXIS = 0.01  # [m] between the middle of the first joints and that of the canonical box
 
 
-class Palmar(NamedTuple):
+class ContactSurface(NamedTuple):
     """Where a hand may touch: n points of its palmar side, those of one link together."""
 
     link: np.ndarray
@@ -23,9 +23,9 @@ class Palmar(NamedTuple):
     """Outward, (n, 3)."""
 
 
-def ruled_palmar(model: HandModel) -> Palmar:
+def contact_surface(model: HandModel) -> ContactSurface:
     """The palmar side where hand.yaml lets a hand touch."""
-    return Palmar(model.contact_link, model.contact_body, model.contact_points, model.contact_normals)
+    return ContactSurface(model.contact_link, model.contact_body, model.contact_points, model.contact_normals)
 
 
 def palm_axis(model: HandModel) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Contact arrays of a HandModel from the contact surfaces of its links."""
+"""Surfaces of a hand's links, and the contact arrays of a HandModel made of them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +29,25 @@ class ContactLink:
     points: np.ndarray  # (n, 3) [m]
     normals: np.ndarray  # (n, 3)
     rules: np.ndarray  # (r, 4) forbidden cones: axis, cosine
+
+
+@dataclass(frozen=True)
+class SurfaceSamples:
+    """Surface of one link in its body frame, and how often the mean fingertip sees each of its points."""
+
+    link: str
+    body: int
+    area: float  # [m^2]
+    points: np.ndarray  # (n, 3) [m]
+    normals: np.ndarray  # (n, 3)
+    seen: np.ndarray  # (n,) share of postures
+    T_body_link: np.ndarray  # (4, 4)
+    mesh: trimesh.Trimesh  # body frame
+
+    @property
+    def seen_area(self) -> float:
+        """Area weighted by how often it is seen [m^2]."""
+        return self.area * float(self.seen.mean())
 
 
 def contact_arrays(

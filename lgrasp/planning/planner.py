@@ -17,7 +17,7 @@ from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import REASONS
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.palm import Palmar, palm_axis
+from lgrasp.hand.palm import ContactSurface, palm_axis
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted
@@ -113,7 +113,7 @@ class Planner:
     model: ObjectModel
     stand_off: float
     params: PlanParams = field(default_factory=PlanParams)
-    palmar: Palmar | None = None
+    palmar: ContactSurface | None = None
     around: ObjectModel | None = None
 
     def run(self, count: int, progress: Callable[[int, int], None] | None = None) -> Planned:

@@ -3,12 +3,12 @@
 import numpy as np
 import warp as wp
 
-from lgrasp.differentiable.solids import hand_solids
+from lgrasp.differentiable.solids import HandPoints, hand_solids
 from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.hand.palm import palm_axis
-from lgrasp.refine.descent_kernels import Moments, Progress, advance, descend, penetration
+from lgrasp.refine.descent_kernels import Moments, Schedule, advance, descend, penetration
 from lgrasp.refine.energy_gradient import MAX_COLUMNS, Search
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.match_kernels import (
@@ -39,20 +39,30 @@ class Descent:
     What becomes of a hand does not depend on the others.
 
     Args:
-        surface: the hand's points.
+        surface: the hand's points. solids: its links; default: made here.
 
     Raises:
         HandError: the hand has too many joints, or no side of it can face an object.
     """
 
-    def __init__(self, hand: HandArrays, target: TargetArrays, params: LocalSearch, surface: HandSurface) -> None:
+    def __init__(
+        self,
+        hand: HandArrays,
+        target: TargetArrays,
+        params: LocalSearch,
+        surface: HandSurface,
+        solids: HandPoints | None = None,
+    ) -> None:
         model = hand.model
         if model.dofs > MAX_COLUMNS:
             raise HandError(
                 f"hand '{model.name}' has {model.dofs} joints; the local search takes {MAX_COLUMNS} at most"
             )
         self.params, self._hand, self._target, self.device = params, hand, target, hand.device
-        self._points, self._solids = _points(surface, self.device), _solids(hand)
+        self._points, self._solids = (
+            _points(surface, self.device),
+            _solids(solids or hand_solids(model, LINK_POINTS), self.device),
+        )
         self._bodies = len(model.tree.joint_dof) + 1
         self._search = self._settings(surface)
         self._back = -palm_axis(model)[1]
@@ -180,8 +190,8 @@ class Descent:
     ) -> None:
         inputs = [self._hand.struct.kin, self._points, self._solids, self._target.own, self._search, m]
         skipped = first * self.params.gradient_steps
-        progress = make_struct(Progress, taken=taken, skipped=skipped, whole=float(whole), gradient=int(gradient))
-        inputs += [progress, moments]
+        schedule = make_struct(Schedule, taken=taken, skipped=skipped, whole=float(whole), gradient=int(gradient))
+        inputs += [schedule, moments]
         wp.launch(
             descend,
             dim=at.pose.shape[0],
@@ -212,8 +222,7 @@ def _points(surface: HandSurface, device: str) -> "Points":
     return upload_struct(Points, device, arrays)
 
 
-def _solids(hand: HandArrays) -> "Solids":
-    found = hand_solids(hand.model, LINK_POINTS)
+def _solids(found: HandPoints, device: str) -> "Solids":
     grids = [x.grid for x in found.solids]
     arrays = {
         "body": found.body,
@@ -226,4 +235,4 @@ def _solids(hand: HandArrays) -> "Solids":
         "points": np.stack([link_probes(x.points) for x in found.solids]),
         "pairs": np.concatenate([found.pairs, found.pairs[:, ::-1]]).reshape(-1, 2),
     }
-    return upload_struct(Solids, hand.device, arrays)
+    return upload_struct(Solids, device, arrays)

@@ -17,7 +17,7 @@ _CLOSE = 1.0e-5  # [m] an advance that is shorter is the last
 
 
 @wp.struct
-class Progress:
+class Schedule:
     """Where in a search a launch is, and whether it moves anything."""
 
     taken: wp.int32  # steps before these
@@ -85,7 +85,7 @@ def descend(
     own: Volume,
     s: Search,
     m: Correspondences,
-    progress: Progress,
+    schedule: Schedule,
     moments: Moments,
     pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),
@@ -118,16 +118,16 @@ def descend(
         centre = wp.transform_point(T, s.middle)
         by_shift = F[0]
         by_turn = M[0] - wp.cross(centre, by_shift)
-        if progress.gradient == 1:
+        if schedule.gradient == 1:
             for e in range(3):
                 moments.first[row, e] = by_shift[e]
                 moments.first[row, 3 + e] = by_turn[e]
             for c in range(q.shape[1]):
                 moments.first[row, 6 + c] = by_q[c]
             return
-        step = progress.taken + k + 1
+        step = schedule.taken + k + 1
         size = wp.pow(
-            s.decay, float(progress.skipped + progress.taken + k) / (float(s.gradient_steps) * progress.whole)
+            s.decay, float(schedule.skipped + schedule.taken + k) / (float(s.gradient_steps) * schedule.whole)
         )
         translation = s.max_translation_step * size * _three_moved(moments, row, 0, by_shift, step, s)
         rotation = s.max_rotation_step * size * _three_moved(moments, row, 3, by_turn, step, s)

@@ -41,7 +41,7 @@ class LinkSolids:
     def __init__(
         self, model: HandModel, cloud: np.ndarray, margin: float, *, dtype: torch.dtype, device: str | torch.device
     ) -> None:
-        solids = hand_solids(model, LINK_POINTS)
+        self.solids = solids = hand_solids(model, LINK_POINTS)
 
         def put(a: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device)

@@ -135,7 +135,9 @@ class Refiner(nn.Module):
         if self._descent is None:
             name = "cpu" if self._device.type == "cpu" else f"cuda:{self._device.index or 0}"
             target = upload_target(self.target.model, self.target.around, name)
-            self._descent = Descent(upload_hand(self._hand, name), target, self.params, self._surface)
+            self._descent = Descent(
+                upload_hand(self._hand, name), target, self.params, self._surface, self._links.solids
+            )
         return self._descent
 
     def _put(self, pose: Pose) -> Hands:

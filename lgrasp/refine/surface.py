@@ -6,7 +6,7 @@ import numpy as np
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.palm import Palmar, ruled_palmar
+from lgrasp.hand.palm import ContactSurface, contact_surface
 
 BLOCK = 24
 """Points are in blocks of this many, each on one body."""
@@ -56,15 +56,15 @@ def link_probes(points: np.ndarray) -> np.ndarray:
 
 
 def hand_surface(
-    model: HandModel, palmar: Palmar | None = None, *, distal: float = DISTAL, other: float = OTHER
+    model: HandModel, palmar: ContactSurface | None = None, *, distal: float = DISTAL, other: float = OTHER
 ) -> HandSurface:
     """Surface of a hand for the local search.
 
     Args:
-        palmar: default: :func:`ruled_palmar`.
+        palmar: default: :func:`contact_surface`.
         distal, other: weight of palmar points on the last links of fingers, and elsewhere.
     """
-    side = palmar or ruled_palmar(model)
+    side = palmar or contact_surface(model)
     last = last_bodies(model)
     bodies, blocks = [], []
     for b in range(len(model.piece_first) - 1):

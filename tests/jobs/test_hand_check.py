@@ -11,7 +11,7 @@ from support.urdfs import gripper
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.hand.drafting.import_urdf import add_hand
+from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.hand_check.check import check_hand, check_objects
 from lgrasp.jobs.hand_check.diagnose import diagnose, field_vectors, hand_findings
@@ -24,7 +24,7 @@ from lgrasp.runtime.device import resolve_device
 def jaws(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a drafted gripper."""
     folder = tmp_path_factory.mktemp("jaws")
-    return add_hand(gripper(folder), out=folder / "jaws").folder
+    return import_urdf(gripper(folder), out=folder / "jaws").folder
 
 
 def spoil(jaws: Path, folder: Path, **changes: object) -> str:

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import trimesh
 import yaml
+from support.samples import SAMPLES, build_sample, write_samples
 
 from lgrasp.object.find import find_object
 from lgrasp.object.preprocess import preprocess_object
-from lgrasp.object.samples import SAMPLES, build_sample, write_samples
 
 SHIPPED = Path(__file__).resolve().parents[2] / "objects"
 

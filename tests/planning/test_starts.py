@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import upload_hand
-from lgrasp.hand.palm import palm_axis, ruled_palmar
+from lgrasp.hand.palm import contact_surface, palm_axis
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.object.find import find_object
 from lgrasp.object.preprocess import preprocess_object
@@ -47,7 +47,7 @@ def test_palmar_points_weigh_as_told(inputs):
     tips = {int(b) for b in surface.body[(surface.weight == DISTAL).any(1)]}
     assert len(tips) == model.groups  # one last link a finger
     pulled = surface.points[surface.weight > 0]
-    gap = np.linalg.norm(pulled[:, None] - ruled_palmar(model).points[None], axis=2).min(1)
+    gap = np.linalg.norm(pulled[:, None] - contact_surface(model).points[None], axis=2).min(1)
     assert gap.max() < 1e-6
 
 

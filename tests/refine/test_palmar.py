@@ -6,7 +6,7 @@ import warp as wp
 
 from lgrasp.engine.cache import Cache
 from lgrasp.jobs.shard_inputs import named_hand
-from lgrasp.refine.visible_surface import seen_palmar
+from lgrasp.refine.visible_surface import visible_surface
 from lgrasp.runtime.device import resolve_device, start
 
 
@@ -19,7 +19,7 @@ def hand(cache_root):
 @pytest.mark.parametrize(("name", "palm"), [("barrett", [0, 0, 1]), ("schunk_svh", [1, 0, 0])])
 def test_what_the_fingertips_see_faces_them(name, palm, hand):
     source, model = hand(name)
-    side = seen_palmar(source, model)
+    side = visible_surface(source, model)
     still = side.body == 0
     assert still.any()
     assert set(side.body) > {0}
@@ -36,6 +36,6 @@ def test_a_gpu_sees_the_same(hand):
     if wp.get_cuda_device_count() == 0:
         pytest.skip("no GPU here")
     source, model = hand("barrett")
-    here, there = (seen_palmar(source, model, device) for device in ("cpu", "cuda:0"))
+    here, there = (visible_surface(source, model, device) for device in ("cpu", "cuda:0"))
     points = {tuple(p) for p in here.points.round(6)}, {tuple(p) for p in there.points.round(6)}
     assert len(points[0] & points[1]) > 0.98 * len(points[0] | points[1])  # rays that graze an edge may differ

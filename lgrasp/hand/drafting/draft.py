@@ -8,8 +8,15 @@ import numpy as np
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
-from lgrasp.hand.drafting.contact_survey import Survey, survey_hand
-from lgrasp.hand.drafting.finger_structure import Anatomy, finger_names, held_value, probe_spec, study_anatomy, tip_link
+from lgrasp.hand.drafting.contact_survey import ContactSurvey, survey_contacts
+from lgrasp.hand.drafting.finger_structure import (
+    FingerStructure,
+    finger_names,
+    finger_structure,
+    held_value,
+    probe_spec,
+    tip_link,
+)
 from lgrasp.hand.drafting.lateral_surfaces import rounded_axis
 from lgrasp.hand.drafting.propose import propose_spaces
 from lgrasp.hand.model import HandModel
@@ -32,29 +39,29 @@ def draft_spec(
     """Rules for a hand from its URDF alone, and what was decided, in words.
 
     Args:
-        jaws: (static link, moving link) of a gripper that :func:`lgrasp.hand.drafting.jaws.make_base` turned round.
+        jaws: (static link, moving link) of a gripper that :func:`lgrasp.hand.drafting.reroot.reroot` turned round.
 
     Raises:
-        HandError: the URDF cannot be used (see :func:`read_urdf`, :func:`study_anatomy`), the hand is of impossible
+        HandError: the URDF cannot be used (see :func:`read_urdf`, :func:`finger_structure`), the hand is of impossible
             size, or no two of its parts ever face each other.
     """
     urdf = read_urdf(urdf_path)
     name = name or urdf.name
-    anatomy = study_anatomy(urdf, name, jaws[1] if jaws else None)
+    structure = finger_structure(urdf, name, jaws[1] if jaws else None)
     if jaws is None:
-        _check_coupled(urdf, anatomy)
-    survey = _best_survey(urdf, anatomy, name, jaws)
+        _check_coupled(urdf, structure)
+    survey = _best_survey(urdf, structure, name, jaws)
     _check_size(urdf, survey)
     _check_hold(urdf, survey)
     said: list[str] = []
     data: dict[str, Any] = {"name": name, "urdf": urdf_path.name, "base_link": survey.model.tree.base_link}
-    if anatomy.base_link:
-        said.append(f"base frame: '{anatomy.base_link}', which carries the fingers (base_link)")
+    if structure.base_link:
+        said.append(f"base frame: '{structure.base_link}', which carries the fingers (base_link)")
     else:
         said.append(f"base frame: the root link '{urdf.root}' (base_link)")
     data["locked"] = survey.locked
     said += _say_locked(survey)
-    names = finger_names(anatomy)
+    names = finger_names(structure)
     data["static_links"] = [
         n for n, b in zip(survey.model.tree.link_names, survey.model.tree.link_body, strict=True) if b == 0
     ]
@@ -65,8 +72,8 @@ def draft_spec(
     low, high = np.round(survey.hold.low, 3), np.round(survey.hold.high, 3)
     data["canonical_box"] = {"min": low.tolist(), "max": high.tolist()}
     said.append(_say_box(survey, names, low, high))
-    drives = [len(d) for tip, d in zip(anatomy.tips, anatomy.drives, strict=True) if tip in survey.sides]
-    if anatomy.tree.groups > 1 and np.mean(drives) <= _FEW_DRIVES:
+    drives = [len(d) for tip, d in zip(structure.tips, structure.drives, strict=True) if tip in survey.sides]
+    if structure.tree.groups > 1 and np.mean(drives) <= _FEW_DRIVES:
         data["contacts"] = (2, 3)
         said.append(
             "grasps touch with 2 or 3 fingers: fingers of one or two drives seldom meet an object more at "
@@ -84,7 +91,7 @@ def draft_spec(
         + "fingers away from the canonical box (open_posture)"
     )
     data["fingers"] = {
-        finger: [n for b in np.flatnonzero(anatomy.tree.body_group == g) for n in anatomy.links(int(b))]
+        finger: [n for b in np.flatnonzero(structure.tree.body_group == g) for n in structure.links(int(b))]
         for g, finger in enumerate(names)
     }
     said += [f"note: {note}" for note in survey.model.notes]
@@ -97,9 +104,9 @@ def draft_spec(
     return spec.model_copy(update={"opposition_spaces": spaces}), [*said, *told]
 
 
-def _with_shared(urdf: Urdf, survey: Survey, spec: HandSpec, said: list[str]) -> tuple[HandSpec, list[str]]:
+def _with_shared(urdf: Urdf, survey: ContactSurvey, spec: HandSpec, said: list[str]) -> tuple[HandSpec, list[str]]:
     """Locked joints that move several fingers take a few values instead, those aside that the palm rides on."""
-    spread = [n for n in spec.locked if n not in survey.anatomy.carrying]
+    spread = [n for n in spec.locked if n not in survey.structure.carrying]
     spread = [n for n in spread if _freed(urdf, spec, {n: (spec.locked[n],)}) is not None]
     by_name = {j.name: j for j in urdf.joints}
     count = _SHARED_VALUES.get(len(spread), 0)
@@ -137,50 +144,50 @@ def _around(best: float, lower: float, upper: float, count: int) -> tuple[float,
     return tuple(values)
 
 
-def _check_coupled(urdf: Urdf, anatomy: Anatomy) -> None:
-    if anatomy.tree.groups == 1 and len(anatomy.tips) > 1:
-        tips = ", ".join(anatomy.links(b)[0] for b in anatomy.tips)
+def _check_coupled(urdf: Urdf, structure: FingerStructure) -> None:
+    if structure.tree.groups == 1 and len(structure.tips) > 1:
+        tips = ", ".join(structure.links(b)[0] for b in structure.tips)
         raise HandError(
             f"URDF {urdf.path}: one drive moves all fingers ({tips}) together; lgrasp places one contact per drive, so "
             f"they cannot oppose each other: 'lgrasp hands add {urdf.path}' makes one of the two jaws the base"
         )
 
 
-def _best_survey(urdf: Urdf, anatomy: Anatomy, name: str, jaws: tuple[str, str] | None) -> Survey:
+def _best_survey(urdf: Urdf, structure: FingerStructure, name: str, jaws: tuple[str, str] | None) -> ContactSurvey:
     """The survey of the lock values at which fingers oppose best: shared joints at 0, or at a share of their range.
 
     An arm that is in the way of the fingers is held elsewhere. Values at which links overlap that other values part are
     taken last: such grasps are invalid.
     """
     by_name = {j.name: j for j in urdf.joints}
-    base = {n: held_value(by_name[n]) for n in anatomy.locked}
-    carrying = anatomy.locked if jaws is not None else anatomy.carrying
-    spread = [n for n in anatomy.locked if n not in carrying]
-    best = survey_hand(urdf, anatomy, name, base, jaws)
+    base = {n: held_value(by_name[n]) for n in structure.locked}
+    carrying = structure.locked if jaws is not None else structure.carrying
+    spread = [n for n in structure.locked if n not in carrying]
+    best = survey_contacts(urdf, structure, name, base, jaws)
     rng = np.random.default_rng(0)
     for _ in range(_ARM_TRIALS):
         if not carrying or best.postures.clear.mean() > 0.6:
             break
         base = {**base, **{n: held_value(by_name[n], float(rng.uniform(0.2, 0.8))) for n in carrying}}
-        survey = survey_hand(urdf, anatomy, name, base, jaws)
+        survey = survey_contacts(urdf, structure, name, base, jaws)
         best = max((best, survey), key=lambda s: (s.hold is not None, s.postures.clear.mean()))
-    apart = _kept_apart(_unlocked(urdf, name, anatomy, best.locked)) if spread else set()
+    apart = _kept_apart(_unlocked(urdf, name, structure, best.locked)) if spread else set()
 
-    def value(s: Survey) -> tuple[int, float]:
+    def value(s: ContactSurvey) -> tuple[int, float]:
         return -len(_stuck(s.model, apart)), s.hold.score if s.hold else 0.0
 
     for share in (0.0, 0.5, 1.0):
         locked = {**best.locked, **{n: held_value(by_name[n], share) for n in spread}}
         if locked != best.locked:
-            best = max((best, survey_hand(urdf, anatomy, name, locked, jaws)), key=value)
+            best = max((best, survey_contacts(urdf, structure, name, locked, jaws)), key=value)
     return best
 
 
-def _unlocked(urdf: Urdf, name: str, anatomy: Anatomy, locked: dict[str, float]) -> HandModel | None:
+def _unlocked(urdf: Urdf, name: str, structure: FingerStructure, locked: dict[str, float]) -> HandModel | None:
     """The hand with its locked spread joints at any value; None when that is too much for a group."""
-    held = {n: value for n, value in locked.items() if n in anatomy.carrying}
+    held = {n: value for n, value in locked.items() if n in structure.carrying}
     shared = {n: (value,) for n, value in locked.items() if n not in held}
-    spec = probe_spec(name, tip_link(urdf, anatomy), held, anatomy.base_link)
+    spec = probe_spec(name, tip_link(urdf, structure), held, structure.base_link)
     try:
         return build_hand(urdf.path, spec.model_copy(update={"shared": shared}))
     except HandError:
@@ -202,7 +209,7 @@ def _stuck(model: HandModel, apart: set[tuple[str, str]]) -> set[tuple[str, str]
     return {(a, b) for a, b in apart - _kept_apart(model) if body[a] != body[b]}
 
 
-def _check_size(urdf: Urdf, survey: Survey) -> None:
+def _check_size(urdf: Urdf, survey: ContactSurvey) -> None:
     t = survey.postures.t.reshape(-1, 3)
     reach = survey.model.body_sphere[survey.model.body_sphere[:, 3] > 0, 3].max()
     extent = float(max(np.ptp(t, axis=0).max(), reach))
@@ -218,7 +225,7 @@ def _check_size(urdf: Urdf, survey: Survey) -> None:
         )
 
 
-def _check_hold(urdf: Urdf, survey: Survey) -> None:
+def _check_hold(urdf: Urdf, survey: ContactSurvey) -> None:
     """Refuse what can hold nothing.
 
     Raises:
@@ -226,10 +233,10 @@ def _check_hold(urdf: Urdf, survey: Survey) -> None:
     """
     if survey.hold is not None:
         return
-    anatomy = survey.anatomy
-    moved = int(anatomy.tree.groups)
-    tips = ", ".join(anatomy.links(b)[0] for b in anatomy.tips)
-    if moved == 1 and len(anatomy.tips) == 1:
+    structure = survey.structure
+    moved = int(structure.tree.groups)
+    tips = ", ".join(structure.links(b)[0] for b in structure.tips)
+    if moved == 1 and len(structure.tips) == 1:
         raise HandError(
             f"URDF {urdf.path} has one finger ({tips}) and no static surface opposite to it; a grasp needs two "
             "contacts that face each other: add the missing fingers, or a fixed link that the finger closes against"
@@ -241,46 +248,46 @@ def _check_hold(urdf: Urdf, survey: Survey) -> None:
     )
 
 
-def _say_locked(survey: Survey) -> list[str]:
+def _say_locked(survey: ContactSurvey) -> list[str]:
     said = []
     for joint, value in survey.locked.items():
-        why = "it carries the whole hand" if joint in survey.anatomy.carrying else "it moves several fingers"
+        why = "it carries the whole hand" if joint in survey.structure.carrying else "it moves several fingers"
         if survey.model.groups == 1:
             why = "it does not move the jaw"
         said.append(f"joint '{joint}' is locked at {value:g}: {why} (locked)")
     return said
 
 
-def _contact_rules(survey: Survey) -> list[dict[str, Any]]:
+def _contact_rules(survey: ContactSurvey) -> list[dict[str, Any]]:
     """One rule per set of links with the same forbidden cones."""
     rules: dict[tuple[tuple[float, ...], ...], list[str]] = {}
     named: set[str] = set()
     for side in (s for sides in survey.sides.values() for s in sides):
-        if side.skin.link not in named:
+        if side.samples.link not in named:
             key = tuple((*rounded_axis(axis), angle) for axis, angle in side.forbidden)
-            rules.setdefault(key, []).append(side.skin.link)
-            named.add(side.skin.link)
+            rules.setdefault(key, []).append(side.samples.link)
+            named.add(side.samples.link)
     return [
         {"links": links, "forbidden": [{"axis": list(cone[:3]), "angle": cone[3]} for cone in cones]}
         for cones, links in rules.items()
     ]
 
 
-def _palm_rule(survey: Survey) -> dict[str, Any]:
+def _palm_rule(survey: ContactSurvey) -> dict[str, Any]:
     if not survey.palm:
         return {}
-    links = [side.skin.link for side in survey.palm]
+    links = [side.samples.link for side in survey.palm]
     return {"links": links, "allowed": [{"axis": rounded_axis(survey.palm[0].axis), "angle": 45.0}]}
 
 
-def _say_contacts(survey: Survey, names: list[str]) -> list[str]:
+def _say_contacts(survey: ContactSurvey, names: list[str]) -> list[str]:
     said = []
-    group = survey.anatomy.tree.body_group
+    group = survey.structure.tree.body_group
     for g, finger in enumerate(names):
-        tips = [t for t in survey.anatomy.tips if group[t] == g]
-        sides = {s.skin.link: s for t in tips for s in survey.sides.get(t, [])}
+        tips = [t for t in survey.structure.tips if group[t] == g]
+        sides = {s.samples.link: s for t in tips for s in survey.sides.get(t, [])}
         joints = len(
-            set().union(*(d for t, d in zip(survey.anatomy.tips, survey.anatomy.drives, strict=True) if t in tips))
+            set().union(*(d for t, d in zip(survey.structure.tips, survey.structure.drives, strict=True) if t in tips))
         )
         if sides:
             area = 1e4 * sum(s.area for s in sides.values())
@@ -295,13 +302,15 @@ def _say_contacts(survey: Survey, names: list[str]) -> list[str]:
             said.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
     if survey.palm:
         area = 1e4 * sum(s.area for s in survey.palm)
-        said.append(f"palm: {', '.join(s.skin.link for s in survey.palm)} ({area:.0f} cm2 face the fingertips; palm)")
+        said.append(
+            f"palm: {', '.join(s.samples.link for s in survey.palm)} ({area:.0f} cm2 face the fingertips; palm)"
+        )
     else:
         said.append("palm: none; no static link shows the fingertips 3 cm2 or more (palm)")
     return said
 
 
-def _say_box(survey: Survey, names: list[str], low: np.ndarray, high: np.ndarray) -> str:
+def _say_box(survey: ContactSurvey, names: list[str], low: np.ndarray, high: np.ndarray) -> str:
     hold = survey.hold
     assert hold is not None
 
@@ -319,7 +328,7 @@ def _say_box(survey: Survey, names: list[str], low: np.ndarray, high: np.ndarray
     return f"canonical box: {place} m, where a 4-6 cm ball is held best: {who} (canonical_box)"
 
 
-def _open_posture(survey: Survey) -> tuple[dict[str, float], bool]:
+def _open_posture(survey: ContactSurvey) -> tuple[dict[str, float], bool]:
     """Joint values free of self-collision, fingers out of the canonical box, as near to 0 as that allows."""
     model, tree = survey.model, survey.model.tree
     assert survey.hold is not None
@@ -336,8 +345,8 @@ def _open_posture(survey: Survey) -> tuple[dict[str, float], bool]:
     postures = sample_bodies(model, q)
     away = np.full(len(q), np.inf)
     for side in (s for sides in survey.sides.values() for s in sides):
-        b = side.skin.body
-        p = np.einsum("nij,kj->nki", postures.R[:, b], side.skin.points[::8]) + postures.t[:, None, b]
+        b = side.samples.body
+        p = np.einsum("nij,kj->nki", postures.R[:, b], side.samples.points[::8]) + postures.t[:, None, b]
         outside = np.maximum(np.maximum(survey.hold.low - p, p - survey.hold.high), 0.0)
         away = np.minimum(away, np.linalg.norm(outside, axis=2).min(1))
     cost = np.abs((q - rest) / span).mean(1)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lgrasp.errors import HandError
 from lgrasp.hand.digest import hand_digest
-from lgrasp.hand.drafting.import_urdf import add_hand
+from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.spec import HandSpec, load_spec
 from lgrasp.paths import cache_dir
 
@@ -16,7 +16,7 @@ def drafted_folder(urdf: Path, name: str) -> Path:
     """Folder of a hand drafted from a package's URDF, kept in the cache.
 
     Raises:
-        HandError: see :func:`add_hand`.
+        HandError: see :func:`import_urdf`.
     """
     probe = {"name": name, "contact": [{"links": ["-"]}], "canonical_box": {"min": (0, 0, 0), "max": (1, 1, 1)}}
     content = hand_digest(urdf, HandSpec.model_validate(probe))
@@ -25,5 +25,5 @@ def drafted_folder(urdf: Path, name: str) -> Path:
     try:
         load_spec(folder / "hand.yaml")
     except HandError:  # not drafted yet, or unreadable
-        add_hand(urdf, name=name, out=folder, force=folder.exists())
+        import_urdf(urdf, name=name, out=folder, force=folder.exists())
     return folder

@@ -13,7 +13,7 @@ _MOST_FINGERS = 6
 
 
 @dataclass(frozen=True)
-class Anatomy:
+class FingerStructure:
     """Fingers of a hand once ``locked`` joints are held.
 
     ``tips`` are the last moving bodies with collision geometry of every branch; body 1 + j is moved by joint j of
@@ -54,9 +54,9 @@ class Anatomy:
         return [n for n, b in zip(self.tree.link_names, self.tree.link_body, strict=True) if b == body]
 
 
-def tip_link(urdf: Urdf, anatomy: Anatomy) -> str:
+def tip_link(urdf: Urdf, structure: FingerStructure) -> str:
     """A fingertip's link with collision geometry."""
-    return next(n for n in anatomy.links(anatomy.tips[0]) if urdf.links[n])
+    return next(n for n in structure.links(structure.tips[0]) if urdf.links[n])
 
 
 def probe_spec(name: str, link: str, locked: dict[str, float], base_link: str | None) -> HandSpec:
@@ -80,7 +80,7 @@ def held_value(joint: Joint, share: float | None = None) -> float:
     return min(max(value, joint.lower), joint.upper)
 
 
-def study_anatomy(urdf: Urdf, name: str, mover: str | None = None) -> Anatomy:
+def finger_structure(urdf: Urdf, name: str, mover: str | None = None) -> FingerStructure:
     """Find fingers; lock arm, wrist and spread joints, one by one, until no joint moves two fingers that could part.
 
     Args:
@@ -97,78 +97,78 @@ def study_anatomy(urdf: Urdf, name: str, mover: str | None = None) -> Anatomy:
         )
     locked: list[str] = []
     if mover is not None:
-        whole = _anatomy(urdf, name, {})
+        whole = _structure(urdf, name, {})
         drive = whole.driven_by(int(whole.tree.link_body[whole.tree.link_names.index(mover)]))
         locked = [n for n in whole.tree.joint_names if n not in drive]
     while mover is None:
-        anatomy = _anatomy(urdf, name, {n: held_value(by_name[n]) for n in locked})
-        joint = _shared_joint(anatomy)
+        structure = _structure(urdf, name, {n: held_value(by_name[n]) for n in locked})
+        joint = _shared_joint(structure)
         if joint is None:
             break
         locked.append(joint)
-    anatomy = _anatomy(urdf, name, {n: held_value(by_name[n]) for n in locked})
+    structure = _structure(urdf, name, {n: held_value(by_name[n]) for n in locked})
     for j in urdf.joints:
-        if j.name in anatomy.tree.joint_names and not j.prismatic and j.upper - j.lower > 13.0:
+        if j.name in structure.tree.joint_names and not j.prismatic and j.upper - j.lower > 13.0:
             raise HandError(
                 f"URDF {urdf.path}: joint '{j.name}' turns from {j.lower:g} to {j.upper:g} rad; its limits are "
                 "probably in degrees, multiply them by 0.0174533"
             )
-    if len(anatomy.tips) == 0:
+    if len(structure.tips) == 0:
         raise HandError(f"URDF {urdf.path}: no moving link has collision geometry; add <collision> to the finger links")
-    if anatomy.tree.groups > _MOST_FINGERS:
+    if structure.tree.groups > _MOST_FINGERS:
         raise HandError(
-            f"URDF {urdf.path} has {anatomy.tree.groups} parts that move by themselves ({_tip_names(anatomy)}), at "
+            f"URDF {urdf.path} has {structure.tree.groups} parts that move by themselves ({_tip_names(structure)}), at "
             f"most {_MOST_FINGERS} fingers are supported; cut the URDF down to one hand, or make joints that are no "
             "fingers fixed"
         )
-    whole = _carrying(urdf, anatomy, locked)
-    base = _common_link(urdf, anatomy) if whole else None
-    return Anatomy(anatomy.tree, base, tuple(locked), whole, anatomy.tips, anatomy.drives)
+    whole = _carrying(urdf, structure, locked)
+    base = _common_link(urdf, structure) if whole else None
+    return FingerStructure(structure.tree, base, tuple(locked), whole, structure.tips, structure.drives)
 
 
-def _tip_names(anatomy: Anatomy) -> str:
-    return ", ".join(anatomy.links(b)[0] for b in anatomy.tips[:12])
+def _tip_names(structure: FingerStructure) -> str:
+    return ", ".join(structure.links(b)[0] for b in structure.tips[:12])
 
 
-def _anatomy(urdf: Urdf, name: str, locked: dict[str, float]) -> Anatomy:
+def _structure(urdf: Urdf, name: str, locked: dict[str, float]) -> FingerStructure:
     solid = [link for link, geometry in urdf.links.items() if geometry]
     tree = build_tree(urdf, probe_spec(name, solid[0], locked, None))
-    rough = Anatomy(tree, None, (), (), (), ())
+    rough = FingerStructure(tree, None, (), (), (), ())
     has = {int(tree.link_body[tree.link_names.index(link)]) for link in solid} - {0}
     inner = {b for body in has for b in rough.path(body)[:-1]}
     tips = tuple(sorted(has - inner))
-    return Anatomy(tree, None, (), (), tips, tuple(rough.driven_by(tip) for tip in tips))
+    return FingerStructure(tree, None, (), (), tips, tuple(rough.driven_by(tip) for tip in tips))
 
 
-def _shared_joint(anatomy: Anatomy) -> str | None:
+def _shared_joint(structure: FingerStructure) -> str | None:
     """The actuated joint that moves most tips of one group, when each of these has other joints left.
 
     Two fingers stay together when one of them would be left with a single drive and there is another finger to oppose
     them: a finger of one drive meets few objects.
     """
     best, most = None, 1
-    group = anatomy.tree.body_group
-    for g in range(anatomy.tree.groups):
-        members = [d for tip, d in zip(anatomy.tips, anatomy.drives, strict=True) if group[tip] == g]
-        for name in anatomy.tree.joint_names:
+    group = structure.tree.body_group
+    for g in range(structure.tree.groups):
+        members = [d for tip, d in zip(structure.tips, structure.drives, strict=True) if group[tip] == g]
+        for name in structure.tree.joint_names:
             moved = [d for d in members if name in d]
-            pair = len(moved) == len(members) == 2 and anatomy.tree.groups > 1 and min(map(len, moved)) == 2
+            pair = len(moved) == len(members) == 2 and structure.tree.groups > 1 and min(map(len, moved)) == 2
             if len(moved) > most and all(len(d) > 1 for d in moved) and not pair:
                 best, most = name, len(moved)
     return best
 
 
-def _carrying(urdf: Urdf, anatomy: Anatomy, locked: list[str]) -> tuple[str, ...]:
+def _carrying(urdf: Urdf, structure: FingerStructure, locked: list[str]) -> tuple[str, ...]:
     """Locked joints between the root and the link that all fingers stand on."""
     into = {j.child: j for j in urdf.joints}
-    at, above = _common_link(urdf, anatomy), []
+    at, above = _common_link(urdf, structure), []
     while at in into:
         above.append(into[at].name)
         at = into[at].parent
     return tuple(n for n in locked if n in above)
 
 
-def _common_link(urdf: Urdf, anatomy: Anatomy) -> str:
+def _common_link(urdf: Urdf, structure: FingerStructure) -> str:
     """The deepest link that carries all fingers."""
     into = {j.child: j for j in urdf.joints}
 
@@ -179,18 +179,18 @@ def _common_link(urdf: Urdf, anatomy: Anatomy) -> str:
             out.append(link)
         return out[::-1]
 
-    static = {n for n, b in zip(anatomy.tree.link_names, anatomy.tree.link_body, strict=True) if b == 0}
+    static = {n for n, b in zip(structure.tree.link_names, structure.tree.link_body, strict=True) if b == 0}
     lines = []
-    for tip in anatomy.tips:
-        first = anatomy.path(tip)[0]
-        lines.append([link for link in above(anatomy.links(first)[0]) if link in static])
+    for tip in structure.tips:
+        first = structure.path(tip)[0]
+        lines.append([link for link in above(structure.links(first)[0]) if link in static])
     depth = 0
     while all(len(line) > depth for line in lines) and len({line[depth] for line in lines}) == 1:
         depth += 1
     return lines[0][depth - 1]
 
 
-def finger_names(anatomy: Anatomy) -> list[str]:
+def finger_names(structure: FingerStructure) -> list[str]:
     """A name for each dependency group, from its links and joints where they say which finger it is."""
     words = (
         ("thumb", ("thumb", "th_", "_th", "thj", "thd")),
@@ -200,10 +200,12 @@ def finger_names(anatomy: Anatomy) -> list[str]:
         ("little", ("little", "pinky", "lf_", "_lf", "lfj", "lfd")),
     )
     names: list[str] = []
-    for g in range(anatomy.tree.groups):
-        bodies = np.flatnonzero(anatomy.tree.body_group == g)
-        texts = [link.lower() for b in bodies for link in anatomy.links(int(b))]
-        texts += [n.lower() for tip, d in zip(anatomy.tips, anatomy.drives, strict=True) if tip in bodies for n in d]
+    for g in range(structure.tree.groups):
+        bodies = np.flatnonzero(structure.tree.body_group == g)
+        texts = [link.lower() for b in bodies for link in structure.links(int(b))]
+        texts += [
+            n.lower() for tip, d in zip(structure.tips, structure.drives, strict=True) if tip in bodies for n in d
+        ]
         count = dict.fromkeys((word for word, _ in words), 0)
         for text in texts:
             found = [word for word, keys in words if any(k in text for k in keys)]

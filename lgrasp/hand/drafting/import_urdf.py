@@ -13,7 +13,8 @@ from lxml import etree
 from lgrasp.errors import HandError, LgraspError
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.draft import draft_spec
-from lgrasp.hand.drafting.jaws import find_jaws, make_base
+from lgrasp.hand.drafting.reroot import reroot
+from lgrasp.hand.drafting.two_jaw import find_jaws
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, thin_mesh
 from lgrasp.hand.spec import HandSpec, load_spec
@@ -25,7 +26,7 @@ _LARGE = 5_000_000  # bytes of a mesh file that is worth looking into
 
 
 @dataclass(frozen=True)
-class Adopted:
+class ImportedHand:
     """A hand that was added."""
 
     folder: Path
@@ -33,7 +34,7 @@ class Adopted:
     decisions: list[str]
 
 
-def add_hand(urdf: Path, *, name: str | None = None, out: Path | None = None, force: bool = False) -> Adopted:
+def import_urdf(urdf: Path, *, name: str | None = None, out: Path | None = None, force: bool = False) -> ImportedHand:
     """Make a hand's folder from a URDF; the folder appears whole or not at all.
 
     Args:
@@ -71,7 +72,7 @@ def add_hand(urdf: Path, *, name: str | None = None, out: Path | None = None, fo
         raise type(error)(text) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    return Adopted(folder, spec, said)
+    return ImportedHand(folder, spec, said)
 
 
 def _slug(text: str) -> str:
@@ -100,7 +101,7 @@ def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> t
     _write(robot, target)
     jaws = find_jaws(target)
     if jaws is not None:
-        make_base(robot, jaws[0])
+        reroot(robot, jaws[0])
         _write(robot, target)
         said.append(
             f"one drive moves both jaws: '{jaws[0]}' is made the base (the copy of the URDF is turned round; joint "

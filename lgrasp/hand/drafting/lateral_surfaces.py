@@ -5,15 +5,15 @@ from itertools import combinations, groupby
 
 import numpy as np
 
-from lgrasp.hand.drafting.contact_survey import Survey, pad_axis
-from lgrasp.hand.drafting.surface_visibility import Skin
+from lgrasp.hand.drafting.contact_survey import ContactSurvey, pad_axis
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import Postures, sample_bodies
 from lgrasp.hand.spec import Surface
 from lgrasp.hand.spec_check import moving_joints
+from lgrasp.hand.surface import SurfaceSamples
 
-_PAD, _FLANK = 60.0, 45.0  # degrees around the axis
-_FLANK_BODIES = 3  # the last of a finger
+_PAD_ANGLE, _LATERAL_ANGLE = 60.0, 45.0  # degrees around the axis
+_LATERAL_BODIES = 3  # the last of a finger
 _BESIDE = 0.5  # cosine of a finger's lateral axis to the way to its neighbour, at least
 _PARALLEL = 0.7  # cosine of neighbours' directions
 _ONE_SIDED = 2.0  # ratio of a joint's room to both sides of its open posture, for it to bend to one
@@ -27,7 +27,9 @@ class Finger:
     name: str
     joints: tuple[str, ...]  # that move its tip, shared ones left out
     pad: tuple[Surface, ...]
-    flanks: dict[int, tuple[Surface, ...]]  # both lateral sides, +1 and -1; empty for a thumb and what does not bend
+    lateral_surfaces: dict[
+        int, tuple[Surface, ...]
+    ]  # both lateral sides, +1 and -1; empty for a thumb and what does not bend
     base: np.ndarray  # (3,) [m] where its last bodies begin
     along: np.ndarray  # (3,) unit, from there to the tip
     lateral: np.ndarray  # (3,) unit, outward of side +1
@@ -46,7 +48,7 @@ def rounded_axis(axis: np.ndarray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def find_fingers(survey: Survey, model: HandModel, names: list[str], q: np.ndarray) -> list[Finger]:
+def find_fingers(survey: ContactSurvey, model: HandModel, names: list[str], q: np.ndarray) -> list[Finger]:
     """The fingers that show the others some surface, as they stand in posture q (K,).
 
     Args:
@@ -58,46 +60,49 @@ def find_fingers(survey: Survey, model: HandModel, names: list[str], q: np.ndarr
     return [finger for finger in found if finger is not None]
 
 
-def _finger(survey: Survey, model: HandModel, standing: Postures, group: int, name: str) -> Finger | None:
+def _finger(survey: ContactSurvey, model: HandModel, standing: Postures, group: int, name: str) -> Finger | None:
     tree = survey.model.tree
     tips = [tip for tip in survey.sides if tree.body_group[tip] == group]
     place = _Place(model, standing)
     pads, hinges, moved = [], [], np.zeros(model.dofs, bool)
     for tip in tips:
-        skins = [s for s in survey.skins if s.body == tip]
-        R, t = place(skins[0])
+        surfaces = [s for s in survey.surfaces if s.body == tip]
+        R, t = place(surfaces[0])
         hinge = R @ tree.joint_axis[tip - 1].astype(float)
-        along = R @ _middle(skins)
-        axis = pad_axis(survey.model, skins, tip)
+        along = R @ _middle(surfaces)
+        axis = pad_axis(survey.model, surfaces, tip)
         if not tree.joint_prismatic[tip - 1] and abs(hinge @ along) < _ALONG * np.linalg.norm(along):
             axis = _flexed(survey, model, tip, R.T @ np.cross(hinge, along), axis)
             hinges.append(hinge)
-        pads += [(s, axis) for s in skins if axis is not None]
-        moved |= moving_joints(model.tree, int(model.tree.link_body[model.tree.link_names.index(skins[0].link)]))
+        pads += [(s, axis) for s in surfaces if axis is not None]
+        moved |= moving_joints(model.tree, int(model.tree.link_body[model.tree.link_names.index(surfaces[0].link)]))
     joints = [n for n, m in zip(model.tree.joint_names, moved, strict=True) if m and n not in model.tree.shared_names]
     if not joints or not pads:
         return None
-    last = [b for b in survey.anatomy.path(tips[0]) if any(s.body == b for s in survey.skins)][-_FLANK_BODIES:]
-    flank = [s for b in last for s in survey.skins if s.body == b]
-    base = place(flank[0])[1]
-    R, t = place(flank[-1])
-    along = R @ _middle([s for s in flank if s.body == last[-1]]) + t - base
+    last = [b for b in survey.structure.path(tips[0]) if any(s.body == b for s in survey.surfaces)][-_LATERAL_BODIES:]
+    last_surfaces = [s for b in last for s in survey.surfaces if s.body == b]
+    base = place(last_surfaces[0])[1]
+    R, t = place(last_surfaces[-1])
+    along = R @ _middle([s for s in last_surfaces if s.body == last[-1]]) + t - base
     along /= max(float(np.linalg.norm(along)), 1e-9)
-    flanks, lateral = {}, np.zeros(3)
+    lateral_surfaces, lateral = {}, np.zeros(3)
     if len(tips) == len(hinges) == 1 and name != "thumb":
         lateral = hinges[0]
-        flanks = {sign: _surfaces([(s, place(s)[0].T @ (sign * lateral)) for s in flank], _FLANK) for sign in (1, -1)}
-    return Finger(name, tuple(joints), _surfaces(pads, _PAD), flanks, base, along, lateral)
+        lateral_surfaces = {
+            sign: _surfaces([(s, place(s)[0].T @ (sign * lateral)) for s in last_surfaces], _LATERAL_ANGLE)
+            for sign in (1, -1)
+        }
+    return Finger(name, tuple(joints), _surfaces(pads, _PAD_ANGLE), lateral_surfaces, base, along, lateral)
 
 
-def _middle(skins: list[Skin]) -> np.ndarray:
+def _middle(surfaces: list[SurfaceSamples]) -> np.ndarray:
     """Mean point of the surface of links on one body, (3,) [m], body frame."""
-    return np.vstack([s.points for s in skins]).mean(0)
+    return np.vstack([s.points for s in surfaces]).mean(0)
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Called with a skin: rotation (3, 3) and position (3,) [m] of the frame of its points in a posture of the hand.
+    """Called with a samples: rotation (3, 3) and position (3,) [m] of the frame of its points in a posture of the hand.
 
     Bodies of the hand need not be those of the survey, which has the shared joints locked; links are the same.
     """
@@ -105,16 +110,16 @@ class _Place:
     model: HandModel
     standing: Postures
 
-    def __call__(self, skin: Skin) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, samples: SurfaceSamples) -> tuple[np.ndarray, np.ndarray]:
         tree = self.model.tree
-        index = tree.link_names.index(skin.link)
+        index = tree.link_names.index(samples.link)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = self.standing.R[0, tree.link_body[index]], self.standing.t[0, tree.link_body[index]]
-        T = T @ tree.T_body_link[index] @ np.linalg.inv(skin.T_body_link)
+        T = T @ tree.T_body_link[index] @ np.linalg.inv(samples.T_body_link)
         return T[:3, :3], T[:3, 3]
 
 
-def _flexed(survey: Survey, model: HandModel, tip: int, way: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
+def _flexed(survey: ContactSurvey, model: HandModel, tip: int, way: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
     """Direction in which a fingertip closes, (3,) unit, body frame: ``way`` or against it.
 
     The open posture leaves a joint most of its room to close; where it does not tell, the side that is ``seen`` does.
@@ -131,8 +136,8 @@ def _flexed(survey: Survey, model: HandModel, tip: int, way: np.ndarray, seen: n
     return way if up > down else -way
 
 
-def _surfaces(parts: list[tuple[Skin, np.ndarray]], angle: float) -> tuple[Surface, ...]:
-    """Surfaces around an axis (body frame) of each skin; neighbouring links with the same axis in one."""
+def _surfaces(parts: list[tuple[SurfaceSamples, np.ndarray]], angle: float) -> tuple[Surface, ...]:
+    """Surfaces around an axis (body frame) of each samples; neighbouring links with the same axis in one."""
     axes = [(s.link, rounded_axis(s.T_body_link[:3, :3].T @ axis)) for s, axis in parts]
     return tuple(
         Surface(links=tuple(link for link, _ in same), axis=axis, angle=angle)
@@ -148,11 +153,16 @@ def neighbours(fingers: list[Finger]) -> set[Beside]:
         for b in fingers:
             way = b.base - a.base
             far = float(np.linalg.norm(way))
-            if b is not a and b.flanks and sign * (a.lateral @ way) > _BESIDE * far and a.along @ b.along > _PARALLEL:
+            if (
+                b is not a
+                and b.lateral_surfaces
+                and sign * (a.lateral @ way) > _BESIDE * far
+                and a.along @ b.along > _PARALLEL
+            ):
                 near.append((far, b.name))
         return min(near)[1] if near else None
 
-    side = {(a.name, sign): nearest(a, sign) for a in fingers for sign in a.flanks}
+    side = {(a.name, sign): nearest(a, sign) for a in fingers for sign in a.lateral_surfaces}
     return {
         (a, sign_a, b, sign_b)
         for (a, sign_a), (b, sign_b) in combinations(side, 2)

@@ -5,13 +5,13 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from lgrasp.hand.drafting.contact_survey import Survey
+from lgrasp.hand.drafting.contact_survey import ContactSurvey
 from lgrasp.hand.drafting.lateral_surfaces import Finger, find_fingers, finger_rows, neighbours
-from lgrasp.hand.drafting.surface_visibility import Skin
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.facing import Opening, space_opening, space_postures
 from lgrasp.hand.opposition.spaces import hand_spaces, side_surface
 from lgrasp.hand.spec import Box, Cone, HandSpec, OppositionSpace, Surface
+from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.urdf import Urdf
 
 _STRAIGHT = 0.9  # cosine of an axis of a palm link to the way across the palm, for the palm to be cut
@@ -20,7 +20,7 @@ _MARGIN = 0.005  # [m] of a part of the palm beyond its surface
 
 
 def propose_spaces(
-    urdf: Urdf, spec: HandSpec, survey: Survey, names: list[str], model: HandModel
+    urdf: Urdf, spec: HandSpec, survey: ContactSurvey, names: list[str], model: HandModel
 ) -> tuple[dict[str, OppositionSpace], list[str]]:
     """Opposition spaces of a hand whose sides can face each other, and what was decided, in words.
 
@@ -57,7 +57,7 @@ def propose_spaces(
 
 
 def _candidates(
-    spec: HandSpec, survey: Survey, names: list[str], model: HandModel
+    spec: HandSpec, survey: ContactSurvey, names: list[str], model: HandModel
 ) -> list[tuple[str, list[OppositionSpace]]]:
     """Spaces to try, by name; of several of one name the one whose sides face each other most often is taken."""
     standing = [find_fingers(survey, model, names, q) for q in model.tree.settings]
@@ -78,7 +78,7 @@ def _candidates(
             out.append(_pair(a, b, a.pad, b.pad))
     for name_a, side_a, name_b, side_b in sorted(set.union(*pairs)):
         a, b = fingers[name_a], fingers[name_b]
-        out.append(_pair(a, b, a.flanks[side_a], b.flanks[side_b]))
+        out.append(_pair(a, b, a.lateral_surfaces[side_a], b.lateral_surfaces[side_b]))
     return out
 
 
@@ -88,7 +88,9 @@ def _pair(
     return f"{a.name}-{b.name}", [OppositionSpace(joints=(*a.joints, *b.joints), sides=(side_a, side_b))]
 
 
-def _palm_parts(spec: HandSpec, survey: Survey, rows: list[list[Finger]], finger: Finger) -> list[tuple[Surface, ...]]:
+def _palm_parts(
+    spec: HandSpec, survey: ContactSurvey, rows: list[list[Finger]], finger: Finger
+) -> list[tuple[Surface, ...]]:
     """Parts of the palm that a finger may close against: its own of a row of fingers, else any part, else all of it."""
     if not spec.palm.links:
         return []
@@ -100,18 +102,18 @@ def _palm_parts(spec: HandSpec, survey: Survey, rows: list[list[Finger]], finger
     return [(Surface(links=spec.palm.links, axis=cone.axis, angle=cone.angle),)]
 
 
-def _cut_palm(spec: HandSpec, survey: Survey, row: list[Finger]) -> list[tuple[Surface, ...]]:
+def _cut_palm(spec: HandSpec, survey: ContactSurvey, row: list[Finger]) -> list[tuple[Surface, ...]]:
     """The palm in parts of one width, one for each finger of a row; none where its links' axes are not square to it."""
     way = row[-1].base - row[0].base
     way /= np.linalg.norm(way)
-    frames = {side.skin.link: side.skin.T_body_link for side in survey.palm}
+    frames = {side.samples.link: side.samples.T_body_link for side in survey.palm}
     main = {link: int(np.argmax(np.abs(T[:3, :3].T @ way))) for link, T in frames.items()}
     across = {link: T[:3, main[link]] * np.sign(T[:3, main[link]] @ way) for link, T in frames.items()}
     first = next(iter(across.values()))
     if first @ way < _STRAIGHT or any(axis @ first < _ALIKE for axis in across.values()):
         return []
     cone = spec.palm.allowed[0]
-    points = {side.skin.link: _in_cone(side.skin, cone) for side in survey.palm}
+    points = {side.samples.link: _in_cone(side.samples, cone) for side in survey.palm}
     place = np.concatenate([p @ first for p in points.values()])
     edges = np.linspace(place.min(), place.max(), len(row) + 1)
     edges[[0, -1]] += [-_MARGIN, _MARGIN]
@@ -132,7 +134,7 @@ def _cut_palm(spec: HandSpec, survey: Survey, row: list[Finger]) -> list[tuple[S
     return parts
 
 
-def _in_cone(skin: Skin, cone: Cone) -> np.ndarray:
-    """Points (n, 3) of a skin whose normals are in a cone of the link frame."""
-    axis = skin.T_body_link[:3, :3] @ np.array(cone.axis)
-    return skin.points[skin.normals @ axis > np.cos(np.radians(cone.angle)) * np.linalg.norm(axis)]
+def _in_cone(samples: SurfaceSamples, cone: Cone) -> np.ndarray:
+    """Points (n, 3) of a samples whose normals are in a cone of the link frame."""
+    axis = samples.T_body_link[:3, :3] @ np.array(cone.axis)
+    return samples.points[samples.normals @ axis > np.cos(np.radians(cone.angle)) * np.linalg.norm(axis)]

@@ -10,16 +10,17 @@ from scipy.spatial import cKDTree
 from lgrasp.engine.inputs import Inputs
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.records import Shard
-from lgrasp.hand.drafting.surface_visibility import Skin, link_skins
 from lgrasp.hand.geometry import thin_mesh
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import space_sides
 from lgrasp.hand.postures import sample_bodies
+from lgrasp.hand.surface import SurfaceSamples
+from lgrasp.hand.surface_visibility import link_surfaces
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hand_check.diagnose import field_vectors, finger_label
 from lgrasp.jobs.hand_check.plotting import add_box, add_triangles, frame_points, new_figure, save_figure, shade
 from lgrasp.refine.surface import DISTAL, OTHER, last_bodies
-from lgrasp.refine.visible_surface import seen_palmar
+from lgrasp.refine.visible_surface import visible_surface
 
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#e377c2", "#17becf")
 _PALM = "#e8a400"
@@ -73,13 +74,13 @@ def draw_palmar(inputs: Inputs, path: Path) -> Path:
 
     source, model = inputs.keys.source, inputs.hand.model
     q, last = model.tree.joint_open, last_bodies(model)
-    side = seen_palmar(source, model, inputs.hand.device)
+    side = visible_surface(source, model, inputs.hand.device)
     triangles, colours = [], []
-    for skin, mesh, placed in _hand_meshes(inputs, q):
-        own, tint = side.link == model.tree.link_names.index(skin.link), shade(placed, _LINK)
+    for samples, mesh, placed in _hand_meshes(inputs, q):
+        own, tint = side.link == model.tree.link_names.index(samples.link), shade(placed, _LINK)
         if own.any():
-            pulled = _seen_faces(mesh, skin, side.points[own])
-            tint[pulled] = shade(placed[pulled], _PULLS[DISTAL if skin.body in last else OTHER])
+            pulled = _seen_faces(mesh, samples, side.points[own])
+            tint[pulled] = shade(placed[pulled], _PULLS[DISTAL if samples.body in last else OTHER])
         triangles.append(placed)
         colours.append(tint)
     figure = new_figure(16, 5.6)
@@ -136,8 +137,8 @@ def draw_spaces(inputs: Inputs, names: list[str], path: Path) -> Path:
             space_sides(urdf, source.spec, model.tree, name, inputs.hand.device), _COLOURS, strict=False
         ):
             for link in side.links:
-                for (skin, mesh, placed), tint in zip(meshes, tints, strict=True):
-                    if skin.link == link.link:
+                for (samples, mesh, placed), tint in zip(meshes, tints, strict=True):
+                    if samples.link == link.link:
                         near = _near_faces(mesh, link.points, link.normals)
                         tint[near] = shade(placed[near], colour)
         axes = figure.add_subplot(rows, columns, i + 1, projection="3d")
@@ -152,10 +153,10 @@ def _hand_triangles(inputs: Inputs, q: np.ndarray, *, patches: bool) -> tuple[np
     """Triangles (n, 3, 3) of a hand in the base frame and their colours (n, 4)."""
     model = inputs.hand.model
     triangles, colours = [], []
-    for skin, mesh, placed in _hand_meshes(inputs, q):
+    for samples, mesh, placed in _hand_meshes(inputs, q):
         tint = shade(placed, _LINK)
         if patches:
-            for group, chosen in _patch_faces(model, skin, mesh):
+            for group, chosen in _patch_faces(model, samples, mesh):
                 colour = _PALM if group == model.groups else _COLOURS[group % len(_COLOURS)]
                 tint[chosen] = shade(placed[chosen], colour)
         triangles.append(placed)
@@ -163,20 +164,20 @@ def _hand_triangles(inputs: Inputs, q: np.ndarray, *, patches: bool) -> tuple[np
     return np.concatenate(triangles), np.concatenate(colours)
 
 
-def _hand_meshes(inputs: Inputs, q: np.ndarray) -> list[tuple[Skin, trimesh.Trimesh, np.ndarray]]:
+def _hand_meshes(inputs: Inputs, q: np.ndarray) -> list[tuple[SurfaceSamples, trimesh.Trimesh, np.ndarray]]:
     """Every link with its mesh (body frame) in about even triangles, and these (n, 3, 3) in the base frame."""
     model = inputs.hand.model
     postures = sample_bodies(model, np.asarray(q, float)[None], inputs.hand.device)
     R, t = postures.R[0], postures.t[0]
     out = []
-    for skin in link_skins(read_urdf(inputs.keys.source.urdf), model):
-        mesh = thin_mesh(skin.mesh, _FACES)
+    for samples in link_surfaces(read_urdf(inputs.keys.source.urdf), model):
+        mesh = thin_mesh(samples.mesh, _FACES)
         if len(mesh.faces) < _FACES:
             edge = max(0.008, float(np.sqrt(4 * mesh.area / _FACES)))
             mesh = trimesh.Trimesh(
                 *trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge)[:2], process=False
             )
-        out.append((skin, mesh, (mesh.vertices @ R[skin.body].T + t[skin.body])[mesh.faces]))
+        out.append((samples, mesh, (mesh.vertices @ R[samples.body].T + t[samples.body])[mesh.faces]))
     return out
 
 
@@ -189,9 +190,9 @@ def _hand_points(inputs: Inputs, q: np.ndarray) -> np.ndarray:
     return np.vstack([placed, postures.t[0][1:]])
 
 
-def _patch_faces(model: HandModel, skin: Skin, mesh: trimesh.Trimesh) -> list[tuple[int, np.ndarray]]:
+def _patch_faces(model: HandModel, samples: SurfaceSamples, mesh: trimesh.Trimesh) -> list[tuple[int, np.ndarray]]:
     """(group, faces that are contact surface) of a link."""
-    link = model.tree.link_names.index(skin.link)
+    link = model.tree.link_names.index(samples.link)
     rows = np.flatnonzero(model.contact_link == link)
     if not len(rows):
         return []
@@ -205,11 +206,11 @@ def _near_faces(mesh: trimesh.Trimesh, points: np.ndarray, normals: np.ndarray) 
     return np.flatnonzero((far < 0.006) & ((mesh.face_normals * normals[near]).sum(1) > 0.6))
 
 
-def _seen_faces(mesh: trimesh.Trimesh, skin: Skin, palmar: np.ndarray) -> np.ndarray:
-    """Faces of a mesh whose nearest sample of the skin that looks their way is one of the palmar ones (n, 3)."""
-    seen = cKDTree(palmar).query(skin.points)[0] < 1e-9
-    near = cKDTree(skin.points).query(mesh.triangles_center, 8)[1]  # (m, 8)
-    alike = np.einsum("mki,mi->mk", skin.normals[near], mesh.face_normals) > 0.6
+def _seen_faces(mesh: trimesh.Trimesh, samples: SurfaceSamples, palmar: np.ndarray) -> np.ndarray:
+    """Faces of a mesh whose nearest sample of the samples that looks their way is one of the palmar ones (n, 3)."""
+    seen = cKDTree(palmar).query(samples.points)[0] < 1e-9
+    near = cKDTree(samples.points).query(mesh.triangles_center, 8)[1]  # (m, 8)
+    alike = np.einsum("mki,mi->mk", samples.normals[near], mesh.face_normals) > 0.6
     chosen = near[np.arange(len(near)), alike.argmax(1)]
     return np.flatnonzero(seen[chosen] & alike.any(1))
 

@@ -26,7 +26,7 @@ from lgrasp.jobs.shard_inputs import mesh_hash, named_hand, named_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.planner import Planner, PlanParams, cloud_params
 from lgrasp.planning.starts import STAND_OFF
-from lgrasp.refine.visible_surface import seen_palmar
+from lgrasp.refine.visible_surface import visible_surface
 from lgrasp.scenes.reader import scene_cloud
 
 VERSION = 1
@@ -114,7 +114,7 @@ class PlanJob(Job):
     def make(self, part: Part, progress: PartProgress) -> Made:
         source, hand, model, around = self._models()
         alias = self.device_used.alias
-        palmar = seen_palmar(source, hand, alias)
+        palmar = visible_surface(source, hand, alias)
         planner = Planner(upload_hand(hand, alias), model, self._stand_off(), self._params(), palmar, around)
         begin = time.perf_counter()
         grasps, counts = planner.run(self.starts, lambda done, plans: progress(done, f"{plans:,} plans"))

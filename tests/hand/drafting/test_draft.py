@@ -13,7 +13,7 @@ from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.finger_structure import held_value
-from lgrasp.hand.drafting.import_urdf import add_hand
+from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.spec import load_spec
@@ -89,7 +89,7 @@ def test_jaws_with_one_drive_get_a_jaw_as_base(tmp_path):
     path = gripper(tmp_path, mimic=True)
     with pytest.raises(HandError, match=r"one drive moves all fingers.*lgrasp hands add"):
         draft_spec(path)
-    made = add_hand(path, out=tmp_path / "made")
+    made = import_urdf(path, out=tmp_path / "made")
     assert made.spec.base_link in ("jaw_l", "jaw_r")
     assert made.spec.palm.links == (made.spec.base_link,)
     assert any("made the base" in line for line in made.decisions)
@@ -105,7 +105,7 @@ def test_visual_geometry_stands_in(tmp_path):
     path = gripper(tmp_path, kind="visual")
     with pytest.raises(HandError, match=r"no collision geometry.*lgrasp hands add"):
         draft_spec(path)
-    made = add_hand(path, out=tmp_path / "made")
+    made = import_urdf(path, out=tmp_path / "made")
     assert any("visual geometry of 3 elements is used as collision" in line for line in made.decisions)
 
 
@@ -135,7 +135,7 @@ def test_mesh_in_millimetres_is_refused_by_its_own_name(tmp_path):
     trimesh.creation.capsule(height=20.0, radius=8.0).export(tmp_path / "tip.stl")
     path = fingers(tmp_path, 2, '<geometry><mesh filename="tip.stl"/></geometry>')
     with pytest.raises(HandError, match=r"tip.stl is .* m wide.*millimetres.*scale") as caught:
-        add_hand(path, out=tmp_path / "made")
+        import_urdf(path, out=tmp_path / "made")
     assert str(tmp_path / "tip.stl") in str(caught.value)
     assert not (tmp_path / "made").exists()
 
@@ -143,7 +143,7 @@ def test_mesh_in_millimetres_is_refused_by_its_own_name(tmp_path):
 def test_huge_mesh_is_thinned_and_keeps_its_shape(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=7, radius=0.012)
     ball.export(tmp_path / "tip.stl")
-    made = add_hand(fingers(tmp_path, 2, '<geometry><mesh filename="tip.stl"/></geometry>'), out=tmp_path / "made")
+    made = import_urdf(fingers(tmp_path, 2, '<geometry><mesh filename="tip.stl"/></geometry>'), out=tmp_path / "made")
     assert any("tip.stl has 327,680 faces: thinned to" in line for line in made.decisions)
     thin = trimesh.load_mesh(made.folder / "meshes" / "collision" / "tip.stl")
     assert len(thin.faces) <= 40_000
@@ -152,23 +152,23 @@ def test_huge_mesh_is_thinned_and_keeps_its_shape(tmp_path):
 
 def test_folder_is_whole_or_absent(tmp_path):
     path, folder = gripper(tmp_path), tmp_path / "hands" / "jaws"
-    made = add_hand(path, out=folder)
+    made = import_urdf(path, out=folder)
     assert load_spec(folder / "hand.yaml") == made.spec
     before = (folder / "hand.yaml").read_bytes()
     with pytest.raises(HandError, match=r"exists.*--name.*--force"):
-        add_hand(path, out=folder)
-    add_hand(path, out=folder, force=True)
+        import_urdf(path, out=folder)
+    import_urdf(path, out=folder, force=True)
     assert (folder / "hand.yaml").read_bytes() == before  # drafting twice gives the same
     with pytest.raises(HandError, match="one finger"):
-        add_hand(fingers(tmp_path, 1), out=folder, force=True)
+        import_urdf(fingers(tmp_path, 1), out=folder, force=True)
     assert (folder / "hand.yaml").read_bytes() == before
     assert [p.name for p in folder.parent.iterdir()] == ["jaws"]
     with pytest.raises(HandError, match="holds something that is no hand"):
-        add_hand(path, out=tmp_path, force=True)
+        import_urdf(path, out=tmp_path, force=True)
 
 
 def test_hand_file_explains_every_key(tmp_path):
-    made = add_hand(gripper(tmp_path), out=tmp_path / "made")
+    made = import_urdf(gripper(tmp_path), out=tmp_path / "made")
     lines = (made.folder / "hand.yaml").read_text().splitlines()
     keys = {line.split(":")[0] for line in lines if line and not line.startswith((" ", "#"))}
     assert keys >= set(type(made.spec).model_fields) - {"description", "notes"}

@@ -8,7 +8,7 @@ from support.hands import REAL, ROOT
 from support.urdfs import fingers, gripper, turned
 
 from lgrasp.hand.drafting.draft import draft_spec
-from lgrasp.hand.drafting.import_urdf import add_hand
+from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.drafting.lateral_surfaces import Beside, finger_rows
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.opposition.spaces import hand_spaces
@@ -69,7 +69,7 @@ def test_jaws_get_one_space_and_the_rest_is_dropped_with_the_reason(tmp_path):
     assert set(spec.opposition_spaces["finger_1-finger_2"].joints) == {"l", "r"}
     assert any("no opposition space finger_1-palm, finger_2-palm: its sides never face" in line for line in said)
     # one jaw made the base: the other closes against it as against a palm
-    made = add_hand(gripper(tmp_path, mimic=True), out=tmp_path / "made").spec
+    made = import_urdf(gripper(tmp_path, mimic=True), out=tmp_path / "made").spec
     (space,) = made.opposition_spaces.values()
     assert len(space.joints) == 1
     assert {link for side in space.sides for part in side for link in part.links} == {"jaw_l", "jaw_r"}

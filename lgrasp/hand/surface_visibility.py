@@ -1,7 +1,5 @@
 """The palmar side of a hand: what the mean fingertip sees, by rays, over many postures."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import trimesh
 import warp as wp
@@ -10,6 +8,7 @@ from lgrasp.hand.geometry import geometry_mesh
 from lgrasp.hand.mesh_kernels import first_hits
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import Postures
+from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.urdf import Urdf
 from lgrasp.runtime.device import start
 
@@ -17,28 +16,9 @@ _POINTS = 400
 _VIEWS = 32
 
 
-@dataclass(frozen=True)
-class Skin:
-    """Surface of one link in its body frame, and how often the mean fingertip sees each of its points."""
-
-    link: str
-    body: int
-    area: float  # [m^2]
-    points: np.ndarray  # (n, 3) [m]
-    normals: np.ndarray  # (n, 3)
-    seen: np.ndarray  # (n,) share of postures
-    T_body_link: np.ndarray  # (4, 4)
-    mesh: trimesh.Trimesh  # body frame
-
-    @property
-    def seen_area(self) -> float:
-        """Area weighted by how often it is seen [m^2]."""
-        return self.area * float(self.seen.mean())
-
-
-def link_skins(urdf: Urdf, model: HandModel) -> list[Skin]:
+def link_surfaces(urdf: Urdf, model: HandModel) -> list[SurfaceSamples]:
     """Surface samples of every link with collision geometry; nothing is seen yet."""
-    skins = []
+    surfaces = []
     tree = model.tree
     for index, link in enumerate(tree.link_names):
         if not urdf.links[link]:
@@ -51,8 +31,8 @@ def link_skins(urdf: Urdf, model: HandModel) -> list[Skin]:
         points, faces = trimesh.sample.sample_surface(mesh, _POINTS, seed=index)[:2]
         normals = np.asarray(mesh.face_normals)[faces]
         T, body = tree.T_body_link[index], int(tree.link_body[index])
-        skins.append(Skin(link, body, float(mesh.area), points, normals, np.zeros(len(points)), T, mesh))
-    return skins
+        surfaces.append(SurfaceSamples(link, body, float(mesh.area), points, normals, np.zeros(len(points)), T, mesh))
+    return surfaces
 
 
 def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
@@ -61,19 +41,21 @@ def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     return joined
 
 
-def see_skins(skins: list[Skin], postures: Postures, tips: dict[int, np.ndarray], device: str = "cpu") -> list[Skin]:
-    """The skins with the share of postures at which the mean fingertip sees each point.
+def surface_visibility(
+    surfaces: list[SurfaceSamples], postures: Postures, tips: dict[int, np.ndarray], device: str = "cpu"
+) -> list[SurfaceSamples]:
+    """The surfaces with the share of postures at which the mean fingertip sees each point.
 
     Args:
         tips: tip body -> fingertip in its body frame [m].
     """
     start()
-    body = np.concatenate([np.full(len(s.mesh.vertices), s.body) for s in skins])
-    vertices = np.concatenate([s.mesh.vertices for s in skins])
-    offsets = np.cumsum([0, *(len(s.mesh.vertices) for s in skins)])
-    faces = np.concatenate([s.mesh.faces + o for s, o in zip(skins, offsets, strict=False)])
-    point_body = np.concatenate([np.full(len(s.points), s.body) for s in skins])
-    points, normals = (np.concatenate([getattr(s, k) for s in skins]) for k in ("points", "normals"))
+    body = np.concatenate([np.full(len(s.mesh.vertices), s.body) for s in surfaces])
+    vertices = np.concatenate([s.mesh.vertices for s in surfaces])
+    offsets = np.cumsum([0, *(len(s.mesh.vertices) for s in surfaces)])
+    faces = np.concatenate([s.mesh.faces + o for s, o in zip(surfaces, offsets, strict=False)])
+    point_body = np.concatenate([np.full(len(s.points), s.body) for s in surfaces])
+    points, normals = (np.concatenate([getattr(s, k) for s in surfaces]) for k in ("points", "normals"))
     seen = np.zeros(len(points))
     chosen = np.argsort(postures.touching, kind="stable")[:_VIEWS]  # postures that collide come last
     handle = None
@@ -96,8 +78,8 @@ def see_skins(skins: list[Skin], postures: Postures, tips: dict[int, np.ndarray]
         targets = wp.array(target.astype(np.float32), dtype=wp.vec3, device=device)
         wp.launch(first_hits, len(target), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device)
         seen += facing & (free.numpy() == 1)
-    parts = np.split(seen / len(chosen), np.cumsum([len(s.points) for s in skins])[:-1])
+    parts = np.split(seen / len(chosen), np.cumsum([len(s.points) for s in surfaces])[:-1])
     return [
-        Skin(s.link, s.body, s.area, s.points, s.normals, part, s.T_body_link, s.mesh)
-        for s, part in zip(skins, parts, strict=True)
+        SurfaceSamples(s.link, s.body, s.area, s.points, s.normals, part, s.T_body_link, s.mesh)
+        for s, part in zip(surfaces, parts, strict=True)
     ]

@@ -1,4 +1,4 @@
-"""Sample objects that ship with the package, built from primitives; ``write_samples`` fills the ``objects/`` folder.
+"""The sample objects that ship with the package, built from primitives; ``write_samples`` fills ``objects/``.
 
 Making them needs manifold3d (part of ``trimesh[easy]``); using the shipped files does not.
 """
