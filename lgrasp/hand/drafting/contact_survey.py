@@ -163,7 +163,7 @@ def _along(surfaces: list[SurfaceSamples]) -> np.ndarray:
 
 
 def _palmar_axis(model: HandModel, surfaces: list[SurfaceSamples], body: int) -> np.ndarray | None:
-    """ContactSurface direction in the body frame: mean of the normals seen, across the flexion axis."""
+    """Palmar direction in the body frame: mean of the normals seen, across the flexion axis."""
     m = sum(((s.seen[:, None] * s.normals).mean(0) * s.area for s in surfaces), np.zeros(3))
     if np.linalg.norm(m) < 1e-9:
         return None
