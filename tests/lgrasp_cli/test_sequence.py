@@ -61,7 +61,7 @@ def test_bad_input(sequence, tmp_path, arguments, words):
 
 
 def test_pipeline_of_one_object(cli, tmp_path):
-    assert "no stage sequence" in cli("sequence", "mug", "sphere", "-p", "swift", "--out", tmp_path / "o").error()
+    assert "has no sequence" in cli("sequence", "mug", "sphere", "-p", "swift", "--out", tmp_path / "o").error()
     line = cli("generate", "--object", "tiny", "-p", "sequence", "--out", tmp_path / "o").error()
     assert "lgrasp sequence" in line
 
