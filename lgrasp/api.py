@@ -185,7 +185,7 @@ def refine(
     Args:
         grasps: grasps, a shard, or a folder of shards.
         coarse: poses are off by centimetres, as those of a network.
-        bounds: :class:`GraspBounds` that rows must pass; default: the strict ones.
+        bounds: :class:`GraspBounds` that rows must pass; default: those that they passed before.
         params: ``matching_rounds``, ``gradient_steps``.
         out: folder for shards; none: no file.
 

@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from lgrasp.notices import notice
+from lgrasp_cli.options import Settings
 from lgrasp_cli.working import How, working
 
 
@@ -42,14 +44,17 @@ def refine(
     coarse: Annotated[
         bool, typer.Option("--coarse", help="Large steps and a long reach: for poses that are far off.")
     ] = False,
-    always: Annotated[
-        bool, typer.Option("--always", help="Store the refined posture of every row, valid or not.")
+    keep_invalid: Annotated[
+        bool,
+        typer.Option("--keep-invalid", help="Keep rows that pass in no posture, refined, with metric 'valid' 0."),
     ] = False,
+    always: Annotated[bool, typer.Option("--always", hidden=True)] = False,
+    settings: Settings = None,
 ) -> None:
     """Move grasps by the gradient of the surface matching energy, check them again, and write shards.
 
-    A refined posture takes the place of its row where it passes every check of the filter stage and resists pulls
-    better; metrics 'refined', 'valid' and 'energy' say what became of a row.
+    A refined posture takes the place of its row where it passes every check and resists loads better. Rows that pass in
+    neither posture are left out. The bounds are those that the shard's rows passed, or --set bounds.KEY=VALUE.
 
     Example: lgrasp refine grasps/allegro-mug --out grasps/allegro-mug-refined
     """
@@ -59,7 +64,10 @@ def refine(
     params = refine_params(
         matching_rounds=matching_rounds, gradient_steps=gradient_steps, outer=outer, inner=inner, coarse=coarse
     )
-    job = how.job(RefineJob, "refine", shards=shards, out=out, form=form, hand=hand, always=always, params=params)
+    if always:
+        notice("--always is now called --keep-invalid; the old name works in this release only")
+    chosen = {"keep_invalid": keep_invalid or always, "settings": tuple(settings or ())}
+    job = how.job(RefineJob, "refine", shards=shards, out=out, form=form, hand=hand, params=params, **chosen)
     how.run(job, _show)
 
 

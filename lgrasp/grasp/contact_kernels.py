@@ -51,7 +51,7 @@ def link_contacts(
 ):
     """One thread per (run, hand): its nearest point that faces the object within the limits, if there is one.
 
-    The contact on the object is the foot of the perpendicular; its normal is that of the contact point beside it.
+    The contact on the object is the contact point beside the foot of the perpendicular, whose normal is true.
 
     Args:
         pose: (n,) T_hand_object.
@@ -96,12 +96,12 @@ def link_contacts(
     m = obj.contact_normals[beside]
     facing = -wp.dot(m, wp.transform_vector(T, runs.normals[c]))
     if runs.grid[s] >= 0:
-        fit = contact_fit(hand, runs.grid[s], T, foot, -m)
+        fit = contact_fit(hand, runs.grid[s], T, obj.contact_points[beside], -m)
         best = fit[0]
         facing = wp.min(fit[1], fit[2])
     if wp.dot(m, n) > limits.min_spread_cosine and facing > limits.min_cosine and best < limits.max_gap:
         found_out.gap[i, s] = best
-        found_out.point[i, s] = foot
+        found_out.point[i, s] = obj.contact_points[beside]
         found_out.normal[i, s] = m
 
 

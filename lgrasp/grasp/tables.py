@@ -220,6 +220,19 @@ def choose_grasps(old: GraspTable, new: GraspTable, into: np.ndarray, rows: np.n
     return grasps_from_arrays(made)
 
 
+def widen_grasps(table: GraspTable, width: int) -> GraspTable:
+    """The table with room for ``width`` contacts at least."""
+    missing = width - table.contact_links.shape[1]
+    if missing <= 0:
+        return table
+    out = grasp_arrays(table)
+    for name in ("contact_points", "contact_normals", "contact_links", "contact_forces"):
+        x = out[name]
+        none = -1 if name == "contact_links" else np.nan
+        out[name] = np.pad(x, [(0, 0), (0, missing)] + [(0, 0)] * (x.ndim - 2), constant_values=none)
+    return grasps_from_arrays(out)
+
+
 def sort_grasps(table: GraspTable) -> GraspTable:
     """The rows in candidate order."""
     return reorder_grasps(table, np.argsort(table.index, kind="stable"))

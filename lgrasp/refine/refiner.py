@@ -112,7 +112,7 @@ class Refiner(nn.Module):
             q: joint positions [rad or m], (N, K); outside the limits they are clamped first.
         """
         with torch.no_grad():
-            given, fast = Pose(R.detach(), t.detach(), self._clamped(q.detach())), self._fast()
+            given, fast = Pose(R.detach(), t.detach(), self._clamped(q.detach())), self.search
 
             def search(part: Pose) -> Pose:
                 at = self._put(part)
@@ -129,9 +129,11 @@ class Refiner(nn.Module):
     def max_penetration(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Depth of the deepest point of hands in anything, or of that in them [m], negative apart, (N,)."""
         with torch.no_grad():
-            return torch.as_tensor(self._fast().max_penetration(self._put(Pose(R, t, q))), device=self._device)
+            return torch.as_tensor(self.search.max_penetration(self._put(Pose(R, t, q))), device=self._device)
 
-    def _fast(self) -> Descent:
+    @property
+    def search(self) -> Descent:
+        """The local search of the fast mode."""
         if self._descent is None:
             name = "cpu" if self._device.type == "cpu" else f"cuda:{self._device.index or 0}"
             target = upload_target(self.target.model, self.target.around, name)
@@ -142,7 +144,7 @@ class Refiner(nn.Module):
 
     def _put(self, pose: Pose) -> Hands:
         base = pose_from_motion(pose.R, pose.t)
-        return Hands.put(base.cpu().numpy(), pose.q.cpu().numpy(), self._fast().device)
+        return Hands.put(base.cpu().numpy(), pose.q.cpu().numpy(), self.search.device)
 
     def _taken(self, at: Hands, dtype: torch.dtype) -> Pose:
         base, q = (torch.as_tensor(x, dtype=dtype, device=self._device) for x in at.numpy())

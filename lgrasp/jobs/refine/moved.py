@@ -6,24 +6,29 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset import GraspRows
-from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.grasp.check import check_grasps
+from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.find_contacts import find_contacts
+from lgrasp.grasp.outcomes import Outcome
 from lgrasp.grasp.rows import grasp_rows, press
-from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays, join_grasps
+from lgrasp.grasp.schema import GRASP_FIELDS
+from lgrasp.grasp.tables import GraspTable, choose_grasps, join_grasps, widen_grasps
 from lgrasp.hand.arrays import HandArrays
+from lgrasp.math.qp import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.energy import Energies
-from lgrasp.refine.refiner import Pose, Refiner, object_pose
+from lgrasp.refine.improve import improve
+from lgrasp.refine.refiner import Pose, Refiner, table_pose
 from lgrasp.stages.refine.params import RefineParams
 
 _ROWS = 256  # at a time
 _FAR = 0.5  # [m] from the object: nothing pulls there
 _BETTER = 1e-3  # of a unit pull that must be resisted more to replace a valid row
+_ROUNDING = 1e-6  # [m] of a pose in a file
 _LIMIT = 1e-4  # [rad or m] that a joint may be outside its limits
 
 
@@ -31,12 +36,14 @@ class Moved(NamedTuple):
     """What became of rows."""
 
     rows: GraspRows
-    """In their order, with metrics ``energy`` and its terms at the posture stored, ``valid`` (passes every check) and
-    ``refined`` (the posture is the refined one)."""
+    """Those to write in their order, with metrics ``energy`` and its terms at the posture stored, ``valid`` (passes
+    every check) and ``refined`` (the posture is the refined one)."""
     energy: tuple[float, float]
-    """Mean E* before and after the search."""
+    """Mean E* of all rows before and after the search."""
     valid: tuple[int, int]
-    """Rows that pass every check, before and as stored."""
+    """Rows that pass every check, before and after."""
+    failed: int
+    """Rows that pass in neither posture."""
     clamped: int
     """Rows whose joints were outside their limits; they are moved, and kept where they stay, from within."""
     far: int
@@ -50,67 +57,114 @@ def move_rows(
     params: RefineParams,
     bounds: GraspBounds,
     *,
-    always: bool = False,
+    keep_invalid: bool = False,
     stored: bool = True,
+    measured: bool = True,
     progress: Callable[[int], None] | None = None,
 ) -> Moved:
     """Refine rows of one object.
 
-    A refined row takes the place of the one given where it passes every check, and that does not or resists pulls less,
-    by what is stored of it too.
+    A refined row takes the place of the one given where it passes every check, and that does not or resists loads less.
+    Rows that pass in neither posture are left out.
 
     Args:
-        always: every row takes the refined posture.
-        stored: rows that are not replaced stay as they are, metrics and contacts included; else all is computed.
+        keep_invalid: those rows are kept too, refined, with their own metrics and ``valid`` 0.
+        stored: contacts of the rows are known, and rows that are not replaced stay as they are.
+        measured: metrics of the rows are of these bounds.
         progress: called with rows done.
     """
     refiner = Refiner(hand.model, obj, params, device=hand.device)
     arrays = upload_object(obj, hand.device)
     outside = _outside(rows, hand)
-    known = np.asarray(rows.metrics.get("unresisted_load", np.full(len(rows), np.nan))) if stored else None
-    parts, before, after, oks = [], [], [], []
-    far = 0
+    parts = []
     for first in range(0, len(rows), _ROWS):
         part = slice(first, first + _ROWS)
-        given = _hands(rows, part, hand, obj)
-        refined = refiner(*given)
-        index = np.arange(len(rows))[part]
-        old, old_outcome = _checked(hand, arrays, given, bounds, index)
-        new, new_outcome = _checked(hand, arrays, refined.pose, bounds, index)
-        good, was = new_outcome == 0, old_outcome == 0
-        least = (
-            old.metrics["unresisted_load"] if known is None else np.fmin(old.metrics["unresisted_load"], known[part])
-        )
-        lower = new.metrics["unresisted_load"] < least - _BETTER
-        take = np.ones_like(good) if always else good & (~was | lower)
-        energies = _numbers(refiner.energy(*given)), _numbers(refined.energies)
-        before.append(energies[0])
-        after.append(np.where(take, energies[1], energies[0]))
-        parts.append((_mixed(old, new, take), take, np.where(take, good, was)))
-        oks.append((was, np.where(take, good, was)))
-        far += int((_distance(given, refiner) > _FAR).sum())
+        parts.append(_moved_part(refiner, hand, arrays, rows, part, params, bounds, stored))
         if progress:
             progress(min(first + _ROWS, len(rows)))
-    table = join_grasps([p[0] for p in parts])
-    take, valid = (np.concatenate([p[k] for p in parts]) for k in (1, 2))
-    first_energy, last_energy = np.concatenate(before, 1), np.concatenate(after, 1)
+    table = join_grasps([p.table for p in parts])
+    first_energy, last_energy = (np.concatenate(x, 1) for x in zip(*(p.energy for p in parts), strict=True))
+    was, known, taken, good = (np.concatenate([p.marks[k] for p in parts]) for k in range(4))
     terms = {f"energy_{name}": values for name, values in zip(Energies._fields, last_energy, strict=True)}
-    extra = {"energy": last_energy.sum(0), **terms, "valid": valid, "refined": take}
+    valid = was | good
+    extra = {"energy": last_energy.sum(0), **terms, "valid": valid, "refined": taken}
     extra = {name: np.asarray(values, np.float32) for name, values in extra.items()}
     made = grasp_rows(press(table), hand.model.tree, obj.center, extra=extra)
     made = replace(made, candidate=rows.candidate)
     if stored:
-        made = _kept(rows, made, take | outside)
-    was = np.concatenate([ok[0] for ok in oks])
+        made = _kept(rows, made, taken | outside | ~known, measured)
+    if not keep_invalid:
+        made = _some(made, valid)
     means = float(first_energy.sum(0).mean()), float(last_energy.sum(0).mean())
-    return Moved(made, means, (int(was.sum()), int(valid.sum())), int(outside.sum()), far)
+    failed, far = int((~valid).sum()), sum(p.far for p in parts)
+    return Moved(made, means, (int(was.sum()), int(valid.sum())), failed, int(outside.sum()), far)
 
 
-def _checked(
-    hand: HandArrays, obj: ObjectArrays, at: Pose, bounds: GraspBounds, index: np.ndarray
-) -> tuple[GraspTable, np.ndarray]:
-    pose, q = object_pose(at), at.q.cpu().numpy()
-    return check_grasps(hand, obj, pose, q, find_contacts(hand, obj, pose, q, bounds), bounds, index=index)
+class _Part(NamedTuple):
+    table: GraspTable
+    energy: tuple[np.ndarray, np.ndarray]  # terms before and after, (6, n)
+    marks: tuple[np.ndarray, ...]  # rows valid before, with the contacts that they name, replaced, valid when refined
+    far: int
+
+
+def _moved_part(
+    refiner: Refiner,
+    hand: HandArrays,
+    obj: ObjectArrays,
+    rows: GraspRows,
+    part: slice,
+    params: RefineParams,
+    bounds: GraspBounds,
+    stored: bool,
+) -> _Part:
+    pose, q = _hands(rows, part, hand, obj.model)
+    index = np.arange(len(rows))[part]
+    found = find_contacts(hand, obj, pose, q, bounds)
+    old, outcome = check_grasps(hand, obj, pose, q, found, bounds, index=index)
+    given = table_pose(old, hand.device)
+    was = outcome == Outcome.KEPT
+    known: np.ndarray = np.zeros(len(q), bool)
+    if stored and np.shape(rows.contact_links)[2] <= MAX_CONTACTS:
+        links, points, normals = (
+            np.asarray(a)[part, 0] for a in (rows.contact_links, rows.contact_points, rows.contact_normals)
+        )
+        own = known_contacts(links, points - obj.model.center, normals, hand.device)
+        told, outcome = check_grasps(hand, obj, pose, q, own, _rounded(bounds), index=index)
+        known = outcome == Outcome.KEPT
+        width = max(old.contact_links.shape[1], told.contact_links.shape[1])
+        at = np.flatnonzero(known)
+        old, was = choose_grasps(widen_grasps(old, width), widen_grasps(told, width), at, at), was | known
+    tries = np.where(was | (params.matching_rounds == 0), 1, params.tries)
+    new, outcome = improve(refiner.search, hand, obj, pose, q, bounds, tries=tries, index=index)
+    good = outcome == Outcome.KEPT
+    lower = new.metrics["unresisted_load"] < old.metrics["unresisted_load"] - _BETTER
+    taken = ~was | (good & lower)
+    at = np.flatnonzero(taken)
+    new = widen_grasps(new, old.contact_links.shape[1])
+    table = choose_grasps(widen_grasps(old, new.contact_links.shape[1]), new, at, at)
+    energy = tuple(_numbers(refiner.energy(*pose)) for pose in (given, table_pose(table, hand.device)))
+    far = int((_distance(given, refiner) > _FAR).sum())
+    return _Part(table, (energy[0], energy[1]), (was, known, taken, good), far)
+
+
+def _rounded(bounds: GraspBounds) -> GraspBounds:
+    """The bounds for rows from a file, whose poses and contacts were rounded in it."""
+    return bounds.model_copy(
+        update={
+            "max_gap": bounds.max_gap + _ROUNDING,
+            "max_penetration": bounds.max_penetration + _ROUNDING,
+            "min_self_distance": max(bounds.min_self_distance - _ROUNDING, 0.0),
+            "max_normal_angle": bounds.max_normal_angle + np.degrees(10 * _ROUNDING),
+            "max_gswo": bounds.max_gswo + 100 * _ROUNDING,
+            "max_unresisted_load": bounds.max_unresisted_load + 1000 * _ROUNDING,
+        }
+    )
+
+
+def _some(rows: GraspRows, chosen: np.ndarray) -> GraspRows:
+    """The rows that are chosen, (N,) bool."""
+    fields = {name: np.asarray(getattr(rows, name))[chosen] for name in GRASP_FIELDS}
+    return replace(rows, **fields, metrics={name: np.asarray(x)[chosen] for name, x in rows.metrics.items()})
 
 
 def _outside(rows: GraspRows, hand: HandArrays) -> np.ndarray:
@@ -119,14 +173,15 @@ def _outside(rows: GraspRows, hand: HandArrays) -> np.ndarray:
     return np.asarray(((q < limits[:, 0] - _LIMIT) | (q > limits[:, 1] + _LIMIT)).any(1))
 
 
-def _hands(rows: GraspRows, part: slice, hand: HandArrays, obj: ObjectModel) -> Pose:
-    """The hands of rows in the object's internal frame, joints within their limits."""
-    T = pose_matrix(np.asarray(rows.object_pose, float)[part, 0])  # base from the user's frame
-    R = T[:, :3, :3].transpose(0, 2, 1)
-    t = -(R @ T[:, :3, 3:])[..., 0] - obj.center
+def _hands(rows: GraspRows, part: slice, hand: HandArrays, obj: ObjectModel) -> tuple[np.ndarray, np.ndarray]:
+    """T_hand_object of the object's internal frame (n, 7), and joints within their limits (n, K); row by row, so that
+    none depends on the others."""
+    pose = np.asarray(rows.object_pose, float)[part, 0]
+    turned = Rotation.from_quat(pose[:, 3:], scalar_first=True)
     tree = hand.model.tree
     q = np.clip(np.asarray(rows.q)[part, : hand.model.dofs], tree.joint_lower, tree.joint_upper)
-    return Pose(*(torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32, device=hand.device) for a in (R, t, q)))
+    made = np.concatenate([pose[:, :3] + turned.apply(obj.center), turned.as_quat()], 1)
+    return made.astype(np.float32), np.ascontiguousarray(q, np.float32)
 
 
 def _distance(pose: Pose, refiner: Refiner) -> np.ndarray:
@@ -139,16 +194,11 @@ def _numbers(energies: Energies) -> np.ndarray:
     return torch.stack(list(energies)).detach().cpu().numpy()
 
 
-def _mixed(old: GraspTable, new: GraspTable, take: np.ndarray) -> GraspTable:
-    a, b = grasp_arrays(old), grasp_arrays(new)
-    return grasps_from_arrays(
-        {name: np.where(take.reshape(-1, *(1,) * (x.ndim - 1)), b[name], x).astype(x.dtype) for name, x in a.items()}
-    )
+def _kept(old: GraspRows, new: GraspRows, take: np.ndarray, measured: bool) -> GraspRows:
+    """``new`` with the stored rows of ``old`` but those to ``take``, with their metrics if ``measured``.
 
-
-def _kept(old: GraspRows, new: GraspRows, take: np.ndarray) -> GraspRows:
-    """``new`` with the stored rows of ``old`` but those to ``take``. Verdicts of a simulator are dropped: they are of
-    the old rows."""
+    Verdicts of a simulator are dropped: they are of the old rows.
+    """
     changes = {}
     for name in ("q", "q_pregrasp", "q_squeeze", "object_pose"):
         keep = (~take).reshape(-1, *(1,) * (np.ndim(getattr(old, name)) - 1))
@@ -159,7 +209,7 @@ def _kept(old: GraspRows, new: GraspRows, take: np.ndarray) -> GraspRows:
         x, y = (_padded(np.asarray(getattr(rows, name)), width) for rows in (old, new))
         changes[name] = np.where((~take).reshape(-1, *(1,) * (x.ndim - 1)), x, y).astype(x.dtype)
     metrics = {
-        name: np.where(take, values, old.metrics[name]) if name in old.metrics else values
+        name: np.where(take, values, old.metrics[name]) if measured and name in old.metrics else values
         for name, values in new.metrics.items()
     }
     return replace(new, **changes, metrics=metrics)

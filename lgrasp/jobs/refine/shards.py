@@ -3,11 +3,12 @@
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from pydantic import Field, PrivateAttr
 
+from lgrasp.config import apply_settings
 from lgrasp.dataset import ShardHeader, read_shard
 from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.reader import ShardReader
@@ -17,7 +18,7 @@ from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import ConfigError, HandError, ShardError
-from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.records import Shard
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.refine.moved import move_rows
@@ -25,7 +26,7 @@ from lgrasp.jobs.refine.sources import grasp_shards
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
 from lgrasp.stages.refine.params import RefineParams
 
-VERSION = 1
+VERSION = 2
 """Raised whenever refined shards change for the same parameters."""
 
 
@@ -35,17 +36,19 @@ class RefineJob(ShardJob):
     shards: tuple[Path, ...] = Field(description="Shards, folders of them at any depth; or one export, see 'form'.")
     form: str | None = Field(None, description="Format of another program; none: shards.")
     hand: str | None = Field(None, description="Of grasps in another format; shards hold their own.")
-    always: bool = Field(False, description="Every row takes its refined posture, whatever the checks say.")
+    keep_invalid: bool = Field(False, description="Rows that pass in no posture are kept too, with metric valid 0.")
     params: RefineParams = Field(default_factory=RefineParams)
-    bounds: GraspBounds = Field(default_factory=GraspBounds)
+    bounds: GraspBounds | None = Field(None, description="None: those that the rows of a shard passed before.")
+    settings: tuple[str, ...] = Field((), description="PART.KEY=VALUE of bounds or refine, in place of theirs.")
     _hands: dict[str, HandArrays] = PrivateAttr(default_factory=dict)
     _given: dict[int, Shard] = PrivateAttr(default_factory=dict)  # of an export, by number of the part
 
     def key(self) -> str:
         described = {
             "params": self.params.model_dump(mode="json"),
-            "bounds": self.bounds.describe(),
-            "always": self.always,
+            "bounds": self.bounds and self.bounds.describe(),
+            "settings": self.settings,
+            "keep_invalid": self.keep_invalid,
         }
         return content_key("refine", VERSION, **described)
 
@@ -83,15 +86,20 @@ class RefineJob(ShardJob):
         _check_rows(part.source, shard)
         hand = self._hand(part.source, shard)
         model = object_of_shard(self.cache, shard.objects[0], self.device_used)
+        told = stored_bounds(shard.header.config)
+        parts = {"bounds": self.bounds or told, "refine": self.params}
+        made = apply_settings(parts, self.settings, "lgrasp refine")
+        bounds, params = cast(GraspBounds, made["bounds"]), cast(RefineParams, made["refine"])
         begin = time.perf_counter()
         moved = move_rows(
             hand,
             model,
             shard.grasps,
-            self.params,
-            self.bounds,
-            always=self.always,
+            params,
+            bounds,
+            keep_invalid=self.keep_invalid,
             stored=self.form is None,
+            measured=(told.friction, told.torque_scale) == (bounds.friction, bounds.torque_scale),
             progress=progress,
         )
         if moved.clamped:
@@ -104,14 +112,18 @@ class RefineJob(ShardJob):
                 f"the hands of {moved.far:,} rows are more than half a metre from their object, nothing draws them to "
                 f"it: {part.source}"
             )
+        if not len(moved.rows):
+            self.cache.warn(f"none of the {moved.failed:,} rows passed the checks; nothing is written: {part.source}")
+            return Made(0)
         counts = {
+            "refine_failed": moved.failed,
             "refine_tried": len(shard.grasps),
             "refine_replaced": int(moved.rows.metrics["refined"].sum()),
             "refine_valid_before": moved.valid[0],
             "refine_energy_before": moved.energy[0] * len(shard.grasps),  # sums, for merged shards
             "seconds_refine": time.perf_counter() - begin,
         }
-        written = self.marked(part, replace(shard, header=self._header(shard), grasps=moved.rows), counts)
+        written = self.marked(part, replace(shard, header=_header(shard, bounds, params), grasps=moved.rows), counts)
         return Made(len(moved.rows), written)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
@@ -131,27 +143,24 @@ class RefineJob(ShardJob):
             self._hands[digest] = upload_hand(model, device.alias)
         return self._hands[digest]
 
-    def _header(self, shard: Shard) -> ShardHeader:
-        config = {
-            **shard.header.config,
-            "bounds": self.bounds.describe(),
-            "refine": self.params.model_dump(mode="json"),
-            "refine_always": self.always,
-        }
-        header = shard.header
-        return ShardHeader(
-            pipeline=header.pipeline,
-            seed=header.seed,
-            shard_index=header.shard_index,
-            config=config,
-            merged_from=header.merged_from,
-        )
+
+def _header(shard: Shard, bounds: GraspBounds, params: RefineParams) -> ShardHeader:
+    header = shard.header
+    config = {**header.config, "bounds": bounds.describe(), "refine": params.model_dump(mode="json")}
+    return ShardHeader(
+        pipeline=header.pipeline,
+        seed=header.seed,
+        shard_index=header.shard_index,
+        config=config,
+        merged_from=header.merged_from,
+    )
 
 
 def _entry(path: Path) -> dict[str, Any]:
     """What a refined shard says of itself."""
     with ShardReader(path) as reader:
         statistics, attributes = reader.statistics, reader.attributes
+        profile = stored_bounds(reader.header.config).profile
         refined, valid, energy = (reader.column(f"metrics/{name}") for name in ("refined", "valid", "energy"))
         rows, objects = len(reader), reader.object_ids
     tried = max(int(statistics["refine_tried"]), 1)
@@ -163,6 +172,8 @@ def _entry(path: Path) -> dict[str, Any]:
         "refined": int(refined.sum()),
         "valid_before": int(statistics["refine_valid_before"]),
         "valid": int(valid.sum()),
+        "profile": profile,
+        "failed": int(statistics["refine_failed"]),
         "energy_before": float(statistics["refine_energy_before"]) / tried,
         "energy": float(energy.mean()) if rows else None,
         "seconds": float(statistics["seconds_refine"]),

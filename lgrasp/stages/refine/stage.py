@@ -2,19 +2,18 @@
 
 import numpy as np
 
-from lgrasp.geometry.poses import device_inverse
-from lgrasp.grasp.check import check_grasps
-from lgrasp.grasp.find_contacts import contact_width, find_contacts
-from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
+from lgrasp.grasp.find_contacts import contact_width
+from lgrasp.grasp.outcomes import Outcome
+from lgrasp.grasp.tables import GraspTable, choose_grasps, widen_grasps
 from lgrasp.refine.descent import Descent
-from lgrasp.refine.hands import Hands
+from lgrasp.refine.improve import improve
 from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.surface import hand_surface
 from lgrasp.refine.volume import upload_target
 from lgrasp.stages.context import Context
 from lgrasp.stages.refine.params import RefineParams
 
-VERSION = 3
+VERSION = 4
 
 
 def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
@@ -27,18 +26,18 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
     """
     width = max(inputs.contact_links.shape[1], contact_width(context.hand.model.contact_link))
     if len(inputs) == 0:
-        return _widened(inputs, width), {"tried": 0, "passed": 0, "replaced": 0}
-    tree = context.hand.model.tree
-    at = Hands.put(device_inverse(inputs.pose), np.clip(inputs.q, tree.joint_lower, tree.joint_upper), context.device)
-    _descent(params, context).run(at)
-    pose, q = at.numpy()
-    pose, bounds = device_inverse(pose), context.bounds
-    contacts = find_contacts(context.hand, context.object, pose, q, bounds)
-    table, outcome = check_grasps(context.hand, context.object, pose, q, contacts, bounds, index=inputs.index)
-    passed = outcome == 0
-    better = passed & (table.metrics["unresisted_load"] < inputs.metrics["unresisted_load"])
-    counts = {"tried": len(inputs), "passed": int(passed.sum()), "replaced": int(better.sum())}
-    return _replaced(_widened(inputs, width), _widened(table, width), better), counts
+        return widen_grasps(inputs, width), {"tried": 0, "passed": 0, "replaced": 0}
+    tree, hand, obj = context.hand.model.tree, context.hand, context.object
+    q = np.clip(inputs.q, tree.joint_lower, tree.joint_upper)
+    once = np.ones(len(inputs), int)  # rows that came are valid: there is nothing to begin again for
+    table, outcome = improve(
+        _descent(params, context), hand, obj, inputs.pose, q, context.bounds, tries=once, index=inputs.index
+    )
+    passed = outcome == Outcome.KEPT
+    better = np.flatnonzero(passed & (table.metrics["unresisted_load"] < inputs.metrics["unresisted_load"]))
+    counts = {"tried": len(inputs), "passed": int(passed.sum()), "replaced": len(better)}
+    made = choose_grasps(widen_grasps(inputs, width), widen_grasps(table, width), better, better)
+    return made, counts
 
 
 def _descent(search: LocalSearch, context: Context) -> Descent:
@@ -50,27 +49,3 @@ def _descent(search: LocalSearch, context: Context) -> Descent:
         return Descent(context.hand, target, search, hand_surface(context.hand.model))
 
     return context.kept.get("refine", key, make)
-
-
-def _replaced(old: GraspTable, new: GraspTable, rows: np.ndarray) -> GraspTable:
-    """``old`` with some rows (N,) bool of ``new``; slots stay."""
-    a, b = grasp_arrays(old), grasp_arrays(new)
-    b["slot"] = a["slot"]
-    return grasps_from_arrays({name: np.where(_over(rows, x), b[name], x).astype(x.dtype) for name, x in a.items()})
-
-
-def _over(rows: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return rows.reshape(-1, *(1,) * (x.ndim - 1))
-
-
-def _widened(table: GraspTable, width: int) -> GraspTable:
-    """The table with room for ``width`` contacts at least."""
-    missing = width - table.contact_links.shape[1]
-    if missing <= 0:
-        return table
-    out = grasp_arrays(table)
-    for name in ("contact_points", "contact_normals", "contact_links", "contact_forces"):
-        x = out[name]
-        none = -1 if name == "contact_links" else np.nan
-        out[name] = np.pad(x, [(0, 0), (0, missing)] + [(0, 0)] * (x.ndim - 2), constant_values=none)
-    return grasps_from_arrays(out)
