@@ -41,22 +41,40 @@ def test_shards(cli, shards, tmp_path):
     assert "--overwrite" in cli("refine", shards, "--out", out, "--device", "cpu", "--coarse").error()
 
 
-def test_every_row_is_moved_if_asked(cli, shards, tmp_path):
-    out = tmp_path / "refined"
+def test_bounds_and_rows_that_fail_them(cli, shards, tmp_path):
+    """With a bound that hardly any row meets, the others are left out, or kept and marked."""
+    quick = ("--matching-rounds", 1, "--set", "refine.tries=1", "--set", "bounds.max_gap=2e-4", "--device", "cpu", "-q")
+    (source,) = shards.glob("*.h5")
+    rows = len(read_shard(source).grasps)
+    assert cli("refine", shards, "--out", tmp_path / "all", "--keep-invalid", *quick).code == 0
+    after = read_shard(tmp_path / "all" / source.name)
+    assert len(after.grasps) == rows
+    valid = after.grasps.metrics["valid"] == 1
+    assert (~valid).sum() > 0
+    assert after.grasps.metrics["gap"][valid].max(initial=0) <= 2.1e-4
+    assert after.header.config["bounds"]["numbers"]["max_gap"] == 2e-4
     assert (
-        cli(
-            "refine", shards, "--out", out, "--always", "--coarse", "--matching-rounds", 2, "--device", "cpu", "-q"
-        ).code
-        == 0
+        "did you mean 'bounds.max_gap'"
+        in cli("refine", shards, "--out", tmp_path / "x", "--set", "bounds.gap=1", "--device", "cpu").error()
     )
-    (path,) = out.glob("*.h5")
-    assert (read_shard(path).grasps.metrics["refined"] == 1).all()
 
 
 def test_exports_of_other_programs(cli, shards, tmp_path):
     folder, out = tmp_path / "export", tmp_path / "refined"
     assert cli("export", shards, "--to", "dexgraspnet", "--out", folder).code == 0
-    found = cli("refine", folder, "--from", "dexgraspnet", "--hand", "allegro", "--out", out, "--device", "cpu")
+    found = cli(
+        "refine",
+        folder,
+        "--from",
+        "dexgraspnet",
+        "--hand",
+        "allegro",
+        "--out",
+        out,
+        "--device",
+        "cpu",
+        "--keep-invalid",
+    )
     assert found.code == 0, found
     (path,) = out.glob("*.h5")
     (source,) = shards.glob("*.h5")
@@ -103,7 +121,8 @@ def test_rows_that_cannot_be_repaired(cli, shards, tmp_path, name, change, words
 
 def test_joints_outside_their_limits_are_clamped(cli, shards, tmp_path):
     folder, out = spoilt(shards, tmp_path / "spoilt", q=put(9.0, 2)), tmp_path / "refined"
-    found = cli("refine", folder, "--out", out, "--matching-rounds", 1, "--device", "cpu", "--json", "-")
+    options = ("--keep-invalid", "--matching-rounds", 1, "--device", "cpu", "--json", "-")
+    found = cli("refine", folder, "--out", out, *options)
     assert found.code == 0, found
     assert found.err.startswith("warning: joints of 1 rows were outside their limits")
     (data,) = json.loads(found.out)["results"]
@@ -215,7 +234,10 @@ def test_plans_of_a_cloud_can_be_refined(cli, tmp_path):
     planned, out = tmp_path / "planned", tmp_path / "refined"
     cloud = ("plan", "--cloud", tmp_path / "ball.npz", "--starts", 2, "--device", "cpu", "-q")
     assert cli(*cloud, "--out", planned).code == 0
-    assert cli("refine", planned, "--out", out, "--always", "--matching-rounds", 2, "--device", "cpu", "-q").code == 0
+    assert (
+        cli("refine", planned, "--out", out, "--keep-invalid", "--matching-rounds", 2, "--device", "cpu", "-q").code
+        == 0
+    )
     before, after = (read_shard(next(folder.glob("*.h5"))) for folder in (planned, out))
     np.testing.assert_array_equal(after.objects[0].normals, before.objects[0].normals)
     assert (after.grasps.metrics["energy"] > 0).all()

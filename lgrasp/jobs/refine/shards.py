@@ -53,10 +53,17 @@ class RefineJob(ShardJob):
         return content_key("refine", VERSION, **described)
 
     def parts(self) -> list[Part]:
+        self._numbers(GraspBounds())  # settings that cannot be are told before anything is read
         parts = super().parts() if self.form is None else self._parts_of_export(self.form)
         if not any(part.rows for part in parts):
             raise ShardError(f"{', '.join(map(str, self.shards))}: no grasps to refine")
         return parts
+
+    def _numbers(self, told: GraspBounds) -> tuple[GraspBounds, RefineParams]:
+        """What rows of a shard that passed ``told`` must pass, and how they are searched."""
+        parts = {"bounds": self.bounds or told, "refine": self.params}
+        made = apply_settings(parts, self.settings, "lgrasp refine")
+        return cast(GraspBounds, made["bounds"]), cast(RefineParams, made["refine"])
 
     def _parts_of_export(self, form: str) -> list[Part]:
         """Grasps in the format of another program: a part of each object."""
@@ -87,9 +94,7 @@ class RefineJob(ShardJob):
         hand = self._hand(part.source, shard)
         model = object_of_shard(self.cache, shard.objects[0], self.device_used)
         told = stored_bounds(shard.header.config)
-        parts = {"bounds": self.bounds or told, "refine": self.params}
-        made = apply_settings(parts, self.settings, "lgrasp refine")
-        bounds, params = cast(GraspBounds, made["bounds"]), cast(RefineParams, made["refine"])
+        bounds, params = self._numbers(told)
         begin = time.perf_counter()
         moved = move_rows(
             hand,
