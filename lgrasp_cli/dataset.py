@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import JsonPath, Quiet, check_report, warn
+from lgrasp_cli.options import JsonPath, Quiet, check_report, old_name, warn
 from lgrasp_cli.working import How, working
 
 if TYPE_CHECKING:
@@ -44,13 +44,13 @@ def info(
 
 
 @app.command()
-def validate(
+def check(
     paths: _Paths,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")] = False,
 ) -> None:
     """Check every byte and value of each shard against the format; exit code 2 if one has a problem.
 
-    Example: lgrasp dataset validate out/mug
+    Example: lgrasp dataset check out/mug
     """
     from lgrasp.dataset import find_shards, validate_shard
 
@@ -65,6 +65,9 @@ def validate(
         raise typer.Exit(2)
     if not as_json:
         typer.echo(f"{_counted(len(problems), 'shard')} valid")
+
+
+app.command("validate", hidden=True)(old_name(check, "lgrasp dataset validate", "lgrasp dataset check"))
 
 
 @app.command()

@@ -24,8 +24,8 @@ from lgrasp_cli import (
     run,
     scenes,
     sequence,
+    simulate,
     stages,
-    validate,
 )
 from lgrasp_cli.interrupt import Interrupted, on_interrupt, stop_asked, stop_now
 from lgrasp_cli.options import warn
@@ -36,7 +36,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (prepare, generate, sequence, plan, refine, run, validate, stages, export):
+for module in (prepare, generate, sequence, plan, refine, run, simulate, stages, export):
     module.register(app)
 app.command("judge")(judge.command)
 for group in (bench, hands, objects, pipelines, cache, dataset, scenes, learn):

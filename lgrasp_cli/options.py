@@ -1,7 +1,9 @@
 """Options that several commands share, with one wording each."""
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -84,6 +86,20 @@ def parse_contacts(text: str) -> tuple[int, ...]:
     if not all(part.isdecimal() and 2 <= int(part) <= 5 for part in parts):
         raise ConfigError(f"--contacts '{text}': give numbers of fingers from 2 to 5, separated by commas, such as 3,4")
     return tuple(int(part) for part in parts)
+
+
+def old_name(command: Callable[..., None], old: str, new: str) -> Callable[..., None]:
+    """A command under the name that it had in the release before, with a notice."""
+
+    def run(**given: Any) -> None:
+        from lgrasp.notices import notice
+
+        notice(f"'{old}' is now '{new}'; the old name works in this release only")
+        command(**given)
+
+    run.__name__, run.__doc__, run.__annotations__ = command.__name__, command.__doc__, command.__annotations__
+    run.__signature__ = inspect.signature(command)  # type: ignore[attr-defined]
+    return run
 
 
 def choose_protocol(simulate: str | None, physics: str | None) -> str | None:

@@ -1,4 +1,4 @@
-"""Physics verdicts of shards: every shard is read, simulated and written again with the verdicts beside its rows."""
+"""Simulates the rows of shards and adds the verdicts to copies of them."""
 
 import os
 import time
@@ -11,31 +11,35 @@ from typing import Any
 import numpy as np
 from pydantic import Field, PrivateAttr, field_validator
 
-from lgrasp.dataset import Shard, read_shard
+from lgrasp.dataset import HandRecord, ObjectRecord, ShardReader, read_shard
+from lgrasp.dataset.extend import extend_shard
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.run import JobOutcome
-from lgrasp.engine.shard_job import ShardJob
+from lgrasp.engine.shard_job import MADE_FROM, ShardJob
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.decompose import decompose
-from lgrasp.simulate.builder import import_mujoco
+from lgrasp.jobs.shard_inputs import mesh_hash
+from lgrasp.runtime.device import resolve_device
 from lgrasp.simulate.columns import COLUMNS, OBJECT_COLUMNS
 from lgrasp.simulate.protocol import Protocol, find_protocol
-from lgrasp.simulate.run import protocol_text, verdicts
-from lgrasp.simulate.scene import Scene, scene_of_shard
+from lgrasp.simulate.run import check_installed, protocol_text, verdicts
+from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
+from lgrasp.stages.context import Keeper
 
 _CONTACTS = 2  # links that it takes to hold anything
 
 
 class SimulateJob(ShardJob):
-    """Verdicts of a physics simulation beside the rows of shards."""
+    """Verdicts of a physics simulation beside the rows of shards, in copies of them."""
 
     protocol: Protocol = Field(description="Named protocol.")
     out: Path | None = Field(None, description="Folder; default: that of the shards with -PROTOCOL added.")
     device: str = "cpu"
     all_directions: bool = Field(False, description="Go on after the first direction in which an object is lost.")
     _said: set[str] = PrivateAttr(default_factory=set)
+    _kept: Keeper = PrivateAttr(default_factory=Keeper)
     _scene: tuple[tuple[str, ...], Scene] | None = PrivateAttr(None)  # the latest
 
     @field_validator("protocol", mode="before")
@@ -58,48 +62,86 @@ class SimulateJob(ShardJob):
         return content_key("simulate", 1, protocol=described, all_directions=self.all_directions, device=self._kind())
 
     def parts(self) -> list[Part]:
-        import_mujoco()
+        check_installed(resolve_device(self.device).alias)
         return super().parts()
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
-        shard = read_shard(part.source)
-        scene = self._scene_of(shard)
-        device = self.device_used.alias
-        text = protocol_text(scene, self.protocol, all_directions=self.all_directions, device=device)
-        begin = time.perf_counter()
+        shard, protocol = read_shard(part.source), self.protocol
+        scene, device = self._scene_of(shard.hand, shard.objects), self.device_used.alias
+        began, compiling = time.perf_counter(), 0.0
+
+        def prepared(seconds: float) -> None:
+            nonlocal compiling
+            compiling += seconds
+
+        def told(done: int, held: int) -> None:
+            seconds = time.perf_counter() - began - compiling
+            progress(done, f"{held:,} hold  {done / max(seconds, 1e-9):.1f}/s")
+
         found = verdicts(
             scene,
             shard.grasps,
-            self.protocol,
+            protocol,
             threads=self.workers or os.cpu_count() or 1,
-            progress=lambda done, held: progress(
-                done, f"{held:,} hold  {done / max(time.perf_counter() - begin, 1e-9):.1f}/s"
-            ),
+            progress=told,
             all_directions=self.all_directions,
             device=device,
+            keep=self._kept.get,
+            prepared=prepared,
         )
-        seconds = time.perf_counter() - begin
-        shard = _with_verdicts(shard, self.protocol, found, text, seconds)
-        return Made(len(shard.grasps), self.marked(part, shard, {}), seconds)
+        seconds = time.perf_counter() - began - compiling
+        added = {
+            "physics": found,
+            "protocol": protocol_text(scene, protocol, all_directions=self.all_directions, device=device),
+            "statistics": {
+                f"{protocol.name}_tried": len(shard.grasps),
+                f"{protocol.name}_held": int(found[f"{protocol.name}_holds"].sum()),
+                f"seconds_{protocol.name}": seconds,
+                f"seconds_{protocol.name}_compile": compiling,
+                MADE_FROM: self.part_key(part),
+            },
+        }
+        return Made(len(shard.grasps), added, (seconds, compiling))
+
+    def write(self, part: Part, contents: Any) -> None:
+        assert part.source is not None
+        extend_shard(part.source, part.file, **contents)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
-        """``protocol``; ``results``: see :func:`summary`; ``notes`` on objects that are approximated."""
+        """``protocol``; ``results``: see :func:`summary`; ``seconds_compile``: of models and, on a GPU, kernels, in no
+        rate."""
         seconds = {part.file: made.result for part, made in outcome.made_parts}
-        done = []
-        for path in outcome.paths:
-            shard = read_shard(path)
-            done.append(_validated(path, shard, self._scene_of(shard), self.protocol, seconds.get(path, 0.0)))
-        return {"protocol": self.protocol.model_dump(mode="json"), "results": summary(done, self.protocol)}
+        done = [self._simulated(path, seconds[path][0] if path in seconds else 0.0) for path in outcome.paths]
+        return {
+            "protocol": self.protocol.model_dump(mode="json"),
+            "results": summary(done, self.protocol),
+            "seconds_compile": sum(compiling for _, compiling in seconds.values()),
+        }
+
+    def _simulated(self, path: Path, seconds: float) -> "Simulated":
+        prefix = f"physics/{self.protocol.name}_"
+        with ShardReader(path) as reader:
+            hand = reader.hand()
+            return Simulated(
+                path=path,
+                hand=hand.name,
+                objects=self._scene_of(hand, reader.objects()).objects,
+                object_index=reader.column("object_index"),
+                columns={
+                    n: reader.column(prefix + n) for n in COLUMNS | OBJECT_COLUMNS if prefix + n in reader.columns
+                },
+                seconds=seconds,
+            )
 
     def _kind(self) -> str:
         return "gpu" if self.device_used.is_cuda else "cpu"
 
-    def _scene_of(self, shard: Shard) -> Scene:
+    def _scene_of(self, hand: HandRecord, objects: Sequence[ObjectRecord]) -> Scene:
         """What is simulated of a shard: hand and objects cut into convex pieces."""
-        key = (shard.hand.sha256, *(f"{record.sha256} {record.scale}" for record in shard.objects))
+        key = (hand.sha256, *(f"{record.id} {mesh_hash(record)}" for record in objects))
         if self._scene is None or self._scene[0] != key:
-            scene = scene_of_shard(shard, partial(decompose, store=self.cache), self.device_used.alias)
+            scene = scene_of(hand, objects, partial(decompose, store=self.cache), self.device_used.alias)
             for line in (f"object {solid.name}: {note}" for solid in scene.objects for note in solid.notes):
                 if line not in self._said:
                     self._said.add(line)
@@ -109,7 +151,7 @@ class SimulateJob(ShardJob):
 
 
 @dataclass(frozen=True)
-class Validated:
+class Simulated:
     """One shard with its verdicts."""
 
     path: Path
@@ -120,39 +162,9 @@ class Validated:
     seconds: float  # 0: the shard was there already
 
 
-def _with_verdicts(
-    shard: Shard, protocol: Protocol, columns: dict[str, np.ndarray], text: str, seconds: float
-) -> Shard:
-    rows = replace(
-        shard.grasps,
-        physics={**shard.grasps.physics, **columns},
-        physics_protocols={**shard.grasps.physics_protocols, **dict.fromkeys(columns, text)},
-    )
-    name = protocol.name
-    counts = {
-        f"{name}_tried": len(rows),
-        f"{name}_held": int(columns[f"{name}_holds"].sum()),
-        f"seconds_{name}": seconds,
-    }
-    return replace(shard, grasps=rows, statistics={**shard.statistics, **counts})
-
-
-def _validated(path: Path, shard: Shard, scene: Scene, protocol: Protocol, seconds: float) -> Validated:
-    prefix = f"{protocol.name}_"
-    columns = {n: shard.grasps.physics.get(prefix + n) for n in COLUMNS | OBJECT_COLUMNS}
-    return Validated(
-        path=path,
-        hand=shard.hand.name,
-        objects=scene.objects,
-        object_index=np.asarray(shard.grasps.object_index),
-        columns={n: values for n, values in columns.items() if values is not None},
-        seconds=seconds,
-    )
-
-
-def summary(done: Sequence[Validated], protocol: Protocol) -> list[dict[str, Any]]:
+def summary(done: Sequence[Simulated], protocol: Protocol) -> list[dict[str, Any]]:
     """One entry per hand and objects of a grasp, in the order of its slots: shares that hold, contacts, load, speed."""
-    groups: dict[tuple[str, tuple[str, ...]], list[Validated]] = {}
+    groups: dict[tuple[str, tuple[str, ...]], list[Simulated]] = {}
     for one in done:
         sets, which = np.unique(one.object_index, axis=0, return_inverse=True)
         for number in np.lexsort([*sets.T[::-1], (sets >= 0).sum(1)]):
@@ -161,7 +173,7 @@ def summary(done: Sequence[Validated], protocol: Protocol) -> list[dict[str, Any
     return [_entry(group, protocol) for group in groups.values()]
 
 
-def _part(one: Validated, chosen: np.ndarray) -> Validated:
+def _part(one: Simulated, chosen: np.ndarray) -> Simulated:
     """The chosen rows (N,), which have the same objects in the same order, and these objects alone."""
     index = one.object_index[chosen]
     return replace(
@@ -173,7 +185,7 @@ def _part(one: Validated, chosen: np.ndarray) -> Validated:
     )
 
 
-def _entry(group: list[Validated], protocol: Protocol) -> dict[str, Any]:
+def _entry(group: list[Simulated], protocol: Protocol) -> dict[str, Any]:
     columns = {n: np.concatenate([one.columns[n] for one in group]) for n in group[0].columns if "object_" not in n}
     rows, simulated = len(columns["holds"]), sum(len(one.columns["holds"]) for one in group if one.seconds)
     seconds = float(sum(one.seconds for one in group))

@@ -3,6 +3,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
+from lgrasp import notices
 from lgrasp.dataset import write_shard
 from lgrasp.errors import ShardError
 from lgrasp_cli.dataset import app
@@ -33,15 +34,15 @@ def test_info(run, folder):
 
 
 def test_validate(run, folder):
-    assert run("validate", folder).stdout == "2 shards valid\n"
+    assert run("check", folder).stdout == "2 shards valid\n"
     data = (folder / "1.h5").read_bytes()
     (folder / "1.h5").write_bytes(data[:-100])
-    result = run("validate", folder)
+    result = run("check", folder)
     assert result.exit_code == 2
     assert result.stdout == ""
     (line,) = result.stderr.splitlines()
     assert line.startswith(f"{folder / '1.h5'}: not a whole HDF5 file")
-    machine = run("validate", folder, "--json")
+    machine = run("check", folder, "--json")
     assert machine.exit_code == 2
     assert [len(v) for v in json.loads(machine.stdout).values()] == [0, 1]
 
@@ -53,6 +54,14 @@ def test_merge(run, folder):
     assert isinstance(result.exception, ShardError)
 
 
-@pytest.mark.parametrize("command", ["info", "validate", "merge"])
+@pytest.mark.parametrize("command", ["info", "check", "merge"])
 def test_help_has_an_example(run, command):
     assert f"Example: lgrasp dataset {command}" in run(command, "--help").stdout
+
+
+def test_validate_is_the_old_name_of_check(run, folder, monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(notices, "_listeners", [said.append])
+    assert run("validate", folder).stdout == run("check", folder).stdout
+    assert said == ["'lgrasp dataset validate' is now 'lgrasp dataset check'; the old name works in this release only"]

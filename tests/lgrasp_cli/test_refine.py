@@ -241,7 +241,7 @@ def test_plans_of_a_cloud_can_be_refined(cli, tmp_path):
     before, after = (read_shard(next(folder.glob("*.h5"))) for folder in (planned, out))
     np.testing.assert_array_equal(after.objects[0].normals, before.objects[0].normals)
     assert (after.grasps.metrics["energy"] > 0).all()
-    assert "is a point cloud" in cli("validate", planned, "--out", tmp_path / "x").error()
+    assert "is a point cloud" in cli("simulate", planned, "--out", tmp_path / "x").error()
 
 
 def test_interrupted(process, shards, tmp_path):

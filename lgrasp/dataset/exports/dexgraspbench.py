@@ -10,7 +10,7 @@ from lgrasp.dataset.exports.folder import GRASPS, OBJECTS, open_folder
 from lgrasp.dataset.exports.grasp_set import GraspSet, ReadObject, make_set, order_of
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_object
-from lgrasp.dataset.exports.selection import Plan
+from lgrasp.dataset.exports.selection import Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import compose, inverse
 
@@ -32,12 +32,12 @@ MJCF files are) needs that turn applied to the first seven numbers.
 """
 
 
-def write_dexgraspbench(plan: Plan, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
+def write_dexgraspbench(selection: Selection, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
     """Write ``grasps/CODE/NUMBER.npy`` for every row, numbered over the whole export.
 
     Args:
-        plan: Rows of single objects.
-        frames: The plan's hand.
+        selection: Rows of single objects.
+        frames: The selection's hand.
         out: Folder of the export.
         advance: Called with numbers of rows that are done.
 
@@ -45,11 +45,11 @@ def write_dexgraspbench(plan: Plan, frames: HandFrames, out: Path, advance: Call
         ShardError: A shard is damaged.
         OutputError: The folder cannot be written.
     """
-    for batch in plan.batches():
+    for batch in selection.batches():
         pose = frames.root_in_object(batch.object_pose[:, 0], batch.q)  # (n, 7)
         postures = [np.concatenate([pose, q], -1) for q in (batch.q, batch.q_pregrasp, batch.q_squeeze)]
         for row, number in enumerate(batch.number):
-            code = plan.objects[batch.object_index[row, 0]].code
+            code = selection.objects[batch.object_index[row, 0]].code
             entry = {
                 "obj_path": f"{OBJECTS}/{code}.obj",
                 "obj_scale": 1.0,

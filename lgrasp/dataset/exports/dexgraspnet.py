@@ -10,7 +10,7 @@ from lgrasp.dataset.exports.folder import GRASPS, open_folder
 from lgrasp.dataset.exports.grasp_set import GraspSet, make_set, order_of
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_objects
-from lgrasp.dataset.exports.selection import Batch, Plan
+from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import euler_from_quaternion, quaternion_from_euler
 
@@ -31,12 +31,12 @@ The object is at the origin. {root} is the root link of hand/hand.urdf.
 """
 
 
-def write_dexgraspnet(plan: Plan, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
+def write_dexgraspnet(selection: Selection, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
     """Write ``grasps/CODE.npy`` for every object; memory does not grow with the rows.
 
     Args:
-        plan: Rows of single objects.
-        frames: The plan's hand.
+        selection: Rows of single objects.
+        frames: The selection's hand.
         out: Folder of the export.
         advance: Called with numbers of rows that are done.
 
@@ -44,9 +44,9 @@ def write_dexgraspnet(plan: Plan, frames: HandFrames, out: Path, advance: Callab
         ShardError: A shard is damaged.
         OutputError: The folder cannot be written.
     """
-    for place, item in enumerate(plan.objects):
-        rows = (entry for batch in plan.batches(place, advance) for entry in _entries(batch, frames))
-        save_objects(out / GRASPS / f"{item.code}.npy", plan.counts[place], rows)
+    for place, item in enumerate(selection.objects):
+        rows = (entry for batch in selection.batches(place, advance) for entry in _entries(batch, frames))
+        save_objects(out / GRASPS / f"{item.code}.npy", selection.counts[place], rows)
 
 
 def _entries(batch: Batch, frames: HandFrames) -> Iterator[dict[str, Any]]:

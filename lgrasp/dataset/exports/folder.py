@@ -14,7 +14,7 @@ import lgrasp
 from lgrasp.dataset.exports.files import write_file
 from lgrasp.dataset.exports.grasp_set import ReadObject
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
-from lgrasp.dataset.exports.selection import ExportObject, Plan
+from lgrasp.dataset.exports.selection import ExportObject, Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 
@@ -24,17 +24,17 @@ _INDEX = "export.json"
 _FORMAT = "lgrasp-export"
 
 
-def write_assets(out: Path, plan: Plan) -> None:
+def write_assets(out: Path, selection: Selection) -> None:
     """Write the hand (URDF and meshes) and the meshes of the objects, in metres, as OBJ.
 
     Raises:
         ShardError: A shard lacks a mesh of its hand.
         OutputError: The folder cannot be written.
     """
-    files = hand_files(plan.hand, plan.shards[0])
+    files = hand_files(selection.hand, selection.shards[0])
     for name, data in files.items():
         write_file(out / HAND / name, data)
-    for item in plan.objects:
+    for item in selection.objects:
         write_file(out / OBJECTS / f"{item.code}.obj", object_text(item))
 
 
@@ -51,7 +51,7 @@ def object_text(item: ExportObject) -> str:
 
 
 def write_index(
-    out: Path, plan: Plan, frames: HandFrames, layout: str, conditions: Sequence[str], run_key: str = ""
+    out: Path, selection: Selection, frames: HandFrames, layout: str, conditions: Sequence[str], run_key: str = ""
 ) -> None:
     """Write ``export.json``; an export without it is not whole.
 
@@ -63,13 +63,13 @@ def write_index(
         "format_version": "1.0",
         "layout": layout,
         "lgrasp_version": lgrasp.__version__,
-        "rows": plan.rows,
-        "shards": [path.name for path in plan.shards],
+        "rows": selection.rows,
+        "shards": [path.name for path in selection.shards],
         "where": list(conditions),
         "run_key": run_key,
         "hand": {
-            "name": plan.hand.name,
-            "sha256": plan.hand.sha256,
+            "name": selection.hand.name,
+            "sha256": selection.hand.sha256,
             "urdf": f"{HAND}/hand.urdf",
             "root_link": frames.root,
             "base_link": frames.base,
@@ -87,7 +87,7 @@ def write_index(
                 "source_sha256": item.record.sha256,
                 "rows": count,
             }
-            for item, count in zip(plan.objects, plan.counts, strict=True)
+            for item, count in zip(selection.objects, selection.counts, strict=True)
         },
     }
     write_file(out / _INDEX, json.dumps(document, indent=2) + "\n")

@@ -15,7 +15,7 @@ from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
 from lgrasp.dataset.exports.readme import readme
-from lgrasp.dataset.exports.selection import Plan, make_plan
+from lgrasp.dataset.exports.selection import Selection, select_rows
 from lgrasp.dataset.exports.where import parse_condition
 from lgrasp.dataset.files import find_shards
 from lgrasp.errors import ConfigError
@@ -28,14 +28,14 @@ class Format(NamedTuple):
     single: bool
     """Has every grasp one object?"""
     notes: str
-    writer: Callable[[Plan, HandFrames, Cut | None], Callable[[Path, Callable[[int], None]], None]]
+    writer: Callable[[Selection, HandFrames, Cut | None], Callable[[Path, Callable[[int], None]], None]]
     """Refuses what it cannot hold, else gives what writes the grasps into a folder and says how far it is."""
     read: Callable[..., GraspSet]
 
 
-def _plain(write: Callable[[Plan, HandFrames, Path, Callable[[int], None]], None]):
+def _plain(write: Callable[[Selection, HandFrames, Path, Callable[[int], None]], None]):
     """The writer of a format without solids."""
-    return lambda plan, frames, _: partial(write, plan, frames)
+    return lambda selection, frames, _: partial(write, selection, frames)
 
 
 FORMATS = {
@@ -104,9 +104,9 @@ def export_shards(
         raise ConfigError(f"--limit {limit}: must be at least 1")
     form, conditions, out = FORMATS[to], [parse_condition(text) for text in where], Path(out)
     check_empty(out)
-    plan = make_plan(find_shards(paths), where=conditions, limit=limit, single=form.single)
-    frames = HandFrames(plan.hand.urdf, plan.hand.base_link, plan.hand.joint_names, plan.shards[0])
-    write = form.writer(plan, frames, cut)
+    selection = select_rows(find_shards(paths), where=conditions, limit=limit, single=form.single)
+    frames = HandFrames(selection.hand.urdf, selection.hand.base_link, selection.hand.joint_names, selection.shards[0])
+    write = form.writer(selection, frames, cut)
     said = list(map(str, conditions))
     done = 0
 
@@ -114,13 +114,13 @@ def export_shards(
         nonlocal done
         done += rows
         if advance:
-            advance(done, plan.rows)
+            advance(done, selection.rows)
 
-    write_assets(out, plan)
-    write_file(out / "README.txt", readme(plan, frames, form.notes, said))
+    write_assets(out, selection)
+    write_file(out / "README.txt", readme(selection, frames, form.notes, said))
     write(out, count)
-    write_index(out, plan, frames, to, said, run_key)
-    return Exported(plan.rows, tuple(item.code for item in plan.objects))
+    write_index(out, selection, frames, to, said, run_key)
+    return Exported(selection.rows, tuple(item.code for item in selection.objects))
 
 
 def read_grasps(path: str | PathLike[str], form: str, *, joint_names: Sequence[str] | None = None) -> GraspSet:

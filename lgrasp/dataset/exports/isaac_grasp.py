@@ -12,7 +12,7 @@ from lgrasp.dataset.exports.files import writing
 from lgrasp.dataset.exports.folder import GRASPS, open_folder
 from lgrasp.dataset.exports.grasp_set import GraspSet, ReadObject, make_set, order_of
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.dataset.exports.selection import Batch, Plan
+from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 
@@ -33,12 +33,12 @@ grasps/CODE.yaml   isaac_grasp format, version 1.0: all grasps of one object by 
 """
 
 
-def write_isaac_grasp(plan: Plan, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
+def write_isaac_grasp(selection: Selection, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
     """Write ``grasps/CODE.yaml`` for every object; memory does not grow with the rows.
 
     Args:
-        plan: Rows of single objects.
-        frames: The plan's hand.
+        selection: Rows of single objects.
+        frames: The selection's hand.
         out: Folder of the export.
         advance: Called with numbers of rows that are done.
 
@@ -46,13 +46,13 @@ def write_isaac_grasp(plan: Plan, frames: HandFrames, out: Path, advance: Callab
         ShardError: A shard is damaged.
         OutputError: The folder cannot be written.
     """
-    for place, item in enumerate(plan.objects):
+    for place, item in enumerate(selection.objects):
         head = {"format": "isaac_grasp", "format_version": 1.0}
         head |= {"object_frame_link": item.code, "gripper_frame_link": frames.base}
         head |= {"object_frame": item.code, "gripper_frame": frames.base}
         with writing(out / GRASPS / f"{item.code}.yaml") as write:
             write(yaml.safe_dump(head, sort_keys=False, allow_unicode=True).encode() + b"grasps:\n")
-            for batch in plan.batches(place, advance):
+            for batch in selection.batches(place, advance):
                 write(_entries(batch, frames).encode())
 
 

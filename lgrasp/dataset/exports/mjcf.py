@@ -14,7 +14,7 @@ from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, object_text, op
 from lgrasp.dataset.exports.grasp_set import GraspSet, ReadObject, make_set, order_of
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.mjcf_scene import Keyframe, MjcfScene, SceneObject
-from lgrasp.dataset.exports.selection import Batch, Plan
+from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 from lgrasp.grasp.records import ObjectRecord
@@ -49,8 +49,8 @@ class MjcfWriter:
     """Writes ``grasps/NUMBER.xml`` for every row, numbered over the whole export.
 
     Args:
-        plan: Rows of one or several objects.
-        frames: The plan's hand.
+        selection: Rows of one or several objects.
+        frames: The selection's hand.
         cut: Convex pieces of an object, vertices [m] of each, shape [V, 3]; without it the hull of its mesh collides.
 
     Raises:
@@ -58,12 +58,12 @@ class MjcfWriter:
         ShardError: A shard is damaged.
     """
 
-    def __init__(self, plan: Plan, frames: HandFrames, cut: Cut | None = None) -> None:
-        self._plan, self._frames, self._cut = plan, frames, cut
-        self._hand = {f"{HAND}/{name}": data for name, data in hand_files(plan.hand, plan.shards[0]).items()}
+    def __init__(self, selection: Selection, frames: HandFrames, cut: Cut | None = None) -> None:
+        self._selection, self._frames, self._cut = selection, frames, cut
+        self._hand = {f"{HAND}/{name}": data for name, data in hand_files(selection.hand, selection.shards[0]).items()}
         self._object = cache(self._make_object)
         self._scene = lru_cache(maxsize=16)(self._make_scene)
-        index = next(plan.batches()).object_index[0]
+        index = next(selection.batches()).object_index[0]
         self._scene(tuple(index[index >= 0].tolist()))
 
     def __call__(self, out: Path, advance: Callable[[int], None]) -> None:
@@ -78,10 +78,10 @@ class MjcfWriter:
             ShardError: A shard is damaged.
             OutputError: The folder cannot be written.
         """
-        for place in range(len(self._plan.objects)):
+        for place in range(len(self._selection.objects)):
             for name, data in self._object(place).pieces.items():
                 write_file(out / name, data)
-        for batch in self._plan.batches():
+        for batch in self._selection.batches():
             poses = _in_root(batch, self._frames)  # (n, O, 7)
             joints = [self._frames.all_joints(values) for values in (batch.q, batch.q_pregrasp)]
             for row, number in enumerate(batch.number):
@@ -100,7 +100,7 @@ class MjcfWriter:
         return MjcfScene(self._hand, self._frames, [self._object(place) for place in objects])
 
     def _make_object(self, place: int) -> SceneObject:
-        item = self._plan.objects[place]
+        item = self._selection.objects[place]
         found = self._cut(item.mesh()) if self._cut else ()
         hulls = [Trimesh(vertices).convex_hull for vertices in found]
         names = [f"{OBJECTS}/{item.code}/piece_{number:02d}.obj" for number in range(len(hulls))]

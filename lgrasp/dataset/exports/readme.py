@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from lgrasp.dataset.exports.folder import HAND, OBJECTS
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.dataset.exports.selection import Plan
+from lgrasp.dataset.exports.selection import Selection
 
 _TEXT = """\
 {rows:,} grasps of the hand {hand}, exported by lgrasp from {shards}{chosen}.
@@ -22,27 +22,27 @@ Joint order, where values have no names:
 {mimics}"""
 
 
-def readme(plan: Plan, frames: HandFrames, notes: str, conditions: Sequence[str]) -> str:
+def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Sequence[str]) -> str:
     """The text.
 
     Args:
-        plan: What is exported.
-        frames: The plan's hand.
+        selection: What is exported.
+        frames: The selection's hand.
         notes: What is special about the format, with ``{root}`` and ``{base}`` for the names of the two links.
         conditions: What the rows satisfy.
     """
     width = max(map(len, frames.joint_names))
-    limits = zip(frames.joint_names, plan.hand.joint_lower, plan.hand.joint_upper, strict=True)
+    limits = zip(frames.joint_names, selection.hand.joint_lower, selection.hand.joint_upper, strict=True)
     joints = [
         f"  {i:3d}  {name:{width}s}  {lower:8.4f} to {upper:.4f}" for i, (name, lower, upper) in enumerate(limits)
     ]
     mimics = [f"  {name} = {m:g} * {source} + {b:g}" for name, (source, m, b) in frames.mimics.items()]
     said = "Joints that follow others (<mimic> in hand.urdf), which have no value of their own:"
-    counts = (f"{item.code} ({count:,})" for item, count in zip(plan.objects, plan.counts, strict=True))
+    counts = (f"{item.code} ({count:,})" for item, count in zip(selection.objects, selection.counts, strict=True))
     return _TEXT.format(
-        rows=plan.rows,
-        hand=plan.hand.name,
-        shards=_few([path.name for path in plan.shards]),
+        rows=selection.rows,
+        hand=selection.hand.name,
+        shards=_few([path.name for path in selection.shards]),
         chosen=f", only rows with {' and '.join(conditions)}" if conditions else "",
         hand_folder=HAND,
         objects_folder=OBJECTS,

@@ -35,18 +35,18 @@ class ExportObject(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Some rows; ``n`` rows, ``K`` joints, ``O`` objects in a row (1 if the plan is of single objects)."""
+    """Some rows; ``n`` rows, ``K`` joints, ``O`` objects in a row (1 if the selection is of single objects)."""
 
     number: np.ndarray
     """Running number of each row in the export, shape [n]."""
     q: np.ndarray
-    """Joint positions [rad or m] in the order of the plan's hand, float64, shape [n, K]."""
+    """Joint positions [rad or m] in the order of the selection's hand, float64, shape [n, K]."""
     q_pregrasp: np.ndarray
     q_squeeze: np.ndarray
     object_pose: np.ndarray
     """Object in the hand base frame, x y z [m] qw qx qy qz, float64, shape [n, O, 7]; NaN where absent."""
     object_index: np.ndarray
-    """Position in the plan's objects, shape [n, O]; -1 where absent."""
+    """Position in the selection's objects, shape [n, O]; -1 where absent."""
     holds: np.ndarray
     """1 where a simulator saw the grasp hold or none ran, 0 where it saw it fail, shape [n]."""
 
@@ -55,13 +55,13 @@ class Batch(NamedTuple):
 class _Source:
     path: Path
     rows: np.ndarray  # chosen, ascending
-    index: np.ndarray  # (n, O) of the chosen rows, in the plan's objects
-    columns: list[int]  # column of q for each joint of the plan
+    index: np.ndarray  # (n, O) of the chosen rows, in the selection's objects
+    columns: list[int]  # column of q for each joint of the selection
     first: int  # running number of the first chosen row
 
 
 @dataclass(frozen=True)
-class Plan:
+class Selection:
     """Rows to export, all of one hand."""
 
     hand: HandRecord
@@ -117,9 +117,9 @@ class Plan:
         return Batch(source.first + some, q, q_pregrasp, q_squeeze, pose.astype(np.float64), index, holds)
 
 
-def make_plan(
+def select_rows(
     paths: Sequence[Path], *, where: Sequence[Condition] = (), limit: int | None = None, single: bool = False
-) -> Plan:
+) -> Selection:
     """Choose rows; reads what the conditions need and no grasp.
 
     Args:
@@ -208,7 +208,7 @@ def _assemble(
     known: list[ExportObject],
     parts: list[tuple[Path, np.ndarray, np.ndarray, list[int]]],
     single: bool,
-) -> Plan:
+) -> Selection:
     """Leave out objects that no chosen row holds, order the others by code, number the rows."""
     count = np.bincount(np.concatenate([index[index >= 0] for _, _, index, _ in parts]), minlength=len(known))
     order = sorted(np.flatnonzero(count), key=lambda i: known[i].code)
@@ -219,7 +219,7 @@ def _assemble(
         if len(rows):
             sources.append(_Source(path, rows, place[index], columns, first))
             first += len(rows)
-    return Plan(
+    return Selection(
         hand=hand,
         objects=tuple(known[i] for i in order),
         counts=tuple(int(count[i]) for i in order),

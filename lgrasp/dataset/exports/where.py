@@ -42,7 +42,7 @@ class Condition(NamedTuple):
         """
         single = [OBJECTS_HELD, *(name for name, (shape, _) in reader.columns.items() if len(shape) == 1)]
         if self.column not in single:
-            hint = " (lgrasp validate adds physics columns)" if self.column.startswith("physics/") else ""
+            hint = " (lgrasp simulate adds physics columns)" if self.column.startswith("physics/") else ""
             known = ", ".join(single)
             raise ShardError(f"{reader.path}: no column {self.column!r}{hint}; with one number per row it has {known}")
         if self.column == OBJECTS_HELD:

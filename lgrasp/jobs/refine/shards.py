@@ -196,4 +196,4 @@ def _check_rows(path: Path, shard: Shard) -> None:
         replace(rows, q=q), hand, [shard.objects[0].id], lambda name, first, end: columns[name][first:end]
     )
     if problems:
-        raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset validate' accepts them can be refined")
+        raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset check' accepts them can be refined")

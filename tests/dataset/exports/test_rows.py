@@ -141,7 +141,7 @@ def test_bad_input_leaves_nothing(tmp_path, shards):
         ("a.h5", "full", {}, OutputError, "full is not empty"),
         ("a.h5", "file", {}, OutputError, "file is a file"),
         ("a.h5", "out", {"limit": 0}, ConfigError, "--limit 0"),
-        ("a.h5", "out", {"where": ["physics/fc_holds"]}, ShardError, "lgrasp validate adds"),
+        ("a.h5", "out", {"where": ["physics/fc_holds"]}, ShardError, "lgrasp simulate adds"),
         (
             "a.h5",
             "out",

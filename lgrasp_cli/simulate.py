@@ -1,4 +1,4 @@
-"""``lgrasp validate``: does each grasp hold its object in a physics simulation?"""
+"""``lgrasp simulate``: does each grasp hold its object in a physics simulation?"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,16 +6,18 @@ from typing import Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import warn
+from lgrasp_cli.options import old_name, warn
 from lgrasp_cli.working import How, working
 
 
 def register(app: typer.Typer) -> None:
     """Mount the commands of this file."""
-    app.command()(working(validate))
+    command = working(simulate)
+    app.command()(command)
+    app.command("validate", hidden=True)(old_name(command, "lgrasp validate", "lgrasp simulate"))
 
 
-def validate(
+def simulate(
     shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.", show_default=False)],
     how: How,
     protocol: Annotated[
@@ -31,13 +33,13 @@ def validate(
         bool, typer.Option("--all-directions", help="Continue after the first direction in which an object is lost.")
     ] = False,
 ) -> None:
-    """Simulate grasps with MuJoCo and write the shards again with a verdict beside every row.
+    """Simulate grasps with MuJoCo and write copies of the shards with a verdict beside every row.
 
     The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
     directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects: the
     hand starts at q, and every object must still touch it. docs/guides/physics.md says what exactly is simulated.
 
-    Example: lgrasp validate grasps/allegro-mug --out grasps/allegro-mug-fc --protocol fc
+    Example: lgrasp simulate grasps/allegro-mug --out grasps/allegro-mug-fc --protocol fc
     """
     from lgrasp.jobs.simulate import SimulateJob
     from lgrasp.simulate.protocol import find_protocol
@@ -47,7 +49,7 @@ def validate(
     chosen = replace(how, workers=how.workers if threads is None else threads)
     job = chosen.job(
         SimulateJob,
-        "validate",
+        "simulate",
         shards=shards,
         protocol=find_protocol(protocol),
         out=out,
@@ -92,6 +94,7 @@ def _show(data: dict[str, Any]) -> None:
             ),
             ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate at {start} and are not simulated"),
             ("diverged", f"{lost['diverged']:,} count as lost"),
+            ("compiling", f"{data['seconds_compile']:.1f} s of models and kernels, in no rate"),
             ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
         ]
     )

@@ -1,4 +1,4 @@
-"""lgrasp validate: the shards again, with verdicts."""
+"""lgrasp simulate: the shards again, with verdicts."""
 
 import json
 import signal
@@ -6,6 +6,7 @@ import sys
 import time
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 from support.jaws import Jaws
@@ -26,7 +27,7 @@ def grasps(tmp_path):
 
 
 def test_adds_columns_and_keeps_the_rest(cli, grasps, tmp_path):
-    result = cli("validate", grasps)
+    result = cli("simulate", grasps)
     assert result.code == 0, result
     head, row = (line.split() for line in result.out.splitlines()[:2])
     assert row[: head.index("+x")] == ["jaws", "cube", "3", "33.3%"]
@@ -55,7 +56,7 @@ def test_several_objects(cli, tmp_path):
         values[2, 1] = -1 if name in ("object_index", "contact_links") else np.nan
     path = tmp_path / "twins" / "a.h5"
     write_shard(path, twin_shard(replace(rows, **absent)))
-    result = cli("validate", path.parent, "--protocol", "seq6", "--json", tmp_path / "report.json")
+    result = cli("simulate", path.parent, "--protocol", "seq6", "--json", tmp_path / "report.json")
     assert result.code == 0, result
     lines = [line.split() for line in result.out.splitlines()[:3]]
     assert [line[1:4] for line in lines] == [
@@ -78,34 +79,34 @@ def test_several_objects(cli, tmp_path):
 def test_goes_on_where_it_was(cli, grasps, tmp_path):
     """What is there stays byte for byte; damage is made anew; a second protocol adds its own columns."""
     out = tmp_path / "verdicts"
-    assert cli("validate", grasps, "--out", out, "--json", "-").code == 0
+    assert cli("simulate", grasps, "--out", out, "--json", "-").code == 0
     kept, lost = sorted(out.iterdir())
     bytes_before = kept.read_bytes()
     lost.write_bytes(lost.read_bytes()[:-50])
-    again = cli("validate", grasps, "--out", out, "--json", "-")
+    again = cli("simulate", grasps, "--out", out, "--json", "-")
     (entry,) = json.loads(again.out)["results"]
     assert (entry["rows"], entry["held"]) == (3, 1)
     assert kept.read_bytes() == bytes_before
     assert not validate_shard(lost)
-    line = cli("validate", grasps, "--out", out, "--protocol", "gravity6").error()
+    line = cli("simulate", grasps, "--out", out, "--protocol", "gravity6").error()
     assert "another protocol" in line
-    assert cli("validate", out, "--out", tmp_path / "both", "--protocol", "gravity6").code == 0
+    assert cli("simulate", out, "--out", tmp_path / "both", "--protocol", "gravity6").code == 0
     physics = read_shard(tmp_path / "both" / kept.name).grasps.physics
     assert {"fc_holds", "gravity6_holds"} <= set(physics)
 
 
 def test_bad_input(cli, grasps, tmp_path, monkeypatch):
-    assert "unknown protocol 'fall'; choose fc" in cli("validate", grasps, "--protocol", "fall").error()
-    assert "no such file or folder" in cli("validate", tmp_path / "nothing").error()
-    assert "would be overwritten" in cli("validate", grasps, "--out", grasps).error()
+    assert "unknown protocol 'fall'; choose fc" in cli("simulate", grasps, "--protocol", "fall").error()
+    assert "no such file or folder" in cli("simulate", tmp_path / "nothing").error()
+    assert "would be overwritten" in cli("simulate", grasps, "--out", grasps).error()
     (tmp_path / "text.h5").write_text("no shard")
-    assert "not a whole HDF5 file" in cli("validate", tmp_path / "text.h5", "--out", tmp_path / "a").error()
+    assert "not a whole HDF5 file" in cli("simulate", tmp_path / "text.h5", "--out", tmp_path / "a").error()
     heavy = Jaws(tmp_path).shard(0.004)
     urdf = heavy.hand.urdf.replace("</link>", '<inertial><mass value="-1"/></inertial></link>', 1)
     write_shard(tmp_path / "heavy" / "a.h5", Jaws(tmp_path).shard(0.004, urdf=urdf))
-    assert "MuJoCo refuses hand 'jaws'" in cli("validate", tmp_path / "heavy").error()
+    assert "MuJoCo refuses hand 'jaws'" in cli("simulate", tmp_path / "heavy").error()
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    assert 'pip install "lgrasp[sim]"' in cli("validate", grasps).error()
+    assert 'pip install "lgrasp[sim]"' in cli("simulate", grasps).error()
     assert not (tmp_path / "a").exists()
     assert not (tmp_path / "grasps-fc").exists()
 
@@ -113,7 +114,7 @@ def test_bad_input(cli, grasps, tmp_path, monkeypatch):
 def test_interruption_leaves_whole_shards(process, grasps, tmp_path):
     write_shard(grasps / "jaws-cube-00002.h5", Jaws(tmp_path).shard(0.004, count=20_000))
     out = tmp_path / "out"
-    running = process("validate", grasps, "--out", out, "--threads", 1)
+    running = process("simulate", grasps, "--out", out, "--threads", 1)
     until = time.monotonic() + 30
     while len(list(out.glob("*.h5"))) < 2 and time.monotonic() < until:
         time.sleep(0.05)
@@ -123,3 +124,27 @@ def test_interruption_leaves_whole_shards(process, grasps, tmp_path):
     assert errors.splitlines()[-1].startswith("interrupted")
     assert sorted(path.name for path in out.iterdir()) == ["jaws-cube-00000.h5", "jaws-cube-00001.h5"]
     assert not any(map(validate_shard, out.iterdir()))
+
+
+def test_validate_is_the_old_name(cli, grasps, tmp_path):
+    result = cli("validate", grasps, "--out", tmp_path / "old", "--json", tmp_path / "report.json")
+    assert result.code == 0, result
+    assert "'lgrasp validate' is now 'lgrasp simulate'" in result.err
+    data = json.loads((tmp_path / "report.json").read_text())
+    (entry,) = data["results"]
+    assert entry["held"] == 1
+    seconds = read_shard(tmp_path / "old" / "jaws-cube-00000.h5").statistics
+    assert 0 < seconds["seconds_fc_compile"] <= data["seconds_compile"]
+    assert entry["per_s"] == pytest.approx(entry["rows"] / entry["seconds"])
+    assert entry["seconds"] + data["seconds_compile"] <= data["seconds"]["total"]
+
+
+def test_what_a_shard_holds_besides_is_copied(cli, grasps, tmp_path):
+    """Members that the format does not know stay."""
+    path = grasps / "jaws-cube-00000.h5"
+    with h5py.File(path, "a") as file:
+        file.create_group("notes").attrs["by"] = "someone"
+    assert cli("simulate", path, "--out", tmp_path / "out").code == 0
+    with h5py.File(tmp_path / "out" / path.name) as file:
+        assert file["notes"].attrs["by"] == "someone"
+    assert validate_shard(tmp_path / "out" / path.name) == []
