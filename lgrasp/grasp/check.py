@@ -20,7 +20,7 @@ from lgrasp.grasp.check_kernels import (
     pack_rows,
     self_overlap,
 )
-from lgrasp.grasp.check_structs import Findings, Limits, Packed, Places, Postures, device_limits, new_findings
+from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
 from lgrasp.grasp.control_kernels import control_poses, open_poses
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS
@@ -46,7 +46,7 @@ class Check:
     held: HeldArrays
     limits: Limits
     places: Places
-    at: Postures
+    at: CheckedPostures
     found: Findings
 
     def __len__(self) -> int:
@@ -147,7 +147,7 @@ def _table(columns: dict[str, np.ndarray], count: int) -> GraspTable:
     )
 
 
-class Contacts(NamedTuple):
+class ContactTable(NamedTuple):
     """Contacts of n hands, C at most each, on a device."""
 
     link: wp.array
@@ -158,11 +158,11 @@ class Contacts(NamedTuple):
     """Outward, (n * C,) vec3."""
 
 
-def known_contacts(links: np.ndarray, points: np.ndarray, normals: np.ndarray, device: str) -> Contacts:
+def known_contacts(links: np.ndarray, points: np.ndarray, normals: np.ndarray, device: str) -> ContactTable:
     """Contacts as a table has them: links (n, C), -1 for none, points and outward normals (n, C, 3)."""
     flat = (np.nan_to_num(np.ascontiguousarray(a, np.float32)).reshape(-1, 3) for a in (points, normals))
     own = wp.array(np.ascontiguousarray(links, np.int32), dtype=wp.int32, device=device)
-    return Contacts(own, *(wp.array(a, dtype=wp.vec3, device=device) for a in flat))
+    return ContactTable(own, *(wp.array(a, dtype=wp.vec3, device=device) for a in flat))
 
 
 def check_grasps(
@@ -170,7 +170,7 @@ def check_grasps(
     obj: ObjectArrays,
     pose: np.ndarray,
     q: np.ndarray,
-    contacts: Contacts,
+    contacts: ContactTable,
     bounds: GraspBounds,
     *,
     around: ObjectArrays | None = None,
@@ -190,7 +190,7 @@ def check_grasps(
     d, n, width = hand.device, len(q), contacts.link.shape[1]
     groups, bodies = hand.model.groups, len(hand.model.piece_first) - 1
     rows = wp.array(np.arange(n, dtype=np.int32), dtype=wp.int32, device=d)
-    at = Postures()
+    at = CheckedPostures()
     at.pose = wp.array(np.ascontiguousarray(pose, np.float32), dtype=wp.transform, device=d)
     at.of, at.index, at.slot = rows, wp.zeros(n, dtype=wp.int32, device=d), wp.zeros(n, dtype=wp.int32, device=d)
     at.chosen = wp.empty((n, groups), dtype=wp.int32, device=d)
@@ -216,7 +216,7 @@ def check_grasps(
     return table, outcome
 
 
-def link_places(model: HandModel, contacts: Contacts, device: str) -> Places:
+def link_places(model: HandModel, contacts: ContactTable, device: str) -> Places:
     """Every link as a place on the hand, and the contacts as places on the object."""
     links = len(model.tree.link_names)
     grid = np.full(links, -1)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lgrasp.grasp.check_structs import Findings, Limits, Packed, Places, Postures
+from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.grasp.collision import body_depth, objects_apart
 from lgrasp.grasp.held import Held, body_depth_in_held, group_fixed
 from lgrasp.grasp.outcomes import CONTACT, KEPT, SELF_COLLISION, UNRESISTED_LOAD
@@ -62,7 +62,7 @@ def check_postures(
     limits: Limits,
     places: Places,
     q: wp.array2d(dtype=wp.float32),
-    at_out: Postures,
+    at_out: CheckedPostures,
     found_out: Findings,
 ):
     """One thread per hand: its bodies, the fit of its contacts, and whether it is clear of itself.
@@ -132,7 +132,7 @@ def measure_penetration(
     obj: Object,
     limits: Limits,
     part: wp.int32,
-    at: Postures,
+    at: CheckedPostures,
     found_out: Findings,
 ):
     """Largest penetration [m] of a part of the hand (TOUCHING, OTHERS or ALL) and the object.
@@ -166,7 +166,7 @@ def measure_held_penetration(
     obj: Object,
     held: Held,
     limits: Limits,
-    at: Postures,
+    at: CheckedPostures,
     found_out: Findings,
 ):
     """Largest penetration [m] of what may move and the held objects, which the new object must keep apart from.
@@ -249,7 +249,7 @@ def self_overlap(
 @wp.kernel
 def pack_rows(
     places: Places,
-    at: Postures,
+    at: CheckedPostures,
     found: Findings,
     rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),

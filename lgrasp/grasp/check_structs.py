@@ -32,7 +32,7 @@ class Limits:
 
 
 @wp.struct
-class Postures:
+class CheckedPostures:
     """n hands before an object: groups G, bodies B, joints K; at most C contacts each."""
 
     pose: wp.array(dtype=wp.transform)  # (P,) T_hand_object of the internal frame

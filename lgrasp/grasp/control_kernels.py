@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.grasp.check_kernels import hand_pairs_clear
-from lgrasp.grasp.check_structs import Findings, Limits, Places, Postures
+from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Places
 from lgrasp.grasp.collision import body_apart
 from lgrasp.grasp.control import press_contact, shift_contact
 from lgrasp.grasp.held import Held, body_clear_of_held
@@ -22,7 +22,7 @@ def control_poses(
     hand: Hand,
     limits: Limits,
     places: Places,
-    at: Postures,
+    at: CheckedPostures,
     found: Findings,
     rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
@@ -81,7 +81,7 @@ def open_poses(
     obj: Object,
     held: Held,
     limits: Limits,
-    at: Postures,
+    at: CheckedPostures,
     opened: wp.array2d(dtype=vec_dof),
     rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.grasp.check import Contacts
+from lgrasp.grasp.check import ContactTable
 from lgrasp.grasp.check_structs import device_limits
 from lgrasp.grasp.contact_kernels import PalmarRuns, RunContacts, choose_contacts, link_contacts
 from lgrasp.hand.arrays import HandArrays
@@ -20,7 +20,7 @@ def find_contacts(
     q: np.ndarray,
     bounds: GraspBounds,
     palmar: ContactSurface | None = None,
-) -> Contacts:
+) -> ContactTable:
     """One contact at most of each link, within the bounds of gap and normals, the nearest of each finger first.
 
     Args:
@@ -48,7 +48,7 @@ def find_contacts(
     inputs = [hand.struct, obj.struct, device_limits(bounds), runs, put(pose.astype(np.float32), wp.transform)]
     joints = put(q.astype(np.float32), wp.float32)
     wp.launch(link_contacts, (len(link), n), [*inputs, joints], [found], device=d)
-    out = Contacts(
+    out = ContactTable(
         wp.empty((n, width), dtype=wp.int32, device=d),
         *(wp.zeros(n * width, dtype=wp.vec3, device=d) for _ in range(2)),
     )

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lgrasp.grasp.check_structs import Findings, Limits, Places, Postures
+from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Places
 from lgrasp.grasp.outcomes import BALANCE, KEPT, OBJECT_COLLISION
 from lgrasp.math.constants import BALANCED, CONE_EDGES
 from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted
@@ -57,7 +57,7 @@ def _balanced(
 
 
 @wp.kernel
-def balance_grasps(limits: Limits, places: Places, at: Postures, found_out: Findings):
+def balance_grasps(limits: Limits, places: Places, at: CheckedPostures, found_out: Findings):
     """FSWO (eq. 1), GSWO (eq. 2, pyramids) and its forces, object frame."""
     i = wp.tid()
     if found_out.outcome[i] == KEPT and found_out.penetration[i] > limits.max_penetration:
@@ -85,7 +85,7 @@ def balance_grasps(limits: Limits, places: Places, at: Postures, found_out: Find
 
 
 @wp.kernel
-def resist_loads(obj: Object, limits: Limits, places: Places, at: Postures, found_out: Findings):
+def resist_loads(obj: Object, limits: Limits, places: Places, at: CheckedPostures, found_out: Findings):
     """One thread per (direction, hand): ``unresisted_load`` grows to the worst direction's."""
     direction, i = wp.tid()
     most = limits.max_unresisted_load
@@ -111,7 +111,7 @@ def resist_loads(obj: Object, limits: Limits, places: Places, at: Postures, foun
 def center_forces(
     limits: Limits,
     places: Places,
-    at: Postures,
+    at: CheckedPostures,
     rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
     found_out: Findings,
@@ -147,7 +147,7 @@ def grasp_epsilon(
     seed: wp.array(dtype=wp.int32),
     limits: Limits,
     places: Places,
-    at: Postures,
+    at: CheckedPostures,
     rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
     epsilon_out: wp.array(dtype=wp.float32),

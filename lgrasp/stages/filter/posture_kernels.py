@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.field.arrays import Field, field_seed
 from lgrasp.grasp.check_kernels import contact_fit, hand_pairs_clear
-from lgrasp.grasp.check_structs import Findings, Limits, Places, Postures
+from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Places
 from lgrasp.grasp.collision import body_clear
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.grasp.outcomes import CONTACT, KEPT, OBJECT_COLLISION, SELF_COLLISION, UNUSED_FINGER
@@ -17,7 +17,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 
 @wp.struct
-class Sets:
+class SetCandidates:
     """Candidates that sets choose from: P poses, groups G, M candidates of each."""
 
     palm_point: wp.array(dtype=wp.int32)  # (P,) place on the hand that touches without a finger, -1 none
@@ -35,8 +35,8 @@ def place_touching(
     held: Held,
     limits: Limits,
     places: Places,
-    sets: Sets,
-    at_out: Postures,
+    sets: SetCandidates,
+    at_out: CheckedPostures,
     found_out: Findings,
 ):
     """Postures and bodies of the touching fingers; contacts on the links' true meshes; collisions among these fingers.
@@ -114,8 +114,8 @@ def fill_unused(
     limits: Limits,
     seed: wp.array(dtype=wp.int32),
     draws: wp.int32,
-    sets: Sets,
-    at_out: Postures,
+    sets: SetCandidates,
+    at_out: CheckedPostures,
     found_out: Findings,
 ):
     """Postures of fingers without contact: random ones of the field, drawn ever closer to the open posture.

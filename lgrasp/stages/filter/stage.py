@@ -4,13 +4,13 @@ import warp as wp
 
 from lgrasp.grasp.check import Check
 from lgrasp.grasp.check_kernels import OTHERS, TOUCHING
-from lgrasp.grasp.check_structs import Places, Postures, device_limits, new_findings
+from lgrasp.grasp.check_structs import CheckedPostures, Places, device_limits, new_findings
 from lgrasp.grasp.tables import ContactSets, GraspTable, trim_sets
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.runtime.tally import Tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.params import FilterParams
-from lgrasp.stages.filter.posture_kernels import Sets, fill_unused, place_touching
+from lgrasp.stages.filter.posture_kernels import SetCandidates, fill_unused, place_touching
 
 VERSION = 7
 
@@ -41,17 +41,17 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     return check.kept(context.seed("filter", 1))
 
 
-def _sets(inputs: ContactSets) -> Sets:
+def _sets(inputs: ContactSets) -> SetCandidates:
     table, poses = inputs.candidates, inputs.candidates.poses
-    s = Sets()
+    s = SetCandidates()
     s.palm_point, s.palm_surface, s.setting = poses.palm_point, poses.palm_surface, poses.setting
     s.surface, s.record, s.q = table.surface, table.record, table.q
     return s
 
 
-def _postures(inputs: ContactSets, context: Context) -> Postures:
+def _postures(inputs: ContactSets, context: Context) -> CheckedPostures:
     d, n, model, poses = context.device, inputs.pose.shape[0], context.hand.model, inputs.candidates.poses
-    at = Postures()
+    at = CheckedPostures()
     at.pose, at.index, at.of, at.slot, at.chosen = poses.pose, poses.index, inputs.pose, inputs.slot, inputs.chosen
     at.body = wp.empty((n, len(model.piece_first) - 2), dtype=wp.transform, device=d)
     at.posture = wp.empty((n, model.groups), dtype=vec_dof, device=d)
