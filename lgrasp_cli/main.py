@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from lgrasp.judge import command as judge
+from lgrasp.judge.__main__ import command as judge
 from lgrasp.notices import on_notice
 from lgrasp_cli import (
     bench,
@@ -38,7 +38,7 @@ app = typer.Typer(
 )
 for module in (prepare, generate, sequence, plan, refine, run, simulate, stages, export):
     module.register(app)
-app.command("judge")(judge.command)
+app.command("judge")(judge)
 for group in (bench, hands, objects, pipelines, cache, dataset, scenes, learn):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])
 

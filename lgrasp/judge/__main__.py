@@ -1,8 +1,87 @@
-"""``python -m lgrasp.judge SHARDS...``"""
+"""The command ``judge``, of ``lgrasp`` and as ``python -m lgrasp.judge SHARDS...``."""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from lgrasp.judge.command import command
+_PLAIN_INTERVAL = 10.0  # [s] between lines of progress where standard error is no terminal
+
+
+def command(
+    shards: Annotated[list[Path], typer.Argument(help="Shards, or folders that hold some at any depth.")],
+    rows: Annotated[
+        int | None, typer.Option(help="Judge this many rows, drawn at random; default: all.", show_default=False)
+    ] = None,
+    urdf: Annotated[
+        Path | None, typer.Option(help="Original URDF in place of the stored one.", show_default=False)
+    ] = None,
+    mesh: Annotated[
+        list[str] | None,
+        typer.Option(help="Original mesh in place of the stored one, PATH or ID=PATH; repeatable.", show_default=False),
+    ] = None,
+    json_path: Annotated[
+        str | None,
+        typer.Option("--json", metavar="PATH", help="Also write the findings as JSON; - prints them instead."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no report; errors only.")] = False,
+) -> None:
+    """Judge every row of shards by the strict bounds, from the URDF and the meshes alone.
+
+    Shares no code with what makes grasps: its own kinematics, distances and solvers. It judges any shard of the
+    format, imported ones included, and trusts no stored number. Rows that a file itself calls invalid count apart.
+
+    Exit code: 0 when every row is strictly valid, 1 when not, 2 for a file that cannot be judged.
+
+    \b
+    Example: lgrasp judge grasps/mug
+    lgrasp judge grasps --rows 1000 --json verdict.json
+    lgrasp judge mug.h5 --urdf allegro.urdf --mesh mug=mug.obj
+    """
+    from lgrasp.judge.bounds import JudgeError
+
+    meshes: dict[str, str | Path] = {}
+    for given in mesh or ():
+        name, sign, file = given.partition("=")
+        meshes |= {name: file} if sign else {"": given}
+    try:
+        from lgrasp.judge.run import judge
+
+        report = judge(shards, urdf=urdf, mesh=meshes or None, rows=rows, progress=None if quiet else _Progress())
+        text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
+        if json_path and json_path != "-":
+            Path(json_path).write_text(text + "\n", encoding="utf-8")
+    except JudgeError as error:
+        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+        raise typer.Exit(2) from error
+    except OSError as error:
+        typer.echo(f"error: {error.filename or json_path}: {error.strerror}", err=True)
+        raise typer.Exit(2) from error
+    if json_path == "-":
+        typer.echo(text)
+    elif not quiet:
+        typer.echo(str(report))
+    raise typer.Exit(0 if report.passed else 1)
+
+
+class _Progress:
+    """Rows judged so far on standard error: rewritten on a terminal, else a line every ten seconds."""
+
+    def __init__(self) -> None:
+        self._live = sys.stderr.isatty()
+        self._start = self._said = time.monotonic()
+
+    def __call__(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if now - self._said < (0.2 if self._live else _PLAIN_INTERVAL):
+            return
+        self._said = now
+        line = f"judging {done:,}/{total:,} rows, {done / (now - self._start):,.0f}/s"
+        typer.echo(f"\r{line} " if self._live else line, err=True, nl=not self._live)
+
 
 if __name__ == "__main__":
     typer.run(command)

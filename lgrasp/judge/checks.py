@@ -2,14 +2,14 @@
 
 import itertools
 import math
+from collections import Counter
 
 import numpy as np
 
 from lgrasp.judge import bounds
 from lgrasp.judge.collision import PlacedSolids, hand_in_object, object_in_object
-from lgrasp.judge.kinematics import inverse, pose_transforms
+from lgrasp.judge.hand import pose_transforms
 from lgrasp.judge.meshes import PROBES
-from lgrasp.judge.sequences import check_frozen, check_parents
 from lgrasp.judge.shard import JudgedShard
 from lgrasp.judge.wrench import ferrari_canny, force_errors, wrench_residual
 
@@ -66,7 +66,7 @@ class RowChecks:
         self.g = {k: v[rows] for k, v in shard.grasps.items()}
         self.values = {k: np.full(n, np.nan) for k in VALUES}
         self.failed = {k: np.zeros(n, bool) for k in CHECKS}
-        self.self_pairs: dict[str, int] = {}
+        self.self_pairs: Counter[str] = Counter()
         self._form()
         bad = self.failed["finite"] | self.failed["indices"]
         good = self.good = np.flatnonzero(~bad)
@@ -146,7 +146,7 @@ class RowChecks:
                 if d > bounds.SELF_PENETRATION:
                     name = " x ".join(sorted(hand.links[hand.solids[k].link] for k in (a, b)))
                     beyond.setdefault(name, set()).add(i)
-        self.self_pairs = {k: len(v) for k, v in beyond.items()}
+        self.self_pairs = Counter({k: len(v) for k, v in beyond.items()})
         self._set("self_penetration", 1e3 * depth)
 
     def _penetration(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
@@ -156,12 +156,12 @@ class RowChecks:
         for o, k in itertools.product(slots, range(len(objects))):
             rows = np.flatnonzero(index[:, o] == k)
             if len(rows):
-                T = inverse(T_objects[rows, o])[:, None] @ T_links[rows]
+                T = np.linalg.inv(T_objects[rows, o])[:, None] @ T_links[rows]
                 a, b = hand_in_object(self.hand, objects[k], T)
                 in_link[rows], in_object[rows] = np.maximum(in_link[rows], a), np.maximum(in_object[rows], b)
         for a, b in itertools.combinations(slots, 2):
             for i in np.flatnonzero((index[:, a] >= 0) & (index[:, b] >= 0)):
-                T = (inverse(T_objects[i, a]) @ T_objects[i, b])[None]
+                T = (np.linalg.inv(T_objects[i, a]) @ T_objects[i, b])[None]
                 depth = object_in_object(objects[index[i, a]], objects[index[i, b]], T)
                 between[i] = max(between[i], depth[0])
         self.values["object_in_link_mm"][self.good] = 1e3 * in_link
@@ -182,7 +182,7 @@ class RowChecks:
             on_object[m] = obj.surface.closest(points[m])[0]
             object_normals[m] = obj.surface.normals(points[m])
         links = self.link_of[r, o, c]
-        T = inverse(T_objects[i, o]) @ T_links[i, links]  # object from link
+        T = np.linalg.inv(T_objects[i, o]) @ T_links[i, links]  # object from link
         on_link, link_normals = self._on_links(links, np.einsum("nji,nj->ni", T[:, :3, :3], points - T[:, :3, 3]))
         link_normals = np.einsum("nij,npj->npi", T[:, :3, :3], link_normals)
         between = angle_deg(-link_normals[:, :, None], object_normals[:, None])  # (n, P, P)
@@ -253,3 +253,46 @@ def _residuals(points: np.ndarray, inward: np.ndarray, given: np.ndarray) -> dic
         "residual_frictionless": wrench_residual(points, inward, mu=0.0)[0],
         "residual_stored_normals": wrench_residual(points, given)[0],
     }
+
+
+def check_frozen(
+    shard: JudgedShard, rows: np.ndarray, index: np.ndarray, link_of: np.ndarray, used: np.ndarray
+) -> np.ndarray:
+    """Rows (n,) whose steps move a joint that is not theirs, or that carries a link on an earlier object.
+
+    Args:
+        index: objects of the rows, shape [n, O], -1 where absent.
+        link_of, used: link of every contact and whether it is one, shape [n, O, C].
+    """
+    steps, g = {k: v[rows] for k, v in shard.steps.items()}, shard.grasps
+    present, free = index >= 0, np.asarray(steps["free_joints"], bool)  # (n, O), (n, O, K)
+    bad = (present[:, 1:] & ~present[:, :-1]).any(axis=1) | (free.sum(axis=1) > 1).any(axis=1)
+    bad |= (free.any(axis=2) != present).any(axis=1)
+    last = np.maximum(present.sum(axis=1) - 1, 0)
+    for name, held in (("q", "q"), ("q_pregrasp", "q"), ("q_squeeze", "q_squeeze")):
+        still = present[:, 1:, None] & ~free[:, 1:]
+        bad |= (still & (steps[name][:, 1:] != steps[held][:, :-1])).any(axis=(1, 2))
+        bad |= (steps[name][np.arange(len(rows)), last] != g[name][rows]).any(axis=1) if name in g else False
+    riders = shard.hand.riders(shard.joint_names)  # (K, L)
+    for o in range(index.shape[1] - 1):
+        later = free[:, o + 1 :].any(axis=1)  # (n, K)
+        carried = later.astype(int) @ riders.astype(int) > 0  # (n, L)
+        bad |= (np.take_along_axis(carried, np.maximum(link_of[:, o], 0), 1) & used[:, o]).any(axis=1)
+    return bad
+
+
+def check_parents(shard: JudgedShard, rows: np.ndarray) -> np.ndarray:
+    """Rows (n,) of several objects that do not extend an earlier row of one object less bit by bit."""
+    g, steps = shard.grasps, shard.steps
+    count, parent = (np.asarray(g["object_index"]) >= 0).sum(axis=1), np.asarray(steps["parent"], int)
+    names = ("object_index", "object_pose", "contact_points", "contact_normals", "contact_links", "contact_forces")
+    columns = [g[k] for k in names if k in g]
+    columns += [steps[k] for k in ("space", "free_joints", "q", "q_pregrasp", "q_squeeze")]
+    bad = np.zeros(len(rows), bool)
+    for i, r in enumerate(rows):
+        p, n = parent[r], count[r] - 1
+        good = p == -1 if n == 0 else 0 <= p < r and count[p] == n
+        if good and n > 0:
+            good = all(v[r, :n].tobytes() == v[p, :n].tobytes() for v in columns)
+        bad[i] = not (good and len(np.unique(steps["space"][r, : n + 1])) == n + 1)
+    return bad

@@ -8,10 +8,9 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from lgrasp.judge.kinematics import LinkTree, inverse
+from lgrasp.judge.hand import LinkTree, parse, read_joint, read_solids
 from lgrasp.judge.meshes import MeshDistance, surface_samples
 from lgrasp.judge.solids import JudgedSolid
-from lgrasp.judge.urdf import parse, read_joint, read_solids
 
 POSTURES = 200
 """Random postures in all of which a pair of links touches before it is left out."""
@@ -97,7 +96,7 @@ class PlacedSolids:
         hull = -coal.distance(sa.shape, self.a, sb.shape, self.b, self.request, self.result)
         if hull <= enough or (sa.convex and sb.convex):
             return hull
-        dense = _deepest(sa, sb, inverse(self.links[i, sa.link]) @ self.links[i, sb.link])
+        dense = _deepest(sa, sb, np.linalg.inv(self.links[i, sa.link]) @ self.links[i, sb.link])
         return min(hull, dense) if dense > 0.0 else -1e-9
 
 
@@ -115,7 +114,7 @@ class JudgedObject:
 
 def _deepest(a: JudgedSolid | JudgedObject, b: JudgedSolid | JudgedObject, T_ab: np.ndarray) -> float:
     """Deepest surface point of one solid or object inside the other [m], from the pose of b in a (4, 4)."""
-    T_ba = inverse(T_ab)
+    T_ba = np.linalg.inv(T_ab)
     one = a.depth(b.samples @ T_ab[:3, :3].T + T_ab[:3, 3]).max()
     return max(float(one), float(b.depth(a.samples @ T_ba[:3, :3].T + T_ba[:3, 3]).max()))
 

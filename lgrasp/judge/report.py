@@ -1,8 +1,10 @@
 """What the judge found, as numbers, as JSON and as text."""
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +34,7 @@ class ShardVerdict:
     failed: dict[str, np.ndarray]
     metrics: dict[str, np.ndarray]
     held: np.ndarray
-    self_pairs: dict[str, int]
+    self_pairs: Counter[str]
     claims: dict[str, str]
     notes: list[str]
 
@@ -43,33 +45,28 @@ class ShardVerdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Counts and failing checks."""
-        claimed = ~self.kept_invalid
-        passed = self.valid
-        return {
-            "path": str(self.path),
-            "total_rows": self.total_rows,
-            "rows": int(claimed.sum()),
-            "valid_rows": int((claimed & passed).sum()),
-            "failures": failures(self.failed, self.values, claimed),
-            "kept_invalid_rows": int(self.kept_invalid.sum()),
-            "kept_invalid_but_valid": int((self.kept_invalid & passed).sum()),
-            "claims": self.claims,
-            "notes": self.notes,
-        }
+        counted = _counts(self.valid, self.kept_invalid, self.failed, self.values)
+        counted["kept_invalid_but_valid"] = int((self.kept_invalid & self.valid).sum())
+        told = {"claims": self.claims, "notes": self.notes}
+        return {"path": str(self.path), "total_rows": self.total_rows, **counted, **told}
 
 
-def failures(
-    failed: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray], rows: np.ndarray
-) -> dict[str, dict[str, float]]:
-    """Of the chosen rows (mask), by check that some fail: how many, the worst value and the bound."""
-    out: dict[str, dict[str, float]] = {}
+def _counts(
+    valid: np.ndarray, kept: np.ndarray, failed: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray]
+) -> dict[str, Any]:
+    """Rows, valid ones, and by check that some fail how many, the worst value and the bound; rows kept as invalid."""
+    failures: dict[str, dict[str, float]] = {}
     for check, (value, bound) in CHECKS.items():
-        mask = failed[check] & rows
+        mask = failed[check] & ~kept
         if mask.any():
-            out[check] = {"rows": int(mask.sum())}
-            if value:
-                out[check] |= {"worst": float(values[value][mask].max()), "bound": bound}
-    return out
+            worst = {"worst": float(values[value][mask].max()), "bound": bound} if value else {}
+            failures[check] = {"rows": int(mask.sum()), **worst}
+    return {
+        "rows": int((~kept).sum()),
+        "valid_rows": int((valid & ~kept).sum()),
+        "failures": failures,
+        "kept_invalid_rows": int(kept.sum()),
+    }
 
 
 class Report:
@@ -110,22 +107,18 @@ class Report:
     @property
     def self_pairs(self) -> dict[str, int]:
         """Pairs of links with self-penetration beyond the bound and their rows, most first."""
-        out: dict[str, int] = {}
-        for name, count in (item for s in self.shards for item in s.self_pairs.items()):
-            out[name] = out.get(name, 0) + count
-        return dict(sorted(out.items(), key=lambda item: -item[1]))
+        return dict(sum((s.self_pairs for s in self.shards), Counter()).most_common())
 
     @property
     def distributions(self) -> dict[str, dict[str, float]]:
         """Largest, 99th percentile and median of each recomputed number."""
-        return _spread(self.values, {"max": 1.0, "p99": 0.99, "p50": 0.5})
+        return _spread(self.values)
 
     @property
     def metrics(self) -> dict[str, dict[str, float]]:
         """Deviations of stored metrics from recomputed numbers."""
         names = dict.fromkeys(name for s in self.shards for name in s.metrics)
-        joined = {k: np.concatenate([s.metrics[k] for s in self.shards if k in s.metrics]) for k in names}
-        return _spread(joined, {"max": 1.0, "p99": 0.99, "p50": 0.5})
+        return _spread({k: np.concatenate([s.metrics[k] for s in self.shards if k in s.metrics]) for k in names})
 
     @property
     def by_objects(self) -> dict[int, dict[str, float]]:
@@ -136,20 +129,16 @@ class Report:
             good = mask & self.valid
             out[int(held)] = {"rows": int(mask.sum()), "valid": int(good.sum())}
             for name, key in (("hand", "penetration_mm"), ("objects", "object_object_mm")):
-                found = _spread({"": self.values[key][good]}, {"max": 1.0, "p50": 0.5}).get("", {})
+                found = _spread({"": self.values[key][good]}).get("", {})
                 out[int(held)] |= {f"{name} {k}": found.get(k, math.nan) for k in ("max", "p50")}
         return out
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the rows' own numbers, fit for JSON; numbers that are not finite are None."""
-        claimed = ~self.kept_invalid
         out = {
-            "rows": int(claimed.sum()),
+            **_counts(self.valid, self.kept_invalid, self.failed, self.values),
             "total_rows": self.total_rows,
-            "valid_rows": int((self.valid & claimed).sum()),
             "valid_share": self.valid_share,
-            "kept_invalid_rows": int(self.kept_invalid.sum()),
-            "failures": failures(self.failed, self.values, claimed),
             "shards": [s.to_dict() for s in self.shards],
             "distributions": self.distributions,
             "stored_metrics": self.metrics,
@@ -175,7 +164,7 @@ class Report:
             d = s.to_dict()
             share = f"{100.0 * d['valid_rows'] / d['rows']:.2f} %" if d["rows"] else "-"
             line = f"{s.path.name:<{width}}{d['rows']:>8}{d['valid_rows']:>8}{share:>10}  "
-            line += ", ".join(_failure(check, f) for check, f in d["failures"].items()) or "none"
+            line += ", ".join(starmap(_failure, d["failures"].items())) or "none"
             line += f"; made for profile {s.claims['profile']}" if s.claims.get("profile", "strict") != "strict" else ""
             if d["kept_invalid_rows"]:
                 line += f"; kept as invalid: {d['kept_invalid_rows']}, of which {d['kept_invalid_but_valid']} pass"
@@ -184,7 +173,7 @@ class Report:
     def _total_lines(self) -> Iterable[str]:
         claimed = ~self.kept_invalid
         yield (
-            f"strictly valid   {int((self.valid & claimed).sum())} of {int(claimed.sum())} judged rows "
+            f"strictly valid   {int(self.valid[claimed].sum())} of {int(claimed.sum())} judged rows "
             f"({100 * self.valid_share:.2f} %), {self.total_rows} rows in the input"
         )
         share = 100 * self.repeats.combined / max(self.total_rows, 1)
@@ -204,8 +193,9 @@ def _failure(check: str, found: Mapping[str, float]) -> str:
     return f"{check} {found['rows']}{worst}"
 
 
-def _spread(values: Mapping[str, np.ndarray], shares: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def _spread(values: Mapping[str, np.ndarray]) -> dict[str, dict[str, float]]:
     finite = {k: v[np.isfinite(v)] for k, v in values.items()}
+    shares = {"max": 1.0, "p99": 0.99, "p50": 0.5}
     return {k: {n: float(np.quantile(v, s)) for n, s in shares.items()} for k, v in finite.items() if len(v)}
 
 

@@ -1,7 +1,9 @@
 """Judges shards: files, folders of them, all of their rows or some."""
 
+import math
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,6 @@ import numpy as np
 
 from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.checks import CHECKS, VALUES, RowChecks
-from lgrasp.judge.claims import metric_errors
 from lgrasp.judge.duplicates import count_repeats
 from lgrasp.judge.report import Report, ShardVerdict
 from lgrasp.judge.shard import JudgedShard, read_shard
@@ -74,9 +75,6 @@ def _judge_shard(shard: JudgedShard, rows: np.ndarray, step: Callable[[int], obj
     for first in range(0, len(rows), BLOCK):
         step(first)
         blocks.append(RowChecks(shard, rows[first : first + BLOCK], epsilon=stored and first < EPSILON_ROWS))
-    self_pairs: dict[str, int] = {}
-    for name, count in (item for b in blocks for item in b.self_pairs.items()):
-        self_pairs[name] = self_pairs.get(name, 0) + count
     values = {k: np.concatenate([np.zeros(0), *(b.values[k] for b in blocks)]) for k in VALUES}
     return ShardVerdict(
         path=shard.path,
@@ -87,7 +85,7 @@ def _judge_shard(shard: JudgedShard, rows: np.ndarray, step: Callable[[int], obj
         failed={k: np.concatenate([np.zeros(0, bool), *(b.failed[k] for b in blocks)]) for k in CHECKS},
         metrics=metric_errors(shard, rows, values),
         held=(np.asarray(shard.grasps["object_index"])[rows] >= 0).sum(axis=1),
-        self_pairs=self_pairs,
+        self_pairs=sum((b.self_pairs for b in blocks), Counter()),
         claims=shard.claims,
         notes=shard.notes,
     )
@@ -112,3 +110,32 @@ def _existing(path: str | Path) -> Path:
     if not Path(path).exists():
         raise JudgeError(f"{path}: no such file or folder")
     return Path(path)
+
+
+def metric_errors(shard: JudgedShard, rows: np.ndarray, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Absolute deviation (n,) of stored metrics from recomputed values; metrics are recognised by name and unit."""
+    out = {}
+    for name, (data, unit) in shard.metrics.items():
+        key, stored = name.lower(), np.asarray(data, float)[rows]
+        to_mm = 1.0 if unit.strip().lower() == "mm" else 1e3
+        to_deg = 1.0 if unit.strip().lower().startswith("deg") else math.degrees(1.0)
+        if "epsilon" in key:
+            out[name] = stored - values["epsilon"]
+        elif "fswo" in key or "frictionless" in key:
+            out[name] = stored - values["residual_frictionless"]
+        elif "gswo" in key or "residual" in key:
+            out[name] = stored - values["residual"]
+            out[f"{name} (stored normals)"] = stored - values["residual_stored_normals"]
+        elif "penetration" in key:
+            which = "object_object" if "object_object" in key or "between" in key else "penetration"
+            which = "self_penetration" if "self" in key else which
+            out[f"{name} [mm]"] = np.maximum(stored, 0.0) * to_mm - values[f"{which}_mm"]
+        elif "gap" in key:
+            out[f"{name} [mm]"] = np.abs(stored) * to_mm - values["contact_link_mm"]
+        elif "normal" in key:
+            out[f"{name} [deg]"] = stored * to_deg - values["normal_deg"]
+        elif "links" in key:
+            out[name] = stored - values["links_in_contact"]
+        elif key in ("contacts", "contact_count", "num_contacts"):
+            out[name] = stored - values["contacts"]
+    return {name: np.abs(d) for name, d in out.items()}

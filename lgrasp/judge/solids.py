@@ -65,11 +65,21 @@ class JudgedSolid:
     def _coal(self) -> Any:
         raise NotImplementedError
 
-    def _signed(self, p: np.ndarray) -> np.ndarray:
+    def _fold(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates (n, D) of points in which the solid is a box of half extents ``size``, and their gradients."""
         raise NotImplementedError
 
+    def _signed(self, p: np.ndarray) -> np.ndarray:
+        d = self._fold(p)[0] - self.size
+        return np.linalg.norm(np.maximum(d, 0.0), axis=1) + np.minimum(d.max(axis=1), 0.0)
+
     def _gradient(self, p: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
+        folded, ways = self._fold(p)  # (n, D), (n, D, 3)
+        d = folded - self.size
+        outside = np.maximum(d, 0.0)
+        length = np.linalg.norm(outside, axis=1, keepdims=True)
+        face = np.eye(len(self.size))[d.argmax(axis=1)]
+        return np.einsum("nd,ndk->nk", np.where(length > 1e-9, outside / np.maximum(length, 1e-12), face), ways)
 
 
 class BoxSolid(JudgedSolid):
@@ -88,16 +98,8 @@ class BoxSolid(JudgedSolid):
     def _coal(self) -> Any:
         return coal.Box(*(2.0 * self.size))
 
-    def _signed(self, p: np.ndarray) -> np.ndarray:
-        d = np.abs(p) - self.size
-        return np.linalg.norm(np.maximum(d, 0.0), axis=1) + np.minimum(d.max(axis=1), 0.0)
-
-    def _gradient(self, p: np.ndarray) -> np.ndarray:
-        d = np.abs(p) - self.size
-        outside = np.maximum(d, 0.0)
-        length = np.linalg.norm(outside, axis=1, keepdims=True)
-        face = np.eye(3)[d.argmax(axis=1)]
-        return np.where(length > 1e-9, outside / np.maximum(length, 1e-12), face) * np.where(p < 0, -1.0, 1.0)
+    def _fold(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.abs(p), np.eye(3) * np.where(p < 0, -1.0, 1.0)[:, None]
 
 
 class SphereSolid(JudgedSolid):
@@ -110,11 +112,9 @@ class SphereSolid(JudgedSolid):
     def _coal(self) -> Any:
         return coal.Sphere(float(self.size[0]))
 
-    def _signed(self, p: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(p, axis=1) - self.size[0]
-
-    def _gradient(self, p: np.ndarray) -> np.ndarray:
-        return p / np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-12)
+    def _fold(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        r = np.linalg.norm(p, axis=1, keepdims=True)
+        return r, (p / np.maximum(r, 1e-12))[:, None]
 
 
 class CylinderSolid(JudgedSolid):
@@ -136,20 +136,12 @@ class CylinderSolid(JudgedSolid):
     def _coal(self) -> Any:
         return coal.Cylinder(float(self.size[0]), float(2.0 * self.size[1]))
 
-    def _rz(self, p: np.ndarray) -> np.ndarray:
-        return np.column_stack([np.linalg.norm(p[:, :2], axis=1), np.abs(p[:, 2])]) - self.size
-
-    def _signed(self, p: np.ndarray) -> np.ndarray:
-        d = self._rz(p)
-        return np.linalg.norm(np.maximum(d, 0.0), axis=1) + np.minimum(d.max(axis=1), 0.0)
-
-    def _gradient(self, p: np.ndarray) -> np.ndarray:
-        d = self._rz(p)
-        outside = np.maximum(d, 0.0)
-        length = np.linalg.norm(outside, axis=1, keepdims=True)
-        g = np.where(length > 1e-9, outside / np.maximum(length, 1e-12), np.eye(2)[d.argmax(axis=1)])
-        radial = p[:, :2] / np.maximum(np.linalg.norm(p[:, :2], axis=1, keepdims=True), 1e-12)
-        return np.column_stack([radial * g[:, :1], np.where(p[:, 2] < 0, -1.0, 1.0) * g[:, 1]])
+    def _fold(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        r = np.linalg.norm(p[:, :2], axis=1)
+        ways = np.zeros((len(p), 2, 3))
+        ways[:, 0, :2] = p[:, :2] / np.maximum(r, 1e-12)[:, None]
+        ways[:, 1, 2] = np.where(p[:, 2] < 0, -1.0, 1.0)
+        return np.column_stack([r, np.abs(p[:, 2])]), ways
 
 
 class MeshSolid(JudgedSolid):

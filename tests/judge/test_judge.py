@@ -22,11 +22,11 @@ from typer.testing import CliRunner
 from lgrasp.judge.checks import CHECKS
 from lgrasp.judge.collision import JudgedHand, JudgedObject, PlacedSolids, object_in_object
 from lgrasp.judge.duplicates import distinct_poses, near_duplicates
+from lgrasp.judge.hand import origin
 from lgrasp.judge.meshes import MeshDistance
 from lgrasp.judge.run import judge
 from lgrasp.judge.shard import _resolver
 from lgrasp.judge.solids import SAMPLES, BoxSolid, CylinderSolid, MeshSolid, SphereSolid
-from lgrasp.judge.urdf import origin
 from lgrasp.judge.wrench import cone_forces, ferrari_canny, wrench_residual
 from lgrasp_cli.main import app
 

@@ -5,8 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from lgrasp.judge.inside import Crossings, Inside
-from lgrasp.judge.meshes import MeshDistance, clean_mesh
+from lgrasp.judge.meshes import Crossings, Inside, MeshDistance, clean_mesh
 
 
 def test_lines_through_edges_and_vertices_count_once():
