@@ -34,8 +34,9 @@ def swift() -> Pipeline:
 
 @pytest.fixture(scope="session")
 def lightning() -> Pipeline:
-    """The published order on a small contact field."""
-    pipeline = load_pipeline("lightning")
+    """The published algorithm on a small contact field, with small domains and few starts a pose."""
+    settings = ("domain.attempts=400", "search.restarts=16", "search.per_pose=16")
+    pipeline = load_pipeline("lightning").with_settings(settings)
     return pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": RECORDS})})
 
 

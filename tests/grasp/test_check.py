@@ -7,6 +7,7 @@ from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import input_keys, load_inputs
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.shard import shard_context
 from lgrasp.field.params import FieldParams
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
@@ -17,8 +18,11 @@ from lgrasp.stages.context import Context
 
 HANDS = ("allegro", "barrett", "dclaw", "leap", "schunk_svh", "shadow")
 OBJECTS = {"allegro": "mug", "barrett": "mug", "dclaw": "mug", "leap": "mug", "schunk_svh": "mug", "shadow": "mug"}
-PIPELINES = {"swift": 1500, "robust": 1500, "lightning": 6000, "swift-refine": 300}
+PIPELINES = {"swift": 1500, "robust": 1500, "lightning": 100, "swift-refine": 300}
 """Pipeline -> candidates."""
+
+FEW = {("barrett", "lightning"), ("schunk_svh", "lightning"), ("shadow", "lightning")}
+"""Where so few candidates may give no row."""
 
 SAME = {"fswo", "penetration", "self_penetration", "gap", "normal_error"}
 """Metrics without a stopping rule or a random ray: the same to the last bit."""
@@ -36,8 +40,9 @@ def test_every_row_of_a_pipeline_passes(hand, pipeline, cache_root):
     found = found.model_copy(update={"field": FieldParams(records=20_000, index=found.field.index)})
     keys = input_keys(find_hand(hand), OBJECTS[hand], 1.0, found.object, found.field)
     inputs = load_inputs(Cache(cache_root, pytest.fail), keys, 1.0, found.object, found.field, resolve_device("cpu"))
-    context = Context(inputs.hand, inputs.object, inputs.field, "cpu", 0, 0, found.bounds)
+    context = shard_context(found, inputs, 0)
     table = run_stages(found, context, 0, PIPELINES[pipeline], found.order[-1])
+    assert len(table) > 0 or (hand, pipeline) in FEW
     again, outcome = rechecked(context, table, found.bounds)
     assert [REASONS[k] for k in outcome[outcome != Outcome.KEPT]] == []
     for name in METRICS:
