@@ -41,9 +41,9 @@ def bench(
     workers: _Workers = 0,
     json_path: JsonPath = None,
 ) -> None:
-    """Measure pipelines side by side: strict-valid grasps per second of placement through filter.
+    """Compare pipelines by strict-valid grasps per second, from placement through filter.
 
-    The pipelines take turns on each object; ratios are to the last one. Nothing is left behind except compiled kernels.
+    The pipelines take turns on each object; ratios are relative to the last one. Only compiled kernels are kept.
 
     Example: lgrasp bench --objects mug,bowl --repeat 5
     """
@@ -105,10 +105,10 @@ def table1(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Keep the cells that --json PATH holds.")] = False,
 ) -> None:
-    """Measure the table of Lightning Grasp: four hands, eight objects, our pipelines in turn, published figures beside.
+    """Measure the table of Lightning Grasp: four hands, eight objects, our pipelines next to the published figures.
 
-    A cell is a hand with an object; --json PATH is written after each, so that an interrupted run keeps what it has.
-    Hands and objects are those of configs/table1.yaml; without --hand-dir they have primitive geometry.
+    A cell is a hand with an object; --json PATH is written after each, so an interrupted run loses at most one cell.
+    configs/table1.yaml lists the hands and objects; without --hand-dir the hands have primitive geometry.
 
     Example: lgrasp bench table1 --hand-dir hands --object-dir meshes --json table1.json --plot table1.png
     """
@@ -161,13 +161,13 @@ def bench_sequence(
     hand: Hand = "allegro",
     length: Annotated[int, typer.Option(min=2, help="Objects in a sequence.")] = 4,
     sequences: Annotated[int, typer.Option(min=1, help="Sequences of objects, drawn from the pool.")] = 3,
-    width: Annotated[int, typer.Option("-n", "--width", min=1, help="Attempts begun with each sequence.")] = 256,
+    width: Annotated[int, typer.Option("-n", "--width", min=1, help="Attempts started with each sequence.")] = 256,
     methods: Annotated[str, typer.Option(help="Methods, separated by commas.")] = "field,anneal",
     baseline_width: Annotated[
         int, typer.Option("--baseline-n", min=1, help="Attempts of methods after the first.")
     ] = 32,
     iterations: Annotated[
-        int | None, typer.Option(min=1, help="Of the optimiser; default: as published.", show_default="6000")
+        int | None, typer.Option(min=1, help="Iterations of the optimiser; default: as published.", show_default="6000")
     ] = None,
     policy: Annotated[str, typer.Option(help="uniform, as published, or lookahead.")] = "uniform",
     physics: Annotated[str, typer.Option(help="Protocol: seq6 (friction 2.0, as published) or seq6_mu06.")] = "seq6",
@@ -175,7 +175,7 @@ def bench_sequence(
     pipeline: Annotated[
         str, typer.Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.")
     ] = "sequence",
-    seed: Annotated[int, typer.Option(min=0, help="Draws the sequences and the grasps.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sequences and the grasps.")] = 0,
     device: Device = "auto",
     workers: _Workers = 0,
     json_path: JsonPath = None,
@@ -183,7 +183,7 @@ def bench_sequence(
 ) -> None:
     """Measure the tables of SeqGrasp: success by opposition space and number of objects, for each method.
 
-    Every row is simulated, and only rows that hold are continued. Nothing is written but the cache.
+    Every row is simulated, and only rows that hold are continued. Only the cache is written.
 
     Example: lgrasp bench sequence --sequences 2 --methods field
     """
@@ -224,15 +224,15 @@ def bench_refine(
     hands: Annotated[str, typer.Option(help="Names, separated by commas.")] = "barrett,schunk_svh",
     objects: Annotated[str, typer.Option(help="Names or mesh files, separated by commas.")] = "bowl,box,bottle,mug",
     starts: Annotated[int, typer.Option("--starts", "-n", min=1, help="Starts on each object.")] = 80,
-    physics: Annotated[str, typer.Option(help="Protocol that decides what is valid.")] = "fc",
-    noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Table IV too: clouds with noise.")] = True,
+    physics: Annotated[str, typer.Option(help="Protocol that decides which plans are valid.")] = "fc",
+    noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Also measure table IV: clouds with noise.")] = True,
     device: Device = "auto",
     json_path: JsonPath = None,
     cache_dir: CacheDir = None,
 ) -> None:
     """Measure tables I, III and IV of DiPGrasp: plans on meshes and noisy clouds, and coarse poses refined.
 
-    Plans are made with one hand at each start, as published, and with the best of several. A plan is valid when it
+    Plans are made with one hand at each start, as published, and with the best of several. A plan is valid if it
     holds its object in simulation.
 
     Example: lgrasp bench refine --objects bottle,mug --starts 40

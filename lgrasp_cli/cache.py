@@ -7,7 +7,7 @@ import typer
 
 from lgrasp_cli.options import CacheDir, open_cache
 
-app = typer.Typer(help="What is kept between runs.", no_args_is_help=True)
+app = typer.Typer(help="List and clear cached results.", no_args_is_help=True)
 
 
 @app.command()
@@ -54,15 +54,15 @@ def list_entries(
 @app.command()
 def prune(
     kind: Annotated[
-        list[str] | None, typer.Option(help="Only this kind, such as bank; may be repeated.", show_default=False)
+        list[str] | None, typer.Option(help="Only this kind, such as bank; repeatable.", show_default=False)
     ] = None,
     older_than: Annotated[
-        float | None, typer.Option(metavar="DAYS", help="Only what was written longer ago.", show_default=False)
+        float | None, typer.Option(metavar="DAYS", help="Only entries older than this.", show_default=False)
     ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Everything, compiled kernels too.")] = False,
+    everything: Annotated[bool, typer.Option("--all", help="All entries, and compiled kernels.")] = False,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Remove entries from the cache; what is needed is made again.
+    """Remove entries from the cache; they are rebuilt when needed.
 
     Example: lgrasp cache prune --kind bank --older-than 7
     """

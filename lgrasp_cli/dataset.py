@@ -12,7 +12,7 @@ from lgrasp_cli.working import How, working
 if TYPE_CHECKING:
     from rich.table import Table
 
-app = typer.Typer(help="Look at, check and merge grasp files (shards).", no_args_is_help=True)
+app = typer.Typer(help="Inspect, check and merge grasp files (shards).", no_args_is_help=True)
 
 _Paths = Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.", show_default=False)]
 
@@ -22,7 +22,7 @@ def info(
     paths: _Paths,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Show rows, hand, objects, pipeline, size and metrics of each shard; of sequences, rows by number of objects.
+    """Show rows, hand, objects, pipeline, size and metrics of each shard; for sequences, rows by number of objects.
 
     Example: lgrasp dataset info out/mug
     """
@@ -100,14 +100,14 @@ def metrics(
         typer.Option(
             "--set",
             metavar="bounds.KEY=VALUE",
-            help="Measure with another value than the rows passed, such as bounds.friction=0.8.",
+            help="Measure with another value than that of the rows, such as bounds.friction=0.8.",
             show_default=False,
         ),
     ] = None,
 ) -> None:
-    """Copy shards and add quality metrics to the copies; those that are in --out already are kept.
+    """Copy shards and add quality metrics to the copies; existing copies are kept.
 
-    Subfolders are looked into and made in --out too. docs/reference/metrics.md defines the metrics.
+    Subfolders are searched and recreated in --out. docs/reference/metrics.md defines the metrics.
 
     Example: lgrasp dataset metrics grasps/allegro-mug --add volume,epsilon_exact -o grasps/measured
     """
@@ -131,9 +131,9 @@ def report(
     json_path: JsonPath = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write what a data set holds as one HTML page: validity, quality, diversity, coverage, physics.
+    """Write a report on a data set as one HTML page: validity, quality, diversity, coverage, physics.
 
-    Shards of several hands and objects may be given; subfolders are looked into. The page stands alone, offline.
+    Shards may be of several hands and objects; subfolders are searched. The page works offline.
 
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """

@@ -20,18 +20,20 @@ def export(
         str, typer.Option("--to", help="dexgraspnet, dexgraspbench, isaac-grasp or mjcf.", show_default=False)
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder to write; empty or not there yet.", show_default=False)
+        Path,
+        typer.Option("--out", "-o", help="Folder to write; it must be empty or not exist yet.", show_default=False),
     ],
-    limit: Annotated[int | None, typer.Option(help="Most grasps.", show_default=False)] = None,
+    limit: Annotated[int | None, typer.Option(help="Largest number of grasps.", show_default=False)] = None,
     where: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only rows of which this is true: a column, or COLUMN OP NUMBER, as in objects == 1; may be repeated.",
+            help="Only rows that meet a condition: a column, or COLUMN OP NUMBER, such as objects == 1; repeatable.",
             show_default=False,
         ),
     ] = None,
     only_holding: Annotated[
-        bool, typer.Option("--only-holding", help="Only grasps that held in the simulator: --where physics/fc_holds.")
+        bool,
+        typer.Option("--only-holding", help="Only grasps that held in simulation; same as --where physics/fc_holds."),
     ] = False,
 ) -> None:
     """Write grasps in the format of another program, with the hand's URDF and all meshes.

@@ -32,7 +32,7 @@ def generate(
     mesh: Mesh,
     how: How,
     hand: Hand = "allegro",
-    rows: Annotated[int, typer.Option("-n", "--rows", help="Grasps asked.")] = 1000,
+    rows: Annotated[int, typer.Option("-n", "--rows", help="Grasps requested.")] = 1000,
     pipeline: PipelineName = "robust",
     settings: Settings = None,
     out: Annotated[
@@ -46,28 +46,36 @@ def generate(
     simulate: Annotated[
         str | None,
         typer.Option(
-            help="Keep only grasps that hold when simulated: protocol fc, gravity6 or gravity6_mu1.", show_default=False
+            help="Keep only grasps that hold in simulation, with protocol fc, gravity6 or gravity6_mu1.",
+            show_default=False,
         ),
     ] = None,
     physics: Physics = None,
-    shard_rows: Annotated[int, typer.Option(help="Rows of a shard; other values give other rows.")] = 10_000,
+    shard_rows: Annotated[
+        int, typer.Option(help="Grasps per shard. Changing it changes which grasps are generated.")
+    ] = 10_000,
     passes: Annotated[
         int | None,
         typer.Option(
             min=1,
             max=64,
-            help="Searches of the poses that yielded: faster, fewer poses; default: the pipeline's, or 8 with --reuse.",
+            help="Searches per successful pose: faster, but fewer poses; default: the pipeline's, or 8 with --reuse.",
             show_default=False,
         ),
     ] = None,
     reuse: Annotated[
-        bool, typer.Option("--reuse", help="Keep how far shards came: a later run with a larger -n goes on there.")
+        bool,
+        typer.Option(
+            "--reuse", help="Cache the state of shards, so that a later run with a larger -n continues from there."
+        ),
     ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be computed; change nothing.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show what would be computed without computing it.")
+    ] = False,
 ) -> None:
     """Generate grasps of an object and write them as shards.
 
-    Exit code 3 when fewer grasps than asked were found; what was found is kept.
+    The exit code is 3 if fewer grasps are found than requested; those found are kept.
 
     Example: lgrasp generate --object mug.obj -n 10000
     """

@@ -17,7 +17,7 @@ _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the
 
 @app.command("list")
 def list_hands(as_json: _AsJson = False) -> None:
-    """List the hands that have a name.
+    """List the hands that can be used by name.
 
     Example: lgrasp hands list
     """
@@ -97,7 +97,7 @@ def add_hand(
     for line in made.decisions:
         typer.echo(f"- {' '.join(line.split())}")
     typer.echo(f"\nwrote {made.folder}")
-    typer.echo(f"change what was decided in {made.folder / 'hand.yaml'}; the key is in brackets above")
+    typer.echo(f"to change these decisions, edit {made.folder / 'hand.yaml'}; the keys are in brackets above")
     typer.echo(f"try it: lgrasp hands check {made.spec.name if out is None else made.folder}")
 
 
@@ -107,7 +107,7 @@ def check_hand(
     out: Annotated[
         Path | None, typer.Option(help="Folder of the pictures; default: check/NAME.", show_default=False)
     ] = None,
-    rows: Annotated[int, typer.Option("-n", "--rows", min=1, help="Grasps asked per object.")] = 200,
+    rows: Annotated[int, typer.Option("-n", "--rows", min=1, help="Grasps requested per object.")] = 200,
     pipeline: PipelineName = "robust",
     device: Device = "auto",
     workers: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
@@ -115,7 +115,7 @@ def check_hand(
     quiet: Quiet = False,
     as_json: _AsJson = False,
 ) -> None:
-    """Try a hand on a ball, a box and a cylinder of 5 cm; say where the yield dies and why; save pictures.
+    """Try a hand on a ball, a box and a cylinder of 5 cm; report where grasps are lost and why, and save pictures.
 
     Example: lgrasp hands check my_hand
     """

@@ -8,7 +8,7 @@ import typer
 from lgrasp_cli.options import CacheDir, Device, JsonPath, Quiet, check_report, open_cache
 from lgrasp_cli.working import How, working
 
-app = typer.Typer(help="Coarse grasps from partial clouds by a small network.", no_args_is_help=True)
+app = typer.Typer(help="Predict coarse grasps from partial point clouds with a small network.", no_args_is_help=True)
 
 _Shards = Annotated[list[Path], typer.Argument(help="Shard files, or folders of them.", show_default=False)]
 
@@ -19,19 +19,21 @@ def fit(
     shards: _Shards,
     how: How,
     out: Annotated[Path, typer.Option("--out", "-o", help="File of the predictor.")] = Path("coarse.pt"),
-    steps: Annotated[int | None, typer.Option(help="Steps on poses alone; default: 1500.", show_default=False)] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Training steps on poses alone; default: 1500.", show_default=False)
+    ] = None,
     joint_steps: Annotated[
-        int | None, typer.Option(help="Steps through the refiner afterwards; default: 80.", show_default=False)
+        int | None, typer.Option(help="Training steps through the refiner afterwards; default: 80.", show_default=False)
     ] = None,
     unrolled: Annotated[
         int | None, typer.Option(help="Unrolled steps of the refiner; default: 5.", show_default=False)
     ] = None,
-    batch: Annotated[int | None, typer.Option(help="Seeds of a step; default: 64.", show_default=False)] = None,
-    seed: Annotated[int, typer.Option(help="Of clouds, weights and batches.")] = 0,
+    batch: Annotated[int | None, typer.Option(help="Seeds per training step; default: 64.", show_default=False)] = None,
+    seed: Annotated[int, typer.Option(help="Seed of clouds, weights and batches.")] = 0,
 ) -> None:
     """Train a predictor on the grasps of shards, first on poses, then through unrolled steps of the refiner.
 
-    The report compares energies on clouds that were not trained on.
+    The report compares energies on clouds outside the training data.
 
     Example: lgrasp learn fit grasps --out coarse.pt
     """
@@ -48,16 +50,16 @@ def fit(
 
 @app.command(name="eval")
 def evaluate(
-    predictor: Annotated[Path, typer.Argument(help="File that lgrasp learn fit wrote.", show_default=False)],
+    predictor: Annotated[Path, typer.Argument(help="File written by lgrasp learn fit.", show_default=False)],
     shards: _Shards,
-    clouds: Annotated[int, typer.Option(min=1, help="New clouds of each object.")] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Of the clouds.")] = 1,
+    clouds: Annotated[int, typer.Option(min=1, help="New clouds per object.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the clouds.")] = 1,
     device: Device = "auto",
     json_path: JsonPath = None,
     cache_dir: CacheDir = None,
     quiet: Quiet = False,
 ) -> None:
-    """Energies of a predictor's answers on new clouds, and after 3, 6, 10 and 13 rounds of the refiner.
+    """Measure the energy of predictions on new clouds, before and after 3, 6, 10 and 13 rounds of the refiner.
 
     Example: lgrasp learn eval coarse.pt grasps
     """

@@ -13,7 +13,7 @@ _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the
 
 @app.command("list")
 def list_objects(as_json: _AsJson = False) -> None:
-    """List the objects that have a name.
+    """List the objects that can be used by name.
 
     Example: lgrasp objects list
     """
@@ -34,7 +34,7 @@ def show_object(
     scale: Scale = 1.0,
     as_json: _AsJson = False,
 ) -> None:
-    """Check a mesh and say what it is and what would be repaired.
+    """Check a mesh; report its properties and needed repairs.
 
     Example: lgrasp objects show mug
     """

@@ -35,11 +35,13 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="PART.KEY=VALUE",
-        help="Another value of a parameter, such as bounds.friction=0.8 or search.restarts=40; may be repeated.",
+        help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.",
         show_default=False,
     ),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no report; warnings and errors only.")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print no progress and no report, only warnings and errors.")
+]
 
 
 def check_report(path: str | None) -> None:

@@ -11,7 +11,7 @@ _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the
 
 @app.command("list")
 def list_pipelines(as_json: _AsJson = False) -> None:
-    """List the pipelines that have a name.
+    """List the pipelines that can be used by name.
 
     Example: lgrasp pipelines list
     """

@@ -21,32 +21,36 @@ def plan(
         typer.Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.", show_default=False),
     ] = None,
     cloud: Annotated[
-        Path | None, typer.Option(help="Point cloud (.ply .xyz .npy .npz .h5), perhaps a scene.", show_default=False)
+        Path | None, typer.Option(help="Point cloud or scene (.ply .xyz .npy .npz .h5).", show_default=False)
     ] = None,
     mask: Annotated[
         Path | None, typer.Option(help="Labels of the cloud's points (.npy, .npz).", show_default=False)
     ] = None,
-    label: Annotated[int | None, typer.Option(help="Which points are to be grasped.", show_default=False)] = None,
+    label: Annotated[int | None, typer.Option(help="Label of the points to grasp.", show_default=False)] = None,
     viewpoint: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,Z", help="Where the cloud was seen from [m]; turns its normals.", show_default=False),
+        typer.Option(
+            metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.", show_default=False
+        ),
     ] = None,
     scale: Scale = 1.0,
     hand: Annotated[
         str, typer.Option(help="Name of a hand, a URDF file, a folder with hand.yaml, or a shard (its hand).")
     ] = "barrett",
-    starts: Annotated[int, typer.Option("--starts", "-n", help="Points of the surface that are tried.")] = 80,
+    starts: Annotated[int, typer.Option("--starts", "-n", help="Points of the surface to start from.")] = 80,
     stand_off: Annotated[
         float | None,
         typer.Option(help="Distance of the hand's base from a start [m]; default: the hand's.", show_default=False),
     ] = None,
     distal: Annotated[float, typer.Option(help="Weight of the palmar side of the last links.")] = 1.0,
-    other: Annotated[float, typer.Option(help="Weight of the rest of the palmar side; small: a pinch.")] = 0.2,
+    other: Annotated[
+        float, typer.Option(help="Weight of the rest of the palmar side; a small value gives pinches.")
+    ] = 0.2,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder; default: plans/HAND-OBJECT.", show_default=False)
     ] = None,
 ) -> None:
-    """Plan grasps by a local search from open hands before the surface; a point cloud will do.
+    """Plan grasps by closing an open hand onto a mesh or point cloud with a local search.
 
     The palm faces each of the starts, the farthest from each other; the best hand of a start that passes all checks
     becomes a row. Exit code 3 when no start gave one.

@@ -9,7 +9,7 @@ import typer
 from lgrasp_cli.options import CacheDir, Device, PipelineName, Scale, choose_pipeline, open_cache
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")]
-_Force = Annotated[bool, typer.Option("--force", help="Make it again even if it is cached.")]
+_Force = Annotated[bool, typer.Option("--force", help="Rebuild it even if it is cached.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -38,7 +38,7 @@ def build_field(
     force: _Force = False,
     as_json: _AsJson = False,
 ) -> None:
-    """Build the contact field of a hand and keep it in the cache.
+    """Build and cache the contact field of a hand.
 
     Example: lgrasp build-field allegro
     """
@@ -79,7 +79,7 @@ def preprocess(
     force: _Force = False,
     as_json: _AsJson = False,
 ) -> None:
-    """Check and preprocess a mesh, say what was repaired, and keep the result in the cache.
+    """Check and preprocess a mesh, report repairs, and cache the result.
 
     Example: lgrasp preprocess mug.obj --scale 0.001
     """
@@ -111,7 +111,7 @@ def warm_up(
     device: Device = "auto",
     cache_dir: CacheDir = None,
 ) -> None:
-    """Compile every kernel for a device, so that the first job does not wait for it.
+    """Compile all kernels for a device ahead of the first job.
 
     Example: lgrasp warm-up --device cuda:0
     """

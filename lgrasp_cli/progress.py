@@ -109,7 +109,7 @@ def interruptible(progress: JobProgress) -> Iterator[None]:
             stop_now()
         progress.stop = True
         waiting.start()
-        say("stopping as soon as what is being made can be left; Ctrl-C again stops at once")
+        say("stopping after the current batch; press Ctrl-C again to stop at once")
 
     with on_interrupt(stop):
         try:

@@ -19,17 +19,17 @@ Reports go to standard output; progress, warnings and errors go to standard erro
 | exit code | meaning |
 |---|---|
 | 0 | done |
-| 1 | a fault of lgrasp, please report it |
-| 2 | bad input, or output that cannot be written; no half-written file is left |
-| 3 | fewer grasps than asked for after the effort that the pipeline allows; those found are on disk |
-| 130 | interrupted; finished files are on disk and the same command continues |
+| 1 | an error in lgrasp; please report it |
+| 2 | bad input, or output that cannot be written; no partial file is left |
+| 3 | fewer grasps found than requested within the pipeline's effort; those found are on disk |
+| 130 | interrupted; finished files are on disk; run the same command again to resume |
 
 | variable | meaning |
 |---|---|
 | `LGRASP_CACHE_DIR` | folder of the cache |
-| `LGRASP_PATH` | folders with `hands`, `objects`, `pipelines`, `configs` that come before the shipped ones |
+| `LGRASP_PATH` | folders with `hands`, `objects`, `pipelines`, `configs`, searched before the shipped ones |
 | `LGRASP_DEBUG` | 1: tracebacks |
-| `WARP_CACHE_PATH` | folder of the compiled kernels |
+| `WARP_CACHE_PATH` | folder of compiled kernels |
 """
 
 

@@ -25,16 +25,16 @@ def refine(
         str | None,
         typer.Option(
             "--from",
-            help="The grasps are in this format: dexgraspnet, dexgraspbench, isaac-grasp or mjcf.",
+            help="Format of the grasps: dexgraspnet, dexgraspbench, isaac-grasp or mjcf.",
             show_default=False,
         ),
     ] = None,
     hand: Annotated[
         str | None,
-        typer.Option(help="Hand of grasps in another format; shards hold their own.", show_default=False),
+        typer.Option(help="Hand of the grasps, for formats without one; shards contain theirs.", show_default=False),
     ] = None,
     matching_rounds: Annotated[
-        int | None, typer.Option(help="Times that nearest points are matched.", show_default=False)
+        int | None, typer.Option(help="Number of times that nearest points are matched.", show_default=False)
     ] = None,
     gradient_steps: Annotated[
         int | None, typer.Option(help="Gradient steps after each matching.", show_default=False)
@@ -42,19 +42,19 @@ def refine(
     outer: Annotated[int | None, typer.Option(hidden=True)] = None,
     inner: Annotated[int | None, typer.Option(hidden=True)] = None,
     coarse: Annotated[
-        bool, typer.Option("--coarse", help="Large steps and a long reach: for poses that are far off.")
+        bool, typer.Option("--coarse", help="Use large steps and a long range, for poses that are far from a grasp.")
     ] = False,
     keep_invalid: Annotated[
         bool,
-        typer.Option("--keep-invalid", help="Keep rows that pass in no posture, refined, with metric 'valid' 0."),
+        typer.Option("--keep-invalid", help="Keep the refined posture of rows that never pass, with metric 'valid' 0."),
     ] = False,
     always: Annotated[bool, typer.Option("--always", hidden=True)] = False,
     settings: Settings = None,
 ) -> None:
-    """Move grasps by the gradient of the surface matching energy, check them again, and write shards.
+    """Improve grasps by gradient descent on the surface matching energy, check them again, and write shards.
 
-    A refined posture takes the place of its row where it passes every check and resists loads better. Rows that pass in
-    neither posture are left out. The bounds are those that the shard's rows passed, or --set bounds.KEY=VALUE.
+    A refined grasp replaces the original if it passes every check and resists loads better. Rows that pass in neither
+    posture are left out. The bounds are those that the shard's rows passed, or --set bounds.KEY=VALUE.
 
     Example: lgrasp refine grasps/allegro-mug --out grasps/allegro-mug-refined
     """

@@ -24,9 +24,11 @@ def run(
     out: Annotated[Path | None, typer.Option("--out", help="Replaces out.", show_default=False)] = None,
     object_dir: Annotated[Path | None, typer.Option(help="Replaces object_dir.", show_default=False)] = None,
     seed: Annotated[int | None, typer.Option(help="Replaces seed.", show_default=False)] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be computed; change nothing.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show what would be computed without computing it.")
+    ] = False,
 ) -> None:
-    """Run the job of a config, or one for every hand, object and pipeline that it names.
+    """Run the job of a config, or one job for every hand, object and pipeline that it names.
 
     Key 'job' names the command whose options the other keys are; without it grasps are generated. A job that fails does
     not stop the others; the exit code is the worst one.
@@ -83,7 +85,7 @@ def _run_one(job: "Job", how: How) -> dict[str, Any]:
 def _show(results: list[dict[str, Any]]) -> None:
     from lgrasp_cli.tables import print_table
 
-    columns = ("job", "what", "asked", "there", "wall s", "strict/s", "status")
+    columns = ("job", "what", "requested", "present", "wall s", "strict/s", "status")
     print_table(columns, [_row(result) for result in results], right=columns[2:6])
 
 

@@ -7,7 +7,7 @@ import typer
 
 from lgrasp_cli.working import How, working
 
-app = typer.Typer(help="Tables with objects: point clouds, masks and grasps that fit in.", no_args_is_help=True)
+app = typer.Typer(help="Objects on tables, with point clouds, masks and feasible grasps.", no_args_is_help=True)
 
 
 @app.command()
@@ -22,7 +22,7 @@ def make(
         str | None, typer.Option(help="Hand; default: that of --grasps, else allegro.", show_default=False)
     ] = None,
     scenes: Annotated[
-        int | None, typer.Option("-n", "--scenes", help="Scenes asked; default: 100.", show_default=False)
+        int | None, typer.Option("-n", "--scenes", help="Scenes requested; default: 100.", show_default=False)
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder of the scenes; default: scenes.", show_default=False)
@@ -32,7 +32,10 @@ def make(
         typer.Option(help="Folder of shards (lgrasp generate); default: grasps are generated.", show_default=False),
     ] = None,
     pipeline: Annotated[
-        str | None, typer.Option("--pipeline", "-p", help="Generates the grasps; default: swift.", show_default=False)
+        str | None,
+        typer.Option(
+            "--pipeline", "-p", help="Pipeline that generates the grasps; default: swift.", show_default=False
+        ),
     ] = None,
     stock: Annotated[
         int | None, typer.Option(help="Grasps generated of each object; default: 1000.", show_default=False)
@@ -44,10 +47,10 @@ def make(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Base seed; default: 0.", show_default=False)] = None,
 ) -> None:
-    """Drop objects on a table, look at them with depth cameras, bring in grasps and write one file a scene.
+    """Drop objects on a table, render depth cameras, add grasps and write one file per scene.
 
-    Grasps come from shards (--grasps), or are generated first into OUT/grasps. Those whose hand would run into the
-    table or other objects are marked. A scene depends on its number and the seed only.
+    Grasps come from shards (--grasps), or are generated first into OUT/grasps. Those in which the hand would hit
+    the table or another object are marked. A scene depends only on its number and the seed.
 
     Example: lgrasp scenes make mug bowl bottle box sphere hammer --hand allegro -n 100 --out scenes
     """
@@ -96,7 +99,7 @@ def info(
     paths: Annotated[list[Path], typer.Argument(help="Scene files, or folders of *.h5 files.", show_default=False)],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Show how many points and grasps scenes hold, object by object.
+    """Show the numbers of points and grasps in scenes, by object.
 
     Example: lgrasp scenes info scenes
     """
@@ -132,10 +135,10 @@ def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, v
 
 
 def _show(data: dict[str, Any]) -> None:
-    extra = f" ({data['present']:,} were there)" if data["present"] else ""
+    extra = f" ({data['present']:,} already present)" if data["present"] else ""
     speed = f", {data['scenes_per_minute']:.1f} scenes/min" if data["made"] else ""
     head = [
-        ("scenes", f"{data['scenes']:,} of {data['asked']:,} asked{extra}"),
+        ("scenes", f"{data['scenes']:,} of {data['asked']:,} requested{extra}"),
         ("where", data["out"]),
         ("hand", data["hand"]),
         ("wall", f"{data['seconds']['scenes']:.2f} s{speed}"),

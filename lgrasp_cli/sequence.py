@@ -20,7 +20,7 @@ def sequence(
     ],
     how: How,
     hand: Hand = "allegro",
-    rows: Annotated[int, typer.Option("-n", "--rows", help="Sequences asked: grasps of all the objects.")] = 256,
+    rows: Annotated[int, typer.Option("-n", "--rows", help="Complete sequences requested.")] = 256,
     method: Annotated[
         str | None, typer.Option(help="field, anneal or mala; default: the pipeline's.", show_default=False)
     ] = None,
@@ -32,7 +32,7 @@ def sequence(
     ] = "1",
     simulate: Annotated[
         str | None,
-        typer.Option(help="Continue only rows that hold when simulated: seq6 or seq6_mu06.", show_default=False),
+        typer.Option(help="Continue only rows that hold in simulation: seq6 or seq6_mu06.", show_default=False),
     ] = None,
     physics: Physics = None,
     pipeline: Annotated[
@@ -44,9 +44,11 @@ def sequence(
         typer.Option("--out", help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT...", show_default=False),
     ] = None,
     seed: Seed = None,
-    shard_rows: Annotated[int, typer.Option(help="Sequences of a shard; other values give other rows.")] = 1000,
+    shard_rows: Annotated[
+        int, typer.Option(help="Sequences per shard. Changing it changes which sequences are generated.")
+    ] = 1000,
 ) -> None:
-    """Grasp several objects one after another, each with joints that hold nothing yet, and write shards.
+    """Grasp several objects one after another, each with joints that are still free, and write shards.
 
     Each grasp uses one opposition space of the hand (hand.yaml); joints and objects of earlier grasps stay in place.
     The shards hold the whole sequences and the rows of fewer objects that these continue. Exit code 3 when fewer

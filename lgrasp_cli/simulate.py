@@ -22,7 +22,7 @@ def simulate(
     how: How,
     protocol: Annotated[
         str,
-        typer.Option("--protocol", "-p", help="What is simulated: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06."),
+        typer.Option("--protocol", "-p", help="Protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06."),
     ] = "fc",
     out: Annotated[
         Path | None,
@@ -33,11 +33,11 @@ def simulate(
         bool, typer.Option("--all-directions", help="Continue after the first direction in which an object is lost.")
     ] = False,
 ) -> None:
-    """Simulate grasps with MuJoCo and write copies of the shards with a verdict beside every row.
+    """Simulate grasps with MuJoCo and write copies of the shards with the verdicts added.
 
     The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
     directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects: the
-    hand starts at q, and every object must still touch it. docs/guides/physics.md says what exactly is simulated.
+    hand starts at q, and every object must still touch it. docs/guides/physics.md describes the simulation.
 
     Example: lgrasp simulate grasps/allegro-mug --out grasps/allegro-mug-fc --protocol fc
     """
@@ -92,9 +92,9 @@ def _show(data: dict[str, Any]) -> None:
                 "protocol",
                 f"{protocol['name']}, friction {protocol['friction']:g}; shares of the grasps run in a direction",
             ),
-            ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate at {start} and are not simulated"),
+            ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate too deeply at {start} and are not simulated"),
             ("diverged", f"{lost['diverged']:,} count as lost"),
-            ("compiling", f"{data['seconds_compile']:.1f} s of models and kernels, in no rate"),
+            ("compiling", f"{data['seconds_compile']:.1f} s for models and kernels, not part of the rates"),
             ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
         ]
     )

@@ -18,19 +18,19 @@ from lgrasp_cli.options import (
 )
 
 _WHAT = {
-    "place": "Place the object before the hand: poses that the palm does not block.",
-    "domain": "Draw the contacts that each finger can make at each pose.",
-    "ik": "Put fingers on their contacts and keep what is clear of the object.",
+    "place": "Sample poses of the object in front of the palm, without collision.",
+    "domain": "Find the contacts that each finger can make at each pose.",
+    "ik": "Move fingers to their contacts and keep those that do not collide with the object.",
     "search": "Combine contacts into sets that balance.",
-    "filter": "Finish grasps and check everything exactly.",
+    "filter": "Complete the grasps and check them exactly.",
 }
 
 
 def register(app: typer.Typer) -> None:
     """Mount the commands of this file."""
     for stage, what in _WHAT.items():
-        text = f"{what}\n\nRuns the pipeline up to this stage on one batch of candidates and keeps every table in the "
-        text += f"cache; stages whose table is there are not run.\n\nExample: lgrasp {stage} --object mug.obj"
+        text = f"{what}\n\nRuns the pipeline up to this stage on one batch of candidates and caches every "
+        text += f"table; stages with a cached table are skipped.\n\nExample: lgrasp {stage} --object mug.obj"
         app.command(stage, help=text)(_verb(stage))
 
 

@@ -52,8 +52,8 @@ def _print_rows(rows: list[list[str]], right: Sequence[int]) -> None:
 
 def counted(data: dict[str, Any], unit: str) -> str:
     """How much is there of what was asked."""
-    extra = f" ({data['present']:,} were there)" if data["present"] else ""
-    return f"{data[unit]:,} of {data['asked']:,} asked{extra}"
+    extra = f" ({data['present']:,} already present)" if data["present"] else ""
+    return f"{data[unit]:,} of {data['asked']:,} requested{extra}"
 
 
 def job_report(data: dict[str, Any]) -> list[tuple[str, str]]:
@@ -64,7 +64,7 @@ def job_report(data: dict[str, Any]) -> list[tuple[str, str]]:
         ("grasps", counted(data, "grasps")),
         ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
         ("hand, object", f"{data['hand']}, {data['object']}; pipeline {data['pipeline']}, seed {data['seed']}"),
-        ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it placement through filter"),
+        ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it from placement through filter"),
     ]
     if made:
         pairs += [("strict-valid", f"{data['strict_valid_per_s']:,.0f} /s ({data['strict']:,})")]

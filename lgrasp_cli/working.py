@@ -24,22 +24,23 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
         Annotated[
             int | None,
             typer.Option(
-                help="Task of an array: makes every NUMth file; default: SLURM_ARRAY_TASK_ID.", show_default=False
+                help="Number of this array task, which makes every NUMth file; default: SLURM_ARRAY_TASK_ID.",
+                show_default=False,
             ),
         ],
         None,
     ),
     "num_shards": (
         Annotated[
-            int | None, typer.Option(help="Tasks of the array; default: SLURM_ARRAY_TASK_COUNT.", show_default=False)
+            int | None, typer.Option(help="Number of array tasks; default: SLURM_ARRAY_TASK_COUNT.", show_default=False)
         ],
         None,
     ),
     "overwrite": (
-        Annotated[bool, typer.Option("--overwrite", help="Replace files that are there; else whole ones stay.")],
+        Annotated[bool, typer.Option("--overwrite", help="Replace existing files; by default complete ones are kept.")],
         False,
     ),
-    "rebuild": (Annotated[bool, typer.Option("--rebuild", help="Make what is cached again.")], False),
+    "rebuild": (Annotated[bool, typer.Option("--rebuild", help="Rebuild cached inputs.")], False),
     "resume": (Annotated[bool, typer.Option("--resume/--no-resume", hidden=True)], True),
     "force": (Annotated[bool, typer.Option("--force", hidden=True)], False),
     "json_path": (JsonPath, None),
@@ -154,8 +155,8 @@ def conclude(data: dict[str, Any], outcome: "JobOutcome") -> None:
         LgraspError: less came out than was asked.
     """
     if outcome.cancelled:
-        files = f"{len(outcome.paths)} whole file{'' if len(outcome.paths) == 1 else 's'}"
-        typer.echo(f"interrupted: {files} in {data['out']}; the same command continues", err=True)
+        files = f"{len(outcome.paths)} finished file{'' if len(outcome.paths) == 1 else 's'}"
+        typer.echo(f"interrupted: {files} in {data['out']}. Run the same command again to resume", err=True)
         raise typer.Exit(130)
     error = outcome.job.shortfall(outcome)
     if error:

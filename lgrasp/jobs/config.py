@@ -36,7 +36,7 @@ class JobConfig(BaseModel):
     seed: int | None = Field(None, ge=0, lt=2**63, description="Replaces the pipelines' own.")
     scale: float = Field(1.0, gt=0, description="Factor from the meshes' unit to metres.")
     out: Path = Field(
-        Path("grasps"), description="Folder of the folders HAND-OBJECT (PIPELINE/HAND-OBJECT if several)."
+        Path("grasps"), description="Folder for the folders HAND-OBJECT (PIPELINE/HAND-OBJECT if several)."
     )
     device: str = "auto"
     workers: int = Field(0, ge=0)
@@ -44,7 +44,7 @@ class JobConfig(BaseModel):
     shard_rows: int = Field(10_000, ge=1)
     passes: int | None = Field(None, ge=1, le=64, description="Replaces the pipelines' own search.passes.")
     reuse: bool = False
-    sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn of them.")
+    sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn.")
 
     @model_validator(mode="after")
     def _has_objects(self) -> "JobConfig":

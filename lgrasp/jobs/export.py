@@ -28,7 +28,7 @@ class ExportJob(Job):
 
     shards: tuple[Path, ...] = Field(description="Shard files, or folders of *.h5 files.")
     to: str = Field(description="Name of the format.")
-    out: Path = Field(description="Folder to write; empty or not there yet.")
+    out: Path = Field(description="Folder to write; it must be empty or not exist yet.")
     limit: int | None = Field(None, description="Most grasps.")
     where: tuple[str, ...] = Field(
         (), description="Only rows of which these are true, such as 'metrics/epsilon > 0.01'."

@@ -35,7 +35,7 @@ class GenerateJob(Job):
 
     hand: str = Field(default="allegro", description="Name or path.")
     object: str = Field(description="Name or mesh file.")
-    rows: int = Field(default=1000, description="Grasps asked.")
+    rows: int = Field(default=1000, description="Grasps requested.")
     pipeline: Pipeline
     out: Path = Field(description="Folder of the shards.")
     scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")

@@ -26,7 +26,9 @@ class LocalSearch(Params):
         "withdraw": "max_exit_distance",
     }
 
-    matching_rounds: int = Field(default=20, ge=0, le=1000, description="Times that nearest points are matched.")
+    matching_rounds: int = Field(
+        default=20, ge=0, le=1000, description="Number of times that nearest points are matched."
+    )
     gradient_steps: int = Field(default=10, ge=1, le=1000, description="Gradient steps after each matching.")
     optimizer: Literal["adam", "sgd"] = Field(default="adam", description="adam, or sgd with momentum.")
     momentum: float = Field(default=0.9, ge=0, lt=1, description="Of sgd; the decay of adam's first moment.")

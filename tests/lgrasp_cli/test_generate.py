@@ -30,7 +30,7 @@ def test_report(generate, tmp_path):
     result = generate("--shard-rows", 8, "--json", tmp_path / "report.json")
     assert (result.code, result.err) == (0, "")
     assert result.out.startswith("grasps ")
-    assert "20 of 20 asked" in result.out
+    assert "20 of 20 requested" in result.out
     data = json.loads((tmp_path / "report.json").read_text())
     assert set(data) >= KEYS
     assert set(data["survivors"]) == STAGES

@@ -31,7 +31,7 @@ def config(tmp_path, quick):
 def test_make_check_info(cli, config):
     made = cli("scenes", "make", config(), "--json", "report.json")
     assert made.code == 0, made
-    assert "2 of 2 asked" in made.out
+    assert "2 of 2 requested" in made.out
     data = json.loads(Path("report.json").read_text())
     assert data["made"] == 2
     assert set(data["objects"]) == {"sphere", "tiny"}
@@ -115,6 +115,6 @@ def test_ctrl_c_leaves_whole_scenes(process, config, cli, tmp_path):
     running.send_signal(signal.SIGINT)
     _, err = running.communicate(timeout=60)
     assert running.returncode == 130, err
-    assert "the same command continues" in err
+    assert "Run the same command again to resume" in err
     assert cli("scenes", "check", "out").code == 0
     assert not list((tmp_path / "out").glob("*.tmp"))

@@ -83,7 +83,7 @@ def export_shards(
 
     Args:
         paths: Shard files or folders of them.
-        out: Folder to write; empty or not there yet.
+        out: Folder to write; it must be empty or not exist yet.
         to: A key of :data:`FORMATS`.
         where: Conditions on columns that a row must satisfy, all of them, such as ``physics/fc_holds`` or
             ``metrics/epsilon > 0.01``.

@@ -48,14 +48,14 @@ class PlanJob(Job):
 
     hand: str = Field("barrett", description="Name, path, or a shard (its hand).")
     out: Path | None = Field(None, description="Folder of the plans; default: plans/HAND-OBJECT.")
-    starts: int = Field(80, description="Points of the surface that are tried.")
+    starts: int = Field(80, description="Points of the surface to start from.")
     object: str | None = Field(None, description="Name, mesh file, or a shard of one object.")
     scale: float = Field(1.0, gt=0, description="Factor from the unit of the mesh or cloud to metres.")
     cloud: Path | InstanceOf[Cloud] | None = Field(
         None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene."
     )
     mask: Path | None = Field(None, description="Labels of the cloud's points (.npy, .npz).")
-    label: int | None = Field(None, description="Which points are to be grasped.")
+    label: int | None = Field(None, description="Label of the points to grasp.")
     viewpoint: tuple[float, float, float] | None = Field(None, description="Where the cloud was seen from [m].")
     stand_off: float | None = Field(None, description="Of the hand's base from a start [m]; default: the hand's.")
     params: PlanParams = Field(default_factory=PlanParams)

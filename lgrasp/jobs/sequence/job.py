@@ -40,7 +40,7 @@ class SequenceJob(Job):
 
     hand: str = Field(default="allegro", description="Name or path.")
     objects: tuple[str, ...] = Field(description="Names or mesh files, in the order in which they are grasped.")
-    rows: int = Field(default=256, description="Whole sequences asked.")
+    rows: int = Field(default=256, description="Complete sequences requested.")
     pipeline: Pipeline
     out: Path = Field(description="Folder of the shards.")
     scale: str = Field(default="1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")

@@ -9,9 +9,11 @@ class RefineParams(LocalSearch):
     """How finished grasps are moved: in small steps, and drawn to balance."""
 
     tries: int = Field(
-        default=6, ge=1, le=100, description="Most searches of a row that passes nowhere; further ones begin near by."
+        default=6, ge=1, le=100, description="Most searches for a row that does not pass; further ones start nearby."
     )
-    matching_rounds: int = Field(default=8, ge=0, le=1000, description="Times that nearest points are matched.")
+    matching_rounds: int = Field(
+        default=8, ge=0, le=1000, description="Number of times that nearest points are matched."
+    )
     max_translation_step: float = Field(
         default=0.0005, gt=0, le=0.1, description="Largest translation of the hand in one step."
     )
