@@ -215,7 +215,7 @@ def simulate(
     Args:
         grasps: grasps, a shard, or a folder of shards.
         protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06; or one with numbers of its own.
-        all_directions: go on after a direction in which a grasp does not hold.
+        all_directions: continue after a direction in which a grasp does not hold.
         out: folder for shards; none: no file.
 
     Raises:

@@ -20,7 +20,7 @@ class CloudError(LgraspError):
 
 
 class DecomposeError(LgraspError):
-    """A mesh could not be cut into convex pieces; callers go on with its hull."""
+    """A mesh could not be cut into convex pieces; callers use its hull instead."""
 
 
 class ConfigError(LgraspError):

@@ -1,4 +1,4 @@
-"""Lines for the user that are no errors: each is said once a process, to whoever listens."""
+"""Notices for the user that are not errors: each is reported once per process, to all listeners."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ def on_notice(listener: Callable[[str], None]) -> None:
 
 
 def notice(line: str) -> None:
-    """Say a line, unless it was said before or nobody listens."""
+    """Report a line, unless it was reported before or there is no listener."""
     if line in _said or not _listeners:
         return
     _said.add(line)

@@ -31,7 +31,7 @@ def stop_now() -> None:
 
 
 def stop_asked() -> bool:
-    """Was :func:`stop_now` called? A module half-imported then may fail in its own way later."""
+    """True if :func:`stop_now` was called; a module half-imported then may fail later in unrelated ways."""
     return _asked.is_set()
 
 

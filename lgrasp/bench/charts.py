@@ -14,7 +14,7 @@ _BARS = 0.84  # of the distance between two objects
 
 
 def check_plot(path: Path) -> None:
-    """Could a plot be written there? To be asked before a long job.
+    """Check, before a long job, that a plot can be written there.
 
     Raises:
         OutputError: not a .png, a folder, or a place that cannot be written.

@@ -146,7 +146,7 @@ def _parse_ply(data: bytes) -> dict[str, np.ndarray]:
         raise ValueError("it has no vertices")
     found, told = len(columns["x"]), int(element["length"])
     if found != told:
-        raise ValueError(f"{found:,} of the {told:,} vertices that its header tells; is the file truncated?")
+        raise ValueError(f"{found:,} of the {told:,} vertices declared in its header; is the file truncated?")
 
     def stack(wanted: tuple[str, ...]) -> np.ndarray:
         return np.stack([np.ravel(columns[name]) for name in wanted], axis=-1)

@@ -14,7 +14,7 @@ from lgrasp.errors import OutputError, ShardError
 
 try:
     import fcntl
-except ImportError:  # Windows: leftovers cannot be told from files being written
+except ImportError:  # Windows: leftovers cannot be distinguished from files being written
     fcntl = None
 
 _LIBVER = ("v110", "v110")  # readable since HDF5 1.10; its metadata blocks carry checksums, the older layout's do not

@@ -55,7 +55,7 @@ def check_manifest(manifest: str | os.PathLike[str], shards: Sequence[Path]) -> 
         raise ShardError(f"{manifest}: {len(missing)} of {len(listed)} shards missing, first {missing[0]}")
     unlisted = sorted(given.keys() - listed.keys())
     if unlisted:
-        raise ShardError(f"{given[unlisted[0]]}: not listed in {manifest}; write the manifest anew")
+        raise ShardError(f"{given[unlisted[0]]}: not listed in {manifest}; write the manifest again")
     for name, path in given.items():
         actual = sha256_file(path)
         if actual != listed[name]:

@@ -91,7 +91,7 @@ def mass_frame(record: ObjectRecord) -> tuple[np.ndarray, float]:
 
 
 def is_extended(target: Path, source: Path, names: Sequence[str]) -> bool:
-    """Is there a whole copy of a shard with the metrics already?
+    """True if there is already a complete copy of a shard with the metrics.
 
     Raises:
         OutputError: Something else is in its place.

@@ -1,4 +1,4 @@
-"""The bank: how far a shard has come, kept so that a later run that asks for more rows goes on from there."""
+"""The bank: the state of a shard, kept so that a later run that requests more rows can continue from it."""
 
 import json
 from dataclasses import dataclass
@@ -53,7 +53,7 @@ class Bank:
         )
 
     def load(self, rows: int) -> Account | None:
-        """The account, or None when there is none that a shard of ``rows`` rows can go on from; damage is said."""
+        """The account, or None if a shard of ``rows`` rows cannot continue from any; damage is reported."""
         arrays = self.cache.load("bank", self.key)
         if arrays is None:
             return None
@@ -61,7 +61,7 @@ class Bank:
             about = json.loads(str(arrays.pop(_ABOUT)))
             account = Account(grasps_from_arrays(arrays), **about)
         except (KeyError, ValueError, TypeError):
-            self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; it is made anew")
+            self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; rebuilding it")
             return None
         return account if account.kept <= rows else None
 

@@ -44,7 +44,7 @@ class Cache:
     Args:
         root: the folder; the platform's user cache folder when None.
         warn: called with one line when an entry is damaged or the folder cannot be written.
-        fresh: find nothing but what this object stored itself, so that everything is made anew.
+        fresh: find only what this object stored itself, so that everything is rebuilt.
     """
 
     def __init__(
@@ -67,12 +67,12 @@ class Cache:
         return self.root / kind / f"{key}.npz"
 
     def has(self, kind: str, key: str) -> bool:
-        """Is there an entry? (It may still turn out damaged on loading.)"""
+        """True if there is an entry. (It may still prove damaged on loading.)"""
         path = self.path(kind, key)
         return os.path.isfile(path) and (not self._fresh or path in self._stored)
 
     def load(self, kind: str, key: str) -> dict[str, np.ndarray] | None:
-        """Arrays of an artifact, or None when it is absent or damaged (which is said)."""
+        """Arrays of an artifact, or None if it is absent or damaged (which is reported)."""
         path = self.path(kind, key)
         if not self.has(kind, key):
             return None
@@ -81,7 +81,7 @@ class Cache:
         except FileNotFoundError:
             return None
         except OSError as error:
-            self.warn(f"cache entry {path} cannot be read ({error.strerror}); it is made anew")
+            self.warn(f"cache entry {path} cannot be read ({error.strerror}); rebuilding it")
             return None
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
@@ -90,13 +90,13 @@ class Cache:
                 raise ValueError("members are missing")
             return arrays
         except Exception:  # damaged bytes make the readers of zip and npy raise almost anything
-            self.warn(f"cache entry {path} is damaged; it is made anew")
+            self.warn(f"cache entry {path} is damaged; rebuilding it")
             return None
 
     def store(self, kind: str, key: str, arrays: dict[str, np.ndarray]) -> None:
         """Write an artifact: unique temporary name, fsync, rename.
 
-        A folder that cannot be written is said once and is no error; nothing more is stored then.
+        A folder that cannot be written is reported once and is not an error; nothing more is stored then.
         """
         if not self._writable:
             return

@@ -49,7 +49,7 @@ class Events:
         """A part is on disk."""
 
     def cancelled(self) -> bool:
-        """Should the job stop?"""
+        """True if the job should stop."""
         return False
 
 

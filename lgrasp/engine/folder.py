@@ -31,7 +31,7 @@ def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
 
 
 def check_folder(out: Path) -> None:
-    """Could files be written into a folder? It is not made: that is the first shard's business.
+    """Check that files can be written into a folder, without creating it (the first shard does).
 
     Raises:
         OutputError: a file is in the way, or the nearest existing folder is read-only.
@@ -81,7 +81,7 @@ def present_parts(
         problems = validate_shard(part.file)
         found = None if problems else _read(part.file)
         if found is None:
-            warn(f"shard {part.file} is damaged ({(problems or ['header'])[0]}); it is made anew")
+            warn(f"shard {part.file} is damaged ({(problems or ['header'])[0]}); rebuilding it")
             continue
         _check_run(part.file, found, key)
         if found.rows >= part.rows or found.tried >= effort(part.rows):

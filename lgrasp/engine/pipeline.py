@@ -48,7 +48,7 @@ class Pipeline(BaseModel):
     field: FieldParams
     stages: tuple[tuple[str, SerializeAsAny[BaseModel]], ...]
     sequence: SerializeAsAny[BaseModel] | None = None
-    """How sequences go on with the next object; None: the pipeline is for single objects."""
+    """How sequences continue with the next object; None: the pipeline is for single objects."""
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -56,7 +56,7 @@ class Pipeline(BaseModel):
 
     @property
     def realised(self) -> bool:
-        """Does ik come before search?"""
+        """True if ik comes before search."""
         return self.order.index("ik") < self.order.index("search")
 
     @property

@@ -50,7 +50,7 @@ STAGES: dict[str, Stage] = {
 }
 
 SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
-"""How a pipeline goes on with the next object: no stage of one object, but with parameters and a version of its own."""
+"""How a pipeline continues with the next object: not a stage of one object, but with its own parameters and version."""
 
 ORDERS = (("place", "domain", "ik", "search", "filter"), ("place", "domain", "search", "ik", "filter"))
 """Accepted orders: contacts realised before they are combined, or (the published order) after."""

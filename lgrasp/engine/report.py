@@ -59,7 +59,7 @@ def peak_device_mb(device: str) -> float:
 
 
 def check_json(path: str | os.PathLike[str]) -> None:
-    """Could a report be written there? To be asked before a long job.
+    """Check, before a long job, that a report can be written there.
 
     Raises:
         OutputError: it is a folder, or its folder cannot be written.

@@ -32,7 +32,7 @@ class Job(BaseModel, ABC):
     unit: ClassVar[str] = "grasps"
     """What is counted."""
     asks: ClassVar[bool] = False
-    """Are rows asked that may not be found? Then a part without any ends the job."""
+    """True if fewer rows than requested may be found. A part without any then ends the job."""
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.stages.", "lgrasp.grasp.")
     """Prefixes of the modules whose kernels the parts launch; empty: none."""
 

@@ -187,7 +187,7 @@ def make_shard(
     """The first ``rows`` grasps of a shard's candidate stream, near-duplicates left out.
 
     Args:
-        bank_cache: go on from the shard's bank there, and keep how far it came; counts and seconds are then those of
+        bank_cache: continue from the shard's bank there, and update it; counts and seconds are then those of
             all runs together.
         progress: called with (rows so far, running result) after each batch; what it raises ends the shard.
     """

@@ -63,7 +63,7 @@ class ShardJob(Job):
                 continue
             problems = validate_shard(part.file)
             if problems:
-                self.cache.warn(f"{part.file}: {problems[0]}; it is made anew")
+                self.cache.warn(f"{part.file}: {problems[0]}; rebuilding it")
                 continue
             with ShardReader(part.file) as reader:
                 known, rows = reader.statistics.get(MADE_FROM), len(reader)

@@ -1,4 +1,4 @@
-"""A ContactField on a device, and what kernels ask of it: is there a contact vector here along this normal?"""
+"""A ContactField on a device, and the query of kernels: whether there is a contact vector here along this normal."""
 
 from dataclasses import dataclass
 

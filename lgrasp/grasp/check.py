@@ -33,7 +33,7 @@ from lgrasp.object.arrays import ObjectArrays
 from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.tally import Tally, empty_tally, read_tallies
 
-_DEEPEST = 0.03  # [m] penetrations above this are not told from each other
+_DEEPEST = 0.03  # [m] penetrations above this are not distinguished
 _DIRECTIONS = 6
 
 

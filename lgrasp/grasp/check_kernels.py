@@ -20,7 +20,7 @@ TOUCHING, OTHERS, ALL = wp.constant(0), wp.constant(1), wp.constant(2)
 
 _DOUBT = wp.constant(3.0e-5)  # [m] beside an edge, within which any of its facets may be the nearest
 _MESH_REACH = wp.constant(0.05)  # [m]
-_APART = wp.constant(1.0)  # [m] penetration told of an object too near to one that is held
+_APART = wp.constant(1.0)  # [m] penetration reported for an object too near to a held one
 
 
 @wp.func
@@ -68,7 +68,7 @@ def check_postures(
     """One thread per hand: its bodies, the fit of its contacts, and whether it is clear of itself.
 
     Reads pose, contact and surface of ``at_out``; writes the rest of it, and outcome, gap and facing of ``found_out``,
-    of which gap and facing go on from what is there.
+    of which gap and facing continue from the present values.
 
     Args:
         q: (n, K) joint positions [rad or m].

@@ -27,7 +27,7 @@ class Limits:
     min_pregrasp_distance: wp.float32
     squeeze_force: wp.float32
     squeeze_stiffness: wp.float32
-    deepest: wp.float32  # penetrations above this are not told from each other
+    deepest: wp.float32  # penetrations above this are not distinguished
     whole: wp.int32  # 1: rows that failed are measured to the end
 
 

@@ -31,7 +31,7 @@ def body_clear(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, slack: 
 
 @wp.func
 def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
-    """Are all surface samples of the body farther than ``margin`` [m] from the object? T = T_object_body."""
+    """True if all surface samples of the body are farther than ``margin`` [m] from the object. T = T_object_body."""
     b = hand.pieces.body_sphere[body]
     if b[3] < 0.0:
         return True
@@ -98,7 +98,7 @@ def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: 
 
 @wp.func
 def _points_apart(a: Object, b: Object, T: wp.transform, margin: wp.float32):
-    """Are all obstacle points of a farther than ``margin`` [m] from b? T = T_b_a."""
+    """True if all obstacle points of a are farther than ``margin`` [m] from b. T = T_b_a."""
     for k in range(a.clusters):
         s = a.cluster_sphere[k]
         if sdf_value(b.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3] + margin:
@@ -110,7 +110,7 @@ def _points_apart(a: Object, b: Object, T: wp.transform, margin: wp.float32):
 
 @wp.func
 def objects_apart(a: Object, b: Object, T: wp.transform, margin: wp.float32):
-    """Are the surface points of either object farther than ``margin`` [m] from the other? T = T_b_a."""
+    """True if the surface points of either object are farther than ``margin`` [m] from the other. T = T_b_a."""
     if sdf_value(b.sdf, wp.transform_point(T, a.com)) > a.radius + margin:
         return True
     return _points_apart(a, b, T, margin) and _points_apart(b, a, wp.transform_inverse(T), margin)

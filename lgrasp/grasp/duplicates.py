@@ -127,7 +127,7 @@ def _longer(array: np.ndarray, count: int, length: int) -> np.ndarray:
 
 
 def _near(pose_a: np.ndarray, q_a: np.ndarray, pose_b: np.ndarray, q_b: np.ndarray) -> np.ndarray:
-    """Mask (N,): is each row of one table a near-duplicate of the same row of another?"""
+    """Mask (N,): True where a row of one table is a near-duplicate of the same row of another."""
     a, b = pose_a.astype(float), pose_b.astype(float)
     near = ((a[:, :3] - b[:, :3]) ** 2).sum(1) <= NEAR_DISTANCE**2
     near &= np.abs((a[:, 3:] * b[:, 3:]).sum(1)) >= np.cos(NEAR_ANGLE / 2)  # q and -q are one rotation

@@ -16,7 +16,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 @wp.struct
 class Held:
-    """H sequences so far; candidate c of a stream goes on from row ``c // tries``."""
+    """H sequences so far; candidate c of a stream continues row ``c // tries``."""
 
     tries: wp.int32
     posture: wp.array2d(dtype=vec_dof)  # (H, G) [rad or m]
@@ -36,7 +36,7 @@ class HeldArrays:
 
 
 def hold_nothing(hand: HandArrays) -> HeldArrays:
-    """An empty hand with every joint free: one row, from which all candidates go on."""
+    """An empty hand with every joint free: one row, which all candidates continue."""
     open_posture = hand.model.tree.joint_open[None].astype(np.float32)
     free: np.ndarray = np.zeros(open_posture.shape, bool)
     return hold(hand, open_posture, free, (), np.zeros((1, 0, 7), np.float32), tries=2**31 - 1, any_setting=True)
@@ -59,7 +59,7 @@ def hold(
         frozen: joints that must not move, (H, K) bool.
         objects: the n objects that every row holds.
         pose: their poses in the hand frame, internal frames, device poses (H, n, 7).
-        tries: candidates that go on from each row.
+        tries: candidates that continue each row.
         any_setting: shared joints may still take any of their values; else they have those of q.
     """
     tree, d = hand.model.tree, hand.device
@@ -91,7 +91,7 @@ def _settings(q: np.ndarray, settings: np.ndarray) -> np.ndarray:
 
 @wp.func
 def group_fixed(hand: Hand, held: Held, row: wp.int32, g: wp.int32):
-    """Must the whole group stay as it is?"""
+    """True if the whole group is fixed."""
     own = (1 << hand.kin.dof_free[g]) - 1
     return own > 0 and (held.frozen[row, g] & own) == own
 
@@ -110,7 +110,7 @@ def with_frozen(hand: Hand, held: Held, row: wp.int32, g: wp.int32, q: vec_dof):
 
 @wp.func
 def body_clear_of_held(hand: Hand, held: Held, row: wp.int32, body: wp.int32, B: wp.transform, margin: wp.float32):
-    """Are all surface samples of the body farther than ``margin`` [m] from every held object? B = T_hand_body."""
+    """True if all surface samples of the body are farther than ``margin`` [m] from all held objects. B = T_hand_body."""
     for k in range(held.objects):
         if not body_apart(hand, held.object[k], body, wp.transform_inverse(held.pose[row, k]) * B, margin):
             return False

@@ -12,14 +12,14 @@ _FAMILIES = ("metrics", "physics")
 _STEPS = ("space", "free", "q", "q_pregrasp", "q_squeeze", "pose")
 _CONTACTS = ("contact_points", "contact_normals", "contact_links", "contact_forces")
 _WORST = {"epsilon": np.fmin}
-"""How a metric of several steps becomes one of the row; the largest where nothing is said."""
+"""How a metric of several steps becomes one of the row; the largest unless stated otherwise."""
 
 
 @dataclass(frozen=True)
 class SequenceTable:
     """N sequences of n steps; step s grasps object s with one opposition space. C contacts per step (palm last)."""
 
-    parent: np.ndarray  # (N,) i64 row of the table before this step that each goes on from
+    parent: np.ndarray  # (N,) i64 row of the table before this step that each continues
     candidate: np.ndarray  # (N,) i64 candidate of the last step in its round
     space: np.ndarray  # (N, n) i32 opposition space of each step
     free: np.ndarray  # (N, n, K) bool joints that each step moved
@@ -87,7 +87,7 @@ def extend(
     """Sequences that are one step longer: joints that the step may not move stay exactly as they were.
 
     Args:
-        before: the sequences that are gone on from.
+        before: the sequences that are continued.
         posture: their :meth:`SequenceTable.posture`, (N, K).
         row: row of ``before`` of each grasp, (M,).
         space: opposition space of the step.

@@ -119,7 +119,7 @@ def _without_misfits(urdf: Urdf, spec: HandSpec) -> tuple[HandSpec, str]:
     """The rules without opposition spaces that do not fit this URDF, and what to tell the user."""
     try:
         tree = build_tree(urdf, spec)
-    except HandError:  # said when the hand is built
+    except HandError:  # reported when the hand is built
         return spec, ""
     problems = {n: space_problem(spec, tree, space, dict(urdf.links)) for n, space in spec.opposition_spaces.items()}
     unfit = {name: problem for name, problem in problems.items() if problem}

@@ -225,7 +225,7 @@ def convex_pieces(
 
 
 def is_dented(body: trimesh.Trimesh, device: str = "cpu") -> bool:
-    """Does a body differ much from its hull: by a tenth of its volume, and by 4 mm somewhere?
+    """True if a body differs from its hull by a tenth of its volume, and by 4 mm somewhere.
 
     Raises:
         QhullError: a flat body.

@@ -54,7 +54,7 @@ def first_hits(
     # out
     free_out: wp.array(dtype=wp.int32),
 ):
-    """Is the way from the origin to each target free, the last ``slack`` [m] left out?
+    """Whether the line from the origin to each target is free, except for the last ``slack`` [m].
 
     Args:
         target: [m], (n,).

@@ -1,4 +1,4 @@
-"""Are parts of a hand apart? Bounding balls first, true convex distance after; sockets on their true surfaces."""
+"""Tests that parts of a hand are apart: bounding balls, then true convex distance; sockets on true surfaces."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""Does a hand.yaml fit its URDF? Contact links, opposition spaces, sizes that the kernels hold."""
+"""Checks that a hand.yaml fits its URDF: contact links, opposition spaces, sizes within the limits of the kernels."""
 
 from collections.abc import Mapping
 

@@ -81,7 +81,7 @@ class ExportJob(Job):
         return {"grasps": outcome.rows, "objects": objects, "format": self.to}
 
     def _cut(self) -> Cut:
-        """Convex pieces of objects as the simulation makes them, from the cache; what is approximated is said."""
+        """Convex pieces of objects as the simulation makes them, from the cache; approximations are reported."""
         from lgrasp.geometry.decompose import decompose
         from lgrasp.simulate.scene import object_of_record
 

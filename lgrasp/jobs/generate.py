@@ -42,7 +42,7 @@ class GenerateJob(Job):
     batch: int = Field(default=0, description="Candidates per batch; 0: by device.")
     rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
     shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
-    reuse: bool = Field(default=False, description="Keep how far shards came; later runs go on there.")
+    reuse: bool = Field(default=False, description="Cache the state of shards; later runs continue from there.")
     _keys: InputKeys | None = PrivateAttr(None)
     _inputs: Inputs | None = PrivateAttr(None)
     _meshes: dict[str, bytes] = PrivateAttr(default_factory=dict)
@@ -141,7 +141,7 @@ class GenerateJob(Job):
         if not outcome.starved:
             return None
         stage, words = starving_stage(self.report(outcome)["counts"])
-        return StarvedError(f"{outcome.rows:,} of {self.rows:,} grasps found; stage {stage} starves: {words}")
+        return StarvedError(f"{outcome.rows:,} of {self.rows:,} grasps found; stage {stage} is the bottleneck: {words}")
 
     def _shard(self, part: Part, result: ShardResult) -> Shard:
         """The shard as records; poses and contacts go from the internal to the user's frame of the object."""

@@ -47,7 +47,7 @@ def hand_record(hand: HandModel, meshes: dict[str, bytes]) -> HandRecord:
 
 
 def object_record(obj: ObjectModel, id: str | None = None) -> ObjectRecord:
-    """The object, in the user's frame; its name is its id where nothing else is said."""
+    """The object, in the user's frame; its name defaults to its id."""
     return ObjectRecord(
         id=id or obj.name,
         name=obj.name,

@@ -23,7 +23,7 @@ class SequenceSets(BaseModel):
     scale: str = Field("0.06:0.10", description="Factor to metres, or range of the longest side [m].")
     method: str | None = Field(None, description="Replaces that of stage sequence.")
     policy: str | None = Field(None, description="Replaces that of stage sequence.")
-    physics: str | None = Field(None, description="Protocol that rows must pass before they go on.")
+    physics: str | None = Field(None, description="Protocol that rows must pass to be continued.")
 
     @field_validator("scale", mode="before")
     @classmethod

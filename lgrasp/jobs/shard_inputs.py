@@ -49,7 +49,7 @@ def hand_of_shard(
     """The hand that the rows of a shard are of, made from the shard alone; cached by its content.
 
     The rules are those in the shard's ``config``. A shard of an older version has none: then those of the very same
-    hand where it is installed, else of a known hand with its joint and link names, else a draft; said in one line.
+    hand where it is installed, else of a known hand with its joint and link names, else a draft; reported in one line.
 
     Raises:
         ShardError: a mesh of the hand is missing from the shard.

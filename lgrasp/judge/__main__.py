@@ -27,7 +27,7 @@ def command(
         str | None,
         typer.Option("--json", metavar="PATH", help="Also write the findings as JSON; - prints them instead."),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no report; errors only.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no report, only errors.")] = False,
 ) -> None:
     """Judge every row of shards by the strict bounds, from the URDF and the meshes alone.
 

@@ -105,7 +105,7 @@ PAIRS = 1_000_000  # points x boxes held at once
 CELLS = 48
 """Cells along the longest side of the grid that tells inside from outside away from the surface."""
 FEW = 256
-"""Points that are told without the grid."""
+"""Points that are decided without the grid."""
 OUTSIDE, INSIDE, CROSSED = range(3)
 
 _ICO = trimesh.creation.icosahedron().vertices

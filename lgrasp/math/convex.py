@@ -135,9 +135,9 @@ def _face(a: wp.vec3, b: wp.vec3, c: wp.vec3, mask: wp.int32):
 
 @wp.func
 def pieces_clear(c: Pieces, i: wp.int32, j: wp.int32, T: wp.transform, margin: wp.float32):
-    """Are pieces i and j farther apart than margin [m]? T takes j's body frame to i's. GJK on true convex sets.
+    """True if pieces i and j are farther apart than margin [m]. T takes j's body frame to i's. GJK on true convex sets.
 
-    Undecided after 24 steps counts as not clear, so the answer errs to the safe side.
+    Undecided after 24 steps counts as not clear, so the answer errs on the safe side.
     """
     si = c.sphere[i]
     sj = c.sphere[j]

@@ -46,7 +46,9 @@ class PlanParams(BaseModel):
         min_length=1,
         description="Angles between the surface's normal and the way back from it [deg], in turn.",
     )
-    finalists: int = Field(default=10, ge=1, le=64, description="Of these go on after the first matchings.")
+    finalists: int = Field(
+        default=10, ge=1, le=64, description="Number of hands that continue after the first matchings."
+    )
     opening: int = Field(default=5, ge=1, le=100, description="Matchings of all of them.")
     clearance: float = Field(
         default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
@@ -86,7 +88,7 @@ def cloud_params(params: PlanParams) -> PlanParams:
 
 
 def _loosened(bounds: GraspBounds) -> GraspBounds:
-    """What hands must meet after the first outer steps, to be told from those that found no contact at all."""
+    """Conditions that hands must meet after the first outer steps, to separate them from those without any contact."""
     return bounds.changed(**{name: max(least, getattr(bounds, name)) for name, least in _COARSE.items()})
 
 

@@ -47,7 +47,7 @@ class Energies(NamedTuple):
 def barrier(u: torch.Tensor) -> torch.Tensor:
     """-(u - 1)^2 ln u of distances u (...) in units of the margin: 0 from u = 1 on, rising as u falls.
 
-    Below a tenth it goes on as the parabola of the same value, slope and curvature, so that points inside are pushed
+    Below a tenth it continues as the parabola of the same value, slope and curvature, so that points inside are pushed
     out the harder the deeper they are.
     """
     a = STEEPEST

@@ -1,6 +1,6 @@
 """Correspondences of hands: planes at the object's surface and at links, and the contacts of the net wrench.
 
-Rows are hands; everything is frozen until it is matched anew (:mod:`lgrasp.refine.descent_kernels` moves the hands).
+Rows are hands; everything is frozen until it is matched again (:mod:`lgrasp.refine.descent_kernels` moves the hands).
 """
 
 import warp as wp

@@ -9,7 +9,7 @@ from lgrasp.config import Params
 LENGTH = 0.01
 """The energy counts distances in this unit [m]."""
 STEEPEST = 0.1
-"""Share of the margin below which a barrier goes on as a parabola."""
+"""Share of the margin below which a barrier continues as a parabola."""
 LIMIT_SHARE = 0.15
 """Joint limits repel within this share of the range."""
 

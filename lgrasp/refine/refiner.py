@@ -47,7 +47,7 @@ class Refined(NamedTuple):
 
     pose: Pose
     energies: Energies
-    """At ``pose``, matched anew, every point within the first reach pulling."""
+    """At ``pose``, with new matches, every point within the first reach pulling."""
 
 
 class Refiner(nn.Module):

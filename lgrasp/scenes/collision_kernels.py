@@ -1,4 +1,4 @@
-"""Kernels of grasps in a scene: does a hand sink into the table or into objects?"""
+"""Kernels of grasps in a scene: how deep a hand sinks into the table or into objects."""
 
 import warp as wp
 

@@ -117,7 +117,7 @@ def _settle(mujoco: Any, model: Any, data: Any, params: DropParams) -> float | N
 
 
 def _on_table(solids: Sequence[Solid], pose: np.ndarray, table: float) -> bool:
-    """Is every object above the table, none sunk into it?"""
+    """True if every object is above the table and none has sunk into it."""
     for solid, T in zip(solids, pose_matrix(pose), strict=True):
         points = np.vstack(solid.pieces) @ T[:3, :3].T + T[:3, 3]
         if np.abs(points[:, :2]).max() > 0.5 * table or points[:, 2].min() < -_SINK:

@@ -43,7 +43,9 @@ class DropParams(BaseModel):
     gap: float = Field(0.01, ge=0.0, le=1.0, description="Least distance of dropped objects to all others at first.")
     friction: float = Field(0.6, gt=0.0, le=5.0)
     timestep: float = Field(0.002, gt=0.0, le=0.01)
-    longest: float = Field(6.0, gt=0.0, le=60.0, description="Objects that still move after this are dropped anew.")
+    longest: float = Field(
+        6.0, gt=0.0, le=60.0, description="If objects still move after this time, all are dropped again."
+    )
     tries: int = Field(10, ge=1, le=1000, description="Times that objects are dropped until they stay on the table.")
 
 

@@ -64,7 +64,7 @@ class SceneGrasps:
     object_depth: np.ndarray
     """The same for all other objects; above the tolerance perhaps too small [m], shape [N, 2], float32."""
     collision_free: np.ndarray
-    """Are all four depths within the tolerance? Shape [N], bool."""
+    """True if all four depths are within the tolerance, shape [N], bool."""
     candidate: np.ndarray
     """Global candidate index in the shard that the grasp comes from, shape [N], uint64."""
     tolerance: float

@@ -31,7 +31,7 @@ def count_clear(
     """One thread per (grasp, group): postures of a group that counts in which it is clear of all objects.
 
     Args:
-        row: of ``held`` that each grasp goes on from, (M,).
+        row: of ``held`` that each grasp continues, (M,).
         pose: T_hand_object, (M,).
         counts: 1 for groups that count, by row of ``held``, (H, G).
         clear_out: postures, (M,), zero before.

@@ -13,9 +13,9 @@ if TYPE_CHECKING:  # torch takes a second to import
 
 
 def optimised_sets(grasps: "Optimised", free: np.ndarray, context: Context) -> ContactSets:
-    """Sets of the two contacts of each grasp; the candidate of row i is the first that goes on from held row i.
+    """Sets of the two contacts of each grasp; the candidate of row i is the first that continues held row i.
 
-    Grasps whose contact point is in no record of the contact field cannot be told and are left out.
+    Grasps whose contact point is in no record of the contact field are left out.
 
     Args:
         grasps: H grasps with the context's opposition space, one for each row of its :class:`Held`.

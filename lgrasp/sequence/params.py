@@ -24,7 +24,7 @@ class SequenceParams(BaseModel):
         256, ge=1, le=65_536, description="Candidates tried with one space before the next is tried (field)."
     )
     waves: int = Field(4, ge=1, le=256, description="Waves of a step before a sequence is given up (field).")
-    branch: int = Field(1, ge=1, le=1024, description="Most sequences that go on from one.")
+    branch: int = Field(1, ge=1, le=1024, description="Largest number of continuations of one sequence.")
     optimiser: OptimiserParams = Field(
         default_factory=lambda: OptimiserParams.model_validate({}),
         description="Numbers of the methods anneal and mala.",
@@ -33,7 +33,7 @@ class SequenceParams(BaseModel):
 
     @property
     def tries(self) -> int:
-        """Most candidates that go on from a sequence in a step."""
+        """Largest number of candidates that continue a sequence in a step."""
         return self.wave * self.waves
 
     @model_validator(mode="after")

@@ -39,7 +39,7 @@ def space_orders(table: SequenceTable, spaces: Sequence[Space], policy: str, lef
 
 
 def _able(spaces: Sequence[Space], taken: tuple[int, ...], used: np.ndarray, policy: str, left: int) -> list[int]:
-    """Spaces that a sequence may go on with."""
+    """Spaces that a sequence may continue with."""
     able = available(spaces, taken, used)
     if policy == "uniform" or not able:
         return able

@@ -14,7 +14,7 @@ def room_left(free: np.ndarray, grasps: GraspTable, row: np.ndarray, context: Co
     Args:
         free: joints that hold nothing even after the grasp, (H, K) bool.
         grasps: M grasps of the context's object.
-        row: row of the context's :class:`Held` that each goes on from, (M,).
+        row: row of the context's :class:`Held` that each continues, (M,).
     """
     tree, d = context.hand.model.tree, context.device
     counts = np.zeros((len(free), tree.groups), np.int32)

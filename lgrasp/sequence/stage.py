@@ -19,12 +19,12 @@ def run(
 
     Args:
         inputs: the sequences that the context's hand holds, one for each row of its :class:`Held`; the number of the
-            opposition space; grasps of the next object by candidates that go on from these rows.
+            opposition space; grasps of the next object by candidates that continue these rows.
 
     Returns:
         The longer sequences by row, up to ``params.branch`` of each, with metric ``room``
         (:func:`~lgrasp.sequence.room.room_left`); and counts ``sequences``, ``grasps``, ``held`` (sequences that
-        go on) and ``kept``.
+        be continued) and ``kept``.
     """
     before, number, grasps = inputs
     assert context.space is not None
@@ -42,10 +42,10 @@ def run(
 
 
 def go_on(row: np.ndarray, room: np.ndarray, params: SequenceParams) -> np.ndarray:
-    """Which of several ways to go on from the same sequences are taken: rising indices.
+    """Which of several continuations of the same sequences are taken: rising indices.
 
     Args:
-        row: sequence that each goes on from, (M,).
+        row: sequence that each continues, (M,).
         room: room that each leaves, (M,); policy ``lookahead`` prefers the largest, ``uniform`` the first.
     """
     worth = -room if params.policy == "lookahead" else np.zeros(len(row))

@@ -1,1 +1,1 @@
-"""Physics verdicts: does a grasp hold its objects when something pulls at them?"""
+"""Physics verdicts: whether a grasp holds its objects when something pulls at them."""

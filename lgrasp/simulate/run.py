@@ -55,7 +55,7 @@ def verdicts(
         protocol: what is simulated.
         threads: grasps simulated at a time.
         progress: called on this thread with (rows done, rows held); what it raises ends the simulation.
-        all_directions: go on after the first direction in which an object is lost.
+        all_directions: continue after the first direction in which an object is lost.
         settled_stop: end a direction when the objects have come to rest well inside their bounds.
         device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0).
         keep: called with (kind, key, make), gives what it made for the key before, or makes it: what a GPU is given

@@ -28,7 +28,7 @@ class Trial:
 
     Args:
         model: O objects in the order of the rows.
-        all_directions: go on after a direction in which the grasp is lost.
+        all_directions: continue after a direction in which the grasp is lost.
         settled_stop: end a direction early when the objects have come to rest well inside their bounds.
     """
 
@@ -103,7 +103,7 @@ class Trial:
         return Closed(contacts, self._slip(rows, i, look.points), bool(rest.all()), worst, depth)
 
     def _touching_at_rest(self) -> int:
-        """Links on the object that the fewest touch, at rest at the targets; the trial then goes on from before."""
+        """Fewest links on any object, at rest at the targets; the trial then continues from the previous state."""
         lib = self._lib
         lib.mj_getState(self._m, self._data, self._state, lib.mjtState.mjSTATE_INTEGRATION)
         self._step(max(1, round(self._protocol.settle / self._m.opt.timestep)))
@@ -112,7 +112,7 @@ class Trial:
         return int(touching.min())
 
     def _pull_all(self, closed: Closed, pulls: Pulls) -> bool:
-        """Directions until nothing is left to decide, into ``pulls``; has one diverged?"""
+        """Run directions into ``pulls`` until all is decided; True if one diverged."""
         diverged, holds, stays = False, True, True
         for k, axis in enumerate(AXES):
             pulls.moved[k], pulls.depth[k] = self._pull(axis, closed)
@@ -219,5 +219,5 @@ class Trial:
         return moved(self._objects(), self._start, self._model.centers)
 
     def _wild(self) -> bool:
-        """Has the simulation diverged?"""
+        """True if the simulation has diverged."""
         return not np.abs(self._data.qvel).max() < WILD or not np.isfinite(self._data.qpos).all()

@@ -98,11 +98,11 @@ class Bounds:
         self._end = np.array([_GONE, np.inf]) if self._by_contact else self.most
 
     def lost(self, moved: np.ndarray) -> Any:
-        """Is an object so far away that nothing can save the grasp (...)?"""
+        """True if an object is so far away that the grasp is lost (...)."""
         return (moved > self._end).any((-2, -1))
 
     def held(self, moved: np.ndarray, touches: np.ndarray, depth: Any) -> Any:
-        """Is a direction held that ended so (...)?
+        """True if a direction that ended in this state is held (...).
 
         Args:
             moved: at worst.
@@ -113,11 +113,11 @@ class Bounds:
         return within & touches.all(-1) & (depth < self._deepest) if self._by_contact else within
 
     def stays(self, moved: np.ndarray) -> Any:
-        """Does every object stay within the bounds (...)? Not where it diverged."""
+        """True if every object stays within the bounds (...). False if it diverged."""
         return (moved <= self.most).all((-2, -1))
 
     def near(self, before: np.ndarray, now: np.ndarray, chunks: Any) -> Any:
-        """Would objects that moved so in a chunk stay in half their bounds at four times that pace to the end (...)?
+        """True if objects at four times their speed of the last chunk stay in half their bounds to the end (...).
 
         Args:
             before, now: ``moved`` a chunk ago and now.

@@ -50,7 +50,7 @@ class Worlds:
         m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
         with wp.ScopedDevice(self._device):
             self._m = mujoco_warp.put_model(m)
-            self._m.opt.warn_overflow = 0  # said by :meth:`overflowed`
+            self._m.opt.warn_overflow = 0  # reported by :meth:`overflowed`
             room = {"nconmax": _CONTACTS * len(model.object_body), "njmax": _CONSTRAINTS * len(model.object_body)}
             self._d = mujoco_warp.make_data(m, nworld=worlds, **room)
             shape = (worlds, m.nu)

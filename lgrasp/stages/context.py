@@ -57,7 +57,7 @@ class Context:
     holding: HeldArrays | None = None
     """What the hand holds already, and what of it may not move; None: nothing."""
     realised: bool = True
-    """Are the candidates that search combines realised already (ik comes before search)?"""
+    """True if the candidates that search combines are already realised (ik comes before search)."""
     salt: int = 0
     """Number of the pass over these candidates."""
     kept: Keeper = with_default(default_factory=Keeper, repr=False, compare=False)

@@ -150,7 +150,7 @@ def test_array_task_numbers():
 def test_starved_run_keeps_what_it_found(generate, tmp_path, monkeypatch):
     monkeypatch.setattr("lgrasp.engine.shard._LEAST_EFFORT", 256)
     result = generate("--json", tmp_path / "report.json", "--scale", 9, mesh="sphere")
-    assert "starves" in result.error(3)
+    assert "bottleneck" in result.error(3)
     data = json.loads((tmp_path / "report.json").read_text())
     assert data["starved"]
     assert data["grasps"] < 20

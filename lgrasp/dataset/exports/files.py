@@ -11,7 +11,7 @@ from lgrasp.errors import OutputError
 
 
 def check_empty(out: Path) -> None:
-    """May an export be written into a folder? It need not exist.
+    """Check that an export can be written into a folder, which need not exist.
 
     Raises:
         OutputError: It holds something, is a file, or cannot be read.

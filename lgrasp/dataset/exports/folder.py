@@ -127,7 +127,7 @@ def open_folder(path: Path, suffix: str, layout: str) -> ExportFolder:
         raise ShardError(f"{path}: no such file or folder")
     index = path / _INDEX
     if not index.exists() and (path / HAND / "hand.urdf").exists():
-        raise ShardError(f"{path}: the export is not whole, it has no {_INDEX}; export anew")
+        raise ShardError(f"{path}: the export is incomplete, it has no {_INDEX}; export again")
     files = tuple(sorted((path / GRASPS if index.exists() else path).rglob(f"*{suffix}")))
     if not files:
         raise ShardError(f"{path}: no {suffix} file in it")

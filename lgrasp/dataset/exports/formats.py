@@ -26,7 +26,7 @@ class Format(NamedTuple):
 
     summary: str
     single: bool
-    """Has every grasp one object?"""
+    """True if every grasp has one object."""
     notes: str
     writer: Callable[[Selection, HandFrames, Cut | None], Callable[[Path, Callable[[int], None]], None]]
     """Refuses what it cannot hold, else gives what writes the grasps into a folder and says how far it is."""

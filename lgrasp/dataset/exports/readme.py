@@ -14,7 +14,7 @@ _TEXT = """\
 export.json        hand, joints, objects and sources for machines; written last, so that an export with it is whole
 
 {notes}
-Units: metres, radians. Rotations: unit quaternions with w first and w >= 0, unless said otherwise above.
+Units: metres, radians. Rotations: unit quaternions with w first and w >= 0, unless stated otherwise above.
 An object's frame is that of its mesh file. Links and joints are those of hand.urdf; poses are of link frames.
 
 Joint order, where values have no names:

@@ -71,7 +71,7 @@ class Selection:
     """How often each object is held."""
     rows: int
     single: bool
-    """Does every row hold exactly one object?"""
+    """True if every row holds exactly one object."""
     _sources: tuple[_Source, ...]
 
     @property

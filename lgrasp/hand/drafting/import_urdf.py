@@ -191,7 +191,7 @@ def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], said: list[
 
 
 def _thinned(file: Path) -> tuple[trimesh.Trimesh, int] | None:
-    """A huge mesh, thinned, and its faces before; None for others, and for what cannot be read (said later)."""
+    """A huge mesh, thinned, and its faces before; None for others, and for what cannot be read (reported later)."""
     if file.stat().st_size < _LARGE:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Do two surfaces of a hand press towards each other, and how far apart are they then?"""
+"""Whether two surfaces of a hand press towards each other, and how far apart they are then."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -130,7 +130,7 @@ def _contacts(
 def _moves_along(
     model: HandModel, postures: Postures, joints: np.ndarray, end: _Contacts, line: np.ndarray
 ) -> np.ndarray:
-    """Does one of the joints move a contact within 60 degrees of a unit vector ``line`` (n, 3) or against it? (n,)"""
+    """True if a joint moves a contact within 60 degrees of a unit vector ``line`` (n, 3) or against it, (n,)."""
     tree = model.tree
     velocity = np.zeros((model.dofs, len(end.row), 3))
     for body in np.unique(end.body[end.body > 0]):

@@ -59,7 +59,7 @@ def available(spaces: Sequence[Space], used_spaces: Collection[int], used_joints
 
 
 def consumed(spaces: Sequence[Space], used_spaces: Collection[int], used_joints: np.ndarray) -> bool:
-    """Is no space left for another object?"""
+    """True if no space is left for another object."""
     return not available(spaces, used_spaces, used_joints)
 
 

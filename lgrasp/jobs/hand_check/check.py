@@ -1,4 +1,4 @@
-"""Try a hand on a ball, a box and a cylinder: survivors per stage, why the yield dies, pictures."""
+"""Try a hand on a ball, a box and a cylinder: survivors per stage, reasons for losses, pictures."""
 
 import tempfile
 from collections.abc import Callable

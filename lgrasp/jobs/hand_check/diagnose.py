@@ -1,4 +1,4 @@
-"""Where the yield of a hand dies and why: measured on its contact field, in words that name the key of hand.yaml."""
+"""Where and why grasps of a hand are lost: measured on its contact field, naming the key of hand.yaml."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,7 +15,7 @@ _SHOWN = 20_000  # contact vectors of a finger that are looked at
 _NEAR = 0.015  # [m]
 _FACING = 0.95  # cosine
 _CHECKED = 0.05  # [m] size of the objects that a hand is tried on
-_POOR = 0.02  # share of survivors that counts as the place where the yield dies
+_POOR = 0.02  # share of survivors below which a stage counts as the bottleneck
 
 
 def finger_label(model: HandModel, names: dict[str, tuple[str, ...]], group: int) -> str:
@@ -79,7 +79,7 @@ def _box_text(low: np.ndarray, high: np.ndarray) -> str:
 
 
 def hand_findings(model: HandModel, field: ContactField, names: dict[str, tuple[str, ...]]) -> dict[str, list[str]]:
-    """What is wrong with a hand's rules, by the stage that it starves."""
+    """Problems of a hand's rules, by the stage that loses the grasps."""
     found: dict[str, list[str]] = {"place": [], "domain": [], "ik": [], "search": [], "filter": []}
     label = [finger_label(model, names, g) for g in range(model.groups)]
     low, high = model.canonical_box

@@ -68,7 +68,7 @@ class SceneJob(SceneConfig):
                 continue
             problems = check_scene(part.file)
             if problems:
-                self.cache.warn(f"scene {part.file} is damaged ({problems[0]}); it is made anew")
+                self.cache.warn(f"scene {part.file} is damaged ({problems[0]}); rebuilding it")
                 continue
             with SceneReader(part.file) as reader:
                 found = reader.config.get("run_key")

@@ -101,7 +101,7 @@ def _generated(config: SceneConfig, cache: Cache, device: Device, report: Callab
 
 
 def _check_meshes(config: SceneConfig) -> None:
-    """Can all meshes be used, and do they have names of their own? Better said before grasps of the first are made."""
+    """Check, before any grasps are generated, that all meshes can be used and have different names."""
     found: dict[str, Path] = {}
     for name in config.objects:
         path = find_object(name)

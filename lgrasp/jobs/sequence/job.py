@@ -45,7 +45,7 @@ class SequenceJob(Job):
     out: Path = Field(description="Folder of the shards.")
     scale: str = Field(default="1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")
     physics: str | None = Field(
-        default=None, description="Protocol that the rows of every step must pass before they go on."
+        default=None, description="Protocol that the rows of every step must pass to be continued."
     )
     shard_rows: int = Field(default=1000, description="Sequences of a shard; part of what decides the rows.")
     _keys: SequenceKeys | None = PrivateAttr(None)

@@ -23,7 +23,7 @@ from lgrasp.sequence.stage import run as grow
 from lgrasp.stages.context import Context
 
 _CPU_CHUNK = 1024  # candidates of a thread at a time
-_CHOICE = 4  # grasps among which policy lookahead chooses, for each that goes on
+_CHOICE = 4  # grasps among which policy lookahead chooses, for each that is continued
 
 Verdicts = Callable[[list[SequenceTable]], dict[str, np.ndarray]]
 """Columns of a simulator for the rows of the last of some levels; the one whose name ends with ``_holds`` decides."""
@@ -60,7 +60,7 @@ def run_round(
     Args:
         workers: threads.
         check: called before each step; what it raises ends the round.
-        verdicts: simulates the rows of each step; only those that hold go on.
+        verdicts: simulates the rows of each step; only those that hold are continued.
     """
     params, model = pipeline.params("sequence"), inputs.hand
     seed = stage_seed(pipeline.seed, shard, "sequence", number)
@@ -87,7 +87,7 @@ def _step(
     pool: ThreadPoolExecutor,
     result: Round,
 ) -> SequenceTable:
-    """The rows that are one object longer, by row that they go on from."""
+    """The rows that are one object longer, by the row that they extend."""
     params, step = pipeline.params("sequence"), rows.steps
     order = space_orders(rows, inputs.spaces, params.policy, len(inputs.objects) - step - 1, seed)
     search = _Search(pipeline, inputs, rows, seed, pool, result)
@@ -123,7 +123,7 @@ class _Search:
         self._have = np.zeros(len(rows), int)
         self._found: dict[int, list[GraspTable]] = {}
         self.tried: dict[int, np.ndarray] = {}
-        """Rows that were gone on from with each space, (N,) bool."""
+        """Rows that were continued with each space, (N,) bool."""
 
     @property
     def wanting(self) -> np.ndarray:
@@ -178,7 +178,7 @@ class _Search:
     def _take(
         self, grasps: GraspTable, meters: list[Meter], chosen: np.ndarray, number: int, size: int, before: int
     ) -> None:
-        """Keep grasps by candidates that go on from ``chosen`` rows, ``size`` each, after ``before`` others."""
+        """Keep grasps by candidates that continue ``chosen`` rows, ``size`` each, after ``before`` others."""
         for meter in meters:
             self._result.add(self._inputs.spaces[number].name, meter.counts, meter.seconds)
         row = chosen[grasps.index // size]
@@ -188,7 +188,7 @@ class _Search:
         self._have += np.bincount(row, minlength=len(self._rows))
 
     def longer(self, number: int) -> SequenceTable:
-        """The sequences that go on with a space; their candidates are counted through all rows."""
+        """The sequences that continue with a space; their candidates are numbered over all rows."""
         tries, rows = self._params.tries, np.flatnonzero(self.tried[number])
         grasps = sort_grasps(join_grasps(self._found[number]))
         place = np.searchsorted(rows, grasps.index // tries) * tries + grasps.index % tries
@@ -203,7 +203,7 @@ class _Search:
 def _context(
     pipeline: Pipeline, inputs: SequenceInputs, before: SequenceTable, number: int, tries: int, seed: int
 ) -> Context:
-    """What stages are given to go on from some sequences with an opposition space."""
+    """Input of the stages that continue some sequences with an opposition space."""
     space, view, step = inputs.spaces[number], inputs.views[number], before.steps
     posture, frozen = before.posture(inputs.hand.tree), before.used | ~space.joints
     holding = hold(view.hand, posture, frozen, inputs.objects[:step], before.pose, tries=tries)
@@ -225,7 +225,7 @@ def _context(
 def _from_field(
     pipeline: Pipeline, context: Context, candidates: int, pool: ThreadPoolExecutor
 ) -> tuple[GraspTable, list[Meter]]:
-    """Grasps of all candidates that go on from the held rows; on a CPU several chunks of them at a time."""
+    """Grasps of all candidates that continue the held rows; on a CPU several chunks of them at a time."""
     size = _CPU_CHUNK if context.device == "cpu" else candidates
     meters = [Meter(context.device) for _ in range(0, candidates, size)]
 

@@ -74,7 +74,7 @@ def make_sequences(
     progress: Callable[[int, SequenceResult], None] | None = None,
     verdicts: Verdicts | None = None,
 ) -> SequenceResult:
-    """The first ``rows`` whole sequences of a shard, near-duplicates left out, with the rows that they go on from.
+    """The first ``rows`` whole sequences of a shard, near-duplicates left out, with the rows that they extend.
 
     Args:
         workers: threads; they do not change the rows.
@@ -107,12 +107,12 @@ def make_sequences(
 
 
 def _missing(result: SequenceResult, objects: int) -> bool:
-    """Has no row of some length been found yet?"""
+    """True if no row of some length has been found yet."""
     return len(result.reached) < objects or min(result.reached) == 0
 
 
 def _lineage(levels: list[SequenceTable], rows: np.ndarray) -> list[SequenceTable]:
-    """Some rows of the last level and those that they go on from; parents are counted anew."""
+    """Some rows of the last level and those that they extend; parents are renumbered."""
     out: list[SequenceTable] = []
     for table in reversed(levels):
         taken = take_sequences(table, rows)

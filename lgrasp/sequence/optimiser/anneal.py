@@ -24,7 +24,7 @@ class Chain(NamedTuple):
 
 
 class Proposals(Protocol):
-    """How a chain goes on. Steps are tensors, so that one can be recorded and replayed: () int64."""
+    """The next state of a chain. Steps are tensors, so that one can be recorded and replayed: () int64."""
 
     def evaluate(
         self, x: torch.Tensor, contact: torch.Tensor, weights: torch.Tensor, /
@@ -76,9 +76,9 @@ def run_chain(
     """Run N chains; every row depends on its own start, seed and energies alone.
 
     Args:
-        x: (N, D) starts. counts: (N, 2) contact points of each side; one of each is drawn, and drawn anew with
+        x: (N, D) starts. counts: (N, 2) contact points of each side; one of each is drawn, and redrawn with
             probability ``switch`` in each step. seed: (N,) int64.
-        weights: (S, T) of the energies in each of S steps. Energies of the state are weighed anew in each step.
+        weights: (S, T) of the energies in each of S steps. Energies of the state are reweighted in each step.
         culling: of the energies; with it steps on a GPU are recorded once and replayed.
         progress: called with the number of steps done.
     """

@@ -1,4 +1,4 @@
-"""Which entries of a mask go on: exactly those, or up to a fixed number where work is recorded once and replayed."""
+"""Which entries of a mask continue: exactly those, or up to a fixed number where work is recorded once and replayed."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ _SLACK = 1.5
 
 
 class Kept(NamedTuple):
-    """Entries that go on."""
+    """Entries that continue."""
 
     index: torch.Tensor
     """Places in the mask, (E,) int64; unused ones are any, spread out: whoever adds up adds zeros there."""
@@ -48,7 +48,7 @@ class Culling:
         self._sizes = None
 
     def lacking(self, rows: int) -> bool:
-        """Was there too little room since :meth:`fix`? If so it is made larger; what was computed is void."""
+        """True if there was too little room since :meth:`fix`; it is then enlarged, and the results are void."""
         assert self._sizes is not None
         most = self._most.tolist()
         short = [k for k, (size, need) in enumerate(zip(self._sizes, most, strict=True)) if need > size]

@@ -18,7 +18,7 @@ class OptimiserParams(BaseModel):
     temperature_period: float = Field(30, gt=0, description="... in this many iterations.")
     mala_temperature: float = Field(4, gt=0, description="First temperature of method mala.")
     mala_turn: float = Field(20, gt=0, description="Noise of angles against that of positions [rad/m], method mala.")
-    switch: float = Field(0.3, ge=0, le=1, description="Probability that a contact point is drawn anew in a step.")
+    switch: float = Field(0.3, ge=0, le=1, description="Probability that a contact point is redrawn in a step.")
 
     w_fc: float = Field(50, ge=0, description="Weight of force closure.")
     w_dis: float = Field(50, ge=0, description="Weight of the distance of contacts.")

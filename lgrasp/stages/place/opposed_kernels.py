@@ -19,7 +19,7 @@ _DRAWS = wp.constant(16)  # of two opposite object points and a contact vector o
 
 @wp.func
 def _fixed(hand: Hand, held: Held, h: wp.int32, side: wp.int32):
-    """Does a side stay as it is: the static links (-1), or a finger that holds something?"""
+    """True if a side is fixed: the static links (-1), or a finger that holds something."""
     return side < 0 or group_fixed(hand, held, h, wp.max(side, 0))
 
 
@@ -96,7 +96,7 @@ def _between(
 
 @wp.func
 def _clear(hand: Hand, obj: Object, held: Held, h: wp.int32, params: PlaceValues, T: wp.transform):
-    """Is an object at T clear of the static links, the fingers that stay as they are and the held objects?"""
+    """True if an object at T is clear of the static links, the fixed fingers and the held objects."""
     T_object = wp.transform_inverse(T)
     if not body_clear(hand, obj, 0, T_object, params.allowed_penetration):
         return False

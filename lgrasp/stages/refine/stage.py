@@ -19,7 +19,7 @@ VERSION = 4
 def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
     """Refine grasps; a refined grasp takes its row's place where it passes every check and resists pulls better.
 
-    Every check is made anew on the refined posture, by the measures of filter. Rows stay where they are: none is lost.
+    Every check is repeated on the refined posture, by the measures of filter. Rows stay where they are: none is lost.
 
     Returns:
         The grasps in the order given; how many there were, passed the checks once refined, and were replaced.

@@ -144,7 +144,7 @@ def _repeats(
     lane: wp.int32,
     r: wp.int32,
 ):
-    """Has found set r the same fingers as the tried one, and all their joints within ``separation``?"""
+    """True if found set r has the same fingers as the tried one, and all their joints within ``separation``."""
     for g in range(tried.chosen.shape[2]):
         a = tried.chosen[row, lane, g]
         b = found.chosen[row, r, g]
