@@ -110,7 +110,7 @@ def with_frozen(hand: Hand, held: Held, row: wp.int32, g: wp.int32, q: vec_dof):
 
 @wp.func
 def body_clear_of_held(hand: Hand, held: Held, row: wp.int32, body: wp.int32, B: wp.transform, margin: wp.float32):
-    """True if all surface samples of the body are farther than ``margin`` [m] from all held objects. B = T_hand_body."""
+    """Whether all surface samples of a body are farther than ``margin`` [m] from all held objects. B = T_hand_body."""
     for k in range(held.objects):
         if not body_apart(hand, held.object[k], body, wp.transform_inverse(held.pose[row, k]) * B, margin):
             return False
