@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lgrasp_cli.interrupt import before_end
-from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, check_report, open_cache, warn
+from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Settings, check_report, open_cache, warn
 
 if TYPE_CHECKING:
     from lgrasp.bench.comparison import Table
@@ -36,6 +36,7 @@ def bench(
     rows: Annotated[int, typer.Option("-n", "--rows", help="Grasps per run.")] = 2000,
     repeat: _Repeat = 3,
     object_dir: _ObjectDir = None,
+    settings: Settings = None,
     seed: _Seed = None,
     device: Device = "auto",
     workers: _Workers = 0,
@@ -61,6 +62,7 @@ def bench(
         "object_dir": object_dir,
         "pipelines": _split(pipelines),
         "rows": rows,
+        "settings": settings or (),
         "seed": seed,
         "device": device,
         "workers": workers,

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import Scale
+from lgrasp_cli.options import Scale, Settings
 from lgrasp_cli.working import How, working
 
 
@@ -46,6 +46,10 @@ def plan(
     other: Annotated[
         float, typer.Option(help="Weight of the rest of the palmar side; a small value gives pinches.")
     ] = 0.2,
+    keep_invalid: Annotated[
+        bool, typer.Option("--keep-invalid", help="Keep the best of a start that fails a check, with metric 'valid' 0.")
+    ] = False,
+    settings: Settings = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder; default: plans/HAND-OBJECT.", show_default=False)
     ] = None,
@@ -57,9 +61,8 @@ def plan(
 
     Example: lgrasp plan --cloud scene.ply --mask labels.npy --label 3 --hand barrett --starts 80
     """
-    from lgrasp.config import parse_model
     from lgrasp.jobs.refine.plan import PlanJob
-    from lgrasp.planning.planner import PlanParams
+    from lgrasp.jobs.refine.settings import plan_params
 
     job = how.job(
         PlanJob,
@@ -74,7 +77,8 @@ def plan(
         label=label,
         viewpoint=_numbers(viewpoint),
         stand_off=stand_off,
-        params=parse_model(PlanParams, {"distal": distal, "other": other}, "plan"),
+        keep_invalid=keep_invalid,
+        params=plan_params(settings or (), distal=distal, other=other),
     )
     how.run(job, _show)
 

@@ -33,6 +33,7 @@ class JobConfig(BaseModel):
     object_dir: Path | None = Field(None, description="Folder where the names of objects are looked up first.")
     pipelines: tuple[str, ...] = Field(("robust",), min_length=1, description="Names or paths.")
     rows: int = Field(1000, ge=1, description="Grasps per hand, object and pipeline.")
+    settings: tuple[str, ...] = Field((), description="PART.KEY=VALUE of every pipeline, such as bounds.friction=0.8.")
     seed: int | None = Field(None, ge=0, lt=2**63, description="Replaces the pipelines' own.")
     scale: float = Field(1.0, gt=0, description="Factor from the meshes' unit to metres.")
     out: Path = Field(
@@ -194,7 +195,7 @@ def plan_sequences(config: JobConfig, cache: Cache) -> list[Job]:
 def _pipelines(config: JobConfig) -> Iterator[tuple[Pipeline, Path]]:
     """Each pipeline with the config's seed, and the folder of its output."""
     for name in config.pipelines:
-        pipeline = load_pipeline(name)
+        pipeline = load_pipeline(name).with_settings(config.settings)
         if config.seed is not None:
             pipeline = pipeline.model_copy(update={"seed": config.seed})
         yield pipeline, config.out / pipeline.name if len(config.pipelines) > 1 else config.out

@@ -14,7 +14,7 @@ from lgrasp.geometry.poses import device_inverse
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps
 from lgrasp.grasp.find_contacts import find_contacts
-from lgrasp.grasp.outcomes import REASONS
+from lgrasp.grasp.outcomes import REASONS, Outcome
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.palm import ContactSurface, palm_axis
@@ -96,7 +96,8 @@ class Planned(NamedTuple):
     """Plans of the starts."""
 
     grasps: GraspTable
-    """The best of each start that passed all checks; ``index`` is the start."""
+    """The best of each start that passed all checks; ``index`` is the start. Metric ``valid`` tells those kept that did
+    not."""
     counts: dict[str, int]
     """Starts, those whose open hand collides, and outcomes of the others."""
 
@@ -118,11 +119,14 @@ class Planner:
     palmar: ContactSurface | None = None
     around: ObjectModel | None = None
 
-    def run(self, count: int, progress: Callable[[int, int], None] | None = None) -> Planned:
+    def run(
+        self, count: int, progress: Callable[[int, int], None] | None = None, *, keep_invalid: bool = False
+    ) -> Planned:
         """Plans from ``count`` starts; those of a start do not depend on the others.
 
         Args:
             progress: called with (starts done, plans); what it raises ends the planning.
+            keep_invalid: the best of a start is kept too where it fails a check.
 
         Raises:
             HandError: no side of the hand can face an object.
@@ -143,7 +147,9 @@ class Planner:
                     counts["colliding"] += tried - len(outcome)
                     for code, name in enumerate(REASONS):
                         counts[name] += int((outcome == code).sum())
-                    tables.append(take_grasps(table, np.flatnonzero(outcome == 0)))
+                    passed = outcome == Outcome.KEPT
+                    table.metrics["valid"] = passed.astype(np.float32)
+                    tables.append(take_grasps(table, np.flatnonzero(passed | keep_invalid)))
                     if progress:
                         progress(counts["starts"], counts["kept"])
             finally:

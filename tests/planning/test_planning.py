@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from lgrasp.grasp.outcomes import REASONS
+from lgrasp.grasp.check import check_grasps, known_contacts
+from lgrasp.grasp.outcomes import REASONS, Outcome
 from lgrasp.planning.planner import Planner, PlanParams
 from lgrasp.refine.params import LocalSearch
 
@@ -33,6 +34,16 @@ def test_plans_satisfy_their_bounds(planned):
     assert metrics["penetration"].max() <= bounds.max_penetration
     assert metrics["gap"].max() <= bounds.max_gap
     assert ((planned.grasps.contact_links >= 0).sum(1) >= 2).all()
+
+
+def test_every_plan_passes_the_check_with_the_contacts_stored(planner, planned, inputs):
+    table = planned.grasps
+    contacts = known_contacts(table.contact_links, table.contact_points, table.contact_normals, "cpu")
+    _, outcome = check_grasps(inputs.hand, inputs.object, table.pose, table.q, contacts, QUICK.bounds)
+    assert (outcome == Outcome.KEPT).all()
+    every = planner.run(8, keep_invalid=True).grasps
+    assert len(every) == planned.counts["starts"] - planned.counts["colliding"]
+    np.testing.assert_array_equal(every.q[every.metrics["valid"] == 1], table.q)
 
 
 def test_a_start_does_not_depend_on_the_others(planner, planned):

@@ -29,7 +29,7 @@ from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.visible_surface import visible_surface
 from lgrasp.scenes.reader import scene_cloud
 
-VERSION = 1
+VERSION = 2
 """Raised whenever plans change for the same parameters."""
 
 _REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way
@@ -58,6 +58,7 @@ class PlanJob(Job):
     label: int | None = Field(None, description="Label of the points to grasp.")
     viewpoint: tuple[float, float, float] | None = Field(None, description="Where the cloud was seen from [m].")
     stand_off: float | None = Field(None, description="Of the hand's base from a start [m]; default: the hand's.")
+    keep_invalid: bool = Field(False, description="The best of a start is kept where it fails too, metric valid 0.")
     params: PlanParams = Field(default_factory=PlanParams)
     _cloud: Cloud | None = PrivateAttr(None)
     _found: tuple[HandSource, HandModel, ObjectModel, ObjectModel | None] | None = PrivateAttr(None)
@@ -92,6 +93,7 @@ class PlanJob(Job):
             starts=self.starts,
             stand_off=self._stand_off(),
             params=self._params().model_dump(mode="json"),
+            keep_invalid=self.keep_invalid,
         )
 
     def parts(self) -> list[Part]:
@@ -117,7 +119,9 @@ class PlanJob(Job):
         palmar = visible_surface(source, hand, alias)
         planner = Planner(upload_hand(hand, alias), model, self._stand_off(), self._params(), palmar, around)
         begin = time.perf_counter()
-        grasps, counts = planner.run(self.starts, lambda done, plans: progress(done, f"{plans:,} plans"))
+        grasps, counts = planner.run(
+            self.starts, lambda done, plans: progress(done, f"{plans:,} plans"), keep_invalid=self.keep_invalid
+        )
         seconds = time.perf_counter() - begin
         result = {"counts": counts, "seconds": seconds}
         if not len(grasps):
@@ -149,14 +153,16 @@ class PlanJob(Job):
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``starts``, ``counts`` (what became of the starts), medians of ``epsilon`` and
-        ``unresisted_load``, ``seconds_planning``."""
+        ``unresisted_load``, ``seconds_planning``, ``valid`` by the bounds of ``profile``."""
         _, hand, model, _ = self._models()
         data: dict[str, Any] = {"hand": hand.name, "object": model.name, "starts": self.starts, "grasps": outcome.rows}
-        data |= {"counts": {}, "seconds_planning": 0.0, "epsilon": None, "unresisted_load": None}
+        data["profile"] = self.params.bounds.profile
+        data |= {"counts": {}, "seconds_planning": 0.0, "epsilon": None, "unresisted_load": None, "valid": 0}
         for result in outcome.results:
             data |= {"counts": result["counts"], "seconds_planning": result["seconds"]}
         for path in outcome.paths:
             with ShardReader(path) as reader:
+                data["valid"] = int(reader.column("metrics/valid").sum())
                 for name in ("epsilon", "unresisted_load"):
                     data[name] = float(np.median(reader.column(f"metrics/{name}")))
                 statistics = reader.statistics
