@@ -1,13 +1,15 @@
 """Writes docs/reference/cli.md from the commands themselves: ``make docs``."""
 
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import typer
 
 _PAGE = Path(__file__).parents[1] / "docs" / "reference" / "cli.md"
+_MANY = 10  # commands from which on an option is listed once for all
 _HEAD = """\
 <!-- Made from the commands by `make docs`; do not edit. -->
 
@@ -37,10 +39,19 @@ def cli_page() -> str:
     """The page: every command with its help, arguments and options."""
     from lgrasp_cli.main import app
 
-    lines = [_HEAD]
-    for command, context in _commands(typer.main.get_command(app), None, "lgrasp"):
+    commands = list(_commands(typer.main.get_command(app), None, "lgrasp"))
+    common = _common(commands)
+    lines = [
+        _HEAD,
+        "## Common options",
+        "",
+        "The commands below name these options without repeating their meaning.",
+        "",
+    ]
+    lines += [*_table(common.items()), ""]
+    for command, context in commands:
         if context.parent is not None:
-            lines += _section(command, context)
+            lines += _section(command, context, common)
         if context.command_path == "lgrasp run":
             lines += _config_keys()
     return "\n".join(lines).rstrip() + "\n"
@@ -55,18 +66,45 @@ def _commands(command: Any, parent: typer.Context | None, name: str) -> Iterator
             yield from _commands(sub, context, below)
 
 
-def _section(command: Any, context: typer.Context) -> list[str]:
+def _options(command: Any, context: typer.Context) -> list[tuple[str, str]]:
+    """Names and help of the options of a command."""
+    records = [p.get_help_record(context) for p in command.get_params(context) if "--help" not in p.opts]
+    return [(_cell(names), _cell(what)) for names, what in filter(None, records)]
+
+
+def _common(commands: list[tuple[Any, typer.Context]]) -> dict[str, str]:
+    """Options that many commands have with the same help: names -> help."""
+    counts = Counter(row for command in commands for row in _options(*command))
+    common: dict[str, str] = {}
+    for (names, what), count in counts.most_common():
+        if count >= _MANY and _flag(names) not in map(_flag, common):
+            common[names] = what
+    return common
+
+
+def _flag(names: str) -> str:
+    """--json of "-j, --json PATH"."""
+    return names.split(", ")[-1].split()[0]
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> list[str]:
+    return ["| option | meaning |", "|---|---|", *(f"| `{names}` | {what} |" for names, what in rows)]
+
+
+def _section(command: Any, context: typer.Context, common: dict[str, str]) -> list[str]:
     text, _, example = (command.help or "").replace("\b", "").partition("Example: ")
     lines = [f"## {context.command_path}", ""]
     for paragraph in filter(str.strip, text.split("\n\n")):
         lines += [" ".join(paragraph.split()), ""]
     if example:
         lines += ["```", example.strip(), "```", ""]
-    records = [p.get_help_record(context) for p in command.get_params(context) if "--help" not in p.opts]
-    rows = [(_cell(names), _cell(what)) for names, what in filter(None, records)]
-    if rows:
-        lines += ["| option | meaning |", "|---|---|"]
-        lines += [f"| `{names}` | {what} |" for names, what in rows] + [""]
+    rows = _options(command, context)
+    own = [row for row in rows if common.get(row[0]) != row[1]]
+    if own:
+        lines += [*_table(own), ""]
+    named = [f"`{_flag(names)}`" for names, what in rows if common.get(names) == what]
+    if named:
+        lines += [f"[Common options](#common-options): {', '.join(named)}.", ""]
     return lines
 
 
