@@ -48,6 +48,6 @@ class CacheError(LgraspError):
 
 
 class StarvedError(LgraspError):
-    """Fewer grasps than asked were found after a bounded effort; what was found is kept."""
+    """Fewer grasps than requested were found after a bounded effort; those found are kept."""
 
     exit_code = 3

@@ -204,7 +204,7 @@ def _normals(
             if (low <= 0.0).all() and (high >= 0.0).all():
                 raise CloudError(
                     f"{path}: {_share(missing)} points have no normals, and the origin lies inside the cloud, so it is "
-                    "no camera; give --viewpoint X,Y,Z, where the points were seen from"
+                    "no camera; give its position as --viewpoint X,Y,Z"
                 )
         origin = np.zeros(3) if seen_from is None else seen_from
         normals[missing] = estimate_normals(points)[missing]

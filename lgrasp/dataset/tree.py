@@ -30,7 +30,7 @@ def shard_tree(
                 continue
             place = file.relative_to(path) if path.is_dir() else Path(file.name)
             if place in found and not found[place].samefile(file):
-                raise ShardError(f"{file}: its place {place} is that of {found[place]} too; name one folder above both")
+                raise ShardError(f"{file}: it has the same place {place} as {found[place]}; name one folder above both")
             found[place] = file
     if not found:
         raise ShardError(f"no shard (*.h5) in {', '.join(map(str, given)) or 'an empty list of paths'}")

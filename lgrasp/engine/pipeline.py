@@ -26,7 +26,7 @@ class _Declared(BaseModel):
     name: str
     description: str = ""
     seed: int = Field(default=0, ge=0, lt=2**63)
-    effort: int = Field(default=400, ge=1, le=10**6, description="Candidates tried per row asked before giving up.")
+    effort: int = Field(default=400, ge=1, le=10**6, description="Candidates tried per requested row before giving up.")
     bounds: dict[str, Any] = Field(default_factory=dict)
     object: dict[str, Any] = Field(default_factory=dict)
     field: dict[str, Any] = Field(default_factory=dict)

@@ -192,7 +192,7 @@ class GenerateJob(Job):
 def check_size(rows: int, shard_rows: int, workers: int) -> None:
     """Raises ConfigError for numbers out of range."""
     if rows <= 0:
-        raise ConfigError(f"-n {rows}: the number asked must be at least 1")
+        raise ConfigError(f"-n {rows}: request at least 1")
     if shard_rows <= 0:
         raise ConfigError(f"--shard-rows {shard_rows}: must be at least 1")
     if workers < 0:

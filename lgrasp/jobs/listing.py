@@ -135,7 +135,7 @@ def describe_pipeline(name: str) -> dict[str, Any]:
     parts = [("bounds", pipeline.bounds), ("object", pipeline.object), ("field", pipeline.field), *sections]
     rows: list[tuple[str, str, Any, str]] = [
         ("", "seed", pipeline.seed, "Base seed of all stages."),
-        ("", "effort", pipeline.effort, "Candidates tried per row asked before giving up."),
+        ("", "effort", pipeline.effort, "Candidates tried per requested row before giving up."),
     ]
     for part, params in parts:
         for key, value in params.model_dump(mode="json").items():

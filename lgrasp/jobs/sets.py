@@ -43,9 +43,9 @@ def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list
     pool = sorted(set(pool))
     most, orders = math.comb(len(pool), sets.length), math.factorial(sets.length)
     if sets.sets > most:
-        raise ConfigError(f"{sets.sets} sets of {sets.length} objects are asked for; {len(pool)} objects make {most}")
+        raise ConfigError(f"{sets.sets} sets of {sets.length} objects are requested; {len(pool)} objects make {most}")
     if sets.permutations > orders:
-        raise ConfigError(f"{sets.permutations} orders are asked for; {sets.length} objects have {orders}")
+        raise ConfigError(f"{sets.permutations} orders are requested; {sets.length} objects have {orders}")
     rng = np.random.default_rng(stage_seed(seed, 0, "sets"))
     chosen: dict[tuple[int, ...], None] = {}
     if most <= 4 * sets.sets:

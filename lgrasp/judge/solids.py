@@ -13,7 +13,7 @@ from lgrasp.judge.meshes import PROBES, MeshDistance, surface_samples
 try:
     import coal
 except ModuleNotFoundError as error:
-    raise JudgeError("the judge measures links in links with coal: pip install 'lgrasp[judge]'") from error
+    raise JudgeError("the judge measures collisions between links with coal: pip install 'lgrasp[judge]'") from error
 
 SAMPLES = 2_000
 """MeshDistance points of a solid, beside every vertex."""

@@ -29,7 +29,7 @@ class SequenceParams(BaseModel):
         default_factory=lambda: OptimiserParams.model_validate({}),
         description="Numbers of the methods anneal and mala.",
     )
-    rounds: int = Field(64, ge=1, le=65_536, description="Rounds per width of sequences asked, before giving up.")
+    rounds: int = Field(64, ge=1, le=65_536, description="Rounds per width of requested sequences before giving up.")
 
     @property
     def tries(self) -> int:

@@ -151,7 +151,7 @@ def load_sequence_inputs(
     most = longest(spaces, (), np.zeros(model.dofs, bool))
     if len(keys.meshes) > most:
         raise ConfigError(
-            f"{len(keys.meshes)} objects are asked for, but the {len(spaces)} opposition spaces of hand "
+            f"{len(keys.meshes)} objects are requested, but the {len(spaces)} opposition spaces of hand "
             f"'{source.name}' ({', '.join(s.name for s in spaces)}) take at most {most} one after another"
         )
     views = []
