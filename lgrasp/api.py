@@ -97,7 +97,7 @@ def generate(
     workers: int = 0,
     out: Name | None = None,
 ) -> Grasps:
-    """Grasps of one object by one hand, each checked; fewer than requested, with a warning, if the search finds no more.
+    """Grasps of one object by one hand, each checked; fewer than requested, with a warning, if no more are found.
 
     Args:
         hand: name, URDF, or folder with hand.yaml.
