@@ -8,7 +8,7 @@ import torch
 
 from lgrasp.object.sdf import SdfGrid
 
-_TOP = 1.001
+_CELLS_BELOW_TOP = 1.001
 """Points are clamped this many cells below the number of nodes, as in lgrasp.math.sdf."""
 
 
@@ -102,7 +102,7 @@ class DistanceGrids:
         self.cell = put([g.cell for g in grids])
         self._first, self._nz = index[:, 3], index[:, 2]
         self._plane = index[:, 1] * index[:, 2]
-        self._top = put(shape - _TOP)
+        self._top = put(shape - _CELLS_BELOW_TOP)
         self._origin = put(np.array([g.origin for g in grids]))
         self._inv_cell = 1 / self.cell
 
@@ -157,7 +157,7 @@ class SurfaceNormals:
         slopes = np.stack([*np.gradient(grid.values, grid.cell), grid.values], -1)
         self._slopes = torch.as_tensor(slopes, dtype=dtype, device=device).reshape(-1, 4)
         shape = np.array(grid.values.shape)
-        self._top = torch.as_tensor(shape - _TOP, dtype=dtype, device=device)
+        self._top = torch.as_tensor(shape - _CELLS_BELOW_TOP, dtype=dtype, device=device)
         self._origin = torch.as_tensor(grid.origin, dtype=dtype, device=device)
         self._inv_cell = 1 / grid.cell
         _, ny, nz = shape.tolist()

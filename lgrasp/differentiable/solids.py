@@ -13,12 +13,12 @@ from lgrasp.object.sdf import SdfGrid
 RUN = 16
 """Surface points are in compact runs of this many."""
 
-_CELL = 0.001
-_MOST_NODES = 120_000
-_MOST_STILL = 0.25  # of a hand's points, on links that do not move
-_PAD = 2.0  # cells
-_BURIED = 0.001  # [m]
-_CHUNK = 1 << 22  # most point-plane distances held at once
+_CELL_SIZE = 0.001  # [m]
+_MAX_NODES = 120_000
+_MAX_STILL_SHARE = 0.25  # of a hand's points, on links that do not move
+_PAD_CELLS = 2.0
+_BURIED_DEPTH = 0.001  # [m]
+_MAX_DISTANCES = 1 << 22  # most point-plane distances held at once
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def hand_solids(model: HandModel, count: int) -> HandPoints:
     pieces = [_piece(model, i) for i in range(len(model.piece_body))]
     members = {int(k): np.flatnonzero(model.piece_link == k) for k in np.unique(model.piece_link)}
     static = int(model.cluster_first[1]) * CLUSTER_SIZE
-    still = min(count * static / len(model.samples), count * _MOST_STILL)
+    still = min(count * static / len(model.samples), count * _MAX_STILL_SHARE)
     share = {True: still / max(static, 1), False: (count - still) / max(len(model.samples) - static, 1)}
     solids = []
     for own in members.values():
@@ -112,7 +112,7 @@ def _link_samples(model: HandModel, pieces: list[Piece], own: np.ndarray) -> np.
     depth = np.array([pieces[i].depth(samples) for i in same])  # (pieces, n)
     nearest = np.abs(depth).argmin(0)
     np.put_along_axis(depth, nearest[None], np.inf, 0)
-    buried = (depth[np.isin(same, own)] < -_BURIED).any(0)
+    buried = (depth[np.isin(same, own)] < -_BURIED_DEPTH).any(0)
     return samples[np.isin(same[nearest], own) & ~buried]
 
 
@@ -127,13 +127,13 @@ def _grid(pieces: list[Piece]) -> SdfGrid:
     """Signed distances of the union of convex pieces, a lower bound outside."""
     low = np.min([p.vertices.min(0) - p.radius for p in pieces], 0)
     high = np.max([p.vertices.max(0) + p.radius for p in pieces], 0)
-    cell = max(_CELL, float(np.prod(high - low + 4 * _CELL) / _MOST_NODES) ** (1 / 3))
-    origin = low - _PAD * cell
-    shape = np.ceil((high - low) / cell + 2 * _PAD).astype(int) + 1
+    cell = max(_CELL_SIZE, float(np.prod(high - low + 4 * _CELL_SIZE) / _MAX_NODES) ** (1 / 3))
+    origin = low - _PAD_CELLS * cell
+    shape = np.ceil((high - low) / cell + 2 * _PAD_CELLS).astype(int) + 1
     nodes = origin + cell * np.indices(shape).reshape(3, -1).T
     values = np.full(len(nodes), np.inf)
     for piece in pieces:
-        rows = max(1, _CHUNK // max(1, len(piece.planes)))
+        rows = max(1, _MAX_DISTANCES // max(1, len(piece.planes)))
         for at in range(0, len(nodes), rows):
             part = slice(at, at + rows)
             values[part] = np.minimum(values[part], piece.depth(nodes[part]))

@@ -14,7 +14,7 @@ BANK_VERSION = 3
 """Raised whenever the arrays of an entry change meaning; the versions of the stages are in the key too."""
 REUSE_PASSES = 8
 """Passes of a run that keeps a bank, unless it or its pipeline says otherwise."""
-_ABOUT = "about"  # member with the numbers
+_NUMBERS_MEMBER = "about"  # member with the numbers
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Bank:
         if arrays is None:
             return None
         try:
-            about = json.loads(str(arrays.pop(_ABOUT)))
+            about = json.loads(str(arrays.pop(_NUMBERS_MEMBER)))
             account = Account(grasps_from_arrays(arrays), **about)
         except (KeyError, ValueError, TypeError):
             self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; rebuilding it")
@@ -68,7 +68,9 @@ class Bank:
     def store(self, account: Account) -> None:
         """Keep the account, in place of an earlier one."""
         about = {name: value for name, value in vars(account).items() if name != "grasps"}
-        self.cache.store("bank", self.key, grasp_arrays(account.grasps) | {_ABOUT: np.asarray(json.dumps(about))})
+        self.cache.store(
+            "bank", self.key, grasp_arrays(account.grasps) | {_NUMBERS_MEMBER: np.asarray(json.dumps(about))}
+        )
 
 
 def with_passes(pipeline: Pipeline, passes: int | None, reuse: bool = False) -> Pipeline:

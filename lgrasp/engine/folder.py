@@ -13,7 +13,7 @@ from lgrasp.dataset.heap import check_heaps
 from lgrasp.engine.events import Part
 from lgrasp.errors import OutputError, ShardError
 
-_LONGEST = 120  # characters of a name; file systems allow 255 bytes
+_MAX_NAME_LENGTH = 120  # characters of a name; file systems allow 255 bytes
 
 
 class _Found(NamedTuple):
@@ -26,7 +26,7 @@ class _Found(NamedTuple):
 
 def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
     """File of a shard."""
-    safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{hand}-{name}")[:_LONGEST]
+    safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{hand}-{name}")[:_MAX_NAME_LENGTH]
     return out / f"{safe}-{shard:05d}.h5"
 
 

@@ -23,7 +23,7 @@ MADE_FROM = "made_from"
 """Statistic of a shard that a job made of another: content key of the job and of the rows that it was made of."""
 
 _ROW = ("q", "q_pregrasp", "q_squeeze", "object_pose", "object_index", "candidate")
-_ROWS = 65_536  # at a time
+_BATCH_ROWS = 65_536  # at a time
 
 
 class ShardJob(Job):
@@ -104,7 +104,7 @@ def rows_digest(path: Path) -> str:
     h = hashlib.sha256()
     with ShardReader(path) as reader:
         for name in _ROW:
-            for first in range(0, len(reader), _ROWS):
-                values: Any = reader.column(name, first, min(first + _ROWS, len(reader)))
+            for first in range(0, len(reader), _BATCH_ROWS):
+                values: Any = reader.column(name, first, min(first + _BATCH_ROWS, len(reader)))
                 h.update(np.ascontiguousarray(values).tobytes())
     return h.hexdigest()

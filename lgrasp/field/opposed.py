@@ -4,8 +4,8 @@ import numpy as np
 
 from lgrasp.hand.opposition.facing import opposed
 
-_DRAWN = 4_000_000  # pairs looked at, all settings together
-_KEPT = 65_536
+_PAIRS_DRAWN = 4_000_000  # pairs looked at, all settings together
+_PAIRS_KEPT = 65_536
 
 
 def opposed_pairs(
@@ -31,7 +31,7 @@ def opposed_pairs(
     ends, normals, slots = [], [], []
     for a, b in both:
         p, q = parts[a], palm if b < 0 else parts[b]
-        i, j = (rng.integers(len(x["position"]), size=_DRAWN // len(both)) for x in (p, q))
+        i, j = (rng.integers(len(x["position"]), size=_PAIRS_DRAWN // len(both)) for x in (p, q))
         first, second = (p["position"][i], p["direction"][i]), (q["position"][j], q["direction"][j])
         good, _ = opposed(*first, *second, still=b < 0)
         ends.append(np.stack([p["position"][i[good]], q["position"][j[good]]], 1))
@@ -57,6 +57,6 @@ def _even(width: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     order = order[np.argsort(np.floor(width[order] / 0.001), kind="stable")]
     _, first, number = np.unique(np.floor(width[order] / 0.001), return_index=True, return_counts=True)
     rank = np.arange(len(order)) - np.repeat(first, number)
-    most = _KEPT // max(len(first), 1)
+    most = _PAIRS_KEPT // max(len(first), 1)
     kept = order[rank < most]
     return kept[np.argsort(width[kept], kind="stable")]

@@ -20,7 +20,7 @@ DECOMPOSE_VERSION = 1
 Decompose = Callable[..., list[np.ndarray]]
 """:func:`decompose`, perhaps with some parameters fixed."""
 
-_SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2, "resolution": 1000}
+_TREE_SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2, "resolution": 1000}
 """CoACD's effort: a tenth of the default's time, pieces hardly worse."""
 
 
@@ -60,7 +60,7 @@ def decompose(
     """
     vertices = np.ascontiguousarray(vertices, np.float64)
     faces = np.ascontiguousarray(faces, np.int32)
-    parameters = {"threshold": threshold, "max_convex_hull": max_pieces, "seed": seed, **_SEARCH}
+    parameters = {"threshold": threshold, "max_convex_hull": max_pieces, "seed": seed, **_TREE_SEARCH}
     key = _key(vertices, faces, parameters)
     found = store.load("convex", key) if store else None
     if found is None:

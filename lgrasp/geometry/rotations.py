@@ -2,7 +2,7 @@
 
 import torch
 
-_SMALL = 1.0e-4
+_SMALL_ANGLE = 1.0e-4  # [rad]
 """Squared angles below this take series; the first term left out is then below 1e-17."""
 
 
@@ -30,7 +30,7 @@ def sixd_from_matrix(R: torch.Tensor) -> torch.Tensor:
 def _series(w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """sin a / a, (1 - cos a) / a^2 and (a - sin a) / a^3 of rotation vectors (..., 3), each (..., 1, 1)."""
     s = (w * w).sum(-1)[..., None, None]
-    small = s < _SMALL
+    small = s < _SMALL_ANGLE
     a2 = torch.where(small, torch.ones_like(s), s)  # keeps the unused branch, and its derivative, finite
     a = a2.sqrt()
     sine = torch.where(small, 1 - s / 6 * (1 - s / 20 * (1 - s / 42)), torch.sin(a) / a)
@@ -51,7 +51,7 @@ def so3_log(R: torch.Tensor) -> torch.Tensor:
     q = quaternion_from_matrix(R)
     v, c = q[..., :3], q[..., 3:]
     s2 = (v * v).sum(-1, keepdim=True)
-    small = s2 < _SMALL
+    small = s2 < _SMALL_ANGLE
     s = torch.where(small, torch.ones_like(s2), s2).sqrt()
     # angle / sin(angle / 2), with c >= 0
     near = 2 * (1 + s2 / 6 * (1 + 9 * s2 / 20 * (1 + 25 * s2 / 42)))

@@ -33,8 +33,8 @@ from lgrasp.object.arrays import ObjectArrays
 from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.tally import Tally, empty_tally, read_tallies
 
-_DEEPEST = 0.03  # [m] penetrations above this are not distinguished
-_DIRECTIONS = 6
+_MAX_RANKED_PENETRATION = 0.03  # [m] penetrations above this are not distinguished
+_LOAD_DIRECTIONS = 6
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Check:
         d, n = self.hand.device, len(self)
         wp.launch(balance_grasps, n, [self.limits, self.places, self.at], [self.found], device=d)
         inputs = [self.obj.struct, self.limits, self.places, self.at]
-        wp.launch(resist_loads, (_DIRECTIONS, n), inputs, [self.found], device=d)
+        wp.launch(resist_loads, (_LOAD_DIRECTIONS, n), inputs, [self.found], device=d)
         tally, passed = empty_tally(REASONS, d), wp.empty(n, dtype=wp.int32, device=d)
         wp.launch(count_outcomes, n, [self.limits], [self.found, passed, tally.device], device=d)
         return tally, passed
@@ -202,7 +202,9 @@ def check_grasps(
     at.surface = wp.array(np.where(contacts.link.numpy() >= 0, surface, -1), dtype=wp.int32, device=d)
     found = new_findings(n, width, d)
     found.facing.fill_(1.0)
-    check = Check(hand, obj, hold_nothing(hand), device_limits(bounds, deepest=_DEEPEST), places, at, found)
+    check = Check(
+        hand, obj, hold_nothing(hand), device_limits(bounds, deepest=_MAX_RANKED_PENETRATION), places, at, found
+    )
     joints = wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=d)
     inputs = [hand.struct, check.held.struct, check.limits, places, joints]
     wp.launch(check_postures, n, inputs, [at, found], device=d)

@@ -18,9 +18,9 @@ wp.set_module_options(KERNEL_OPTIONS)
 TOUCHING, OTHERS, ALL = wp.constant(0), wp.constant(1), wp.constant(2)
 """Parts of a hand: base and touching fingers, fingers without contact, everything."""
 
-_DOUBT = wp.constant(3.0e-5)  # [m] beside an edge, within which any of its facets may be the nearest
+_EDGE_TOLERANCE = wp.constant(3.0e-5)  # [m] beside an edge, within which any of its facets may be the nearest
 _MESH_REACH = wp.constant(0.05)  # [m]
-_APART = wp.constant(1.0)  # [m] penetration reported for an object too near to a held one
+_TOO_NEAR_PENETRATION = wp.constant(1.0)  # [m] penetration reported for an object too near to a held one
 
 
 @wp.func
@@ -51,7 +51,7 @@ def contact_fit(hand: Hand, grid: wp.int32, B: wp.transform, p: wp.vec3, inward:
         out[1] = wp.dot(inward, wp.transform_vector(B, wp.mesh_eval_face_normal(mesh, hit.face)))
         # beside an edge rounding decides which facet is nearest, so all of them must do
         turned = wp.transform_vector(wp.transform_inverse(B), inward)
-        out[2] = least_facing(mesh, local, out[0] + _DOUBT, turned)
+        out[2] = least_facing(mesh, local, out[0] + _EDGE_TOLERANCE, turned)
     return out
 
 
@@ -182,7 +182,7 @@ def measure_held_penetration(
         for k in range(held.objects):
             T = wp.transform_inverse(held.pose[h, k]) * at.pose[row]
             if not objects_apart(obj, held.object[k], T, limits.min_object_distance):
-                wp.atomic_max(found_out.penetration, i, _APART)
+                wp.atomic_max(found_out.penetration, i, _TOO_NEAR_PENETRATION)
                 return
         return
     if not group_fixed(hand, held, h, hand.body_group[b]):

@@ -12,10 +12,10 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_BESIDE = wp.constant(0.006)  # [m] from a contact point of the object whose normal stands for that of its surface
+_NORMAL_REACH = wp.constant(0.006)  # [m] from a contact point of the object whose normal stands for that of its surface
 _MAX_RUNS = wp.constant(64)
 _MAX_GROUPS = wp.constant(16)
-_SECOND = wp.constant(1.0e3)  # [m] by which a group's second contact comes after all first ones
+_SECOND_CONTACT_OFFSET = wp.constant(1.0e3)  # [m] by which a group's second contact comes after all first ones
 
 
 @wp.struct
@@ -85,7 +85,7 @@ def link_contacts(
     n = wp.vec3(e[0], e[1], e[2])
     foot = p - n * e[3]
     beside = int(-1)
-    near = float(_BESIDE)
+    near = float(_NORMAL_REACH)
     for k in range(obj.contacts):
         far = wp.length(obj.contact_points[k] - foot)
         if far < near:
@@ -130,7 +130,7 @@ def choose_contacts(
         least = float(1.0e30)
         for s in range(found.gap.shape[1]):
             if found.gap[i, s] >= 0.0 and taken[s] == 0:
-                worth = found.gap[i, s] + _SECOND * float(has[hand.body_group[runs.body[s]] + 1])
+                worth = found.gap[i, s] + _SECOND_CONTACT_OFFSET * float(has[hand.body_group[runs.body[s]] + 1])
                 if worth < least:
                     least = worth
                     best = s

@@ -14,7 +14,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_SHARES = wp.constant(5)  # of the way open that are tried
+_OPENING_SHARES = wp.constant(5)  # of the way open that are tried
 
 
 @wp.kernel
@@ -106,8 +106,8 @@ def open_poses(
     T_object = wp.transform_inverse(at.pose[at.of[s]])
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     share = float(1.0)
-    for t in range(_SHARES + 1):
-        share = 1.0 - float(t) / float(_SHARES)
+    for t in range(_OPENING_SHARES + 1):
+        share = 1.0 - float(t) / float(_OPENING_SHARES)
         clear = int(1)
         for g in range(G):
             x = at.posture[s, g] + share * (opened[i, g] - at.posture[s, g])

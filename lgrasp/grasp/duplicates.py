@@ -10,7 +10,7 @@ NEAR_DISTANCE = 0.005  # [m]
 NEAR_ANGLE = np.radians(5.0)
 NEAR_JOINT = 0.1  # [rad or m]
 
-_REACH = NEAR_DISTANCE * 1.001  # of the grid look-ups, which only propose pairs
+_LOOKUP_REACH = NEAR_DISTANCE * 1.001  # of the grid look-ups, which only propose pairs
 
 
 def near_pairs(pose: np.ndarray, q: np.ndarray, device: str = "cpu") -> np.ndarray:
@@ -96,13 +96,13 @@ class _NearRows:
         position = wp.array(np.ascontiguousarray(pose[:, :3], np.float32), dtype=wp.vec3, device=d)
         rotation = wp.array(np.ascontiguousarray(pose[:, 3:], np.float32), dtype=wp.vec4, device=d)
         joints = wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=d)
-        self._grid.build(position, _REACH)
+        self._grid.build(position, _LOOKUP_REACH)
 
         def listed(asked: np.ndarray, places: np.ndarray, room: int) -> tuple[np.ndarray, np.ndarray]:
             """How many rows are near before each one asked and, given places for them, which."""
             number, others = (wp.empty(n, dtype=wp.int32, device=d) for n in (len(asked), room))
             # with some slack for rounding: pairs are decided in double precision below
-            limits = [_REACH, float(np.cos(NEAR_ANGLE / 2)) - 1e-6, NEAR_JOINT * 1.00001]
+            limits = [_LOOKUP_REACH, float(np.cos(NEAR_ANGLE / 2)) - 1e-6, NEAR_JOINT * 1.00001]
             given = [wp.array(a.astype(np.int32), dtype=wp.int32, device=d) for a in (asked, places)]
             inputs = [self._grid.id, position, rotation, joints, given[0], *limits, given[1]]
             wp.launch(list_near, len(asked), inputs, [number, others], device=d)

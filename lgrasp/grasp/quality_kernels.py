@@ -14,8 +14,8 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 _EDGES = wp.constant(CONE_EDGES)
 _BALANCED = wp.constant(BALANCED)
-_NARROWER = wp.constant(2)  # cones tried before the full one
-_SLACK = wp.constant(1.0e-3)  # by which their residual may be larger
+_NARROWER_CONES = wp.constant(2)  # cones tried before the full one
+_RESIDUAL_TOLERANCE = wp.constant(1.0e-3)  # by which their residual may be larger
 
 
 @wp.func
@@ -132,10 +132,10 @@ def center_forces(
     k = _contacts(places, at.surface[s], points, normals)
     if k < 2:
         return
-    goal = found_out.gswo[s] + _SLACK
-    for step in range(_NARROWER):
-        mu = limits.friction * (float(step) + 1.0) / float(_NARROWER + 1)
-        if _balanced(points, normals, k, mu, 0, limits.torque_scale, goal - 0.5 * _SLACK, forces) <= goal:
+    goal = found_out.gswo[s] + _RESIDUAL_TOLERANCE
+    for step in range(_NARROWER_CONES):
+        mu = limits.friction * (float(step) + 1.0) / float(_NARROWER_CONES + 1)
+        if _balanced(points, normals, k, mu, 0, limits.torque_scale, goal - 0.5 * _RESIDUAL_TOLERANCE, forces) <= goal:
             for c in range(k):
                 found_out.force[s, c] = forces[c]
             break

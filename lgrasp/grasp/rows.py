@@ -16,7 +16,7 @@ METRIC_UNITS = {"penetration": "m", "self_penetration": "m", "gap": "m", "normal
 POSTURES = ("q", "q_pregrasp", "q_squeeze")
 CONTACTS = ("contact_points", "contact_normals", "contact_links", "contact_forces")
 _SHARD_BITS = np.uint64(40)
-_LEAST = 1e-3  # of the normal forces together, which are 1
+_MIN_FORCE_SHARE = 1e-3  # of the normal forces together, which are 1
 
 
 def grasp_rows(
@@ -92,8 +92,8 @@ def press(table: GraspTable) -> GraspTable:
     """The table with forces whose normal parts sum to 1 in every row; one whose contacts do not press has none."""
     normal = -np.nansum(table.contact_forces * table.contact_normals, axis=(1, 2))
     # a single contact carries no force: a row has contacts that press against each other, or none
-    filled = (table.contact_links >= 0) & (normal > _LEAST)[:, None]
-    forces = table.contact_forces / np.maximum(normal, _LEAST)[:, None, None]
+    filled = (table.contact_links >= 0) & (normal > _MIN_FORCE_SHARE)[:, None]
+    forces = table.contact_forces / np.maximum(normal, _MIN_FORCE_SHARE)[:, None, None]
 
     def where(values: np.ndarray) -> np.ndarray:
         return np.where(filled[..., None], values, np.nan).astype(np.float32)

@@ -11,7 +11,7 @@ from lgrasp.math.constants import CONE_EDGES
 FRICTION: float = GraspBounds.model_fields["friction"].default
 """Of the strict bounds."""
 
-_NIL = 1e-8  # epsilon below this is rounding: the origin lies on the hull or outside
+_EPSILON_ROUNDING = 1e-8  # epsilon below this is rounding: the origin lies on the hull or outside
 
 
 class WrenchSpace(NamedTuple):
@@ -78,7 +78,7 @@ def wrench_space(wrenches: np.ndarray) -> WrenchSpace:
         return WrenchSpace(0.0, 0.0)
     hull = ConvexHull(wrenches, qhull_options="QJ")
     epsilon = -float(hull.equations[:, 6].max())  # facets: normal . w + offset <= 0 inside
-    return WrenchSpace(epsilon, float(hull.volume)) if epsilon > _NIL else WrenchSpace(0.0, 0.0)
+    return WrenchSpace(epsilon, float(hull.volume)) if epsilon > _EPSILON_ROUNDING else WrenchSpace(0.0, 0.0)
 
 
 def wrench_spaces(

@@ -122,9 +122,9 @@ class _Solids:
             for geometry in urdf.links[link]:
                 T = T_body_link @ geometry.T_link_geometry
                 mesh = geometry_mesh(urdf, geometry)
-                pieces, said = convex_pieces(urdf, geometry, mesh, decompose, device)
-                if said:
-                    self.notes.append(f"link '{link}': {said}")
+                pieces, note = convex_pieces(urdf, geometry, mesh, decompose, device)
+                if note:
+                    self.notes.append(f"link '{link}': {note}")
                     self.dented.add(link)
                 mesh.apply_transform(T)
                 self.meshes.setdefault(link, []).append(mesh)

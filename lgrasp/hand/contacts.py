@@ -8,15 +8,15 @@ import trimesh
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.spec import Cone, Surface
 
-_GRID_CELL = 8.0e-4
-_GRID_PAD = 6.0e-3
+_GRID_CELL = 8.0e-4  # [m], more on large links
+_GRID_PAD = 6.0e-3  # [m] of a grid beyond its link
 _POINTS_PER_LINK = 600
-_DRAWN_AREA = 1.0e-6  # [m^2] of a link's surface to a point drawn for a side, if that is _DRAWN points
-_DRAWN = (4_800, 60_000)
+_DRAWN_AREA = 1.0e-6  # [m^2] of a link's surface to a point drawn for a side, if that is _POINTS_DRAWN points
+_POINTS_DRAWN = (4_800, 60_000)
 _SIDE_AREA = 2.5e-6  # [m^2] of a side to a point that is kept, if that is _SIDE_POINTS points of a link
 _SIDE_POINTS = (200, 2_400)
-_PATCH_RADIUS = 0.010
-_PATCH_CONE = np.radians(36.0)
+_PATCH_RADIUS = 0.010  # [m]
+_PATCH_CONE = np.radians(36.0)  # [rad]
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def side_points(
         meshes: solids of the link. around: those of all links on its body.
     """
     area = sum(float(m.area) for m in meshes)
-    drawn = np.clip(area / _DRAWN_AREA, *_DRAWN)
+    drawn = np.clip(area / _DRAWN_AREA, *_POINTS_DRAWN)
     shares = [max(1, round(drawn * float(m.area) / area)) for m in meshes]
     parts = [_sample(m, rng, count) for m, count in zip(meshes, shares, strict=True)]
     points, normals = map(np.vstack, zip(*parts, strict=True))

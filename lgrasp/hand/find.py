@@ -110,8 +110,8 @@ def rules_of_known(path: Path) -> HandSource | None:
                 note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
             stated = {j.name for j in urdf.joints if j.mimic is not None}
             added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
-            spec, told = _without_misfits(urdf, source.spec.model_copy(update={"mimic": added | missing}))
-            return HandSource(source.name, path, spec, note + told)
+            spec, left_out = _without_misfits(urdf, source.spec.model_copy(update={"mimic": added | missing}))
+            return HandSource(source.name, path, spec, note + left_out)
     return None
 
 
@@ -126,8 +126,8 @@ def _without_misfits(urdf: Urdf, spec: HandSpec) -> tuple[HandSpec, str]:
     if not unfit:
         return spec, ""
     fit = {name: space for name, space in spec.opposition_spaces.items() if name not in unfit}
-    told = f", without the opposition spaces {', '.join(unfit)}, which do not fit: {next(iter(unfit.values()))}"
-    return spec.model_copy(update={"opposition_spaces": fit}), told
+    note = f", without the opposition spaces {', '.join(unfit)}, which do not fit: {next(iter(unfit.values()))}"
+    return spec.model_copy(update={"opposition_spaces": fit}), note
 
 
 def _missing_couplings(joints: tuple[Joint, ...], known: tuple[Joint, ...]) -> dict[str, Coupling]:

@@ -15,12 +15,12 @@ from lgrasp.hand.urdf import Geometry, Urdf
 
 _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by half of it leaves +-0.2 mm
 _CYLINDER_SIDES = 32
-_MOST_BODIES = 16
+_MAX_BODIES = 16  # of one mesh
 _SHARP_CELL, _MOST_SHARP = 0.002, 96
-_FILLED = 0.9  # a body that fills less of its hull ...
-_DENT = 4.0e-3  # ... and lies deeper below it [m] somewhere is cut into convex pieces
+_MIN_HULL_SHARE = 0.9  # a body that fills less of its hull ...
+_MAX_DENT = 4.0e-3  # ... and lies deeper below it [m] somewhere is cut into convex pieces
 _MOST_PIECES = 8  # of one collision element; kernels go through all of them
-_UNCOVERED = 7.0e-4  # pieces may leave out no more of the true surface [m]
+_MAX_UNCOVERED = 7.0e-4  # pieces may leave out no more of the true surface [m]
 MOST_FACES = 40_000
 """Collision meshes with more faces are thinned to about this many."""
 
@@ -195,7 +195,7 @@ def convex_pieces(
     if geometry.kind != "mesh":
         return [convex_piece(urdf, geometry, mesh)], ""
     bodies, hulls = [mesh], []
-    if 1 < mesh.body_count <= _MOST_BODIES:
+    if 1 < mesh.body_count <= _MAX_BODIES:
         bodies = list(mesh.split(only_watertight=False))
     try:
         hulls = [convex_piece(urdf, geometry, body) for body in bodies]
@@ -208,9 +208,9 @@ def convex_pieces(
     if not any(dented):
         return hulls, ""
     share = 100 * abs(mesh.volume) / sum(hull.hull_volume for hull in hulls)
-    said = f"mesh {geometry.mesh} fills {share:.0f} % of its convex hull"
+    note = f"mesh {geometry.mesh} fills {share:.0f} % of its convex hull"
     if decompose is None:
-        return hulls, said
+        return hulls, note
     pieces, failures = [], []
     for body, hull, cut in zip(bodies, hulls, dented, strict=True):
         parts = [hull]
@@ -220,8 +220,8 @@ def convex_pieces(
             except DecomposeError as error:
                 failures.append(str(error))
         pieces += parts
-    said += f"; {len(pieces)} convex pieces" if len(pieces) > len(hulls) else "; the hull is used"
-    return pieces, said + (f" ({failures[0]})" if failures else "")
+    note += f"; {len(pieces)} convex pieces" if len(pieces) > len(hulls) else "; the hull is used"
+    return pieces, note + (f" ({failures[0]})" if failures else "")
 
 
 def is_dented(body: trimesh.Trimesh, device: str = "cpu") -> bool:
@@ -231,11 +231,11 @@ def is_dented(body: trimesh.Trimesh, device: str = "cpu") -> bool:
         QhullError: a flat body.
     """
     hull = ConvexHull(np.asarray(body.vertices, float))
-    if abs(body.volume) >= _FILLED * hull.volume:
+    if abs(body.volume) >= _MIN_HULL_SHARE * hull.volume:
         return False
     shell = trimesh.Trimesh(hull.points, hull.simplices, process=False)
     points = trimesh.sample.sample_surface(shell, 2000, seed=0)[0]
-    return bool(np.abs(signed_distance(body, points, device)).max() > _DENT)
+    return bool(np.abs(signed_distance(body, points, device)).max() > _MAX_DENT)
 
 
 def _cut(body: trimesh.Trimesh, decompose: Decompose, most: int) -> list[Piece]:
@@ -244,7 +244,7 @@ def _cut(body: trimesh.Trimesh, decompose: Decompose, most: int) -> list[Piece]:
     Raises:
         DecomposeError: see :func:`lgrasp.geometry.decompose.decompose`; also pieces that leave out some of the surface.
     """
-    found = decompose(np.asarray(body.vertices), np.asarray(body.faces), threshold=_DENT, max_pieces=most)
+    found = decompose(np.asarray(body.vertices), np.asarray(body.faces), threshold=_MAX_DENT, max_pieces=most)
     pieces = []
     for vertices in found:
         try:
@@ -253,7 +253,7 @@ def _cut(body: trimesh.Trimesh, decompose: Decompose, most: int) -> list[Piece]:
             continue
     points = np.vstack([body.vertices, trimesh.sample.sample_surface(body, 4000, seed=0)[0]])
     left = float(np.min([piece.depth(points) for piece in pieces], 0).max()) if pieces else np.inf
-    if left > _UNCOVERED:
+    if left > _MAX_UNCOVERED:
         raise DecomposeError(f"its convex pieces leave out {1e3 * left:.1f} mm of the surface")
     return pieces
 

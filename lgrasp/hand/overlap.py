@@ -14,12 +14,12 @@ import trimesh
 from lgrasp.hand.contacts import LinkGrid, box_grid
 from lgrasp.hand.self_collision import OVERLAP
 
-_SPACING = 8.0e-4
-_MOST_POINTS = 20_000
-_CELL = 6.0e-4
-_MOST_CELLS = 300_000
-_PAD_ANGLE = 3.0e-3
-_SHALLOW = 3.0e-4  # points that never get deeper than this are not kept
+_POINT_SPACING = 8.0e-4  # [m]
+_MAX_POINTS = 20_000
+_MIN_CELL = 6.0e-4  # [m]
+_MAX_CELLS = 300_000
+_GRID_PAD = 3.0e-3  # [m]
+_MIN_DEPTH = 3.0e-4  # [m] points that never get deeper than this are not kept
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,14 @@ class OverlapSide:
 
 
 def _surface(meshes: Sequence[trimesh.Trimesh]) -> np.ndarray:
-    """Points (n, 3) of a link's surface about _SPACING apart, vertices included."""
+    """Points (n, 3) of a link's surface about _POINT_SPACING apart, vertices included."""
     parts = [np.asarray(m.vertices, float) for m in meshes]
     for mesh in meshes:
-        count = int(np.clip(4 * mesh.area / _SPACING**2, 64, 8 * _MOST_POINTS))
+        count = int(np.clip(4 * mesh.area / _POINT_SPACING**2, 64, 8 * _MAX_POINTS))
         parts.append(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
     points = np.vstack(parts)
-    _, first = np.unique(np.floor(points / _SPACING).astype(np.int64), axis=0, return_index=True)
-    return points[np.sort(first)][:_MOST_POINTS]
+    _, first = np.unique(np.floor(points / _POINT_SPACING).astype(np.int64), axis=0, return_index=True)
+    return points[np.sort(first)][:_MAX_POINTS]
 
 
 def _lookup(grid: LinkGrid, p: np.ndarray) -> np.ndarray:
@@ -75,8 +75,8 @@ def _side(
     if not near.any():
         return None
     points = points[near]
-    box_low, box_high = box_low - _PAD_ANGLE, box_high + _PAD_ANGLE
-    cell = max(_CELL, float(np.prod(box_high - box_low) / _MOST_CELLS) ** (1 / 3))
+    box_low, box_high = box_low - _GRID_PAD, box_high + _GRID_PAD
+    cell = max(_MIN_CELL, float(np.prod(box_high - box_low) / _MAX_CELLS) ** (1 / 3))
     holes = not all(m.is_watertight for m in grid_meshes)
     grid = box_grid(list(grid_meshes), box_low, box_high, cell, device, winding=holes)
     depth, often, deepest = np.zeros(len(T)), np.zeros(len(points)), np.zeros(len(points))
@@ -86,7 +86,7 @@ def _side(
         often += sunk > OVERLAP
         deepest = np.maximum(deepest, sunk)
     order = np.argsort(-often, kind="stable")
-    return OverlapSide(body, grid_body, points[order[deepest[order] > _SHALLOW]], grid, depth)
+    return OverlapSide(body, grid_body, points[order[deepest[order] > _MIN_DEPTH]], grid, depth)
 
 
 def overlap_sides(

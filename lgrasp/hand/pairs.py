@@ -15,11 +15,11 @@ from lgrasp.hand.pair_kernels import mark_touching
 from lgrasp.hand.self_collision import OVERLAP
 from lgrasp.runtime.device import start
 
-_POSTURES = 256
-_EVERY = 2000  # postures in which a pair must touch to count as touching always
-_NEARLY = 0.95  # of all postures
-_HOPELESS = 0.98
-_TOUCH = 5.0e-5  # [m] that distance grids may err
+_SAMPLED_POSTURES = 256
+_CONFIRMING_POSTURES = 2000  # postures in which a pair must touch to count as touching always
+_ALMOST_ALWAYS = 0.95  # of all postures
+_UNUSABLE_SHARE = 0.98  # of all postures
+_GRID_ERROR = 5.0e-5  # [m] that distance grids may err
 
 
 def pieces_touch(
@@ -80,7 +80,7 @@ def with_pairs(
     if not candidates:
         return model
     pairs = np.array(candidates, np.int32)
-    q = _postures(model, _POSTURES)
+    q = _postures(model, _SAMPLED_POSTURES)
     touch = pieces_touch(model, q, pairs, device=device)
     # links, not pieces, are what touches: a link pair is left out when some pieces of it touch in every posture
     links = np.sort(model.piece_link[pairs], axis=1)
@@ -91,14 +91,17 @@ def with_pairs(
         members = (links == pair).all(1)
         share = touch[:, members].any(1).mean()
         a, b = (names[k] for k in pair)
-        if share > _NEARLY and (a in dented or b in dented):
+        if share > _ALMOST_ALWAYS and (a in dented or b in dented):
             keep[members] = False
             found, note = _true_overlap(model, (a, b), meshes, q, device)
             sides += found
             body_a, body_b = sorted(int(group[model.tree.link_body[k]]) for k in pair)
             keys += [body_a * groups + body_b] * len(found)
             notes += [note] if note else []
-        elif share == 1.0 and pieces_touch(model, _postures(model, _EVERY), pairs[members], device=device).any(1).all():
+        elif (
+            share == 1.0
+            and pieces_touch(model, _postures(model, _CONFIRMING_POSTURES), pairs[members], device=device).any(1).all()
+        ):
             keep[members] = False
     pairs = pairs[keep]
     key = group[model.piece_body[pairs[:, 0]]] * groups + group[model.piece_body[pairs[:, 1]]]
@@ -124,11 +127,11 @@ def _true_overlap(
     if not sides:
         return [], ""
     depth = np.max([side.depth for side in sides], 0)
-    said = f"links '{pair[0]}' and '{pair[1]}' overlap"
-    if (depth > _TOUCH).all():
-        depth = overlap_depth(sides, bodies, placed(_postures(model, _EVERY)))
+    note = f"links '{pair[0]}' and '{pair[1]}' overlap"
+    if (depth > _GRID_ERROR).all():
+        depth = overlap_depth(sides, bodies, placed(_postures(model, _CONFIRMING_POSTURES)))
         # a pair that comes apart in a few odd postures only could never be used if it were kept apart
-        if (depth > _TOUCH).all() or (depth > OVERLAP).mean() > _HOPELESS:
-            return [], f"{said} in every posture; they are not kept apart"
+        if (depth > _GRID_ERROR).all() or (depth > OVERLAP).mean() > _UNUSABLE_SHARE:
+            return [], f"{note} in every posture; they are not kept apart"
     share = (depth > OVERLAP).mean()
-    return sides, f"{said} by more than {1e3 * OVERLAP:.2g} mm in {100 * share:.0f} % of all postures" if share else ""
+    return sides, f"{note} by more than {1e3 * OVERLAP:.2g} mm in {100 * share:.0f} % of all postures" if share else ""

@@ -12,8 +12,8 @@ from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.urdf import Urdf
 from lgrasp.runtime.device import start
 
-_POINTS = 400
-_VIEWS = 32
+_POINTS_PER_LINK = 400
+_VIEWED_POSTURES = 32  # of those given
 
 
 def link_surfaces(urdf: Urdf, model: HandModel) -> list[SurfaceSamples]:
@@ -28,7 +28,7 @@ def link_surfaces(urdf: Urdf, model: HandModel) -> list[SurfaceSamples]:
             mesh = geometry_mesh(urdf, geometry)
             meshes.append(mesh.apply_transform(tree.T_body_link[index] @ geometry.T_link_geometry))
         mesh = _join(meshes)
-        points, faces = trimesh.sample.sample_surface(mesh, _POINTS, seed=index)[:2]
+        points, faces = trimesh.sample.sample_surface(mesh, _POINTS_PER_LINK, seed=index)[:2]
         normals = np.asarray(mesh.face_normals)[faces]
         T, body = tree.T_body_link[index], int(tree.link_body[index])
         surfaces.append(SurfaceSamples(link, body, float(mesh.area), points, normals, np.zeros(len(points)), T, mesh))
@@ -57,7 +57,7 @@ def surface_visibility(
     point_body = np.concatenate([np.full(len(s.points), s.body) for s in surfaces])
     points, normals = (np.concatenate([getattr(s, k) for s in surfaces]) for k in ("points", "normals"))
     seen = np.zeros(len(points))
-    chosen = np.argsort(postures.touching, kind="stable")[:_VIEWS]  # postures that collide come last
+    chosen = np.argsort(postures.touching, kind="stable")[:_VIEWED_POSTURES]  # postures that collide come last
     handle = None
     for row in chosen:
         R, t = postures.R[row], postures.t[row]

@@ -28,7 +28,7 @@ from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
 from lgrasp.stages.context import Keeper
 
-_CONTACTS = 2  # links that it takes to hold anything
+_MIN_HOLDING_LINKS = 2  # links that it takes to hold anything
 
 
 class SimulateJob(ShardJob):
@@ -202,8 +202,8 @@ def _entry(group: list[Simulated], protocol: Protocol) -> dict[str, Any]:
         "penetration": float(np.median(columns["penetration"])) if "penetration" in columns else None,
         "directions_held": (columns["directions"] == 1).sum(0).tolist(),
         "directions_run": run.sum(0).tolist(),
-        "contact_at_q": int((columns["contact_at_q"] >= _CONTACTS).sum()),
-        "contact_at_grasp": int((columns["contact_at_grasp"] >= _CONTACTS).sum()),
+        "contact_at_q": int((columns["contact_at_q"] >= _MIN_HOLDING_LINKS).sum()),
+        "contact_at_grasp": int((columns["contact_at_grasp"] >= _MIN_HOLDING_LINKS).sum()),
         "pregrasp_too_deep": int((columns["pregrasp_penetration"] > protocol.most_penetration).sum()),
         "diverged": int(columns["diverged"].sum()),
         "mass": sum(load.mass for load in loads),

@@ -18,7 +18,7 @@ from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
 _CAMERA = CameraParams.model_validate(
     {"views": 2, "width": 96, "height": 96, "angle": 40.0, "calibration": 0.003, "voxel": 0.0, "window": 2}
 )
-_DISTANCE = 4.0  # of a camera, in radii of the object
+_CAMERA_DISTANCE = 4.0  # of a camera, in radii of the object
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def partial_clouds(
         way /= np.linalg.norm(way, axis=1)[:, None]
         if np.abs(way[:, 2]).max() > 0.98:  # no upright image
             continue
-        images = render(surface, intrinsics_of(_CAMERA), look_at(_DISTANCE * radius * way, np.zeros(3)), device)
+        images = render(surface, intrinsics_of(_CAMERA), look_at(_CAMERA_DISTANCE * radius * way, np.zeros(3)), device)
         merged = merge_views(add_noise(images, _CAMERA, rng), draw_offsets(_CAMERA, rng), _CAMERA, device)
         if len(merged.points):
             kept = np.resize(rng.permutation(len(merged.points)), count)

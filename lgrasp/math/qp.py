@@ -13,18 +13,18 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 MAX_CONTACTS = 7
 """Fingers plus palm in one grasp."""
-_CORRAL = 8
-_CORRAL_C = wp.constant(_CORRAL)
+_MAX_CORRAL = 8
+_CORRAL_C = wp.constant(_MAX_CORRAL)
 _LOAD_SCALE = wp.constant(1.0 / LOAD_ARM)  # [1/m]
 _LOAD_FORCE = wp.constant(LOAD_FORCE)
 _EXACT, _LOAD_EXACT = wp.constant(1.0e-4), wp.constant(1.0e-3)  # relative errors of squared norms
 _NO_LIMIT = wp.constant(1.0e15)
 
 vec6 = wp.types.vector(6, wp.float32)
-vec8 = wp.types.vector(_CORRAL, wp.float32)
-mat8 = wp.types.matrix((_CORRAL, _CORRAL), wp.float32)
-mat86 = wp.types.matrix((_CORRAL, 6), wp.float32)
-mat83 = wp.types.matrix((_CORRAL, 3), wp.float32)
+vec8 = wp.types.vector(_MAX_CORRAL, wp.float32)
+mat8 = wp.types.matrix((_MAX_CORRAL, _MAX_CORRAL), wp.float32)
+mat86 = wp.types.matrix((_MAX_CORRAL, 6), wp.float32)
+mat83 = wp.types.matrix((_MAX_CORRAL, 3), wp.float32)
 mat63 = wp.types.matrix((MAX_CONTACTS, 3), wp.float32)
 mat_gram = wp.types.matrix((MAX_CONTACTS, MAX_CONTACTS), wp.float32)
 vec_share = wp.types.vector(MAX_CONTACTS, wp.float32)
@@ -194,7 +194,7 @@ def _least_norm(
             G[j, m] = s
         m += 1
         # inner loop: least-norm point of the affine hull; leave it at the boundary of the simplex, drop, repeat
-        for _minor in range(_CORRAL):
+        for _minor in range(_MAX_CORRAL):
             z = _affine_weights(G, m)
             low = float(1.0)
             for j in range(m):

@@ -29,8 +29,8 @@ from lgrasp.refine.volume import upload_target
 
 _CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
 _COLLIDES, _CLOUD_GAP = 1.0e-3, 6.0e-3  # [m]
-_COARSE = {"max_penetration": 0.01, "max_gap": 0.012, "max_normal_angle": 60.0, "max_normal_spread": 90.0}
-_PLAN = GraspBounds(profile="plan")
+_COARSE_BOUNDS = {"max_penetration": 0.01, "max_gap": 0.012, "max_normal_angle": 60.0, "max_normal_spread": 90.0}
+_PLAN_BOUNDS = GraspBounds(profile="plan")
 
 
 class PlanParams(BaseModel):
@@ -74,7 +74,7 @@ class PlanParams(BaseModel):
     rank_friction: float = Field(
         default=0.3, gt=0, le=2, description="Friction coefficient at which the hands of a start are compared."
     )
-    bounds: GraspBounds = Field(default=_PLAN, description="What a plan must satisfy.")
+    bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
     def weights(self) -> dict[str, float]:
         """Arguments of :func:`hand_surface`."""
@@ -89,7 +89,7 @@ def cloud_params(params: PlanParams) -> PlanParams:
 
 def _loosened(bounds: GraspBounds) -> GraspBounds:
     """Conditions that hands must meet after the first outer steps, to separate them from those without any contact."""
-    return bounds.changed(**{name: max(least, getattr(bounds, name)) for name, least in _COARSE.items()})
+    return bounds.changed(**{name: max(least, getattr(bounds, name)) for name, least in _COARSE_BOUNDS.items()})
 
 
 class Planned(NamedTuple):

@@ -29,8 +29,8 @@ from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
 from lgrasp.runtime.structs import make_struct, upload_struct
 
-_ADVANCES = 30
-_ROWS = 32  # hands of a block of threads: few hands spread over many processors
+_MAX_ADVANCES = 30
+_BLOCK_ROWS = 32  # hands of a block of threads: few hands spread over many processors
 
 
 class Descent:
@@ -108,7 +108,7 @@ class Descent:
         self._place(at, body)
         ways = wp.array(np.ascontiguousarray(direction, np.float32), dtype=wp.vec3, device=d)
         most = wp.array(np.ascontiguousarray(travel, np.float32), dtype=wp.float32, device=d)
-        inputs = [self._points, t.own, t.around, int(t.has_around), _ADVANCES, clearance, ways, most, body]
+        inputs = [self._points, t.own, t.around, int(t.has_around), _MAX_ADVANCES, clearance, ways, most, body]
         wp.launch(advance, dim=rows, inputs=inputs, outputs=[at.pose], device=d)
 
     def max_penetration(self, at: Hands) -> np.ndarray:
@@ -174,7 +174,9 @@ class Descent:
         self._place(at, body)
         self._match_object(m, body, reach)
         near = max(p.contacts, int(p.nearest * points.palmar.shape[0]))
-        wp.launch(choose_contacts, dim=rows, inputs=[points, near, p.contacts, body, m], device=d, block_dim=_ROWS)
+        wp.launch(
+            choose_contacts, dim=rows, inputs=[points, near, p.contacts, body, m], device=d, block_dim=_BLOCK_ROWS
+        )
         wp.launch(match_links, dim=(solids.pairs.shape[0], rows), inputs=[solids, p.margin, body, m], device=d)
 
     def _match_object(self, m: "Correspondences", body: wp.array, reach: float) -> None:
@@ -198,7 +200,7 @@ class Descent:
             inputs=inputs,
             outputs=[at.pose, at.q],
             device=self.device,
-            block_dim=_ROWS,
+            block_dim=_BLOCK_ROWS,
         )
 
 

@@ -11,9 +11,9 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 wp.set_module_options(KERNEL_OPTIONS)
 
 _TINY = wp.constant(1.0e-12)
-_SECOND = wp.constant(0.99)  # decay of adam's second moment
+_SECOND_MOMENT_DECAY = wp.constant(0.99)  # decay of adam's second moment
 _BODIES = MAX_BODIES + 1
-_CLOSE = 1.0e-5  # [m] an advance that is shorter is the last
+_LAST_ADVANCE = 1.0e-5  # [m] an advance that is shorter is the last
 
 
 @wp.struct
@@ -49,10 +49,10 @@ def _moved(
     moments.first[row, k] = mean
     if s.sgd == 1:
         return -mean
-    root = _SECOND * moments.second[row, k] + (1.0 - _SECOND) * square
+    root = _SECOND_MOMENT_DECAY * moments.second[row, k] + (1.0 - _SECOND_MOMENT_DECAY) * square
     moments.second[row, k] = root
     mean = mean / (1.0 - wp.pow(s.momentum, float(step)))
-    root = wp.sqrt(root / (1.0 - wp.pow(_SECOND, float(step))))
+    root = wp.sqrt(root / (1.0 - wp.pow(_SECOND_MOMENT_DECAY, float(step))))
     return -wp.clamp(mean / (root + _TINY), -1.0, 1.0)
 
 
@@ -185,7 +185,7 @@ def advance(
                     gap = wp.min(gap, volume_at(around, x)[3])
         step = wp.min(wp.max(gap - clearance, 0.0), travel[row] - gone)
         gone += step
-        if step < _CLOSE:
+        if step < _LAST_ADVANCE:
             break
     T = pose[row]
     pose[row] = wp.transform(wp.transform_get_translation(T) + way * gone, wp.transform_get_rotation(T))

@@ -21,9 +21,9 @@ MAX_COLUMNS = 32
 
 _LENGTH = wp.constant(LENGTH)
 _STEEPEST = wp.constant(STEEPEST)
-_LOG = math.log(STEEPEST)
-_SLOPE = wp.constant(-2 * (STEEPEST - 1) * _LOG - (STEEPEST - 1) ** 2 / STEEPEST)
-_BEND = wp.constant(-2 * _LOG - 4 * (STEEPEST - 1) / STEEPEST + (STEEPEST - 1) ** 2 / STEEPEST**2)
+_LOG_STEEPEST = math.log(STEEPEST)
+_PARABOLA_SLOPE = wp.constant(-2 * (STEEPEST - 1) * _LOG_STEEPEST - (STEEPEST - 1) ** 2 / STEEPEST)
+_PARABOLA_CONSTANT = wp.constant(-2 * _LOG_STEEPEST - 4 * (STEEPEST - 1) / STEEPEST + (STEEPEST - 1) ** 2 / STEEPEST**2)
 
 _vec_joints = wp.types.vector(MAX_COLUMNS, wp.float32)
 
@@ -61,7 +61,7 @@ def _repulsion(u: wp.float32):
     if u >= 1.0:
         return 0.0
     if u < _STEEPEST:
-        return _SLOPE + _BEND * (u - _STEEPEST)
+        return _PARABOLA_SLOPE + _PARABOLA_CONSTANT * (u - _STEEPEST)
     return -2.0 * (u - 1.0) * wp.log(u) - (u - 1.0) * (u - 1.0) / u
 
 

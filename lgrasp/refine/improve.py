@@ -17,9 +17,9 @@ from lgrasp.object.arrays import ObjectArrays
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
 
-_LOOK = 4  # matching rounds between two looks
-_SHIFT, _BEND = 0.003, 0.03  # spread of further starts [m], [rad or m]
-_CPU_ROWS = 32
+_ROUNDS_PER_LOOK = 4  # matching rounds between two looks
+_START_SHIFT, _START_BEND = 0.003, 0.03  # spread of further starts [m], [rad or m]
+_CPU_ROWS = 32  # of one thread
 
 
 def improve(
@@ -95,15 +95,15 @@ def _start(search: Descent, hand: HandArrays, pose: np.ndarray, q: np.ndarray, n
     base, tree = device_inverse(pose), hand.model.tree
     if number:
         rng = np.random.default_rng(number)
-        base[:, :3] += (_SHIFT * rng.normal(size=3)).astype(np.float32)
-        q = np.clip(q + _BEND * rng.normal(size=q.shape[1]), tree.joint_lower, tree.joint_upper)
+        base[:, :3] += (_START_SHIFT * rng.normal(size=3)).astype(np.float32)
+        q = np.clip(q + _START_BEND * rng.normal(size=q.shape[1]), tree.joint_lower, tree.joint_upper)
     return Hands.put(base, q, search.device)
 
 
 def _looks(search: Descent, at: Hands, number: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """T_hand_object and joints of hands along a search."""
     rounds = search.params.matching_rounds * (2 if number else 1)
-    stops = [*range(_LOOK, rounds, _LOOK), rounds]
+    stops = [*range(_ROUNDS_PER_LOOK, rounds, _ROUNDS_PER_LOOK), rounds]
     for first, stop in zip([0, *stops[:-1]], stops, strict=True):
         if stop > first:
             search.run(at, rounds=stop, first=first, whole=rounds)

@@ -15,8 +15,8 @@ wp.set_module_options(KERNEL_OPTIONS)
 DEEPEST, LINK_DEEPEST = 4, 2
 """Points that are kept of each link in the object, and of each ordered pair of links."""
 
-_NOTHING = -1.0  # [m] offset of a plane that nothing is near
-_FAR = 1.0e9
+_NO_PLANE = -1.0  # [m] offset of a plane that nothing is near
+_FAR_DISTANCE = 1.0e9  # [m]
 _HALVINGS = 40
 
 _vec_block = wp.types.vector(32, wp.float32)
@@ -124,7 +124,7 @@ def match_points(
         at = volume_at(own, x)
         m.plane[row, i] = _plane(at, x)
         m.distance[row, i] = at[3]
-        apart[k] = wp.where(points.weight[i] > 0.0, wp.abs(at[3]), _FAR)
+        apart[k] = wp.where(points.weight[i] > 0.0, wp.abs(at[3]), _FAR_DISTANCE)
         if has_around == 1:
             other = volume_at(around, x)
             if other[3] < at[3]:
@@ -133,7 +133,7 @@ def match_points(
     # the part of each link that is nearest to the object: a surface that fits nowhere else is no error
     least = float(-1.0)
     for _ in range(touching):
-        following = float(_FAR)
+        following = float(_FAR_DISTANCE)
         for k in range(points.block):
             if apart[k] > least:
                 following = wp.min(following, apart[k])
@@ -157,8 +157,8 @@ def choose_contacts(
     """
     row = wp.tid()
     best = int(0)
-    low = float(_FAR)
-    high = float(-_FAR)
+    low = float(_FAR_DISTANCE)
+    high = float(-_FAR_DISTANCE)
     for k in range(points.palmar.shape[0]):
         d = m.distance[row, points.palmar[k]]
         if d < low:
@@ -183,7 +183,7 @@ def choose_contacts(
             i = points.palmar[k]
             if m.distance[row, i] <= high:
                 x = wp.transform_point(body[row, points.body[i // points.block]], points.points[i])
-                gap = float(_FAR)
+                gap = float(_FAR_DISTANCE)
                 for e in range(c):
                     o = m.contacts[row, e]
                     y = wp.transform_point(body[row, points.body[o // points.block]], points.points[o])
@@ -230,7 +230,7 @@ def match_solids(
     centre = _centre(s, i, T)
     radius = s.ball[i][3] + margin
     grid = _grid(s, i)
-    depth = _vec_deep(_FAR)
+    depth = _vec_deep(_FAR_DISTANCE)
     which = _veci_deep(0)
     for k in range(cloud.shape[0]):
         if wp.length_sq(cloud[k] - centre) < radius * radius:
@@ -245,8 +245,8 @@ def match_solids(
                     d = later
                     at = later_at
     for e in range(DEEPEST):
-        plane = wp.vec4(0.0, 0.0, 0.0, _NOTHING)
-        if depth[e] < _FAR:
+        plane = wp.vec4(0.0, 0.0, 0.0, _NO_PLANE)
+        if depth[e] < _FAR_DISTANCE:
             plane = _link_plane(grid, wp.transform_point(back, cloud[which[e]]))
         m.deep[row, i * DEEPEST + e] = cloud[which[e]]
         m.deep_plane[row, i * DEEPEST + e] = plane
@@ -266,13 +266,13 @@ def match_links(s: Solids, margin: wp.float32, body: wp.array2d(dtype=wp.transfo
     B = body[row, s.body[b]]
     first = pair * LINK_DEEPEST
     for e in range(LINK_DEEPEST):
-        m.link_plane[row, first + e] = wp.vec4(0.0, 0.0, 0.0, _NOTHING)
+        m.link_plane[row, first + e] = wp.vec4(0.0, 0.0, 0.0, _NO_PLANE)
     reach = s.ball[a][3] + s.ball[b][3] + margin
     if wp.length_sq(_centre(s, a, A) - _centre(s, b, B)) >= reach * reach:
         return
     T = wp.transform_inverse(B) * A
     grid = _grid(s, b)
-    depth = wp.vec2(_FAR, _FAR)
+    depth = wp.vec2(_FAR_DISTANCE, _FAR_DISTANCE)
     which = wp.vec2i(0, 0)
     for k in range(s.points.shape[1]):
         d = sdf_value(grid, wp.transform_point(T, s.points[a, k]))

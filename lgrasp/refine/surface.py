@@ -16,8 +16,8 @@ DISTAL, OTHER = 1.0, 0.2
 LINK_POINTS = 1024
 """Points of the surfaces of all links together, where links are solids (:func:`hand_solids`)."""
 
-_PROBES = 32
-_PALMAR = 16  # of a block
+_PROBES_PER_LINK = 32
+_PALMAR_PER_BLOCK = 16  # of a block
 _AREA_BLOCKS = 4  # most blocks of one body
 _PER_BLOCK = 500  # surface samples of a body to a block
 
@@ -52,7 +52,7 @@ def farthest_points(points: np.ndarray, count: int, *, first: int = 0) -> np.nda
 
 def link_probes(points: np.ndarray) -> np.ndarray:
     """Those of a link's surface points that other links are probed with, (32, 3) [m]."""
-    return points[farthest_points(points, _PROBES)]
+    return points[farthest_points(points, _PROBES_PER_LINK)]
 
 
 def hand_surface(
@@ -73,16 +73,16 @@ def hand_surface(
         if len(samples) == 0:
             continue
         count = int(np.clip(len(samples) // _PER_BLOCK, 1, _AREA_BLOCKS))
-        drawn = _PALMAR * count if len(own) else 0
+        drawn = _PALMAR_PER_BLOCK * count if len(own) else 0
         rest = samples[farthest_points(samples, BLOCK * count - drawn)]
         weight = np.zeros((count, BLOCK))
         p, n = np.zeros((count, BLOCK, 3)), np.zeros((count, BLOCK, 3))
         if drawn:
             chosen = own[farthest_points(side.points[own], drawn)]
-            p[:, :_PALMAR] = side.points[chosen].reshape(count, -1, 3)
-            n[:, :_PALMAR] = side.normals[chosen].reshape(count, -1, 3)
-            weight[:, :_PALMAR] = distal if b in last else other
-            p[:, _PALMAR:] = rest.reshape(count, -1, 3)
+            p[:, :_PALMAR_PER_BLOCK] = side.points[chosen].reshape(count, -1, 3)
+            n[:, :_PALMAR_PER_BLOCK] = side.normals[chosen].reshape(count, -1, 3)
+            weight[:, :_PALMAR_PER_BLOCK] = distal if b in last else other
+            p[:, _PALMAR_PER_BLOCK:] = rest.reshape(count, -1, 3)
         else:
             p[:] = rest.reshape(count, -1, 3)
         bodies += [b] * count

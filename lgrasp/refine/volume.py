@@ -10,7 +10,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS, start
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_CLOUD = 512
+_CLOUD_POINTS = 512  # of an object
 
 
 @wp.struct
@@ -58,7 +58,7 @@ def upload_target(model: ObjectModel, around: ObjectModel | None, device: str) -
 
 def solid_cloud(model: ObjectModel) -> np.ndarray:
     """Some points of an object's surface, evenly spread [m], (n, 3)."""
-    count = min(_CLOUD, len(model.obstacle_points))
+    count = min(_CLOUD_POINTS, len(model.obstacle_points))
     return model.obstacle_points[((np.arange(count) + 0.5) * len(model.obstacle_points) / count).astype(int)]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-_LINE = 256  # bytes that places in the staging memory are rounded up to
+_ALIGNMENT = 256  # bytes that places in the staging memory are rounded up to
 _staging: dict[str, wp.array] = {}  # by device
 _lock = threading.Lock()
 
@@ -19,7 +19,9 @@ def fetch(arrays: Sequence[wp.array]) -> list[np.ndarray]:
     """
     if not arrays or not arrays[0].device.is_cuda:
         return [a.numpy().copy() for a in arrays]
-    places = np.cumsum([0, *(-(-a.size * wp.types.type_size_in_bytes(a.dtype) // _LINE) * _LINE for a in arrays)])
+    places = np.cumsum(
+        [0, *(-(-a.size * wp.types.type_size_in_bytes(a.dtype) // _ALIGNMENT) * _ALIGNMENT for a in arrays)]
+    )
     device = arrays[0].device
     with _lock:
         memory = _staging.get(device.alias)

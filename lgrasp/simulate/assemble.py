@@ -17,8 +17,8 @@ from lgrasp.simulate.urdf import bare_urdf, joint_ends
 OBJECT = "lgrasp object"
 """Begins the name of every object's body; its number follows."""
 
-_POSTURES = 200
-_NEARLY = 0.95  # of all postures; links that touch so often are left to touch
+_SAMPLED_POSTURES = 200
+_ALMOST_ALWAYS = 0.95  # of all postures; links that touch so often are left to touch
 
 
 def assemble(
@@ -107,7 +107,7 @@ def _always_touching(mujoco: Any, model: Any) -> list[tuple[int, int]]:
     rng = np.random.default_rng(0)
     count: dict[tuple[int, int], int] = {}
     away = model.jnt_qposadr[free]
-    for _ in range(_POSTURES):
+    for _ in range(_SAMPLED_POSTURES):
         data.qpos[model.jnt_qposadr[joints]] = rng.uniform(limits[:, 0], limits[:, 1])
         for number, address in enumerate(away):
             data.qpos[address : address + 7] = [100 * (number + 1), 0, 0, 1, 0, 0, 0]
@@ -117,4 +117,4 @@ def _always_touching(mujoco: Any, model: Any) -> list[tuple[int, int]]:
         touching = np.sort(model.geom_bodyid[data.contact.geom], axis=1)
         for a, b in {(int(a), int(b)) for a, b in touching[data.contact.dist < 0]}:
             count[a, b] = count.get((a, b), 0) + 1
-    return sorted(pair for pair, n in count.items() if n > _NEARLY * _POSTURES)
+    return sorted(pair for pair, n in count.items() if n > _ALMOST_ALWAYS * _SAMPLED_POSTURES)

@@ -47,7 +47,7 @@ _TYPES = {
     "stays": np.bool_,
     "object_touches": np.int8,
 }
-_WIDE = {"directions", "displacement", "rotation"}  # a column per direction
+_PER_DIRECTION = {"directions", "displacement", "rotation"}  # a column per direction
 
 
 def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.ndarray) -> dict[str, np.ndarray]:
@@ -66,6 +66,6 @@ def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.nd
             for row, found, slot in zip(stacked, values, slots, strict=True):
                 row[slot >= 0] = found[slot[slot >= 0]]
         else:
-            stacked = np.array(values, dtype).reshape((len(verdicts), 6) if column in _WIDE else len(verdicts))
+            stacked = np.array(values, dtype).reshape((len(verdicts), 6) if column in _PER_DIRECTION else len(verdicts))
         out[f"{protocol.name}_{column}"] = stacked
     return out

@@ -15,7 +15,7 @@ from lgrasp.simulate.scene import HandSolids, Scene
 from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.urdf import welded_joints
 
-_NEAR = 1.0e-3  # [m]
+_NEAR_DISTANCE = 1.0e-3  # [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
         model = spec.compile()
         for geom in spec.geoms:
             if geom.parent.name.startswith(OBJECT):
-                geom.margin = _NEAR
+                geom.margin = _NEAR_DISTANCE
         near = spec.compile()
     except (ValueError, KeyError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:300]

@@ -10,11 +10,11 @@ from lgrasp.errors import DecomposeError, ObjectError
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.distance import signed_distance
 
-_DENT = 2.0e-3  # dents shallower than this [m] may stay filled
+_ALLOWED_DENT = 2.0e-3  # dents shallower than this [m] may stay filled
 _MOST_PIECES = 128
-_EFFORTS = ((1.5e-4, _DENT, 180.0), (5.0e-4, 2 * _DENT, 120.0))
+_EFFORTS = ((1.5e-4, _ALLOWED_DENT, 180.0), (5.0e-4, 2 * _ALLOWED_DENT, 120.0))
 # tried in turn: surface details [m] that are smoothed away first, dents [m] that may stay filled, time [s]
-_SLIVER = 1.0e-11  # [m^3] a piece of less volume is left out
+_MIN_PIECE_VOLUME = 1.0e-11  # [m^3] a piece of less volume is left out
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device
         notes.append("the mesh is not closed; mass and inertia are those of its convex hull")
     pieces = [mesh.vertices[hull.vertices]]
     excess = _excess(mesh, pieces, device)
-    if excess > _DENT:
+    if excess > _ALLOWED_DENT:
         failures = []
         for effort in _EFFORTS:
             try:
@@ -93,7 +93,7 @@ def _cut(mesh: trimesh.Trimesh, decompose: Decompose, detail: float, dent: float
             hull = ConvexHull(vertices)
         except QhullError:
             continue
-        if hull.volume > _SLIVER:
+        if hull.volume > _MIN_PIECE_VOLUME:
             pieces.append(vertices[hull.vertices])
     if not pieces:
         raise DecomposeError("convex decomposition gave slivers only")

@@ -15,7 +15,7 @@ REST = (0.01, 0.1)
 AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
 """Directions of the load in the hand's base frame."""
 
-_GONE = 0.5  # [m]: an object that got so far from its start will not touch the hand again
+_LOST_DISTANCE = 0.5  # [m]: an object that got so far from its start will not touch the hand again
 
 
 class Verdict(NamedTuple):
@@ -95,7 +95,7 @@ class Bounds:
     def __init__(self, protocol: Protocol) -> None:
         self.most = np.array([protocol.most_displacement, np.radians(protocol.most_rotation)])
         self._by_contact, self._deepest = protocol.success == "touches", protocol.most_penetration
-        self._end = np.array([_GONE, np.inf]) if self._by_contact else self.most
+        self._end = np.array([_LOST_DISTANCE, np.inf]) if self._by_contact else self.most
 
     def lost(self, moved: np.ndarray) -> Any:
         """True if an object is so far away that the grasp is lost (...)."""

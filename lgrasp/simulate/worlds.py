@@ -13,9 +13,9 @@ from lgrasp.simulate.verdict import CHUNK, WILD, links_touching, moved
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_CONTACTS = 96  # per world and object, on average
-_FULL = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # buffers that may be full
-_CONSTRAINTS = 640  # rows per world and object: four a contact, limits, couplings
+_CONTACTS_PER_OBJECT = 96  # per world and object, on average
+_BUFFER_WARNINGS = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # buffers that may be full
+_CONSTRAINTS_PER_OBJECT = 640  # rows per world and object: four a contact, limits, couplings
 
 
 @wp.kernel
@@ -51,14 +51,17 @@ class Worlds:
         with wp.ScopedDevice(self._device):
             self._m = mujoco_warp.put_model(m)
             self._m.opt.warn_overflow = 0  # reported by :meth:`overflowed`
-            room = {"nconmax": _CONTACTS * len(model.object_body), "njmax": _CONSTRAINTS * len(model.object_body)}
+            room = {
+                "nconmax": _CONTACTS_PER_OBJECT * len(model.object_body),
+                "njmax": _CONSTRAINTS_PER_OBJECT * len(model.object_body),
+            }
             self._d = mujoco_warp.make_data(m, nworld=worlds, **room)
             shape = (worlds, m.nu)
             self._start, self._end, self._step = (wp.zeros(s, dtype=wp.float32) for s in (shape, shape, (worlds,)))
         self._ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
         self.chunk = max(1, round(CHUNK / m.opt.timestep))
         self._graph: Any = None
-        self._full = sum(int(mujoco_warp.OverflowType[name]) for name in _FULL)
+        self._full = sum(int(mujoco_warp.OverflowType[name]) for name in _BUFFER_WARNINGS)
         self.steps = 0
         self._compile()
 

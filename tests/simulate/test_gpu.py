@@ -61,7 +61,7 @@ def test_a_world_without_room_is_judged_by_mujoco(six, monkeypatch):
     """Rows that need more constraints than there is room for get MuJoCo's own verdict."""
     from lgrasp.simulate import worlds
 
-    monkeypatch.setattr(worlds, "_CONSTRAINTS", 8)
+    monkeypatch.setattr(worlds, "_CONSTRAINTS_PER_OBJECT", 8)
     here, there = verdicts(*six, FC, all_directions=True), judge(*six)
     for name, values in here.items():
         np.testing.assert_array_equal(values, there[name], err_msg=name)

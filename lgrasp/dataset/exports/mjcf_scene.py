@@ -14,8 +14,8 @@ from lgrasp.simulate.protocol import PROTOCOLS
 if TYPE_CHECKING:
     import mujoco
 
-_AS = PROTOCOLS["fc"]  # the scenes are as this one simulates
-_DEEP = 0.001  # links of the hand that overlap more at the grasp do so because hulls stand for meshes [m]
+_PROTOCOL = PROTOCOLS["fc"]  # the scenes are as this one simulates
+_MAX_LINK_OVERLAP = 0.001  # links of the hand that overlap more at the grasp do so because hulls stand for meshes [m]
 
 
 class Keyframe(NamedTuple):
@@ -68,7 +68,7 @@ class MjcfScene:
             for name, item in zip(self._objects, objects, strict=True):
                 _add_object(mujoco, spec, name, item)
             for geom in spec.geoms:
-                set_contact(geom, _AS, 4 if geom.parent.name in self._objects else 1)
+                set_contact(geom, _PROTOCOL, 4 if geom.parent.name in self._objects else 1)
             self._model = spec.compile()
             self._xml = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:
@@ -115,7 +115,7 @@ class MjcfScene:
         found = set()
         for contact in data.contact[: data.ncon]:
             pair = tuple(sorted(model.body(model.geom_bodyid[g]).name for g in contact.geom))
-            if contact.dist < -_DEEP and not {*self._objects} & {*pair}:
+            if contact.dist < -_MAX_LINK_OVERLAP and not {*self._objects} & {*pair}:
                 found.add(pair)
         return found
 
@@ -126,7 +126,7 @@ def _hand_spec(mujoco, files: dict[str, bytes]) -> "mujoco.MjSpec":
         mesh.set("filename", f"hand/{mesh.get('filename')}")
     set_compiler(robot, meshdir="../")  # of the export, seen from the scenes
     spec = mujoco.MjSpec.from_string(etree.tostring(robot, encoding="unicode"), assets=files)
-    set_options(mujoco, spec, _AS)
+    set_options(mujoco, spec, _PROTOCOL)
     return spec
 
 
@@ -137,22 +137,22 @@ def _add_object(mujoco, spec: "mujoco.MjSpec", name: str, item: SceneObject) -> 
     spec.add_mesh(name=name, file=item.mesh)
     shape = {"type": mujoco.mjtGeom.mjGEOM_MESH}
     if not item.pieces:
-        body.add_geom(name=name, meshname=name, mass=_AS.mass, **shape)
+        body.add_geom(name=name, meshname=name, mass=_PROTOCOL.mass, **shape)
         return
     body.add_geom(name=name, meshname=name, mass=0, contype=0, conaffinity=0, group=2, **shape)
     for number, (file, volume) in enumerate(zip(item.pieces, item.volumes, strict=True)):
         piece = f"{name}_{number}"
         spec.add_mesh(name=piece, file=file)
-        mass = _AS.mass * volume / sum(item.volumes)
+        mass = _PROTOCOL.mass * volume / sum(item.volumes)
         body.add_geom(name=piece, meshname=piece, mass=mass, group=3, **shape)
 
 
 def _add_drives(mujoco, spec: "mujoco.MjSpec", joint_names: Sequence[str]) -> None:
     """Position control of the joints of q; controls come in their order."""
     for joint in spec.joints:
-        set_joint(mujoco, joint, _AS)
+        set_joint(mujoco, joint, _PROTOCOL)
     for name in joint_names:
-        add_drive(mujoco, spec, spec.joint(name), _AS, _AS.stiffness)
+        add_drive(mujoco, spec, spec.joint(name), _PROTOCOL, _PROTOCOL.stiffness)
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:

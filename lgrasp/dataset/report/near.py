@@ -4,7 +4,7 @@ import numpy as np
 
 from lgrasp.grasp.duplicates import KeptRows, near_pairs
 
-_MOST = 2_000_000  # rows held for comparison
+_MAX_ROWS = 2_000_000  # rows held for comparison
 
 
 class NearRows:
@@ -33,7 +33,7 @@ class NearRows:
             self._compare_sets(pose, q)
             return
         self._kept = self._kept or KeptRows(q.shape[1])
-        room = _MOST - self._kept.count
+        room = _MAX_ROWS - self._kept.count
         if room > 0:
             kept, near = self._kept.add(pose[:, 0], q, room)
             self.compared += len(kept) + near

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-_CELLS = 4096
+_HISTOGRAM_CELLS = 4096
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Distribution:
     """Counts of a quantity's values in cells between fourth powers: medians within one or two percent."""
 
     quantity: Quantity
-    counts: np.ndarray = field(default_factory=lambda: np.zeros(_CELLS, np.int64))
+    counts: np.ndarray = field(default_factory=lambda: np.zeros(_HISTOGRAM_CELLS, np.int64))
     rows: int = 0
     missing: int = 0
     """Rows where it was not measured (NaN)."""
@@ -58,8 +58,8 @@ class Distribution:
         self.missing += len(values) - len(good)
         self.rows += len(good)
         if len(good):
-            cell = np.clip(good / self.quantity.top, 0, 1) ** 0.25 * _CELLS
-            self.counts += np.bincount(np.minimum(cell.astype(int), _CELLS - 1), minlength=_CELLS)
+            cell = np.clip(good / self.quantity.top, 0, 1) ** 0.25 * _HISTOGRAM_CELLS
+            self.counts += np.bincount(np.minimum(cell.astype(int), _HISTOGRAM_CELLS - 1), minlength=_HISTOGRAM_CELLS)
             self.zeros += int((good <= 0).sum())
             shown = good * self.quantity.factor
             self.least, self.most = min(self.least, float(shown.min())), max(self.most, float(shown.max()))
@@ -74,7 +74,7 @@ class Distribution:
 
     def edges(self) -> np.ndarray:
         """Edges of the cells in the shown unit, shape [cells + 1]."""
-        return self.quantity.top * self.quantity.factor * np.linspace(0, 1, _CELLS + 1) ** 4
+        return self.quantity.top * self.quantity.factor * np.linspace(0, 1, _HISTOGRAM_CELLS + 1) ** 4
 
     def quantile(self, share: float) -> float:
         """Value below which a share of the rows lies, in the shown unit."""

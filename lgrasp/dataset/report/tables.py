@@ -5,7 +5,7 @@ from typing import Any
 
 from lgrasp.dataset.report.parts import escape, number, table
 
-_SHOWN = (  # metric, head, format
+_METRIC_COLUMNS = (  # metric, head, format
     ("penetration", "penetration [mm]", ".2f"),
     ("self_penetration", "self-pen. [mm]", ".2f"),
     ("gap", "gap [mm]", ".2f"),
@@ -15,7 +15,7 @@ _SHOWN = (  # metric, head, format
 )
 
 _NEAR_SHARE = 0.01  # most near-duplicates of a good data set
-_VERDICTS = (  # column, head, factor, format
+_VERDICT_COLUMNS = (  # column, head, factor, format
     ("contact_at_q", "links at q", 1, ".1f"),
     ("contact_at_grasp", "links at grasp", 1, ".1f"),
     ("slip", "slip [mm]", 1e3, ".1f"),
@@ -58,7 +58,7 @@ def _stage(name: str, left: int, run: dict[str, Any]) -> list[str]:
 
 def validity_table(data: dict[str, Any]) -> str:
     """Median and worst of each metric, a row per object (or set of objects held at once) and one for all."""
-    shown = [s for s in _SHOWN if s[0] in data["metrics"]]
+    shown = [s for s in _METRIC_COLUMNS if s[0] in data["metrics"]]
     columns = ["object", "rows", *(w for s in shown for w in ("median", "best" if s[0] == "epsilon" else "worst"))]
     groups = [("", 2), *((head, 2) for _, head, _ in shown)]
     rows = [[" + ".join(group["objects"]), *_metrics(group, shown)] for group in data["objects"]]
@@ -133,12 +133,13 @@ def _share(group: dict[str, Any], protocol: str) -> str:
 
 def physics_table(data: dict[str, Any]) -> str:
     """What each protocol says of each object: share that holds, the object's mass, means of other verdicts."""
-    rows, columns = [], ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in _VERDICTS)]
+    rows = []
+    columns = ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in _VERDICT_COLUMNS)]
     for group in data["objects"]:
         for name, found in sorted(group["physics"].items()):
             share = f"{found['share']:.1%}" if found["run"] else "-"
             cells = [" + ".join(group["objects"]), name, number(found["run"]), share, _mass(found["protocols"])]
-            for column, _, factor, style in _VERDICTS:
+            for column, _, factor, style in _VERDICT_COLUMNS:
                 mean = found["means"].get(column)
                 cells.append("-" if mean is None else f"{factor * mean:{style}}")
             rows.append(cells)

@@ -14,11 +14,11 @@ from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.surface_visibility import link_surfaces, surface_visibility
 from lgrasp.hand.urdf import Urdf
 
-_POSTURES = 1200
-_LEAST_TIP = 5.0e-5  # [m^2] distal half of a fingertip
-_PALM_SPREAD = 45.0
-_LEAST_AREA = 2.0e-5  # [m^2] contact surface of a link
-_LEAST_PALM = 3.0e-4
+_SAMPLED_POSTURES = 1200
+_MIN_TIP_AREA = 5.0e-5  # [m^2] distal half of a fingertip
+_PALM_SPREAD = 45.0  # [degrees]
+_MIN_LINK_AREA = 2.0e-5  # [m^2] contact surface of a link
+_MIN_PALM_AREA = 3.0e-4  # [m^2]
 _PALM_REACH = 0.10  # [m] from the palm to what is held
 
 
@@ -58,7 +58,7 @@ def survey_contacts(
     model = build_hand(urdf.path, probe_spec(name, tip_link(urdf, structure), locked, structure.base_link))
     rng = np.random.default_rng(0)
     tree = model.tree
-    postures = sample_bodies(model, rng.uniform(tree.joint_lower, tree.joint_upper, (_POSTURES, model.dofs)))
+    postures = sample_bodies(model, rng.uniform(tree.joint_lower, tree.joint_upper, (_SAMPLED_POSTURES, model.dofs)))
     surfaces = link_surfaces(urdf, model)
     used = structure.tips if jaws is None else (int(tree.link_body[tree.link_names.index(jaws[1])]),)
     tips = {b: _tip_point([s for s in surfaces if s.body == b]) for b in used}
@@ -82,7 +82,7 @@ def survey_contacts(
     palm = _palm_sides([s for s in surfaces if s.body == 0], None if hold is None else hold.centre)
     if palm:
         points, normals = _allowed(palm, 0)
-        hold = best_hold([*touches, still_touches("palm", points, normals, 8 * _POSTURES)], blocked)
+        hold = best_hold([*touches, still_touches("palm", points, normals, 8 * _SAMPLED_POSTURES)], blocked)
     return ContactSurvey(model, structure, locked, postures, surfaces, sides, palm, hold)
 
 
@@ -135,21 +135,21 @@ def _finger_sides(structure: FingerStructure, model: HandModel, surfaces: list[S
     across = _across(model, axis, along, tip)
     if across is not None and len(structure.driven_by(tip)) >= 3:
         sides = [_side(s, [(-along, 91.0), (-across, 60.0)]) for s in distal]
-        sides = [side for side in sides if side.area >= _LEAST_TIP]
+        sides = [side for side in sides if side.area >= _MIN_TIP_AREA]
         if sides:
             return sides
     if across is not None:
         axis = across + 0.5 * along
         axis /= np.linalg.norm(axis)
     sides = [_side(s, [(-axis, 105.0)]) for s in distal]
-    sides = [side for side in sides if side.area >= _LEAST_AREA]
+    sides = [side for side in sides if side.area >= _MIN_LINK_AREA]
     before = structure.parent(tip)
     if sides and structure.tree.groups > 1 and before > 0 and before not in structure.tips:
         inner = [s for s in surfaces if s.body == before]
         siblings = [t for t in structure.tips if t != tip and before in structure.path(t)]
         axis = _palmar_axis(model, inner, before) if inner and not siblings else None
         if axis is not None:
-            more = [side for s in inner if (side := _side(s, [(-axis, 120.0)])).area >= _LEAST_AREA]
+            more = [side for s in inner if (side := _side(s, [(-axis, 120.0)])).area >= _MIN_LINK_AREA]
             shown = sum(s.samples.seen[s.chosen].mean() * s.area for s in more)
             if shown > 0.7 * sum(s.samples.seen[s.chosen].mean() * s.area for s in sides) and shown > 1e-4:
                 sides += more
@@ -232,7 +232,7 @@ def _palm_sides(surfaces: list[SurfaceSamples], centre: np.ndarray | None) -> li
         if np.linalg.norm(m) < 1e-9:
             continue
         side = _side(s, [(-m / np.linalg.norm(m), 180.0 - _PALM_SPREAD)])
-        if side.area < _LEAST_PALM or float(s.seen[side.chosen].mean()) < 0.15:
+        if side.area < _MIN_PALM_AREA or float(s.seen[side.chosen].mean()) < 0.15:
             continue
         if not sides or side.axis @ sides[0].axis > 0.94:
             sides.append(side)

@@ -53,35 +53,35 @@ def draft_spec(
     survey = _best_survey(urdf, structure, name, jaws)
     _check_size(urdf, survey)
     _check_hold(urdf, survey)
-    said: list[str] = []
+    decided: list[str] = []
     data: dict[str, Any] = {"name": name, "urdf": urdf_path.name, "base_link": survey.model.tree.base_link}
     if structure.base_link:
-        said.append(f"base frame: '{structure.base_link}', which carries the fingers (base_link)")
+        decided.append(f"base frame: '{structure.base_link}', which carries the fingers (base_link)")
     else:
-        said.append(f"base frame: the root link '{urdf.root}' (base_link)")
+        decided.append(f"base frame: the root link '{urdf.root}' (base_link)")
     data["locked"] = survey.locked
-    said += _say_locked(survey)
+    decided += _say_locked(survey)
     names = finger_names(structure)
     data["static_links"] = [
         n for n, b in zip(survey.model.tree.link_names, survey.model.tree.link_body, strict=True) if b == 0
     ]
     data["contact"] = _contact_rules(survey)
     data["palm"] = _palm_rule(survey)
-    said += _say_contacts(survey, names)
+    decided += _say_contacts(survey, names)
     assert survey.hold is not None
     low, high = np.round(survey.hold.low, 3), np.round(survey.hold.high, 3)
     data["canonical_box"] = {"min": low.tolist(), "max": high.tolist()}
-    said.append(_say_box(survey, names, low, high))
+    decided.append(_say_box(survey, names, low, high))
     drives = [len(d) for tip, d in zip(structure.tips, structure.drives, strict=True) if tip in survey.sides]
     if structure.tree.groups > 1 and np.mean(drives) <= _FEW_DRIVES:
         data["contacts"] = (2, 3)
-        said.append(
+        decided.append(
             "grasps touch with 2 or 3 fingers: fingers of one or two drives seldom meet an object more at "
             "a time (contacts)"
         )
     opened, clear = _open_posture(survey)
     data["open_posture"] = opened
-    said.append(
+    decided.append(
         "open posture: "
         + (
             "free of self-collision, "
@@ -94,17 +94,17 @@ def draft_spec(
         finger: [n for b in np.flatnonzero(structure.tree.body_group == g) for n in structure.links(int(b))]
         for g, finger in enumerate(names)
     }
-    said += [f"note: {note}" for note in survey.model.notes]
+    decided += [f"note: {note}" for note in survey.model.notes]
     spec = HandSpec.model_validate(data)
     if jaws is None:
-        spec, said = _with_shared(urdf, survey, spec, said)
+        spec, decided = _with_shared(urdf, survey, spec, decided)
     # without shared joints the hand is that of the survey in another open posture
     model = build_hand(urdf.path, spec) if spec.shared else replace(survey.model, tree=build_tree(urdf, spec))
-    spaces, told = propose_spaces(urdf, spec, survey, names, model)
-    return spec.model_copy(update={"opposition_spaces": spaces}), [*said, *told]
+    spaces, of_spaces = propose_spaces(urdf, spec, survey, names, model)
+    return spec.model_copy(update={"opposition_spaces": spaces}), [*decided, *of_spaces]
 
 
-def _with_shared(urdf: Urdf, survey: ContactSurvey, spec: HandSpec, said: list[str]) -> tuple[HandSpec, list[str]]:
+def _with_shared(urdf: Urdf, survey: ContactSurvey, spec: HandSpec, decided: list[str]) -> tuple[HandSpec, list[str]]:
     """Locked joints that move several fingers take a few values instead, those aside that the palm rides on."""
     spread = [n for n in spec.locked if n not in survey.structure.carrying]
     spread = [n for n in spread if _freed(urdf, spec, {n: (spec.locked[n],)}) is not None]
@@ -113,13 +113,13 @@ def _with_shared(urdf: Urdf, survey: ContactSurvey, spec: HandSpec, said: list[s
     shared = {n: _around(spec.locked[n], by_name[n].lower, by_name[n].upper, count) for n in spread}
     free = _freed(urdf, spec, shared) if count else None
     if free is None:
-        return spec, said
-    told = [line for line in said if not any(line.startswith(f"joint '{n}' is locked") for n in shared)]
-    told += [
+        return spec, decided
+    decided = [line for line in decided if not any(line.startswith(f"joint '{n}' is locked") for n in shared)]
+    decided += [
         f"joint '{n}' moves several fingers: poses take it at {', '.join(f'{v:g}' for v in values)} (shared)"
         for n, values in shared.items()
     ]
-    return free, told
+    return free, decided
 
 
 def _freed(urdf: Urdf, spec: HandSpec, shared: dict[str, tuple[float, ...]]) -> HandSpec | None:
@@ -249,13 +249,13 @@ def _check_hold(urdf: Urdf, survey: ContactSurvey) -> None:
 
 
 def _say_locked(survey: ContactSurvey) -> list[str]:
-    said = []
+    decided = []
     for joint, value in survey.locked.items():
         why = "it carries the whole hand" if joint in survey.structure.carrying else "it moves several fingers"
         if survey.model.groups == 1:
             why = "it does not move the jaw"
-        said.append(f"joint '{joint}' is locked at {value:g}: {why} (locked)")
-    return said
+        decided.append(f"joint '{joint}' is locked at {value:g}: {why} (locked)")
+    return decided
 
 
 def _contact_rules(survey: ContactSurvey) -> list[dict[str, Any]]:
@@ -281,7 +281,7 @@ def _palm_rule(survey: ContactSurvey) -> dict[str, Any]:
 
 
 def _say_contacts(survey: ContactSurvey, names: list[str]) -> list[str]:
-    said = []
+    decided = []
     group = survey.structure.tree.body_group
     for g, finger in enumerate(names):
         tips = [t for t in survey.structure.tips if group[t] == g]
@@ -291,23 +291,23 @@ def _say_contacts(survey: ContactSurvey, names: list[str]) -> list[str]:
         )
         if sides:
             area = 1e4 * sum(s.area for s in sides.values())
-            said.append(
+            decided.append(
                 f"finger '{finger}': {joints} drives, may touch with {', '.join(sides)} ({area:.1f} cm2; contact)"
             )
         else:
-            said.append(
+            decided.append(
                 f"finger '{finger}': {joints} drives, shows the others no surface, so it touches nothing (contact)"
             )
         if len(tips) > 1:
-            said.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
+            decided.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
     if survey.palm:
         area = 1e4 * sum(s.area for s in survey.palm)
-        said.append(
+        decided.append(
             f"palm: {', '.join(s.samples.link for s in survey.palm)} ({area:.0f} cm2 face the fingertips; palm)"
         )
     else:
-        said.append("palm: none; no static link shows the fingertips 3 cm2 or more (palm)")
-    return said
+        decided.append("palm: none; no static link shows the fingertips 3 cm2 or more (palm)")
+    return decided
 
 
 def _say_box(survey: ContactSurvey, names: list[str], low: np.ndarray, high: np.ndarray) -> str:

@@ -9,7 +9,7 @@ from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Joint, Urdf
 
-_MOST_FINGERS = 6
+_MAX_FINGERS = 6
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,10 @@ def finger_structure(urdf: Urdf, name: str, mover: str | None = None) -> FingerS
             )
     if len(structure.tips) == 0:
         raise HandError(f"URDF {urdf.path}: no moving link has collision geometry; add <collision> to the finger links")
-    if structure.tree.groups > _MOST_FINGERS:
+    if structure.tree.groups > _MAX_FINGERS:
         raise HandError(
             f"URDF {urdf.path} has {structure.tree.groups} parts that move by themselves ({_tip_names(structure)}), at "
-            f"most {_MOST_FINGERS} fingers are supported; cut the URDF down to one hand, or make joints that are no "
+            f"most {_MAX_FINGERS} fingers are supported; cut the URDF down to one hand, or make joints that are no "
             "fingers fixed"
         )
     whole = _carrying(urdf, structure, locked)

@@ -21,8 +21,8 @@ from lgrasp.hand.spec import HandSpec, load_spec
 from lgrasp.hand.urdf import find_mesh, parse_robot, read_urdf
 from lgrasp.paths import user_dir
 
-_DULL = {"hand", "robot", "model", "urdf", "gripper"}
-_LARGE = 5_000_000  # bytes of a mesh file that is worth looking into
+_UNINFORMATIVE_NAMES = {"hand", "robot", "model", "urdf", "gripper"}
+_LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def import_urdf(urdf: Path, *, name: str | None = None, out: Path | None = None,
         HandError: the URDF cannot be used, or the folder exists.
     """
     source = read_urdf(urdf)
-    name = name or _slug(urdf.stem if urdf.stem.lower() not in _DULL else source.name)
+    name = name or _slug(urdf.stem if urdf.stem.lower() not in _UNINFORMATIVE_NAMES else source.name)
     if name != _slug(name):
         raise HandError(f"hand name '{name}' may hold letters, digits, '.', '_' and '-' only, such as '{_slug(name)}'")
     folder = Path(out).expanduser() if out is not None else user_dir("hands") / name
@@ -61,7 +61,7 @@ def import_urdf(urdf: Path, *, name: str | None = None, out: Path | None = None,
         raise HandError(f"hand folder {folder} cannot be made: {error.strerror}; choose another with --out") from None
     originals = {temporary / "hand.urdf": urdf}
     try:
-        spec, said = _fill(urdf, name, temporary, originals)
+        spec, changes = _fill(urdf, name, temporary, originals)
         temporary.chmod(0o755)
         _swap(temporary, folder)
     except LgraspError as error:
@@ -72,7 +72,7 @@ def import_urdf(urdf: Path, *, name: str | None = None, out: Path | None = None,
         raise type(error)(text) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    return ImportedHand(folder, spec, said)
+    return ImportedHand(folder, spec, changes)
 
 
 def _slug(text: str) -> str:
@@ -95,24 +95,24 @@ def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> t
     for note in [e for e in robot.iter() if not isinstance(e.tag, str)]:
         if note.getparent() is not None:
             note.getparent().remove(note)
-    said = _take_visuals(robot)
-    said += _take_meshes(robot, urdf, folder, originals)
+    changes = _take_visuals(robot)
+    changes += _take_meshes(robot, urdf, folder, originals)
     target = folder / "hand.urdf"
     _write(robot, target)
     jaws = find_jaws(target)
     if jaws is not None:
         reroot(robot, jaws[0])
         _write(robot, target)
-        said.append(
+        changes.append(
             f"one drive moves both jaws: '{jaws[0]}' is made the base (the copy of the URDF is turned round; joint "
             f"values mean the same), so that '{jaws[1]}' closes against it as against a palm"
         )
     spec, decided = draft_spec(target, name, jaws=jaws)
     spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {urdf.name}"})
-    write_spec(spec, folder / "hand.yaml", [*said, *decided])
+    write_spec(spec, folder / "hand.yaml", [*changes, *decided])
     written = load_spec(folder / "hand.yaml")
     build_hand(target, written)
-    return written, [*said, *decided]
+    return written, [*changes, *decided]
 
 
 def _write(robot: etree._Element, path: Path) -> None:
@@ -142,7 +142,7 @@ def _take_meshes(robot: etree._Element, urdf: Path, folder: Path, originals: dic
 
     ``originals`` gets the file that each copy was made from.
     """
-    said: list[str] = []
+    changes: list[str] = []
     for kind in ("collision", "visual"):
         copied: dict[Path, str] = {}
         for element in list(robot.iter(kind)):
@@ -154,16 +154,16 @@ def _take_meshes(robot: etree._Element, urdf: Path, folder: Path, originals: dic
                     if kind == "collision":
                         raise
                     element.getparent().remove(element)
-                    said.append(f"link '{link}': visual mesh left out ({str(error).split(': ', 1)[-1]})")
+                    changes.append(f"link '{link}': visual mesh left out ({str(error).split(': ', 1)[-1]})")
                     break
                 if file not in copied:
-                    copied[file] = _copy_mesh(file, folder, kind, set(copied.values()), said)
+                    copied[file] = _copy_mesh(file, folder, kind, set(copied.values()), changes)
                     originals[folder / copied[file]] = file
                 mesh.set("filename", copied[file])
-    return said
+    return changes
 
 
-def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], said: list[str]) -> str:
+def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], changes: list[str]) -> str:
     """Path, relative to the folder, of the copy of a mesh."""
     base = f"meshes/{kind}/{_slug(file.stem)}"
     suffix = file.suffix.lower()
@@ -179,7 +179,7 @@ def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], said: list[
     if thin is not None:
         mesh, before = thin
         mesh.export(target)
-        said.append(f"collision mesh {file.name} has {before:,} faces: thinned to {len(mesh.faces):,}")
+        changes.append(f"collision mesh {file.name} has {before:,} faces: thinned to {len(mesh.faces):,}")
         return name
     shutil.copyfile(file, target)
     if suffix == ".obj":
@@ -192,7 +192,7 @@ def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], said: list[
 
 def _thinned(file: Path) -> tuple[trimesh.Trimesh, int] | None:
     """A huge mesh, thinned, and its faces before; None for others, and for what cannot be read (reported later)."""
-    if file.stat().st_size < _LARGE:
+    if file.stat().st_size < _LARGE_FILE:
         return None
     try:
         mesh = trimesh.load_mesh(file, process=True)

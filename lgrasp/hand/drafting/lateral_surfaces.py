@@ -14,10 +14,10 @@ from lgrasp.hand.surface import SurfaceSamples
 
 _PAD_ANGLE, _LATERAL_ANGLE = 60.0, 45.0  # degrees around the axis
 _LATERAL_BODIES = 3  # the last of a finger
-_BESIDE = 0.5  # cosine of a finger's lateral axis to the way to its neighbour, at least
-_PARALLEL = 0.7  # cosine of neighbours' directions
-_ONE_SIDED = 2.0  # ratio of a joint's room to both sides of its open posture, for it to bend to one
-_ALONG = 0.6  # cosine of the last hinge to the finger's direction, at most
+_MIN_NEIGHBOUR_COSINE = 0.5  # cosine of a finger's lateral axis to the way to its neighbour, at least
+_MIN_PARALLEL_COSINE = 0.7  # cosine of neighbours' directions
+_ONE_SIDED_RATIO = 2.0  # ratio of a joint's room to both sides of its open posture, for it to bend to one
+_MAX_HINGE_COSINE = 0.6  # cosine of the last hinge to the finger's direction, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def _finger(survey: ContactSurvey, model: HandModel, standing: Postures, group: 
         hinge = R @ tree.joint_axis[tip - 1].astype(float)
         along = R @ _middle(surfaces)
         axis = pad_axis(survey.model, surfaces, tip)
-        if not tree.joint_prismatic[tip - 1] and abs(hinge @ along) < _ALONG * np.linalg.norm(along):
+        if not tree.joint_prismatic[tip - 1] and abs(hinge @ along) < _MAX_HINGE_COSINE * np.linalg.norm(along):
             axis = _flexed(survey, model, tip, R.T @ np.cross(hinge, along), axis)
             hinges.append(hinge)
         pads += [(s, axis) for s in surfaces if axis is not None]
@@ -131,7 +131,7 @@ def _flexed(survey: ContactSurvey, model: HandModel, tip: int, way: np.ndarray, 
     room = tree.joint_mult[k] * (limits - model.tree.joint_open[column])
     down, up = -min(room), max(room)
     way = way / np.linalg.norm(way)
-    if seen is not None and max(up, down) < _ONE_SIDED * min(up, down):
+    if seen is not None and max(up, down) < _ONE_SIDED_RATIO * min(up, down):
         return way if way @ seen > 0 else -way
     return way if up > down else -way
 
@@ -156,8 +156,8 @@ def neighbours(fingers: list[Finger]) -> set[Beside]:
             if (
                 b is not a
                 and b.lateral_surfaces
-                and sign * (a.lateral @ way) > _BESIDE * far
-                and a.along @ b.along > _PARALLEL
+                and sign * (a.lateral @ way) > _MIN_NEIGHBOUR_COSINE * far
+                and a.along @ b.along > _MIN_PARALLEL_COSINE
             ):
                 near.append((far, b.name))
         return min(near)[1] if near else None

@@ -14,9 +14,9 @@ from lgrasp.hand.spec import Box, Cone, HandSpec, OppositionSpace, Surface
 from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.urdf import Urdf
 
-_STRAIGHT = 0.9  # cosine of an axis of a palm link to the way across the palm, for the palm to be cut
-_ALIKE = 0.99  # cosine of these axes of several palm links
-_MARGIN = 0.005  # [m] of a part of the palm beyond its surface
+_MIN_ACROSS_COSINE = 0.9  # cosine of an axis of a palm link to the way across the palm, for the palm to be cut
+_MIN_ALIKE_COSINE = 0.99  # cosine of these axes of several palm links
+_PALM_PART_MARGIN = 0.005  # [m] of a part of the palm beyond its surface
 
 
 def propose_spaces(
@@ -49,11 +49,13 @@ def propose_spaces(
         name = name if name not in spaces else f"{name}-side"
         spaces[name] = space
         kept.append(f"{name} ({1e3 * best.low:.0f}-{1e3 * best.high:.0f} mm)")
-    said = [f"opposition spaces, and how far apart their sides face each other: {', '.join(kept)} (opposition_spaces)"]
+    decided = [
+        f"opposition spaces, and how far apart their sides face each other: {', '.join(kept)} (opposition_spaces)"
+    ]
     if not kept:
-        said = ["opposition spaces: none, so 'lgrasp sequence' cannot use this hand (opposition_spaces)"]
-    said += [f"no opposition space {', '.join(names)}: {problem}" for problem, names in dropped.items()]
-    return spaces, said
+        decided = ["opposition spaces: none, so 'lgrasp sequence' cannot use this hand (opposition_spaces)"]
+    decided += [f"no opposition space {', '.join(names)}: {problem}" for problem, names in dropped.items()]
+    return spaces, decided
 
 
 def _candidates(
@@ -110,20 +112,20 @@ def _cut_palm(spec: HandSpec, survey: ContactSurvey, row: list[Finger]) -> list[
     main = {link: int(np.argmax(np.abs(T[:3, :3].T @ way))) for link, T in frames.items()}
     across = {link: T[:3, main[link]] * np.sign(T[:3, main[link]] @ way) for link, T in frames.items()}
     first = next(iter(across.values()))
-    if first @ way < _STRAIGHT or any(axis @ first < _ALIKE for axis in across.values()):
+    if first @ way < _MIN_ACROSS_COSINE or any(axis @ first < _MIN_ALIKE_COSINE for axis in across.values()):
         return []
     cone = spec.palm.allowed[0]
     points = {side.samples.link: _in_cone(side.samples, cone) for side in survey.palm}
     place = np.concatenate([p @ first for p in points.values()])
     edges = np.linspace(place.min(), place.max(), len(row) + 1)
-    edges[[0, -1]] += [-_MARGIN, _MARGIN]
+    edges[[0, -1]] += [-_PALM_PART_MARGIN, _PALM_PART_MARGIN]
     parts = []
     for low, high in pairwise(edges):
         part = []
         for link, p in points.items():
             T, k = frames[link], main[link]
             local = (p - T[:3, 3]) @ T[:3, :3]
-            box = np.array([local.min(0) - _MARGIN, local.max(0) + _MARGIN])
+            box = np.array([local.min(0) - _PALM_PART_MARGIN, local.max(0) + _PALM_PART_MARGIN])
             ends = (np.array([low, high]) - T[:3, 3] @ first) * np.sign(T[:3, k] @ first)
             box[:, k] = np.sort(ends)
             if ((p @ first >= low) & (p @ first <= high)).any():

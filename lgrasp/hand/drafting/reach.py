@@ -7,13 +7,13 @@ import numpy as np
 
 from lgrasp.hand.postures import Postures
 
-_CELL = 0.010  # [m], more where fingers reach farther than hands do
-_MOST_CELLS = 400_000
-_RADII = (0.02, 0.025, 0.03)  # of the balls that are held [m]
+_MIN_CELL = 0.010  # [m], more where fingers reach farther than hands do
+_MAX_CELLS = 400_000
+_BALL_RADII = (0.02, 0.025, 0.03)  # of the balls that are held [m]
 _PALM_WEIGHT = 0.02  # of a finger against the palm, where fingers could face each other
-_FULL = 4.0  # votes at which a finger counts as able to touch from a direction
-_LEAST = 0.020  # half edges of the box [m]
-_MOST = 0.035
+_FULL_VOTES = 4.0  # votes at which a finger counts as able to touch from a direction
+_MIN_HALF_EDGE = 0.020  # half edges of the box [m]
+_MAX_HALF_EDGE = 0.035  # [m]
 
 
 @dataclass(frozen=True)
@@ -98,21 +98,21 @@ def best_hold(touches: list[Touch], blocked) -> Hold | None:
     touches = [t for t in touches if len(t.points)]
     if len(touches) < 2:
         return None
-    centres = [np.vstack([t.points + r * t.normals for r in _RADII]) for t in touches]
+    centres = [np.vstack([t.points + r * t.normals for r in _BALL_RADII]) for t in touches]
     low, high = np.min([c.min(0) for c in centres], 0), np.max([c.max(0) for c in centres], 0)
-    size = max(_CELL, float(np.prod(high - low) / _MOST_CELLS) ** (1 / 3))
+    size = max(_MIN_CELL, float(np.prod(high - low) / _MAX_CELLS) ** (1 / 3))
     shape = np.floor((high - low) / size).astype(int) + 1
     axes = _directions()
     able = []
     for t, c in zip(touches, centres, strict=True):
         cell = np.ravel_multi_index(tuple(np.floor((c - low) / size).astype(int).T), tuple(shape))
-        side = np.tile(np.argmax(t.normals @ axes.T, 1), len(_RADII))
+        side = np.tile(np.argmax(t.normals @ axes.T, 1), len(_BALL_RADII))
         votes = np.bincount(cell * len(axes) + side, minlength=int(shape.prod()) * len(axes)).astype(np.float32)
         # neighbouring directions count as well
         votes = _smooth(votes.reshape(*shape, len(axes))).reshape(-1, len(axes)) @ (axes @ axes.T > 0.85).astype(
             np.float32
         )
-        able.append(np.minimum(votes * (20_000 / len(c)) / _FULL / 8, 1.0))
+        able.append(np.minimum(votes * (20_000 / len(c)) / _FULL_VOTES / 8, 1.0))
     places = low + (np.stack(np.unravel_index(np.arange(shape.prod()), tuple(shape)), -1) + 0.5) * size
     free = ~blocked(places)
     opposite = axes @ axes.T < -0.82
@@ -142,7 +142,7 @@ def best_hold(touches: list[Touch], blocked) -> Hold | None:
     near = (grid > 0.6 * grid[best]) & (np.linalg.norm(places - places[best], axis=1) < 0.05)
     weight = grid[near] / grid[near].sum()
     centre = weight @ places[near]
-    half = np.clip(1.3 * np.sqrt(weight @ (places[near] - centre) ** 2), _LEAST, _MOST)
+    half = np.clip(1.3 * np.sqrt(weight @ (places[near] - centre) ** 2), _MIN_HALF_EDGE, _MAX_HALF_EDGE)
     strength = {k: float(min(1.0, v[near].max())) for k, v in pairs.items()}
     reached = {t.name: float(a[near].max()) for t, a in zip(touches, able, strict=True)}
     return Hold(float(grid[best]), centre, centre - half, centre + half, reached, strength)

@@ -9,14 +9,14 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space, SpaceSide
 from lgrasp.hand.postures import Postures, sample_bodies
 
-_CONE = np.cos(np.radians(35.0))  # of each hand normal to the line between the two, at least
-_PALM_CONE = np.cos(np.radians(16.0))  # of the palm's, which no finger can turn
-_WIDTHS = (0.002, 0.20)  # [m]
-_POSTURES = 1200
-_DRAWN = 400_000  # pairs of points that are looked at
-_LEAST = 100  # of them that must face each other for a space to hold anything
-_PRESSED = 0.3  # share of those that a joint must move towards each other
-_LEAST_SPEED = 5.0e-3  # [m/rad] of a contact that a joint moves
+_MIN_FACING_COSINE = np.cos(np.radians(35.0))  # of each hand normal to the line between the two, at least
+_MIN_PALM_COSINE = np.cos(np.radians(16.0))  # of the palm's, which no finger can turn
+_WIDTH_RANGE = (0.002, 0.20)  # [m]
+_SAMPLED_POSTURES = 1200
+_PAIRS_DRAWN = 400_000  # pairs of points that are looked at
+_MIN_FACING_PAIRS = 100  # of them that must face each other for a space to hold anything
+_MIN_PRESSED_SHARE = 0.3  # share of those that a joint must move towards each other
+_MIN_SPEED = 5.0e-3  # [m/rad] of a contact that a joint moves
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Opening:
         """Why the space can hold nothing; empty when it can."""
         if not np.isfinite(self.low):
             return "its sides never face each other"
-        return "" if self.pressed > _PRESSED else "no joint of it moves its sides towards each other"
+        return "" if self.pressed > _MIN_PRESSED_SHARE else "no joint of it moves its sides towards each other"
 
 
 def opposed(
@@ -47,18 +47,18 @@ def opposed(
     """
     line = q - p
     width = np.linalg.norm(line, axis=1)
-    limit = _CONE * width
-    good = (np.einsum("nd,nd->n", line, n) > limit) & (width > _WIDTHS[0]) & (width < _WIDTHS[1])
-    good &= np.einsum("nd,nd->n", line, m) < -(_PALM_CONE * width if still else limit)
+    limit = _MIN_FACING_COSINE * width
+    good = (np.einsum("nd,nd->n", line, n) > limit) & (width > _WIDTH_RANGE[0]) & (width < _WIDTH_RANGE[1])
+    good &= np.einsum("nd,nd->n", line, m) < -(_MIN_PALM_COSINE * width if still else limit)
     return good, width
 
 
 def space_postures(model: HandModel, device: str = "cpu") -> Postures:
     """Random postures of a hand; row r has the shared joints at setting r modulo the number of settings."""
     tree = model.tree
-    q = np.random.default_rng(0).uniform(tree.joint_lower, tree.joint_upper, (_POSTURES, model.dofs))
+    q = np.random.default_rng(0).uniform(tree.joint_lower, tree.joint_upper, (_SAMPLED_POSTURES, model.dofs))
     shared = np.isin(tree.joint_names, tree.shared_names)
-    q[:, shared] = np.resize(tree.settings[:, shared], (_POSTURES, int(shared.sum())))
+    q[:, shared] = np.resize(tree.settings[:, shared], (_SAMPLED_POSTURES, int(shared.sum())))
     return sample_bodies(model, q, device)
 
 
@@ -72,7 +72,7 @@ def space_opening(model: HandModel, postures: Postures, space: Space, sides: tup
     still = second.links[0].group == model.groups
     rng = np.random.default_rng(1)
     settings = len(model.tree.settings)
-    count = _DRAWN // settings
+    count = _PAIRS_DRAWN // settings
     widths, pressed = [np.zeros(0)], 0
     for setting in range(settings):
         ends = [_contacts(model, postures, side, setting, settings, count, rng) for side in (first, second)]
@@ -85,7 +85,7 @@ def space_opening(model: HandModel, postures: Postures, space: Space, sides: tup
         widths.append(width[good])
         pressed += int((moves[0] | moves[1]).sum())
     width = np.concatenate(widths)
-    low, high = np.percentile(width, [0.1, 99.9]) if len(width) >= _LEAST else (np.nan, np.nan)
+    low, high = np.percentile(width, [0.1, 99.9]) if len(width) >= _MIN_FACING_PAIRS else (np.nan, np.nan)
     return Opening(len(width) / (count * settings), pressed / max(len(width), 1), float(low), float(high))
 
 
@@ -146,4 +146,4 @@ def _moves_along(
             j = -1 if up < 0 else int(tree.joint_first[group]) + up
     speed = np.linalg.norm(velocity[joints], axis=2)
     along = np.abs(np.einsum("jnd,nd->jn", velocity[joints], line))
-    return ((along > 0.5 * speed) & (speed > _LEAST_SPEED)).any(0)
+    return ((along > 0.5 * speed) & (speed > _MIN_SPEED)).any(0)

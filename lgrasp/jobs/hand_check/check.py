@@ -20,7 +20,7 @@ from lgrasp.jobs.hand_check.diagnose import diagnose, hand_findings
 from lgrasp.jobs.hand_check.pictures import draw_grasps, draw_hand, draw_palmar, draw_spaces, draw_workspace
 from lgrasp.jobs.hand_check.space_check import SpaceCheck, check_spaces, longest_sequence
 
-_EFFORT = 300  # candidates per row before an object is given up
+_CANDIDATES_PER_ROW = 300  # candidates per row before an object is given up
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def check_hand(
     """
     say = report or (lambda line: None)
     cache = cache or Cache()
-    bounded = pipeline.model_copy(update={"effort": _EFFORT})
+    bounded = pipeline.model_copy(update={"effort": _CANDIDATES_PER_ROW})
     result: HandCheck | None = None
     shards: dict[str, Shard] = {}
     inputs: Inputs | None = None

@@ -11,11 +11,11 @@ from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.math.transforms import NORMAL_BINS
 
-_SHOWN = 20_000  # contact vectors of a finger that are looked at
-_NEAR = 0.015  # [m]
-_FACING = 0.95  # cosine
-_CHECKED = 0.05  # [m] size of the objects that a hand is tried on
-_POOR = 0.02  # share of survivors below which a stage counts as the bottleneck
+_VECTORS_EXAMINED = 20_000  # contact vectors of a finger that are looked at
+_NEAR_DISTANCE = 0.015  # [m]
+_MIN_FACING_COSINE = 0.95  # cosine
+_OBJECT_SIZE = 0.05  # [m] size of the objects that a hand is tried on
+_POOR_SURVIVAL = 0.02  # share of survivors below which a stage counts as the bottleneck
 
 
 def finger_label(model: HandModel, names: dict[str, tuple[str, ...]], group: int) -> str:
@@ -34,7 +34,7 @@ def field_vectors(field: ContactField, group: int, groups: int) -> tuple[np.ndar
     Those of all settings of the shared joints together; ``groups`` is the number of groups of the hand.
     """
     slots = range(group, len(field.shape), groups)
-    parts = [_slot_vectors(field, slot, _SHOWN // len(slots)) for slot in slots]
+    parts = [_slot_vectors(field, slot, _VECTORS_EXAMINED // len(slots)) for slot in slots]
     return np.concatenate([p for p, _ in parts]), np.concatenate([n for _, n in parts])
 
 
@@ -70,7 +70,7 @@ def _touches(model: HandModel, field: ContactField) -> list[Touch]:
     touches = [Touch(str(g), *field_vectors(field, g, model.groups)) for g in range(model.groups)]
     a, b = model.contact_first[model.groups : model.groups + 2]
     if b > a:
-        touches.append(still_touches("palm", model.contact_points[a:b], model.contact_normals[a:b], _SHOWN))
+        touches.append(still_touches("palm", model.contact_points[a:b], model.contact_normals[a:b], _VECTORS_EXAMINED))
     return touches
 
 
@@ -112,7 +112,7 @@ def hand_findings(model: HandModel, field: ContactField, names: dict[str, tuple[
         )
         found["place"] += found["search"]
     widest = _widest_gap(model, field)
-    if widest is not None and widest < _CHECKED:
+    if widest is not None and widest < _OBJECT_SIZE:
         found["search"].append(
             f"where the two contact surfaces face each other they are at most {1000 * widest:.0f} mm apart: objects "
             "with parallel sides must be narrower, or contact and palm must name surface that faces farther apart"
@@ -136,9 +136,9 @@ def _widest_gap(model: HandModel, field: ContactField) -> float | None:
     )
     way = r[None] - p[:, None]
     far = np.maximum(np.linalg.norm(way, axis=2), 1e-9)
-    facing = np.einsum("ijk,ik->ij", way, n) > _FACING * far
-    facing &= np.einsum("ijk,jk->ij", way, m) < -_FACING * far
-    facing &= n @ m.T < -_FACING
+    facing = np.einsum("ijk,ik->ij", way, n) > _MIN_FACING_COSINE * far
+    facing &= np.einsum("ijk,jk->ij", way, m) < -_MIN_FACING_COSINE * far
+    facing &= n @ m.T < -_MIN_FACING_COSINE
     return float(far[facing].max()) if facing.any() else 0.0
 
 
@@ -146,7 +146,7 @@ def _near_share(vectors: np.ndarray, points: np.ndarray) -> float:
     """Share of points with a contact vector close by."""
     if not len(vectors):
         return 0.0
-    return float((cKDTree(vectors).query(points, distance_upper_bound=_NEAR)[0] < np.inf).mean())
+    return float((cKDTree(vectors).query(points, distance_upper_bound=_NEAR_DISTANCE)[0] < np.inf).mean())
 
 
 def diagnose(inputs: Inputs, counts: dict[str, dict[str, int]], rows: int, asked: int) -> list[str]:
@@ -178,7 +178,7 @@ def _outcomes(model: HandModel, counts: dict[str, dict[str, int]]) -> list[str]:
     """What the ik and filter stages say of candidates and sets that nearly became grasps."""
     lines = []
     ik = counts.get("ik", {})
-    if ik.get("tried", 0) > 100 and ik.get("kept", 0) < _POOR * ik.get("reached", 0):
+    if ik.get("tried", 0) > 100 and ik.get("kept", 0) < _POOR_SURVIVAL * ik.get("reached", 0):
         share = 100 * ik.get("kept", 0) / max(ik.get("reached", 0), 1)
         lines.append(
             f"ik: only {share:.1f} % of the contacts that are reached leave the finger clear of the object: parts "

@@ -25,9 +25,9 @@ from lgrasp.refine.visible_surface import visible_surface
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#e377c2", "#17becf")
 _PALM = "#e8a400"
 _LINK = "#c4c8cc"
-_PULLS = {DISTAL: "#d62728", OTHER: "#f2b134"}  # palmar points by their weight
+_WEIGHT_COLOURS = {DISTAL: "#d62728", OTHER: "#f2b134"}  # palmar points by their weight
 _OBJECT = "#ff9a3c"
-_FACES = 2500  # of a link
+_MAX_LINK_FACES = 2500  # of a link
 
 
 def draw_hand(inputs: Inputs, path: Path) -> Path:
@@ -80,7 +80,7 @@ def draw_palmar(inputs: Inputs, path: Path) -> Path:
         own, tint = side.link == model.tree.link_names.index(samples.link), shade(placed, _LINK)
         if own.any():
             pulled = _seen_faces(mesh, samples, side.points[own])
-            tint[pulled] = shade(placed[pulled], _PULLS[DISTAL if samples.body in last else OTHER])
+            tint[pulled] = shade(placed[pulled], _WEIGHT_COLOURS[DISTAL if samples.body in last else OTHER])
         triangles.append(placed)
         colours.append(tint)
     figure = new_figure(16, 5.6)
@@ -89,7 +89,7 @@ def draw_palmar(inputs: Inputs, path: Path) -> Path:
         add_triangles(axes, np.concatenate(triangles), np.concatenate(colours))
         frame_points(axes, _hand_points(inputs, q), _palmar_direction(inputs), turn)
     words = {DISTAL: "last links", OTHER: "other links"}
-    marks = [Patch(color=colour, label=f"{words[w]}, weight {w:g}") for w, colour in _PULLS.items()]
+    marks = [Patch(color=colour, label=f"{words[w]}, weight {w:g}") for w, colour in _WEIGHT_COLOURS.items()]
     figure.legend(handles=[*marks, Patch(color=_LINK, label="not palmar")], loc="lower center", ncols=3, frameon=False)
     figure.suptitle(f"{model.name}: palmar side, from the front, both sides and the back")
     return save_figure(figure, path)
@@ -104,7 +104,9 @@ def draw_grasps(inputs: Inputs, samples: list[tuple[str, Shard, int]], path: Pat
         triangles, colours = _hand_triangles(inputs, shard.grasps.q[row], patches=True)
         obj = shard.objects[0]
         pose = pose_matrix(shard.grasps.object_pose[row, 0])
-        mesh = thin_mesh(trimesh.Trimesh(np.asarray(obj.vertices), np.asarray(obj.faces), process=False), _FACES)
+        mesh = thin_mesh(
+            trimesh.Trimesh(np.asarray(obj.vertices), np.asarray(obj.faces), process=False), _MAX_LINK_FACES
+        )
         vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
         solid = vertices[mesh.faces]
         add_triangles(axes, np.vstack([triangles, solid]), np.vstack([colours, shade(solid, _OBJECT)]))
@@ -171,9 +173,9 @@ def _hand_meshes(inputs: Inputs, q: np.ndarray) -> list[tuple[SurfaceSamples, tr
     R, t = postures.R[0], postures.t[0]
     out = []
     for samples in link_surfaces(read_urdf(inputs.keys.source.urdf), model):
-        mesh = thin_mesh(samples.mesh, _FACES)
-        if len(mesh.faces) < _FACES:
-            edge = max(0.008, float(np.sqrt(4 * mesh.area / _FACES)))
+        mesh = thin_mesh(samples.mesh, _MAX_LINK_FACES)
+        if len(mesh.faces) < _MAX_LINK_FACES:
+            edge = max(0.008, float(np.sqrt(4 * mesh.area / _MAX_LINK_FACES)))
             mesh = trimesh.Trimesh(
                 *trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge)[:2], process=False
             )

@@ -33,7 +33,7 @@ ROUNDS = (3, 6, 10, 13)
 """Outer steps of the refiner that the published table has."""
 
 _FORMAT, _VERSION = "lgrasp-coarse", 1
-_LEAST = 16  # grasps to learn from
+_MIN_GRASPS = 16  # grasps to learn from
 
 
 class FitJob(Job):
@@ -84,9 +84,9 @@ class FitJob(Job):
         p, device = self.params, self.device_used.alias
         hand, train, held_out = _examples(self.shards, self.hand, p, self.cache, device)
         grasps = sum(len(e.q) for e in train)
-        if grasps < _LEAST:
+        if grasps < _MIN_GRASPS:
             raise ConfigError(
-                f"{', '.join(map(str, self.shards))}: {grasps} grasps; at least {_LEAST} are needed to learn from"
+                f"{', '.join(map(str, self.shards))}: {grasps} grasps; at least {_MIN_GRASPS} are needed to learn from"
             )
         trainer = Trainer(hand, train, p, device=device)
         start = time.perf_counter()

@@ -25,11 +25,11 @@ from lgrasp.refine.improve import improve
 from lgrasp.refine.refiner import Pose, Refiner, table_pose
 from lgrasp.stages.refine.params import RefineParams
 
-_ROWS = 256  # at a time
-_FAR = 0.5  # [m] from the object: nothing pulls there
-_BETTER = 1e-3  # of a unit pull that must be resisted more to replace a valid row
-_ROUNDING = 1e-6  # [m] of a pose in a file
-_LIMIT = 1e-4  # [rad or m] that a joint may be outside its limits
+_BATCH_ROWS = 256  # at a time
+_MAX_OBJECT_DISTANCE = 0.5  # [m] from the object: nothing pulls there
+_MIN_GAIN = 1e-3  # of a unit pull that must be resisted more to replace a valid row
+_POSE_ROUNDING = 1e-6  # [m] of a pose in a file
+_JOINT_TOLERANCE = 1e-4  # [rad or m] that a joint may be outside its limits
 
 
 class Moved(NamedTuple):
@@ -77,11 +77,11 @@ def move_rows(
     arrays = upload_object(obj, hand.device)
     outside = _outside(rows, hand)
     parts = []
-    for first in range(0, len(rows), _ROWS):
-        part = slice(first, first + _ROWS)
+    for first in range(0, len(rows), _BATCH_ROWS):
+        part = slice(first, first + _BATCH_ROWS)
         parts.append(_moved_part(refiner, hand, arrays, rows, part, params, bounds, stored))
         if progress:
-            progress(min(first + _ROWS, len(rows)))
+            progress(min(first + _BATCH_ROWS, len(rows)))
     table = join_grasps([p.table for p in parts])
     first_energy, last_energy = (np.concatenate(x, 1) for x in zip(*(p.energy for p in parts), strict=True))
     was, known, taken, good = (np.concatenate([p.marks[k] for p in parts]) for k in range(4))
@@ -137,13 +137,13 @@ def _moved_part(
     tries = np.where(was | (params.matching_rounds == 0), 1, params.tries)
     new, outcome = improve(refiner.search, hand, obj, pose, q, bounds, tries=tries, index=index)
     good = outcome == Outcome.KEPT
-    lower = new.metrics["unresisted_load"] < old.metrics["unresisted_load"] - _BETTER
+    lower = new.metrics["unresisted_load"] < old.metrics["unresisted_load"] - _MIN_GAIN
     taken = ~was | (good & lower)
     at = np.flatnonzero(taken)
     new = widen_grasps(new, old.contact_links.shape[1])
     table = choose_grasps(widen_grasps(old, new.contact_links.shape[1]), new, at, at)
     energy = tuple(_numbers(refiner.energy(*pose)) for pose in (given, table_pose(table, hand.device)))
-    far = int((_distance(given, refiner) > _FAR).sum())
+    far = int((_distance(given, refiner) > _MAX_OBJECT_DISTANCE).sum())
     return _Part(table, (energy[0], energy[1]), (was, known, taken, good), far)
 
 
@@ -151,12 +151,12 @@ def _rounded(bounds: GraspBounds) -> GraspBounds:
     """The bounds for rows from a file, whose poses and contacts were rounded in it."""
     return bounds.model_copy(
         update={
-            "max_gap": bounds.max_gap + _ROUNDING,
-            "max_penetration": bounds.max_penetration + _ROUNDING,
-            "min_self_distance": max(bounds.min_self_distance - _ROUNDING, 0.0),
-            "max_normal_angle": bounds.max_normal_angle + np.degrees(10 * _ROUNDING),
-            "max_gswo": bounds.max_gswo + 100 * _ROUNDING,
-            "max_unresisted_load": bounds.max_unresisted_load + 1000 * _ROUNDING,
+            "max_gap": bounds.max_gap + _POSE_ROUNDING,
+            "max_penetration": bounds.max_penetration + _POSE_ROUNDING,
+            "min_self_distance": max(bounds.min_self_distance - _POSE_ROUNDING, 0.0),
+            "max_normal_angle": bounds.max_normal_angle + np.degrees(10 * _POSE_ROUNDING),
+            "max_gswo": bounds.max_gswo + 100 * _POSE_ROUNDING,
+            "max_unresisted_load": bounds.max_unresisted_load + 1000 * _POSE_ROUNDING,
         }
     )
 
@@ -170,7 +170,7 @@ def _some(rows: GraspRows, chosen: np.ndarray) -> GraspRows:
 def _outside(rows: GraspRows, hand: HandArrays) -> np.ndarray:
     """Rows with joints outside their limits, (N,) bool."""
     limits, q = hand.model.tree.listed_limits, np.asarray(rows.q)
-    return np.asarray(((q < limits[:, 0] - _LIMIT) | (q > limits[:, 1] + _LIMIT)).any(1))
+    return np.asarray(((q < limits[:, 0] - _JOINT_TOLERANCE) | (q > limits[:, 1] + _JOINT_TOLERANCE)).any(1))
 
 
 def _hands(rows: GraspRows, part: slice, hand: HandArrays, obj: ObjectModel) -> tuple[np.ndarray, np.ndarray]:

@@ -32,9 +32,9 @@ from lgrasp.scenes.reader import scene_cloud
 VERSION = 2
 """Raised whenever plans change for the same parameters."""
 
-_REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way
+_OBSTACLE_REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way
 _LEAST_AROUND = 50
-_FARTHEST = 1.0  # [m] of a base from a start
+_MAX_BASE_DISTANCE = 1.0  # [m] of a base from a start
 
 
 class PlanJob(Job):
@@ -103,8 +103,10 @@ class PlanJob(Job):
             raise ConfigError("--mask, --label and --viewpoint belong to --cloud")
         if self.starts < 1:
             raise ConfigError(f"--starts {self.starts}: at least 1")
-        if self.stand_off is not None and not 0 < self.stand_off <= _FARTHEST:
-            raise ConfigError(f"--stand-off {self.stand_off:g}: more than 0 and at most {_FARTHEST:g} m is accepted")
+        if self.stand_off is not None and not 0 < self.stand_off <= _MAX_BASE_DISTANCE:
+            raise ConfigError(
+                f"--stand-off {self.stand_off:g}: more than 0 and at most {_MAX_BASE_DISTANCE:g} m is accepted"
+            )
         if not self.params.distal + self.params.other > 0:
             raise ConfigError("--distal 0 --other 0: nothing pulls the hand to the object; give one of them a weight")
         source, _, model, _ = self._models()
@@ -237,7 +239,7 @@ def _cloud_models(cloud: Cloud, name: str) -> tuple[ObjectModel, ObjectModel | N
     if cloud.target.all():
         return model, None
     rest = cloud.only(~cloud.target)
-    near = (abs(rest.points - model.center) < model.extents.max() + _REACH).all(1)
+    near = (abs(rest.points - model.center) < model.extents.max() + _OBSTACLE_REACH).all(1)
     if near.sum() < _LEAST_AROUND:
         return model, None
     around = cloud_object(rest.points[near] - model.center, rest.normals[near], name="around", centred=False)

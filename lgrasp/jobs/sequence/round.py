@@ -23,7 +23,7 @@ from lgrasp.sequence.stage import run as grow
 from lgrasp.stages.context import Context
 
 _CPU_CHUNK = 1024  # candidates of a thread at a time
-_CHOICE = 4  # grasps among which policy lookahead chooses, for each that is continued
+_LOOKAHEAD_CHOICES = 4  # grasps among which policy lookahead chooses, for each that is continued
 
 Verdicts = Callable[[list[SequenceTable]], dict[str, np.ndarray]]
 """Columns of a simulator for the rows of the last of some levels; the one whose name ends with ``_holds`` decides."""
@@ -128,7 +128,7 @@ class _Search:
     @property
     def wanting(self) -> np.ndarray:
         """Rows that have not enough grasps yet, (N,) bool."""
-        return self._have < self._params.branch * (_CHOICE if self._params.policy == "lookahead" else 1)
+        return self._have < self._params.branch * (_LOOKAHEAD_CHOICES if self._params.policy == "lookahead" else 1)
 
     def go_on(self, chosen: np.ndarray, number: int, wave: int) -> None:
         """Give some rows a wave of candidates with a space."""

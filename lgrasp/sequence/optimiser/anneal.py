@@ -10,7 +10,7 @@ from lgrasp.sequence.optimiser.culling import Culling
 from lgrasp.sequence.optimiser.params import OptimiserParams
 from lgrasp.sequence.optimiser.replay import replayed
 
-_DRAWS = 5  # uniform numbers of a row and step: acceptance, two switches, two contact points
+_DRAWS_PER_STEP = 5  # uniform numbers of a row and step: acceptance, two switches, two contact points
 
 
 class Chain(NamedTuple):
@@ -85,7 +85,7 @@ def run_chain(
 
     def advance(step: torch.Tensor, chain: Chain) -> Chain:
         w = weights.index_select(0, step[None])[0]
-        u = uniforms(seed, step, _DRAWS)
+        u = uniforms(seed, step, _DRAWS_PER_STEP)
         contact = torch.where(u[:, 1:3] < switch, (u[:, 3:] * counts).to(torch.int64), chain.contact)
         there, memory = proposals.propose(step, chain)
         terms, gradient = proposals.evaluate(there, contact, w)

@@ -7,11 +7,11 @@ import torch
 from lgrasp.geometry.rotations import matrix_from_sixd
 from lgrasp.sequence.optimiser.problem import GraspProblem
 
-_GAP = 0.002
-_BEND = 1 - math.cos(math.radians(20))
-_FC = 0.1
+_GAP_SCALE = 0.002  # [m]
+_ANGLE_SCALE = 1 - math.cos(math.radians(20))
+_BALANCE_SCALE = 0.1
 """A gap [m], 1 - cosine of the angle of the normals, and an energy fc that count alike."""
-_NEAREST, _BEST = 32, 12  # points of a side whose normals are looked at, and those that are paired
+_POINTS_EXAMINED, _POINTS_PAIRED = 32, 12  # points of a side whose normals are looked at, and those that are paired
 
 
 @torch.no_grad()
@@ -29,19 +29,19 @@ def touching_points(problem: GraspProblem, x: torch.Tensor) -> torch.Tensor:
     at, _ = problem.sides.placed(points, bodies)
     local = _back(R, at - t[:, None, None])
     gap = torch.where(listed, problem.energy.distance(local).abs(), torch.inf)
-    gap, near = gap.topk(min(_NEAREST, gap.shape[2]), largest=False)
+    gap, near = gap.topk(min(_POINTS_EXAMINED, gap.shape[2]), largest=False)
     points = points.gather(2, near)
     local, normal = torch.take_along_dim(local, near[..., None], 2), _back(R, problem.sides.placed(points, bodies)[1])
     outward = problem.energy.normals(local)
-    badness = gap / _GAP + (1 + (normal * outward).sum(-1)) / _BEND
-    badness, best = badness.topk(min(_BEST, gap.shape[2]), largest=False)  # (N, 2, B)
+    badness = gap / _GAP_SCALE + (1 + (normal * outward).sum(-1)) / _ANGLE_SCALE
+    badness, best = badness.topk(min(_POINTS_PAIRED, gap.shape[2]), largest=False)  # (N, 2, B)
     chosen = [torch.take_along_dim(v, best[..., None], 2) for v in (local, outward)]
     pair = [v[:, side] for v in chosen for side in (0, 1)]  # each (N, B, 3): places of both sides, normals of both
     first, second = (v.shape[1] for v in pair[:2])
     x2 = torch.stack([pair[0][:, :, None].expand(-1, -1, second, 3), pair[1][:, None].expand(-1, first, -1, 3)], 3)
     n2 = torch.stack([pair[2][:, :, None].expand(-1, -1, second, 3), pair[3][:, None].expand(-1, first, -1, 3)], 3)
     fc = problem.energy.balance(x2.reshape(-1, 2, 3), n2.reshape(-1, 2, 3)).reshape(len(x), first, second)
-    total = badness[:, 0, :, None] + badness[:, 1, None] + fc / _FC
+    total = badness[:, 0, :, None] + badness[:, 1, None] + fc / _BALANCE_SCALE
     flat = total.flatten(1).argmin(1)
     rank = torch.stack([flat // second, flat % second], 1)[..., None]
     return near.gather(2, best.gather(2, rank))[..., 0]

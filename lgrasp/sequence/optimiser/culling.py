@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import torch
 
-_SLACK = 1.5
+_ROOM_FACTOR = 1.5
 """Room that is made beyond what was needed, when there was too little."""
 
 
@@ -53,7 +53,7 @@ class Culling:
         most = self._most.tolist()
         short = [k for k, (size, need) in enumerate(zip(self._sizes, most, strict=True)) if need > size]
         for k in short:
-            self._per_row[k] = _SLACK * most[k] / rows
+            self._per_row[k] = _ROOM_FACTOR * most[k] / rows
         if short:
             self.fix(rows)
         return bool(short)

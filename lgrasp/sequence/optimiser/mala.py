@@ -7,7 +7,7 @@ import torch
 from lgrasp.runtime.streams import normals
 from lgrasp.sequence.optimiser.anneal import Chain
 
-_NOISE = 1 << 31
+_NOISE_STREAM = 1 << 31
 """Added to steps: streams of noise beside those of :func:`run_chain`."""
 
 
@@ -38,7 +38,7 @@ class Langevin:
 
     def propose(self, step: torch.Tensor, chain: Chain) -> tuple[torch.Tensor, torch.Tensor]:
         g, scale = chain.gradient, self._scale(step)
-        noise = normals(self._seed, step + _NOISE, g.shape[1]).to(g.dtype)
+        noise = normals(self._seed, step + _NOISE_STREAM, g.shape[1]).to(g.dtype)
         motion = -scale * g + (2 * self.temperature(step) * scale).sqrt() * noise
         return self._moved(chain.x, motion), motion
 

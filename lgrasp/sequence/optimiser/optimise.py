@@ -97,7 +97,7 @@ def optimise(
             motion_from_pose(torch.as_tensor(held[filled], dtype=torch.float32, device=device)),
         )
 
-        def told(step: int, before: int = number * params.iterations) -> None:
+        def report(step: int, before: int = number * params.iterations) -> None:
             if progress is not None:
                 progress(before + step, len(blocks) * params.iterations)
 
@@ -110,7 +110,7 @@ def optimise(
             torch.as_tensor(seed[filled].astype(np.int64), device=device),
             params,
             method,
-            told,
+            report,
         )
         parts.append([column[: len(block)].cpu().numpy() for column in columns])
     pose, joints, hand_point, object_point, energies = (np.concatenate(column) for column in zip(*parts, strict=True))

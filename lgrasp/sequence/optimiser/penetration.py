@@ -10,13 +10,13 @@ from lgrasp.differentiable.distance import DistanceGrids
 from lgrasp.differentiable.solids import RUN, PointSolid
 from lgrasp.sequence.optimiser.culling import Culling, Kept
 
-_QUANTUM = 2.0**-48
+_SUM_UNIT = 2.0**-48
 """Sums are made in integers of this unit: exact in any order, so no result depends on batch, threads or atomics. Their
 range is 32,768: metres, or points that pull."""
 
 
-_ROOMS = (128, 32, 1024, 256, 128, 384)
-"""Entries per row: pairs with balls that meet, pairs that may touch, their runs, those with balls that meet, those that
+_ENTRIES_PER_ROW = (128, 32, 1024, 256, 128, 384)
+"""Pairs with balls that meet, pairs that may touch, their runs, those with balls that meet, those that
 may touch, points inside."""
 
 
@@ -34,7 +34,7 @@ class _Entries(NamedTuple):
 
 
 def _counted(x: torch.Tensor) -> torch.Tensor:
-    return (x * (1 / _QUANTUM)).round().to(torch.int64)
+    return (x * (1 / _SUM_UNIT)).round().to(torch.int64)
 
 
 def _product(A: torch.Tensor, B: torch.Tensor) -> torch.Tensor:
@@ -93,7 +93,7 @@ class PenetrationSums:
         self._run_ball = put(np.concatenate([s.run_ball for s in solids]))
         self._run_frame = index(np.repeat(np.asarray(frame), runs))
         self._run_first, self._run_count = index(np.cumsum([0, *runs[:-1]])), index(runs)
-        self.culling = Culling(_ROOMS, device)
+        self.culling = Culling(_ENTRIES_PER_ROW, device)
         points = np.concatenate([s.points for s in solids])
         self._points = put(points.reshape(-1, RUN * 3))
 
@@ -167,7 +167,7 @@ class PenetrationSums:
             rows = torch.where(kept.used[:, None], rows, 0)
         summed = torch.zeros(len(e.row), 13, dtype=torch.int64, device=R.device)
         summed.index_add_(0, entry, _counted(rows))
-        pull, lever = (summed[:, 1:].to(R.dtype) * _QUANTUM).split([3, 9], 1)
+        pull, lever = (summed[:, 1:].to(R.dtype) * _SUM_UNIT).split([3, 9], 1)
         lever = lever.reshape(-1, 3, 3)
         force = _turned(Rb, pull)
         by_a = torch.cat([_product(Rb, lever), force[..., None]], 2)
@@ -179,8 +179,8 @@ class PenetrationSums:
         place = torch.cat([slot * frames + self._frame[e.points], slot * frames + self._frame[e.grid]])
         slopes = torch.zeros(batch * self.terms * frames, 12, dtype=torch.int64, device=R.device)
         slopes.index_add_(0, place, _counted(torch.cat([by_a, by_b])).reshape(-1, 12))
-        slopes = slopes.to(R.dtype) * _QUANTUM
-        return (sums.to(R.dtype) * _QUANTUM).reshape(batch, -1), slopes.reshape(batch, self.terms, frames, 3, 4)
+        slopes = slopes.to(R.dtype) * _SUM_UNIT
+        return (sums.to(R.dtype) * _SUM_UNIT).reshape(batch, -1), slopes.reshape(batch, self.terms, frames, 3, 4)
 
 
 class _Sums(torch.autograd.Function):

@@ -6,8 +6,8 @@ import torch
 
 from lgrasp.sequence.optimiser.culling import Culling
 
-_STRETCH = 100  # steps after which it is asked whether there was room for all entries
-_WARM_UP = 3
+_STEPS_PER_STRETCH = 100  # steps after which it is asked whether there was room for all entries
+_WARM_UP_STEPS = 3
 
 _Advance = Callable[[torch.Tensor, Sequence[torch.Tensor]], Sequence[torch.Tensor]]
 
@@ -37,7 +37,7 @@ def replayed(
         while done < steps:
             if graph is None:
                 graph = _recorded(advance, step, now)
-            before, size = [x.clone() for x in now], min(_STRETCH, steps - done)
+            before, size = [x.clone() for x in now], min(_STEPS_PER_STRETCH, steps - done)
             for _ in range(size):
                 graph.replay()
             if culling.lacking(rows):
@@ -59,7 +59,7 @@ def _recorded(advance: _Advance, step: torch.Tensor, now: list[torch.Tensor]) ->
     aside = torch.cuda.Stream(now[0].device)
     aside.wait_stream(torch.cuda.current_stream(now[0].device))
     with torch.cuda.stream(aside):
-        for _ in range(_WARM_UP):
+        for _ in range(_WARM_UP_STEPS):
             advance(step, now)
     torch.cuda.current_stream(now[0].device).wait_stream(aside)
     graph = torch.cuda.CUDAGraph()
