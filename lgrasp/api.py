@@ -129,10 +129,10 @@ def sequence(
     workers: int = 0,
     out: Name | None = None,
 ) -> Grasps:
-    """Grasps of several objects that a hand takes one after another; rows of fewer objects come before those of more.
+    """Grasps of several objects that a hand grasps one after another; rows with fewer objects come first.
 
     Args:
-        n: whole sequences.
+        n: complete sequences.
         scale: factor to metres, or a range of the longest side [m] such as ``"0.06:0.10"``.
         out: folder for shards; none: no file.
 
@@ -155,7 +155,7 @@ def plan(
     device: str = "auto",
     out: Name | None = None,
 ) -> Grasps:
-    """Grasps of an object or a point cloud by local search, one a start where one passes the checks of a plan.
+    """Grasps of an object or a point cloud by local search: one per start that yields a valid plan.
 
     Args:
         object: name, mesh file, or a cloud of :func:`read_cloud`.
@@ -180,11 +180,11 @@ def refine(
     out: Name | None = None,
     **params: int,
 ) -> Grasps:
-    """Grasps moved by a local search to where hand and object fit better, and checked again.
+    """Grasps improved by a local search, and checked again.
 
     Args:
         grasps: grasps, a shard, or a folder of shards.
-        coarse: poses are off by centimetres, as those of a network.
+        coarse: poses are off by centimetres, as from a network.
         bounds: :class:`GraspBounds` that rows must pass; default: those that they passed before.
         params: ``matching_rounds``, ``gradient_steps``.
         out: folder for shards; none: no file.
@@ -214,7 +214,7 @@ def simulate(
 
     Args:
         grasps: grasps, a shard, or a folder of shards.
-        protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06; or one with numbers of its own.
+        protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06; or a protocol with other numbers.
         all_directions: continue after a direction in which a grasp does not hold.
         out: folder for shards; none: no file.
 
@@ -244,7 +244,7 @@ def read_cloud(path: Name, mask: Name | None = None, label: int | None = None, *
     Args:
         mask: file with a label for each point; default: those in the cloud's own file.
         label: which points are the target.
-        options: ``scale``, ``viewpoint`` (x y z from where it was seen), ``scene``.
+        options: ``scale``, ``viewpoint`` (x y z of the camera), ``scene``.
 
     Raises:
         CloudError: the cloud cannot be used.
@@ -273,17 +273,17 @@ def load_object(name: Name, scale: float = 1.0, device: str = "cpu") -> Object:
 
 
 def hands() -> dict[str, str]:
-    """Known hands and what they are."""
+    """Known hands with their descriptions."""
     return {entry["name"]: entry["description"] for entry in list_hands()}
 
 
 def objects() -> dict[str, str]:
-    """Named objects and what they are."""
+    """Named objects with their descriptions."""
     return {entry["name"]: entry["description"] for entry in list_objects()}
 
 
 def pipelines() -> dict[str, str]:
-    """Pipelines and what they are for."""
+    """Pipelines with their uses."""
     return {entry["name"]: entry["description"] for entry in list_pipelines()}
 
 

@@ -1,4 +1,4 @@
-"""``lgrasp bench``: how fast, on this machine; its commands set published figures beside ours."""
+"""``lgrasp bench``: how fast, on this machine; its commands compare published figures with ours."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any

@@ -1,4 +1,4 @@
-"""``lgrasp cache``: what is kept between runs."""
+"""``lgrasp cache``: list and clear cached results."""
 
 from datetime import datetime
 from typing import Annotated

@@ -106,7 +106,7 @@ def generate(
 
 
 def show_plans(jobs: "list[tuple[Job, How]]", how: How) -> None:
-    """Print what jobs would compute, each with its own task of an array."""
+    """Print the plans of jobs, each with its own array task."""
     from lgrasp.jobs.preview import preview
     from lgrasp_cli.tables import print_report, print_table
 

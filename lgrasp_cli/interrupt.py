@@ -1,4 +1,4 @@
-"""What Ctrl-C and SIGTERM do."""
+"""Handling of Ctrl-C and SIGTERM."""
 
 import os
 import signal

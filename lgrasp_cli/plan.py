@@ -1,4 +1,4 @@
-"""``lgrasp plan``: grasps of an object, or of what is seen of it, from starts all over its surface."""
+"""``lgrasp plan``: grasps of an object, or of its visible part, from starts all over its surface."""
 
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,4 +1,4 @@
-"""``lgrasp build-field``, ``preprocess`` and ``warm-up``: what a job needs before it can start."""
+"""``lgrasp build-field``, ``preprocess`` and ``warm-up``: the preparations of a job."""
 
 import sys
 import time

@@ -1,4 +1,4 @@
-"""While a job runs: one stream of progress on standard error, Ctrl-C to stop at the end of what is being made."""
+"""While a job runs: one stream of progress on standard error, Ctrl-C to stop after the current batch."""
 
 import signal
 import sys
@@ -54,7 +54,7 @@ class Bar:
             self._bar.stop()
 
     def show(self, what: str, done: int | None = None, total: int = 0, note: str = "") -> None:
-        """Tell what is going on, and how much of how much is done if that is known."""
+        """Show the current activity, and how much is done if that is known."""
         if self._bar:
             whole = total if done is not None and total else None
             self._bar.update(self._task, description=what, completed=done or 0, total=whole, note=note)

@@ -1,4 +1,4 @@
-"""``lgrasp scenes``: tables with objects, what depth cameras see of them, and grasps that fit in."""
+"""``lgrasp scenes``: tables with objects, images of depth cameras, and feasible grasps."""
 
 from pathlib import Path
 from typing import Annotated, Any

@@ -30,7 +30,7 @@ def print_report(data: Any, json_path: str | None, show: Callable[[], None] | No
 
 
 def print_pairs(pairs: Iterable[tuple[str, str]]) -> None:
-    """Two columns: what, value."""
+    """Two columns: label, value."""
     _print_rows([list(pair) for pair in pairs], ())
 
 
@@ -51,7 +51,7 @@ def _print_rows(rows: list[list[str]], right: Sequence[int]) -> None:
 
 
 def counted(data: dict[str, Any], unit: str) -> str:
-    """How much is there of what was asked."""
+    """How much of the requested amount exists."""
     extra = f" ({data['present']:,} already present)" if data["present"] else ""
     return f"{data[unit]:,} of {data['asked']:,} requested{extra}"
 

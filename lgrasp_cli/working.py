@@ -1,4 +1,4 @@
-"""What all commands that make files share: their options, and how a job is run, reported and concluded."""
+"""Common parts of all commands that make files: their options, and how a job is run, reported and concluded."""
 
 import inspect
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Hands x objects, pipelines in turn in one run on one device, beside published figures if there are any."""
+"""Hands x objects, pipelines in turn in one run on one device, compared with published figures if there are any."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ Cell = dict[str, Any]
 
 
 def new_table(config: JobConfig, *, repeat: int, baseline_rows: int, published: Published | None = None) -> Table:
-    """A table without cells: what will be measured, and how. The last of several pipelines is the baseline.
+    """A table without cells: the plan of the measurement. The last of several pipelines is the baseline.
 
     Returns:
         ``settings`` (two tables can be joined if theirs agree), ``hands``, ``objects``, ``published``, ``complete``,
@@ -199,14 +199,14 @@ def trimmed_mean(values: list[float]) -> float:
 
 
 def cell_line(table: Table, cell: Cell) -> str:
-    """What the newest cell gave, in one line."""
+    """The result of the newest cell, in one line."""
     total = len(table["hands"]) * len(table["objects"])
     rates = ", ".join(f"{name} {number(_rate(cell, name))}/s" for name in cell["pipelines"])
     return f"[{len(table['cells'])}/{total}] {cell['hand']} {cell['object']}: {cell['error'] or rates}"
 
 
 def comparison_page(table: Table) -> Page:
-    """A table as texts: rates with ratios for each hand, then what lies behind them."""
+    """A table as texts: rates with ratios for each hand, then details."""
     settings, published = table["settings"], table["published"]
     names = settings["pipelines"]
     baseline = f", {names[-1]} {settings['baseline_rows']:,}" if len(names) > 1 else ""

@@ -1,4 +1,4 @@
-"""What every benchmark gives besides its numbers: tables beside published figures, and what differs between them."""
+"""Pages of benchmarks: tables compared with published figures, and the differences between the measurements."""
 
 from typing import Any, NamedTuple
 
@@ -51,7 +51,7 @@ def load_published(name: str) -> Published:
 
 
 def caveats(published: dict[str, Any]) -> list[str]:
-    """The lines below a comparison: the source, its machine, and what differs."""
+    """The lines below a comparison: the source, its machine, and the differences."""
     lines = [f"published: {published['source']}, on {published['device']}; what differs:"]
     return [*lines, *(f"- {line}" for line in published["differs"])]
 

@@ -1,4 +1,4 @@
-"""What the values of a shard must satisfy; used before writing and when validating."""
+"""Conditions on the values of a shard; used before writing and when validating."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ _UNIT_TOLERANCE = 1e-3  # of quaternion and normal lengths, and of the sum of no
 
 
 def hand_problems(hand: HandRecord) -> list[str]:
-    """What is wrong with a hand's values: limits that are NaN or crossed, repeated names, no URDF."""
+    """Problems of a hand's values: limits that are NaN or crossed, repeated names, no URDF."""
     problems = []
     lower, upper = np.asarray(hand.joint_lower), np.asarray(hand.joint_upper)
     if not np.all(lower <= upper):  # NaN fails too
@@ -27,7 +27,7 @@ def hand_problems(hand: HandRecord) -> list[str]:
 
 
 def object_problems(record: ObjectRecord) -> list[str]:
-    """What is wrong with an object's values: vertices not finite, faces out of range, normals, scale not positive."""
+    """Problems of an object's values: vertices not finite, faces out of range, normals, scale not positive."""
     where, problems = f"objects/{record.id}", []
     if not np.isfinite(record.vertices).all():
         problems.append(f"{where}/vertices: not finite")
@@ -48,7 +48,7 @@ def object_problems(record: ObjectRecord) -> list[str]:
 def row_problems(
     rows: GraspRows, hand: HandRecord, object_ids: Sequence[str], column: Column, *, first_row: int = 0
 ) -> list[str]:
-    """What is wrong with the values of some rows, one line per kind of problem, naming the first row that has it.
+    """Problems of the values of some rows, one line per kind of problem, naming the first row that has it.
 
     Args:
         rows: Rows with the shapes and dtypes of the format.

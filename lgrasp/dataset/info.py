@@ -1,4 +1,4 @@
-"""What shards hold, in one dictionary each."""
+"""The contents of shards, in one dictionary each."""
 
 import os
 from collections.abc import Iterable

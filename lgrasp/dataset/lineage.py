@@ -1,4 +1,4 @@
-"""What rows of sequences must satisfy: each step in itself, and against the row that it extends."""
+"""Conditions on rows of sequences: each step by itself, and against the row that it extends."""
 
 from collections.abc import Callable
 
@@ -31,7 +31,7 @@ _HELD = {"q": "q", "q_pregrasp": "q", "q_squeeze": "q_squeeze"}
 
 
 def check_steps(rows: GraspRows, steps: SequenceRows, lower: np.ndarray, upper: np.ndarray, require: _Require) -> None:
-    """Check what a row says by itself.
+    """Check a row by itself.
 
     Args:
         rows: Some rows.

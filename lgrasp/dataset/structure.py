@@ -140,7 +140,7 @@ def _kind_matches(value: Any, kind: str) -> bool:
 
 
 def text_sha256(file: h5py.File) -> str:
-    """SHA-256 over every attribute (except ``text_sha256``) and every scalar string: what HDF5 keeps no checksum of.
+    """SHA-256 over every attribute (except ``text_sha256``) and every scalar string, which have no HDF5 checksum.
 
     The hash is of the JSON object, sorted keys, no spaces, ASCII escapes, that maps ``path@name`` to an attribute's
     value and ``path`` to a scalar string dataset's text; paths have no leading slash.

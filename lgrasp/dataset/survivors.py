@@ -1,4 +1,4 @@
-"""What stages let through, in one number each, from the counts that shards keep."""
+"""Survivors of stages, in one number each, from the counts in shards."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -82,7 +82,7 @@ def write_context(file: h5py.File, header: ShardHeader, hand: HandRecord, object
 
 
 def write_spaces(file: h5py.File, space_names: Sequence[str]) -> None:
-    """Write the opposition spaces that ``sequence/space`` counts in: what makes a file one of sequences."""
+    """Write the opposition spaces that ``sequence/space`` indexes, which make a file one of sequences."""
     _create_texts(file.create_group("sequence"), "space_names", space_names)
 
 

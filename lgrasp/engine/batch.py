@@ -27,7 +27,7 @@ PASS_BITS = np.uint64(0xFF << PASS_SHIFT)
 
 @dataclass
 class BatchResult:
-    """What a batch gave: grasps in candidate order, counts and seconds per stage."""
+    """Result of a batch: grasps in candidate order, counts and seconds per stage."""
 
     grasps: GraspTable
     counts: dict[str, dict[str, int]] = field(default_factory=dict)

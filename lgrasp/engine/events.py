@@ -1,4 +1,4 @@
-"""Parts of a job, what came of them, and what a job tells while it makes them."""
+"""Parts of a job, their results, and the events of a running job."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Part:
 
 @dataclass
 class Made:
-    """What came of one part."""
+    """Result of one part."""
 
     rows: int
     contents: Any = None
@@ -34,7 +34,7 @@ class Made:
 
 
 class Events:
-    """What a job tells while it runs, and asks; every method may be overridden."""
+    """Notifications and queries of a running job; every method may be overridden."""
 
     def loading(self, what: str, share: float = 0.0) -> None:
         """An input is being loaded or made."""

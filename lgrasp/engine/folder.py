@@ -1,4 +1,4 @@
-"""The output folder of a job: where its shards lie, which of them are there already, and whether they may stay."""
+"""The output folder of a job: paths of its shards, which of them exist already, and whether they may stay."""
 
 import os
 import re
@@ -47,7 +47,7 @@ def check_folder(out: Path) -> None:
 
 
 def clean_folder(files: Sequence[Path]) -> None:
-    """Remove what killed processes left while writing files like these; files being written stay."""
+    """Remove leftovers of killed processes that wrote files like these; files being written stay."""
     for folder, stem in {(path.parent, _stem(path)) for path in files}:
         remove_leftovers(folder, f"{stem}-*.tmp")
 

@@ -1,4 +1,4 @@
-"""CUDA graphs of batches: what is launched before the number of survivors is known is launched as one."""
+"""CUDA graphs of batches: launches before the number of survivors is known are combined into one."""
 
 import threading
 from dataclasses import dataclass, replace

@@ -34,7 +34,7 @@ Report = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class InputKeys:
-    """Content keys of what a job starts from."""
+    """Content keys of the inputs of a job."""
 
     source: HandSource
     mesh: Path | None
@@ -45,7 +45,7 @@ class InputKeys:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a job starts from, on its device."""
+    """Inputs of a job, on its device."""
 
     hand: HandArrays
     object: ObjectArrays

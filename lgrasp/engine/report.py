@@ -1,4 +1,4 @@
-"""What every job reports, and where reports are written."""
+"""The report that all jobs share, and where reports are written."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from lgrasp.errors import OutputError
 
 
 def job_report(outcome: JobOutcome) -> dict[str, Any]:
-    """The report of a job, JSON-serialisable: its own numbers and what all jobs have.
+    """The report of a job, JSON-serialisable: its own numbers and those of all jobs.
 
     Returns:
         Of all jobs ``asked``, ``made``, ``present`` (rows), ``out``, ``shards`` (names of the files), ``device``,

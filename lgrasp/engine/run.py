@@ -1,4 +1,4 @@
-"""The one loop of all jobs: device, folder, what is there already, kernels, parts one after another, report."""
+"""The one loop of all jobs: device, folder, existing parts, kernels, parts one after another, report."""
 
 import os
 import time
@@ -22,7 +22,7 @@ from lgrasp.runtime.kernels import kernel_modules, load_kernels
 
 
 class Job(BaseModel, ABC):
-    """Something that makes files, part by part: what is asked, and how one part is made.
+    """A job that makes files part by part: its settings, and how one part is made.
 
     The fields are the keys of a config (``lgrasp run``). What is loaded for the parts is private to the job.
     """
@@ -44,7 +44,7 @@ class Job(BaseModel, ABC):
 
     @property
     def title(self) -> str:
-        """What the job is, in a few words."""
+        """Title of the job, in a few words."""
         return str(self.folder)
 
     @property
@@ -73,7 +73,7 @@ class Job(BaseModel, ABC):
         return present_parts(parts, self.key(), self.effort, self.cache.warn)
 
     def clean(self, parts: Sequence[Part]) -> None:
-        """Remove what killed processes left while writing parts; files being written stay."""
+        """Remove leftovers of killed processes that wrote parts; files being written stay."""
         clean_folder([part.file for part in parts])
 
     def effort(self, rows: int) -> int:
@@ -81,7 +81,7 @@ class Job(BaseModel, ABC):
         return 0
 
     def load(self, events: Events, missing: bool) -> None:
-        """Load what the parts are made from, onto ``self.device_used``.
+        """Load the inputs of the parts onto ``self.device_used``.
 
         Args:
             missing: are there parts to make?
@@ -89,7 +89,7 @@ class Job(BaseModel, ABC):
 
     @abstractmethod
     def make(self, part: Part, progress: PartProgress) -> Made:
-        """Make one part: a pure function of what is asked and of its number."""
+        """Make one part: a pure function of the job's settings and of its number."""
 
     def write(self, part: Part, contents: Any) -> None:
         """Put a part on disk, whole or not at all."""
@@ -97,10 +97,10 @@ class Job(BaseModel, ABC):
 
     @abstractmethod
     def report(self, outcome: "JobOutcome") -> dict[str, Any]:
-        """What came of it in numbers, JSON-serialisable; :func:`lgrasp.engine.report.job_report` adds the rest."""
+        """The results in numbers, JSON-serialisable; :func:`lgrasp.engine.report.job_report` adds the rest."""
 
     def shortfall(self, outcome: "JobOutcome") -> LgraspError | None:
-        """What to say of an outcome that is less than was asked."""
+        """The error for an outcome that falls short of the request, if any."""
         return None
 
     def at_once(self) -> int:
@@ -112,16 +112,16 @@ class Job(BaseModel, ABC):
         return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | changes)
 
     def close(self) -> None:
-        """Let go of what was opened for the parts; called when the job ends in any way."""
+        """Release what was opened for the parts; called however the job ends."""
 
     @property
     def events(self) -> Events:
-        """Who listens, for what is loaded when it is first asked for."""
+        """The listener, for inputs loaded on first use."""
         return self._events
 
     @property
     def device_used(self) -> Device:
-        """The device, once the job has begun."""
+        """The device, once the job has started."""
         return self._device
 
     def threads(self) -> int:
@@ -131,7 +131,7 @@ class Job(BaseModel, ABC):
 
 @dataclass
 class JobOutcome:
-    """What a call of :func:`run` did."""
+    """Result of a call of :func:`run`."""
 
     job: Any
     """The job, with what it loaded."""

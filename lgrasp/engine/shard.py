@@ -159,7 +159,7 @@ def shard_effort(pipeline: Pipeline, rows: int) -> int:
 
 
 def shard_context(pipeline: Pipeline, inputs: Inputs, shard: int) -> Context:
-    """What the stages of a pipeline are given in a shard."""
+    """The context of the stages of a pipeline in a shard."""
     return Context(
         inputs.hand,
         inputs.object,
@@ -258,7 +258,7 @@ class _Rows:
         return self._kept.count
 
     def add(self, grasps: GraspTable) -> None:
-        """Take over what is new of further rows, until there are those asked."""
+        """Add the new ones of further rows, up to the number requested."""
         if self.count >= self._rows:
             self._aside = grasps
             return
@@ -271,7 +271,7 @@ class _Rows:
         self._aside = take_grasps(grasps, np.arange(len(new) + duplicates, len(grasps)))
 
     def restore(self, account: Account) -> None:
-        """Begin with what an earlier run found."""
+        """Start from the state of an earlier run."""
         table = account.grasps
         own = take_grasps(table, np.arange(account.kept))
         self._kept.restore(user_poses(own.pose, self._center), own.q)

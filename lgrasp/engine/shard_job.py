@@ -100,7 +100,7 @@ def shard_rows(path: Path) -> int:
 
 
 def rows_digest(path: Path) -> str:
-    """SHA-256 of what tells the rows of a shard apart: joints, poses, objects, candidates."""
+    """SHA-256 of the identity of the rows of a shard: joints, poses, objects, candidates."""
     h = hashlib.sha256()
     with ShardReader(path) as reader:
         for name in _ROW:

@@ -1,4 +1,4 @@
-"""Triangle mesh -> convex pieces by CoACD, in a process of its own that may hang, crash or print what it likes."""
+"""Triangle mesh -> convex pieces by CoACD, in a separate process, which may hang, crash or print anything."""
 
 import hashlib
 import json

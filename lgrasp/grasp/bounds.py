@@ -1,4 +1,4 @@
-"""The one declaration of a valid grasp: every bound that a row must meet, and what its measures are measured with."""
+"""The one declaration of a valid grasp: every bound that a row must meet, and the parameters of its measures."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -26,7 +26,7 @@ bounded."""
 
 
 class GraspBounds(Params):
-    """What a finished grasp must satisfy, and its control poses; a profile's numbers stand in for those not given.
+    """Bounds of a finished grasp and of its control poses; numbers that are not given come from the profile.
 
     Lengths in metres, angles in degrees. A pipeline declares them once, under ``bounds``; no stage has its own.
     """

@@ -59,7 +59,7 @@ class Places:
 
 @wp.struct
 class Findings:
-    """What is found of n hands."""
+    """Findings on n hands."""
 
     outcome: wp.array(dtype=wp.int32)  # (n,) Outcome
     numbers: wp.array2d(dtype=wp.float32)  # (6, n) MEASURED
@@ -104,7 +104,7 @@ def device_limits(bounds: GraspBounds, *, deepest: float | None = None) -> Limit
 
 
 def new_findings(n: int, width: int, device: str) -> Findings:
-    """Room for what is found of n hands with ``width`` contacts at most."""
+    """Room for the findings on n hands with ``width`` contacts at most."""
     f = Findings()
     f.outcome = wp.zeros(n, dtype=wp.int32, device=device)
     f.numbers = wp.zeros((6, max(n, 1)), dtype=wp.float32, device=device)

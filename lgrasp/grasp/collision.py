@@ -1,4 +1,4 @@
-"""Hand against object: a fast test for searching and an exact one for what is emitted; object against object."""
+"""Hand against object: a fast test for searching and an exact one for the results; object against object."""
 
 import warp as wp
 

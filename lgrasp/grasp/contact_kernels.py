@@ -32,7 +32,7 @@ class PalmarRuns:
 
 @wp.struct
 class RunContacts:
-    """What is found of n hands, run by run."""
+    """Findings on n hands, run by run."""
 
     gap: wp.array2d(dtype=wp.float32)  # (n, r) [m], -1 without contact
     point: wp.array2d(dtype=wp.vec3)  # (n, r) on the object, its internal frame [m]

@@ -1,4 +1,4 @@
-"""What a hand holds already when it takes another object: frozen joints and the objects, one row a sequence."""
+"""The state of a hand that already holds objects: frozen joints and the objects, one row a sequence."""
 
 from dataclasses import dataclass
 

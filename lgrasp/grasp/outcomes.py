@@ -1,4 +1,4 @@
-"""What becomes of a grasp that is checked, and the numbers kept of it."""
+"""Outcomes of checked grasps, and the numbers kept of them."""
 
 from enum import IntEnum
 

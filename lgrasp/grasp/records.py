@@ -1,4 +1,4 @@
-"""What a shard holds, in memory: frozen records of NumPy arrays."""
+"""The contents of a shard in memory: frozen records of NumPy arrays."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

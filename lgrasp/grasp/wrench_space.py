@@ -15,7 +15,7 @@ _EPSILON_ROUNDING = 1e-8  # epsilon below this is rounding: the origin lies on t
 
 
 class WrenchSpace(NamedTuple):
-    """What the hull says of a grasp."""
+    """Quality of a grasp from its hull."""
 
     epsilon: float
     """Largest ball about the origin inside the hull (Ferrari and Canny's quality); 0 when the origin is not inside."""

@@ -1,4 +1,4 @@
-"""What a hand is made of, in one digest."""
+"""The contents of a hand, in one digest."""
 
 import hashlib
 from pathlib import Path

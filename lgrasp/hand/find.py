@@ -1,4 +1,4 @@
-"""What the user names as a hand -> its URDF file and rules."""
+"""From the user's name of a hand to its URDF file and rules."""
 
 import difflib
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Queries of triangle meshes: signed distances of points, and what a ray meets first."""
+"""Queries of triangle meshes: signed distances of points, and first hits of rays."""
 
 import warp as wp
 

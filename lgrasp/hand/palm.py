@@ -1,4 +1,4 @@
-"""Where a hand may touch, where its palm is, and what that faces."""
+"""Where a hand may touch, where its palm is, and where the palm faces."""
 
 from typing import NamedTuple
 

@@ -23,7 +23,7 @@ class Postures:
 
 
 def sample_bodies(model: HandModel, q: np.ndarray, device: str = "cpu") -> Postures:
-    """Body poses at postures q (N, K) and what is clear there."""
+    """Body poses at postures q (N, K), and which of them are clear."""
     start()
     poses = body_poses(upload_hand(model, device), q)
     R = device_rotation(poses.reshape(-1, 7)).as_matrix().reshape(*poses.shape[:2], 3, 3)

@@ -124,7 +124,7 @@ class HandSpec(_Strict):
 
 
 def spec_problem(error: ValidationError) -> str:
-    """First problem of a pydantic error as one phrase: key, value, what is wrong, the nearest valid key."""
+    """First problem of a pydantic error as one phrase: key, value, problem, the nearest valid key."""
     found = error.errors()
     # a misspelt key is the cause of one that is missing
     first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])

@@ -1,4 +1,4 @@
-"""The palmar side of a hand: what the mean fingertip sees, by rays, over many postures."""
+"""The palmar side of a hand: surface visible from the mean fingertip, by rays, over many postures."""
 
 import numpy as np
 import trimesh

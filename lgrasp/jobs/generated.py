@@ -1,4 +1,4 @@
-"""What a job of grasps did: counted shard by shard from the files, so memory does not grow with the rows."""
+"""Results of a job of grasps: counted shard by shard from the files, so memory does not grow with the rows."""
 
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor

@@ -6,7 +6,7 @@ from lgrasp.hand.find import HandSource, find_hand
 
 
 def hand_source(name: str) -> HandSource:
-    """What the user names as a hand; see :func:`lgrasp.hand.find.find_hand`.
+    """A hand by the user's name for it; see :func:`lgrasp.hand.find.find_hand`.
 
     Raises:
         HandError: nothing of that name, or a URDF that no rules can be drafted for.

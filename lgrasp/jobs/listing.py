@@ -79,7 +79,7 @@ def describe_hand(name: str) -> dict[str, Any]:
 
 
 def list_objects() -> list[dict[str, Any]]:
-    """Name, file, faces, licence and description of every named object; what objects.yaml does not say is empty."""
+    """Name, file, faces, licence and description of every named object; keys absent from objects.yaml are empty."""
     notes: dict[str, Any] = {}
     for folder in data_dirs("objects"):
         if (folder / "objects.yaml").is_file():

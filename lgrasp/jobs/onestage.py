@@ -37,7 +37,7 @@ from lgrasp.runtime.meter import Meter
 
 @dataclass(frozen=True)
 class StageRun:
-    """What one stage gave."""
+    """Result of one stage."""
 
     stage: str
     hit: bool

@@ -1,4 +1,4 @@
-"""What a job would compute, found out without computing or writing anything."""
+"""The plan of a job, without computing or writing anything."""
 
 import os
 import tempfile

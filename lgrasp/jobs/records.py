@@ -21,7 +21,7 @@ RULES = "hand_rules"
 
 
 def hand_config(source: HandSource) -> dict[str, Any]:
-    """What the config of a shard says of its hand: the rules, and joints that were held [rad or m]."""
+    """The hand in the config of a shard: its rules, and joints held fixed [rad or m]."""
     return {RULES: source.spec.model_dump_json(), "locked": dict(source.spec.locked)}
 
 

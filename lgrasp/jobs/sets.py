@@ -1,4 +1,4 @@
-"""Object sets and their orders, drawn from a pool with a seed: what a config of sequences runs over."""
+"""Object sets and their orders, drawn from a pool with a seed, for a config of sequences."""
 
 import itertools
 import math

@@ -32,7 +32,7 @@ _MIN_HOLDING_LINKS = 2  # links that it takes to hold anything
 
 
 class SimulateJob(ShardJob):
-    """Verdicts of a physics simulation beside the rows of shards, in copies of them."""
+    """Adds verdicts of a physics simulation to copies of shards."""
 
     protocol: Protocol = Field(description="Named protocol.")
     out: Path | None = Field(None, description="Folder; default: that of the shards with -PROTOCOL added.")

@@ -28,4 +28,4 @@ UNIT_NORMAL = 1e-2
 
 
 class JudgeError(Exception):
-    """A file that cannot be judged, in one line: the file, what is wrong, what would be accepted."""
+    """A file that cannot be judged, in one line: the file, the problem, what would be accepted."""

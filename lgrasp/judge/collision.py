@@ -1,4 +1,4 @@
-"""What goes into what: links in links, hand in object, object in object."""
+"""Penetration: links in links, hand in object, object in object."""
 
 import itertools
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""What the judge found, as numbers, as JSON and as text."""
+"""The judge's findings, as numbers, as JSON and as text."""
 
 import math
 from collections import Counter

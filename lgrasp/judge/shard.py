@@ -44,7 +44,7 @@ OPTIONAL = ("q_pregrasp", "q_squeeze", "contact_forces")
 
 @dataclass
 class JudgedShard:
-    """One shard. ``metrics`` holds columns with their units; ``claims`` is what the file says of itself."""
+    """One shard. ``metrics`` holds columns with their units; ``claims`` holds the file's own statements."""
 
     path: Path
     hand: JudgedHand

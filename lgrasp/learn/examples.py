@@ -1,4 +1,4 @@
-"""What the predictor learns from: partial clouds of objects by simulated cameras, and grasps with their palm points."""
+"""Training data of the predictor: partial clouds of objects by simulated cameras, and grasps with their palm points."""
 
 from dataclasses import dataclass
 

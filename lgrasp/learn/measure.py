@@ -1,4 +1,4 @@
-"""How good coarse answers are, and what the refiner makes of them: energies against steps."""
+"""Quality of coarse answers before and after the refiner: energies against steps."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

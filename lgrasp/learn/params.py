@@ -4,7 +4,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class LearnParams(BaseModel):
-    """What the network sees, its size, and how long it is trained."""
+    """Input and size of the network, and the length of its training."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -96,7 +96,7 @@ def _affine_weights(G: mat8, m: wp.int32):
 
 @wp.struct
 class Program:
-    """What is asked of the forces of a grasp."""
+    """Conditions on the forces of a grasp."""
 
     friction: wp.float32
     edges: wp.int32  # of each friction pyramid, 0 for round cones

@@ -1,4 +1,4 @@
-"""What every later stage knows about an object, as plain arrays that can be cached."""
+"""The model of an object for all later stages, as plain arrays that can be cached."""
 
 import os
 from dataclasses import dataclass, fields
@@ -84,6 +84,6 @@ class ObjectModel:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "ObjectModel":
-        """Read what :meth:`save` wrote."""
+        """Read a file written by :meth:`save`."""
         with np.load(path, allow_pickle=False) as arrays:
             return cls.from_arrays(arrays)

@@ -34,7 +34,7 @@ _PLAN_BOUNDS = GraspBounds(profile="plan")
 
 
 class PlanParams(BaseModel):
-    """How many hands are tried, how far they are moved, and what a plan must satisfy."""
+    """How many hands are tried, how far they are moved, and the conditions on a plan."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

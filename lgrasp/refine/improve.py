@@ -1,4 +1,4 @@
-"""Hands moved until they pass the checks: a local search, looked at on its way, begun again near by where it fails."""
+"""Hands moved until they pass the checks: a local search, evaluated on its way, restarted nearby if it fails."""
 
 import os
 from collections.abc import Iterator

@@ -53,7 +53,7 @@ class Solids:
 
 @wp.struct
 class Correspondences:
-    """What hands are matched to; a plane (n, o) has the signed distance n . x - o [m]."""
+    """Matches of hands; a plane (n, o) has the signed distance n . x - o [m]."""
 
     plane: wp.array2d(dtype=wp.vec4)  # (N, P) of each point, object's frame
     pull: wp.array2d(dtype=wp.float32)  # (N, P) weight of each point, 0 where it does not pull

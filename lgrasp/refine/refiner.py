@@ -43,7 +43,7 @@ class Pose(NamedTuple):
 
 
 class Refined(NamedTuple):
-    """What the fast mode gives."""
+    """Result of the fast mode."""
 
     pose: Pose
     energies: Energies

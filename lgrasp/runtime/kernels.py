@@ -1,4 +1,4 @@
-"""Compiles (or loads from the kernel cache) what a job is going to launch, before the clock of its stages starts."""
+"""Compiles (or loads from the kernel cache) the kernels of a job, before the clock of its stages starts."""
 
 import importlib
 import os

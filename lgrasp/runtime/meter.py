@@ -11,7 +11,7 @@ _Moment = wp.Event | float
 
 
 class Meter:
-    """Stages of one batch: what they counted, and how long they took on their device."""
+    """Stages of one batch: their counts, and how long they took on their device."""
 
     def __init__(self, device: str) -> None:
         self._device = wp.get_device(device)

@@ -1,4 +1,4 @@
-"""What the values of a scene must satisfy; used before writing and when checking."""
+"""Conditions on the values of a scene; used before writing and when checking."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ _LIMIT = 1.0e-4  # [rad or m] outside the joint limits
 
 
 def scene_problems(scene: SceneRecord) -> list[str]:
-    """What is wrong with a scene, one line per kind of problem."""
+    """Problems of a scene, one line per kind."""
     problems = hand_problems(scene.hand)
     for record in scene.objects:
         problems += object_problems(record)

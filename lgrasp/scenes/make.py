@@ -86,7 +86,7 @@ def make_scene(
 def observe(
     surface: LabelledMesh, params: CameraParams, rng: np.random.Generator, device: str = "cpu"
 ) -> tuple[ViewsRecord, CloudRecord]:
-    """What cameras around the table see of a surface, and the cloud that is made of it."""
+    """Images of a surface by cameras around the table, and the cloud made from them."""
     camera, pose = intrinsics_of(params), place_cameras(params, rng).astype(np.float32)
     offsets = draw_offsets(params, rng).astype(np.float32)
     images = add_noise(render(surface, camera, pose, device), params, rng)

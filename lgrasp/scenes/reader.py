@@ -93,13 +93,13 @@ class SceneReader:
             return tuple(read_object(self._file, i) for i in sorted(self._file["objects"]))
 
     def layout(self) -> Layout:
-        """Which objects lie on the table, and where."""
+        """The objects on the table, and their poses."""
         with reading(self.path):
             table = float(self._file["scene"].attrs["table"])
             return Layout(tuple(sorted(self._file["objects"])), table=table, **self._arrays("scene"))
 
     def views(self) -> ViewsRecord:
-        """What the cameras saw."""
+        """Images of the cameras."""
         with reading(self.path):
             attrs, arrays = self._file["views"].attrs, self._arrays("views")
             height, width = arrays["depth"].shape[1:]

@@ -1,4 +1,4 @@
-"""What a scene file holds, in memory: frozen records of NumPy arrays."""
+"""The contents of a scene file in memory: frozen records of NumPy arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ def _now() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewsRecord:
-    """What ``V`` depth cameras saw, noise included."""
+    """Images of ``V`` depth cameras, noise included."""
 
     intrinsics: Intrinsics
     pose: np.ndarray

@@ -1,4 +1,4 @@
-"""What depth cameras see of meshes: depths, labels, normals."""
+"""Renders depth cameras that see meshes: depths, labels, normals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class LabelledMesh:
 
 @dataclass(frozen=True)
 class Images:
-    """What v cameras see."""
+    """Images of v cameras."""
 
     intrinsics: Intrinsics
     pose: np.ndarray

@@ -1,4 +1,4 @@
-"""What real cameras make of exact images: noisy depths, views that do not quite fit together, one merged cloud."""
+"""Exact images made realistic: noisy depths, slightly misaligned views, one merged cloud."""
 
 from dataclasses import dataclass, replace
 

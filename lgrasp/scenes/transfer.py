@@ -1,4 +1,4 @@
-"""Grasps of an object brought to where it lies in a scene, and what the hand would run into there."""
+"""Grasps of an object moved to its pose in a scene, and the collisions of the hand there."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

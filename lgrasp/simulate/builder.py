@@ -1,4 +1,4 @@
-"""What every MuJoCo scene of ours is built of: options, contacts, drives and free bodies."""
+"""Parts of every MuJoCo scene: options, contacts, drives and free bodies."""
 
 from typing import Any
 

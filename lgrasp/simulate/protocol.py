@@ -1,4 +1,4 @@
-"""What is simulated: named protocols with every number, written beside each verdict."""
+"""Named protocols of the simulation with all their numbers, which are stored with each verdict."""
 
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,7 +22,7 @@ _GRAVITY = 9.8  # [m/s^2]
 
 
 class Load(BaseModel):
-    """What a protocol asks of one object and its hand."""
+    """Requirements of a protocol for one object and its hand."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -1,4 +1,4 @@
-"""What a simulator is given: a hand as URDF and convex pieces, objects as convex pieces and their mass properties."""
+"""Input of a simulator: a hand as URDF and convex pieces, objects as convex pieces and their mass properties."""
 
 import warnings
 from collections.abc import Sequence

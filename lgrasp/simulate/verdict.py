@@ -1,4 +1,4 @@
-"""What is found of one grasp, and the rules by which its simulation ends and holds; on the CPU as on a GPU."""
+"""Findings on one grasp, and the rules by which its simulation ends and holds; on the CPU and on a GPU."""
 
 from typing import Any, NamedTuple, Self
 
@@ -19,7 +19,7 @@ _LOST_DISTANCE = 0.5  # [m]: an object that got so far from its start will not t
 
 
 class Verdict(NamedTuple):
-    """What is found of one grasp of O objects; COLUMNS and OBJECT_COLUMNS say what the numbers mean."""
+    """Findings on one grasp of O objects; COLUMNS and OBJECT_COLUMNS say what the numbers mean."""
 
     holds: bool
     directions: np.ndarray  # (6,) i8

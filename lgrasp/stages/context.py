@@ -1,4 +1,4 @@
-"""What every stage is given beside its inputs and parameters."""
+"""The context that every stage gets in addition to its inputs and parameters."""
 
 import threading
 from collections.abc import Callable, Hashable

@@ -1,4 +1,4 @@
-"""What every export has besides its grasps: the hand, the meshes, a README, and an index that is written last."""
+"""The parts of an export other than its grasps: the hand, the meshes, a README, and an index that is written last."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -58,7 +58,7 @@ FORMATS = {
 
 
 class Exported(NamedTuple):
-    """What an export wrote."""
+    """The result of an export."""
 
     rows: int
     objects: tuple[str, ...]

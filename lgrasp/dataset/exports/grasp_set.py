@@ -1,4 +1,4 @@
-"""What the readers of exports give: rows in the shape of a shard's, with names."""
+"""The result of the readers of exports: rows as in a shard, with names."""
 
 from collections.abc import Sequence
 from pathlib import Path

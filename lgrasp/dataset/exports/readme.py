@@ -1,4 +1,4 @@
-"""README.txt of an export: what lies where, frames, units, the order of joints."""
+"""README.txt of an export: contents, frames, units, the order of joints."""
 
 from collections.abc import Sequence
 

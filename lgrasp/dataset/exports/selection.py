@@ -1,4 +1,4 @@
-"""What an export holds: which rows of which shards, in which order, of which objects."""
+"""The contents of an export: which rows of which shards, in which order, of which objects."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -120,7 +120,7 @@ class Selection:
 def select_rows(
     paths: Sequence[Path], *, where: Sequence[Condition] = (), limit: int | None = None, single: bool = False
 ) -> Selection:
-    """Choose rows; reads what the conditions need and no grasp.
+    """Choose rows; reads only the columns of the conditions.
 
     Args:
         paths: Shard files.

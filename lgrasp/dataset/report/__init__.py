@@ -1,4 +1,4 @@
-"""``lgrasp dataset report``: what a data set holds, as one HTML page and as numbers."""
+"""``lgrasp dataset report``: the contents of a data set, as one HTML page and as numbers."""
 
 from lgrasp.dataset.report.write import read_dataset, report_dataset
 

@@ -1,4 +1,4 @@
-"""Reads shards once and keeps what the report needs: counts and a sample, not rows."""
+"""Reads shards once and keeps the counts and the sample that the report needs, not rows."""
 
 from collections import Counter
 from collections.abc import Callable

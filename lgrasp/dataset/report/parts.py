@@ -12,7 +12,7 @@ def number(value: int) -> str:
 
 
 def tiles(pairs: Iterable[tuple[str, str]]) -> str:
-    """Large values with what they are."""
+    """Large values with labels."""
     inner = "".join(f"<li><b>{escape(value)}</b><span>{escape(what)}</span></li>" for value, what in pairs)
     return f'<ul class="tiles">{inner}</ul>'
 

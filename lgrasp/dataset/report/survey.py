@@ -13,7 +13,7 @@ from lgrasp.dataset.tree import shard_tree
 
 
 class Head(NamedTuple):
-    """What a shard says of itself."""
+    """Header of a shard."""
 
     path: Path
     bytes: int
@@ -36,7 +36,7 @@ class Head(NamedTuple):
 
 
 def survey(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> tuple[list[Head], list[str]]:
-    """Heads of all shards, by hand and objects, and remarks on what looks wrong.
+    """Heads of all shards, by hand and objects, and remarks on problems.
 
     Raises:
         ShardError: No shard is found, or one cannot be read.

@@ -25,7 +25,7 @@ _VERDICT_COLUMNS = (  # column, head, factor, format
 
 
 def run_tables(data: dict[str, Any]) -> str:
-    """Where a hand's rows come from, and what survived each stage."""
+    """The origin of a hand's rows, and the survivors of each stage."""
     about = [
         ("hand", f"{data['hand']} ({data['sha256'][:12]}…), {len(data['joints'])} joints"),
         ("rows", f"{number(data['rows'])} in {number(data['shards'])} shard{'s' if data['shards'] != 1 else ''}"),
@@ -132,7 +132,7 @@ def _share(group: dict[str, Any], protocol: str) -> str:
 
 
 def physics_table(data: dict[str, Any]) -> str:
-    """What each protocol says of each object: share that holds, the object's mass, means of other verdicts."""
+    """Verdicts of each protocol for each object: share that holds, the object's mass, means of other verdicts."""
     rows = []
     columns = ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in _VERDICT_COLUMNS)]
     for group in data["objects"]:

@@ -17,7 +17,7 @@ _Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
 def report_dataset(paths: _Paths, out: Path, *, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
-    """Write what a data set holds as one HTML file that needs no other and no network.
+    """Write a report on a data set as one self-contained HTML file, without network.
 
     Args:
         paths: Shard files, or folders that hold some at any depth; of several hands and objects if need be.
@@ -43,7 +43,7 @@ def report_dataset(paths: _Paths, out: Path, *, progress: Callable[[int, int], N
 def read_dataset(
     paths: _Paths, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[dict[str, Any], dict[tuple[str, str], HandRows]]:
-    """The numbers of a report, and what its charts are drawn from, by name and hash of the hands.
+    """The numbers of a report, and the data of its charts, by name and hash of the hands.
 
     Shards are read once, some thousand rows at a time; of the rows stay counts, an even sample of at most 50,000 per
     hand for the scatter plots, and poses and joints of one hand with one object at a time to find near-duplicates (some

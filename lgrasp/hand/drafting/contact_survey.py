@@ -1,4 +1,4 @@
-"""What a hand can do with given joints locked: palmar surface, contact cones, and the best place to hold something."""
+"""Survey of a hand with given joints locked: palmar surface, contact cones, and the best place to hold something."""
 
 from dataclasses import dataclass, replace
 

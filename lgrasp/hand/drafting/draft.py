@@ -36,7 +36,7 @@ _SHARED_VALUES = {1: 4, 2: 3, 3: 2}  # values of each shared joint, by their num
 def draft_spec(
     urdf_path: Path, name: str | None = None, *, jaws: tuple[str, str] | None = None
 ) -> tuple[HandSpec, list[str]]:
-    """Rules for a hand from its URDF alone, and what was decided, in words.
+    """Rules for a hand from its URDF alone, with the decisions in words.
 
     Args:
         jaws: (static link, moving link) of a gripper that :func:`lgrasp.hand.drafting.reroot.reroot` turned round.

@@ -60,7 +60,7 @@ def tip_link(urdf: Urdf, structure: FingerStructure) -> str:
 
 
 def probe_spec(name: str, link: str, locked: dict[str, float], base_link: str | None) -> HandSpec:
-    """Rules that say no more than what is needed to build a model: one contact link."""
+    """The least rules that are needed to build a model: one contact link."""
     box = {"min": (0.0, 0.0, 0.0), "max": (0.1, 0.1, 0.1)}
     data = {
         "name": name,

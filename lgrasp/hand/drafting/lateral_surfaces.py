@@ -22,7 +22,7 @@ _MAX_HINGE_COSINE = 0.6  # cosine of the last hinge to the finger's direction, a
 
 @dataclass(frozen=True, eq=False)
 class Finger:
-    """What a finger can press with, and where it is in a posture (base frame)."""
+    """The contact surface of a finger, and where it is in a posture (base frame)."""
 
     name: str
     joints: tuple[str, ...]  # that move its tip, shared ones left out

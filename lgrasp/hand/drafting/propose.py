@@ -22,7 +22,7 @@ _PALM_PART_MARGIN = 0.005  # [m] of a part of the palm beyond its surface
 def propose_spaces(
     urdf: Urdf, spec: HandSpec, survey: ContactSurvey, names: list[str], model: HandModel
 ) -> tuple[dict[str, OppositionSpace], list[str]]:
-    """Opposition spaces of a hand whose sides can face each other, and what was decided, in words.
+    """Opposition spaces of a hand whose sides can face each other, with the decisions in words.
 
     Args:
         spec: rules of the hand, without spaces. model: the hand built from them.

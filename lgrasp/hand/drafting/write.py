@@ -8,7 +8,7 @@ from lgrasp.hand.spec import Cone, HandSpec, OppositionSpace, Surface
 
 
 def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
-    """Write a hand.yaml with a comment on every key and what was decided on top."""
+    """Write a hand.yaml with a comment on every key and the decisions at the top."""
     lines = [
         "# Drafted by 'lgrasp hands add'. Every key may be changed; 'lgrasp hands check' says what a change does.",
         "#",

@@ -25,7 +25,7 @@ _CANDIDATES_PER_ROW = 300  # candidates per row before an object is given up
 
 @dataclass(frozen=True)
 class ObjectCheck:
-    """What one object gave."""
+    """Result for one object."""
 
     name: str
     asked: int
@@ -38,7 +38,7 @@ class ObjectCheck:
 
 @dataclass
 class HandCheck:
-    """What :func:`check_hand` found."""
+    """Result of :func:`check_hand`."""
 
     hand: str
     note: str  # where the rules come from

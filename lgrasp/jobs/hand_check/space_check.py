@@ -1,4 +1,4 @@
-"""What the opposition spaces of a hand can hold: surface of their sides, and how far apart these face each other."""
+"""Check of the opposition spaces of a hand: surface of their sides, and how far apart these face each other."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from lgrasp.jobs.hand_check.diagnose import finger_label
 
 @dataclass(frozen=True)
 class SpaceCheck:
-    """What one opposition space was found to be."""
+    """Findings on one opposition space."""
 
     name: str
     joints: list[str]

@@ -33,7 +33,7 @@ _JOINT_TOLERANCE = 1e-4  # [rad or m] that a joint may be outside its limits
 
 
 class Moved(NamedTuple):
-    """What became of rows."""
+    """Outcomes of rows."""
 
     rows: GraspRows
     """Those to write in their order, with metrics ``energy`` and its terms at the posture stored, ``valid`` (passes

@@ -215,7 +215,7 @@ class PlanJob(Job):
 
 
 def lost_starts(counts: dict[str, int]) -> str:
-    """What became of the starts that gave no plan, in words."""
+    """Outcomes of the starts that gave no plan, in words."""
     return ", ".join(f"{n} {what}" for what, n in counts.items() if what not in ("starts", "kept") and n)
 
 

@@ -14,7 +14,7 @@ from lgrasp.scenes.params import SceneParams
 
 
 class SceneConfig(Job):
-    """What scenes are asked of one hand. Paths are relative to the current folder."""
+    """The scenes requested of one hand. Paths are relative to the current folder."""
 
     hand: str | None = Field(None, description="Name or path; default: that of the grasps, else allegro.")
     objects: tuple[str, ...] = Field((), description="Names or paths; default: all objects of the grasps.")
@@ -39,7 +39,7 @@ def scene_configs() -> dict[str, Path]:
 
 
 def read_scene_config(name: str) -> dict[str, Any]:
-    """What a config holds, by path or by name.
+    """Read a config, by path or by name.
 
     Raises:
         ConfigError: no such config.

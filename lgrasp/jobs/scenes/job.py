@@ -98,7 +98,7 @@ class SceneJob(SceneConfig):
         write_scene(part.file, contents)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
-        """What the scenes hold (see :func:`describe_scenes`), ``hand`` and ``scenes_per_minute``."""
+        """The contents of the scenes (see :func:`describe_scenes`), ``hand`` and ``scenes_per_minute``."""
         seconds, made = outcome.seconds["parts"], len(outcome.written)
         return describe_scenes(outcome.paths) | {
             "hand": self.hand_name,

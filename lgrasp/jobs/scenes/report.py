@@ -1,4 +1,4 @@
-"""What scenes hold, in numbers, from the files."""
+"""The contents of scenes, in numbers, from the files."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a job of sequences starts from: a hand, the views of its opposition spaces with their fields, the objects."""
+"""Inputs of a job of sequences: a hand, the views of its opposition spaces with their fields, the objects."""
 
 import hashlib
 import json
@@ -36,7 +36,7 @@ Report = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class SequenceKeys:
-    """Content keys of what a job starts from."""
+    """Content keys of the inputs of a job."""
 
     source: HandSource
     hand: str
@@ -62,7 +62,7 @@ class SpaceView:
 
 @dataclass(frozen=True)
 class SequenceInputs:
-    """What a job starts from, on its device."""
+    """Inputs of a job, on its device."""
 
     hand: HandModel
     spaces: tuple[Space, ...]

@@ -72,7 +72,7 @@ class SequenceJob(Job):
 
     @property
     def inputs(self) -> SequenceInputs:
-        """What the sequences are made from, once it is loaded."""
+        """The inputs of the sequences, once loaded."""
         assert self._inputs is not None
         return self._inputs
 

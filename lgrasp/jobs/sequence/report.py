@@ -1,4 +1,4 @@
-"""What a job of sequences did, in numbers; and why an object was not held."""
+"""Results of a job of sequences, in numbers; and why objects were not held."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""One round: sequences begun together, object by object."""
+"""One round: sequences started together, object by object."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -31,7 +31,7 @@ Verdicts = Callable[[list[SequenceTable]], dict[str, np.ndarray]]
 
 @dataclass
 class Round:
-    """What a round gave: level n holds the rows of n + 1 objects; their parents are rows of the level before."""
+    """Result of a round: level n holds the rows of n + 1 objects; their parents are rows of the level before."""
 
     levels: list[SequenceTable] = field(default_factory=list)
     counts: dict[str, dict[str, int]] = field(default_factory=dict)

@@ -18,7 +18,7 @@ _NEIGHBOURS = wp.constant(16.0)  # contact points before and after one, in order
 
 
 class DomainCount(IntEnum):
-    """What the stage counts."""
+    """Counts of the stage."""
 
     POSES = 0
     RICH = 1

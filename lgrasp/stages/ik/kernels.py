@@ -23,7 +23,7 @@ mat_dof = wp.types.matrix((MAX_DOFS, MAX_DOFS), wp.float32)
 
 
 class IkCount(IntEnum):
-    """What the stage counts; SETS of contact sets only."""
+    """Counts of the stage; SETS of contact sets only."""
 
     TRIED = 0
     REACHED = 1

@@ -29,7 +29,7 @@ _PALM_COSINE = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched obje
 
 
 class PlaceCount(IntEnum):
-    """What the stage counts."""
+    """Counts of the stage."""
 
     TRIED = 0
     BLOCKED = 1

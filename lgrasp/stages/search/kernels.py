@@ -1,4 +1,4 @@
-"""Kernels of the search stage about its methods: what may be combined, which sets are sound, which are kept."""
+"""Kernels of the search stage about its methods: contacts that may be combined, sets that are sound, sets that are kept."""
 
 from enum import IntEnum
 
@@ -20,7 +20,7 @@ _INSCRIBED = wp.constant(INSCRIBED)
 
 
 class SearchCount(IntEnum):
-    """What the stage counts."""
+    """Counts of the stage."""
 
     POSES = 0
     YIELDING = 1

@@ -52,7 +52,7 @@ class Usable:
 
 @wp.struct
 class TriedSets:
-    """What L starts at each pose came to."""
+    """Results of L starts at each pose."""
 
     chosen: wp.array3d(dtype=wp.int32)  # (P, L, G) candidate of each group, -1 unused
     score: wp.array2d(dtype=wp.float32)  # (P, L) norm of the residual wrench, below 0: no set

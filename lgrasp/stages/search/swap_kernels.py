@@ -1,4 +1,4 @@
-"""Search by swaps: a contact is replaced by another of its group, and what lowers the residual stays."""
+"""Search by swaps: a contact is replaced by another of its group, and kept if that lowers the residual."""
 
 from typing import Any
 
