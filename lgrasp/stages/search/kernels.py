@@ -1,4 +1,4 @@
-"""Kernels of the search stage about its methods: contacts that may be combined, sets that are sound, sets that are kept."""
+"""Kernels of the search stage shared by its methods: usable contacts, sound sets, sets that are kept."""
 
 from enum import IntEnum
 
