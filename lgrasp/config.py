@@ -1,7 +1,7 @@
 """YAML declarations -> checked pydantic models; unknown keys fail and name the nearest valid one."""
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_args
 
@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, mod
 
 from lgrasp.errors import ConfigError
 from lgrasp.notices import notice
+from lgrasp.paths import data_dirs
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -38,6 +39,21 @@ class Params(BaseModel):
                 notice(f"{where}'{key}' is now called '{name}'; the old name works in this release only")
             read[name] = value
         return read
+
+
+def did_you_mean(name: str, choices: Iterable[str], cutoff: float = 0.6) -> str:
+    """``did you mean 'x'? `` for the nearest of the choices, empty when none is near."""
+    near = difflib.get_close_matches(name, list(choices), n=1, cutoff=cutoff)
+    return f"did you mean '{near[0]}'? " if near else ""
+
+
+def yaml_files(kind: str) -> dict[str, Path]:
+    """Name -> YAML file in a data folder (``pipelines``, ``configs/scenes``), the first on the search path of each."""
+    found: dict[str, Path] = {}
+    top, _, below = kind.partition("/")
+    for path in (path for folder in data_dirs(top) for path in sorted((folder / below).glob("*.yaml"))):
+        found.setdefault(path.stem, path)
+    return found
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -70,8 +86,7 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
         key = ".".join(str(part) for part in first["loc"]) or "(whole)"
         if first["type"] == "extra_forbidden":
             name, valid = str(first["loc"][-1]), _keys_at(model, first["loc"][:-1])
-            near = difflib.get_close_matches(name, valid, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
+            hint = did_you_mean(name, valid)
             raise ConfigError(f"{where}: unknown key '{key}'; {hint}valid keys: {', '.join(valid)}") from None
         if first["type"] == "missing":
             raise ConfigError(f"{where}: key '{key}' is missing") from None
@@ -98,9 +113,8 @@ def apply_settings(parts: Mapping[str, BaseModel], settings: Sequence[str], wher
             raise ConfigError(f"--set '{text}': give PART.KEY=VALUE, such as bounds.friction=0.8")
         known = {f"{p}.{k}" for p, model in parts.items() for k in type(model).model_fields}
         if part not in parts or key not in type(parts[part]).model_fields:
-            near = difflib.get_close_matches(name.strip(), sorted(known), n=1, cutoff=0.4)
             keys = [k for k in sorted(known) if k.startswith(f"{part}.")] or sorted(parts)
-            hint = f"did you mean '{near[0]}'? " if near else ""
+            hint = did_you_mean(name.strip(), sorted(known), cutoff=0.4)
             raise ConfigError(f"--set '{text}': {where} has no '{name.strip()}'; {hint}known: {', '.join(keys)}")
         try:
             changes.setdefault(part, {})[key] = yaml.safe_load(value)

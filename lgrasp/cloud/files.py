@@ -1,9 +1,6 @@
 """Files of point clouds and masks: bytes to arrays, nothing judged but their form."""
 
-import contextlib
 import io
-import logging
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +9,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.errors import CloudError, ShardError
+from lgrasp.object.load import quiet_parsers, read_bytes, short_reason
 
 CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz", ".h5")
 
@@ -35,7 +33,7 @@ def read_arrays(path: Path, read_scene: SceneCloud | None = None) -> dict[str, n
         CloudError: no such file, an unknown suffix, or not the form of that suffix.
     """
     accepted = CLOUD_SUFFIXES if read_scene else tuple(s for s in CLOUD_SUFFIXES if s != ".h5")
-    data = _read_bytes(path, accepted, "a point cloud")
+    data = read_bytes(path, accepted, "a point cloud", CloudError)
     kind = path.suffix.lower()
     if kind == ".h5" and read_scene is not None:
         try:
@@ -43,10 +41,10 @@ def read_arrays(path: Path, read_scene: SceneCloud | None = None) -> dict[str, n
         except ShardError as error:
             raise CloudError(str(error)) from None
     try:
-        with _silence():
+        with quiet_parsers():
             found = _parse_ply(data) if kind == ".ply" else _parse_xyz(data) if kind == ".xyz" else _parse_numpy(data)
     except Exception as error:  # the parsers raise anything on garbage
-        raise CloudError(f"{path}: not a readable {kind} cloud ({_reason(error)})") from None
+        raise CloudError(f"{path}: not a readable {kind} cloud ({short_reason(error)})") from None
     points = found["points"]
     if points.ndim not in (2, 3) or points.shape[-1] not in (3, 6) or points.dtype.kind not in "fiu":
         raise CloudError(
@@ -75,13 +73,13 @@ def read_mask(path: Path, count: int) -> np.ndarray:
     Raises:
         CloudError: no such file, not integers or flags, or of another length.
     """
-    data = _read_bytes(path, _MASK_SUFFIXES, "a mask")
+    data = read_bytes(path, _MASK_SUFFIXES, "a mask", CloudError)
     try:
         values = _load_numpy(data)
         if not isinstance(values, np.ndarray):
             values = values[_named(values, (*_LABELS, "mask"), "labels")]
     except Exception as error:  # the parsers raise anything on garbage
-        raise CloudError(f"{path}: not a readable mask ({_reason(error)})") from None
+        raise CloudError(f"{path}: not a readable mask ({short_reason(error)})") from None
     return check_labels(np.asarray(values), count, str(path))
 
 
@@ -97,39 +95,6 @@ def check_labels(values: np.ndarray, count: int, where: str) -> np.ndarray:
     if values.size != count:
         raise CloudError(f"{where}: {values.size:,} labels for a cloud of {count:,} points; one for each is accepted")
     return values.ravel().astype(np.int64)
-
-
-def _read_bytes(path: Path, suffixes: tuple[str, ...], what: str) -> bytes:
-    accepted = ", ".join(suffixes)
-    if not path.is_file():
-        state = "is a folder" if path.is_dir() else "does not exist"
-        raise CloudError(f"{path}: {state}; {what} ({accepted}) is accepted")
-    if path.suffix.lower() not in suffixes:
-        raise CloudError(f"{path}: suffix '{path.suffix}' is unknown; accepted are {accepted}")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise CloudError(f"{path}: cannot be read ({error.strerror})") from None
-    if not data:
-        raise CloudError(f"{path}: 0 bytes; {what} ({accepted}) is accepted")
-    return data
-
-
-@contextlib.contextmanager
-def _silence():
-    """Keep the parsers from warning or logging: whatever matters is checked on their result."""
-    log = logging.getLogger("trimesh")
-    before, log.disabled = log.disabled, True
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        log.disabled = before
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__
 
 
 def _parse_ply(data: bytes) -> dict[str, np.ndarray]:

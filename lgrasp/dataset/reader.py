@@ -2,17 +2,17 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import h5py
 import numpy as np
 
 from lgrasp.dataset.heap import check_heaps
-from lgrasp.dataset.structure import expand, format_problem, structure_problems
+from lgrasp.dataset.structure import expand, format_problems, structure_problems
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
@@ -53,27 +53,27 @@ def open_hdf5(path: str | os.PathLike[str]) -> h5py.File:
         raise ShardError(f"{path}: {kind}{reason[:200]}") from error
 
 
-class ShardReader:
-    """One open shard; a context manager. Rows are read on demand; opening reads no row.
+class FileReader:
+    """An open file with a hand and objects; a context manager. Opening reads no array.
 
     Raises:
         ShardError: On opening, the file is truncated, foreign, of another format version or not of the format's
             structure; on reading, a checksum does not match.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], problems: Callable[[h5py.File], list[str]]) -> None:
         self.path = Path(path)
         self._file = open_hdf5(self.path)
         try:
             with reading(self.path):
-                problem = format_problem(self._file) or next(iter(structure_problems(self._file)), None)
+                problem = next(iter(problems(self._file)), None)
             if problem:
                 raise ShardError(f"{self.path}: {problem}")
         except BaseException:
             self.close()
             raise
 
-    def __enter__(self) -> "ShardReader":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -82,9 +82,6 @@ class ShardReader:
     def close(self) -> None:
         """Close the file; closing twice is harmless."""
         self._file.close()
-
-    def __len__(self) -> int:
-        return self._dataset("q").shape[0]
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -96,6 +93,39 @@ class ShardReader:
     def object_ids(self) -> list[str]:
         """Sorted object ids; ``object_index`` counts in this list."""
         return sorted(self._file["objects"])
+
+    def hand(self) -> HandRecord:
+        """The hand, with its mesh files."""
+        with reading(self.path):
+            return read_hand(self._file)
+
+    def object(self, object_id: str) -> ObjectRecord:
+        """One object with its mesh."""
+        with reading(self.path):
+            if object_id not in self.object_ids:
+                raise ShardError(f"{self.path}: no object {object_id!r}; it has {', '.join(self.object_ids)}")
+            return read_object(self._file, object_id)
+
+    def objects(self) -> tuple[ObjectRecord, ...]:
+        """All objects, sorted by id."""
+        return tuple(self.object(i) for i in self.object_ids)
+
+    @property
+    def statistics(self) -> dict[str, int | float | str]:
+        """Counts and seconds, device name."""
+        with reading(self.path):
+            attrs = self._file["statistics"].attrs
+            return {k: v.item() if isinstance(v, np.generic) else v for k, v in sorted(attrs.items())}
+
+
+class ShardReader(FileReader):
+    """One open shard; rows are read on demand."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        super().__init__(path, lambda file: format_problems(file) or structure_problems(file))
+
+    def __len__(self) -> int:
+        return self._dataset("q").shape[0]
 
     @cached_property
     def space_names(self) -> tuple[str, ...] | None:
@@ -159,29 +189,6 @@ class ShardReader:
                 lgrasp_version=attrs["lgrasp_version"],
                 merged_from=tuple(json.loads(attrs.get("merged_from", "[]"))),
             )
-
-    def hand(self) -> HandRecord:
-        """The hand, with its mesh files."""
-        with reading(self.path):
-            return read_hand(self._file)
-
-    def object(self, object_id: str) -> ObjectRecord:
-        """One object with its mesh."""
-        with reading(self.path):
-            if object_id not in self.object_ids:
-                raise ShardError(f"{self.path}: no object {object_id!r}; it has {', '.join(self.object_ids)}")
-            return read_object(self._file, object_id)
-
-    def objects(self) -> tuple[ObjectRecord, ...]:
-        """All objects, sorted by id."""
-        return tuple(self.object(i) for i in self.object_ids)
-
-    @property
-    def statistics(self) -> dict[str, int | float | str]:
-        """Counts and seconds per stage, device name."""
-        with reading(self.path):
-            attrs = self._file["statistics"].attrs
-            return {k: v.item() if isinstance(v, np.generic) else v for k, v in sorted(attrs.items())}
 
     def _dataset(self, name: str) -> h5py.Dataset:
         with reading(self.path):

@@ -21,17 +21,19 @@ from lgrasp.grasp.schema import (
 )
 
 
-def format_problem(file: h5py.File) -> str | None:
-    """Why a file is not a whole shard of a version that this package reads, or None."""
-    if file.attrs.get("format") != FORMAT:
-        return f"not a grasp shard (attribute format is {file.attrs.get('format')!r}, expected {FORMAT!r})"
-    version = str(file.attrs.get("format_version"))
-    major = FORMAT_VERSION.partition(".")[0]
-    if not re.fullmatch(rf"{major}\.\d+", version):
-        return f"format_version is {version!r}, this lgrasp reads {major}.x; use a newer lgrasp"
-    if not np.array_equal(file.attrs.get("complete"), 1):
-        return f"incomplete (attribute complete is {file.attrs.get('complete')!r}, expected 1)"
-    return None
+def format_problems(
+    file: h5py.File, name: str = "grasp shard", form: str = FORMAT, version: str = FORMAT_VERSION
+) -> list[str]:
+    """Why a file is no whole file of a version that this package reads, in one line; empty when it is."""
+    attrs, major = file.attrs, version.partition(".")[0]
+    if attrs.get("format") != form:
+        return [f"not a {name} (attribute format is {attrs.get('format')!r}, expected {form!r})"]
+    found = str(attrs.get("format_version"))
+    if not re.fullmatch(rf"{major}\.\d+", found):
+        return [f"format_version is {found!r}, this lgrasp reads {major}.x; use a newer lgrasp"]
+    if not np.array_equal(attrs.get("complete"), 1):
+        return [f"incomplete (attribute complete is {attrs.get('complete')!r}, expected 1)"]
+    return []
 
 
 def structure_problems(file: h5py.File) -> list[str]:

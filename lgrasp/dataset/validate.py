@@ -7,7 +7,7 @@ import numpy as np
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.heap import check_heaps
 from lgrasp.dataset.reader import ShardReader, open_hdf5, reading
-from lgrasp.dataset.structure import format_problem, structure_problems, text_sha256
+from lgrasp.dataset.structure import format_problems, structure_problems, text_sha256
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import object_set_sha256
 
@@ -21,8 +21,7 @@ def validate_shard(path: str | os.PathLike[str]) -> list[str]:
     try:
         check_heaps(path)
         with open_hdf5(path) as file, reading(path):
-            fatal = format_problem(file)
-            problems = [fatal] if fatal else structure_problems(file)
+            problems = format_problems(file) or structure_problems(file)
             if not problems and file.attrs.get("text_sha256", text_sha256(file)) != text_sha256(file):
                 problems = ["/: attributes or texts were changed after writing (text_sha256 differs)"]
         if problems:

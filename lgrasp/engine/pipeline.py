@@ -1,13 +1,12 @@
 """pipelines/NAME.yaml: ordered stages with parameters; all of it is in the content keys."""
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny
+from pydantic import BaseModel, Field, SerializeAsAny
 
-from lgrasp.config import apply_settings, parse_model, read_yaml
+from lgrasp.config import Params, apply_settings, did_you_mean, parse_model, read_yaml, yaml_files
 from lgrasp.engine.migration import ALIASES, move_to_bounds, stage_name
 from lgrasp.engine.registry import SEQUENCE, STAGES, Stage, check_order
 from lgrasp.errors import ConfigError
@@ -15,13 +14,10 @@ from lgrasp.field.params import FieldParams
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.notices import notice
 from lgrasp.object.params import ObjectParams
-from lgrasp.paths import data_dirs
 
 
-class _Declared(BaseModel):
+class _Declared(Params):
     """The file as written."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     description: str = ""
@@ -34,10 +30,8 @@ class _Declared(BaseModel):
     sequence: dict[str, Any] | None = None
 
 
-class Pipeline(BaseModel):
+class Pipeline(Params):
     """What is computed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     description: str = ""
@@ -128,11 +122,7 @@ class Pipeline(BaseModel):
 
 def pipeline_files() -> dict[str, Path]:
     """Name -> file of every pipeline on the search path."""
-    found: dict[str, Path] = {}
-    for folder in data_dirs("pipelines"):
-        for path in sorted(folder.glob("*.yaml")):
-            found.setdefault(path.stem, path)
-    return found
+    return yaml_files("pipelines")
 
 
 def load_pipeline(name: str) -> Pipeline:
@@ -147,8 +137,7 @@ def load_pipeline(name: str) -> Pipeline:
         name = ALIASES[name]
     path = files.get(name) or Path(name).expanduser()
     if not path.is_file():
-        near = difflib.get_close_matches(name, files, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(name, files)
         known = ", ".join(files)
         raise ConfigError(f"unknown pipeline '{name}'; {hint}known: {known}, or give the path of a YAML file")
     declared = parse_model(_Declared, read_yaml(path), f"pipeline {path}")
@@ -164,8 +153,7 @@ def load_pipeline(name: str) -> Pipeline:
                 sequence = params or {}
                 continue
             if stage not in STAGES:
-                near = difflib.get_close_matches(stage, STAGES, n=1)
-                hint = f"did you mean '{near[0]}'? " if near else ""
+                hint = did_you_mean(stage, STAGES)
                 raise ConfigError(f"pipeline {path}: unknown stage '{stage}'; {hint}stages: {', '.join(STAGES)}")
             stages.append((stage, parse_model(STAGES[stage].params, params or {}, f"pipeline {path}, stage {stage}")))
     check_order(tuple(n for n, _ in stages), f"pipeline {path}")

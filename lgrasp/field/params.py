@@ -2,13 +2,13 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from lgrasp.config import Params
 
 
-class FieldParams(BaseModel):
+class FieldParams(Params):
     """How the contact field of a hand is sampled and indexed; lengths in metres."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     index: Literal["voxel", "bvh"] = Field(
         "voxel", description="voxel: table with joint seeds; bvh: one tree per patch."

@@ -1,8 +1,8 @@
-"""Rotations and rigid motions in torch: 6D representation, exponential and logarithm, quaternions."""
+"""Rotations and rigid motions in torch: 6D representation, exponential, quaternions."""
 
 import torch
 
-_SMALL_ANGLE = 1.0e-4  # [rad]
+_SMALL_ANGLE = 1.0e-4  # [rad²], squared angles below take series
 """Squared angles below this take series; the first term left out is then below 1e-17."""
 
 
@@ -27,46 +27,16 @@ def sixd_from_matrix(R: torch.Tensor) -> torch.Tensor:
     return torch.cat([R[..., 0], R[..., 1]], -1)
 
 
-def _series(w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """sin a / a, (1 - cos a) / a^2 and (a - sin a) / a^3 of rotation vectors (..., 3), each (..., 1, 1)."""
+def so3_exp(w: torch.Tensor) -> torch.Tensor:
+    """Rotations (..., 3, 3) about axes and by angles of rotation vectors (..., 3) [rad]; smooth at 0."""
     s = (w * w).sum(-1)[..., None, None]
     small = s < _SMALL_ANGLE
     a2 = torch.where(small, torch.ones_like(s), s)  # keeps the unused branch, and its derivative, finite
     a = a2.sqrt()
     sine = torch.where(small, 1 - s / 6 * (1 - s / 20 * (1 - s / 42)), torch.sin(a) / a)
     cosine = torch.where(small, 0.5 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56))), (1 - torch.cos(a)) / a2)
-    cubic = torch.where(small, (1 - s / 20 * (1 - s / 42 * (1 - s / 72))) / 6, (a - torch.sin(a)) / (a2 * a))
-    return sine, cosine, cubic
-
-
-def so3_exp(w: torch.Tensor) -> torch.Tensor:
-    """Rotations (..., 3, 3) about axes and by angles of rotation vectors (..., 3) [rad]; smooth at 0."""
-    sine, cosine, _ = _series(w)
     K = skew(w)
     return torch.eye(3, dtype=w.dtype, device=w.device) + sine * K + cosine * (K @ K)
-
-
-def so3_log(R: torch.Tensor) -> torch.Tensor:
-    """Rotation vectors (..., 3) [rad] of rotations (..., 3, 3); angles up to pi, derivatives below pi."""
-    q = quaternion_from_matrix(R)
-    v, c = q[..., :3], q[..., 3:]
-    s2 = (v * v).sum(-1, keepdim=True)
-    small = s2 < _SMALL_ANGLE
-    s = torch.where(small, torch.ones_like(s2), s2).sqrt()
-    # angle / sin(angle / 2), with c >= 0
-    near = 2 * (1 + s2 / 6 * (1 + 9 * s2 / 20 * (1 + 25 * s2 / 42)))
-    return torch.where(small, near, 2 * torch.atan2(s, c) / s) * v
-
-
-def se3_exp(xi: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rigid motions R (..., 3, 3) and t (..., 3) of twists (..., 6): velocity [m], then rotation vector [rad]."""
-    v, w = xi[..., :3], xi[..., 3:]
-    sine, cosine, cubic = _series(w)
-    K = skew(w)
-    K2 = K @ K
-    one = torch.eye(3, dtype=xi.dtype, device=xi.device)
-    V = one + cosine * K + cubic * K2
-    return one + sine * K + cosine * K2, (V @ v[..., None])[..., 0]
 
 
 def matrix_from_quaternion(q: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,8 @@ import lgrasp
 from lgrasp.grasp.schema import GRASP_FIELDS, SEQUENCE_FIELDS
 
 
-def _now() -> str:
+def now() -> str:
+    """ISO 8601 with time zone."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
@@ -140,7 +141,7 @@ class ShardHeader:
     """Position in the run; -1 for a merged file."""
     config: Mapping[str, Any] = field(default_factory=dict)
     """Resolved pipeline parameters, JSON-serialisable."""
-    created: str = field(default_factory=_now)
+    created: str = field(default_factory=now)
     """ISO 8601 with time zone."""
     lgrasp_version: str = lgrasp.__version__
     merged_from: Sequence[Mapping[str, Any]] = ()

@@ -76,7 +76,7 @@ ROW_GROUPS: dict[str, DatasetSpec] = {
 }
 """Families of row datasets by their name in :class:`lgrasp.dataset.GraspRows`."""
 
-DATASETS: tuple[DatasetSpec, ...] = (
+MODEL_DATASETS: tuple[DatasetSpec, ...] = (
     DatasetSpec("hand/urdf", "text", ()),
     DatasetSpec("hand/meshes/*", "u1", ("b",)),
     DatasetSpec("hand/joint_names", "text", ("K",)),
@@ -85,6 +85,11 @@ DATASETS: tuple[DatasetSpec, ...] = (
     DatasetSpec("hand/link_names", "text", ("L",)),
     DatasetSpec("objects/*/vertices", "f4", ("v", 3), "m"),
     DatasetSpec("objects/*/faces", "i4", ("f", 3)),
+)
+"""Of a hand and of objects, in every format."""
+
+DATASETS: tuple[DatasetSpec, ...] = (
+    *MODEL_DATASETS,
     DatasetSpec("objects/*/normals", "f4", ("v", 3), required=False),
     *GRASP_FIELDS.values(),
     *ROW_GROUPS.values(),
@@ -96,6 +101,16 @@ SEQUENCE_DATASETS: tuple[DatasetSpec, ...] = (
     *SEQUENCE_FIELDS.values(),
 )
 """Datasets of a file of sequences; where one is there, all are required."""
+
+MODEL_ATTRIBUTES: tuple[AttributeSpec, ...] = (
+    AttributeSpec("hand", "base_link", "text"),
+    AttributeSpec("hand/meshes/*", "path", "text"),
+    AttributeSpec("objects/*", "name", "text"),
+    AttributeSpec("objects/*", "scale", "float"),
+    AttributeSpec("objects/*", "sha256", "sha256"),
+    AttributeSpec("objects/*", "watertight", "bool"),
+)
+"""Of a hand and of objects, in every format."""
 
 ATTRIBUTES: tuple[AttributeSpec, ...] = (
     AttributeSpec("", "format", "text"),
@@ -112,12 +127,7 @@ ATTRIBUTES: tuple[AttributeSpec, ...] = (
     AttributeSpec("", "complete", "int"),
     AttributeSpec("", "merged_from", "json", required=False),
     AttributeSpec("", "text_sha256", "sha256", required=False),
-    AttributeSpec("hand", "base_link", "text"),
-    AttributeSpec("hand/meshes/*", "path", "text"),
-    AttributeSpec("objects/*", "name", "text"),
-    AttributeSpec("objects/*", "scale", "float"),
-    AttributeSpec("objects/*", "sha256", "sha256"),
-    AttributeSpec("objects/*", "watertight", "bool"),
+    *MODEL_ATTRIBUTES,
     AttributeSpec("grasps/metrics/*", "unit", "text"),
     AttributeSpec("grasps/physics/*", "protocol", "text"),
 )

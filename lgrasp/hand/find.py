@@ -1,10 +1,10 @@
 """From the user's name of a hand to its URDF file and rules."""
 
-import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lgrasp.config import did_you_mean
 from lgrasp.errors import HandError
 from lgrasp.hand.packages import PACKAGE_HANDS, package_urdf
 from lgrasp.hand.spec import Coupling, HandSpec, load_spec
@@ -66,8 +66,7 @@ def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
         return _from_urdf(path, known)
     if path.suffix or "/" in name:
         raise HandError(f"hand file {path} does not exist; known hands: {', '.join(known)}")
-    near = difflib.get_close_matches(name, [*known, *PACKAGE_HANDS], n=1)
-    hint = f"did you mean '{near[0]}'? " if near else ""
+    hint = did_you_mean(name, [*known, *PACKAGE_HANDS])
     raise HandError(
         f"unknown hand '{name}'; {hint}known hands: {', '.join(known)}, those of packages: {', '.join(PACKAGE_HANDS)}, "
         "or give the path of a URDF"

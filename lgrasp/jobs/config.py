@@ -1,14 +1,13 @@
 """On what and where: default folders and configs/*.yaml."""
 
-import difflib
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from lgrasp.config import parse_model, read_yaml
+from lgrasp.config import Params, did_you_mean, parse_model, read_yaml, yaml_files
 from lgrasp.engine.bank import with_passes
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
@@ -18,13 +17,10 @@ from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
 from lgrasp.object.find import MESH_SUFFIXES, find_object
-from lgrasp.paths import data_dirs
 
 
-class JobConfig(BaseModel):
+class JobConfig(Params):
     """Many hands and objects in one run: configs/NAME.yaml. Paths are relative to the current folder."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     description: str = ""
     hands: tuple[str, ...] = Field(("allegro",), min_length=1, description="Names or paths.")
@@ -56,11 +52,7 @@ class JobConfig(BaseModel):
 
 def config_files() -> dict[str, Path]:
     """Name -> file of every job config on the search path."""
-    found: dict[str, Path] = {}
-    for folder in data_dirs("configs"):
-        for path in sorted(folder.glob("*.yaml")):
-            found.setdefault(path.stem, path)
-    return found
+    return yaml_files("configs")
 
 
 def config_path(name: str) -> Path:
@@ -74,8 +66,7 @@ def config_path(name: str) -> Path:
         return path
     files = config_files()
     if name not in files:
-        near = difflib.get_close_matches(path.stem, files, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(path.stem, files)
         names = ", ".join(files) or "none"
         raise ConfigError(f"unknown config '{name}'; {hint}known: {names}, or give the path of a YAML file")
     return files[name]
@@ -114,8 +105,7 @@ def load_jobs(name: str, changes: dict[str, Any], cache: Cache) -> list[Job]:
     data = read_yaml(path)
     kind = data.pop("job", "generate")
     if kind not in ("generate", *KINDS):
-        near = difflib.get_close_matches(str(kind), ("generate", *KINDS), n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(str(kind), ("generate", *KINDS))
         raise ConfigError(f"config {path}: unknown job '{kind}'; {hint}known: generate, {', '.join(KINDS)}")
     if kind == "generate" or "sequences" in data:
         config = parse_model(JobConfig, data | changes, f"config {path}")

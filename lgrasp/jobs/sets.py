@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
+from lgrasp.config import Params
 from lgrasp.errors import ConfigError
 from lgrasp.seeding import stage_seed
 
 
-class SequenceSets(BaseModel):
+class SequenceSets(Params):
     """How sequences are drawn from the objects of a config."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     sets: int = Field(600, ge=1, description="Different sets of objects.")
     length: int = Field(4, ge=2, le=16, description="Objects in a set.")

@@ -1,12 +1,12 @@
 """Parameters of the coarse predictor and its training; lengths in metres."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from lgrasp.config import Params
 
 
-class LearnParams(BaseModel):
+class LearnParams(Params):
     """Input and size of the network, and the length of its training."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     points: int = Field(96, ge=16, le=8192, description="Points of a cloud that the network sees.")
     width: int = Field(64, ge=8, le=4096, description="Channels of a point; the whole has twice as many.")

@@ -6,7 +6,7 @@ import io
 import logging
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
 
-from lgrasp.errors import ObjectError
+from lgrasp.errors import LgraspError, ObjectError
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.params import ObjectParams
 
@@ -67,7 +67,7 @@ def load_mesh(
     else:
         path = Path(source)
         label, name = str(path), path.stem
-        data = _read_bytes(path)
+        data = read_bytes(path, MESH_SUFFIXES, "a mesh file", ObjectError)
         sha = hashlib.sha256(data).hexdigest()
         vertices, faces, parts = _parse(path, data)
     if not len(faces):
@@ -101,25 +101,31 @@ def open_edges(faces: np.ndarray) -> np.ndarray:
     return edges[(balance[group] != 0.0) & ((balance[group] > 0.0) == forward)]
 
 
-def _read_bytes(path: Path) -> bytes:
-    accepted = ", ".join(MESH_SUFFIXES)
+def read_bytes(path: Path, suffixes: Sequence[str], what: str, error: type[LgraspError]) -> bytes:
+    """All bytes of an input file.
+
+    Args:
+        what: what is accepted, such as ``a mesh file``.
+        error: raised, in one line, for no file, an unknown suffix, a file that cannot be read or is empty.
+    """
+    accepted = f"{what} ({', '.join(suffixes)}) is accepted"
     if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise ObjectError(f"{path}: {what}; a mesh file ({accepted}) is accepted")
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise ObjectError(f"{path}: suffix '{path.suffix}' is unknown; accepted are {accepted}")
+        raise error(f"{path}: {'is a folder' if path.is_dir() else 'does not exist'}; {accepted}")
+    if path.suffix.lower() not in suffixes:
+        raise error(f"{path}: suffix '{path.suffix}' is unknown; accepted are {', '.join(suffixes)}")
     try:
         data = path.read_bytes()
-    except OSError as error:
-        raise ObjectError(f"{path}: cannot be read ({error.strerror}); a readable mesh file is accepted") from error
+    except OSError as problem:
+        why = f"cannot be read ({problem.strerror}); a readable {what.partition(' ')[2]} is accepted"
+        raise error(f"{path}: {why}") from problem
     if not data:
-        raise ObjectError(f"{path}: 0 bytes; a mesh file ({accepted}) is accepted")
+        raise error(f"{path}: 0 bytes; {accepted}")
     return data
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep the mesh parsers from warning or logging: whatever matters is checked on their result."""
+def quiet_parsers() -> Iterator[None]:
+    """Keep the parsers of files from warning or logging: whatever matters is checked on their result."""
     log = logging.getLogger("trimesh")
     before, log.disabled = log.disabled, True
     try:
@@ -130,6 +136,11 @@ def _silence() -> Iterator[None]:
         log.disabled = before
 
 
+def short_reason(error: Exception) -> str:
+    """What a parser says, in at most 120 characters of one line."""
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
 def _parse(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray, int]:
     """Vertices, faces and the number of geometries of a mesh file's bytes."""
     kind = path.suffix.lower()[1:]
@@ -137,12 +148,12 @@ def _parse(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray, int]:
     if kind == "gltf":
         options["resolver"] = FilePathResolver(str(path))
     try:
-        with _silence():
+        with quiet_parsers():
             scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, **options)
             meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
     except Exception as error:  # the parsers raise anything on garbage
-        why = " ".join(str(error).split())[:120] or type(error).__name__
-        raise ObjectError(f"{path}: not a readable .{kind} mesh ({why}); a triangle mesh file is accepted") from error
+        why = f"not a readable .{kind} mesh ({short_reason(error)}); a triangle mesh file is accepted"
+        raise ObjectError(f"{path}: {why}") from error
     if not meshes:
         raise ObjectError(f"{path}: 0 faces; a .{kind} file with a triangle mesh of a solid is accepted")
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
@@ -224,7 +235,7 @@ def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.nda
     if len(open_edges(faces)):
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         if not mesh.is_winding_consistent:
-            with _silence():
+            with quiet_parsers():
                 trimesh.repair.fix_winding(mesh)
             turned = int((mesh.faces != faces).any(axis=1).sum())
             if turned:

@@ -1,6 +1,5 @@
 """The model of an object for all later stages, as plain arrays that can be cached."""
 
-import os
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -75,15 +74,3 @@ class ObjectModel:
         plain: dict[str, Any] = {k: v.item() if v.ndim == 0 else np.ascontiguousarray(v) for k, v in values.items()}
         plain["notes"] = plain["notes"].split("\n") if plain["notes"] else []
         return cls(**plain)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`to_arrays` to an npz file."""
-        with open(path, "wb") as file:
-            arrays: dict[str, Any] = self.to_arrays()
-            np.savez(file, **arrays)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "ObjectModel":
-        """Read a file written by :meth:`save`."""
-        with np.load(path, allow_pickle=False) as arrays:
-            return cls.from_arrays(arrays)

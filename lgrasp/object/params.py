@@ -2,15 +2,15 @@
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from lgrasp.config import Params
 
 Length = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
-class ObjectParams(BaseModel):
+class ObjectParams(Params):
     """How a mesh becomes an :class:`~lgrasp.object.ObjectModel`; lengths in metres, angles in degrees."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: int = Field(default=0, ge=0, description="Seed of every sampling step.")
     min_extent: Length = Field(default=0.005, description="Largest side below this is refused as a unit mistake.")

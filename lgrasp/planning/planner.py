@@ -8,8 +8,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from lgrasp.config import Params
 from lgrasp.geometry.poses import device_inverse
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps
@@ -33,10 +34,8 @@ _COARSE_BOUNDS = {"max_penetration": 0.01, "max_gap": 0.012, "max_normal_angle":
 _PLAN_BOUNDS = GraspBounds(profile="plan")
 
 
-class PlanParams(BaseModel):
+class PlanParams(Params):
     """How many hands are tried, how far they are moved, and the conditions on a plan."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rolls: int = Field(
         default=30, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."

@@ -2,15 +2,15 @@
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from lgrasp.config import Params
 
 _Length = Annotated[float, Field(gt=0.0, le=5.0)]
 
 
-class CameraParams(BaseModel):
+class CameraParams(Params):
     """Depth cameras around the table; lengths in metres, angles in degrees."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     views: int = Field(3, ge=1, le=16, description="Cameras, evenly around the table from a random direction on.")
     width: int = Field(320, ge=16, le=4096, description="Pixels.")
@@ -34,10 +34,8 @@ class CameraParams(BaseModel):
         return self
 
 
-class DropParams(BaseModel):
+class DropParams(Params):
     """How objects come to lie on the table; lengths in metres, times in seconds."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     radius: _Length = Field(0.25, description="Objects are dropped within this distance of the table's middle.")
     gap: float = Field(0.01, ge=0.0, le=1.0, description="Least distance of dropped objects to all others at first.")
@@ -49,10 +47,8 @@ class DropParams(BaseModel):
     tries: int = Field(10, ge=1, le=1000, description="Times that objects are dropped until they stay on the table.")
 
 
-class SceneParams(BaseModel):
+class SceneParams(Params):
     """What decides a scene, beside the objects, the grasps and the seed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     objects: int = Field(5, ge=1, le=32, description="Objects on the table.")
     table: _Length = Field(0.8, description="Side of the square table [m].")

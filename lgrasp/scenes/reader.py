@@ -2,17 +2,15 @@
 
 import json
 import os
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
-from lgrasp.dataset import HandRecord, ObjectRecord
 from lgrasp.dataset.heap import check_heaps
-from lgrasp.dataset.reader import open_hdf5, read_hand, read_object, reading
-from lgrasp.dataset.structure import schema_problems, text_sha256
+from lgrasp.dataset.reader import FileReader, open_hdf5, reading
+from lgrasp.dataset.structure import format_problems, schema_problems, text_sha256
 from lgrasp.errors import ShardError
 from lgrasp.scenes.camera import Intrinsics
 from lgrasp.scenes.checks import scene_problems
@@ -33,41 +31,11 @@ class Layout(NamedTuple):
     """T_scene_object, x y z [m] qw qx qy qz, shape [M, 7]."""
 
 
-class SceneReader:
-    """One open scene; a context manager. Opening reads no array.
-
-    Raises:
-        ShardError: On opening, the file is truncated, foreign, of another format version or not of the format's
-            structure; on reading, a checksum does not match.
-    """
+class SceneReader(FileReader):
+    """One open scene."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
-        self._file = open_hdf5(self.path)
-        try:
-            with reading(self.path):
-                problem = next(iter(_structure_problems(self._file)), None)
-            if problem:
-                raise ShardError(f"{self.path}: {problem}")
-        except BaseException:
-            self.close()
-            raise
-
-    def __enter__(self) -> "SceneReader":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file; closing twice is harmless."""
-        self._file.close()
-
-    @cached_property
-    def attributes(self) -> dict[str, Any]:
-        """The root attributes as stored (``config`` is JSON text)."""
-        with reading(self.path):
-            return dict(self._file.attrs)
+        super().__init__(path, _structure_problems)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -75,28 +43,11 @@ class SceneReader:
         with reading(self.path):
             return json.loads(self.attributes["config"])
 
-    @property
-    def statistics(self) -> dict[str, int | float | str]:
-        """Counts and seconds."""
-        with reading(self.path):
-            attrs = self._file["statistics"].attrs
-            return {k: v.item() if isinstance(v, np.generic) else v for k, v in sorted(attrs.items())}
-
-    def hand(self) -> HandRecord:
-        """The hand, with its mesh files."""
-        with reading(self.path):
-            return read_hand(self._file)
-
-    def objects(self) -> tuple[ObjectRecord, ...]:
-        """The objects on the table, each once, sorted by id."""
-        with reading(self.path):
-            return tuple(read_object(self._file, i) for i in sorted(self._file["objects"]))
-
     def layout(self) -> Layout:
         """The objects on the table, and their poses."""
         with reading(self.path):
             table = float(self._file["scene"].attrs["table"])
-            return Layout(tuple(sorted(self._file["objects"])), table=table, **self._arrays("scene"))
+            return Layout(tuple(self.object_ids), table=table, **self._arrays("scene"))
 
     def views(self) -> ViewsRecord:
         """Images of the cameras."""
@@ -168,13 +119,9 @@ def check_scene(path: str | os.PathLike[str]) -> list[str]:
 
 def _structure_problems(file: h5py.File) -> list[str]:
     """Why a file is no whole scene of a version that this package reads, one line each."""
-    if file.attrs.get("format") != FORMAT:
-        return [f"not a scene (attribute format is {file.attrs.get('format')!r}, expected {FORMAT!r})"]
-    version = str(file.attrs.get("format_version"))
-    if version.partition(".")[0] != FORMAT_VERSION.partition(".")[0]:
-        return [f"format_version is {version!r}, this lgrasp reads 1.x; use a newer lgrasp"]
-    if not np.array_equal(file.attrs.get("complete"), 1):
-        return [f"incomplete (attribute complete is {file.attrs.get('complete')!r}, expected 1)"]
+    problems = format_problems(file, "scene", FORMAT, FORMAT_VERSION)
+    if problems:
+        return problems
     if not isinstance(file.get("objects"), h5py.Group) or not len(file["objects"]):
         return ["objects: no object"]
     missing = [f"{name}: missing group" for name in ("hand", "scene", "views", "cloud", "grasps") if name not in file]

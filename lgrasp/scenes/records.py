@@ -2,18 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
 import lgrasp
-from lgrasp.dataset import HandRecord, ObjectRecord
+from lgrasp.grasp.records import HandRecord, ObjectRecord, now
 from lgrasp.scenes.camera import Intrinsics
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +91,6 @@ class SceneRecord:
     config: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that decide the scene, JSON-serialisable."""
     statistics: Mapping[str, int | float | str] = field(default_factory=dict)
-    created: str = field(default_factory=_now)
+    created: str = field(default_factory=now)
     """ISO 8601 with time zone."""
     lgrasp_version: str = lgrasp.__version__

@@ -4,7 +4,7 @@ Capital letters in a shape hold across the file: ``M`` objects on the table, ``V
 ``P`` points, ``N`` grasps, ``K`` listed joints, ``L`` links.
 """
 
-from lgrasp.grasp.schema import AttributeSpec, DatasetSpec
+from lgrasp.grasp.schema import MODEL_ATTRIBUTES, MODEL_DATASETS, AttributeSpec, DatasetSpec
 
 FORMAT = "lgrasp-scene"
 FORMAT_VERSION = "1.0"
@@ -13,14 +13,7 @@ DEPTH_UNIT = 1.0e-4
 """[m] of a step of ``views/depth``."""
 
 DATASETS: tuple[DatasetSpec, ...] = (
-    DatasetSpec("hand/urdf", "text", ()),
-    DatasetSpec("hand/meshes/*", "u1", ("b",)),
-    DatasetSpec("hand/joint_names", "text", ("K",)),
-    DatasetSpec("hand/joint_lower", "f4", ("K",), "rad or m"),
-    DatasetSpec("hand/joint_upper", "f4", ("K",), "rad or m"),
-    DatasetSpec("hand/link_names", "text", ("L",)),
-    DatasetSpec("objects/*/vertices", "f4", ("v", 3), "m"),
-    DatasetSpec("objects/*/faces", "i4", ("f", 3)),
+    *MODEL_DATASETS,
     DatasetSpec("scene/object_index", "i4", ("M",)),
     DatasetSpec("scene/object_pose", "f4", ("M", 7), "m"),
     DatasetSpec("views/pose", "f4", ("V", 7), "m"),
@@ -55,12 +48,7 @@ ATTRIBUTES: tuple[AttributeSpec, ...] = (
     AttributeSpec("", "hand_sha256", "sha256"),
     AttributeSpec("", "complete", "int"),
     AttributeSpec("", "text_sha256", "sha256"),
-    AttributeSpec("hand", "base_link", "text"),
-    AttributeSpec("hand/meshes/*", "path", "text"),
-    AttributeSpec("objects/*", "name", "text"),
-    AttributeSpec("objects/*", "scale", "float"),
-    AttributeSpec("objects/*", "sha256", "sha256"),
-    AttributeSpec("objects/*", "watertight", "bool"),
+    *MODEL_ATTRIBUTES,
     AttributeSpec("scene", "table", "float"),
     AttributeSpec("views", "fx", "float"),
     AttributeSpec("views", "fy", "float"),

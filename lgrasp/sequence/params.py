@@ -2,15 +2,14 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from lgrasp.config import Params
 from lgrasp.sequence.optimiser.params import OptimiserParams
 
 
-class SequenceParams(BaseModel):
+class SequenceParams(Params):
     """How sequences of grasps grow, object by object."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     method: Literal["field", "anneal", "mala"] = Field(
         "field", description="field: the contact field proposes; anneal, mala: the published optimiser, true Langevin."

@@ -2,8 +2,9 @@
 
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from lgrasp.config import Params
 from lgrasp.errors import ConfigError
 from lgrasp.math.constants import DRIVE_STIFFNESS, SLIDING_ARM
 
@@ -21,10 +22,8 @@ DENSITY = 500.0
 _GRAVITY = 9.8  # [m/s^2]
 
 
-class Load(BaseModel):
+class Load(Params):
     """Requirements of a protocol for one object and its hand."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     mass: float
     """Of the object [kg]."""
@@ -34,10 +33,8 @@ class Load(BaseModel):
     """Of the position control of revolute joints [N m/rad]."""
 
 
-class Physics(BaseModel):
+class Physics(Params):
     """How bodies touch, and the steps of time."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     timestep: float = Field(default=0.004, gt=0, le=0.02, description="[s]")
     friction: float = Field(default=0.6, gt=0, le=5, description="Sliding friction of every contact.")

@@ -1,15 +1,13 @@
 """configs/scenes/*.yaml: what lies on the table, whose grasps, how many scenes, where they go."""
 
-import difflib
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
-from lgrasp.config import read_yaml
+from lgrasp.config import did_you_mean, read_yaml, yaml_files
 from lgrasp.engine.run import Job
 from lgrasp.errors import ConfigError
-from lgrasp.paths import data_dirs
 from lgrasp.scenes.params import SceneParams
 
 
@@ -31,11 +29,7 @@ class SceneConfig(Job):
 
 def scene_configs() -> dict[str, Path]:
     """Name -> file of every config of scenes on the search path."""
-    found: dict[str, Path] = {}
-    for folder in data_dirs("configs"):
-        for path in sorted((folder / "scenes").glob("*.yaml")):
-            found.setdefault(path.stem, path)
-    return found
+    return yaml_files("configs/scenes")
 
 
 def read_scene_config(name: str) -> dict[str, Any]:
@@ -47,8 +41,7 @@ def read_scene_config(name: str) -> dict[str, Any]:
     files, path = scene_configs(), Path(name).expanduser()
     if not path.is_file():
         if name not in files:
-            near = difflib.get_close_matches(path.stem, files, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
+            hint = did_you_mean(path.stem, files)
             names = ", ".join(files) or "none"
             raise ConfigError(f"unknown config of scenes '{name}'; {hint}known: {names}, or the path of a YAML file")
         path = files[name]

@@ -1,12 +1,12 @@
 """Parameters of the published optimiser and of the Langevin sampler beside it."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from lgrasp.config import Params
 
 
-class OptimiserParams(BaseModel):
+class OptimiserParams(Params):
     """Minimisation of the grasp energy from random starts; lengths in metres. Defaults are published ones."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     iterations: int = Field(6000, ge=1, le=1_000_000, description="Steps for each object.")
     step: float = Field(0.005, gt=0, le=1, description="First step of each coordinate [m, rad or 1].")

@@ -1,14 +1,13 @@
 """Parameters of the simulate stage."""
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
+from lgrasp.config import Params
 from lgrasp.simulate.protocol import PROTOCOLS
 
 
-class SimulateParams(BaseModel):
+class SimulateParams(Params):
     """Under which protocol a grasp must hold."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     protocol: str = Field("fc", description="Named protocol under which every grasp must hold.")
 
