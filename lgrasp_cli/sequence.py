@@ -96,7 +96,9 @@ def _show(data: dict[str, Any]) -> None:
     )
     if data["spaces"]:
         print_table(
-            ("object", "space", "sequences", "go on", "share"), _shares(data), right=("sequences", "go on", "share")
+            ("object", "space", "sequences", "continued", "share"),
+            _shares(data),
+            right=("sequences", "continued", "share"),
         )
 
 

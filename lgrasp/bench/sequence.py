@@ -190,7 +190,7 @@ def sequence_page(result: dict[str, Any]) -> Page:
     head = [f"{result['device']}: {count} sequence{'s' if count > 1 else ''} of objects; physics {result['physics']}"]
     tables = []
     for method, found in result["methods"].items():
-        title = f"{method}: {found['begun']} attempts begun with each sequence"
+        title = f"{method}: {found['begun']} attempts started with each sequence"
         tables += [_space_table(title, found["spaces"], published["spaces"])]
         tables += [_share_table(found["objects"], published), _measure_table(found["objects"], published)]
     tables.append(_rate_table(result))

@@ -18,7 +18,7 @@ Search = Callable[[Context, int, int], tuple[ContactSets, Meter]]
 """(context, first candidate, number of candidates) -> what search makes of them, counted."""
 
 PASS_BLOCK = 64
-"""Candidates that later passes search again before the next ones are begun: it decides the order of the rows."""
+"""Candidates that later passes search again before the next ones start: it decides the order of the rows."""
 PASS_SHIFT = 32
 """Bits of the number of a candidate below that of its pass."""
 PASS_BITS = np.uint64(0xFF << PASS_SHIFT)

@@ -84,7 +84,7 @@ def _batches(
 ) -> Generator[tuple[int, BatchResult]]:
     """Results of consecutive batches, in order; ``workers`` of them are worked on at a time.
 
-    Closing the generator (or an error in a batch) drops the batches not begun and waits for those that were.
+    Closing the generator (or an error in a batch) drops the batches not started and waits for the others.
 
     Args:
         run: makes the batch of candidates ``first .. first + count - 1`` from (first, count).

@@ -19,9 +19,11 @@ class CameraParams(Params):
     distance: tuple[_Length, _Length] = Field((0.7, 0.9), description="Range from the middle of the table.")
     elevation: tuple[float, float] = Field((35.0, 60.0), description="Range above the horizon.")
     noise: float = Field(0.001, ge=0.0, le=0.1, description="Standard deviation of a depth, near the camera.")
-    noise_square: float = Field(0.0015, ge=0.0, le=0.1, description="More of it, times the depth squared [1/m].")
-    calibration: float = Field(0.01, ge=0.0, le=0.1, description="Each view is displaced by so much, in any direction.")
-    window: int = Field(3, ge=1, le=15, description="Normals: plane through the pixels at most so far away.")
+    noise_square: float = Field(
+        0.0015, ge=0.0, le=0.1, description="Additional standard deviation per depth squared [1/m]."
+    )
+    calibration: float = Field(0.01, ge=0.0, le=0.1, description="Displacement of each view, in a random direction.")
+    window: int = Field(3, ge=1, le=15, description="Normals: radius of the fitted window.")
     voxel: float = Field(0.003, ge=0.0, le=0.1, description="Edge of the cubes of which one point is kept; 0: all.")
 
     @model_validator(mode="after")
@@ -52,9 +54,15 @@ class SceneParams(Params):
 
     objects: int = Field(5, ge=1, le=32, description="Objects on the table.")
     table: _Length = Field(0.8, description="Side of the square table [m].")
-    tested: int = Field(1000, ge=0, le=1_000_000, description="Grasps of each object that are brought and tested.")
-    grasps: int = Field(200, ge=0, le=1_000_000, description="Collision-free ones of each object kept at most.")
-    colliding: int = Field(40, ge=0, le=1_000_000, description="Others of each object kept at most.")
+    tested: int = Field(
+        1000, ge=0, le=1_000_000, description="Grasps of each object that are moved into the scene and tested."
+    )
+    grasps: int = Field(
+        200, ge=0, le=1_000_000, description="Largest number of collision-free grasps kept of each object."
+    )
+    colliding: int = Field(
+        40, ge=0, le=1_000_000, description="Largest number of colliding grasps kept of each object."
+    )
     tolerance: float = Field(
         0.001, ge=0.0, le=0.01, description="How deep a hand may sink into table and other objects [m]."
     )

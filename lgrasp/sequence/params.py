@@ -18,7 +18,7 @@ class SequenceParams(Params):
         "uniform",
         description="Opposition space of a step: any that is left; or those, and grasps, that leave most for later.",
     )
-    width: int = Field(320, ge=1, le=65_536, description="Sequences begun in a round.")
+    width: int = Field(320, ge=1, le=65_536, description="Sequences started in a round.")
     wave: int = Field(
         256, ge=1, le=65_536, description="Candidates tried with one space before the next is tried (field)."
     )
