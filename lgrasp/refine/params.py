@@ -48,7 +48,7 @@ class LocalSearch(Params):
         default=0.012,
         ge=0,
         le=0.1,
-        description="How far a hand that starts deep in the object may be moved straight out; four times as far once opened.",
+        description="How far a hand deep in the object may be moved straight out; four times as far once opened.",
     )
     points: float = Field(
         default=1.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared."
