@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from lgrasp.learn.network import best_answers
     from lgrasp.refine.params import LocalSearch
     from lgrasp.refine.refiner import Refiner
-    from lgrasp.scenes.reader import SceneReader, read_scene
+    from lgrasp.scenes.files import SceneReader, read_scene
 
 __version__ = "0.2.0"
 __all__ = [
@@ -115,7 +115,7 @@ _HOMES = {
     "lgrasp.learn.network": ("best_answers",),
     "lgrasp.refine.params": ("LocalSearch",),
     "lgrasp.refine.refiner": ("Refiner",),
-    "lgrasp.scenes.reader": ("SceneReader", "read_scene"),
+    "lgrasp.scenes.files": ("SceneReader", "read_scene"),
 }
 """Module of every public name."""
 

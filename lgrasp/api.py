@@ -249,7 +249,7 @@ def read_cloud(path: Name, mask: Name | None = None, label: int | None = None, *
     Raises:
         CloudError: the cloud cannot be used.
     """
-    from lgrasp.scenes.reader import scene_cloud
+    from lgrasp.scenes.files import scene_cloud
 
     return _read_cloud(path, mask, label, read_scene=scene_cloud, **options)
 

@@ -79,7 +79,7 @@ def check(
     Example: lgrasp scenes check scenes
     """
     from lgrasp.dataset import find_shards
-    from lgrasp.scenes.reader import check_scene
+    from lgrasp.scenes.files import check_scene
     from lgrasp_cli.tables import print_json
 
     problems = {str(path): check_scene(path) for path in find_shards(paths)}

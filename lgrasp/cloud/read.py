@@ -6,10 +6,39 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from lgrasp.cloud.files import SceneCloud, check_labels, read_arrays, read_mask
-from lgrasp.cloud.normals import estimate_normals, face_viewpoint
 from lgrasp.errors import CloudError
+
+NEIGHBOURS = 24
+"""Points, the point itself among them, through which a plane is laid."""
+
+_BLOCK = 65_536  # points at a time, for memory
+
+
+def estimate_normals(points: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:
+    """Unit normals of the planes that fit each point and its nearest neighbours best; either side may be meant.
+
+    Args:
+        points: [m], shape (n, 3), n >= 3.
+
+    Returns:
+        Shape (n, 3), f64.
+    """
+    tree, k = KDTree(points), min(neighbours, len(points))
+    out = np.empty((len(points), 3))
+    for at in range(0, len(points), _BLOCK):
+        near = points[tree.query(points[at : at + _BLOCK], k)[1]]  # (b, k, 3)
+        near = near - near.mean(axis=1, keepdims=True)
+        out[at : at + _BLOCK] = np.linalg.eigh(np.einsum("bki,bkj->bij", near, near))[1][:, :, 0]
+    return out
+
+
+def face_viewpoint(points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
+    """Which normals point away from a viewpoint (3,) [m]: flags, shape (n,)."""
+    return np.einsum("nd,nd->n", normals, viewpoint - points) < 0.0
+
 
 MIN_POINTS = 50
 """Fewer points do not show a surface."""
@@ -67,7 +96,7 @@ def read_cloud(
         viewpoint: Where the points were seen from, x y z in the file's frame [m] after scaling. Normals are turned to
             it. Without one, normals that the file lacks are turned to the origin, which must lie outside the cloud.
         scene: Without a label it may be a scene, larger than anything that a hand grasps.
-        read_scene: Reader of scenes of this project (.h5), such as :func:`lgrasp.scenes.reader.scene_cloud`.
+        read_scene: Reader of scenes of this project (.h5), such as :func:`lgrasp.scenes.files.scene_cloud`.
 
     Raises:
         CloudError: no usable points, a mask of another length or that selects next to nothing, an unlikely size, or

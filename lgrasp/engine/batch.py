@@ -11,7 +11,7 @@ from lgrasp.engine.fit import fit_params
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, reorder_grasps, select_poses
-from lgrasp.runtime.meter import Meter
+from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
 
 Search = Callable[[Context, int, int], tuple[ContactSets, Meter]]

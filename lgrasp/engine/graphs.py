@@ -8,7 +8,7 @@ import warp as wp
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.grasp.tables import ContactSets
-from lgrasp.runtime.meter import Meter
+from lgrasp.runtime.tally import Meter
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
 

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.geometry.poses import device_from_matrix
-from lgrasp.hand.kernels import move_points, place_bodies
+from lgrasp.hand.kernels import place_bodies
 from lgrasp.hand.model import HandModel
 from lgrasp.math.convex import Pieces
 from lgrasp.math.kinematics import Kinematics
@@ -167,18 +167,3 @@ def body_poses(hand: HandArrays, q: np.ndarray) -> np.ndarray:
     queries = wp.array(q, dtype=wp.float32, device=hand.device)
     wp.launch(place_bodies, dim=len(q), inputs=[hand.struct.kin, queries], outputs=[out], device=hand.device)
     return out.numpy().reshape(len(q), bodies, 7)
-
-
-def point_jacobians(hand: HandArrays, q: np.ndarray, body: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """d(base position)/dq, (N, 3, K) [m/rad or m/m], of a body-frame point (N, 3) on body (N,) at postures q (N, K)."""
-    poses = wp.array(body_poses(hand, q), dtype=wp.transform, device=hand.device)
-    out = wp.zeros((len(q), 3, hand.model.dofs), dtype=wp.float32, device=hand.device)
-    inputs = [
-        hand.struct.kin,
-        poses,
-        wp.array(hand.model.tree.body_group, dtype=wp.int32, device=hand.device),
-        wp.array(np.asarray(body, np.int32), dtype=wp.int32, device=hand.device),
-        wp.array(np.ascontiguousarray(point, np.float32), dtype=wp.vec3, device=hand.device),
-    ]
-    wp.launch(move_points, dim=len(q), inputs=inputs, outputs=[out], device=hand.device)
-    return out.numpy()

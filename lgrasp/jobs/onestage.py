@@ -32,7 +32,7 @@ from lgrasp.grasp.tables import (
 from lgrasp.jobs.hands import hand_source
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
-from lgrasp.runtime.meter import Meter
+from lgrasp.runtime.tally import Meter
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
-"""Training of the coarse predictor: on poses alone, then jointly through unrolled steps of the refiner."""
+"""Training of the coarse predictor, on poses alone, then jointly through unrolled steps of the refiner; its quality."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch.nn import functional
@@ -149,3 +150,35 @@ class Trainer:
 
 def _moved(e: Examples, device: torch.device) -> Examples:
     return Examples(e.model, *(x.to(device) for x in (e.points, e.normals, e.R, e.t, e.q, e.anchor)))
+
+
+class Measured(NamedTuple):
+    """Means over all clouds and seeds that were measured on."""
+
+    poses: int
+    coarse: float
+    """E* of the answers."""
+    unrolled: float
+    """E* after the K unrolled steps of joint training."""
+    refined: tuple[float, ...]
+    """E* after each number of rounds that was asked for."""
+
+
+def measure(trainer: Trainer, examples: Sequence[Examples], *, seeds: int = 4, rounds: Sequence[int] = ()) -> Measured:
+    """Energies of the answers at the same seeds of the same clouds, every time.
+
+    Args:
+        seeds: points of each cloud that are asked.
+        rounds: numbers of rounds of the refiner.
+    """
+    parts: list[torch.Tensor] = []
+    for e in examples:
+        coarse, refiner = trainer.predict(e, seeds), trainer.refiner(e)
+        start = Pose(coarse.R, coarse.t, coarse.q)
+        poses = [start, Pose(*(x.detach() for x in refiner.unrolled(*start, steps=trainer.params.unrolled)))]
+        poses += [refiner(*start, rounds=steps).pose for steps in rounds]
+        with torch.no_grad():
+            parts.append(torch.stack([whole_energy(refiner, pose) for pose in poses]))
+    every = torch.cat(parts, 1)  # (2 + rounds, N)
+    coarse, unrolled, *refined = every.mean(1).tolist()
+    return Measured(every.shape[1], coarse, unrolled, tuple(refined))

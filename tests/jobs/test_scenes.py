@@ -17,8 +17,7 @@ from lgrasp.geometry.poses import pose_matrix
 from lgrasp.jobs.scenes.config import read_scene_config, scene_configs
 from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.jobs.scenes.report import describe_scenes
-from lgrasp.scenes.reader import SceneReader, check_scene, read_scene, scene_cloud
-from lgrasp.scenes.writer import write_scene
+from lgrasp.scenes.files import SceneReader, check_scene, read_scene, scene_cloud, write_scene
 
 QUICK = Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml"
 OBJECTS = ["box", "sphere", "tiny"]

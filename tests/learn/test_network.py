@@ -10,10 +10,9 @@ from lgrasp.engine.inputs import Inputs
 from lgrasp.geometry.poses import pose_from_matrix
 from lgrasp.geometry.rotations import so3_exp
 from lgrasp.learn.examples import Examples, make_examples, palm_point, partial_clouds
-from lgrasp.learn.measure import measure
 from lgrasp.learn.network import Coarse, CoarseNet, best_answers, seed_frames
 from lgrasp.learn.params import LearnParams
-from lgrasp.learn.training import Trainer, pose_loss, whole_energy
+from lgrasp.learn.training import Trainer, measure, pose_loss, whole_energy
 from lgrasp.object.sdf import SdfGrid, sample_sdf
 from lgrasp.refine.refiner import Pose
 

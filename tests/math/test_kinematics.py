@@ -7,9 +7,10 @@ import pytest
 import yourdfpy
 from scipy.spatial.transform import Rotation
 from support.hands import HANDS, LOCKED, hand_model, hand_source, minimal_spec
+from support.jacobians import point_jacobians
 from support.kinematics import link_poses
 
-from lgrasp.hand.arrays import body_poses, point_jacobians, upload_hand
+from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.model import HandModel
 

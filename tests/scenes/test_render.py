@@ -9,8 +9,18 @@ from lgrasp.geometry.poses import pose_matrix
 from lgrasp.runtime.device import start
 from lgrasp.scenes.camera import Intrinsics, intrinsics_of, look_at, place_cameras
 from lgrasp.scenes.params import CameraParams
-from lgrasp.scenes.render import NOTHING, TABLE, LabelledMesh, image_normals, join_surfaces, render, table_surface
-from lgrasp.scenes.sensor import add_noise, draw_offsets, merge_views
+from lgrasp.scenes.render import (
+    NOTHING,
+    TABLE,
+    LabelledMesh,
+    add_noise,
+    draw_offsets,
+    image_normals,
+    join_surfaces,
+    merge_views,
+    render,
+    table_surface,
+)
 
 SIZE = 0.8
 RADIUS = 0.08

@@ -12,7 +12,7 @@ from lgrasp.hand.arrays import body_poses
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
-from lgrasp.scenes.transfer import find_collisions, hand_poses
+from lgrasp.scenes.make import find_collisions, hand_poses
 
 SMALL = ObjectParams(contact_count=256, obstacle_count=2048, sdf_cells=64**3, sdf_min_cell=0.001)
 LIMIT = 0.001

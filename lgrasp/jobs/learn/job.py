@@ -23,10 +23,9 @@ from lgrasp.hand.model import HandModel
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import object_of_shard
 from lgrasp.learn.examples import Examples, make_examples
-from lgrasp.learn.measure import Measured, measure
 from lgrasp.learn.network import CoarseNet
 from lgrasp.learn.params import LearnParams
-from lgrasp.learn.training import Trainer
+from lgrasp.learn.training import Measured, Trainer, measure
 from lgrasp.runtime.device import resolve_device
 
 ROUNDS = (3, 6, 10, 13)

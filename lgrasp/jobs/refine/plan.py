@@ -27,7 +27,7 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.planning.planner import Planner, PlanParams, cloud_params
 from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.visible_surface import visible_surface
-from lgrasp.scenes.reader import scene_cloud
+from lgrasp.scenes.files import scene_cloud
 
 VERSION = 2
 """Raised whenever plans change for the same parameters."""

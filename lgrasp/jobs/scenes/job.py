@@ -21,9 +21,8 @@ from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.scenes.config import SceneConfig
 from lgrasp.jobs.scenes.report import describe_scenes
 from lgrasp.jobs.scenes.stock import Stock, load_stock
+from lgrasp.scenes.files import SceneReader, check_scene, write_scene
 from lgrasp.scenes.make import make_scene
-from lgrasp.scenes.reader import SceneReader, check_scene
-from lgrasp.scenes.writer import write_scene
 from lgrasp.simulate.builder import import_mujoco
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.scenes.reader import SceneReader
+from lgrasp.scenes.files import SceneReader
 
 _COUNTS = ("grasps_tested", "grasps_free", "grasps_into_table", "grasps_into_objects")
 

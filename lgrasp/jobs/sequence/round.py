@@ -14,7 +14,7 @@ from lgrasp.grasp.held import hold
 from lgrasp.grasp.sequences import SequenceTable, empty_sequences, join_sequences, take_sequences
 from lgrasp.grasp.tables import GraspTable, join_grasps, sort_grasps
 from lgrasp.jobs.sequence.inputs import SequenceInputs
-from lgrasp.runtime.meter import Meter
+from lgrasp.runtime.tally import Meter
 from lgrasp.seeding import stage_seed
 from lgrasp.sequence.optimised_sets import optimised_sets
 from lgrasp.sequence.policy import space_orders
