@@ -7,9 +7,11 @@ import typer
 
 from lgrasp_cli.interrupt import before_end
 from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Settings, check_report, open_cache, warn
+from lgrasp_cli.progress import say
+from lgrasp_cli.tables import Block, TextTable, print_report
 
 if TYPE_CHECKING:
-    from lgrasp.bench.comparison import Table
+    from lgrasp.bench.comparison import Table as Comparison
     from lgrasp.bench.page import Page
     from lgrasp.engine.cache import Cache
     from lgrasp.jobs.config import JobConfig
@@ -217,7 +219,7 @@ def bench_sequence(
         )
         for names in object_sequences(pool, sets, seed)
     ]
-    result = bench_methods(jobs, _split(methods), baseline_width, _say)
+    result = bench_methods(jobs, _split(methods), baseline_width, say)
     _print(result, json_path, sequence_page(result))
 
 
@@ -245,7 +247,7 @@ def bench_refine(
 
     noises = NOISES if noise else ()
     result = bench_hands(
-        _split(hands), _split(objects), starts, physics, noises=noises, device=device, cache=cache, progress=_say
+        _split(hands), _split(objects), starts, physics, noises=noises, device=device, cache=cache, progress=say
     )
     _print(result, json_path, refine_page(result))
 
@@ -254,24 +256,14 @@ def _split(names: str) -> list[str]:
     return [name.strip() for name in names.split(",")]
 
 
-def _say(line: str) -> None:
-    typer.echo(line, err=True)
-
-
 def _print(result: Any, json_path: str | None, page: "Page") -> None:
-    from lgrasp_cli.tables import print_report, print_table
-
-    def show() -> None:
-        for line in page.head:
-            typer.echo(line)
-        for table in page.tables:
-            typer.echo(f"\n{table.title}" if table.title else "")
-            print_table(table.columns, table.rows, right=table.columns[table.texts :])
-        typer.echo()
-        for line in page.notes:
-            typer.echo(line)
-
-    print_report(result, json_path, show)
+    blocks: list[Block] = [*page.head]
+    for table in page.tables:
+        blocks += [
+            f"\n{table.title}" if table.title else "",
+            TextTable(table.columns, table.rows, table.columns[table.texts :]),
+        ]
+    print_report(result, json_path, [*blocks, "", *page.notes])
 
 
 def _refuse_options(context: typer.Context) -> None:
@@ -292,22 +284,22 @@ def _those_here(config: "JobConfig") -> "JobConfig":
     return config
 
 
-def _measure(table: "Table", config: "JobConfig", cache: "Cache", file: str | None = None) -> "Table":
+def _measure(table: "Comparison", config: "JobConfig", cache: "Cache", file: str | None = None) -> "Comparison":
     """The table with all its cells; written to the file after each."""
     from lgrasp.bench.comparison import cell_line, measure_table
     from lgrasp.bench.rate import Bench
     from lgrasp.engine.report import write_json
 
     with Bench() as runs, before_end(runs.discard):
-        measured = measure_table(runs, table, config, cache, progress=_say)
+        measured = measure_table(runs, table, config, cache, progress=say)
         for table, cell in measured:
             if file:
                 write_json(file, table)
-            _say(cell_line(table, cell))
+            say(cell_line(table, cell))
     return table
 
 
-def _print_comparison(table: "Table", json_path: str | None) -> None:
+def _print_comparison(table: "Comparison", json_path: str | None) -> None:
     """Print a table; the exit code is that of bad input if no cell could be measured."""
     from lgrasp.bench.comparison import comparison_page
     from lgrasp.errors import ConfigError

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from lgrasp_cli.options import CacheDir, open_cache
+from lgrasp_cli.tables import Answer, TextTable, reporting
 
 app = typer.Typer(help="List and clear cached results.", no_args_is_help=True)
 
@@ -22,33 +23,27 @@ def path(cache_dir: CacheDir = None) -> None:
 
 
 @app.command("list")
+@reporting
 def list_entries(
     files: Annotated[bool, typer.Option("--files", help="One line for every file.")] = False,
     cache_dir: CacheDir = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
-) -> None:
+) -> Answer:
     """List what is in the cache, by kind.
 
     Example: lgrasp cache list --files
     """
-    from lgrasp_cli.tables import print_json, print_table
-
     cache = open_cache(cache_dir)
     entries = cache.entries()
-    kernels = cache.kernel_bytes()
-    if as_json:
-        print_json([{**vars(e), "path": str(e.path)} for e in entries])
-        return
+    data = [{**vars(e), "path": str(e.path)} for e in entries]
     if files:
         rows = [(e.kind, f"{e.size / 1e6:.2f}", f"{datetime.fromtimestamp(e.modified):%F %R}", e.key) for e in entries]
-        print_table(("kind", "MB", "written", "key"), rows, right=("MB",))
-        return
-    kinds = sorted({e.kind for e in entries})
-    sizes = {kind: [e.size for e in entries if e.kind == kind] for kind in kinds}
-    rows = [(kind, str(len(found)), f"{sum(found) / 1e6:.1f}") for kind, found in sizes.items()]
-    rows.append(("kernels", "", f"{kernels / 1e6:.1f}"))
-    print_table(("kind", "files", "MB"), rows, right=("files", "MB"))
-    typer.echo(str(cache.root))
+        return Answer(data, [TextTable(("kind", "MB", "written", "key"), rows, right=("MB",))])
+    rows = []
+    for kind in sorted({e.kind for e in entries}):
+        sizes = [e.size for e in entries if e.kind == kind]
+        rows.append((kind, str(len(sizes)), f"{sum(sizes) / 1e6:.1f}"))
+    rows.append(("kernels", "", f"{cache.kernel_bytes() / 1e6:.1f}"))
+    return Answer(data, [TextTable(("kind", "files", "MB"), rows, right=("files", "MB")), str(cache.root)])
 
 
 @app.command()

@@ -1,16 +1,13 @@
 """``lgrasp dataset``: look at, check and merge grasp files."""
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import JsonPath, Quiet, check_report, old_name, warn
+from lgrasp_cli.options import Quiet, old_name, warn
+from lgrasp_cli.tables import Answer, Block, TextTable, checked, plural, reporting
 from lgrasp_cli.working import How, working
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 app = typer.Typer(help="Inspect, check and merge grasp files (shards).", no_args_is_help=True)
 
@@ -18,10 +15,8 @@ _Paths = Annotated[list[Path], typer.Argument(help="Shard files, or folders of *
 
 
 @app.command()
-def info(
-    paths: _Paths,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
-) -> None:
+@reporting
+def info(paths: _Paths) -> Answer:
     """Show rows, hand, objects, pipeline, size and metrics of each shard; for sequences, rows by number of objects.
 
     Example: lgrasp dataset info out/mug
@@ -29,42 +24,24 @@ def info(
     from lgrasp.dataset import describe
 
     shards = describe(paths)
-    if as_json:
-        typer.echo(json.dumps(shards, indent=2))
-        return
-    from rich.console import Console
-
-    console = Console()
-    console.print(_shard_table(shards))
-    console.print(_metric_table(shards))
+    blocks = [_shard_table(shards), "", _metric_table(shards)]
     if any(set(s["rows_by_objects"]) - {"1"} for s in shards):
-        console.print(_count_table(shards, "objects in the hand", "rows_by_objects"))
+        blocks += ["", _count_table(shards, "objects in the hand", "rows_by_objects")]
     if any(s["rows_by_space"] for s in shards):
-        console.print(_count_table(shards, "opposition space of the last step", "rows_by_space"))
+        blocks += ["", _count_table(shards, "opposition space of the last step", "rows_by_space")]
+    return Answer(shards, blocks)
 
 
 @app.command()
-def check(
-    paths: _Paths,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")] = False,
-) -> None:
+@reporting
+def check(paths: _Paths) -> Answer:
     """Check every byte and value of each shard against the format; exit code 2 if one has a problem.
 
     Example: lgrasp dataset check out/mug
     """
     from lgrasp.dataset import find_shards, validate_shard
 
-    problems = {str(path): validate_shard(path) for path in find_shards(paths)}
-    if as_json:
-        typer.echo(json.dumps(problems, indent=2))
-    for path, lines in problems.items():
-        for line in lines:
-            typer.echo(f"{path}: {line}", err=True)
-    bad = sum(map(bool, problems.values()))
-    if bad:
-        raise typer.Exit(2)
-    if not as_json:
-        typer.echo(f"{_counted(len(problems), 'shard')} valid")
+    return checked({str(path): validate_shard(path) for path in find_shards(paths)}, "shard")
 
 
 app.command("validate", hidden=True)(old_name(check, "lgrasp dataset validate", "lgrasp dataset check"))
@@ -118,42 +95,35 @@ def metrics(
     how.run(job, _show_metrics)
 
 
-def _show_metrics(data: dict[str, Any]) -> None:
+def _show_metrics(data: dict[str, Any]) -> list[Block]:
     there = f"; {data['present']:,} rows there already" if data["present"] else ""
-    made = f"{_counted(len(data['shards']), 'shard')}, {data['rows']:,} rows, {data['rows_per_s']:,.0f} rows/s"
-    typer.echo(f"{data['out']}: {made}{there}")
+    made = f"{plural(len(data['shards']), 'shard')}, {data['rows']:,} rows, {data['rows_per_s']:,.0f} rows/s"
+    return [f"{data['out']}: {made}{there}"]
 
 
 @app.command()
+@reporting
 def report(
     paths: _Paths,
     out: Annotated[Path, typer.Option("--out", "-o", help="HTML file to write.")] = Path("report.html"),
-    json_path: JsonPath = None,
     quiet: Quiet = False,
-) -> None:
+) -> Answer:
     """Write a report on a data set as one HTML page: validity, quality, diversity, coverage, physics.
 
     Shards may be of several hands and objects; subfolders are searched. The page works offline.
 
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """
-    check_report(json_path)
     from lgrasp.dataset.report import report_dataset
-    from lgrasp.engine.report import check_json, write_json
-    from lgrasp_cli.counting import counting
-    from lgrasp_cli.tables import print_json, print_pairs
+    from lgrasp.engine.report import check_json
+    from lgrasp_cli.progress import Bar
 
     check_json(out)
-    with counting("read", quiet=quiet) as progress:
-        numbers = report_dataset(paths, out, progress=progress)
-    if json_path == "-":
-        print_json(numbers)
-    elif json_path:
-        write_json(json_path, numbers)
+    with Bar(quiet=quiet) as bar:
+        numbers = report_dataset(paths, out, progress=lambda done, rows: bar.show("read", done, rows, "rows"))
     for line in numbers["remarks"]:
         warn(line)
-    if not quiet and json_path != "-":
-        print_pairs(_report_pairs(numbers, out))
+    return Answer(numbers, [] if quiet else [_report_pairs(numbers, out)])
 
 
 def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
@@ -165,8 +135,8 @@ def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
     above = ", ".join(f"{name} {count:,}" for name, count in over.items() if count)
     near = sum(group["near_duplicates"]["duplicates"] for group in groups)
     pairs = [
-        ("grasps", f"{numbers['rows']:,} in {_counted(numbers['shards'], 'shard')}, {numbers['bytes'] / 1e6:,.1f} MB"),
-        ("hands", ", ".join(f"{h['hand']} ({_counted(len(h['objects']), 'object')})" for h in numbers["hands"])),
+        ("grasps", f"{numbers['rows']:,} in {plural(numbers['shards'], 'shard')}, {numbers['bytes'] / 1e6:,.1f} MB"),
+        ("hands", ", ".join(f"{h['hand']} ({plural(len(h['objects']), 'object')})" for h in numbers["hands"])),
         ("above a strict bound", above or "none"),
         ("near-duplicates", f"{near:,}"),
         ("distinct poses", f"{sum(group['distinct_poses'] for group in groups):,}"),
@@ -183,49 +153,43 @@ def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
     return [*pairs, ("where", str(out))]
 
 
-def _counted(n: int, what: str) -> str:
-    return f"{n:,} {what}{'' if n == 1 else 's'}"
-
-
-def _shard_table(shards: list[dict[str, Any]]) -> "Table":
-    from rich.table import Table
-
-    table = Table("shard", "hand", "objects", "pipeline", "seed", "index")
-    for name in ("rows", "joints", "MB"):
-        table.add_column(name, justify="right")
-    for s in shards:
-        texts = (Path(s["file"]).name, s["hand"], ", ".join(s["objects"]), s["pipeline"], s["seed"], s["shard_index"])
-        table.add_row(*map(str, texts), f"{s['rows']:,}", str(len(s["joints"])), f"{s['bytes'] / 1e6:.1f}")
+def _shard_table(shards: list[dict[str, Any]]) -> TextTable:
+    columns = ("shard", "hand", "objects", "pipeline", "seed", "index", "rows", "joints", "MB")
+    rows = [
+        (
+            Path(s["file"]).name,
+            *map(str, (s["hand"], ", ".join(s["objects"]), s["pipeline"], s["seed"], s["shard_index"])),
+            f"{s['rows']:,}",
+            str(len(s["joints"])),
+            f"{s['bytes'] / 1e6:.1f}",
+        )
+        for s in shards
+    ]
     if len(shards) > 1:
         total, size = sum(s["rows"] for s in shards), sum(s["bytes"] for s in shards)
-        table.add_section()
-        table.add_row(f"{len(shards)} shards", "", "", "", "", "", f"{total:,}", "", f"{size / 1e6:.1f}")
-    return table
+        rows.append((plural(len(shards), "shard"), "", "", "", "", "", f"{total:,}", "", f"{size / 1e6:.1f}"))
+    return TextTable(columns, rows, right=columns[6:])
 
 
-def _metric_table(shards: list[dict[str, Any]]) -> "Table":
-    from rich.table import Table
+def _metric_table(shards: list[dict[str, Any]]) -> TextTable:
+    ends = ("min", "mean", "max")
+    rows = [
+        (
+            Path(s["file"]).name,
+            metric,
+            values["unit"],
+            *("-" if values[k] is None else f"{values[k]:.4g}" for k in ends),
+        )
+        for s in shards
+        for metric, values in s["metrics"].items()
+    ]
+    return TextTable(("shard", "metric", "unit", *ends), rows, right=ends)
 
-    table = Table("shard", "metric", "unit")
-    for name in ("min", "mean", "max"):
-        table.add_column(name, justify="right")
-    for s in shards:
-        for metric, values in s["metrics"].items():
-            numbers = ("-" if values[k] is None else f"{values[k]:.4g}" for k in ("min", "mean", "max"))
-            table.add_row(Path(s["file"]).name, metric, values["unit"], *numbers)
-    return table
 
-
-def _count_table(shards: list[dict[str, Any]], what: str, key: str) -> "Table":
+def _count_table(shards: list[dict[str, Any]], what: str, key: str) -> TextTable:
     """Rows of all shards by the names under ``key``."""
-    from rich.table import Table
-
     counts: dict[str, int] = {}
     for s in shards:
         for name, rows in (s[key] or {}).items():
             counts[name] = counts.get(name, 0) + rows
-    table = Table(what)
-    table.add_column("rows", justify="right")
-    for name, rows in counts.items():
-        table.add_row(name, f"{rows:,}")
-    return table
+    return TextTable((what, "rows"), [(name, f"{rows:,}") for name, rows in counts.items()], right=("rows",))

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lgrasp_cli.tables import Block, plural
 from lgrasp_cli.working import How, working
 
 
@@ -47,6 +48,5 @@ def export(
     how.run(how.job(ExportJob, "export", shards=shards, out=out, to=to, where=conditions, limit=limit), _show)
 
 
-def _show(data: dict[str, Any]) -> None:
-    objects = f"{len(data['objects'])} object{'s' if len(data['objects']) > 1 else ''}"
-    typer.echo(f"{data['out']}: {data['grasps']:,} grasps of {objects}, {data['format']}")
+def _show(data: dict[str, Any]) -> list[Block]:
+    return [f"{data['out']}: {data['grasps']:,} grasps of {plural(len(data['objects']), 'object')}, {data['format']}"]

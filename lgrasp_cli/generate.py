@@ -1,7 +1,7 @@
 """``lgrasp generate``: the main job."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,6 +17,7 @@ from lgrasp_cli.options import (
     choose_pipeline,
     choose_protocol,
 )
+from lgrasp_cli.tables import Block, TextTable, counted, place, print_report
 from lgrasp_cli.working import How, working
 
 if TYPE_CHECKING:
@@ -82,7 +83,6 @@ def generate(
     from lgrasp.engine.bank import with_passes
     from lgrasp.jobs.config import default_out
     from lgrasp.jobs.generate import GenerateJob
-    from lgrasp_cli.tables import job_report, print_pairs
 
     chosen, protocol = choose_pipeline(pipeline, seed, contacts, settings), choose_protocol(simulate, physics)
     chosen = with_passes(chosen, passes, reuse)
@@ -102,14 +102,40 @@ def generate(
     if dry_run:
         show_plans([(job, how)], how)
     else:
-        how.run(job, lambda data: print_pairs(job_report(data)))
+        how.run(job, _show)
 
 
 def show_plans(jobs: "list[tuple[Job, How]]", how: How) -> None:
     """Print the plans of jobs, each with its own array task."""
     from lgrasp.jobs.preview import preview
-    from lgrasp_cli.tables import print_report, print_table
 
     lines = list({x: None for job, own in jobs for x in preview(job, array=own.array, resume=not own.overwrite)})
-    columns = ("what", "which", "state", "to do", "file")
-    print_report([line._asdict() for line in lines], how.json_path, lambda: print_table(columns, lines))
+    table = TextTable(("what", "which", "state", "to do", "file"), lines)
+    print_report([line._asdict() for line in lines], how.json_path, [table])
+
+
+def _show(data: dict[str, Any]) -> list[Block]:
+    seconds, stages = data["seconds"], list(data["counts"])
+    rates = []
+    if data["made"]:
+        rates.append(("strict-valid", f"{data['strict_valid_per_s']:,.0f} /s ({data['strict']:,})"))
+        if data["strict"] < data["grasps"]:
+            rates.append(("by own bounds", f"{data['grasps_per_s']:,.0f} /s ({data['grasps']:,})"))
+        rates.append(("published count", f"{data['published_count_per_s']:,.0f} /s ({data['published_count']:,})"))
+    device_memory = f", device {data['peak_device_mb']:,.0f} MB" if data["peak_device_mb"] else ""
+    return [
+        [
+            ("grasps", counted(data, "grasps")),
+            place(data),
+            ("hand, object", f"{data['hand']}, {data['object']}; pipeline {data['pipeline']}, seed {data['seed']}"),
+            ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it from placement through filter"),
+            *rates,
+            ("survivors", "  ".join(f"{name} {data['survivors'][name]:,}" for name in stages)),
+            ("thread-seconds", "  ".join(f"{name} {seconds[name]:.2f}" for name in stages)),
+            ("loading", "  ".join(f"{n} {seconds[n]:.2f} s" for n in ("hand", "object", "field", "kernels"))),
+            ("near-duplicates", f"{data['near_duplicates']:,}"),
+            ("distinct poses", f"{data['distinct_poses']:,}"),
+            ("peak memory", f"{data['peak_rss_mb']:,.0f} MB{device_memory}"),
+            ("device", data["device"]),
+        ]
+    ]

@@ -6,49 +6,42 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lgrasp_cli.options import CacheDir, Device, PipelineName, Quiet, choose_pipeline, open_cache
+from lgrasp_cli.tables import Answer, Block, TextTable, plural, reporting
 
 if TYPE_CHECKING:
     from lgrasp.jobs.hand_check.check import HandCheck
 
 app = typer.Typer(help="List, show, add and check hands.", no_args_is_help=True)
 
-_AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")]
-
 
 @app.command("list")
-def list_hands(as_json: _AsJson = False) -> None:
+@reporting
+def list_hands() -> Answer:
     """List the hands that can be used by name.
 
     Example: lgrasp hands list
     """
     from lgrasp.jobs.listing import list_hands as listed
-    from lgrasp_cli.tables import print_json, print_table
 
     hands = listed()
-    if as_json:
-        print_json(hands)
-        return
     columns = ("name", "description", "spaces", "licence", "folder")
-    print_table(columns, [[str(hand[c]) for c in columns] for hand in hands], right=("spaces",))
+    return Answer(hands, [TextTable(columns, [[str(hand[c]) for c in columns] for hand in hands], right=("spaces",))])
 
 
 @app.command("show")
+@reporting
 def show_hand(
     name: Annotated[str, typer.Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")],
-    as_json: _AsJson = False,
-) -> None:
+) -> Answer:
     """Show fingers, joints, limits and contact rules of a hand.
 
     Example: lgrasp hands show allegro
     """
     from lgrasp.jobs.listing import describe_hand
-    from lgrasp_cli.tables import print_json, print_pairs, print_table
 
     hand = describe_hand(name)
-    if as_json:
-        print_json(hand)
-        return
     box = " to ".join(" ".join(f"{1000 * x:.0f}" for x in hand["canonical_box"][end]) for end in ("min", "max"))
+    spaces = hand["opposition_spaces"]
     pairs = [
         ("hand", f"{hand['name']}: {hand['description']}" if hand["description"] else hand["name"]),
         ("file", hand["urdf"]),
@@ -58,22 +51,17 @@ def show_hand(
         ("palm", ", ".join(hand["palm_links"]) or "none"),
         *(("shared joint", f"{n}: {', '.join(f'{x:g}' for x in v)}") for n, v in hand["shared"].items()),
         ("canonical box", f"{box} mm"),
-        ("opposition spaces", _spaces_line(hand["opposition_spaces"])),
+        ("opposition spaces", f"{len(spaces)}: {', '.join(spaces)}" if spaces else "none"),
         ("licence", hand["licence"] or "not stated"),
         ("source", hand["source"] or "not stated"),
         *(("note", note) for note in hand["notes"]),
     ]
-    print_pairs([(what, " ".join(text.split())) for what, text in pairs])
-    typer.echo()
     rows = [
         ("shared" if j["finger"] is None else str(j["finger"]), j["name"], f"{j['lower']:.3f}", f"{j['upper']:.3f}")
         for j in hand["joints"]
     ]
-    print_table(("finger", "joint", "lower", "upper"), rows, right=("lower", "upper"))
-
-
-def _spaces_line(spaces: dict[str, list[str]]) -> str:
-    return f"{len(spaces)}: {', '.join(spaces)}" if spaces else "none"
+    table = TextTable(("finger", "joint", "lower", "upper"), rows, right=("lower", "upper"))
+    return Answer(hand, [[(what, " ".join(text.split())) for what, text in pairs], "", table])
 
 
 @app.command("add")
@@ -102,6 +90,7 @@ def add_hand(
 
 
 @app.command("check")
+@reporting
 def check_hand(
     name: Annotated[str, typer.Argument(help="Name of a hand, a URDF file, a folder, or a hand of a package.")],
     out: Annotated[
@@ -113,8 +102,7 @@ def check_hand(
     workers: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
     cache_dir: CacheDir = None,
     quiet: Quiet = False,
-    as_json: _AsJson = False,
-) -> None:
+) -> Answer:
     """Try a hand on a ball, a box and a cylinder of 5 cm; report where grasps are lost and why, and save pictures.
 
     Example: lgrasp hands check my_hand
@@ -124,7 +112,6 @@ def check_hand(
     from lgrasp.jobs.hand_check.check import check_hand as check
     from lgrasp.jobs.hands import hand_source
     from lgrasp_cli.progress import say
-    from lgrasp_cli.tables import print_json, print_table
 
     chosen, cache = choose_pipeline(pipeline), open_cache(cache_dir)
     folder = out or Path("check") / hand_source(name).name
@@ -138,37 +125,28 @@ def check_hand(
         cache=cache,
         report=None if quiet else lambda line: say(f"trying {line}"),
     )
-    if as_json:
-        print_json(asdict(found) | {"pictures": [str(p) for p in found.pictures]})
-        return
-    if found.note:
-        typer.echo(found.note)
-    for note in found.notes:
-        typer.echo(f"note: {note}")
     stages = list(found.objects[0].survivors)
     rated = [
         [o.name, *(f"{o.survivors[s]:,}" for s in stages), f"{o.rows:,} of {o.asked:,}", f"{o.seconds:.1f}"]
         for o in found.objects
     ]
     columns = ("object", *stages, "grasps", "seconds")
-    print_table(columns, rated, right=columns[1:])
-    for o in found.objects:
-        for line in o.reasons:
-            typer.echo(f"{o.name}: {line}")
-    for line in found.hints:
-        typer.echo(f"could be better: {line}")
-    _print_spaces(found)
-    for picture in found.pictures:
-        typer.echo(f"wrote {picture}")
+    blocks = [
+        *([found.note] if found.note else ()),
+        *(f"note: {note}" for note in found.notes),
+        TextTable(columns, rated, right=columns[1:]),
+        *(f"{o.name}: {line}" for o in found.objects for line in o.reasons),
+        *(f"could be better: {line}" for line in found.hints),
+        *_show_spaces(found),
+        *(f"wrote {picture}" for picture in found.pictures),
+    ]
+    return Answer(asdict(found) | {"pictures": [str(p) for p in found.pictures]}, blocks)
 
 
-def _print_spaces(found: "HandCheck") -> None:
+def _show_spaces(found: "HandCheck") -> list[Block]:
     """Opposition spaces: fingers, joints, area of both sides, distances at which these face each other."""
-    from lgrasp_cli.tables import print_table
-
     if not found.spaces:
-        typer.echo("no opposition spaces: 'lgrasp sequence' cannot use this hand")
-        return
+        return ["no opposition spaces: 'lgrasp sequence' cannot use this hand"]
     rows = []
     for space in found.spaces:
         sides = [
@@ -176,11 +154,9 @@ def _print_spaces(found: "HandCheck") -> None:
         ]
         apart = "-" if space.low is None or space.high is None else f"{1e3 * space.low:.0f}-{1e3 * space.high:.0f}"
         rows.append([space.name, str(len(space.joints)), *sides, apart])
-    print_table(
-        ("space", "joints", "side", "cm2", "other", "cm2", "apart, mm"), rows, right=("joints", "cm2", "apart, mm")
-    )
-    for space in found.spaces:
-        if space.problem:
-            typer.echo(f"{space.name} can hold nothing: {space.problem}")
-    count = found.longest_sequence
-    typer.echo(f"a sequence holds {count} object{'s' if count != 1 else ''} at most")
+    columns = ("space", "joints", "side", "cm2", "other", "cm2", "apart, mm")
+    return [
+        TextTable(columns, rows, right=("joints", "cm2", "apart, mm")),
+        *(f"{space.name} can hold nothing: {space.problem}" for space in found.spaces if space.problem),
+        f"a sequence holds {plural(found.longest_sequence, 'object')} at most",
+    ]

@@ -5,7 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from lgrasp_cli.options import CacheDir, Device, JsonPath, Quiet, check_report, open_cache
+from lgrasp_cli.options import CacheDir, Device, Quiet, open_cache
+from lgrasp_cli.tables import Answer, Block, reporting
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Predict coarse grasps from partial point clouds with a small network.", no_args_is_help=True)
@@ -40,33 +41,30 @@ def fit(
     from lgrasp.config import parse_model
     from lgrasp.jobs.learn.job import FitJob
     from lgrasp.learn.params import LearnParams
-    from lgrasp_cli.tables import print_pairs
 
     given = {"steps": steps, "joint_steps": joint_steps, "unrolled": unrolled, "batch": batch, "seed": seed}
     params = parse_model(LearnParams, {k: v for k, v in given.items() if v is not None}, "learn fit")
     job = how.job(FitJob, "learn fit", shards=shards, out=out, params=params)
-    how.run(job, lambda data: print_pairs(_fit_pairs(data)))
+    how.run(job, _show_fit)
 
 
 @app.command(name="eval")
+@reporting
 def evaluate(
     predictor: Annotated[Path, typer.Argument(help="File written by lgrasp learn fit.", show_default=False)],
     shards: _Shards,
     clouds: Annotated[int, typer.Option(min=1, help="New clouds per object.")] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the clouds.")] = 1,
     device: Device = "auto",
-    json_path: JsonPath = None,
     cache_dir: CacheDir = None,
     quiet: Quiet = False,
-) -> None:
+) -> Answer:
     """Measure the energy of predictions on new clouds, before and after 3, 6, 10 and 13 rounds of the refiner.
 
     Example: lgrasp learn eval coarse.pt grasps
     """
-    check_report(json_path)
     cache = open_cache(cache_dir)
     from lgrasp.jobs.learn.job import evaluate as run
-    from lgrasp_cli.tables import print_pairs, print_report
 
     data = run(predictor, shards, cache, clouds=clouds, seed=seed, device=device)
     pairs = [
@@ -78,15 +76,14 @@ def evaluate(
         (f"{steps}-step", f"{energy:.4f}  ({data['coarse'] / energy:.1f}x lower)")
         for steps, energy in zip(data["rounds"], data["refined"], strict=True)
     ]
-    print_report(data, json_path, None if quiet else lambda: print_pairs(pairs))
+    return Answer(data, [] if quiet else [pairs])
 
 
-def _fit_pairs(data: dict[str, Any]) -> list[tuple[str, str]]:
-    seconds = data["seconds"]
+def _show_fit(data: dict[str, Any]) -> list[Block]:
     pairs = [
         ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
         ("where", data["out"]),
-        ("seconds", "  ".join(f"{name} {value:.1f}" for name, value in seconds.items())),
+        ("seconds", "  ".join(f"{name} {value:.1f}" for name, value in data["seconds"].items())),
     ]
     words = {
         "frozen": "trained on poses",
@@ -94,10 +91,8 @@ def _fit_pairs(data: dict[str, Any]) -> list[tuple[str, str]]:
         "joint": "jointly through the refiner",
     }
     for name, what in words.items():
-        if name in data:
-            found = data[name]
+        if found := data.get(name):
             pairs.append((what, f"energy {found['coarse']:.4f}, after the unrolled steps {found['unrolled']:.4f}"))
-    if "lowered" in data:
-        lowered = data["lowered"]
+    if lowered := data.get("lowered"):
         pairs.append(("lowered by", f"{lowered['coarse']:.1%}, after the unrolled steps {lowered['unrolled']:.1%}"))
-    return pairs
+    return [pairs]

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from lgrasp_cli.options import Scale, Settings
+from lgrasp_cli.tables import Block
 from lgrasp_cli.working import How, working
 
 
@@ -97,22 +98,18 @@ def _numbers(text: str | None) -> list[float] | None:
     return numbers
 
 
-def _show(data: dict[str, Any]) -> None:
+def _show(data: dict[str, Any]) -> list[Block]:
     from lgrasp.jobs.refine.plan import lost_starts
-    from lgrasp_cli.tables import print_pairs
 
     if not data["grasps"]:
-        return
-    seconds = data["seconds_planning"]
-    print_pairs(
+        return []
+    seconds, lost = data["seconds_planning"], lost_starts(data["counts"]) or "none lost"
+    return [
         [
-            (
-                "plans",
-                f"{data['grasps']:,} of {data['starts']:,} starts ({lost_starts(data['counts']) or 'none lost'})",
-            ),
+            ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({lost})"),
             ("where", data["out"]),
             ("hand, object", f"{data['hand']}, {data['object']}"),
             ("quality", f"median epsilon {data['epsilon']:.3f}, unresisted load {data['unresisted_load']:.2f}"),
             ("wall", f"{seconds:.1f} s, {seconds / data['grasps']:.3f} s a plan"),
         ]
-    )
+    ]

@@ -63,6 +63,10 @@ class Bar:
             count = "" if done is None else f" {done:,}/{total:,}"
             say(f"{what}{count} {note}".rstrip())
 
+    def share(self, what: str, share: float) -> None:
+        """Tell what is being loaded or made, and how much of it is done, from 0 to 1."""
+        self.show("loading", note=f"{what} {share:.0%}" if share else what)
+
 
 class JobProgress(Events):
     """What a job tells, on a bar.
@@ -78,7 +82,7 @@ class JobProgress(Events):
         self._asked = 0
 
     def loading(self, what: str, share: float = 0.0) -> None:
-        self._bar.show("loading", note=f"{what} {share:.0%}" if share else what)
+        self._bar.share(what, share)
 
     def started(self, parts: "Sequence[Part]", present: Mapping[int, int]) -> None:
         self.running = True

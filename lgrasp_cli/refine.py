@@ -7,6 +7,7 @@ import typer
 
 from lgrasp.notices import notice
 from lgrasp_cli.options import Settings
+from lgrasp_cli.tables import Block, TextTable
 from lgrasp_cli.working import How, working
 
 
@@ -71,23 +72,16 @@ def refine(
     how.run(job, _show)
 
 
-def _show(data: dict[str, Any]) -> None:
-    from lgrasp_cli.tables import print_table
-
+def _show(data: dict[str, Any]) -> list[Block]:
     names = ("hand", "object", "rows", "refined", "valid before", "valid", "energy before", "energy", "s")
     rows = [
         (
             one["hand"],
             one["object"],
-            f"{one['rows']:,}",
-            f"{one['refined']:,}",
-            f"{one['valid_before']:,}",
-            f"{one['valid']:,}",
-            f"{one['energy_before']:.4f}",
-            f"{one['energy']:.4f}",
+            *(f"{one[name]:,}" for name in ("rows", "refined", "valid_before", "valid")),
+            *(f"{one[name]:.4f}" for name in ("energy_before", "energy")),
             f"{one['seconds']:.1f}",
         )
         for one in data["results"]
     ]
-    print_table(names, rows, right=names[2:])
-    typer.echo(data["out"])
+    return [TextTable(names, rows, right=names[2:]), data["out"]]

@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lgrasp_cli.generate import show_plans
 from lgrasp_cli.options import check_report
+from lgrasp_cli.tables import Block, TextTable, print_report
 from lgrasp_cli.working import How, conclude, run_job, working
 
 if TYPE_CHECKING:
@@ -36,8 +38,6 @@ def run(
     Example: lgrasp run configs/smoke.yaml
     """
     from lgrasp.jobs.config import load_jobs
-    from lgrasp_cli.generate import show_plans
-    from lgrasp_cli.tables import print_report
 
     changes = {"rows": rows, "out": out, "object_dir": object_dir, "seed": seed}
     changes |= {"device": how.device, "workers": how.workers}
@@ -55,7 +55,7 @@ def run(
         if results[-1]["exit_code"] == 130:
             break
     code = max(result["exit_code"] for result in results)
-    print_report({"jobs": results, "exit_code": code}, how.json_path, None if how.quiet else lambda: _show(results))
+    print_report({"jobs": results, "exit_code": code}, how.json_path, () if how.quiet else _show(results))
     if code:
         raise typer.Exit(code)
 
@@ -82,11 +82,9 @@ def _run_one(job: "Job", how: How) -> dict[str, Any]:
     return data | {"status": "done", "error": "", "exit_code": 0}
 
 
-def _show(results: list[dict[str, Any]]) -> None:
-    from lgrasp_cli.tables import print_table
-
+def _show(results: list[dict[str, Any]]) -> list[Block]:
     columns = ("job", "what", "requested", "present", "wall s", "strict/s", "status")
-    print_table(columns, [_row(result) for result in results], right=columns[2:6])
+    return [TextTable(columns, map(_row, results), right=columns[2:6])]
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:

@@ -5,9 +5,12 @@ from typing import Annotated, Any
 
 import typer
 
+from lgrasp_cli.tables import Answer, Block, TextTable, checked, counted, reporting
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Objects on tables, with point clouds, masks and feasible grasps.", no_args_is_help=True)
+
+_Paths = Annotated[list[Path], typer.Argument(help="Scene files, or folders of *.h5 files.", show_default=False)]
 
 
 @app.command()
@@ -70,48 +73,30 @@ def make(
 
 
 @app.command()
-def check(
-    paths: Annotated[list[Path], typer.Argument(help="Scene files, or folders of *.h5 files.", show_default=False)],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")] = False,
-) -> None:
+@reporting
+def check(paths: _Paths) -> Answer:
     """Check every byte and value of each scene against the format; exit code 2 if one has a problem.
 
     Example: lgrasp scenes check scenes
     """
     from lgrasp.dataset import find_shards
     from lgrasp.scenes.files import check_scene
-    from lgrasp_cli.tables import print_json
 
-    problems = {str(path): check_scene(path) for path in find_shards(paths)}
-    if as_json:
-        print_json(problems)
-    for path, lines in problems.items():
-        for line in lines:
-            typer.echo(f"{path}: {line}", err=True)
-    if any(problems.values()):
-        raise typer.Exit(2)
-    if not as_json:
-        typer.echo(f"{len(problems):,} scene{'' if len(problems) == 1 else 's'} valid")
+    return checked({str(path): check_scene(path) for path in find_shards(paths)}, "scene")
 
 
 @app.command()
-def info(
-    paths: Annotated[list[Path], typer.Argument(help="Scene files, or folders of *.h5 files.", show_default=False)],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
-) -> None:
+@reporting
+def info(paths: _Paths) -> Answer:
     """Show the numbers of points and grasps in scenes, by object.
 
     Example: lgrasp scenes info scenes
     """
     from lgrasp.dataset import find_shards
     from lgrasp.jobs.scenes.report import describe_scenes
-    from lgrasp_cli.tables import print_json
 
     data = describe_scenes(find_shards(paths))
-    if as_json:
-        print_json(data)
-    else:
-        _print(data, [("scenes", f"{data['scenes']:,}")])
+    return Answer(data, _blocks(data, [("scenes", f"{data['scenes']:,}")]))
 
 
 def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, views: int | None) -> dict[str, Any]:
@@ -134,32 +119,27 @@ def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, v
     return data
 
 
-def _show(data: dict[str, Any]) -> None:
-    extra = f" ({data['present']:,} already present)" if data["present"] else ""
+def _show(data: dict[str, Any]) -> list[Block]:
     speed = f", {data['scenes_per_minute']:.1f} scenes/min" if data["made"] else ""
     head = [
-        ("scenes", f"{data['scenes']:,} of {data['asked']:,} requested{extra}"),
+        ("scenes", counted(data, "scenes")),
         ("where", data["out"]),
         ("hand", data["hand"]),
         ("wall", f"{data['seconds']['scenes']:.2f} s{speed}"),
     ]
-    _print(data, head)
+    return _blocks(data, head)
 
 
-def _print(data: dict[str, Any], head: list[tuple[str, str]]) -> None:
-    from lgrasp_cli.tables import print_pairs, print_table
-
+def _blocks(data: dict[str, Any], head: list[tuple[str, str]]) -> list[Block]:
     scenes, tested = max(data["scenes"], 1), max(data["grasps_tested"], 1)
     table, others = data["grasps_into_table"] / tested, data["grasps_into_objects"] / tested
-    print_pairs(
-        [
-            *head,
-            ("points", f"{data['points'] / scenes:,.0f} a scene, {data['object_points'] / scenes:,.0f} on objects"),
-            ("grasps", f"{data['grasps_tested']:,} tested, {data['grasps_free'] / tested:.1%} collision-free"),
-            ("collide", f"{table:.1%} with the table, {others:.1%} with other objects"),
-            ("size", f"{data['bytes'] / 1e6 / scenes:.1f} MB a scene"),
-        ]
-    )
+    pairs = [
+        *head,
+        ("points", f"{data['points'] / scenes:,.0f} a scene, {data['object_points'] / scenes:,.0f} on objects"),
+        ("grasps", f"{data['grasps_tested']:,} tested, {data['grasps_free'] / tested:.1%} collision-free"),
+        ("collide", f"{table:.1%} with the table, {others:.1%} with other objects"),
+        ("size", f"{data['bytes'] / 1e6 / scenes:.1f} MB a scene"),
+    ]
     rows = [
         (
             name,
@@ -172,4 +152,4 @@ def _print(data: dict[str, Any], head: list[tuple[str, str]]) -> None:
         for name, found in data["objects"].items()
     ]
     columns = ("object", "times", "points", "free", "colliding", "without a free one")
-    print_table(columns, rows, right=columns[1:])
+    return [pairs, TextTable(columns, rows, right=columns[1:])]

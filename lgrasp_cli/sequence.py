@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from lgrasp_cli.options import Hand, Physics, Seed, Settings, choose_pipeline, choose_protocol
+from lgrasp_cli.tables import Block, TextTable, counted, place, share
 from lgrasp_cli.working import How, working
 
 
@@ -78,28 +79,20 @@ def sequence(
     how.run(job, _show)
 
 
-def _show(data: dict[str, Any]) -> None:
-    from lgrasp_cli.tables import counted, print_pairs, print_table
-
+def _show(data: dict[str, Any]) -> list[Block]:
     if not data["sequences"]:
-        return
-    print_pairs(
-        [
-            ("sequences", counted(data, "sequences")),
-            ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
-            ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
-            ("how", f"pipeline {data['pipeline']}, method {data['method']}, policy {data['policy']}"),
-            ("wall", f"{data['seconds']['total']:.2f} s, {data['seconds']['wall']:.2f} s of it the sequences"),
-            ("penetration", f"median {data['penetration'][0]:.2f} mm, largest {data['penetration'][1]:.2f} mm"),
-            ("device", data["device"]),
-        ]
-    )
-    if data["spaces"]:
-        print_table(
-            ("object", "space", "sequences", "continued", "share"),
-            _shares(data),
-            right=("sequences", "continued", "share"),
-        )
+        return []
+    pairs = [
+        ("sequences", counted(data, "sequences")),
+        place(data),
+        ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
+        ("how", f"pipeline {data['pipeline']}, method {data['method']}, policy {data['policy']}"),
+        ("wall", f"{data['seconds']['total']:.2f} s, {data['seconds']['wall']:.2f} s of it the sequences"),
+        ("penetration", f"median {data['penetration'][0]:.2f} mm, largest {data['penetration'][1]:.2f} mm"),
+        ("device", data["device"]),
+    ]
+    columns = ("object", "space", "sequences", "continued", "share")
+    return [pairs, TextTable(columns, _shares(data), right=columns[2:])] if data["spaces"] else [pairs]
 
 
 def _shares(data: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -108,5 +101,5 @@ def _shares(data: dict[str, Any]) -> list[tuple[str, ...]]:
     for name, spaces in zip(data["objects"], data["spaces"], strict=False):
         for space, counts in spaces.items():
             tried, held = counts["sequence"]["sequences"], counts["sequence"]["held"]
-            rows.append((name, space, f"{tried:,}", f"{held:,}", f"{held / tried:.1%}" if tried else "-"))
+            rows.append((name, space, f"{tried:,}", f"{held:,}", share(held, tried)))
     return rows

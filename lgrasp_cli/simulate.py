@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from lgrasp_cli.options import old_name, warn
+from lgrasp_cli.tables import Block, TextTable, place, share
 from lgrasp_cli.working import How, working
 
 
@@ -58,47 +59,38 @@ def simulate(
     chosen.run(job, _show)
 
 
-def _show(data: dict[str, Any]) -> None:
+def _show(data: dict[str, Any]) -> list[Block]:
     from lgrasp.simulate.protocol import DIRECTIONS
-    from lgrasp_cli.tables import print_pairs, print_table
 
     entries, protocol = data["results"], data["protocol"]
     stay = ("stay",) if any(entry["stay"] is not None for entry in entries) else ()
     names = ("hand", "object", "grasps", "hold", *stay, *DIRECTIONS, "at q", "at grasp", "mass", "stiffness", "/s")
-    rows = []
-    for entry in entries:
-        directions = zip(entry["directions_held"], entry["directions_run"], strict=True)
-        rows.append(
-            (
-                entry["hand"],
-                entry["object"],
-                f"{entry['rows']:,}",
-                _share(entry["held"], entry["rows"]),
-                *(_share(entry["stay"], entry["rows"]) for _ in stay),
-                *(_share(held, run) for held, run in directions),
-                _share(entry["contact_at_q"], entry["rows"]),
-                _share(entry["contact_at_grasp"], entry["rows"]),
-                f"{1e3 * entry['mass']:.0f} g",
-                f"{entry['stiffness']:.3g}",
-                "-" if entry["per_s"] is None else f"{entry['per_s']:.1f}",
-            )
+    rows = [
+        (
+            entry["hand"],
+            entry["object"],
+            f"{entry['rows']:,}",
+            share(entry["held"], entry["rows"]),
+            *(share(entry["stay"], entry["rows"]) for _ in stay),
+            *map(share, entry["directions_held"], entry["directions_run"]),
+            share(entry["contact_at_q"], entry["rows"]),
+            share(entry["contact_at_grasp"], entry["rows"]),
+            f"{1e3 * entry['mass']:.0f} g",
+            f"{entry['stiffness']:.3g}",
+            "-" if entry["per_s"] is None else f"{entry['per_s']:.1f}",
         )
-    print_table(names, rows, right=names[2:])
+        for entry in entries
+    ]
     start = "q" if protocol["start"] == "grasp" else "q_pregrasp"
     lost = {name: sum(entry[name] for entry in entries) for name in ("pregrasp_too_deep", "diverged")}
-    print_pairs(
+    told = f"{protocol['name']}, friction {protocol['friction']:g}; shares of the grasps run in a direction"
+    return [
+        TextTable(names, rows, right=names[2:]),
         [
-            (
-                "protocol",
-                f"{protocol['name']}, friction {protocol['friction']:g}; shares of the grasps run in a direction",
-            ),
+            ("protocol", told),
             ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate too deeply at {start} and are not simulated"),
             ("diverged", f"{lost['diverged']:,} count as lost"),
             ("compiling", f"{data['seconds_compile']:.1f} s for models and kernels, not part of the rates"),
-            ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
-        ]
-    )
-
-
-def _share(part: int, whole: int) -> str:
-    return f"{part / whole:.1%}" if whole else "-"
+            place(data),
+        ],
+    ]

@@ -16,6 +16,7 @@ from lgrasp_cli.options import (
     choose_pipeline,
     open_cache,
 )
+from lgrasp_cli.tables import Answer, TextTable, reporting
 
 _WHAT = {
     "place": "Sample poses of the object in front of the palm, without collision.",
@@ -48,17 +49,12 @@ def _verb(stage: str):
         device: Device = "auto",
         force: Annotated[bool, typer.Option("--force", help="Run every stage again.")] = False,
         cache_dir: CacheDir = None,
-        as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
-    ) -> None:
+    ) -> Answer:
         cache = open_cache(cache_dir, fresh=force)
         from lgrasp.jobs.onestage import run_up_to
-        from lgrasp_cli.tables import print_json, print_table
 
         chosen = choose_pipeline(pipeline, seed, contacts)
         runs = run_up_to(stage, chosen, hand, mesh, first, candidates, shard_index, cache, scale=scale, device=device)
-        if as_json:
-            print_json([{**vars(run), "path": str(run.path)} for run in runs])
-            return
         rows = [
             (
                 run.stage,
@@ -68,7 +64,7 @@ def _verb(stage: str):
             )
             for run in runs
         ]
-        print_table(("stage", "cache", "seconds", "survivors"), rows, right=("seconds",))
-        typer.echo(str(runs[-1].path))
+        table = TextTable(("stage", "cache", "seconds", "survivors"), rows, right=("seconds",))
+        return Answer([{**vars(run), "path": str(run.path)} for run in runs], [table, str(runs[-1].path)])
 
-    return run
+    return reporting(run)

@@ -1,53 +1,108 @@
-"""Tables on standard output: aligned columns, the same on a terminal and in a file."""
+"""Reports on standard output: lines, pairs and tables in aligned columns, the same on a terminal and in a file."""
 
+import inspect
 import json
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, get_type_hints
 
 import typer
 
-
-def print_json(data: Any) -> None:
-    """JSON on standard output."""
-    typer.echo(json.dumps(data, indent=2))
+from lgrasp_cli.options import JsonPath, check_report
 
 
-def print_report(data: Any, json_path: str | None, show: Callable[[], None] | None) -> None:
-    """A report as --json says: to standard output for -, else shown, and written to the path if there is one.
+@dataclass(frozen=True)
+class TextTable:
+    """A table with a header line."""
+
+    columns: Sequence[str]
+    rows: Iterable[Sequence[str]]
+    right: Sequence[str] = ()
+    """Columns of numbers."""
+
+
+Block = str | TextTable | list[tuple[str, str]]
+"""A line, a table, or pairs of what and value."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command found."""
+
+    data: Any
+    """JSON-serialisable."""
+    blocks: Sequence[Block]
+    """The same to be read."""
+    exit_code: int = 0
+
+
+def reporting(command: Callable[..., Answer]) -> Callable[..., None]:
+    """A command that returns its report: it gets ``--json``, and the report is printed and written as that says."""
+
+    def run(json_path: str | None, **given: Any) -> None:
+        check_report(json_path)
+        report = command(**given)
+        print_report(report.data, json_path, report.blocks)
+        if report.exit_code:
+            raise typer.Exit(report.exit_code)
+
+    return with_options(command, {"json_path": (JsonPath, None)}, run)
+
+
+def with_options(
+    command: Callable[..., Any], options: dict[str, tuple[Any, Any]], run: Callable[..., None], without: str = ""
+) -> Callable[..., None]:
+    """``run`` with the name, help and options of a command, and more options: name -> (type, default).
 
     Args:
-        show: prints the tables; None: nothing is to be shown.
+        without: an argument of the command that is none of its options.
     """
+    hints = get_type_hints(command, include_extras=True)
+    own = {n: (hints[n], p.default) for n, p in inspect.signature(command).parameters.items() if n != without}
+    parameters = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in (own | options).items()
+    ]
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run
+
+
+def print_report(data: Any, json_path: str | None, blocks: Iterable[Block]) -> None:
+    """A report as --json says: to standard output for -, else shown, and written to the path if there is one."""
     if json_path == "-":
-        print_json(data)
+        typer.echo(json.dumps(data, indent=2))
         return
-    if show:
-        show()
+    for block in blocks:
+        if isinstance(block, str):
+            typer.echo(block)
+        elif isinstance(block, TextTable):
+            right = {i for i, name in enumerate(block.columns) if name in block.right}
+            _print_rows([list(block.columns), *map(list, block.rows)], right)
+        else:
+            _print_rows([list(pair) for pair in block], set())
     if json_path:
         from lgrasp.engine.report import write_json
 
         write_json(json_path, data)
 
 
-def print_pairs(pairs: Iterable[tuple[str, str]]) -> None:
-    """Two columns: label, value."""
-    _print_rows([list(pair) for pair in pairs], ())
-
-
-def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[str] = ()) -> None:
-    """A table with a header line.
-
-    Args:
-        right: columns of numbers.
-    """
-    _print_rows([list(columns), *(list(row) for row in rows)], [i for i, name in enumerate(columns) if name in right])
-
-
-def _print_rows(rows: list[list[str]], right: Sequence[int]) -> None:
+def _print_rows(rows: list[list[str]], right: set[int]) -> None:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = [c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
         typer.echo("  ".join(cells).rstrip())
+
+
+def plural(n: int, what: str) -> str:
+    """A number of things: ``1 shard``, ``2 shards``."""
+    return f"{n:,} {what}{'' if n == 1 else 's'}"
+
+
+def share(part: int, whole: int) -> str:
+    """``12.5%``, or a dash of nothing."""
+    return f"{part / whole:.1%}" if whole else "-"
 
 
 def counted(data: dict[str, Any], unit: str) -> str:
@@ -56,34 +111,16 @@ def counted(data: dict[str, Any], unit: str) -> str:
     return f"{data[unit]:,} of {data['asked']:,} requested{extra}"
 
 
-def job_report(data: dict[str, Any]) -> list[tuple[str, str]]:
-    """The report of a job as pairs of texts."""
-    seconds, made = data["seconds"], data["made"]
-    stages = list(data["counts"])
-    pairs = [
-        ("grasps", counted(data, "grasps")),
-        ("where", f"{data['out']} ({len(data['shards'])} shard{'s' if len(data['shards']) != 1 else ''})"),
-        ("hand, object", f"{data['hand']}, {data['object']}; pipeline {data['pipeline']}, seed {data['seed']}"),
-        ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it from placement through filter"),
-    ]
-    if made:
-        pairs += [("strict-valid", f"{data['strict_valid_per_s']:,.0f} /s ({data['strict']:,})")]
-        if data["strict"] < data["grasps"]:
-            pairs += [("by own bounds", f"{data['grasps_per_s']:,.0f} /s ({data['grasps']:,})")]
-        pairs += [
-            ("published count", f"{data['published_count_per_s']:,.0f} /s ({data['published_count']:,})"),
-        ]
-    pairs += [
-        ("survivors", "  ".join(f"{name} {data['survivors'][name]:,}" for name in stages)),
-        ("thread-seconds", "  ".join(f"{name} {seconds[name]:.2f}" for name in stages)),
-        ("loading", "  ".join(f"{n} {seconds[n]:.2f} s" for n in ("hand", "object", "field", "kernels"))),
-        ("near-duplicates", f"{data['near_duplicates']:,}"),
-        ("distinct poses", f"{data['distinct_poses']:,}"),
-        (
-            "peak memory",
-            f"{data['peak_rss_mb']:,.0f} MB"
-            + (f", device {data['peak_device_mb']:,.0f} MB" if data["peak_device_mb"] else ""),
-        ),
-        ("device", data["device"]),
-    ]
-    return pairs
+def place(data: dict[str, Any]) -> tuple[str, str]:
+    """Where the shards of a job are."""
+    return "where", f"{data['out']} ({plural(len(data['shards']), 'shard')})"
+
+
+def checked(problems: dict[str, list[str]], unit: str) -> Answer:
+    """The problems of each file, a line each on standard error; exit code 2 if there are any."""
+    for path, lines in problems.items():
+        for line in lines:
+            typer.echo(f"{path}: {line}", err=True)
+    if any(problems.values()):
+        return Answer(problems, [], exit_code=2)
+    return Answer(problems, [f"{plural(len(problems), unit)} valid"])

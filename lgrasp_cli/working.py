@@ -1,14 +1,14 @@
 """Common parts of all commands that make files: their options, and how a job is run, reported and concluded."""
 
-import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache, warn
+from lgrasp_cli.tables import Block, plural, print_report, with_options
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
@@ -77,39 +77,26 @@ class How:
         asked = given | {"device": self.device, "workers": self.workers, "cache": self.cache}
         return parse_model(kind, {name: value for name, value in asked.items() if value is not None}, where)
 
-    def run(self, job: "Job", show: Callable[[dict[str, Any]], None]) -> None:
+    def run(self, job: "Job", show: Callable[[dict[str, Any]], Sequence[Block]]) -> None:
         """Run a job with progress, report it, and leave with its exit code if it fell short.
 
         Args:
-            show: prints the report on standard output.
+            show: its report to be read.
         """
         check_report(self.json_path)
         data, outcome = run_job(job, self)
-        from lgrasp_cli.tables import print_report
-
-        print_report(data, self.json_path, None if self.quiet else lambda: show(data))
+        print_report(data, self.json_path, () if self.quiet or self.json_path == "-" else show(data))
         conclude(data, outcome)
 
 
 def working(command: Callable[..., None]) -> Callable[..., None]:
     """A command whose argument ``how`` is a :class:`How`: it gets the options that all jobs share."""
-    own = inspect.signature(command)
-    hints = get_type_hints(command, include_extras=True)
-    kept = [p.replace(annotation=hints[p.name]) for p in own.parameters.values() if p.name != "how"]
-    shared = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-        for name, (kind, default) in _OPTIONS.items()
-    ]
 
     def run(**given: Any) -> None:
         options = {name: given.pop(name) for name in _OPTIONS}
         command(**given, how=_how(**options))
 
-    run.__name__, run.__doc__ = command.__name__, command.__doc__
-    as_keywords = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in kept]
-    run.__signature__ = inspect.Signature([*as_keywords, *shared])  # type: ignore[attr-defined]
-    run.__annotations__ = {p.name: p.annotation for p in (*as_keywords, *shared)}
-    return run
+    return with_options(command, _OPTIONS, run, without="how")
 
 
 def _how(
@@ -155,7 +142,7 @@ def conclude(data: dict[str, Any], outcome: "JobOutcome") -> None:
         LgraspError: less came out than was asked.
     """
     if outcome.cancelled:
-        files = f"{len(outcome.paths)} finished file{'' if len(outcome.paths) == 1 else 's'}"
+        files = plural(len(outcome.paths), "finished file")
         typer.echo(f"interrupted: {files} in {data['out']}. Run the same command again to resume", err=True)
         raise typer.Exit(130)
     error = outcome.job.shortfall(outcome)

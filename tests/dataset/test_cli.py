@@ -29,7 +29,7 @@ def test_info(run, folder):
     assert text.exit_code == 0
     assert "2 shards" in text.stdout
     assert "penetration" in text.stdout
-    machine = run("info", folder / "0.h5", "--json")
+    machine = run("info", folder / "0.h5", "--json", "-")
     assert json.loads(machine.stdout)[0]["rows"] == 4
 
 
@@ -42,7 +42,7 @@ def test_validate(run, folder):
     assert result.stdout == ""
     (line,) = result.stderr.splitlines()
     assert line.startswith(f"{folder / '1.h5'}: not a whole HDF5 file")
-    machine = run("check", folder, "--json")
+    machine = run("check", folder, "--json", "-")
     assert machine.exit_code == 2
     assert [len(v) for v in json.loads(machine.stdout).values()] == [0, 1]
 

@@ -278,7 +278,7 @@ def test_info(path):
     text = CliRunner().invoke(app, ["info", str(path)]).stdout
     assert "objects in the hand" in text
     assert "finger 3" in text
-    (machine,) = json.loads(CliRunner().invoke(app, ["info", str(path), "--json"]).stdout)
+    (machine,) = json.loads(CliRunner().invoke(app, ["info", str(path), "--json", "-"]).stdout)
     assert machine["rows_by_objects"] == shard["rows_by_objects"]
 
 

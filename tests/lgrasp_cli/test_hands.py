@@ -23,11 +23,11 @@ def change(folder, spaces) -> None:
 
 
 def test_list_and_show_tell_the_spaces(cli, jaws):
-    counts = {hand["name"]: hand["spaces"] for hand in json.loads(cli("hands", "list", "--json").out)}
+    counts = {hand["name"]: hand["spaces"] for hand in json.loads(cli("hands", "list", "--json", "-").out)}
     assert counts["allegro"] == 7
     assert min(counts.values()) >= 3
     assert "opposition spaces  7: index-palm, middle-palm, ring-palm, thumb-palm" in cli("hands", "show", "allegro").out
-    spaces = json.loads(cli("hands", "show", "allegro", "--json").out)["opposition_spaces"]
+    spaces = json.loads(cli("hands", "show", "allegro", "--json", "-").out)["opposition_spaces"]
     assert spaces["thumb-index"] == [f"joint_{k}.0" for k in (0, 1, 2, 3, 12, 13, 14, 15)]
     assert f"opposition spaces  1: {PINCH}" in cli("hands", "show", jaws).out
     change(jaws, {})
