@@ -29,7 +29,7 @@ _BATCH_ROWS = 65_536  # at a time
 class ShardJob(Job):
     """A part is a shard, written under its place in the output folder."""
 
-    kernels: ClassVar[str] = ""
+    kernels: ClassVar[tuple[str, ...]] = ()
 
     shards: tuple[Path, ...] = Field(description="Shard files, or folders of them at any depth.")
     out: Path = Field(description="Folder of the files, under the places of the shards.")

@@ -24,7 +24,7 @@ _INDEX = "export.json"  # the last file of an export: one without it is not whol
 class ExportJob(Job):
     """Grasps of shards, all of one hand, with the hand's URDF and all meshes."""
 
-    kernels: ClassVar[str] = ""
+    kernels: ClassVar[tuple[str, ...]] = ()
 
     shards: tuple[Path, ...] = Field(description="Shard files, or folders of *.h5 files.")
     to: str = Field(description="Name of the format.")

@@ -10,24 +10,29 @@ import pytest
 from lgrasp.dataset import read_shard, write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
+from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import Job, run
 from lgrasp.jobs.export import ExportJob
 from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.learn.job import FitJob, load_predictor
 from lgrasp.jobs.metrics import MetricsJob
 from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.jobs.refine.shards import RefineJob
+from lgrasp.jobs.scenes.job import SceneJob
+from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.simulate import SimulateJob
+from lgrasp.learn.params import LearnParams
 from lgrasp.simulate.protocol import find_protocol
 
-NAMES = ("generate", "refine", "plan", "simulate", "metrics", "export")
+NAMES = ("generate", "sequence", "refine", "plan", "simulate", "scenes", "learn", "metrics", "export")
 
 
 @pytest.fixture(scope="module")
 def source(swift, cache_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of three shards of four grasps."""
+    """A folder of three shards of six grasps."""
     out = tmp_path_factory.mktemp("source")
-    given = {"object": "mug", "rows": 12, "shard_rows": 4, "batch": 128, "workers": 1, "device": "cpu"}
+    given = {"object": "mug", "rows": 18, "shard_rows": 6, "batch": 128, "workers": 1, "device": "cpu"}
     generate(GenerateJob(**given, pipeline=swift, out=out, cache=Cache(cache_root)))
     return out
 
@@ -44,6 +49,20 @@ def jobs(swift, source: Path, cache_root: Path) -> Callable[[str, Path], Job]:
             return SimulateJob(**shards, protocol=find_protocol("fc"))
         if name == "generate":
             return GenerateJob(**base, object="mug", rows=12, shard_rows=4, batch=128, pipeline=swift)
+        if name == "sequence":
+            pipeline = load_pipeline("sequence").model_copy(update={"field": swift.field})
+            pipeline = pipeline.with_params("sequence", width=16, wave=64, waves=2)
+            return SequenceJob(
+                **base, objects=("sphere", "mug"), scale="0.06:0.08", rows=4, shard_rows=2, pipeline=pipeline
+            )
+        if name == "scenes":
+            pytest.importorskip("mujoco")
+            scene = {"objects": 1, "grasps": 4, "colliding": 2, "camera": {"views": 1, "width": 64, "height": 48}}
+            return SceneJob.model_validate(base | {"grasps": source, "scenes": 2, "scene": scene})
+        if name == "learn":
+            small = {"points": 32, "width": 8, "clouds": 2, "held_out": 1, "batch": 4, "steps": 3, "joint_steps": 1}
+            params = LearnParams.model_validate(small | {"unrolled": 1})
+            return FitJob(**shards | {"out": out / "coarse.pt"}, params=params)
         if name == "plan":
             return PlanJob(**base, object="sphere", starts=3)
         if name == "export":
@@ -54,10 +73,14 @@ def jobs(swift, source: Path, cache_root: Path) -> Callable[[str, Path], Job]:
 
 
 def contents(folder: Path) -> dict[str, dict[str, bytes] | bytes]:
-    """What every file holds: rows of shards, bytes of others."""
+    """What every file holds: rows of shards and scenes, weights of predictors, bytes of others."""
     found: dict[str, dict[str, bytes] | bytes] = {}
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         name = path.relative_to(folder).as_posix()
+        if path.suffix == ".pt":
+            weights = load_predictor(path)[0].state_dict()
+            found[name] = {key: values.numpy().tobytes() for key, values in weights.items()}
+            continue
         if path.suffix != ".h5":
             found[name] = path.read_bytes()
             continue

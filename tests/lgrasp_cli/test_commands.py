@@ -89,6 +89,13 @@ def test_pipelines(cli):
     assert "iterations" in cli("pipelines", "show", "swift").out
 
 
+def test_json_without_a_path_is_standard_output_with_a_notice(cli):
+    found = cli("objects", "list", "--json")
+    assert found.out == cli("objects", "list", "--json", "-").out
+    (line,) = found.err.splitlines()
+    assert line.startswith("warning: --json takes a path")
+
+
 def test_cache(cli, tmp_path, shared_cache, quick):
     assert cli("cache", "path").out.strip() == str(shared_cache)
     own = ("--cache-dir", tmp_path / "cache")
@@ -109,7 +116,7 @@ def test_run(cli, tmp_path, quick):
     plan = cli("run", config, "--dry-run")
     assert "nothing" in plan.error()
     assert not (tmp_path / "made").exists()
-    result = cli("run", config, "--json", "-", tmp_path / "r.json", "-n", 5)
+    result = cli("run", config, "--json", tmp_path / "r.json", "-n", 5)
     assert result.code == 2
     data = json.loads((tmp_path / "r.json").read_text())
     assert [job["status"] for job in data["jobs"]] == ["done", "failed", "done"]
@@ -144,7 +151,7 @@ def test_shipped_configs(cli):
 
 def test_bench(cli, tmp_path, quick):
     base = ("bench", "--objects", "tiny", "--pipelines", quick, "-n", 10, "--repeat", 2, "--device", "cpu")
-    result = cli(*base, "--json", "-", tmp_path / "b.json")
+    result = cli(*base, "--json", tmp_path / "b.json")
     assert result.code == 0, result.err
     (cell,) = json.loads((tmp_path / "b.json").read_text())["cells"]
     (entry,) = cell["pipelines"].values()
@@ -167,7 +174,7 @@ def table1(cli, quick, tmp_path_factory):
 
 
 def test_bench_table1(table1, tmp_path):
-    result = table1("--json", "-", "t.json", "--plot", "t.png")
+    result = table1("--json", "t.json", "--plot", "t.png")
     assert result.code == 0, result.err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["t.json", "t.png"]
     assert (tmp_path / "t.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
@@ -187,7 +194,7 @@ def test_bench_table1(table1, tmp_path):
     for text in ("trimmed mean", "quick/slow", "Table 1", "A100", "survivors", "near-dup", "field s"):
         assert text in result.out
     assert "[2/2] allegro capsule: quick" in result.err
-    again = table1("--json", "-", "t.json", "--resume")
+    again = table1("--json", "t.json", "--resume")
     assert again.code == 0
     assert "run 1/1" not in again.err
     assert again.out == result.out
@@ -205,12 +212,12 @@ def test_bench_table1_interrupted(table1, monkeypatch, tmp_path):
 
     with monkeypatch.context() as patch:
         patch.setattr(Bench, "measure", stopped)
-        assert table1("--json", "-", "t.json").code == 130
+        assert table1("--json", "t.json").code == 130
     kept = json.loads((tmp_path / "t.json").read_text())
     assert [cell["object"] for cell in kept["cells"]] == ["tiny"]
     assert not kept["complete"]
     assert [p.name for p in tmp_path.iterdir()] == ["t.json"]
-    result = table1("--json", "-", "t.json", "--resume")
+    result = table1("--json", "t.json", "--resume")
     assert "tiny, " not in result.err
     whole = json.loads((tmp_path / "t.json").read_text())
     assert whole["cells"][0] == kept["cells"][0]

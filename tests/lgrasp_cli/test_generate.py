@@ -5,6 +5,7 @@ import os
 import signal
 import time
 
+import numpy as np
 import pytest
 
 from lgrasp.dataset import read_shard, validate_shard
@@ -177,6 +178,16 @@ def test_interruption_leaves_whole_shards(process, generate, tmp_path, number, q
     assert shards
     assert {p.suffix for p in shards} == {".h5"}
     assert {len(read_shard(p).grasps) for p in shards} == {50}
+    if number == signal.SIGINT:
+        kept = {p: p.stat().st_mtime_ns for p in shards}
+        for folder in (out, tmp_path / "whole"):
+            assert generate("--shard-rows", 50, rows=150, out=folder).code == 0
+        assert {p: p.stat().st_mtime_ns for p in kept} == kept
+        for path in sorted((tmp_path / "whole").iterdir()):
+            whole, resumed = read_shard(path).grasps.columns(), read_shard(out / path.name).grasps.columns()
+            assert {name: np.asarray(values).tobytes() for name, values in whole.items()} == {
+                name: np.asarray(values).tobytes() for name, values in resumed.items()
+            }
 
 
 @pytest.mark.parametrize("delay", [0.5, 1.0])

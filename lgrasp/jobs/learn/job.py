@@ -44,7 +44,7 @@ class FitJob(Job):
     """
 
     unit: ClassVar[str] = "steps"
-    kernels: ClassVar[str] = ""
+    kernels: ClassVar[tuple[str, ...]] = ()
 
     shards: tuple[Path, ...] = Field(description="Shard files, or folders of them at any depth.")
     out: Path = Field(Path("coarse.pt"), description="File of the predictor.")

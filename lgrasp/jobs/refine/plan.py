@@ -44,7 +44,7 @@ class PlanJob(Job):
     """
 
     unit: ClassVar[str] = "starts"
-    kernels: ClassVar[str] = ""
+    kernels: ClassVar[tuple[str, ...]] = ()
 
     hand: str = Field("barrett", description="Name, path, or a shard (its hand).")
     out: Path | None = Field(None, description="Folder of the plans; default: plans/HAND-OBJECT.")

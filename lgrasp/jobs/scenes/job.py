@@ -30,7 +30,7 @@ class SceneJob(SceneConfig):
     """Scenes of one hand, one a file."""
 
     unit: ClassVar[str] = "scenes"
-    kernels: ClassVar[str] = "lgrasp.scenes."
+    kernels: ClassVar[tuple[str, ...]] = ("lgrasp.scenes.",)
     _stock: Stock | None = PrivateAttr(None)
 
     @property
