@@ -18,9 +18,11 @@ def names():
     group = typer.main.get_command(app)
     found = []
     for name, command in group.commands.items():
+        if command.hidden:  # the name of the release before
+            continue
         if name not in GROUPS:  # bench is a command by itself as well
             found.append((name,))
-        found += [(name, sub) for sub in getattr(command, "commands", ())]
+        found += [(name, sub) for sub, below in getattr(command, "commands", {}).items() if not below.hidden]
     return found
 
 
