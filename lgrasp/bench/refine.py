@@ -22,7 +22,8 @@ from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.palm import ContactSurface
+from lgrasp.hand.surface import ContactSurface
+from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
 from lgrasp.jobs.refine.settings import COARSE
 from lgrasp.jobs.shard_inputs import named_hand
@@ -32,7 +33,6 @@ from lgrasp.planning.planner import Planner, PlanParams, cloud_params
 from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.refiner import Pose, Refiner, table_pose
 from lgrasp.refine.surface import hand_surface
-from lgrasp.refine.visible_surface import visible_surface
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts

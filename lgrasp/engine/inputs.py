@@ -16,9 +16,9 @@ from lgrasp.field.arrays import FieldArrays, upload_field
 from lgrasp.field.model import FIELD_VERSION, ContactField
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
+from lgrasp.hand.spec import hand_digest
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel

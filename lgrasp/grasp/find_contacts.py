@@ -8,7 +8,7 @@ from lgrasp.grasp.check import ContactTable
 from lgrasp.grasp.check_structs import device_limits
 from lgrasp.grasp.contact_kernels import PalmarRuns, RunContacts, choose_contacts, link_contacts
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.palm import ContactSurface, contact_surface
+from lgrasp.hand.surface import ContactSurface, contact_surface
 from lgrasp.math.qp import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays
 

@@ -1,4 +1,4 @@
-"""A HandModel on a device, as Warp structs; forward kinematics and Jacobians of whole postures."""
+"""A HandModel on a device, as Warp structs; forward kinematics of whole postures."""
 
 from dataclasses import dataclass
 
@@ -6,10 +6,9 @@ import numpy as np
 import warp as wp
 
 from lgrasp.geometry.poses import device_from_matrix
-from lgrasp.hand.kernels import place_bodies
 from lgrasp.hand.model import HandModel
 from lgrasp.math.convex import Pieces
-from lgrasp.math.kinematics import Kinematics
+from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_dofs, group_forward
 from lgrasp.math.sdf import sdf_part
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.structs import upload_struct
@@ -157,6 +156,28 @@ def hand_grid(c: Contacts, i: wp.int32):
 def overlap_grid(c: Overlaps, i: wp.int32):
     """Distance grid of side i."""
     return sdf_part(c.grid_values, c.grid_first[i], c.grid_shape[i], c.grid_origin[i], c.grid_inv_cell[i])
+
+
+@wp.kernel
+def place_bodies(
+    h: Kinematics,
+    q: wp.array2d(dtype=wp.float32),
+    # out
+    pose_out: wp.array2d(dtype=wp.transform),
+):
+    """Bodies of postures in the base frame; launched over postures.
+
+    Args:
+        q: [rad or m], (N, K).
+        pose_out: T_base_body, (N, B).
+    """
+    row = wp.tid()
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    pose_out[row, 0] = wp.transform_identity()
+    for g in range(h.groups):
+        first = group_forward(h, g, group_dofs(h, g, q, row), X, 0)
+        for j in range(h.joint_first[g + 1] - first):
+            pose_out[row, 1 + first + j] = X[j]
 
 
 def body_poses(hand: HandArrays, q: np.ndarray) -> np.ndarray:

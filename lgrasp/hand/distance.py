@@ -4,8 +4,47 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from lgrasp.hand.mesh_kernels import mesh_distance, winding_distance
-from lgrasp.runtime.device import start
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+
+@wp.kernel
+def mesh_distance(
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    # out
+    distance_out: wp.array(dtype=wp.float32),
+):
+    """Distances (n,) [m] of points (n,) [m] within 1 m of a mesh, negative inside by the nearest face's normal.
+
+    Args:
+        points: [m], (n,).
+        distance_out: [m], (n,).
+    """
+    i = wp.tid()
+    q = wp.mesh_query_point_sign_normal(mesh, points[i], 1.0)
+    p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
+    distance_out[i] = q.sign * wp.length(points[i] - p)
+
+
+@wp.kernel
+def winding_distance(
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    # out
+    distance_out: wp.array(dtype=wp.float32),
+):
+    """As :func:`mesh_distance`, inside and outside by winding numbers, which bear holes.
+
+    Args:
+        points: [m], (n,).
+        distance_out: [m], (n,).
+    """
+    i = wp.tid()
+    q = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0)
+    p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
+    distance_out[i] = q.sign * wp.length(points[i] - p)
 
 
 def signed_distance(

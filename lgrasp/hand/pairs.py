@@ -11,15 +11,41 @@ from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.overlap import OverlapSide, overlap_arrays, overlap_depth, overlap_sides
-from lgrasp.hand.pair_kernels import mark_touching
 from lgrasp.hand.self_collision import OVERLAP
-from lgrasp.runtime.device import start
+from lgrasp.math.convex import Pieces, pieces_clear
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 _SAMPLED_POSTURES = 256
 _CONFIRMING_POSTURES = 2000  # postures in which a pair must touch to count as touching always
 _ALMOST_ALWAYS = 0.95  # of all postures
 _UNUSABLE_SHARE = 0.98  # of all postures
 _GRID_ERROR = 5.0e-5  # [m] that distance grids may err
+
+
+@wp.kernel
+def mark_touching(
+    pieces: Pieces,
+    pose: wp.array2d(dtype=wp.transform),
+    pairs: wp.array(dtype=wp.vec2i),
+    margin: wp.float32,
+    # out
+    touch_out: wp.array2d(dtype=wp.int32),
+):
+    """Pairs of pieces that are within ``margin`` [m] of each other; launched over (posture, pair).
+
+    Args:
+        pose: T_base_body, (N, B).
+        pairs: two pieces each, (Q,).
+        touch_out: set to 1 where they are, (N, Q).
+    """
+    row, k = wp.tid()
+    i = pairs[k][0]
+    j = pairs[k][1]
+    T = wp.transform_inverse(pose[row, pieces.body[i]]) * pose[row, pieces.body[j]]
+    if not pieces_clear(pieces, i, j, T, margin):
+        touch_out[row, k] = 1
 
 
 def pieces_touch(

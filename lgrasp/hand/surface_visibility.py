@@ -1,19 +1,23 @@
-"""The palmar side of a hand: surface visible from the mean fingertip, by rays, over many postures."""
+"""The gripper weighting map: surface of a hand visible from the mean fingertip, by rays, over many postures."""
 
 import numpy as np
 import trimesh
 import warp as wp
 
+from lgrasp.hand.find import HandSource
 from lgrasp.hand.geometry import geometry_mesh
-from lgrasp.hand.mesh_kernels import first_hits
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.postures import Postures
-from lgrasp.hand.surface import SurfaceSamples
-from lgrasp.hand.urdf import Urdf
-from lgrasp.runtime.device import start
+from lgrasp.hand.postures import Postures, sample_bodies
+from lgrasp.hand.surface import ContactSurface, SurfaceSamples, joined_mesh
+from lgrasp.hand.urdf import Urdf, read_urdf
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 _POINTS_PER_LINK = 400
 _VIEWED_POSTURES = 32  # of those given
+_SAMPLED_POSTURES = 64
+_MIN_SEEN_SHARE = 0.3  # of postures
 
 
 def link_surfaces(urdf: Urdf, model: HandModel) -> list[SurfaceSamples]:
@@ -27,18 +31,12 @@ def link_surfaces(urdf: Urdf, model: HandModel) -> list[SurfaceSamples]:
         for geometry in urdf.links[link]:
             mesh = geometry_mesh(urdf, geometry)
             meshes.append(mesh.apply_transform(tree.T_body_link[index] @ geometry.T_link_geometry))
-        mesh = _join(meshes)
+        mesh = joined_mesh(meshes)
         points, faces = trimesh.sample.sample_surface(mesh, _POINTS_PER_LINK, seed=index)[:2]
         normals = np.asarray(mesh.face_normals)[faces]
         T, body = tree.T_body_link[index], int(tree.link_body[index])
         surfaces.append(SurfaceSamples(link, body, float(mesh.area), points, normals, np.zeros(len(points)), T, mesh))
     return surfaces
-
-
-def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    joined = trimesh.util.concatenate(meshes)
-    assert isinstance(joined, trimesh.Trimesh)
-    return joined
 
 
 def surface_visibility(
@@ -83,3 +81,68 @@ def surface_visibility(
         SurfaceSamples(s.link, s.body, s.area, s.points, s.normals, part, s.T_body_link, s.mesh)
         for s, part in zip(surfaces, parts, strict=True)
     ]
+
+
+def visible_surface(source: HandSource, model: HandModel, device: str = "cpu") -> ContactSurface:
+    """The palmar side of a hand: what the mean fingertip sees. A ray from there meets it first, in three of ten random
+    postures or more."""
+    tree = model.tree
+    q = np.random.default_rng(0).uniform(tree.joint_lower, tree.joint_upper, (_SAMPLED_POSTURES, model.dofs))
+    surfaces = link_surfaces(read_urdf(source.urdf), model)
+    tips = {b: tip_point([s for s in surfaces if s.body == b], 0.1) for b in last_bodies(model)}
+    seen = surface_visibility(surfaces, sample_bodies(model, q, device), tips, device)
+    chosen = [s.seen >= _MIN_SEEN_SHARE for s in seen]
+    parts = [
+        (np.full(int(c.sum()), tree.link_names.index(s.link)), s.points[c], s.normals[c])
+        for s, c in zip(seen, chosen, strict=True)
+    ]
+    link, points, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return ContactSurface(link, tree.link_body[link], points, normals)
+
+
+def tip_point(surfaces: list[SurfaceSamples], share: float) -> np.ndarray:
+    """Middle of the part of a body's surface that is farthest from its joint, (3,) [m].
+
+    Args:
+        share: of the points, those that count.
+    """
+    points = np.concatenate([s.points for s in surfaces])
+    far = np.linalg.norm(points, axis=1)
+    return points[far >= np.quantile(far, 1 - share)].mean(0)
+
+
+def last_bodies(model: HandModel) -> set[int]:
+    """Bodies with geometry that no body with geometry rides on: the last links of fingers."""
+    tree = model.tree
+    group = np.repeat(np.arange(tree.groups), np.diff(tree.joint_first))
+    parent = np.where(tree.joint_parent < 0, -1, tree.joint_parent + tree.joint_first[group])  # joint of each joint
+    solid = {int(b) for b in model.piece_body if b > 0}
+    inner = set()
+    for b in solid:
+        j = int(parent[b - 1])
+        while j >= 0:
+            inner.add(1 + j)
+            j = int(parent[j])
+    return solid - inner
+
+
+@wp.kernel
+def first_hits(
+    mesh: wp.uint64,
+    origin: wp.vec3,
+    target: wp.array(dtype=wp.vec3),
+    slack: wp.float32,
+    # out
+    free_out: wp.array(dtype=wp.int32),
+):
+    """Whether the line from the origin to each target is free, except for the last ``slack`` [m].
+
+    Args:
+        target: [m], (n,).
+        free_out: 1 where it is, (n,).
+    """
+    i = wp.tid()
+    way = target[i] - origin
+    length = wp.length(way)
+    hit = wp.mesh_query_ray(mesh, origin, way / length, length - slack)
+    free_out[i] = wp.where(hit.result, 0, 1)

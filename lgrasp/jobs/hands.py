@@ -15,6 +15,6 @@ def hand_source(name: str) -> HandSource:
 
 
 def _draft(urdf: Path, name: str) -> Path:
-    from lgrasp.hand.drafting.drafted import drafted_folder  # needed by few hands, and slow to load
+    from lgrasp.hand.drafting.import_urdf import drafted_folder  # needed by few hands, and slow to load
 
     return drafted_folder(urdf, name)

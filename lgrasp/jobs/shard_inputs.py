@@ -18,10 +18,9 @@ from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import OBJECT_VERSION, load_hand, load_object, object_key
 from lgrasp.errors import HandError, ShardError
 from lgrasp.grasp.hand_files import write_hand
-from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource, rules_of_known
 from lgrasp.hand.model import HAND_VERSION, HandModel
-from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.spec import HandSpec, hand_digest
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hands import hand_source

@@ -18,7 +18,7 @@ from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import REASONS, Outcome
 from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.palm import ContactSurface, palm_axis
+from lgrasp.hand.surface import ContactSurface, palm_axis
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted

@@ -8,10 +8,8 @@ import torch
 from lgrasp.differentiable.distance import DistanceGrids
 from lgrasp.differentiable.solids import hand_solids
 from lgrasp.hand.model import HandModel
-from lgrasp.refine.match_kernels import DEEPEST, LINK_DEEPEST
+from lgrasp.refine.match_kernels import DEEPEST, LINK_DEEPEST, NO_PLANE
 from lgrasp.refine.surface import LINK_POINTS, link_probes
-
-_NO_PLANE = -1.0  # [m] offset of a plane that nothing is near
 
 
 class Intrusions(NamedTuple):
@@ -80,7 +78,7 @@ class LinkSolids:
         rows = torch.arange(len(cloud), device=cloud.device)[:, None, None]
         p = _into(link_R[:, :, None], link_t[:, :, None], cloud[rows, best.indices])  # (N, S, k, 3)
         normal, offset = self._planes(p, torch.arange(len(self._body), device=p.device)[:, None])
-        return self._cloud[best.indices], normal, torch.where(best.values.isinf(), _NO_PLANE, offset)
+        return self._cloud[best.indices], normal, torch.where(best.values.isinf(), NO_PLANE, offset)
 
     def _link_planes(
         self, link_R: torch.Tensor, link_t: torch.Tensor, centre: torch.Tensor
@@ -96,7 +94,7 @@ class LinkSolids:
         normal, offset = self._planes(p.gather(1, best[..., None].expand(-1, -1, 3)), second[:, None])
         shape = (len(centre), len(a), LINK_DEEPEST)
         points = centre.new_zeros((*shape, 3))
-        normals, offsets = torch.zeros_like(points), centre.new_full(shape, _NO_PLANE)
+        normals, offsets = torch.zeros_like(points), centre.new_full(shape, NO_PLANE)
         points[row, pair] = self._points[first[:, None], best]
         normals[row, pair], offsets[row, pair] = normal, offset
         return points, normals, offsets

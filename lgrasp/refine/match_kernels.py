@@ -15,7 +15,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 DEEPEST, LINK_DEEPEST = 4, 2
 """Points that are kept of each link in the object, and of each ordered pair of links."""
 
-_NO_PLANE = -1.0  # [m] offset of a plane that nothing is near
+NO_PLANE = -1.0  # [m] offset of a plane that nothing is near
 _FAR_DISTANCE = 1.0e9  # [m]
 _HALVINGS = 40
 
@@ -245,7 +245,7 @@ def match_solids(
                     d = later
                     at = later_at
     for e in range(DEEPEST):
-        plane = wp.vec4(0.0, 0.0, 0.0, _NO_PLANE)
+        plane = wp.vec4(0.0, 0.0, 0.0, NO_PLANE)
         if depth[e] < _FAR_DISTANCE:
             plane = _link_plane(grid, wp.transform_point(back, cloud[which[e]]))
         m.deep[row, i * DEEPEST + e] = cloud[which[e]]
@@ -266,7 +266,7 @@ def match_links(s: Solids, margin: wp.float32, body: wp.array2d(dtype=wp.transfo
     B = body[row, s.body[b]]
     first = pair * LINK_DEEPEST
     for e in range(LINK_DEEPEST):
-        m.link_plane[row, first + e] = wp.vec4(0.0, 0.0, 0.0, _NO_PLANE)
+        m.link_plane[row, first + e] = wp.vec4(0.0, 0.0, 0.0, NO_PLANE)
     reach = s.ball[a][3] + s.ball[b][3] + margin
     if wp.length_sq(_centre(s, a, A) - _centre(s, b, B)) >= reach * reach:
         return

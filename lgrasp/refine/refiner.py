@@ -25,7 +25,6 @@ from lgrasp.refine.energy import (
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.links import LinkSolids
 from lgrasp.refine.params import LocalSearch
-from lgrasp.refine.steps import Gradient, clipped
 from lgrasp.refine.surface import HandSurface, hand_surface
 from lgrasp.refine.target import Target
 from lgrasp.refine.volume import upload_target
@@ -48,6 +47,28 @@ class Refined(NamedTuple):
     pose: Pose
     energies: Energies
     """At ``pose``, with new matches, every point within the first reach pulling."""
+
+
+class Gradient(NamedTuple):
+    """Of the total energy by motions of the base about the hand's middle and by the joints."""
+
+    translation: torch.Tensor  # (N, 3) [1/m]
+    rotation: torch.Tensor  # (N, 3) [1/rad]
+    joints: torch.Tensor  # (N, K)
+
+
+def clipped(g: Gradient, p: LocalSearch) -> Gradient:
+    """A step down, at most the parameters' sizes, per sample."""
+
+    def down(x: torch.Tensor, size: float) -> torch.Tensor:
+        scaled = x * size
+        return -size * scaled / (1 + (scaled * scaled).sum(-1, keepdim=True)).sqrt()
+
+    return Gradient(
+        down(g.translation, p.max_translation_step),
+        down(g.rotation, p.max_rotation_step),
+        down(g.joints, p.max_joint_step),
+    )
 
 
 class Refiner(nn.Module):

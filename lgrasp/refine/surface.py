@@ -6,7 +6,8 @@ import numpy as np
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.palm import ContactSurface, contact_surface
+from lgrasp.hand.surface import ContactSurface, contact_surface
+from lgrasp.hand.surface_visibility import last_bodies
 
 BLOCK = 24
 """Points are in blocks of this many, each on one body."""
@@ -89,18 +90,3 @@ def hand_surface(
         blocks.append((p, n, weight))
     p, n, weight = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     return HandSurface(np.array(bodies), p, n, weight)
-
-
-def last_bodies(model: HandModel) -> set[int]:
-    """Bodies with geometry that no body with geometry rides on: the last links of fingers."""
-    tree = model.tree
-    group = np.repeat(np.arange(tree.groups), np.diff(tree.joint_first))
-    parent = np.where(tree.joint_parent < 0, -1, tree.joint_parent + tree.joint_first[group])  # joint of each joint
-    solid = {int(b) for b in model.piece_body if b > 0}
-    inner = set()
-    for b in solid:
-        j = int(parent[b - 1])
-        while j >= 0:
-            inner.add(1 + j)
-            j = int(parent[j])
-    return solid - inner

@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 
 from lgrasp.engine.cache import Cache
+from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.shard_inputs import named_hand
-from lgrasp.refine.visible_surface import visible_surface
 from lgrasp.runtime.device import resolve_device, start
 
 

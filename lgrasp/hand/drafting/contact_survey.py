@@ -11,7 +11,7 @@ from lgrasp.hand.geometry import Piece
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import Postures, sample_bodies
 from lgrasp.hand.surface import SurfaceSamples
-from lgrasp.hand.surface_visibility import link_surfaces, surface_visibility
+from lgrasp.hand.surface_visibility import link_surfaces, surface_visibility, tip_point
 from lgrasp.hand.urdf import Urdf
 
 _SAMPLED_POSTURES = 1200
@@ -61,9 +61,9 @@ def survey_contacts(
     postures = sample_bodies(model, rng.uniform(tree.joint_lower, tree.joint_upper, (_SAMPLED_POSTURES, model.dofs)))
     surfaces = link_surfaces(urdf, model)
     used = structure.tips if jaws is None else (int(tree.link_body[tree.link_names.index(jaws[1])]),)
-    tips = {b: _tip_point([s for s in surfaces if s.body == b]) for b in used}
+    tips = {b: tip_point([s for s in surfaces if s.body == b], 0.2) for b in used}
     if jaws is not None:
-        tips[0] = _tip_point([s for s in surfaces if s.link == jaws[0]] or [s for s in surfaces if s.body == 0])
+        tips[0] = tip_point([s for s in surfaces if s.link == jaws[0]] or [s for s in surfaces if s.body == 0], 0.2)
     elif len(tips) == 1 and any(s.body == 0 for s in surfaces):
         tips[0] = _nearest_static(surfaces, postures, used[0], tips[used[0]])
     surfaces = surface_visibility(surfaces, postures, tips)
@@ -106,13 +106,6 @@ def _one_per_group(touches: list[Touch], structure: FingerStructure) -> list[Tou
         else:
             merged[key] = Touch(key, t.points, t.normals)
     return list(merged.values())
-
-
-def _tip_point(surfaces: list[SurfaceSamples]) -> np.ndarray:
-    """Middle of the part of a body's surface that is farthest from its joint."""
-    points = np.vstack([s.points for s in surfaces])
-    far = np.linalg.norm(points, axis=1)
-    return points[far >= np.quantile(far, 0.8)].mean(0)
 
 
 def _allowed(sides: list[Side], body: int) -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +151,7 @@ def _finger_sides(structure: FingerStructure, model: HandModel, surfaces: list[S
 
 def _along(surfaces: list[SurfaceSamples]) -> np.ndarray:
     """Unit vector from a body's joint to the far end of its surface."""
-    way = _tip_point(surfaces)
+    way = tip_point(surfaces, 0.2)
     return way / max(float(np.linalg.norm(way)), 1e-9)
 
 

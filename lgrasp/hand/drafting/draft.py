@@ -39,7 +39,7 @@ def draft_spec(
     """Rules for a hand from its URDF alone, with the decisions in words.
 
     Args:
-        jaws: (static link, moving link) of a gripper that :func:`lgrasp.hand.drafting.reroot.reroot` turned round.
+        jaws: (static link, moving link) of a gripper that :func:`lgrasp.hand.drafting.two_jaw.reroot` turned round.
 
     Raises:
         HandError: the URDF cannot be used (see :func:`read_urdf`, :func:`finger_structure`), the hand is of impossible

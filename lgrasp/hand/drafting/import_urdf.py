@@ -1,5 +1,6 @@
 """Any URDF -> a hand's folder: the URDF with its meshes beside it, and a drafted, commented hand.yaml."""
 
+import hashlib
 import os
 import re
 import shutil
@@ -13,15 +14,15 @@ from lxml import etree
 from lgrasp.errors import HandError, LgraspError
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.draft import draft_spec
-from lgrasp.hand.drafting.reroot import reroot
-from lgrasp.hand.drafting.two_jaw import find_jaws
+from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, thin_mesh
-from lgrasp.hand.spec import HandSpec, load_spec
+from lgrasp.hand.spec import HandSpec, hand_digest, load_spec
 from lgrasp.hand.urdf import find_mesh, parse_robot, read_urdf
-from lgrasp.paths import user_dir
+from lgrasp.paths import cache_dir, user_dir
 
 _UNINFORMATIVE_NAMES = {"hand", "robot", "model", "urdf", "gripper"}
+_DRAFT_VERSION = 3
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
 
 
@@ -201,3 +202,20 @@ def _thinned(file: Path) -> tuple[trimesh.Trimesh, int] | None:
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) <= MOST_FACES:
         return None
     return thin_mesh(mesh, MOST_FACES), len(mesh.faces)
+
+
+def drafted_folder(urdf: Path, name: str) -> Path:
+    """Folder of a hand drafted from a package's URDF, kept in the cache.
+
+    Raises:
+        HandError: see :func:`import_urdf`.
+    """
+    probe = {"name": name, "contact": [{"links": ["-"]}], "canonical_box": {"min": (0, 0, 0), "max": (1, 1, 1)}}
+    content = hand_digest(urdf, HandSpec.model_validate(probe))
+    key = hashlib.sha256(f"{_DRAFT_VERSION} {content}".encode()).hexdigest()
+    folder = cache_dir() / "drafts" / key[:32] / name
+    try:
+        load_spec(folder / "hand.yaml")
+    except HandError:  # not drafted yet, or unreadable
+        import_urdf(urdf, name=name, out=folder, force=folder.exists())
+    return folder

@@ -15,12 +15,11 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import space_sides
 from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.surface import SurfaceSamples
-from lgrasp.hand.surface_visibility import link_surfaces
+from lgrasp.hand.surface_visibility import last_bodies, link_surfaces, visible_surface
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hand_check.diagnose import field_vectors, finger_label
 from lgrasp.jobs.hand_check.plotting import add_box, add_triangles, frame_points, new_figure, save_figure, shade
-from lgrasp.refine.surface import DISTAL, OTHER, last_bodies
-from lgrasp.refine.visible_surface import visible_surface
+from lgrasp.refine.surface import DISTAL, OTHER
 
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#e377c2", "#17becf")
 _PALM = "#e8a400"

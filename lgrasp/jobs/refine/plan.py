@@ -21,12 +21,12 @@ from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
 from lgrasp.jobs.shard_inputs import mesh_hash, named_hand, named_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.planner import Planner, PlanParams, cloud_params
 from lgrasp.planning.starts import STAND_OFF
-from lgrasp.refine.visible_surface import visible_surface
 from lgrasp.scenes.files import scene_cloud
 
 VERSION = 2

@@ -10,8 +10,8 @@ import numpy as np
 from lgrasp.dataset import HandRecord, ObjectRecord, ShardReader
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, ShardError
-from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.spec import hand_digest
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.shard_inputs import hand_of_shard, mesh_hash
 from lgrasp.runtime.device import Device

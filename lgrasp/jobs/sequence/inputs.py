@@ -19,10 +19,10 @@ from lgrasp.field.build import build_field
 from lgrasp.field.model import FIELD_VERSION, ContactField
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
 from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, space_view
+from lgrasp.hand.spec import hand_digest
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.sequence.size import Size, object_scales
 from lgrasp.object.arrays import ObjectArrays, upload_object

@@ -13,11 +13,10 @@ from support.hands import ROOT, hand_model, hand_source
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
-from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space, available, consumed, free_joints, hand_spaces, longest, space_view
-from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.spec import HandSpec, hand_digest
 
 # index 0-3, middle 4-7, ring 8-11, thumb 12-15
 ALLEGRO = {
