@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 from lgrasp.runtime.device import start
+from lgrasp_cli import progress
 from lgrasp_cli.main import main
 
 QUICK = str(Path(__file__).parent / "quick.yaml")
@@ -47,6 +48,7 @@ def cli(monkeypatch, capfd, shared_cache, tmp_path):
     """cli(*arguments): run the command in this process, in an empty folder."""
     monkeypatch.setenv("LGRASP_CACHE_DIR", str(shared_cache))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(progress, "_PLAIN_INTERVAL", float("inf"))  # on a slow machine lines of progress come too
     for name in [name for name in os.environ if name.startswith("SLURM_")]:
         monkeypatch.delenv(name)
 

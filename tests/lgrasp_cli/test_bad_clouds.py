@@ -1,5 +1,7 @@
 """``lgrasp plan --cloud`` on clouds that cannot be used, or only after a repair that is said."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -40,8 +42,8 @@ def changed(where, points=POINTS, normals=NORMALS, **more):
     [
         ({"points": np.full((COUNT, 3), np.nan)}, f"all {COUNT:,} points are NaN"),
         ({"points": POINTS[:7], "normals": NORMALS[:7]}, "7 usable points; at least 50"),
-        ({"points": POINTS - [0, 0, 0.5], "normals": None}, "give --viewpoint X,Y,Z"),
-        ({"points": POINTS - [0, 0, 0.5], "normals": np.zeros((COUNT, 3))}, "give --viewpoint X,Y,Z"),
+        ({"points": POINTS - [0, 0, 0.5], "normals": None}, "give its position as --viewpoint X,Y,Z"),
+        ({"points": POINTS - [0, 0, 0.5], "normals": np.zeros((COUNT, 3))}, "give its position as --viewpoint X,Y,Z"),
         ({"normals": NORMALS[:5]}, "normals have shape (5, 3)"),
         ({"points": 1e3 * POINTS}, "in millimetres use --scale 0.001"),
         ({"points": 1e2 * POINTS}, "in centimetres use --scale 0.01"),
@@ -137,7 +139,7 @@ def repaired(found, words):
     assert found.code == 0, found
     assert words in found.err
     assert found.err.startswith("warning: ")
-    (path,) = (found.out.split()[found.out.split().index("where") + 1],)
+    (path,) = Path(found.out.split()[found.out.split().index("where") + 1]).glob("*.h5")
     return read_shard(path).objects[0]
 
 
@@ -163,7 +165,7 @@ def test_a_mesh_gives_its_vertices_and_their_normals(plan, tmp_path):
     record = repaired(plan("--cloud", tmp_path / "mesh.ply"), "mesh.ply is a mesh: its vertices are the points")
     assert (record.normals * NORMALS).sum(1).min() > 0.99
     trimesh.creation.box((0.05,) * 3).export(tmp_path / "box.ply")
-    assert "8 usable points" in (line := plan("--cloud", tmp_path / "box.ply", "--force").error())
+    assert "8 usable points" in (line := plan("--cloud", tmp_path / "box.ply", "--overwrite").error())
     assert "--object takes" in line
 
 
