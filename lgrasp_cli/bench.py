@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lgrasp_cli.interrupt import before_end
-from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Settings, check_report, open_cache, warn
+from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Physics, Settings, check_report, open_cache, warn
 from lgrasp_cli.progress import say
 from lgrasp_cli.tables import Block, TextTable, print_report
 
@@ -174,7 +174,8 @@ def bench_sequence(
         int | None, typer.Option(min=1, help="Iterations of the optimiser; default: as published.", show_default="6000")
     ] = None,
     policy: Annotated[str, typer.Option(help="uniform, as published, or lookahead.")] = "uniform",
-    physics: Annotated[str, typer.Option(help="Protocol: seq6 (friction 2.0, as published) or seq6_mu06.")] = "seq6",
+    simulate: Annotated[str, typer.Option(help="Protocol: seq6 (friction 2.0, as published) or seq6_mu06.")] = "seq6",
+    physics: Physics = None,
     scale: Annotated[str, typer.Option(help="Factor to metres, or range of the longest side [m].")] = "0.06:0.10",
     pipeline: Annotated[
         str, typer.Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.")
@@ -197,11 +198,11 @@ def bench_sequence(
     from lgrasp.config import parse_model
     from lgrasp.jobs.sequence.job import SequenceJob
     from lgrasp.jobs.sets import SequenceSets, object_sequences
-    from lgrasp_cli.options import choose_pipeline
+    from lgrasp_cli.options import choose_pipeline, choose_protocol
 
     pool = objects or ["mug", "sphere", "box", "capsule", "bottle", "bowl"]
     sets = parse_model(SequenceSets, {"sets": sequences, "length": length, "permutations": 1}, "bench sequence")
-    chosen = choose_pipeline(pipeline, seed)
+    chosen, protocol = choose_pipeline(pipeline, seed), choose_protocol(simulate, physics) or simulate
     optimiser = chosen.params("sequence").optimiser.model_dump() | ({"iterations": iterations} if iterations else {})
     chosen = chosen.with_params("sequence", policy=policy, width=width, optimiser=optimiser)
     jobs = [
@@ -212,7 +213,7 @@ def bench_sequence(
             pipeline=chosen,
             out=Path("."),
             scale=scale,
-            physics=physics,
+            simulate=protocol,
             device=device,
             workers=workers,
             cache=cache,
@@ -228,7 +229,8 @@ def bench_refine(
     hands: Annotated[str, typer.Option(help="Names, separated by commas.")] = "barrett,schunk_svh",
     objects: Annotated[str, typer.Option(help="Names or mesh files, separated by commas.")] = "bowl,box,bottle,mug",
     starts: Annotated[int, typer.Option("--starts", "-n", min=1, help="Starts on each object.")] = 80,
-    physics: Annotated[str, typer.Option(help="Protocol that decides which plans are valid.")] = "fc",
+    simulate: Annotated[str, typer.Option(help="Protocol that decides which plans are valid.")] = "fc",
+    physics: Physics = None,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Also measure table IV: clouds with noise.")] = True,
     device: Device = "auto",
     json_path: JsonPath = None,
@@ -244,10 +246,11 @@ def bench_refine(
     check_report(json_path)
     cache = open_cache(cache_dir)
     from lgrasp.bench.refine import NOISES, bench_hands, refine_page
+    from lgrasp_cli.options import choose_protocol
 
-    noises = NOISES if noise else ()
+    noises, protocol = NOISES if noise else (), choose_protocol(simulate, physics) or simulate
     result = bench_hands(
-        _split(hands), _split(objects), starts, physics, noises=noises, device=device, cache=cache, progress=say
+        _split(hands), _split(objects), starts, protocol, noises=noises, device=device, cache=cache, progress=say
     )
     _print(result, json_path, refine_page(result))
 

@@ -110,7 +110,7 @@ def choose_protocol(simulate: str | None, physics: str | None) -> str | None:
         from lgrasp.notices import notice
 
         notice("--physics is now --simulate; the old name works in this release only")
-    return simulate or physics
+    return physics or simulate
 
 
 def choose_pipeline(

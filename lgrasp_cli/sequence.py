@@ -73,7 +73,7 @@ def sequence(
         pipeline=chosen,
         out=out or Path("grasps") / sequence_name(hand_source(hand).name, tuple(objects)),
         scale=scale,
-        physics=choose_protocol(simulate, physics),
+        simulate=choose_protocol(simulate, physics),
         shard_rows=shard_rows,
     )
     how.run(job, _show)

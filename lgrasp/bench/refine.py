@@ -94,7 +94,7 @@ def bench_hands(
 
     Tables I and IV: ``starts`` on each object, on its mesh and for each noise on points of its surface with the normals
     of the clean surface, once with one hand at each start and once with the best of several. A plan is valid when it
-    holds the true object under the physics protocol. Table III: the valid plans on meshes, displaced as a network would
+    holds the true object under the protocol. Table III: the valid plans on meshes, displaced as a network would
     (1 cm and 0.15 rad an axis, 0.15 rad a joint), refined by ``COARSE``.
 
     Returns:

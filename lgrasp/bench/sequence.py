@@ -29,7 +29,7 @@ def bench_methods(
     """Run each method on the same sequences of objects; methods after the first with ``baseline_width`` attempts.
 
     Returns:
-        ``published``; ``device``, ``physics`` and ``sequences`` as asked; ``methods``: name -> see
+        ``published``; ``device``, ``simulate`` and ``sequences`` as asked; ``methods``: name -> see
         :func:`measure_sequences`, with the ``ratios`` of the first method to it, by rows per second.
     """
     found: dict[str, dict[str, Any]] = {}
@@ -46,7 +46,7 @@ def bench_methods(
         "published": load_published("seqgrasp").model_dump(mode="json"),
         "device": resolve_device(jobs[0].device).name,
         "sequences": [list(job.objects) for job in jobs],
-        "physics": jobs[0].physics,
+        "simulate": jobs[0].simulate,
         "methods": found,
     }
 
@@ -58,7 +58,7 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
     links in links are left out before.
 
     Args:
-        jobs: the same method on several sequences of objects; each names a physics protocol.
+        jobs: the same method on several sequences of objects; each names a protocol.
         progress: called with one line before each round.
 
     Returns:
@@ -78,13 +78,13 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
         scene = make_scene(cache, inputs.hand, object_records(inputs), meshes, device.alias)
         inputs = replace(inputs, scene=scene)
         load_kernels(device.alias, kernel_modules("lgrasp.stages.", "lgrasp.grasp."))
-        assert job.physics
+        assert job.simulate
         params = pipeline.params("sequence")
         if progress:
             progress(f"{params.method}, {' '.join(inputs.object_ids)}: {params.width} attempts")
         seen: list[SequenceTable] = []
         workers = job.workers or os.cpu_count() or 1
-        found = run_round(pipeline, inputs, 0, 0, workers, verdicts=_watched(simulated(inputs, job.physics), seen))
+        found = run_round(pipeline, inputs, 0, 0, workers, verdicts=_watched(simulated(inputs, job.simulate), seen))
         _count_spaces(spaces, found)
         attempts = [params.width, *map(len, found.levels)]
         for step, entry in enumerate(objects):
@@ -187,7 +187,7 @@ def _percent(part: int, whole: int) -> float | None:
 def sequence_page(result: dict[str, Any]) -> Page:
     """The tables as texts; published figures stand in parentheses beside what is counted as they are."""
     published, count = result["published"]["figures"], len(result["sequences"])
-    head = [f"{result['device']}: {count} sequence{'s' if count > 1 else ''} of objects; physics {result['physics']}"]
+    head = [f"{result['device']}: {count} sequence{'s' if count > 1 else ''} of objects; protocol {result['simulate']}"]
     tables = []
     for method, found in result["methods"].items():
         title = f"{method}: {found['begun']} attempts started with each sequence"

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
+from pydantic import ConfigDict, Field, PrivateAttr
 
+from lgrasp.config import Params
 from lgrasp.dataset import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError, Events, Made, Part, PartProgress
@@ -21,13 +22,13 @@ from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 
 
-class Job(BaseModel, ABC):
+class Job(Params, ABC):
     """A job that makes files part by part: its settings, and how one part is made.
 
     The fields are the keys of a config (``lgrasp run``). What is loaded for the parts is private to the job.
     """
 
-    model_config = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+    model_config = ConfigDict(frozen=False, arbitrary_types_allowed=True)
 
     unit: ClassVar[str] = "grasps"
     """What is counted."""

@@ -170,7 +170,7 @@ def plan_sequences(config: JobConfig, cache: Cache) -> list[Job]:
             pipeline=pipeline.with_params("sequence", **changes) if changes else pipeline,
             out=out / sequence_name(Path(hand).stem, sequence),
             scale=sets.scale,
-            physics=sets.physics,
+            simulate=sets.simulate,
             device=config.device,
             workers=config.workers,
             shard_rows=min(config.shard_rows, 1000),
@@ -222,10 +222,10 @@ def in_folder(folder: Path | None, mesh: str) -> str:
     return mesh if found is None else str(found)
 
 
-def default_out(hand: str, mesh: str, physics: str | None = None) -> Path:
-    """``grasps/HAND-OBJECT``, or with ``-PHYSICS`` after it, for a hand and an object given by name or path.
+def default_out(hand: str, mesh: str, protocol: str | None = None) -> Path:
+    """``grasps/HAND-OBJECT``, or with ``-PROTOCOL`` after it, for a hand and an object given by name or path.
 
     Raises:
         HandError, ObjectError: there is no such hand or object.
     """
-    return Path("grasps") / f"{hand_source(hand).name}-{find_object(mesh).stem}{f'-{physics}' if physics else ''}"
+    return Path("grasps") / f"{hand_source(hand).name}-{find_object(mesh).stem}{f'-{protocol}' if protocol else ''}"

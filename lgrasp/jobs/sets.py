@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -16,13 +17,15 @@ from lgrasp.seeding import stage_seed
 class SequenceSets(Params):
     """How sequences are drawn from the objects of a config."""
 
+    RENAMED: ClassVar[dict[str, str]] = {"physics": "simulate"}
+
     sets: int = Field(600, ge=1, description="Different sets of objects.")
     length: int = Field(4, ge=2, le=16, description="Objects in a set.")
     permutations: int = Field(4, ge=1, description="Different orders of each set.")
     scale: str = Field("0.06:0.10", description="Factor to metres, or range of the longest side [m].")
     method: str | None = Field(None, description="Replaces that of stage sequence.")
     policy: str | None = Field(None, description="Replaces that of stage sequence.")
-    physics: str | None = Field(None, description="Protocol that rows must pass to be continued.")
+    simulate: str | None = Field(None, description="Protocol that rows must pass to be continued.")
 
     @field_validator("scale", mode="before")
     @classmethod

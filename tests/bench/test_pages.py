@@ -96,7 +96,7 @@ def sequences(monkeypatch):
 
     monkeypatch.setattr(sequence, "measure_sequences", measured)
     pipeline = load_pipeline("sequence").with_params("sequence", width=256)
-    job = SequenceJob(hand="allegro", objects=("mug", "box"), rows=1, pipeline=pipeline, out=Path("."), physics="seq6")
+    job = SequenceJob(hand="allegro", objects=("mug", "box"), rows=1, pipeline=pipeline, out=Path("."), simulate="seq6")
     result = bench_methods([job], ["field", "anneal"], 32, lambda line: None)
     assert widths == {"field": 256, "anneal": 32}
     return result

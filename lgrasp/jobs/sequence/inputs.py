@@ -46,9 +46,9 @@ class SequenceKeys:
     scales: tuple[float, ...]
     objects: tuple[str, ...]
 
-    def run_key(self, pipeline: dict[str, Any], shard_rows: int, physics: str | None) -> str:
+    def run_key(self, pipeline: dict[str, Any], shard_rows: int, simulate: str | None) -> str:
         """Content key of a run: everything that decides its rows."""
-        parts = [pipeline, self.hand, self.fields, self.objects, shard_rows, physics]
+        parts = [pipeline, self.hand, self.fields, self.objects, shard_rows, simulate]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

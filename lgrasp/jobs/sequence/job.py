@@ -35,6 +35,8 @@ from lgrasp.stages.context import Keeper
 class SequenceJob(Job):
     """Sequences of grasps of several objects by one hand."""
 
+    RENAMED: ClassVar[dict[str, str]] = {"physics": "simulate"}
+
     unit: ClassVar[str] = "sequences"
     asks: ClassVar[bool] = True
 
@@ -44,7 +46,7 @@ class SequenceJob(Job):
     pipeline: Pipeline
     out: Path = Field(description="Folder of the shards.")
     scale: str = Field(default="1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")
-    physics: str | None = Field(
+    simulate: str | None = Field(
         default=None, description="Protocol that the rows of every step must pass to be continued."
     )
     shard_rows: int = Field(default=1000, description="Sequences of a shard; part of what decides the rows.")
@@ -77,7 +79,7 @@ class SequenceJob(Job):
         return self._inputs
 
     def key(self) -> str:
-        return self.keys.run_key(self.pipeline.describe(), self.shard_rows, self.physics)
+        return self.keys.run_key(self.pipeline.describe(), self.shard_rows, self.simulate)
 
     def parts(self) -> list[Part]:
         check_size(self.rows, self.shard_rows, self.workers)
@@ -85,8 +87,8 @@ class SequenceJob(Job):
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}' has no sequence; use pipeline sequence, or add 'sequence: {{}}' to it"
             )
-        if self.physics:
-            find_protocol(self.physics)
+        if self.simulate:
+            find_protocol(self.simulate)
             check_installed(resolve_device(self.device).alias)
         name = sequence_name("", self.objects)[1:]
         return shard_parts(self.out, self.keys.source.name, name, self.rows, self.shard_rows)
@@ -98,7 +100,7 @@ class SequenceJob(Job):
         pipeline, device = self.pipeline, self.device_used
         inputs = load_sequence_inputs(self.cache, self.keys, pipeline.object, pipeline.field, device, events.loading)
         self._meshes = mesh_blobs(self.keys.source.urdf)
-        if missing and self.physics:
+        if missing and self.simulate:
             events.loading("scene")
             scene = make_scene(self.cache, inputs.hand, object_records(inputs), self._meshes, device.alias)
             inputs = replace(inputs, scene=scene)
@@ -119,7 +121,7 @@ class SequenceJob(Job):
             self.threads(),
             check=progress.check,
             progress=tell,
-            verdicts=simulated(self.inputs, self.physics) if self.physics else None,
+            verdicts=simulated(self.inputs, self.simulate) if self.simulate else None,
         )
         contents = self._shard(part, result) if len(result) else None
         return Made(len(result), contents, replace(result, levels=[]))
@@ -139,7 +141,7 @@ class SequenceJob(Job):
         )
 
     def _shard(self, part: Part, result: SequenceResult) -> Shard:
-        inputs, physics = self.inputs, self.physics
+        inputs, protocol_name = self.inputs, self.simulate
         header = ShardHeader(
             pipeline=self.pipeline.name,
             seed=self.pipeline.seed,
@@ -151,7 +153,7 @@ class SequenceJob(Job):
                 "objects": list(self.objects),
                 "scales": list(self.keys.scales),
                 "shard_rows": self.shard_rows,
-                "physics": physics,
+                "physics": protocol_name,
                 **hand_config(self.keys.source),
             },
         )
@@ -165,8 +167,8 @@ class SequenceJob(Job):
             **{f"found_{step}": found for step, found in enumerate(result.reached, 1)},
         }
         protocol = ""
-        if physics and inputs.scene:
-            protocol = protocol_text(inputs.scene, find_protocol(physics), device=inputs.device.alias)
+        if protocol_name and inputs.scene:
+            protocol = protocol_text(inputs.scene, find_protocol(protocol_name), device=inputs.device.alias)
         return Shard(
             header=header,
             hand=hand_record(inputs.hand, self._meshes),
@@ -176,9 +178,9 @@ class SequenceJob(Job):
         )
 
 
-def simulated(inputs: SequenceInputs, physics: str) -> Verdicts:
+def simulated(inputs: SequenceInputs, name: str) -> Verdicts:
     """A function that simulates the rows of the last of some levels, on all cores."""
-    protocol, scene = find_protocol(physics), inputs.scene
+    protocol, scene = find_protocol(name), inputs.scene
     assert scene is not None
     kept = Keeper()
 

@@ -53,7 +53,7 @@ def sequence_report(job: Any, outcome: JobOutcome) -> dict[str, Any]:
         "pipeline": job.pipeline.name,
         "method": params.method,
         "policy": params.policy,
-        "physics": job.physics,
+        "simulate": job.simulate,
         "seed": job.pipeline.seed,
     }
 
