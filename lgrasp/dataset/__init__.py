@@ -4,8 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from lgrasp.dataset.files import find_shards
 from lgrasp.dataset.info import describe
-from lgrasp.dataset.manifest import write_manifest
-from lgrasp.dataset.merge import merge_shards
+from lgrasp.dataset.merge import merge_shards, write_manifest
 from lgrasp.dataset.reader import ShardReader, iter_grasps, read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard

@@ -1,12 +1,14 @@
-"""Whole-or-absent output files, and which files are shards."""
+"""Whole-or-absent output files, which files are shards, and guards against damage that HDF5 does not notice."""
 
 import errno
 import hashlib
+import mmap
 import os
 import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from struct import unpack_from
 
 import h5py
 
@@ -169,3 +171,73 @@ def sha256_file(path: str | os.PathLike[str]) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise ShardError(f"{path}: {error.strerror or error}") from error
+
+
+def shard_tree(
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], *, leave_out: Path | None = None
+) -> dict[Path, Path]:
+    """Shard files by their place below the folder that was named, sorted; a file's place is its own name.
+
+    Args:
+        paths: Shard files, or folders whose ``*.h5`` files at any depth are meant.
+        leave_out: Folder that is not looked into.
+
+    Raises:
+        ShardError: A path does not exist, no shard is left, or two of them have one place.
+    """
+    given = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
+    found: dict[Path, Path] = {}
+    for path in given:
+        if not path.exists():
+            raise ShardError(f"{path}: no such file or folder")
+        files = sorted(path.rglob("*.h5")) if path.is_dir() else [path]
+        for file in files:
+            if leave_out is not None and file.resolve().is_relative_to(leave_out.resolve()):
+                continue
+            place = file.relative_to(path) if path.is_dir() else Path(file.name)
+            if place in found and not found[place].samefile(file):
+                raise ShardError(f"{file}: it has the same place {place} as {found[place]}; name one folder above both")
+            found[place] = file
+    if not found:
+        raise ShardError(f"no shard (*.h5) in {', '.join(map(str, given)) or 'an empty list of paths'}")
+    return found
+
+
+_SIGNATURE = b"GCOL\x01\x00\x00\x00"
+_HEADER = 16  # bytes, of a collection and of each entry
+
+
+def check_heaps(path: str | os.PathLike[str]) -> None:
+    """Walk through every string heap of an HDF5 file; reads the whole file once.
+
+    Raises:
+        ShardError: The file cannot be read, or an entry of a heap does not fit.
+    """
+    try:
+        with open(path, "rb") as file:
+            if os.fstat(file.fileno()).st_size == 0:
+                return  # opening it reports this better
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                start = data.find(_SIGNATURE)
+                while start >= 0:
+                    if not _is_sound(data, start):
+                        raise ShardError(f"{path}: cannot be read, it is damaged: string heap at byte {start}")
+                    start = data.find(_SIGNATURE, start + _HEADER)
+    except OSError as error:
+        raise ShardError(f"{path}: {error.strerror or error}") from error
+
+
+def _is_sound(data: mmap.mmap, start: int) -> bool:
+    if start + _HEADER > len(data):
+        return False
+    (size,) = unpack_from("<Q", data, start + 8)
+    end = start + size
+    if end > len(data):
+        return False
+    entry = start + _HEADER
+    while entry + _HEADER <= end:
+        index, length = unpack_from("<H6xQ", data, entry)
+        if index == 0:  # the free space, which is the rest and counts its own header
+            return entry + length == end
+        entry += _HEADER + (length + 7) // 8 * 8
+    return entry <= end

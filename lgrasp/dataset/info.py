@@ -1,7 +1,7 @@
-"""The contents of shards, in one dictionary each."""
+"""The contents of shards, in one dictionary each, and survivors of stages, in one number each."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,3 +67,41 @@ def _range(values: np.ndarray) -> dict[str, float | None]:
     if not len(values):
         return {"min": None, "mean": None, "max": None}
     return {"min": float(values.min()), "mean": float(values.mean()), "max": float(values.max())}
+
+
+Counts = dict[str, dict[str, int]]
+"""Stage -> what is counted -> number."""
+
+SURVIVORS = {
+    "place": "kept",
+    "domain": "rich",
+    "ik": "kept",
+    "search": "sets",
+    "filter": "kept",
+    "refine": "tried",
+    "sequence": "kept",
+    "simulate": "held",
+}
+"""The count of a stage that says how many came through."""
+
+_OLD_NAMES = {"validate": "simulate"}
+"""Stages as shards of 0.1 name them."""
+
+
+def survivors(counts: Counts) -> dict[str, int]:
+    """One number per stage: poses, poses in reach, realised contacts (or sets), sets, grasps."""
+    return {
+        stage: found.get("sets" if stage == "ik" and "sets" in found else SURVIVORS[stage], 0)
+        for stage, found in counts.items()
+    }
+
+
+def stage_counts(statistics: Mapping[str, Any]) -> Counts:
+    """Counts by stage from the statistics of a shard (``STAGE_NAME``)."""
+    counts: Counts = {}
+    for key, value in statistics.items():
+        stage, _, name = key.partition("_")
+        stage = _OLD_NAMES.get(stage, stage)
+        if stage in SURVIVORS and isinstance(value, int):
+            counts.setdefault(stage, {})[name.replace("_", " ")] = value
+    return counts

@@ -1,5 +1,6 @@
-"""Puts the rows of many shards of one hand and one object set into one file."""
+"""Puts the rows of many shards of one hand and one object set into one file, and lists the shards of a folder."""
 
+import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,10 +11,7 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.checks import row_problems
-from lgrasp.dataset.files import find_shards, new_shard_file
-from lgrasp.dataset.heap import check_heaps
-from lgrasp.dataset.manifest import MANIFEST_NAME, check_manifest
-from lgrasp.dataset.padding import pad_column, widest
+from lgrasp.dataset.files import check_heaps, find_shards, new_file, new_shard_file, sha256_file
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import create_rows, finish, write_context, write_spaces
 from lgrasp.errors import ShardError
@@ -213,3 +211,83 @@ def _checked(source: _Source, hand: HandRecord, part: int) -> Iterator[GraspRows
             if problems:
                 raise ShardError(f"{source.path}: {problems[0]}")
             yield rows
+
+
+def pad_column(name: str, values: np.ndarray, tail: tuple[int, ...]) -> np.ndarray:
+    """Values of one row dataset, padded at the end of each axis with the fill value of the format.
+
+    Verdicts of a simulator, which may have a number per object, are padded with what means not run: NaN, -1 or false.
+
+    Args:
+        name: Flat name, as in :meth:`GraspRows.columns`.
+        values: Shape [n, ...].
+        tail: Wanted lengths of all axes but the first; none is shorter than in ``values``.
+
+    Returns:
+        Shape [n, *tail]; ``values`` itself if nothing is to be padded.
+    """
+    if values.shape[1:] == tail:
+        return values
+    spec = (GRASP_FIELDS | SEQUENCE_FIELDS).get(name)
+    fill = spec.fill if spec else {"f": np.nan, "i": -1}.get(values.dtype.kind, 0)
+    padded = np.full((len(values), *tail), fill, dtype=values.dtype)
+    padded[tuple(slice(size) for size in values.shape)] = values
+    return padded
+
+
+def widest(tails: Iterable[tuple[int, ...]]) -> tuple[int, ...]:
+    """The smallest tail that holds all given ones; they have the same number of axes."""
+    return tuple(max(sizes) for sizes in zip(*tails, strict=True))
+
+
+MANIFEST_NAME = "manifest.json"
+_FORMAT = "lgrasp-manifest"
+_VERSION = "1.0"
+
+
+def write_manifest(folder: str | os.PathLike[str]) -> Path:
+    """Write ``manifest.json`` for the shards of a folder: file, rows, shard index and SHA-256 of each.
+
+    Raises:
+        ShardError: The folder holds no shard, or a shard cannot be read.
+        OutputError: The manifest cannot be written.
+    """
+    shards = []
+    for path in find_shards(folder):
+        with ShardReader(path) as reader:
+            shards.append({"file": path.name, "rows": len(reader), "shard_index": reader.header.shard_index})
+        shards[-1]["sha256"] = sha256_file(path)
+    document = {"format": _FORMAT, "format_version": _VERSION, "rows": sum(s["rows"] for s in shards), "shards": shards}
+    target = Path(folder) / MANIFEST_NAME
+    with new_file(target) as file:
+        file.write(json.dumps(document, indent=2).encode() + b"\n")
+    return target
+
+
+def check_manifest(manifest: str | os.PathLike[str], shards: Sequence[Path]) -> None:
+    """Compare shard files with a manifest; files are matched by name.
+
+    Raises:
+        ShardError: The manifest cannot be read, a listed shard is missing or has another hash, or a shard is not
+            listed.
+    """
+    try:
+        document = json.loads(Path(manifest).read_bytes())
+        listed = {entry["file"]: entry["sha256"] for entry in document["shards"]}
+        if document["format"] != _FORMAT:
+            raise ValueError(f"format is {document['format']!r}, expected {_FORMAT!r}")
+    except OSError as error:
+        raise ShardError(f"{manifest}: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise ShardError(f"{manifest}: not a manifest of shards: {error}") from error
+    given = {path.name: path for path in shards}
+    missing = sorted(listed.keys() - given.keys())
+    if missing:
+        raise ShardError(f"{manifest}: {len(missing)} of {len(listed)} shards missing, first {missing[0]}")
+    unlisted = sorted(given.keys() - listed.keys())
+    if unlisted:
+        raise ShardError(f"{given[unlisted[0]]}: not listed in {manifest}; write the manifest again")
+    for name, path in given.items():
+        actual = sha256_file(path)
+        if actual != listed[name]:
+            raise ShardError(f"{path}: SHA-256 is {actual[:12]}…, {manifest} says {str(listed[name])[:12]}…")

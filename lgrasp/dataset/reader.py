@@ -11,7 +11,7 @@ from typing import Any, Self
 import h5py
 import numpy as np
 
-from lgrasp.dataset.heap import check_heaps
+from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.structure import expand, format_problems, structure_problems
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader

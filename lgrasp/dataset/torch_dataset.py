@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from lgrasp.dataset.files import find_shards
-from lgrasp.dataset.padding import pad_column, widest
+from lgrasp.dataset.merge import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord

@@ -5,7 +5,7 @@ import os
 import numpy as np
 
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
-from lgrasp.dataset.heap import check_heaps
+from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.reader import ShardReader, open_hdf5, reading
 from lgrasp.dataset.structure import format_problems, structure_problems, text_sha256
 from lgrasp.errors import ShardError

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lgrasp.dataset import ShardReader, validate_shard
-from lgrasp.dataset.files import remove_leftovers
-from lgrasp.dataset.heap import check_heaps
+from lgrasp.dataset.files import check_heaps, remove_leftovers
 from lgrasp.engine.events import Part
 from lgrasp.errors import OutputError, ShardError
 

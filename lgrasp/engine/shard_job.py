@@ -9,9 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from lgrasp.dataset.files import remove_leftovers
+from lgrasp.dataset.files import remove_leftovers, shard_tree
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.tree import shard_tree
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Part

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from lgrasp.dataset.info import stage_counts, survivors
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.survivors import stage_counts, survivors
 from lgrasp.engine.batch import PASS_BITS
 from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard import add_counts, add_seconds

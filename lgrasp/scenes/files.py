@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from lgrasp.dataset.files import new_shard_file
-from lgrasp.dataset.heap import check_heaps
+from lgrasp.dataset.files import check_heaps, new_shard_file
 from lgrasp.dataset.reader import FileReader, open_hdf5, reading
 from lgrasp.dataset.structure import format_problems, schema_problems, text_sha256
 from lgrasp.dataset.writer import create_array, finish, write_hand, write_object

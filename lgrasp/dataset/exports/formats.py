@@ -15,8 +15,7 @@ from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
 from lgrasp.dataset.exports.readme import readme
-from lgrasp.dataset.exports.selection import Selection, select_rows
-from lgrasp.dataset.exports.where import parse_condition
+from lgrasp.dataset.exports.selection import Selection, parse_condition, select_rows
 from lgrasp.dataset.files import find_shards
 from lgrasp.errors import ConfigError
 

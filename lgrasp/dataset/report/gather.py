@@ -9,13 +9,106 @@ import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.report.coverage import Coverage
-from lgrasp.dataset.report.held import HeldRows, add_held
-from lgrasp.dataset.report.near import NearRows
-from lgrasp.dataset.report.physics import Verdicts, add_verdicts
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
-from lgrasp.dataset.report.sample import EvenSample
+from lgrasp.dataset.report.verdicts import HeldRows, Verdicts, add_held, add_verdicts
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.grasp.duplicates import KeptRows, near_pairs
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
+
+_MAX_ROWS = 2_000_000  # rows held for comparison
+
+
+class NearRows:
+    """Rows that are near-duplicates of a row before them.
+
+    With one object every row is compared with all rows kept so far, up to two million. With several, all of which must
+    be near, it is compared within the rows of one call.
+    """
+
+    def __init__(self) -> None:
+        self.compared = self.duplicates = self.poses = 0
+        self._kept: KeptRows | None = None
+        self._last: np.ndarray | None = None
+
+    def add(self, pose: np.ndarray, q: np.ndarray) -> None:
+        """Compare further rows.
+
+        Args:
+            pose: Object poses, shape [n, o, 7]; the same ones present in every row.
+            q: Joints, shape [n, K].
+        """
+        if not len(pose):
+            return
+        self._count_poses(np.ascontiguousarray(pose.reshape(len(pose), -1)))
+        if pose.shape[1] > 1:
+            self._compare_sets(pose, q)
+            return
+        self._kept = self._kept or KeptRows(q.shape[1])
+        room = _MAX_ROWS - self._kept.count
+        if room > 0:
+            kept, near = self._kept.add(pose[:, 0], q, room)
+            self.compared += len(kept) + near
+            self.duplicates += near
+
+    def close(self) -> None:
+        """Forget the rows, keep the counts."""
+        self._kept = None
+
+    def _compare_sets(self, pose: np.ndarray, q: np.ndarray) -> None:
+        n = len(q)
+        near = [i * n + j for i, j in (near_pairs(pose[:, o], q).T for o in range(pose.shape[1]))]
+        shared = near[0]
+        for pairs in near[1:]:
+            shared = np.intersect1d(shared, pairs)
+        drop = np.zeros(n, bool)
+        for i, j in sorted((int(p // n), int(p % n)) for p in shared):  # by the earlier row, so it is decided
+            drop[j] |= not drop[i]
+        self.compared += n
+        self.duplicates += int(drop.sum())
+
+    def _count_poses(self, pose: np.ndarray) -> None:
+        """Rows of one object pose follow one another; a call may begin in the midst of them."""
+        self.poses += len(np.unique(pose, axis=0))
+        if self._last is not None and np.array_equal(self._last, pose[0]):
+            self.poses -= 1
+        self._last = pose[-1]
+
+
+class EvenSample:
+    """Every k-th row of a stream, however it is cut; k doubles whenever more than ``limit`` rows are held.
+
+    Args:
+        limit: Most rows held.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.step = 1
+        """Every how many-th row is held."""
+        self._seen = 0
+        self._parts: list[dict[str, np.ndarray]] = []
+
+    def add(self, columns: dict[str, np.ndarray]) -> None:
+        """Take rows: arrays with one first axis, the same names at every call."""
+        n = len(next(iter(columns.values())))
+        first = -self._seen % self.step
+        self._seen += n
+        if first < n:
+            self._parts.append({name: values[first :: self.step] for name, values in columns.items()})
+        while self._count() > self.limit:
+            held = self.columns()
+            self._parts = [{name: values[::2] for name, values in held.items()}]
+            self.step *= 2
+
+    def _count(self) -> int:
+        return sum(len(next(iter(part.values()))) for part in self._parts)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The rows held; empty if there were none."""
+        if not self._parts:
+            return {}
+        return {name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]}
+
 
 BLOCK_ROWS = 16_384
 _SAMPLE_ROWS = 50_000

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
+from lgrasp.dataset.report.coverage import principal_postures
 from lgrasp.dataset.report.gather import HandRows
-from lgrasp.dataset.report.parts import escape, figure, number, tiles
 from lgrasp.dataset.report.plots import (
     MAPS,
     contact_chart,
@@ -15,13 +15,16 @@ from lgrasp.dataset.report.plots import (
     posture_chart,
     quantity_chart,
 )
-from lgrasp.dataset.report.posture import principal_postures
 from lgrasp.dataset.report.tables import (
     diversity_table,
+    escape,
+    figure,
     held_tables,
+    number,
     physics_table,
     protocol_list,
     run_tables,
+    tiles,
     validity_table,
 )
 
@@ -30,7 +33,7 @@ def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows]) -> 
     """The page.
 
     Args:
-        numbers: Of :func:`lgrasp.dataset.report.summary.summary`.
+        numbers: Of :func:`lgrasp.dataset.report.write.summary`.
         hands: What it was made of, for the samples.
     """
     title = f"Grasps: {number(numbers['rows'])} of {_hands(numbers)}"

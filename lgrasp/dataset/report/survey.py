@@ -7,9 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lgrasp.dataset.heap import check_heaps
+from lgrasp.dataset.files import check_heaps, shard_tree
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.tree import shard_tree
 
 
 class Head(NamedTuple):

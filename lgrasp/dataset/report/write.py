@@ -1,16 +1,19 @@
 """Makes the report: shards in, one HTML file and the numbers out."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lgrasp.dataset.files import new_file
+from lgrasp.dataset.info import SURVIVORS, stage_counts, survivors
+from lgrasp.dataset.merge import sum_statistics
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.report.gather import HandRows
+from lgrasp.dataset.report.coverage import principal_postures
+from lgrasp.dataset.report.gather import HandRows, ObjectRows
 from lgrasp.dataset.report.page import page
-from lgrasp.dataset.report.summary import summary
-from lgrasp.dataset.report.survey import survey
+from lgrasp.dataset.report.survey import Head, survey
+from lgrasp.dataset.report.verdicts import held_numbers
 from lgrasp.errors import OutputError
 
 _Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -71,3 +74,71 @@ def read_dataset(
         before = head
         done += head.rows
     return summary(heads, remarks, hands), hands
+
+
+def summary(heads: Sequence[Head], remarks: list[str], hands: Mapping[tuple[str, str], HandRows]) -> dict[str, Any]:
+    """Everything that the page shows but the sampled dots."""
+    return {
+        "shards": len(heads),
+        "rows": sum(head.rows for head in heads),
+        "bytes": sum(head.bytes for head in heads),
+        "remarks": remarks,
+        "hands": [_hand(key, rows, [h for h in heads if h.hand == key]) for key, rows in hands.items()],
+    }
+
+
+def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, Any]:
+    posture = principal_postures(hand.rows, hand.sum_q, hand.sum_qq)
+    contacts = int(hand.links.sum())
+    shares = {name: int(n) / contacts for name, n in zip(hand.hand.link_names, hand.links, strict=True) if n}
+    return {
+        "hand": key[0],
+        "sha256": key[1],
+        "joints": list(hand.hand.joint_names),
+        "rows": hand.rows,
+        "shards": len(heads),
+        "created": [min(h.created for h in heads), max(h.created for h in heads)],
+        "lgrasp_versions": sorted({h.version for h in heads}),
+        "runs": [_run(name, [h for h in heads if h.pipeline == name]) for name in sorted({h.pipeline for h in heads})],
+        "metrics": {name: d.numbers() for name, d in hand.together().items() if d.rows},
+        "objects": [_objects(group) for group in hand.objects.values()],
+        "held": held_numbers(hand.held),
+        "contact_links": dict(sorted(shares.items(), key=lambda item: -item[1])),
+        "posture": posture.numbers(),
+        "sample": {"rows": len(hand.sample.columns().get("group", ())), "every": hand.sample.step},
+    }
+
+
+def _run(pipeline: str, heads: list[Head]) -> dict[str, Any]:
+    """What one pipeline counted on its way, over all shards."""
+    statistics = sum_statistics([head.statistics for head in heads])
+    counts = stage_counts(statistics)
+    timed = {name: value for name, value in statistics.items() if name.startswith("seconds_")}
+    seconds = {n.removeprefix("seconds_"): float(value) for n, value in timed.items() if not isinstance(value, str)}
+    return {
+        "pipeline": pipeline,
+        "rows": sum(head.rows for head in heads),
+        "seeds": sorted({head.seed for head in heads}),
+        "device": str(statistics.get("device", "")),
+        "survivors": survivors({stage: counts[stage] for stage in heads[0].stages or SURVIVORS if stage in counts}),
+        "counts": counts,
+        "seconds": seconds,
+    }
+
+
+def _objects(group: ObjectRows) -> dict[str, Any]:
+    near = group.near
+    return {
+        "objects": list(group.names),
+        "rows": group.rows,
+        "metrics": {name: d.numbers() for name, d in group.quantities.items() if d.rows},
+        "contacts": {str(n): rows for n, rows in sorted(group.contacts.items())},
+        "distinct_poses": near.poses,
+        "near_duplicates": {
+            "compared": near.compared,
+            "duplicates": near.duplicates,
+            "share": near.duplicates / near.compared if near.compared else 0.0,
+        },
+        "coverage": {name: coverage.numbers(near.poses) for name, coverage in group.coverage.items()},
+        "physics": {name: verdicts.numbers() for name, verdicts in group.verdicts.items()},
+    }

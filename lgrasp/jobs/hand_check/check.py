@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from lgrasp.dataset.info import survivors
 from lgrasp.dataset.reader import read_shard
-from lgrasp.dataset.survivors import survivors
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline

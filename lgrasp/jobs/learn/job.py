@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from pydantic import Field, PrivateAttr
 
-from lgrasp.dataset.files import new_file
-from lgrasp.dataset.tree import shard_tree
+from lgrasp.dataset.files import new_file, shard_tree
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.run import Job, JobOutcome

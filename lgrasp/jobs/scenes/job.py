@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 
 from pydantic import PrivateAttr
 
+from lgrasp.dataset.files import shard_tree
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.tree import shard_tree
 from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import JobOutcome

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lgrasp.dataset import HandRecord
-from lgrasp.dataset.tree import shard_tree
+from lgrasp.dataset.files import shard_tree
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from lgrasp.dataset import Shard, ShardHeader
-from lgrasp.dataset.survivors import survivors
+from lgrasp.dataset.info import survivors
 from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.run import Job, JobOutcome

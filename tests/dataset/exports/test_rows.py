@@ -8,7 +8,7 @@ import pytest
 from lxml import etree
 
 from lgrasp.dataset.exports import FORMATS, export_shards, read_grasps
-from lgrasp.dataset.exports.where import Condition, parse_condition
+from lgrasp.dataset.exports.selection import Condition, parse_condition
 from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 

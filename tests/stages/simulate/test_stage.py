@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lgrasp.dataset import read_shard
-from lgrasp.dataset.survivors import stage_counts
+from lgrasp.dataset.info import stage_counts
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, OutputError, PhysicsError
