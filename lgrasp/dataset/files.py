@@ -5,7 +5,7 @@ import hashlib
 import mmap
 import os
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from struct import unpack_from
@@ -18,6 +18,9 @@ try:
     import fcntl
 except ImportError:  # Windows: leftovers cannot be distinguished from files being written
     fcntl = None
+
+Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+"""Shard files, or folders of them."""
 
 _LIBVER = ("v110", "v110")  # readable since HDF5 1.10; its metadata blocks carry checksums, the older layout's do not
 
@@ -70,10 +73,11 @@ class _Sink:
 
 
 @contextmanager
-def new_file(path: str | os.PathLike[str]) -> Iterator:
+def new_file(path: str | os.PathLike[str], *, flush: bool = True) -> Iterator:
     """A binary file that appears under its name only when the block ends without an error.
 
     The bytes go to a unique ``*.tmp`` in the same folder, which is fsynced and renamed; then the folder is fsynced.
+    Without ``flush`` nothing is fsynced, which takes longer than all the rest where files are many and small.
     Missing parent folders are made. On any error the temporary file is removed; what a killed process leaves is taken
     away by :func:`remove_leftovers`.
 
@@ -87,9 +91,11 @@ def new_file(path: str | os.PathLike[str]) -> Iterator:
         with open(temporary, "x+b", buffering=0) as file:
             hold_file(file.fileno())
             yield file
-            os.fsync(file.fileno())
+            if flush:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
-        _sync_folder(path.parent)
+        if flush:
+            _sync_folder(path.parent)
     except OSError as error:
         if error.errno is None:  # not the operating system's: a reader's complaint passing through
             raise
@@ -140,13 +146,13 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def find_shards(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
+def find_shards(paths: Paths) -> list[Path]:
     """The shard files named by paths: a folder stands for its ``*.h5`` files, sorted by name, not recursive.
 
     Raises:
         ShardError: A path does not exist, or no shard is left.
     """
-    given = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
+    given = _listed(paths)
     found: list[Path] = []
     for path in given:
         if path.is_dir():
@@ -155,9 +161,17 @@ def find_shards(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
             found.append(path)
         else:
             raise ShardError(f"{path}: no such file or folder")
+    _require_some(found, given)
+    return found
+
+
+def _listed(paths: Paths) -> list[Path]:
+    return [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
+
+
+def _require_some(found: Sized, given: list[Path]) -> None:
     if not found:
         raise ShardError(f"no shard (*.h5) in {', '.join(map(str, given)) or 'an empty list of paths'}")
-    return found
 
 
 def sha256_file(path: str | os.PathLike[str]) -> str:
@@ -173,9 +187,7 @@ def sha256_file(path: str | os.PathLike[str]) -> str:
         raise ShardError(f"{path}: {error.strerror or error}") from error
 
 
-def shard_tree(
-    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], *, leave_out: Path | None = None
-) -> dict[Path, Path]:
+def shard_tree(paths: Paths, *, leave_out: Path | None = None) -> dict[Path, Path]:
     """Shard files by their place below the folder that was named, sorted; a file's place is its own name.
 
     Args:
@@ -185,7 +197,7 @@ def shard_tree(
     Raises:
         ShardError: A path does not exist, no shard is left, or two of them have one place.
     """
-    given = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
+    given = _listed(paths)
     found: dict[Path, Path] = {}
     for path in given:
         if not path.exists():
@@ -198,8 +210,7 @@ def shard_tree(
             if place in found and not found[place].samefile(file):
                 raise ShardError(f"{file}: it has the same place {place} as {found[place]}; name one folder above both")
             found[place] = file
-    if not found:
-        raise ShardError(f"no shard (*.h5) in {', '.join(map(str, given)) or 'an empty list of paths'}")
+    _require_some(found, given)
     return found
 
 
@@ -209,6 +220,9 @@ _HEADER = 16  # bytes, of a collection and of each entry
 
 def check_heaps(path: str | os.PathLike[str]) -> None:
     """Walk through every string heap of an HDF5 file; reads the whole file once.
+
+    Attributes and the URDF are strings of variable length, which HDF5 keeps in "global heap collections" without
+    checksums: a flipped bit in the size of an entry can make the library loop for ever instead of reporting an error.
 
     Raises:
         ShardError: The file cannot be read, or an entry of a heap does not fit.

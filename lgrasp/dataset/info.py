@@ -1,17 +1,16 @@
 """The contents of shards, in one dictionary each, and survivors of stages, in one number each."""
 
-import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.files import find_shards
+from lgrasp.dataset.files import Paths, find_shards
 from lgrasp.dataset.reader import ShardReader
 
 
-def describe(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[dict[str, Any]]:
+def describe(paths: Paths) -> list[dict[str, Any]]:
     """Summaries of shards, JSON-serialisable, one per file.
 
     Args:

@@ -11,17 +11,15 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.checks import row_problems
-from lgrasp.dataset.files import check_heaps, find_shards, new_file, new_shard_file, sha256_file
+from lgrasp.dataset.files import Paths, check_heaps, find_shards, new_file, new_shard_file, sha256_file
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import create_rows, finish, write_context, write_spaces
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ShardHeader
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 
-_Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
-
-def merge_shards(paths: _Paths, out: str | os.PathLike[str], *, manifest: str | os.PathLike[str] | None = None) -> int:
+def merge_shards(paths: Paths, out: str | os.PathLike[str], *, manifest: str | os.PathLike[str] | None = None) -> int:
     """Copy the rows of shards, ordered by shard index, into one shard file; streams, so memory stays bounded.
 
     The shards must agree in hand, objects, pipeline, config and seed, and in the names of metrics and verdicts. Rows

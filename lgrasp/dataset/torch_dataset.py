@@ -1,9 +1,8 @@
 """Grasps of many shards as a map-style PyTorch Dataset."""
 
-import os
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from lgrasp.dataset.files import find_shards
+from lgrasp.dataset.files import Paths, find_shards
 from lgrasp.dataset.merge import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ShardError
@@ -52,7 +51,7 @@ class GraspDataset(torch.utils.data.Dataset):
 
     def __init__(
         self,
-        paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+        paths: Paths,
         *,
         columns: Sequence[str] | None = None,
         cache_bytes: int = 1 << 29,

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.exports.folder import GRASPS, OBJECTS, open_folder
-from lgrasp.dataset.exports.grasp_set import GraspSet, ReadObject, make_set, order_of
+from lgrasp.dataset.exports.folder import GRASPS, OBJECTS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_object
+from lgrasp.dataset.exports.reading import GraspSet, ReadObject, open_folder, order_of
 from lgrasp.dataset.exports.selection import Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import compose, inverse
@@ -33,18 +33,7 @@ MJCF files are) needs that turn applied to the first seven numbers.
 
 
 def write_dexgraspbench(selection: Selection, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
-    """Write ``grasps/CODE/NUMBER.npy`` for every row, numbered over the whole export.
-
-    Args:
-        selection: Rows of single objects.
-        frames: The selection's hand.
-        out: Folder of the export.
-        advance: Called with numbers of rows that are done.
-
-    Raises:
-        ShardError: A shard is damaged.
-        OutputError: The folder cannot be written.
-    """
+    """Write ``grasps/CODE/NUMBER.npy`` for every row, numbered over the whole export."""
     for batch in selection.batches():
         pose = frames.root_in_object(batch.object_pose[:, 0], batch.q)  # (n, 7)
         postures = [np.concatenate([pose, q], -1) for q in (batch.q, batch.q_pregrasp, batch.q_squeeze)]
@@ -66,13 +55,8 @@ def read_dexgraspbench(path: Path | str, *, joint_names: Sequence[str] | None = 
 
     The hand's pose is that of ``grasp_qpos``; a hand that moves between the postures is not represented.
 
-    Args:
-        path: Export, folder or file.
-        joint_names: Wanted order of q; by default that of the export, else that of the first file. Files without
-            ``joint_names`` are taken to be in this order.
-
-    Raises:
-        ShardError: A file is missing, damaged, of another format, or names other joints.
+    Files without ``joint_names`` are taken to be in the order wanted. Arguments and errors as of
+    :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
     folder = open_folder(Path(path), ".npy", "dexgraspbench")
     names = tuple(joint_names or folder.joint_names or ())
@@ -93,15 +77,10 @@ def read_dexgraspbench(path: Path | str, *, joint_names: Sequence[str] | None = 
         world.append(_numbers(entry, "obj_pose", 7, file))
         if not (world[-1][3:].any() and root[-1][3:].any()):
             raise ShardError(f"{file}: a quaternion is 0 0 0 0; one of unit length is accepted")
-        known = folder.object(_code(entry, file), float(_numbers(entry, "obj_scale", 1, file)[0]))
-        if known not in objects:
-            objects.append(known)
-        index.append([objects.index(known)])
+        scale = float(_numbers(entry, "obj_scale", 1, file)[0])
+        index.append(folder.place(objects, _code(entry, file), scale))
     in_object = compose(inverse(np.array(world)), np.array(root))
-    joints = np.array(q)  # (n, 3, K)
-    order = order_of(names, folder.joint_names or names, path)
-    pose = folder.object_pose(in_object, joints[:, 0][:, order])
-    return make_set(names, objects, joints, pose[:, None], np.array(index))
+    return folder.rows(names, objects, np.array(q), in_object, index)
 
 
 def _code(entry: dict[str, Any], file: Path) -> str:

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.exports.folder import GRASPS, open_folder
-from lgrasp.dataset.exports.grasp_set import GraspSet, make_set, order_of
+from lgrasp.dataset.exports.folder import GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_objects
+from lgrasp.dataset.exports.reading import GraspSet, ReadObject, open_folder, order_of
 from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import euler_from_quaternion, quaternion_from_euler
@@ -32,18 +32,7 @@ The object is at the origin. {root} is the root link of hand/hand.urdf.
 
 
 def write_dexgraspnet(selection: Selection, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
-    """Write ``grasps/CODE.npy`` for every object; memory does not grow with the rows.
-
-    Args:
-        selection: Rows of single objects.
-        frames: The selection's hand.
-        out: Folder of the export.
-        advance: Called with numbers of rows that are done.
-
-    Raises:
-        ShardError: A shard is damaged.
-        OutputError: The folder cannot be written.
-    """
+    """Write ``grasps/CODE.npy`` for every object; memory does not grow with the rows."""
     for place, item in enumerate(selection.objects):
         rows = (entry for batch in selection.batches(place, advance) for entry in _entries(batch, frames))
         save_objects(out / GRASPS / f"{item.code}.npy", selection.counts[place], rows)
@@ -64,31 +53,22 @@ def read_dexgraspnet(path: Path | str, *, joint_names: Sequence[str] | None = No
 
     What lacks ``qpos_pregrasp`` or ``qpos_squeeze`` gets the joints of the grasp there.
 
-    Args:
-        path: Export, folder or file.
-        joint_names: Wanted order of q; by default that of the export, else that of the first entry.
-
-    Raises:
-        ShardError: A file is missing, damaged, of another format, or names other joints.
+    Arguments and errors as of :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
     folder = open_folder(Path(path), ".npy", "dexgraspnet")
     names = tuple(joint_names or folder.joint_names or ())
-    objects, index, values = [], [], []
+    objects: list[ReadObject] = []
+    index, values = [], []
     for file in folder.files:
         for number, entry in enumerate(load_objects(file)):
             where = f"{file}: entry {number}"
             names = names or _joints(entry, where)
             values.append([_row(entry, posture, names, where) for posture in _POSTURES])
-            known = folder.object(file.stem, _scale(entry, where))
-            if known not in objects:
-                objects.append(known)
-            index.append(objects.index(known))
+            index.append(folder.place(objects, file.stem, _scale(entry, where)))
     table = np.array(values, np.float64).reshape(len(values), 3, len(_WRIST) + len(names))
     wrist, q = table[:, 0, :6], table[:, :, 6:]
-    order = order_of(names, folder.joint_names or names, path)
     pose = np.concatenate([wrist[:, :3], quaternion_from_euler(wrist[:, 3:])], -1)
-    pose = folder.object_pose(pose, q[:, 0][:, order])
-    return make_set(names, objects, q, pose[:, None], np.array(index, int).reshape(-1, 1))
+    return folder.rows(names, objects, q, pose, index)
 
 
 def _joints(entry: Any, where: str) -> tuple[str, ...]:

@@ -1,27 +1,71 @@
 """The parts of an export other than its grasps: the hand, the meshes, a README, and an index that is written last."""
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from trimesh import Trimesh
 from trimesh.exchange.obj import export_obj
 
 import lgrasp
-from lgrasp.dataset.exports.files import write_file
-from lgrasp.dataset.exports.grasp_set import ReadObject
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.selection import ExportObject, Selection
-from lgrasp.errors import ShardError
-from lgrasp.geometry.poses import inverse
+from lgrasp.dataset.files import new_file
+from lgrasp.errors import OutputError
+
+
+def check_empty(out: Path) -> None:
+    """Check that an export can be written into a folder, which need not exist.
+
+    Raises:
+        OutputError: It holds something, is a file, or cannot be read.
+    """
+    try:
+        first = next(iter(sorted(os.listdir(out))), None)
+    except FileNotFoundError:
+        return
+    except NotADirectoryError:
+        raise OutputError(f"{out} is a file; --out needs an empty folder, or one that does not exist") from None
+    except OSError as error:
+        raise OutputError(f"{out}: {error.strerror or error}") from error
+    if first is not None:
+        raise OutputError(
+            f"{out} is not empty (it holds {first}); --out needs an empty folder, or one that does not exist"
+        )
+
+
+@contextmanager
+def writing(path: Path, *, flush: bool = True) -> Iterator[Callable[[bytes], None]]:
+    """A function that appends bytes to a file, which appears under its name when the block ends without an error.
+
+    Raises:
+        OutputError: The folder cannot be written or is full.
+    """
+    with new_file(path, flush=flush) as file:
+
+        def write(data: bytes) -> None:
+            rest = memoryview(data)
+            while rest:  # an unbuffered file may take a part only
+                rest = rest[file.write(rest) :]
+
+        yield write
+
+
+def write_file(path: Path, data: bytes | str, *, flush: bool = True) -> None:
+    """Write a whole file; text is UTF-8. ``flush`` as of :func:`~lgrasp.dataset.files.new_file`.
+
+    Raises:
+        OutputError: The folder cannot be written or is full.
+    """
+    with writing(path, flush=flush) as write:
+        write(data.encode() if isinstance(data, str) else data)
+
 
 HAND, OBJECTS, GRASPS = "hand", "objects", "grasps"
 """Folders of an export."""
-_INDEX = "export.json"
-_FORMAT = "lgrasp-export"
+INDEX, INDEX_FORMAT = "export.json", "lgrasp-export"
 
 
 def write_assets(out: Path, selection: Selection) -> None:
@@ -59,7 +103,7 @@ def write_index(
         OutputError: The folder cannot be written.
     """
     document = {
-        "format": _FORMAT,
+        "format": INDEX_FORMAT,
         "format_version": "1.0",
         "layout": layout,
         "lgrasp_version": lgrasp.__version__,
@@ -90,67 +134,55 @@ def write_index(
             for item, count in zip(selection.objects, selection.counts, strict=True)
         },
     }
-    write_file(out / _INDEX, json.dumps(document, indent=2) + "\n")
+    write_file(out / INDEX, json.dumps(document, indent=2) + "\n")
 
 
-@dataclass(frozen=True)
-class ExportFolder:
-    """A folder to read grasps from: an export of lgrasp, or one that another program wrote, which tells less."""
+_TEXT = """\
+{rows:,} grasps of the hand {hand}, exported by lgrasp from {shards}{chosen}.
 
-    path: Path
-    files: tuple[Path, ...]
-    """Files of grasps, sorted."""
-    joint_names: tuple[str, ...] | None
-    """Joints in the order of q, where the folder says so."""
-    frames: HandFrames | None
-    meshes: Mapping[str, Path]
-    """Mesh of each object by its code."""
+{hand_folder}/hand.urdf     the hand, with its mesh files under {hand_folder}/meshes
+{objects_folder}/CODE.obj    the objects: {objects}
+export.json        hand, joints, objects and sources for machines; written last, so that an export with it is whole
 
-    def object(self, code: str, scale: float) -> ReadObject:
-        """The object of a code."""
-        return ReadObject(code, scale, self.meshes.get(code))
+{notes}
+Units: metres, radians. Rotations: unit quaternions with w first and w >= 0, unless stated otherwise above.
+An object's frame is that of its mesh file. Links and joints are those of hand.urdf; poses are of link frames.
 
-    def object_pose(self, pose: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Objects in the hand's base frame, for root links in the objects' frames; both [n, 7]; q is [n, K]."""
-        return inverse(pose) if self.frames is None else self.frames.object_in_base(pose, q)
+Joint order, where values have no names:
+{joints}
+{mimics}"""
 
 
-def open_folder(path: Path, suffix: str, layout: str) -> ExportFolder:
-    """Find the files of grasps in an export, in any other folder, or take a single file.
+def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Sequence[str]) -> str:
+    """The text.
 
-    Raises:
-        ShardError: No such folder, no file with the suffix, an export of another format, or one that is not whole.
+    Args:
+        selection: What is exported.
+        frames: The selection's hand.
+        notes: What is special about the format, with ``{root}`` and ``{base}`` for the names of the two links.
+        conditions: What the rows satisfy.
     """
-    if path.is_file():
-        return ExportFolder(path, (path,), None, None, {})
-    if not path.is_dir():
-        raise ShardError(f"{path}: no such file or folder")
-    index = path / _INDEX
-    if not index.exists() and (path / HAND / "hand.urdf").exists():
-        raise ShardError(f"{path}: the export is incomplete, it has no {_INDEX}; export again")
-    files = tuple(sorted((path / GRASPS if index.exists() else path).rglob(f"*{suffix}")))
-    if not files:
-        raise ShardError(f"{path}: no {suffix} file in it")
-    if not index.exists():
-        return ExportFolder(path, files, None, None, {})
-    try:
-        document = json.loads(index.read_bytes())
-        _require(document, layout)
-        hand = document["hand"]
-        urdf = (path / HAND / "hand.urdf").read_text(encoding="utf-8")
-        names = tuple(map(str, hand["joint_names"]))
-        frames = HandFrames(urdf, hand["base_link"], names, path / HAND / "hand.urdf")
-        meshes = {code: path / OBJECTS / f"{code}.obj" for code in document["objects"]}
-    except OSError as error:
-        raise ShardError(f"{error.filename}: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise ShardError(f"{index}: not an index of an export: {error}") from error
-    return ExportFolder(path, files, names, frames, meshes)
+    width = max(map(len, frames.joint_names))
+    limits = zip(frames.joint_names, selection.hand.joint_lower, selection.hand.joint_upper, strict=True)
+    joints = [
+        f"  {i:3d}  {name:{width}s}  {lower:8.4f} to {upper:.4f}" for i, (name, lower, upper) in enumerate(limits)
+    ]
+    mimics = [f"  {name} = {m:g} * {source} + {b:g}" for name, (source, m, b) in frames.mimics.items()]
+    said = "Joints that follow others (<mimic> in hand.urdf), which have no value of their own:"
+    counts = (f"{item.code} ({count:,})" for item, count in zip(selection.objects, selection.counts, strict=True))
+    return _TEXT.format(
+        rows=selection.rows,
+        hand=selection.hand.name,
+        shards=_few([path.name for path in selection.shards]),
+        chosen=f", only rows with {' and '.join(conditions)}" if conditions else "",
+        hand_folder=HAND,
+        objects_folder=OBJECTS,
+        objects=_few(list(counts)),
+        notes=notes.format(root=frames.root, base=frames.base),
+        joints="\n".join(joints),
+        mimics="\n".join(["", said, *mimics, ""]) if mimics else "",
+    )
 
 
-def _require(document: Any, layout: str) -> None:
-    found = {"format": document["format"], "layout": document["layout"]}
-    wanted = {"format": _FORMAT, "layout": layout}
-    for key, value in wanted.items():
-        if found[key] != value:
-            raise ValueError(f"{key} is {found[key]!r}, expected {value!r}")
+def _few(names: list[str], most: int = 8) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most:,} more" if len(names) > most else "")

@@ -1,6 +1,6 @@
 """Formats of other programs by name, and the export to one of them."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -8,15 +8,13 @@ from typing import NamedTuple
 
 from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgraspbench, write_dexgraspbench
 from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
-from lgrasp.dataset.exports.files import check_empty, write_file
-from lgrasp.dataset.exports.folder import write_assets, write_index
-from lgrasp.dataset.exports.grasp_set import GraspSet
+from lgrasp.dataset.exports.folder import check_empty, readme, write_assets, write_file, write_index
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
-from lgrasp.dataset.exports.readme import readme
+from lgrasp.dataset.exports.reading import GraspSet
 from lgrasp.dataset.exports.selection import Selection, parse_condition, select_rows
-from lgrasp.dataset.files import find_shards
+from lgrasp.dataset.files import Paths, find_shards
 from lgrasp.errors import ConfigError
 
 
@@ -65,7 +63,7 @@ class Exported(NamedTuple):
 
 
 def export_shards(
-    paths: str | PathLike[str] | Iterable[str | PathLike[str]],
+    paths: Paths,
     out: str | PathLike[str],
     to: str,
     *,

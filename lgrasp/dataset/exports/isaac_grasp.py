@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lgrasp.dataset.exports.files import writing
-from lgrasp.dataset.exports.folder import GRASPS, open_folder
-from lgrasp.dataset.exports.grasp_set import GraspSet, ReadObject, make_set, order_of
+from lgrasp.dataset.exports.folder import GRASPS, writing
 from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.exports.reading import GraspSet, ReadObject, make_set, open_folder, order_of
 from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
@@ -34,18 +33,7 @@ grasps/CODE.yaml   isaac_grasp format, version 1.0: all grasps of one object by 
 
 
 def write_isaac_grasp(selection: Selection, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
-    """Write ``grasps/CODE.yaml`` for every object; memory does not grow with the rows.
-
-    Args:
-        selection: Rows of single objects.
-        frames: The selection's hand.
-        out: Folder of the export.
-        advance: Called with numbers of rows that are done.
-
-    Raises:
-        ShardError: A shard is damaged.
-        OutputError: The folder cannot be written.
-    """
+    """Write ``grasps/CODE.yaml`` for every object; memory does not grow with the rows."""
     for place, item in enumerate(selection.objects):
         head = {"format": "isaac_grasp", "format_version": 1.0}
         head |= {"object_frame_link": item.code, "gripper_frame_link": frames.base}
@@ -79,19 +67,14 @@ def read_isaac_grasp(path: Path | str, *, joint_names: Sequence[str] | None = No
 
     What lacks a posture gets the joints of the grasp there. Names and confidences of grasps are not kept.
 
-    Args:
-        path: Export, folder or file.
-        joint_names: Wanted order of q; by default that of the export, else that of the first grasp.
-
-    Raises:
-        ShardError: A file is missing, damaged, of another format, or names other joints.
+    Arguments and errors as of :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
     folder = open_folder(Path(path), ".yaml", "isaac-grasp")
     names = tuple(joint_names or folder.joint_names or ())
     objects: list[ReadObject] = []
     index, poses, q = [], [], []
-    for place, file in enumerate(folder.files):
-        objects.append(folder.object(file.stem, 1.0))
+    for file in folder.files:
+        place = folder.place(objects, file.stem, 1.0)
         for name, entry in _load(file).items():
             where = f"{file}: {name}"
             try:

@@ -9,11 +9,10 @@ from lxml import etree
 from trimesh import Trimesh
 from trimesh.exchange.obj import export_obj
 
-from lgrasp.dataset.exports.files import write_file, write_small
-from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, object_text, open_folder
-from lgrasp.dataset.exports.grasp_set import GraspSet, ReadObject, make_set, order_of
+from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, object_text, write_file
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.mjcf_scene import Keyframe, MjcfScene, SceneObject
+from lgrasp.dataset.exports.reading import GraspSet, ReadObject, make_set, open_folder, order_of
 from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
@@ -93,7 +92,7 @@ class MjcfWriter:
                     Keyframe(_KEYS[1], before, batch.q_pregrasp[row], pose),
                     Keyframe(_KEYS[2], at, batch.q_squeeze[row], pose),
                 ]
-                write_small(out / GRASPS / f"{number:08d}.xml", self._scene(objects).text(keys).encode())
+                write_file(out / GRASPS / f"{number:08d}.xml", self._scene(objects).text(keys), flush=False)
                 advance(1)
 
     def _make_scene(self, objects: tuple[int, ...]) -> MjcfScene:
@@ -142,11 +141,9 @@ def read_mjcf(path: Path | str, *, joint_names: Sequence[str] | None = None) -> 
     q, poses, index = [], [], []
     for file in folder.files:
         values, seen = _read(file, folder.joint_names)
-        known = [folder.object(code, 1.0) for code, _ in seen]
-        objects += [item for item in dict.fromkeys(known) if item not in objects]
         q.append(values)
         poses.append([pose for _, pose in seen])
-        index.append([objects.index(item) for item in known])
+        index.append([folder.place(objects, code, 1.0) for code, _ in seen])
     joints = np.array(q)  # (n, 3, K)
     width = max(map(len, index))
     pose, place = np.full((len(index), width, 7), np.nan), np.full((len(index), width), -1)

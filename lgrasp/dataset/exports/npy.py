@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.exports.files import write_small, writing
+from lgrasp.dataset.exports.folder import write_file, writing
 from lgrasp.errors import ShardError
 
 _PROTOCOL = 3  # names are plain text in it, and every Python 3 reads it
@@ -29,7 +29,7 @@ def save_object(path: Path, value: Any) -> None:
         OutputError: The file cannot be written.
     """
     head, tail = _frame(())
-    write_small(path, head + _words(value) + tail)
+    write_file(path, head + _words(value) + tail, flush=False)
 
 
 def save_objects(path: Path, count: int, values: Iterable[Any]) -> None:

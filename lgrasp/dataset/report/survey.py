@@ -1,13 +1,12 @@
 """Finds the shards of a data set and tells its hands and objects apart."""
 
 import json
-import os
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lgrasp.dataset.files import check_heaps, shard_tree
+from lgrasp.dataset.files import Paths, check_heaps, shard_tree
 from lgrasp.dataset.reader import ShardReader
 
 
@@ -34,7 +33,7 @@ class Head(NamedTuple):
     statistics: Mapping[str, int | float | str]
 
 
-def survey(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> tuple[list[Head], list[str]]:
+def survey(paths: Paths) -> tuple[list[Head], list[str]]:
     """Heads of all shards, by hand and objects, and remarks on problems.
 
     Raises:

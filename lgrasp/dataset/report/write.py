@@ -1,11 +1,10 @@
 """Makes the report: shards in, one HTML file and the numbers out."""
 
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lgrasp.dataset.files import new_file
+from lgrasp.dataset.files import Paths, new_file
 from lgrasp.dataset.info import SURVIVORS, stage_counts, survivors
 from lgrasp.dataset.merge import sum_statistics
 from lgrasp.dataset.reader import ShardReader
@@ -16,10 +15,9 @@ from lgrasp.dataset.report.survey import Head, survey
 from lgrasp.dataset.report.verdicts import held_numbers
 from lgrasp.errors import OutputError
 
-_Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
-def report_dataset(paths: _Paths, out: Path, *, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
+def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
     """Write a report on a data set as one self-contained HTML file, without network.
 
     Args:
@@ -44,7 +42,7 @@ def report_dataset(paths: _Paths, out: Path, *, progress: Callable[[int, int], N
 
 
 def read_dataset(
-    paths: _Paths, *, progress: Callable[[int, int], None] | None = None
+    paths: Paths, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[dict[str, Any], dict[tuple[str, str], HandRows]]:
     """The numbers of a report, and the data of its charts, by name and hash of the hands.
 
