@@ -27,16 +27,6 @@ def near_pairs(pose: np.ndarray, q: np.ndarray, device: str = "cpu") -> np.ndarr
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
-def new_rows(pose: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Mask (N,) of the rows that have no kept near-duplicate before them; rows are decided in order."""
-    keep = np.ones(len(pose), bool)
-    pairs = near_pairs(pose, q)
-    for i, j in pairs[np.argsort(pairs[:, 1], kind="stable")]:
-        if keep[i]:
-            keep[j] = False
-    return keep
-
-
 class KeptRows:
     """Rows kept so far of a stream, without near-duplicates: the same ones however the stream is cut.
 

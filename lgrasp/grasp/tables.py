@@ -101,28 +101,15 @@ class GraspTable:
 
 def pose_arrays(table: PoseTable) -> dict[str, np.ndarray]:
     """The rows in use of a PoseTable as NumPy arrays; ``pose`` holds device poses (P, 7)."""
-    n = len(table)
-    return {
-        "index": table.index.numpy()[:n],
-        "pose": table.pose.numpy().reshape(-1, 7)[:n],
-        "palm_point": table.palm_point.numpy()[:n],
-        "palm_surface": table.palm_surface.numpy()[:n],
-        "setting": table.setting.numpy()[:n],
-        "anchor": table.anchor.numpy()[:n],
-    }
+    found = {f.name: getattr(table, f.name).numpy()[: len(table)] for f in fields(table) if f.name != "rows"}
+    return found | {"pose": found["pose"].reshape(-1, 7)}
 
 
 def pose_table(arrays: dict[str, np.ndarray], device: str) -> PoseTable:
     """Inverse of :func:`pose_arrays`."""
-    return PoseTable(
-        index=wp.array(arrays["index"], dtype=wp.int32, device=device),
-        pose=wp.array(arrays["pose"], dtype=wp.transform, device=device),
-        palm_point=wp.array(arrays["palm_point"], dtype=wp.int32, device=device),
-        palm_surface=wp.array(arrays["palm_surface"], dtype=wp.int32, device=device),
-        setting=wp.array(arrays["setting"], dtype=wp.int32, device=device),
-        anchor=wp.array(arrays["anchor"], dtype=wp.int32, device=device),
-        rows=wp.full(1, len(arrays["index"]), dtype=wp.int32, device=device),
-    )
+    dtypes = dict.fromkeys((f.name for f in fields(PoseTable) if f.name != "rows"), wp.int32) | {"pose": wp.transform}
+    own = {name: wp.array(arrays[name], dtype=dtype, device=device) for name, dtype in dtypes.items()}
+    return PoseTable(**own, rows=wp.full(1, len(arrays["index"]), dtype=wp.int32, device=device))
 
 
 def candidate_arrays(table: CandidateTable) -> dict[str, np.ndarray]:

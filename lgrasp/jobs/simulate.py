@@ -21,11 +21,11 @@ from lgrasp.errors import ConfigError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.jobs.shard_inputs import mesh_hash
 from lgrasp.runtime.device import resolve_device
-from lgrasp.simulate.columns import COLUMNS, OBJECT_COLUMNS
 from lgrasp.simulate.protocol import Protocol, find_protocol
 from lgrasp.simulate.run import check_installed, protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
+from lgrasp.simulate.verdict import COLUMNS, OBJECT_COLUMNS
 from lgrasp.stages.context import Keeper
 
 _MIN_HOLDING_LINKS = 2  # links that it takes to hold anything

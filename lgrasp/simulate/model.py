@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 
 from lgrasp.errors import PhysicsError
-from lgrasp.simulate.assemble import OBJECT, assemble
+from lgrasp.simulate.assemble import OBJECT, assemble, welded_joints
 from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import HandSolids, Scene
 from lgrasp.simulate.solid import Solid
-from lgrasp.simulate.urdf import welded_joints
 
 _NEAR_DISTANCE = 1.0e-3  # [m]
 

@@ -13,7 +13,7 @@ from lgrasp.errors import PhysicsError
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.decompose import decompose as cut_mesh
 from lgrasp.grasp.hand_files import write_hand
-from lgrasp.grasp.records import HandRecord, ObjectRecord, Shard
+from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.simulate.solid import Solid, solid_of_mesh
@@ -61,11 +61,6 @@ def scene_of(
     return Scene(hand_of_record(hand, decompose, device), tuple(solids))
 
 
-def scene_of_shard(shard: Shard, decompose: Decompose = cut_mesh, device: str = "cpu") -> Scene:
-    """The scene of a shard; nothing but the shard is read. Arguments and errors as of :func:`scene_of`."""
-    return scene_of(shard.hand, shard.objects, decompose, device)
-
-
 def hand_of_record(record: HandRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> HandSolids:
     """The hand of a shard, cut into the convex pieces that the generator uses.
 
@@ -79,9 +74,9 @@ def hand_of_record(record: HandRecord, decompose: Decompose = cut_mesh, device: 
         for link, geometries in urdf.links.items():
             found = []
             for geometry in geometries:
-                parts, said = convex_pieces(urdf, geometry, geometry_mesh(urdf, geometry), decompose, device)
+                parts, note = convex_pieces(urdf, geometry, geometry_mesh(urdf, geometry), decompose, device)
                 found += [part.moved(geometry.T_link_geometry) for part in parts]
-                notes += [f"link '{link}': {said}"] if said else []
+                notes += [f"link '{link}': {note}"] if note else []
             pieces[link] = found
     return HandSolids(
         name=record.name,

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.near import new_rows
 
-from lgrasp.grasp.duplicates import NEAR_ANGLE, NEAR_DISTANCE, NEAR_JOINT, KeptRows, near_pairs, new_rows
+from lgrasp.grasp.duplicates import NEAR_ANGLE, NEAR_DISTANCE, NEAR_JOINT, KeptRows, near_pairs
 
 
 def rows(seed: int, n: int, spread: float, joints: int = 3) -> tuple[np.ndarray, np.ndarray]:

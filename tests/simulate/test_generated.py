@@ -11,7 +11,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
-from lgrasp.simulate.scene import Scene, scene_of_shard
+from lgrasp.simulate.scene import Scene, scene_of
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -35,7 +35,7 @@ def first(path: Path, count: int = ROWS) -> GraspRows:
 
 @pytest.fixture(scope="module")
 def scene(path: Path) -> Scene:
-    return scene_of_shard(read_shard(path))
+    return scene_of(read_shard.hand, read_shard.objects(path))
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,11 @@ from support.jaws import Jaws
 from support.twins import in_one_gripper, twin_rows, twin_shard
 
 from lgrasp.runtime.device import start
-from lgrasp.simulate.columns import stack_verdicts
-from lgrasp.simulate.groups import group_rows
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.protocol import PROTOCOLS
-from lgrasp.simulate.run import verdicts
-from lgrasp.simulate.scene import scene_of_shard
+from lgrasp.simulate.run import group_rows, verdicts
+from lgrasp.simulate.scene import scene_of
+from lgrasp.simulate.verdict import stack_verdicts
 
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed (extra gpu-sim)")
 
@@ -33,7 +32,7 @@ def six(jaws: Jaws):
     """A scene and six grasps; the first presses too little, the last ones hold."""
     shard = jaws.shard(0.002, count=6)
     depth = np.linspace(0.0002, 0.004, 6, dtype="f4")[:, None]
-    return scene_of_shard(shard), Jaws.rows(shard, q_squeeze=shard.grasps.q - depth)
+    return scene_of(shard.hand, shard.objects), Jaws.rows(shard, q_squeeze=shard.grasps.q - depth)
 
 
 def judge(scene, rows, worlds: int = 8, protocol=FC):
@@ -78,7 +77,7 @@ def test_two_objects(name: str):
     one = in_one_gripper(0.004)
     squeeze[3], q[3], start[3], pose[3] = one.q_squeeze[0], one.q[0], one.q_pregrasp[0], one.object_pose[0]
     rows = replace(rows, q=q, q_squeeze=squeeze, q_pregrasp=start, object_pose=pose)
-    scene = scene_of_shard(twin_shard(rows))
+    scene = scene_of(twin_shard.hand, twin_shard.objects(rows))
     here, there = verdicts(scene, rows, protocol, all_directions=True), judge(scene, rows, protocol=protocol)
     assert here[f"{name}_holds"].tolist() == [True, False, False, True]
     for column in ("holds", "directions", "stays", "object_touches", "settled", "diverged", "contact_at_q"):

@@ -15,7 +15,7 @@ from lgrasp.geometry.decompose import decompose
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
-from lgrasp.simulate.scene import Scene, hand_of_record, object_of_record, scene_of_shard
+from lgrasp.simulate.scene import Scene, hand_of_record, object_of_record, scene_of
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -71,7 +71,7 @@ def test_inertia_is_that_of_the_mesh(jaws: Jaws):
     shard = jaws.shard()
     mesh = prism(YOU, 0.02)
     shard = replace(shard, objects=[mesh_record("you", mesh)])
-    scene = scene_of_shard(shard, no_cut)
+    scene = scene_of(shard.hand, shard.objects, no_cut)
     model = build_model(scene, FC, shard.grasps.q[0])
     (body,) = model.object_body
     mesh.density = FC.mass / mesh.volume
@@ -120,7 +120,7 @@ def test_what_carries_the_base_does_not_matter(jaws: Jaws, kind: str):
         wide = {n: np.hstack([getattr(rows, n), [[np.float32(0.5)]]]) for n in ("q", "q_pregrasp", "q_squeeze")}
         rows = replace(rows, **wide)
     carried = replace(plain, hand=replace(plain.hand, urdf=urdf, joint_names=names), grasps=rows)
-    a, b = (verdicts(scene_of_shard(s), s.grasps, FC, all_directions=True) for s in (plain, carried))
+    a, b = (verdicts(scene_of(s.hand, s.objects), s.grasps, FC, all_directions=True) for s in (plain, carried))
     assert a["fc_holds"].all()
     for name, values in a.items():
         np.testing.assert_allclose(values, b[name], atol=1e-5, err_msg=name)

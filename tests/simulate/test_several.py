@@ -8,10 +8,10 @@ from support.jaws import EDGE
 from support.twins import SIDE, in_one_gripper, twin_rows, twin_shard
 
 from lgrasp.dataset import GraspRows, Shard
-from lgrasp.simulate.columns import COLUMNS, OBJECT_COLUMNS
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
-from lgrasp.simulate.scene import scene_of, scene_of_shard
+from lgrasp.simulate.scene import scene_of
+from lgrasp.simulate.verdict import COLUMNS, OBJECT_COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -21,7 +21,7 @@ SLIDING = 500.0  # [N/m] of a jaw
 
 
 def judge(shard: Shard, protocol=SEQ, rows: GraspRows | None = None, **more) -> dict[str, np.ndarray]:
-    found = verdicts(scene_of_shard(shard), rows or shard.grasps, protocol, **more)
+    found = verdicts(scene_of(shard.hand, shard.objects), rows or shard.grasps, protocol, **more)
     assert set(found) == {f"{protocol.name}_{name}" for name in COLUMNS | OBJECT_COLUMNS}
     return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
 

@@ -8,10 +8,10 @@ import pytest
 from support.jaws import EDGE, Jaws
 
 from lgrasp.errors import ConfigError, PhysicsError
-from lgrasp.simulate.columns import COLUMNS
 from lgrasp.simulate.protocol import PROTOCOLS, find_protocol
 from lgrasp.simulate.run import protocol_text, verdicts
-from lgrasp.simulate.scene import scene_of_shard
+from lgrasp.simulate.scene import scene_of
+from lgrasp.simulate.verdict import COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -20,7 +20,7 @@ SLIDING = FC.stiffness / FC.lever**2  # [N/m] of a jaw
 
 
 def judge(shard, protocol=FC, rows=None, **more):
-    found = verdicts(scene_of_shard(shard), rows or shard.grasps, protocol, **more)
+    found = verdicts(scene_of(shard.hand, shard.objects), rows or shard.grasps, protocol, **more)
     assert set(found) == {f"{protocol.name}_{name}" for name in COLUMNS}
     return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
 
@@ -148,7 +148,7 @@ def test_no_rows(jaws: Jaws):
 
 
 def test_protocol_text_names_every_number(jaws: Jaws):
-    text = json.loads(protocol_text(scene_of_shard(jaws.shard()), FC))
+    text = json.loads(protocol_text(scene_of(jaws.shard.hand, jaws.shard.objects()), FC))
     assert text["name"] == "fc"
     for name, value in FC.model_dump(mode="json").items():
         assert text[name] == value

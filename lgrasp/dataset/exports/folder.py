@@ -168,7 +168,7 @@ def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Seq
         f"  {i:3d}  {name:{width}s}  {lower:8.4f} to {upper:.4f}" for i, (name, lower, upper) in enumerate(limits)
     ]
     mimics = [f"  {name} = {m:g} * {source} + {b:g}" for name, (source, m, b) in frames.mimics.items()]
-    said = "Joints that follow others (<mimic> in hand.urdf), which have no value of their own:"
+    heading = "Joints that follow others (<mimic> in hand.urdf), which have no value of their own:"
     counts = (f"{item.code} ({count:,})" for item, count in zip(selection.objects, selection.counts, strict=True))
     return _TEXT.format(
         rows=selection.rows,
@@ -180,7 +180,7 @@ def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Seq
         objects=_few(list(counts)),
         notes=notes.format(root=frames.root, base=frames.base),
         joints="\n".join(joints),
-        mimics="\n".join(["", said, *mimics, ""]) if mimics else "",
+        mimics="\n".join(["", heading, *mimics, ""]) if mimics else "",
     )
 
 

@@ -26,7 +26,11 @@ class Format(NamedTuple):
     """True if every grasp has one object."""
     notes: str
     writer: Callable[[Selection, HandFrames, Cut | None], Callable[[Path, Callable[[int], None]], None]]
-    """Refuses what it cannot hold, else gives what writes the grasps into a folder and says how far it is."""
+    """Refuses what it cannot hold, else gives what writes the selection's grasps with the frames of its hand into the
+    folder of an export and calls a function with numbers of rows that are done.
+
+    Raises ShardError at a damaged shard, OutputError where the folder cannot be written.
+    """
     read: Callable[..., GraspSet]
 
 
@@ -104,7 +108,7 @@ def export_shards(
     selection = select_rows(find_shards(paths), where=conditions, limit=limit, single=form.single)
     frames = HandFrames(selection.hand.urdf, selection.hand.base_link, selection.hand.joint_names, selection.shards[0])
     write = form.writer(selection, frames, cut)
-    said = list(map(str, conditions))
+    chosen = list(map(str, conditions))
     done = 0
 
     def count(rows: int) -> None:
@@ -114,9 +118,9 @@ def export_shards(
             advance(done, selection.rows)
 
     write_assets(out, selection)
-    write_file(out / "README.txt", readme(selection, frames, form.notes, said))
+    write_file(out / "README.txt", readme(selection, frames, form.notes, chosen))
     write(out, count)
-    write_index(out, selection, frames, to, said, run_key)
+    write_index(out, selection, frames, to, chosen, run_key)
     return Exported(selection.rows, tuple(item.code for item in selection.objects))
 
 

@@ -210,10 +210,10 @@ def _mass(protocols: list[Any]) -> str:
     """Mass of the object [g], if the protocols say one."""
     masses = []
     for protocol in protocols:
-        said = protocol if isinstance(protocol, dict) else {}
-        said = said | said["resolved"] if isinstance(said.get("resolved"), dict) else said
-        if isinstance(said.get("mass"), int | float):
-            masses.append(f"{1000 * said['mass']:.0f}")
+        found = protocol if isinstance(protocol, dict) else {}
+        found = found | found["resolved"] if isinstance(found.get("resolved"), dict) else found
+        if isinstance(found.get("mass"), int | float):
+            masses.append(f"{1000 * found['mass']:.0f}")
     return ", ".join(dict.fromkeys(masses)) or "-"
 
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.near import new_rows
 from typer.testing import CliRunner
 
 from lgrasp.dataset import merge_shards, read_shard, write_shard
@@ -20,7 +21,6 @@ from lgrasp.dataset.report.gather import EvenSample
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
-from lgrasp.grasp.duplicates import new_rows
 from lgrasp_cli.dataset import app
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}

@@ -14,10 +14,10 @@ from lgrasp.errors import ConfigError, OutputError, PhysicsError
 from lgrasp.grasp.tables import GraspTable, grasp_arrays
 from lgrasp.jobs.generate import generate
 from lgrasp.jobs.records import make_scene, mesh_blobs, object_record
-from lgrasp.simulate.columns import COLUMNS
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import check_installed, verdicts
-from lgrasp.simulate.scene import scene_of_shard
+from lgrasp.simulate.scene import scene_of
+from lgrasp.simulate.verdict import COLUMNS
 from lgrasp.stages.context import Context
 from lgrasp.stages.simulate.params import SimulateParams
 from lgrasp.stages.simulate.stage import run
@@ -80,7 +80,7 @@ def test_generated_rows_hold(job, swift, tmp_path, raw_grasps):
     physics = shard.grasps.physics
     assert physics["gravity6_holds"].all()
     assert len(shard.grasps) == 8
-    again = verdicts(scene_of_shard(shard), shard.grasps, PROTOCOLS["gravity6"])
+    again = verdicts(scene_of(shard.hand, shard.objects), shard.grasps, PROTOCOLS["gravity6"])
     for name, values in again.items():
         np.testing.assert_array_equal(physics[name], values, err_msg=name)
     assert shard.statistics["simulate_tried"] >= shard.statistics["simulate_held"] >= 8
