@@ -35,7 +35,8 @@ def first(path: Path, count: int = ROWS) -> GraspRows:
 
 @pytest.fixture(scope="module")
 def scene(path: Path) -> Scene:
-    return scene_of(read_shard.hand, read_shard.objects(path))
+    shard = read_shard(path)
+    return scene_of(shard.hand, shard.objects)
 
 
 @pytest.fixture(scope="module")

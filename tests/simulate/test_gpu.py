@@ -77,7 +77,8 @@ def test_two_objects(name: str):
     one = in_one_gripper(0.004)
     squeeze[3], q[3], start[3], pose[3] = one.q_squeeze[0], one.q[0], one.q_pregrasp[0], one.object_pose[0]
     rows = replace(rows, q=q, q_squeeze=squeeze, q_pregrasp=start, object_pose=pose)
-    scene = scene_of(twin_shard.hand, twin_shard.objects(rows))
+    shard = twin_shard(rows)
+    scene = scene_of(shard.hand, shard.objects)
     here, there = verdicts(scene, rows, protocol, all_directions=True), judge(scene, rows, protocol=protocol)
     assert here[f"{name}_holds"].tolist() == [True, False, False, True]
     for column in ("holds", "directions", "stays", "object_touches", "settled", "diverged", "contact_at_q"):

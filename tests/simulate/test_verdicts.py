@@ -148,7 +148,8 @@ def test_no_rows(jaws: Jaws):
 
 
 def test_protocol_text_names_every_number(jaws: Jaws):
-    text = json.loads(protocol_text(scene_of(jaws.shard.hand, jaws.shard.objects()), FC))
+    shard = jaws.shard()
+    text = json.loads(protocol_text(scene_of(shard.hand, shard.objects), FC))
     assert text["name"] == "fc"
     for name, value in FC.model_dump(mode="json").items():
         assert text[name] == value
