@@ -16,7 +16,6 @@ from lgrasp.dataset.report.verdicts import held_numbers
 from lgrasp.errors import OutputError
 
 
-
 def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
     """Write a report on a data set as one self-contained HTML file, without network.
 
