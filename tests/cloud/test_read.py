@@ -178,7 +178,7 @@ def fill(value):
         (lambda p: 1000 * p, {}, "millimetres use --scale 0.001"),
         (lambda p: p, {"scale": 0.001}, "in metres already: use --scale 1"),
         (lambda p: p, {"scale": -1}, "scale -1 cannot be used"),
-        (lambda p: p - CENTRE, {}, "give --viewpoint"),
+        (lambda p: p - CENTRE, {}, "give its position as --viewpoint"),
         (lambda p: p, {"viewpoint": [0, 0]}, "x y z of the camera"),
         (lambda p: p, {"label": 1}, "has no labels; give --mask"),
         (lambda p: p[:, :2], {}, "shape (2000, 2)"),
