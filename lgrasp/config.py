@@ -3,16 +3,25 @@
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
 from lgrasp.errors import ConfigError
 from lgrasp.notices import notice
 from lgrasp.paths import data_dirs
 
 Model = TypeVar("Model", bound=BaseModel)
+
+# fields that several models have
+Seed = Annotated[int, Field(ge=0, lt=2**63, description="Decides every random draw.")]
+DeviceName = Annotated[str, Field(description="auto, cpu or cuda:N.")]
+Workers = Annotated[int, Field(ge=0, description="Threads or processes; 0: by device.")]
+HandName = Annotated[str, Field(description="Name or path.")]
+MeshScale = Annotated[float, Field(gt=0, description="Factor from the meshes' unit to metres.")]
+ShardPaths = Annotated[tuple[Path, ...], Field(description="Shard files, or folders of them at any depth.")]
+ShardFolder = Annotated[Path, Field(description="Folder of the shards.")]
 
 
 class Params(BaseModel):

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field, SerializeAsAny
 
-from lgrasp.config import Params, apply_settings, did_you_mean, parse_model, read_yaml, yaml_files
+from lgrasp.config import Params, Seed, apply_settings, did_you_mean, parse_model, read_yaml, yaml_files
 from lgrasp.engine.migration import ALIASES, move_to_bounds, stage_name
 from lgrasp.engine.registry import SEQUENCE, STAGES, Stage, check_order
 from lgrasp.errors import ConfigError
@@ -16,13 +16,18 @@ from lgrasp.notices import notice
 from lgrasp.object.params import ObjectParams
 
 
-class _Declared(Params):
-    """The file as written."""
+class _Head(Params):
+    """What a file says of a pipeline as a whole."""
 
     name: str
     description: str = ""
-    seed: int = Field(default=0, ge=0, lt=2**63)
+    seed: Seed = 0
     effort: int = Field(default=400, ge=1, le=10**6, description="Candidates tried per requested row before giving up.")
+
+
+class _Declared(_Head):
+    """The file as written."""
+
     bounds: dict[str, Any] = Field(default_factory=dict)
     object: dict[str, Any] = Field(default_factory=dict)
     field: dict[str, Any] = Field(default_factory=dict)
@@ -30,13 +35,9 @@ class _Declared(Params):
     sequence: dict[str, Any] | None = None
 
 
-class Pipeline(Params):
+class Pipeline(_Head):
     """What is computed."""
 
-    name: str
-    description: str = ""
-    seed: int = 0
-    effort: int = 400
     bounds: GraspBounds = GraspBounds()
     object: ObjectParams
     field: FieldParams

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 
 from pydantic import ConfigDict, Field, PrivateAttr
 
-from lgrasp.config import Params
+from lgrasp.config import DeviceName, Params, Workers
 from lgrasp.dataset import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError, Events, Made, Part, PartProgress
@@ -37,8 +37,8 @@ class Job(Params, ABC):
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.stages.", "lgrasp.grasp.")
     """Prefixes of the modules whose kernels the parts launch; empty: none."""
 
-    device: str = "auto"
-    workers: int = Field(0, description="Threads or processes; 0: by device.")
+    device: DeviceName = "auto"
+    workers: Workers = 0
     cache: Cache = Field(default_factory=Cache, exclude=True, repr=False)
     _device: Device = PrivateAttr()
     _events: Events = PrivateAttr(default_factory=Events)

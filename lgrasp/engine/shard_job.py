@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from lgrasp.config import ShardPaths
 from lgrasp.dataset.files import remove_leftovers, shard_tree
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.validate import validate_shard
@@ -30,7 +31,7 @@ class ShardJob(Job):
 
     kernels: ClassVar[tuple[str, ...]] = ()
 
-    shards: tuple[Path, ...] = Field(description="Shard files, or folders of them at any depth.")
+    shards: ShardPaths
     out: Path = Field(description="Folder of the files, under the places of the shards.")
 
     @property

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from lgrasp.config import Params
+from lgrasp.config import Params, Seed
 
 
 class FieldParams(Params):
@@ -20,4 +20,4 @@ class FieldParams(Params):
     max_mb: int = Field(
         512, ge=16, le=65536, description="Memory bound of the field [MB]; vectors and voxels give way."
     )
-    seed: int = Field(0, ge=0, description="Seed of the sampling.")
+    seed: Seed = 0

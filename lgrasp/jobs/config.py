@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from lgrasp.config import Params, did_you_mean, parse_model, read_yaml, yaml_files
+from lgrasp.config import DeviceName, MeshScale, Params, Workers, did_you_mean, parse_model, read_yaml, yaml_files
 from lgrasp.engine.bank import with_passes
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
@@ -31,12 +31,12 @@ class JobConfig(Params):
     rows: int = Field(1000, ge=1, description="Grasps per hand, object and pipeline.")
     settings: tuple[str, ...] = Field((), description="PART.KEY=VALUE of every pipeline, such as bounds.friction=0.8.")
     seed: int | None = Field(None, ge=0, lt=2**63, description="Replaces the pipelines' own.")
-    scale: float = Field(1.0, gt=0, description="Factor from the meshes' unit to metres.")
+    scale: MeshScale = 1.0
     out: Path = Field(
         Path("grasps"), description="Folder for the folders HAND-OBJECT (PIPELINE/HAND-OBJECT if several)."
     )
-    device: str = "auto"
-    workers: int = Field(0, ge=0)
+    device: DeviceName = "auto"
+    workers: Workers = 0
     batch: int = Field(0, ge=0)
     shard_rows: int = Field(10_000, ge=1)
     passes: int | None = Field(None, ge=1, le=64, description="Replaces the pipelines' own search.passes.")

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field, PrivateAttr
 
+from lgrasp.config import HandName, ShardFolder
 from lgrasp.dataset import Shard, ShardHeader
 from lgrasp.dataset.info import survivors
 from lgrasp.engine.events import Events, Made, Part, PartProgress
@@ -33,11 +34,11 @@ class GenerateJob(Job):
 
     asks: ClassVar[bool] = True
 
-    hand: str = Field(default="allegro", description="Name or path.")
+    hand: HandName = "allegro"
     object: str = Field(description="Name or mesh file.")
     rows: int = Field(default=1000, description="Grasps requested.")
     pipeline: Pipeline
-    out: Path = Field(description="Folder of the shards.")
+    out: ShardFolder
     scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
     batch: int = Field(default=0, description="Candidates per batch; 0: by device.")
     rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, PrivateAttr, field_validator
 
+from lgrasp.config import DeviceName
 from lgrasp.dataset import HandRecord, ObjectRecord, ShardReader, read_shard
 from lgrasp.dataset.extend import extend_shard
 from lgrasp.engine.cache import content_key
@@ -36,7 +37,7 @@ class SimulateJob(ShardJob):
 
     protocol: Protocol = Field(description="Named protocol.")
     out: Path | None = Field(None, description="Folder; default: that of the shards with -PROTOCOL added.")
-    device: str = "cpu"
+    device: DeviceName = "cpu"
     all_directions: bool = Field(False, description="Go on after the first direction in which an object is lost.")
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)

@@ -22,4 +22,4 @@ class LearnParams(Params):
     joint_rate: float = Field(3.0e-4, gt=0, le=1.0)
     unrolled: int = Field(5, ge=0, le=100, description="Steps K of the refiner that gradients go through.")
     pose_weight: float = Field(0.1, ge=0, le=1.0e6, description="Weight of the loss on poses in joint training.")
-    seed: int = Field(0, ge=0, lt=2**31)
+    seed: int = Field(0, ge=0, lt=2**31, description="Of the training and of the examples.")

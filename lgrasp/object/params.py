@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from lgrasp.config import Params
+from lgrasp.config import Params, Seed
 
 Length = Annotated[float, Field(gt=0.0, le=1.0)]
 
@@ -12,7 +12,7 @@ Length = Annotated[float, Field(gt=0.0, le=1.0)]
 class ObjectParams(Params):
     """How a mesh becomes an :class:`~lgrasp.object.ObjectModel`; lengths in metres, angles in degrees."""
 
-    seed: int = Field(default=0, ge=0, description="Seed of every sampling step.")
+    seed: Seed = 0
     min_extent: Length = Field(default=0.005, description="Largest side below this is refused as a unit mistake.")
     max_extent: Length = Field(default=1.0, description="Largest side above this is refused as a unit mistake.")
     hole_perimeter: Length = Field(default=0.03, description="Holes with at most this perimeter are closed.")

@@ -1,6 +1,6 @@
 """Parameters of the local search and its energy; lengths in metres, angles in radians."""
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -12,6 +12,18 @@ STEEPEST = 0.1
 """Share of the margin below which a barrier continues as a parabola."""
 LIMIT_SHARE = 0.15
 """Joint limits repel within this share of the range."""
+
+# fields with other defaults in stage refine
+MatchingRounds = Annotated[int, Field(ge=0, le=1000, description="Number of times that nearest points are matched.")]
+TranslationStep = Annotated[float, Field(gt=0, le=0.1, description="Largest translation of the hand in one step.")]
+RotationStep = Annotated[float, Field(gt=0, le=1, description="Largest rotation of the hand in one step.")]
+JointStep = Annotated[float, Field(gt=0, le=1, description="Largest motion of a joint in one step.")]
+EndReach = Annotated[float, Field(gt=0, le=1, description="The same at the last matching.")]
+PointsWeight = Annotated[
+    float, Field(ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared.")
+]
+ForceWeight = Annotated[float, Field(ge=0, le=1e6, description="Weight of the net wrench of four contacts.")]
+BarrierMargin = Annotated[float, Field(gt=0, le=0.05, description="Distance below which the barrier acts.")]
 
 
 class LocalSearch(Params):
@@ -26,22 +38,18 @@ class LocalSearch(Params):
         "withdraw": "max_exit_distance",
     }
 
-    matching_rounds: int = Field(
-        default=20, ge=0, le=1000, description="Number of times that nearest points are matched."
-    )
+    matching_rounds: MatchingRounds = 20
     gradient_steps: int = Field(default=10, ge=1, le=1000, description="Gradient steps after each matching.")
     optimizer: Literal["adam", "sgd"] = Field(default="adam", description="adam, or sgd with momentum.")
     momentum: float = Field(default=0.9, ge=0, lt=1, description="Of sgd; the decay of adam's first moment.")
-    max_translation_step: float = Field(
-        default=0.0015, gt=0, le=0.1, description="Largest translation of the hand in one step."
-    )
-    max_rotation_step: float = Field(default=0.015, gt=0, le=1, description="Largest rotation of the hand in one step.")
-    max_joint_step: float = Field(default=0.02, gt=0, le=1, description="Largest motion of a joint in one step.")
+    max_translation_step: TranslationStep = 0.0015
+    max_rotation_step: RotationStep = 0.015
+    max_joint_step: JointStep = 0.02
     decay: float = Field(default=0.05, gt=0, le=1, description="Size of the last step over that of the first.")
     reach: float = Field(
         default=0.02, gt=0, le=1, description="Points farther from the object do not pull, first matching."
     )
-    reach_end: float = Field(default=0.01, gt=0, le=1, description="The same at the last matching.")
+    reach_end: EndReach = 0.01
     soft: float = Field(default=0.004, gt=0, le=1, description="Distance about which pulls stop growing.")
     touching: int = Field(default=4, ge=1, le=16, description="Palmar points of a link, nearest first, that pull.")
     max_exit_distance: float = Field(
@@ -50,16 +58,14 @@ class LocalSearch(Params):
         le=0.1,
         description="How far a hand deep in the object may be moved straight out; four times as far once opened.",
     )
-    points: float = Field(
-        default=1.0, ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared."
-    )
+    points: PointsWeight = 1.0
     normals: float = Field(default=0.02, ge=0, le=1e6, description="Weight of normals that do not oppose.")
-    force: float = Field(default=0.05, ge=0, le=1e6, description="Weight of the net wrench of four contacts.")
+    force: ForceWeight = 0.05
     barrier: float = Field(
         default=0.002, ge=0, le=1e6, description="Weight of the barriers against penetration, per point."
     )
     limits: float = Field(default=0.01, ge=0, le=1e6, description="Weight of the barrier at the joint limits.")
-    margin: float = Field(default=0.003, gt=0, le=0.05, description="Distance below which the barrier acts.")
+    margin: BarrierMargin = 0.003
     link_margin: float = Field(default=0.001, gt=0, le=0.05, description="The same between links.")
     contacts: int = Field(default=4, ge=2, le=16, description="Contacts that the net wrench is made of.")
     nearest: float = Field(

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from pydantic import Field, PrivateAttr
 
+from lgrasp.config import ShardPaths
 from lgrasp.dataset.files import new_file, shard_tree
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.events import Made, Part, PartProgress
@@ -45,7 +46,7 @@ class FitJob(Job):
     unit: ClassVar[str] = "steps"
     kernels: ClassVar[tuple[str, ...]] = ()
 
-    shards: tuple[Path, ...] = Field(description="Shard files, or folders of them at any depth.")
+    shards: ShardPaths
     out: Path = Field(Path("coarse.pt"), description="File of the predictor.")
     params: LearnParams = Field(default_factory=lambda: LearnParams.model_validate({}))
     hand: str | None = Field(None, description="Default: that of the shards.")

@@ -5,7 +5,7 @@ from typing import Any
 
 from pydantic import Field
 
-from lgrasp.config import did_you_mean, read_yaml, yaml_files
+from lgrasp.config import MeshScale, Seed, did_you_mean, read_yaml, yaml_files
 from lgrasp.engine.run import Job
 from lgrasp.errors import ConfigError
 from lgrasp.scenes.params import SceneParams
@@ -16,12 +16,12 @@ class SceneConfig(Job):
 
     hand: str | None = Field(None, description="Name or path; default: that of the grasps, else allegro.")
     objects: tuple[str, ...] = Field((), description="Names or paths; default: all objects of the grasps.")
-    scale: float = Field(1.0, gt=0, description="Factor from the meshes' unit to metres.")
+    scale: MeshScale = 1.0
     grasps: Path | None = Field(None, description="Folder of shards; default: grasps are generated.")
     pipeline: str = Field("robust", description="Generates grasps where no folder of them is given.")
     stock: int = Field(1000, ge=1, description="Grasps that are generated of each object.")
     scenes: int = Field(100, ge=1)
-    seed: int = Field(0, ge=0, lt=2**63)
+    seed: Seed = 0
     out: Path = Field(Path("scenes"), description="Folder of the scenes.")
     workers: int = Field(0, ge=0, description="Scenes made at once; 0: one a core.")
     scene: SceneParams = Field(default_factory=lambda: SceneParams.model_validate({}))

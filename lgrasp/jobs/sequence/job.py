@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field, PrivateAttr
 
+from lgrasp.config import HandName, ShardFolder
 from lgrasp.dataset import Shard, ShardHeader
 from lgrasp.dataset.info import survivors
 from lgrasp.engine.events import Events, Made, Part, PartProgress
@@ -40,11 +41,11 @@ class SequenceJob(Job):
     unit: ClassVar[str] = "sequences"
     asks: ClassVar[bool] = True
 
-    hand: str = Field(default="allegro", description="Name or path.")
+    hand: HandName = "allegro"
     objects: tuple[str, ...] = Field(description="Names or mesh files, in the order in which they are grasped.")
     rows: int = Field(default=256, description="Complete sequences requested.")
     pipeline: Pipeline
-    out: Path = Field(description="Folder of the shards.")
+    out: ShardFolder
     scale: str = Field(default="1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")
     simulate: str | None = Field(
         default=None, description="Protocol that the rows of every step must pass to be continued."
