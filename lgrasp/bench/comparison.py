@@ -45,6 +45,7 @@ def new_table(config: JobConfig, *, repeat: int, baseline_rows: int, published: 
         "repeat": repeat,
         "shard_rows": config.shard_rows,
         "seed": config.seed,
+        "set": list(config.settings),
         "workers": config.workers,
         "hand_dir": config.hand_dir and str(config.hand_dir),
         "object_dir": config.object_dir and str(config.object_dir),

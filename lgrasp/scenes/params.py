@@ -6,6 +6,8 @@ from pydantic import Field, model_validator
 
 from lgrasp.config import Params
 
+from lgrasp.simulate.protocol import FRICTION
+
 _Length = Annotated[float, Field(gt=0.0, le=5.0)]
 
 
@@ -41,7 +43,7 @@ class DropParams(Params):
 
     radius: _Length = Field(0.25, description="Objects are dropped within this distance of the table's middle.")
     gap: float = Field(0.01, ge=0.0, le=1.0, description="Least distance of dropped objects to all others at first.")
-    friction: float = Field(0.6, gt=0.0, le=5.0)
+    friction: float = Field(FRICTION, gt=0.0, le=5.0)
     timestep: float = Field(0.002, gt=0.0, le=0.01)
     longest: float = Field(
         6.0, gt=0.0, le=60.0, description="If objects still move after this time, all are dropped again."

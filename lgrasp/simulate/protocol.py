@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Directions of the load in the hand's base frame, in the order of the columns."""
 
+FRICTION = 0.6
+"""Of everything that is simulated, unless a protocol says otherwise."""
 DENSITY = 500.0
 """Of objects that are weighed [kg/m^3]."""
 
@@ -37,7 +39,7 @@ class Physics(Params):
     """How bodies touch, and the steps of time."""
 
     timestep: float = Field(default=0.004, gt=0, le=0.02, description="[s]")
-    friction: float = Field(default=0.6, gt=0, le=5, description="Sliding friction of every contact.")
+    friction: float = Field(default=FRICTION, gt=0, le=5, description="Sliding friction of every contact.")
     torsion: float = Field(default=0.02, ge=0, le=1, description="Torsional friction of every contact [m].")
     impratio: float = Field(default=10.0, ge=1, description="Stiffness of friction against that of contact normals.")
     noslip: int = Field(default=2, ge=0, description="Iterations of the solver that takes the creep out of friction.")
@@ -120,10 +122,10 @@ def _protocols() -> dict[str, Protocol]:
     sequence |= {"most_rotation": 180.0}
     made = (
         Protocol(name="fc"),
-        Protocol(name="gravity6", friction=0.6, **gravity),
+        Protocol(name="gravity6", friction=FRICTION, **gravity),
         Protocol(name="gravity6_mu1", friction=1.0, **gravity),
         Protocol(name="seq6", friction=2.0, **gravity, **sequence),
-        Protocol(name="seq6_mu06", friction=0.6, **gravity, **sequence),
+        Protocol(name="seq6_mu06", friction=FRICTION, **gravity, **sequence),
     )
     return {protocol.name: protocol for protocol in made}
 

@@ -16,13 +16,20 @@ from lgrasp.hand.find import find_hand
 from lgrasp.runtime.device import resolve_device
 from lgrasp.stages.context import Context
 
-HANDS = ("allegro", "barrett", "dclaw", "leap", "schunk_svh", "shadow")
-OBJECTS = {"allegro": "mug", "barrett": "mug", "dclaw": "mug", "leap": "mug", "schunk_svh": "mug", "shadow": "mug"}
-PIPELINES = {"swift": 1500, "robust": 1500, "lightning": 100, "swift-refine": 300}
+OBJECTS = {
+    "allegro": "mug",
+    "barrett": "sphere",
+    "dclaw": "bottle",
+    "leap": "mug",
+    "schunk_svh": "sphere",
+    "shadow": "mug",
+}
+"""Hand -> what it is good at."""
+PIPELINES = {"swift": 600, "robust": 1500, "lightning": 600, "swift-refine": 300}
 """Pipeline -> candidates."""
 
-FEW = {("barrett", "lightning"), ("schunk_svh", "lightning"), ("shadow", "lightning")}
-"""Where so few candidates may give no row."""
+FEW = {("schunk_svh", "lightning")}
+"""Where so few candidates give no row."""
 
 SAME = {"fswo", "penetration", "self_penetration", "gap", "normal_error"}
 """Metrics without a stopping rule or a random ray: the same to the last bit."""
@@ -34,7 +41,7 @@ def rechecked(context: Context, table, bounds: GraspBounds):
 
 
 @pytest.mark.parametrize("pipeline", PIPELINES)
-@pytest.mark.parametrize("hand", HANDS)
+@pytest.mark.parametrize("hand", OBJECTS)
 def test_every_row_of_a_pipeline_passes(hand, pipeline, cache_root):
     found = load_pipeline(pipeline)
     found = found.model_copy(update={"field": FieldParams(records=20_000, index=found.field.index)})
