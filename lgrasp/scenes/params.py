@@ -5,7 +5,6 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from lgrasp.config import Params
-
 from lgrasp.simulate.protocol import FRICTION
 
 _Length = Annotated[float, Field(gt=0.0, le=5.0)]
