@@ -17,7 +17,7 @@ from lgrasp.config import apply_settings
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.errors import OutputError
-from lgrasp.grasp.bounds import stored_bounds
+from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 
@@ -47,10 +47,11 @@ def measure_shard(
     with ShardReader(path) as reader:
         frames = [mass_frame(record) for record in reader.objects()]
         bounds = stored_bounds(reader.header.config)
-        friction = apply_settings({"bounds": bounds}, settings, "dataset metrics")["bounds"].friction
+        bounds = apply_settings({"bounds": bounds}, settings, "dataset metrics")["bounds"]
+        assert isinstance(bounds, GraspBounds)
         table = np.zeros((len(reader), len(METRICS)), np.float32)
         for start in range(0, len(reader), step):
-            table[start : start + step] = row_metrics(reader.rows(start, start + step), frames, friction, each)
+            table[start : start + step] = row_metrics(reader.rows(start, start + step), frames, bounds.friction, each)
             report(min(start + step, len(reader)))
     return dict(zip(METRICS, table.T, strict=True))
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -39,11 +40,12 @@ def grasp_rows(
     columns = step_columns(tree, postures, table.pose[:, None], contacts, center[None])
     links = columns["contact_links"]
     width = used_width(links)
+    shared: dict[str, Any] = {name: columns[name][:, 0] for name in POSTURES}
+    shared |= {name: columns[name][:, :, :width] for name in CONTACTS}
     return GraspRows(
-        **{name: columns[name][:, 0] for name in POSTURES},
+        **shared,
         object_pose=columns["object_pose"],
         object_index=np.zeros((len(table), 1), np.int32),
-        **{name: columns[name][:, :, :width] for name in CONTACTS},
         candidate=row_numbers(shard, table.index),
         metrics={**table.metrics, "contacts": (links >= 0).sum((1, 2)).astype(np.float32), **(extra or {})},
         metric_units=METRIC_UNITS,
