@@ -12,13 +12,14 @@ import numpy as np
 
 from lgrasp.cloud.read import Cloud
 from lgrasp.cloud.read import read_cloud as _read_cloud
+from lgrasp.config import parse_model
 from lgrasp.dataset.files import find_shards
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
-from lgrasp.engine.run import run
+from lgrasp.engine.run import Job, run
 from lgrasp.errors import ConfigError, StarvedError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 from lgrasp.hand.model import HandModel
@@ -114,7 +115,7 @@ def generate(
 
     with _folder(out) as folder:
         what = _asked(hand, n, pipeline, seed, device, workers, folder, out is None)
-        return _made(run(GenerateJob(object=str(object), scale=scale, **what)).paths, n)
+        return _made(run(_job(GenerateJob, object=str(object), scale=scale, **what)).paths, n)
 
 
 def sequence(
@@ -143,7 +144,7 @@ def sequence(
 
     with _folder(out) as folder:
         what = _asked(hand, n, pipeline, seed, device, workers, folder, out is None)
-        return _made(run(SequenceJob(objects=tuple(map(str, objects)), scale=str(scale), **what)).paths)
+        return _made(run(_job(SequenceJob, objects=tuple(map(str, objects)), scale=str(scale), **what)).paths)
 
 
 def plan(
@@ -168,7 +169,7 @@ def plan(
 
     what: dict[str, Any] = {"cloud": object} if isinstance(object, Cloud) else {"object": str(object), "scale": scale}
     with _folder(out) as folder:
-        return _made(run(PlanJob(hand=str(hand), out=folder, starts=starts, device=device, **what)).paths)
+        return _made(run(_job(PlanJob, hand=str(hand), out=folder, starts=starts, device=device, **what)).paths)
 
 
 def refine(
@@ -198,7 +199,7 @@ def refine(
     chosen = {} if bounds is None else {"bounds": bounds}
     with _files(grasps) as files, _folder(out) as folder:
         chosen |= {"params": refine_params(coarse=coarse, **params), "device": device}
-        return _made(run(RefineJob(shards=tuple(files), out=folder, **chosen)).paths)
+        return _made(run(_job(RefineJob, shards=tuple(files), out=folder, **chosen)).paths)
 
 
 def simulate(
@@ -226,7 +227,7 @@ def simulate(
     found = find_protocol(protocol) if isinstance(protocol, str) else protocol
     with _files(grasps) as files, _folder(out) as folder:
         what: dict[str, Any] = {"workers": threads, "device": device, "all_directions": all_directions}
-        return _made(run(SimulateJob(shards=tuple(files), protocol=found, out=folder, **what)).paths)
+        return _made(run(_job(SimulateJob, shards=tuple(files), protocol=found, out=folder, **what)).paths)
 
 
 def open(path: Name) -> Grasps:
@@ -319,6 +320,11 @@ def _files(grasps: Grasps | Name) -> Iterator[list[Path]]:
     with _folder(None) as folder:
         folder.mkdir()
         yield [grasps.save(folder / f"{grasps.hand.name}-{grasps.objects[0].id}-00000.h5")]
+
+
+def _job(kind: type[Job], **fields: Any) -> Job:
+    """A job of some settings; ConfigError where one is out of range."""
+    return parse_model(kind, fields, kind.__name__.removesuffix("Job").lower())
 
 
 def _made(paths: Sequence[Path], asked: int = 0) -> Grasps:

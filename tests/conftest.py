@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from lgrasp.config import parse_model
 from lgrasp.dataset import read_shard
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
@@ -84,7 +85,7 @@ def job(swift: Pipeline, cache_root: Path, tmp_path: Path) -> Callable[..., Gene
         "batch": 128,
         "cache": Cache(cache_root, pytest.fail),
     }
-    return lambda **changes: GenerateJob(**defaults | changes)
+    return lambda **changes: parse_model(GenerateJob, defaults | changes, "generate")
 
 
 @pytest.fixture

@@ -176,7 +176,7 @@ def test_what_cannot_be_done(tmp_path, make_shard):
         add_metrics(tmp_path / "a", out, ["volum"])
     with pytest.raises(OutputError, match="is the folder of the shards"):
         add_metrics(tmp_path / "a" / "0.h5", tmp_path / "a", ["volume"])
-    with pytest.raises(ShardError, match=r"place 0\.h5 is that of"):
+    with pytest.raises(ShardError, match=r"it has the same place 0\.h5 as"):
         add_metrics([tmp_path / "a", tmp_path / "b"], out, ["volume"])
     with pytest.raises(ShardError, match="no such file"):
         add_metrics(tmp_path / "c", out, ["volume"])

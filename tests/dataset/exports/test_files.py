@@ -213,7 +213,7 @@ def test_damaged_exports(tmp_path, shards, form):
             read_grasps(tmp_path / "out", form)
     file.write_bytes(data)
     (tmp_path / "out" / "export.json").unlink()
-    with pytest.raises(ShardError, match="not whole"):
+    with pytest.raises(ShardError, match="incomplete"):
         read_grasps(tmp_path / "out", form)
     with pytest.raises(ShardError, match="no such file or folder"):
         read_grasps(tmp_path / "nothing", form)
