@@ -113,7 +113,7 @@ def snapshot(*folders):
 @pytest.mark.parametrize("built", [False, True])
 def test_dry_run_has_no_side_effects(cli, generate, tmp_path, shared_cache, built):
     if built:
-        generate("--shard-rows", 8, rows=8)
+        generate("--shard-rows", 8, "--reuse", rows=8)
     cache = shared_cache if built else tmp_path / "none"
     more = () if built else ("--cache-dir", cache)
     before = snapshot(tmp_path, cache) if built else {}
