@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from lgrasp import notices
 from lgrasp.runtime.device import start
 from lgrasp_cli import progress
 from lgrasp_cli.main import main
@@ -49,6 +50,8 @@ def cli(monkeypatch, capfd, shared_cache, tmp_path):
     monkeypatch.setenv("LGRASP_CACHE_DIR", str(shared_cache))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(progress, "_PLAIN_INTERVAL", float("inf"))  # on a slow machine lines of progress come too
+    monkeypatch.setattr(notices, "_said", set())  # a command is a process of its own
+    monkeypatch.setattr(notices, "_listeners", [])
     for name in [name for name in os.environ if name.startswith("SLURM_")]:
         monkeypatch.delenv(name)
 
