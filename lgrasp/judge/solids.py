@@ -1,6 +1,7 @@
 """Collision solids of links: boxes, spheres, cylinders in closed form, meshes as they are."""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,13 +17,13 @@ except ModuleNotFoundError as error:
     raise JudgeError("the judge measures collisions between links with coal: pip install 'lgrasp[judge]'") from error
 
 SAMPLES = 2_000
-"""MeshDistance points of a solid, beside every vertex."""
+"""Sampled points of a solid, beside every vertex."""
 DENT = 5e-4
 """A mesh whose hull is nowhere further from its surface counts as convex [m]."""
 
 
 @dataclass
-class JudgedSolid:
+class JudgedSolid(ABC):
     """One collision solid in the frame of its link; concrete kinds fill in the distance."""
 
     link: int
@@ -50,8 +51,27 @@ class JudgedSolid:
     def depth(self, points: np.ndarray) -> np.ndarray:
         return np.maximum(-self.signed(points), 0.0)
 
+    @abstractmethod
     def normals(self, points: np.ndarray) -> np.ndarray:
         """Admissible outward normals at the closest points, (n, P, 3), link frame; entry 0 is the nominal one."""
+
+    @abstractmethod
+    def _samples(self) -> np.ndarray:
+        """Points of the surface (S, 3), solid's frame."""
+
+    @abstractmethod
+    def _coal(self) -> Any:
+        """The solid as coal takes it."""
+
+    @abstractmethod
+    def _signed(self, p: np.ndarray) -> np.ndarray:
+        """Signed distance of points (n, 3), solid's frame."""
+
+
+class PrimitiveSolid(JudgedSolid):
+    """A solid that is a box in folded coordinates."""
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
         p = self.local(points)
         nominal = self._gradient(p)
         foot = p - self._signed(p)[:, None] * nominal
@@ -59,15 +79,9 @@ class JudgedSolid:
         normals[:, 0] = nominal
         return normals @ self.T[:3, :3].T
 
-    def _samples(self) -> np.ndarray:
-        raise NotImplementedError
-
-    def _coal(self) -> Any:
-        raise NotImplementedError
-
+    @abstractmethod
     def _fold(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates (n, D) of points in which the solid is a box of half extents ``size``, and their gradients."""
-        raise NotImplementedError
 
     def _signed(self, p: np.ndarray) -> np.ndarray:
         d = self._fold(p)[0] - self.size
@@ -82,7 +96,7 @@ class JudgedSolid:
         return np.einsum("nd,ndk->nk", np.where(length > 1e-9, outside / np.maximum(length, 1e-12), face), ways)
 
 
-class BoxSolid(JudgedSolid):
+class BoxSolid(PrimitiveSolid):
     def _samples(self) -> np.ndarray:
         h = self.size
         area = 8.0 * (h[0] * h[1] + h[1] * h[2] + h[0] * h[2])
@@ -102,7 +116,7 @@ class BoxSolid(JudgedSolid):
         return np.abs(p), np.eye(3) * np.where(p < 0, -1.0, 1.0)[:, None]
 
 
-class SphereSolid(JudgedSolid):
+class SphereSolid(PrimitiveSolid):
     def _samples(self) -> np.ndarray:
         i = np.arange(SAMPLES) + 0.5
         z, a = 1.0 - 2.0 * i / SAMPLES, i * math.pi * (3.0 - math.sqrt(5.0))
@@ -117,7 +131,7 @@ class SphereSolid(JudgedSolid):
         return r, (p / np.maximum(r, 1e-12))[:, None]
 
 
-class CylinderSolid(JudgedSolid):
+class CylinderSolid(PrimitiveSolid):
     def _samples(self) -> np.ndarray:
         r, h = self.size
         step = math.sqrt((2.0 * math.pi * r * 2.0 * h + 2.0 * math.pi * r * r) / SAMPLES)
