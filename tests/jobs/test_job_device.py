@@ -20,7 +20,6 @@ from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.runtime.device import Device, start
 
 OTHER = "other"
-JOBS = ("generate", "refine.plan", "scenes.job")
 
 
 @pytest.fixture
@@ -34,8 +33,7 @@ def on_cpu(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setitem(runtime.device_map, OTHER, context.Device(runtime, OTHER, ordinal=-1))
     # of a processor Warp asks a package that need not be there
     monkeypatch.setattr(context.Device, "free_memory", property(lambda device: 4 << 30))
-    for job in JOBS:
-        monkeypatch.setattr(f"lgrasp.engine.{job}.resolve_device", lambda name: Device(OTHER, OTHER))
+    monkeypatch.setattr("lgrasp.engine.run.resolve_device", lambda name: Device(OTHER, OTHER))
     launch, found = wp.launch, []
 
     def watched(kernel, *args, **more):
@@ -81,4 +79,4 @@ def test_pictures_and_spaces_of_a_hand(on_cpu, swift: Pipeline, cache_root, tmp_
 def test_launches_on_the_processor_are_seen(on_cpu, inputs):
     model: HandModel = inputs.hand.model
     sample_bodies(model, model.tree.joint_open[None])
-    assert any("_body_poses" in line for line in on_cpu)
+    assert any("place_bodies" in line for line in on_cpu)
