@@ -19,11 +19,9 @@ if TYPE_CHECKING:
 app = typer.Typer(invoke_without_command=True, subcommand_metavar="[table1|sequence|refine [OPTIONS]]")
 
 _List = Annotated[str | None, typer.Option(help="Names or files, separated by commas.", show_default="the published")]
-_ObjectDir = Annotated[
-    Path | None, typer.Option(help="Folder where the names of objects are looked up first.", show_default=False)
-]
+_ObjectDir = Annotated[Path | None, typer.Option(help="Folder where the names of objects are looked up first.")]
 _Repeat = Annotated[int, typer.Option(min=1, help="Runs of each pipeline and object.")]
-_Seed = Annotated[int | None, typer.Option(help="Base seed; default: the pipelines'.", show_default=False)]
+_Seed = Annotated[int | None, typer.Option(help="Base seed; default: the pipelines'.")]
 _Workers = Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")]
 
 
@@ -79,9 +77,7 @@ def bench(
 def table1(
     hands: _List = None,
     objects: _List = None,
-    hand_dir: Annotated[
-        Path | None, typer.Option(help="Folder where NAME/NAME.urdf is looked up first.", show_default=False)
-    ] = None,
+    hand_dir: Annotated[Path | None, typer.Option(help="Folder where NAME/NAME.urdf is looked up first.")] = None,
     object_dir: _ObjectDir = None,
     pipelines: Annotated[
         str | None,
@@ -104,9 +100,7 @@ def table1(
     device: Device = "auto",
     workers: _Workers = 0,
     json_path: JsonPath = None,
-    plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Also draw the table as bars.", show_default=False)
-    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Also draw the table as bars.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Keep the cells that --json PATH holds.")] = False,
 ) -> None:
     """Measure the table of Lightning Grasp: four hands, eight objects, our pipelines next to the published figures.

@@ -25,8 +25,7 @@ def path(cache_dir: CacheDir = None) -> None:
 @app.command("list")
 @reporting
 def list_entries(
-    files: Annotated[bool, typer.Option("--files", help="One line for every file.")] = False,
-    cache_dir: CacheDir = None,
+    files: Annotated[bool, typer.Option("--files", help="One line for every file.")] = False, cache_dir: CacheDir = None
 ) -> Answer:
     """List what is in the cache, by kind.
 
@@ -48,12 +47,8 @@ def list_entries(
 
 @app.command()
 def prune(
-    kind: Annotated[
-        list[str] | None, typer.Option(help="Only this kind, such as bank; repeatable.", show_default=False)
-    ] = None,
-    older_than: Annotated[
-        float | None, typer.Option(metavar="DAYS", help="Only entries older than this.", show_default=False)
-    ] = None,
+    kind: Annotated[list[str] | None, typer.Option(help="Only this kind, such as bank; repeatable.")] = None,
+    older_than: Annotated[float | None, typer.Option(metavar="DAYS", help="Only entries older than this.")] = None,
     everything: Annotated[bool, typer.Option("--all", help="All entries, and compiled kernels.")] = False,
     cache_dir: CacheDir = None,
 ) -> None:

@@ -11,7 +11,7 @@ from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Inspect, check and merge grasp files (shards).", no_args_is_help=True)
 
-_Paths = Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.", show_default=False)]
+_Paths = Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.")]
 
 
 @app.command()
@@ -50,7 +50,7 @@ app.command("validate", hidden=True)(old_name(check, "lgrasp dataset validate", 
 @app.command()
 def merge(
     paths: _Paths,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")],
     manifest: Annotated[
         Path | None, typer.Option(help="List of shards to check against; by default manifest.json of a single folder.")
     ] = None,
@@ -70,15 +70,14 @@ def merge(
 def metrics(
     paths: _Paths,
     how: How,
-    add: Annotated[str, typer.Option(help="Metrics, separated by commas: volume, epsilon_exact.", show_default=False)],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the new shards.", show_default=False)],
+    add: Annotated[str, typer.Option(help="Metrics, separated by commas: volume, epsilon_exact.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the new shards.")],
     settings: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="bounds.KEY=VALUE",
             help="Measure with another value than that of the rows, such as bounds.friction=0.8.",
-            show_default=False,
         ),
     ] = None,
 ) -> None:

@@ -15,21 +15,15 @@ def register(app: typer.Typer) -> None:
 
 
 def export(
-    shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.", show_default=False)],
+    shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.")],
     how: How,
-    to: Annotated[
-        str, typer.Option("--to", help="dexgraspnet, dexgraspbench, isaac-grasp or mjcf.", show_default=False)
-    ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", help="Folder to write; it must be empty or not exist yet.", show_default=False),
-    ],
-    limit: Annotated[int | None, typer.Option(help="Largest number of grasps.", show_default=False)] = None,
+    to: Annotated[str, typer.Option("--to", help="dexgraspnet, dexgraspbench, isaac-grasp or mjcf.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must be empty or not exist yet.")],
+    limit: Annotated[int | None, typer.Option(help="Largest number of grasps.")] = None,
     where: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only rows that meet a condition: a column, or COLUMN OP NUMBER, such as objects == 1; repeatable.",
-            show_default=False,
+            help="Only rows that meet a condition: a column, or COLUMN OP NUMBER, such as objects == 1; repeatable."
         ),
     ] = None,
     only_holding: Annotated[

@@ -36,20 +36,14 @@ def generate(
     rows: Annotated[int, typer.Option("-n", "--rows", help="Grasps requested.")] = 1000,
     pipeline: PipelineName = "robust",
     settings: Settings = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder of the shards; default: grasps/HAND-OBJECT", show_default=False),
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the shards; default: grasps/HAND-OBJECT")] = None,
     seed: Seed = None,
     contacts: Contacts = None,
     scale: Scale = 1.0,
     batch: Annotated[int, typer.Option(min=0, help="Candidates per batch; 0: by device.")] = 0,
     simulate: Annotated[
         str | None,
-        typer.Option(
-            help="Keep only grasps that hold in simulation, with protocol fc, gravity6 or gravity6_mu1.",
-            show_default=False,
-        ),
+        typer.Option(help="Keep only grasps that hold in simulation, with protocol fc, gravity6 or gravity6_mu1."),
     ] = None,
     physics: Physics = None,
     shard_rows: Annotated[
@@ -61,7 +55,6 @@ def generate(
             min=1,
             max=64,
             help="Searches per successful pose: faster, but fewer poses; default: the pipeline's, or 8 with --reuse.",
-            show_default=False,
         ),
     ] = None,
     reuse: Annotated[

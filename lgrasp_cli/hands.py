@@ -67,10 +67,9 @@ def show_hand(
 @app.command("add")
 def add_hand(
     urdf: Annotated[Path, typer.Argument(metavar="URDF", help="URDF file of the hand.")],
-    name: Annotated[str | None, typer.Option(help="Name of the hand; default: the file's.", show_default=False)] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the hand; default: the file's.")] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(help="Folder of the hand; default: hands/NAME in your data folder.", show_default=False),
+        Path | None, typer.Option(help="Folder of the hand; default: hands/NAME in your data folder.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the hand of that name.")] = False,
 ) -> None:
@@ -93,9 +92,7 @@ def add_hand(
 @reporting
 def check_hand(
     name: Annotated[str, typer.Argument(help="Name of a hand, a URDF file, a folder, or a hand of a package.")],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of the pictures; default: check/NAME.", show_default=False)
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the pictures; default: check/NAME.")] = None,
     rows: Annotated[int, typer.Option("-n", "--rows", min=1, help="Grasps requested per object.")] = 200,
     pipeline: PipelineName = "robust",
     device: Device = "auto",

@@ -11,7 +11,7 @@ from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Predict coarse grasps from partial point clouds with a small network.", no_args_is_help=True)
 
-_Shards = Annotated[list[Path], typer.Argument(help="Shard files, or folders of them.", show_default=False)]
+_Shards = Annotated[list[Path], typer.Argument(help="Shard files, or folders of them.")]
 
 
 @app.command()
@@ -20,16 +20,12 @@ def fit(
     shards: _Shards,
     how: How,
     out: Annotated[Path, typer.Option("--out", "-o", help="File of the predictor.")] = Path("coarse.pt"),
-    steps: Annotated[
-        int | None, typer.Option(help="Training steps on poses alone; default: 1500.", show_default=False)
-    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Training steps on poses alone; default: 1500.")] = None,
     joint_steps: Annotated[
-        int | None, typer.Option(help="Training steps through the refiner afterwards; default: 80.", show_default=False)
+        int | None, typer.Option(help="Training steps through the refiner afterwards; default: 80.")
     ] = None,
-    unrolled: Annotated[
-        int | None, typer.Option(help="Unrolled steps of the refiner; default: 5.", show_default=False)
-    ] = None,
-    batch: Annotated[int | None, typer.Option(help="Seeds per training step; default: 64.", show_default=False)] = None,
+    unrolled: Annotated[int | None, typer.Option(help="Unrolled steps of the refiner; default: 5.")] = None,
+    batch: Annotated[int | None, typer.Option(help="Seeds per training step; default: 64.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of clouds, weights and batches.")] = 0,
 ) -> None:
     """Train a predictor on the grasps of shards, first on poses, then through unrolled steps of the refiner.
@@ -51,7 +47,7 @@ def fit(
 @app.command(name="eval")
 @reporting
 def evaluate(
-    predictor: Annotated[Path, typer.Argument(help="File written by lgrasp learn fit.", show_default=False)],
+    predictor: Annotated[Path, typer.Argument(help="File written by lgrasp learn fit.")],
     shards: _Shards,
     clouds: Annotated[int, typer.Option(min=1, help="New clouds per object.")] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the clouds.")] = 1,

@@ -12,20 +12,15 @@ if TYPE_CHECKING:
     from lgrasp.engine.pipeline import Pipeline
 
 Hand = Annotated[str, typer.Option("--hand", help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
-Mesh = Annotated[str, typer.Option("--object", "-o", help="Mesh file, or the name of an object.", show_default=False)]
+Mesh = Annotated[str, typer.Option("--object", "-o", help="Mesh file, or the name of an object.")]
 PipelineName = Annotated[str, typer.Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.")]
-Seed = Annotated[int | None, typer.Option(help="Base seed; default: the pipeline's.", show_default=False)]
+Seed = Annotated[int | None, typer.Option(help="Base seed; default: the pipeline's.")]
 Scale = Annotated[float, typer.Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda:N.")]
-Physics = Annotated[str | None, typer.Option("--physics", hidden=True)]
+Physics = Annotated[str | None, typer.Option(hidden=True)]
 """The name of ``--simulate`` in the release before."""
-CacheDir = Annotated[
-    Path | None,
-    typer.Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.", show_default=False),
-]
-Contacts = Annotated[
-    str | None, typer.Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.", show_default=False)
-]
+CacheDir = Annotated[Path | None, typer.Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.")]
+Contacts = Annotated[str | None, typer.Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.")]
 JsonPath = Annotated[
     str | None,
     typer.Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
@@ -36,7 +31,6 @@ Settings = Annotated[
         "--set",
         metavar="PART.KEY=VALUE",
         help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.",
-        show_default=False,
     ),
 ]
 Quiet = Annotated[

@@ -18,21 +18,13 @@ def register(app: typer.Typer) -> None:
 def plan(
     how: How,
     mesh: Annotated[
-        str | None,
-        typer.Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.", show_default=False),
+        str | None, typer.Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.")
     ] = None,
-    cloud: Annotated[
-        Path | None, typer.Option(help="Point cloud or scene (.ply .xyz .npy .npz .h5).", show_default=False)
-    ] = None,
-    mask: Annotated[
-        Path | None, typer.Option(help="Labels of the cloud's points (.npy, .npz).", show_default=False)
-    ] = None,
-    label: Annotated[int | None, typer.Option(help="Label of the points to grasp.", show_default=False)] = None,
+    cloud: Annotated[Path | None, typer.Option(help="Point cloud or scene (.ply .xyz .npy .npz .h5).")] = None,
+    mask: Annotated[Path | None, typer.Option(help="Labels of the cloud's points (.npy, .npz).")] = None,
+    label: Annotated[int | None, typer.Option(help="Label of the points to grasp.")] = None,
     viewpoint: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.", show_default=False
-        ),
+        str | None, typer.Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")
     ] = None,
     scale: Scale = 1.0,
     hand: Annotated[
@@ -40,8 +32,7 @@ def plan(
     ] = "barrett",
     starts: Annotated[int, typer.Option("--starts", "-n", help="Points of the surface to start from.")] = 80,
     stand_off: Annotated[
-        float | None,
-        typer.Option(help="Distance of the hand's base from a start [m]; default: the hand's.", show_default=False),
+        float | None, typer.Option(help="Distance of the hand's base from a start [m]; default: the hand's.")
     ] = None,
     distal: Annotated[float, typer.Option(help="Weight of the palmar side of the last links.")] = 1.0,
     other: Annotated[
@@ -51,9 +42,7 @@ def plan(
         bool, typer.Option("--keep-invalid", help="Keep the best of a start that fails a check, with metric 'valid' 0.")
     ] = False,
     settings: Settings = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder; default: plans/HAND-OBJECT.", show_default=False)
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; default: plans/HAND-OBJECT.")] = None,
 ) -> None:
     """Plan grasps by closing an open hand onto a mesh or point cloud with a local search.
 

@@ -19,9 +19,7 @@ def register(app: typer.Typer) -> None:
 
 def build_field(
     hand: Annotated[str, typer.Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")],
-    index: Annotated[
-        str | None, typer.Option(help="voxel or bvh; default: the pipeline's.", show_default=False)
-    ] = None,
+    index: Annotated[str | None, typer.Option(help="voxel or bvh; default: the pipeline's.")] = None,
     pipeline: PipelineName = "robust",
     device: Device = "auto",
     cache_dir: CacheDir = None,
@@ -84,10 +82,7 @@ def preprocess(
     return Answer(data, [pairs])
 
 
-def warm_up(
-    device: Device = "auto",
-    cache_dir: CacheDir = None,
-) -> None:
+def warm_up(device: Device = "auto", cache_dir: CacheDir = None) -> None:
     """Compile all kernels for a device ahead of the first job.
 
     Example: lgrasp warm-up --device cuda:0

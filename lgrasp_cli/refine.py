@@ -17,29 +17,20 @@ def register(app: typer.Typer) -> None:
 
 
 def refine(
-    shards: Annotated[
-        list[Path], typer.Argument(help="Shard files, or folders of them; or one export.", show_default=False)
-    ],
+    shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of them; or one export.")],
     how: How,
-    out: Annotated[Path, typer.Option("--out", help="Folder of the refined shards.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder of the refined shards.")],
     form: Annotated[
         str | None,
-        typer.Option(
-            "--from",
-            help="Format of the grasps: dexgraspnet, dexgraspbench, isaac-grasp or mjcf.",
-            show_default=False,
-        ),
+        typer.Option("--from", help="Format of the grasps: dexgraspnet, dexgraspbench, isaac-grasp or mjcf."),
     ] = None,
     hand: Annotated[
-        str | None,
-        typer.Option(help="Hand of the grasps, for formats without one; shards contain theirs.", show_default=False),
+        str | None, typer.Option(help="Hand of the grasps, for formats without one; shards contain theirs.")
     ] = None,
     matching_rounds: Annotated[
-        int | None, typer.Option(help="Number of times that nearest points are matched.", show_default=False)
+        int | None, typer.Option(help="Number of times that nearest points are matched.")
     ] = None,
-    gradient_steps: Annotated[
-        int | None, typer.Option(help="Gradient steps after each matching.", show_default=False)
-    ] = None,
+    gradient_steps: Annotated[int | None, typer.Option(help="Gradient steps after each matching.")] = None,
     outer: Annotated[int | None, typer.Option(hidden=True)] = None,
     inner: Annotated[int | None, typer.Option(hidden=True)] = None,
     coarse: Annotated[

@@ -22,10 +22,10 @@ def register(app: typer.Typer) -> None:
 def run(
     config: Annotated[str, typer.Argument(help="Config file, or the name of a config.")],
     how: How,
-    rows: Annotated[int | None, typer.Option("-n", "--rows", help="Replaces rows.", show_default=False)] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Replaces out.", show_default=False)] = None,
-    object_dir: Annotated[Path | None, typer.Option(help="Replaces object_dir.", show_default=False)] = None,
-    seed: Annotated[int | None, typer.Option(help="Replaces seed.", show_default=False)] = None,
+    rows: Annotated[int | None, typer.Option("-n", "--rows", help="Replaces rows.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Replaces out.")] = None,
+    object_dir: Annotated[Path | None, typer.Option(help="Replaces object_dir.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Replaces seed.")] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would be computed without computing it.")
     ] = False,

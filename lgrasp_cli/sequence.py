@@ -16,24 +16,17 @@ def register(app: typer.Typer) -> None:
 
 
 def sequence(
-    objects: Annotated[
-        list[str], typer.Argument(help="Mesh files or names of objects, in the order of grasping.", show_default=False)
-    ],
+    objects: Annotated[list[str], typer.Argument(help="Mesh files or names of objects, in the order of grasping.")],
     how: How,
     hand: Hand = "allegro",
     rows: Annotated[int, typer.Option("-n", "--rows", help="Complete sequences requested.")] = 256,
-    method: Annotated[
-        str | None, typer.Option(help="field, anneal or mala; default: the pipeline's.", show_default=False)
-    ] = None,
-    policy: Annotated[
-        str | None, typer.Option(help="uniform or lookahead; default: the pipeline's.", show_default=False)
-    ] = None,
+    method: Annotated[str | None, typer.Option(help="field, anneal or mala; default: the pipeline's.")] = None,
+    policy: Annotated[str | None, typer.Option(help="uniform or lookahead; default: the pipeline's.")] = None,
     scale: Annotated[
         str, typer.Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")
     ] = "1",
     simulate: Annotated[
-        str | None,
-        typer.Option(help="Continue only rows that hold in simulation: seq6 or seq6_mu06.", show_default=False),
+        str | None, typer.Option(help="Continue only rows that hold in simulation: seq6 or seq6_mu06.")
     ] = None,
     physics: Physics = None,
     pipeline: Annotated[
@@ -41,8 +34,7 @@ def sequence(
     ] = "sequence",
     settings: Settings = None,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT...", show_default=False),
+        Path | None, typer.Option(help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT...")
     ] = None,
     seed: Seed = None,
     shard_rows: Annotated[

@@ -19,15 +19,13 @@ def register(app: typer.Typer) -> None:
 
 
 def simulate(
-    shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.", show_default=False)],
+    shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.")],
     how: How,
     protocol: Annotated[
-        str,
-        typer.Option("--protocol", "-p", help="Protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06."),
+        str, typer.Option("--protocol", "-p", help="Protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06.")
     ] = "fc",
     out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder of the results; default: that of the shards with -PROTOCOL added."),
+        Path | None, typer.Option(help="Folder of the results; default: that of the shards with -PROTOCOL added.")
     ] = None,
     threads: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
     all_directions: Annotated[
@@ -49,12 +47,7 @@ def simulate(
         warn("--threads is now called --workers; the old name works in this release only")
     chosen = replace(how, workers=how.workers if threads is None else threads)
     job = chosen.job(
-        SimulateJob,
-        "simulate",
-        shards=shards,
-        protocol=find_protocol(protocol),
-        out=out,
-        all_directions=all_directions,
+        SimulateJob, "simulate", shards=shards, protocol=find_protocol(protocol), out=out, all_directions=all_directions
     )
     chosen.run(job, _show)
 

@@ -15,25 +15,17 @@ if TYPE_CHECKING:
     from lgrasp.engine.run import Job, JobOutcome
 
 _OPTIONS: dict[str, tuple[Any, Any]] = {
-    "device": (Annotated[str | None, typer.Option(help="auto, cpu or cuda:N.", show_default=False)], None),
-    "workers": (
-        Annotated[int | None, typer.Option(min=0, help="Threads or processes; 0: by device.", show_default=False)],
-        None,
-    ),
+    "device": (Annotated[str | None, typer.Option(help="auto, cpu or cuda:N.")], None),
+    "workers": (Annotated[int | None, typer.Option(min=0, help="Threads or processes; 0: by device.")], None),
     "shard_index": (
         Annotated[
             int | None,
-            typer.Option(
-                help="Number of this array task, which makes every NUMth file; default: SLURM_ARRAY_TASK_ID.",
-                show_default=False,
-            ),
+            typer.Option(help="Number of this array task, which makes every NUMth file; default: SLURM_ARRAY_TASK_ID."),
         ],
         None,
     ),
     "num_shards": (
-        Annotated[
-            int | None, typer.Option(help="Number of array tasks; default: SLURM_ARRAY_TASK_COUNT.", show_default=False)
-        ],
+        Annotated[int | None, typer.Option(help="Number of array tasks; default: SLURM_ARRAY_TASK_COUNT.")],
         None,
     ),
     "overwrite": (

@@ -104,12 +104,7 @@ def read_table(path: Path, wanted: Table) -> Table:
 
 
 def measure_table(
-    bench: Bench,
-    table: Table,
-    config: JobConfig,
-    cache: Cache,
-    *,
-    progress: Callable[[str], None] | None = None,
+    bench: Bench, table: Table, config: JobConfig, cache: Cache, *, progress: Callable[[str], None] | None = None
 ) -> Iterator[tuple[Table, Cell]]:
     """Measure the cells that a table lacks; the table so far and its newest cell come back after each.
 

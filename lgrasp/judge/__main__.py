@@ -13,15 +13,10 @@ _PLAIN_INTERVAL = 10.0  # [s] between lines of progress where standard error is 
 
 def command(
     shards: Annotated[list[Path], typer.Argument(help="Shards, or folders that hold some at any depth.")],
-    rows: Annotated[
-        int | None, typer.Option(help="Judge this many rows, drawn at random; default: all.", show_default=False)
-    ] = None,
-    urdf: Annotated[
-        Path | None, typer.Option(help="Original URDF in place of the stored one.", show_default=False)
-    ] = None,
+    rows: Annotated[int | None, typer.Option(help="Judge this many rows, drawn at random; default: all.")] = None,
+    urdf: Annotated[Path | None, typer.Option(help="Original URDF in place of the stored one.")] = None,
     mesh: Annotated[
-        list[str] | None,
-        typer.Option(help="Original mesh in place of the stored one, PATH or ID=PATH; repeatable.", show_default=False),
+        list[str] | None, typer.Option(help="Original mesh in place of the stored one, PATH or ID=PATH; repeatable.")
     ] = None,
     json_path: Annotated[
         str | None,
