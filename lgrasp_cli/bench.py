@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.interrupt import before_end
 from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Physics, Settings, check_report, open_cache, warn
@@ -18,22 +19,20 @@ if TYPE_CHECKING:
 
 app = typer.Typer(invoke_without_command=True, subcommand_metavar="[table1|sequence|refine [OPTIONS]]")
 
-_List = Annotated[str | None, typer.Option(help="Names or files, separated by commas.", show_default="the published")]
-_ObjectDir = Annotated[Path | None, typer.Option(help="Folder where the names of objects are looked up first.")]
-_Repeat = Annotated[int, typer.Option(min=1, help="Runs of each pipeline and object.")]
-_Seed = Annotated[int | None, typer.Option(help="Base seed; default: the pipelines'.")]
-_Workers = Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")]
+_List = Annotated[str | None, Option(help="Names or files, separated by commas.", show_default="the published")]
+_ObjectDir = Annotated[Path | None, Option(help="Folder where the names of objects are looked up first.")]
+_Repeat = Annotated[int, Option(min=1, help="Runs of each pipeline and object.")]
+_Seed = Annotated[int | None, Option(help="Base seed; default: the pipelines'.")]
+_Workers = Annotated[int, Option(min=0, help="Threads; 0: all cores (1 on a GPU).")]
 
 
 @app.callback()
 def bench(
     context: typer.Context,
     hand: Hand = "allegro",
-    objects: Annotated[str, typer.Option(help="Names or mesh files, separated by commas.")] = "mug",
-    pipelines: Annotated[
-        str, typer.Option(help="Names or YAML files, separated by commas.")
-    ] = "robust,swift,lightning",
-    rows: Annotated[int, typer.Option("-n", "--rows", help="Grasps per run.")] = 2000,
+    objects: Annotated[str, Option(help="Names or mesh files, separated by commas.")] = "mug",
+    pipelines: Annotated[str, Option(help="Names or YAML files, separated by commas.")] = "robust,swift,lightning",
+    rows: Annotated[int, Option("-n", "--rows", help="Grasps per run.")] = 2000,
     repeat: _Repeat = 3,
     object_dir: _ObjectDir = None,
     settings: Settings = None,
@@ -77,31 +76,28 @@ def bench(
 def table1(
     hands: _List = None,
     objects: _List = None,
-    hand_dir: Annotated[Path | None, typer.Option(help="Folder where NAME/NAME.urdf is looked up first.")] = None,
+    hand_dir: Annotated[Path | None, Option(help="Folder where NAME/NAME.urdf is looked up first.")] = None,
     object_dir: _ObjectDir = None,
     pipelines: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Names or files; the last of several is the baseline.", show_default="those of configs/table1.yaml"
         ),
     ] = None,
-    rows: Annotated[
-        int | None, typer.Option("-n", "--rows", min=1, help="Grasps per run.", show_default="2000")
-    ] = None,
+    rows: Annotated[int | None, Option("-n", "--rows", min=1, help="Grasps per run.", show_default="2000")] = None,
     baseline_rows: Annotated[
-        int | None,
-        typer.Option("--baseline-n", min=1, help="Grasps per run of the baseline.", show_default="a tenth of -n"),
+        int | None, Option("--baseline-n", min=1, help="Grasps per run of the baseline.", show_default="a tenth of -n")
     ] = None,
     repeat: _Repeat = 3,
     shard_rows: Annotated[
-        int | None, typer.Option(min=1, help="Rows of a shard; large ones fill a GPU.", show_default="10000")
+        int | None, Option(min=1, help="Rows of a shard; large ones fill a GPU.", show_default="10000")
     ] = None,
     seed: _Seed = None,
     device: Device = "auto",
     workers: _Workers = 0,
     json_path: JsonPath = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Also draw the table as bars.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep the cells that --json PATH holds.")] = False,
+    plot: Annotated[Path | None, Option(metavar="FILE.png", help="Also draw the table as bars.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Keep the cells that --json PATH holds.")] = False,
 ) -> None:
     """Measure the table of Lightning Grasp: four hands, eight objects, our pipelines next to the published figures.
 
@@ -154,27 +150,25 @@ def table1(
 def bench_sequence(
     objects: Annotated[
         list[str] | None,
-        typer.Argument(help="Pool of objects: mesh files or names.", show_default="mug sphere box capsule bottle bowl"),
+        Argument(help="Pool of objects: mesh files or names.", show_default="mug sphere box capsule bottle bowl"),
     ] = None,
     hand: Hand = "allegro",
-    length: Annotated[int, typer.Option(min=2, help="Objects in a sequence.")] = 4,
-    sequences: Annotated[int, typer.Option(min=1, help="Sequences of objects, drawn from the pool.")] = 3,
-    width: Annotated[int, typer.Option("-n", "--width", min=1, help="Attempts started with each sequence.")] = 256,
-    methods: Annotated[str, typer.Option(help="Methods, separated by commas.")] = "field,anneal",
-    baseline_width: Annotated[
-        int, typer.Option("--baseline-n", min=1, help="Attempts of methods after the first.")
-    ] = 32,
+    length: Annotated[int, Option(min=2, help="Objects in a sequence.")] = 4,
+    sequences: Annotated[int, Option(min=1, help="Sequences of objects, drawn from the pool.")] = 3,
+    width: Annotated[int, Option("-n", "--width", min=1, help="Attempts started with each sequence.")] = 256,
+    methods: Annotated[str, Option(help="Methods, separated by commas.")] = "field,anneal",
+    baseline_width: Annotated[int, Option("--baseline-n", min=1, help="Attempts of methods after the first.")] = 32,
     iterations: Annotated[
-        int | None, typer.Option(min=1, help="Iterations of the optimiser; default: as published.", show_default="6000")
+        int | None, Option(min=1, help="Iterations of the optimiser; default: as published.", show_default="6000")
     ] = None,
-    policy: Annotated[str, typer.Option(help="uniform, as published, or lookahead.")] = "uniform",
-    simulate: Annotated[str, typer.Option(help="Protocol: seq6 (friction 2.0, as published) or seq6_mu06.")] = "seq6",
+    policy: Annotated[str, Option(help="uniform, as published, or lookahead.")] = "uniform",
+    simulate: Annotated[str, Option(help="Protocol: seq6 (friction 2.0, as published) or seq6_mu06.")] = "seq6",
     physics: Physics = None,
-    scale: Annotated[str, typer.Option(help="Factor to metres, or range of the longest side [m].")] = "0.06:0.10",
+    scale: Annotated[str, Option(help="Factor to metres, or range of the longest side [m].")] = "0.06:0.10",
     pipeline: Annotated[
-        str, typer.Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.")
+        str, Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.")
     ] = "sequence",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the sequences and the grasps.")] = 0,
+    seed: Annotated[int, Option(min=0, help="Seed of the sequences and the grasps.")] = 0,
     device: Device = "auto",
     workers: _Workers = 0,
     json_path: JsonPath = None,
@@ -220,12 +214,12 @@ def bench_sequence(
 
 @app.command("refine")
 def bench_refine(
-    hands: Annotated[str, typer.Option(help="Names, separated by commas.")] = "barrett,schunk_svh",
-    objects: Annotated[str, typer.Option(help="Names or mesh files, separated by commas.")] = "bowl,box,bottle,mug",
-    starts: Annotated[int, typer.Option("--starts", "-n", min=1, help="Starts on each object.")] = 80,
-    simulate: Annotated[str, typer.Option(help="Protocol that decides which plans are valid.")] = "fc",
+    hands: Annotated[str, Option(help="Names, separated by commas.")] = "barrett,schunk_svh",
+    objects: Annotated[str, Option(help="Names or mesh files, separated by commas.")] = "bowl,box,bottle,mug",
+    starts: Annotated[int, Option("--starts", "-n", min=1, help="Starts on each object.")] = 80,
+    simulate: Annotated[str, Option(help="Protocol that decides which plans are valid.")] = "fc",
     physics: Physics = None,
-    noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Also measure table IV: clouds with noise.")] = True,
+    noise: Annotated[bool, Option("--noise/--no-noise", help="Also measure table IV: clouds with noise.")] = True,
     device: Device = "auto",
     json_path: JsonPath = None,
     cache_dir: CacheDir = None,

@@ -4,6 +4,7 @@ from datetime import datetime
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from lgrasp_cli.options import CacheDir, open_cache
 from lgrasp_cli.tables import Answer, TextTable, reporting
@@ -25,7 +26,7 @@ def path(cache_dir: CacheDir = None) -> None:
 @app.command("list")
 @reporting
 def list_entries(
-    files: Annotated[bool, typer.Option("--files", help="One line for every file.")] = False, cache_dir: CacheDir = None
+    files: Annotated[bool, Option("--files", help="One line for every file.")] = False, cache_dir: CacheDir = None
 ) -> Answer:
     """List what is in the cache, by kind.
 
@@ -47,9 +48,9 @@ def list_entries(
 
 @app.command()
 def prune(
-    kind: Annotated[list[str] | None, typer.Option(help="Only this kind, such as bank; repeatable.")] = None,
-    older_than: Annotated[float | None, typer.Option(metavar="DAYS", help="Only entries older than this.")] = None,
-    everything: Annotated[bool, typer.Option("--all", help="All entries, and compiled kernels.")] = False,
+    kind: Annotated[list[str] | None, Option(help="Only this kind, such as bank; repeatable.")] = None,
+    older_than: Annotated[float | None, Option(metavar="DAYS", help="Only entries older than this.")] = None,
+    everything: Annotated[bool, Option("--all", help="All entries, and compiled kernels.")] = False,
     cache_dir: CacheDir = None,
 ) -> None:
     """Remove entries from the cache; they are rebuilt when needed.

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.options import Quiet, old_name, warn
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, plural, reporting
@@ -11,7 +12,7 @@ from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Inspect, check and merge grasp files (shards).", no_args_is_help=True)
 
-_Paths = Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.")]
+_Paths = Annotated[list[Path], Argument(help="Shard files, or folders of *.h5 files.")]
 
 
 @app.command()
@@ -50,9 +51,9 @@ app.command("validate", hidden=True)(old_name(check, "lgrasp dataset validate", 
 @app.command()
 def merge(
     paths: _Paths,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")],
+    out: Annotated[Path, Option("--out", "-o", help="File to write.")],
     manifest: Annotated[
-        Path | None, typer.Option(help="List of shards to check against; by default manifest.json of a single folder.")
+        Path | None, Option(help="List of shards to check against; by default manifest.json of a single folder.")
     ] = None,
 ) -> None:
     """Put the rows of shards of one hand, object and run into one file.
@@ -70,11 +71,11 @@ def merge(
 def metrics(
     paths: _Paths,
     how: How,
-    add: Annotated[str, typer.Option(help="Metrics, separated by commas: volume, epsilon_exact.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the new shards.")],
+    add: Annotated[str, Option(help="Metrics, separated by commas: volume, epsilon_exact.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder of the new shards.")],
     settings: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--set",
             metavar="bounds.KEY=VALUE",
             help="Measure with another value than that of the rows, such as bounds.friction=0.8.",
@@ -104,7 +105,7 @@ def _show_metrics(data: dict[str, Any]) -> list[Block]:
 @reporting
 def report(
     paths: _Paths,
-    out: Annotated[Path, typer.Option("--out", "-o", help="HTML file to write.")] = Path("report.html"),
+    out: Annotated[Path, Option("--out", "-o", help="HTML file to write.")] = Path("report.html"),
     quiet: Quiet = False,
 ) -> Answer:
     """Write a report on a data set as one HTML page: validity, quality, diversity, coverage, physics.

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.tables import Block, plural
 from lgrasp_cli.working import How, working
@@ -15,20 +16,19 @@ def register(app: typer.Typer) -> None:
 
 
 def export(
-    shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.")],
+    shards: Annotated[list[Path], Argument(help="Shard files, or folders of *.h5 files.")],
     how: How,
-    to: Annotated[str, typer.Option("--to", help="dexgraspnet, dexgraspbench, isaac-grasp or mjcf.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must be empty or not exist yet.")],
-    limit: Annotated[int | None, typer.Option(help="Largest number of grasps.")] = None,
+    to: Annotated[str, Option("--to", help="dexgraspnet, dexgraspbench, isaac-grasp or mjcf.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write; it must be empty or not exist yet.")],
+    limit: Annotated[int | None, Option(help="Largest number of grasps.")] = None,
     where: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             help="Only rows that meet a condition: a column, or COLUMN OP NUMBER, such as objects == 1; repeatable."
         ),
     ] = None,
     only_holding: Annotated[
-        bool,
-        typer.Option("--only-holding", help="Only grasps that held in simulation; same as --where physics/fc_holds."),
+        bool, Option("--only-holding", help="Only grasps that held in simulation; same as --where physics/fc_holds.")
     ] = False,
 ) -> None:
     """Write grasps in the format of another program, with the hand's URDF and all meshes.

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from lgrasp_cli.options import (
     Contacts,
@@ -33,25 +34,24 @@ def generate(
     mesh: Mesh,
     how: How,
     hand: Hand = "allegro",
-    rows: Annotated[int, typer.Option("-n", "--rows", help="Grasps requested.")] = 1000,
+    rows: Annotated[int, Option("-n", "--rows", help="Grasps requested.")] = 1000,
     pipeline: PipelineName = "robust",
     settings: Settings = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the shards; default: grasps/HAND-OBJECT")] = None,
+    out: Annotated[Path | None, Option(help="Folder of the shards; default: grasps/HAND-OBJECT")] = None,
     seed: Seed = None,
     contacts: Contacts = None,
     scale: Scale = 1.0,
-    batch: Annotated[int, typer.Option(min=0, help="Candidates per batch; 0: by device.")] = 0,
+    batch: Annotated[int, Option(min=0, help="Candidates per batch; 0: by device.")] = 0,
     simulate: Annotated[
-        str | None,
-        typer.Option(help="Keep only grasps that hold in simulation, with protocol fc, gravity6 or gravity6_mu1."),
+        str | None, Option(help="Keep only grasps that hold in simulation, with protocol fc, gravity6 or gravity6_mu1.")
     ] = None,
     physics: Physics = None,
     shard_rows: Annotated[
-        int, typer.Option(help="Grasps per shard. Changing it changes which grasps are generated.")
+        int, Option(help="Grasps per shard. Changing it changes which grasps are generated.")
     ] = 10_000,
     passes: Annotated[
         int | None,
-        typer.Option(
+        Option(
             min=1,
             max=64,
             help="Searches per successful pose: faster, but fewer poses; default: the pipeline's, or 8 with --reuse.",
@@ -59,13 +59,9 @@ def generate(
     ] = None,
     reuse: Annotated[
         bool,
-        typer.Option(
-            "--reuse", help="Cache the state of shards, so that a later run with a larger -n continues from there."
-        ),
+        Option("--reuse", help="Cache the state of shards, so that a later run with a larger -n continues from there."),
     ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be computed without computing it.")
-    ] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Show what would be computed without computing it.")] = False,
 ) -> None:
     """Generate grasps of an object and write them as shards.
 

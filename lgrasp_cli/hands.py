@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.options import CacheDir, Device, PipelineName, Quiet, choose_pipeline, open_cache
 from lgrasp_cli.tables import Answer, Block, TextTable, plural, reporting
@@ -31,7 +32,7 @@ def list_hands() -> Answer:
 @app.command("show")
 @reporting
 def show_hand(
-    name: Annotated[str, typer.Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")],
+    name: Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")],
 ) -> Answer:
     """Show fingers, joints, limits and contact rules of a hand.
 
@@ -66,12 +67,10 @@ def show_hand(
 
 @app.command("add")
 def add_hand(
-    urdf: Annotated[Path, typer.Argument(metavar="URDF", help="URDF file of the hand.")],
-    name: Annotated[str | None, typer.Option(help="Name of the hand; default: the file's.")] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of the hand; default: hands/NAME in your data folder.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the hand of that name.")] = False,
+    urdf: Annotated[Path, Argument(metavar="URDF", help="URDF file of the hand.")],
+    name: Annotated[str | None, Option(help="Name of the hand; default: the file's.")] = None,
+    out: Annotated[Path | None, Option(help="Folder of the hand; default: hands/NAME in your data folder.")] = None,
+    force: Annotated[bool, Option("--force", help="Replace the hand of that name.")] = False,
 ) -> None:
     """Draft a hand from its URDF: fingers, palmar surface, canonical box, open posture.
 
@@ -91,12 +90,12 @@ def add_hand(
 @app.command("check")
 @reporting
 def check_hand(
-    name: Annotated[str, typer.Argument(help="Name of a hand, a URDF file, a folder, or a hand of a package.")],
-    out: Annotated[Path | None, typer.Option(help="Folder of the pictures; default: check/NAME.")] = None,
-    rows: Annotated[int, typer.Option("-n", "--rows", min=1, help="Grasps requested per object.")] = 200,
+    name: Annotated[str, Argument(help="Name of a hand, a URDF file, a folder, or a hand of a package.")],
+    out: Annotated[Path | None, Option(help="Folder of the pictures; default: check/NAME.")] = None,
+    rows: Annotated[int, Option("-n", "--rows", min=1, help="Grasps requested per object.")] = 200,
     pipeline: PipelineName = "robust",
     device: Device = "auto",
-    workers: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
+    workers: Annotated[int, Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
     cache_dir: CacheDir = None,
     quiet: Quiet = False,
 ) -> Answer:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.options import CacheDir, Device, Quiet, open_cache
 from lgrasp_cli.tables import Answer, Block, reporting
@@ -11,7 +12,7 @@ from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Predict coarse grasps from partial point clouds with a small network.", no_args_is_help=True)
 
-_Shards = Annotated[list[Path], typer.Argument(help="Shard files, or folders of them.")]
+_Shards = Annotated[list[Path], Argument(help="Shard files, or folders of them.")]
 
 
 @app.command()
@@ -19,14 +20,14 @@ _Shards = Annotated[list[Path], typer.Argument(help="Shard files, or folders of 
 def fit(
     shards: _Shards,
     how: How,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File of the predictor.")] = Path("coarse.pt"),
-    steps: Annotated[int | None, typer.Option(help="Training steps on poses alone; default: 1500.")] = None,
+    out: Annotated[Path, Option("--out", "-o", help="File of the predictor.")] = Path("coarse.pt"),
+    steps: Annotated[int | None, Option(help="Training steps on poses alone; default: 1500.")] = None,
     joint_steps: Annotated[
-        int | None, typer.Option(help="Training steps through the refiner afterwards; default: 80.")
+        int | None, Option(help="Training steps through the refiner afterwards; default: 80.")
     ] = None,
-    unrolled: Annotated[int | None, typer.Option(help="Unrolled steps of the refiner; default: 5.")] = None,
-    batch: Annotated[int | None, typer.Option(help="Seeds per training step; default: 64.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of clouds, weights and batches.")] = 0,
+    unrolled: Annotated[int | None, Option(help="Unrolled steps of the refiner; default: 5.")] = None,
+    batch: Annotated[int | None, Option(help="Seeds per training step; default: 64.")] = None,
+    seed: Annotated[int, Option(help="Seed of clouds, weights and batches.")] = 0,
 ) -> None:
     """Train a predictor on the grasps of shards, first on poses, then through unrolled steps of the refiner.
 
@@ -47,10 +48,10 @@ def fit(
 @app.command(name="eval")
 @reporting
 def evaluate(
-    predictor: Annotated[Path, typer.Argument(help="File written by lgrasp learn fit.")],
+    predictor: Annotated[Path, Argument(help="File written by lgrasp learn fit.")],
     shards: _Shards,
-    clouds: Annotated[int, typer.Option(min=1, help="New clouds per object.")] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the clouds.")] = 1,
+    clouds: Annotated[int, Option(min=1, help="New clouds per object.")] = 8,
+    seed: Annotated[int, Option(min=0, help="Seed of the clouds.")] = 1,
     device: Device = "auto",
     cache_dir: CacheDir = None,
     quiet: Quiet = False,

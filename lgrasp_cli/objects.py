@@ -3,6 +3,7 @@
 from typing import Annotated
 
 import typer
+from typer import Argument
 
 from lgrasp_cli.options import Scale
 from lgrasp_cli.tables import Answer, TextTable, reporting
@@ -27,8 +28,7 @@ def list_objects() -> Answer:
 @app.command("show")
 @reporting
 def show_object(
-    mesh: Annotated[str, typer.Argument(metavar="NAME", help="Mesh file, or the name of an object.")],
-    scale: Scale = 1.0,
+    mesh: Annotated[str, Argument(metavar="NAME", help="Mesh file, or the name of an object.")], scale: Scale = 1.0
 ) -> Answer:
     """Check a mesh; report its properties and needed repairs.
 

@@ -6,36 +6,35 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
     from lgrasp.engine.pipeline import Pipeline
 
-Hand = Annotated[str, typer.Option("--hand", help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
-Mesh = Annotated[str, typer.Option("--object", "-o", help="Mesh file, or the name of an object.")]
-PipelineName = Annotated[str, typer.Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.")]
-Seed = Annotated[int | None, typer.Option(help="Base seed; default: the pipeline's.")]
-Scale = Annotated[float, typer.Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda:N.")]
-Physics = Annotated[str | None, typer.Option(hidden=True)]
+Hand = Annotated[str, Option("--hand", help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
+Mesh = Annotated[str, Option("--object", "-o", help="Mesh file, or the name of an object.")]
+PipelineName = Annotated[str, Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.")]
+Seed = Annotated[int | None, Option(help="Base seed; default: the pipeline's.")]
+Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
+Device = Annotated[str, Option(help="auto, cpu or cuda:N.")]
+Physics = Annotated[str | None, Option(hidden=True)]
 """The name of ``--simulate`` in the release before."""
-CacheDir = Annotated[Path | None, typer.Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.")]
-Contacts = Annotated[str | None, typer.Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.")]
+CacheDir = Annotated[Path | None, Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.")]
+Contacts = Annotated[str | None, Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.")]
 JsonPath = Annotated[
     str | None,
-    typer.Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
+    Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
 ]
 Settings = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--set",
         metavar="PART.KEY=VALUE",
         help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.",
     ),
 ]
-Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Print no progress and no report, only warnings and errors.")
-]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="Print no progress and no report, only warnings and errors.")]
 
 
 def check_report(path: str | None) -> None:

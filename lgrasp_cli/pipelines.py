@@ -3,6 +3,7 @@
 from typing import Annotated
 
 import typer
+from typer import Argument
 
 from lgrasp_cli.tables import Answer, TextTable, reporting
 
@@ -25,7 +26,7 @@ def list_pipelines() -> Answer:
 
 @app.command("show")
 @reporting
-def show_pipeline(name: Annotated[str, typer.Argument(help="Name of a pipeline, or a YAML file.")]) -> Answer:
+def show_pipeline(name: Annotated[str, Argument(help="Name of a pipeline, or a YAML file.")]) -> Answer:
     """Show every parameter of a pipeline with its value and meaning.
 
     Example: lgrasp pipelines show swift

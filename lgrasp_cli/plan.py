@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
 from lgrasp_cli.options import Scale, Settings
 from lgrasp_cli.tables import Block
@@ -18,31 +19,29 @@ def register(app: typer.Typer) -> None:
 def plan(
     how: How,
     mesh: Annotated[
-        str | None, typer.Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.")
+        str | None, Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.")
     ] = None,
-    cloud: Annotated[Path | None, typer.Option(help="Point cloud or scene (.ply .xyz .npy .npz .h5).")] = None,
-    mask: Annotated[Path | None, typer.Option(help="Labels of the cloud's points (.npy, .npz).")] = None,
-    label: Annotated[int | None, typer.Option(help="Label of the points to grasp.")] = None,
+    cloud: Annotated[Path | None, Option(help="Point cloud or scene (.ply .xyz .npy .npz .h5).")] = None,
+    mask: Annotated[Path | None, Option(help="Labels of the cloud's points (.npy, .npz).")] = None,
+    label: Annotated[int | None, Option(help="Label of the points to grasp.")] = None,
     viewpoint: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")
+        str | None, Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")
     ] = None,
     scale: Scale = 1.0,
     hand: Annotated[
-        str, typer.Option(help="Name of a hand, a URDF file, a folder with hand.yaml, or a shard (its hand).")
+        str, Option(help="Name of a hand, a URDF file, a folder with hand.yaml, or a shard (its hand).")
     ] = "barrett",
-    starts: Annotated[int, typer.Option("--starts", "-n", help="Points of the surface to start from.")] = 80,
+    starts: Annotated[int, Option("--starts", "-n", help="Points of the surface to start from.")] = 80,
     stand_off: Annotated[
-        float | None, typer.Option(help="Distance of the hand's base from a start [m]; default: the hand's.")
+        float | None, Option(help="Distance of the hand's base from a start [m]; default: the hand's.")
     ] = None,
-    distal: Annotated[float, typer.Option(help="Weight of the palmar side of the last links.")] = 1.0,
-    other: Annotated[
-        float, typer.Option(help="Weight of the rest of the palmar side; a small value gives pinches.")
-    ] = 0.2,
+    distal: Annotated[float, Option(help="Weight of the palmar side of the last links.")] = 1.0,
+    other: Annotated[float, Option(help="Weight of the rest of the palmar side; a small value gives pinches.")] = 0.2,
     keep_invalid: Annotated[
-        bool, typer.Option("--keep-invalid", help="Keep the best of a start that fails a check, with metric 'valid' 0.")
+        bool, Option("--keep-invalid", help="Keep the best of a start that fails a check, with metric 'valid' 0.")
     ] = False,
     settings: Settings = None,
-    out: Annotated[Path | None, typer.Option(help="Folder; default: plans/HAND-OBJECT.")] = None,
+    out: Annotated[Path | None, Option(help="Folder; default: plans/HAND-OBJECT.")] = None,
 ) -> None:
     """Plan grasps by closing an open hand onto a mesh or point cloud with a local search.
 

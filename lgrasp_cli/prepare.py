@@ -3,11 +3,12 @@
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.options import CacheDir, Device, PipelineName, Scale, choose_pipeline, open_cache
 from lgrasp_cli.tables import Answer, reporting
 
-_Force = Annotated[bool, typer.Option("--force", help="Rebuild it even if it is cached.")]
+_Force = Annotated[bool, Option("--force", help="Rebuild it even if it is cached.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -18,8 +19,8 @@ def register(app: typer.Typer) -> None:
 
 
 def build_field(
-    hand: Annotated[str, typer.Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")],
-    index: Annotated[str | None, typer.Option(help="voxel or bvh; default: the pipeline's.")] = None,
+    hand: Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")],
+    index: Annotated[str | None, Option(help="voxel or bvh; default: the pipeline's.")] = None,
     pipeline: PipelineName = "robust",
     device: Device = "auto",
     cache_dir: CacheDir = None,
@@ -53,7 +54,7 @@ def build_field(
 
 
 def preprocess(
-    mesh: Annotated[str, typer.Argument(metavar="OBJECT", help="Mesh file, or the name of an object.")],
+    mesh: Annotated[str, Argument(metavar="OBJECT", help="Mesh file, or the name of an object.")],
     scale: Scale = 1.0,
     pipeline: PipelineName = "robust",
     cache_dir: CacheDir = None,

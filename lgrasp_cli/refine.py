@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from lgrasp.notices import notice
 from lgrasp_cli.options import Settings
@@ -17,30 +18,26 @@ def register(app: typer.Typer) -> None:
 
 
 def refine(
-    shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of them; or one export.")],
+    shards: Annotated[list[Path], Argument(help="Shard files, or folders of them; or one export.")],
     how: How,
-    out: Annotated[Path, typer.Option(help="Folder of the refined shards.")],
+    out: Annotated[Path, Option(help="Folder of the refined shards.")],
     form: Annotated[
-        str | None,
-        typer.Option("--from", help="Format of the grasps: dexgraspnet, dexgraspbench, isaac-grasp or mjcf."),
+        str | None, Option("--from", help="Format of the grasps: dexgraspnet, dexgraspbench, isaac-grasp or mjcf.")
     ] = None,
     hand: Annotated[
-        str | None, typer.Option(help="Hand of the grasps, for formats without one; shards contain theirs.")
+        str | None, Option(help="Hand of the grasps, for formats without one; shards contain theirs.")
     ] = None,
-    matching_rounds: Annotated[
-        int | None, typer.Option(help="Number of times that nearest points are matched.")
-    ] = None,
-    gradient_steps: Annotated[int | None, typer.Option(help="Gradient steps after each matching.")] = None,
-    outer: Annotated[int | None, typer.Option(hidden=True)] = None,
-    inner: Annotated[int | None, typer.Option(hidden=True)] = None,
+    matching_rounds: Annotated[int | None, Option(help="Number of times that nearest points are matched.")] = None,
+    gradient_steps: Annotated[int | None, Option(help="Gradient steps after each matching.")] = None,
+    outer: Annotated[int | None, Option(hidden=True)] = None,
+    inner: Annotated[int | None, Option(hidden=True)] = None,
     coarse: Annotated[
-        bool, typer.Option("--coarse", help="Use large steps and a long range, for poses that are far from a grasp.")
+        bool, Option("--coarse", help="Use large steps and a long range, for poses that are far from a grasp.")
     ] = False,
     keep_invalid: Annotated[
-        bool,
-        typer.Option("--keep-invalid", help="Keep the refined posture of rows that never pass, with metric 'valid' 0."),
+        bool, Option("--keep-invalid", help="Keep the refined posture of rows that never pass, with metric 'valid' 0.")
     ] = False,
-    always: Annotated[bool, typer.Option("--always", hidden=True)] = False,
+    always: Annotated[bool, Option("--always", hidden=True)] = False,
     settings: Settings = None,
 ) -> None:
     """Improve grasps by gradient descent on the surface matching energy, check them again, and write shards.

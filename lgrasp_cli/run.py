@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.generate import show_plans
 from lgrasp_cli.options import check_report
@@ -20,15 +21,13 @@ def register(app: typer.Typer) -> None:
 
 
 def run(
-    config: Annotated[str, typer.Argument(help="Config file, or the name of a config.")],
+    config: Annotated[str, Argument(help="Config file, or the name of a config.")],
     how: How,
-    rows: Annotated[int | None, typer.Option("-n", "--rows", help="Replaces rows.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Replaces out.")] = None,
-    object_dir: Annotated[Path | None, typer.Option(help="Replaces object_dir.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Replaces seed.")] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be computed without computing it.")
-    ] = False,
+    rows: Annotated[int | None, Option("-n", "--rows", help="Replaces rows.")] = None,
+    out: Annotated[Path | None, Option(help="Replaces out.")] = None,
+    object_dir: Annotated[Path | None, Option(help="Replaces object_dir.")] = None,
+    seed: Annotated[int | None, Option(help="Replaces seed.")] = None,
+    dry_run: Annotated[bool, Option("--dry-run", help="Show what would be computed without computing it.")] = False,
 ) -> None:
     """Run the job of a config, or one job for every hand, object and pipeline that it names.
 

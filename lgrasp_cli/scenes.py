@@ -4,13 +4,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, counted, reporting
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Objects on tables, with point clouds, masks and feasible grasps.", no_args_is_help=True)
 
-_Paths = Annotated[list[Path], typer.Argument(help="Scene files, or folders of *.h5 files.")]
+_Paths = Annotated[list[Path], Argument(help="Scene files, or folders of *.h5 files.")]
 
 
 @app.command()
@@ -18,22 +19,22 @@ _Paths = Annotated[list[Path], typer.Argument(help="Scene files, or folders of *
 def make(
     how: How,
     objects: Annotated[
-        list[str] | None, typer.Argument(help="Names or mesh files of objects; or one config of scenes.")
+        list[str] | None, Argument(help="Names or mesh files of objects; or one config of scenes.")
     ] = None,
-    hand: Annotated[str | None, typer.Option(help="Hand; default: that of --grasps, else allegro.")] = None,
-    scenes: Annotated[int | None, typer.Option("-n", "--scenes", help="Scenes requested; default: 100.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the scenes; default: scenes.")] = None,
+    hand: Annotated[str | None, Option(help="Hand; default: that of --grasps, else allegro.")] = None,
+    scenes: Annotated[int | None, Option("-n", "--scenes", help="Scenes requested; default: 100.")] = None,
+    out: Annotated[Path | None, Option(help="Folder of the scenes; default: scenes.")] = None,
     grasps: Annotated[
-        Path | None, typer.Option(help="Folder of shards (lgrasp generate); default: grasps are generated.")
+        Path | None, Option(help="Folder of shards (lgrasp generate); default: grasps are generated.")
     ] = None,
     pipeline: Annotated[
-        str | None, typer.Option("--pipeline", "-p", help="Pipeline that generates the grasps; default: swift.")
+        str | None, Option("--pipeline", "-p", help="Pipeline that generates the grasps; default: swift.")
     ] = None,
-    stock: Annotated[int | None, typer.Option(help="Grasps generated of each object; default: 1000.")] = None,
-    on_table: Annotated[int | None, typer.Option(help="Objects on a table; default: 5.")] = None,
-    views: Annotated[int | None, typer.Option(help="Depth cameras; default: 3.")] = None,
-    scale: Annotated[float | None, typer.Option(help="Factor from the meshes' unit to metres.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Base seed; default: 0.")] = None,
+    stock: Annotated[int | None, Option(help="Grasps generated of each object; default: 1000.")] = None,
+    on_table: Annotated[int | None, Option(help="Objects on a table; default: 5.")] = None,
+    views: Annotated[int | None, Option(help="Depth cameras; default: 3.")] = None,
+    scale: Annotated[float | None, Option(help="Factor from the meshes' unit to metres.")] = None,
+    seed: Annotated[int | None, Option(help="Base seed; default: 0.")] = None,
 ) -> None:
     """Drop objects on a table, render depth cameras, add grasps and write one file per scene.
 

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.options import Hand, Physics, Seed, Settings, choose_pipeline, choose_protocol
 from lgrasp_cli.tables import Block, TextTable, counted, place, share
@@ -16,29 +17,27 @@ def register(app: typer.Typer) -> None:
 
 
 def sequence(
-    objects: Annotated[list[str], typer.Argument(help="Mesh files or names of objects, in the order of grasping.")],
+    objects: Annotated[list[str], Argument(help="Mesh files or names of objects, in the order of grasping.")],
     how: How,
     hand: Hand = "allegro",
-    rows: Annotated[int, typer.Option("-n", "--rows", help="Complete sequences requested.")] = 256,
-    method: Annotated[str | None, typer.Option(help="field, anneal or mala; default: the pipeline's.")] = None,
-    policy: Annotated[str | None, typer.Option(help="uniform or lookahead; default: the pipeline's.")] = None,
+    rows: Annotated[int, Option("-n", "--rows", help="Complete sequences requested.")] = 256,
+    method: Annotated[str | None, Option(help="field, anneal or mala; default: the pipeline's.")] = None,
+    policy: Annotated[str | None, Option(help="uniform or lookahead; default: the pipeline's.")] = None,
     scale: Annotated[
-        str, typer.Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")
+        str, Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")
     ] = "1",
     simulate: Annotated[
-        str | None, typer.Option(help="Continue only rows that hold in simulation: seq6 or seq6_mu06.")
+        str | None, Option(help="Continue only rows that hold in simulation: seq6 or seq6_mu06.")
     ] = None,
     physics: Physics = None,
     pipeline: Annotated[
-        str, typer.Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.")
+        str, Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.")
     ] = "sequence",
     settings: Settings = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT...")
-    ] = None,
+    out: Annotated[Path | None, Option(help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT...")] = None,
     seed: Seed = None,
     shard_rows: Annotated[
-        int, typer.Option(help="Sequences per shard. Changing it changes which sequences are generated.")
+        int, Option(help="Sequences per shard. Changing it changes which sequences are generated.")
     ] = 1000,
 ) -> None:
     """Grasp several objects one after another, each with joints that are still free, and write shards.

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from lgrasp_cli.options import old_name, warn
 from lgrasp_cli.tables import Block, TextTable, place, share
@@ -19,17 +20,17 @@ def register(app: typer.Typer) -> None:
 
 
 def simulate(
-    shards: Annotated[list[Path], typer.Argument(help="Shard files, or folders of *.h5 files.")],
+    shards: Annotated[list[Path], Argument(help="Shard files, or folders of *.h5 files.")],
     how: How,
     protocol: Annotated[
-        str, typer.Option("--protocol", "-p", help="Protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06.")
+        str, Option("--protocol", "-p", help="Protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06.")
     ] = "fc",
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the results; default: that of the shards with -PROTOCOL added.")
+        Path | None, Option(help="Folder of the results; default: that of the shards with -PROTOCOL added.")
     ] = None,
-    threads: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
+    threads: Annotated[int | None, Option(min=0, hidden=True)] = None,
     all_directions: Annotated[
-        bool, typer.Option("--all-directions", help="Continue after the first direction in which an object is lost.")
+        bool, Option("--all-directions", help="Continue after the first direction in which an object is lost.")
     ] = False,
 ) -> None:
     """Simulate grasps with MuJoCo and write copies of the shards with the verdicts added.

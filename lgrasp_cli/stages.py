@@ -3,6 +3,7 @@
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from lgrasp_cli.options import (
     CacheDir,
@@ -40,14 +41,14 @@ def _verb(stage: str):
         mesh: Mesh,
         hand: Hand = "allegro",
         pipeline: PipelineName = "robust",
-        candidates: Annotated[int, typer.Option(help="Candidates in the batch.")] = 1024,
-        first: Annotated[int, typer.Option(help="First candidate of the batch.")] = 0,
-        shard_index: Annotated[int, typer.Option(help="Shard whose candidate stream is used.")] = 0,
+        candidates: Annotated[int, Option(help="Candidates in the batch.")] = 1024,
+        first: Annotated[int, Option(help="First candidate of the batch.")] = 0,
+        shard_index: Annotated[int, Option(help="Shard whose candidate stream is used.")] = 0,
         seed: Seed = None,
         contacts: Contacts = None,
         scale: Scale = 1.0,
         device: Device = "auto",
-        force: Annotated[bool, typer.Option("--force", help="Run every stage again.")] = False,
+        force: Annotated[bool, Option("--force", help="Run every stage again.")] = False,
         cache_dir: CacheDir = None,
     ) -> Answer:
         cache = open_cache(cache_dir, fresh=force)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache, warn
 from lgrasp_cli.tables import Block, plural, print_report, with_options
@@ -15,26 +16,23 @@ if TYPE_CHECKING:
     from lgrasp.engine.run import Job, JobOutcome
 
 _OPTIONS: dict[str, tuple[Any, Any]] = {
-    "device": (Annotated[str | None, typer.Option(help="auto, cpu or cuda:N.")], None),
-    "workers": (Annotated[int | None, typer.Option(min=0, help="Threads or processes; 0: by device.")], None),
+    "device": (Annotated[str | None, Option(help="auto, cpu or cuda:N.")], None),
+    "workers": (Annotated[int | None, Option(min=0, help="Threads or processes; 0: by device.")], None),
     "shard_index": (
         Annotated[
             int | None,
-            typer.Option(help="Number of this array task, which makes every NUMth file; default: SLURM_ARRAY_TASK_ID."),
+            Option(help="Number of this array task, which makes every NUMth file; default: SLURM_ARRAY_TASK_ID."),
         ],
         None,
     ),
-    "num_shards": (
-        Annotated[int | None, typer.Option(help="Number of array tasks; default: SLURM_ARRAY_TASK_COUNT.")],
-        None,
-    ),
+    "num_shards": (Annotated[int | None, Option(help="Number of array tasks; default: SLURM_ARRAY_TASK_COUNT.")], None),
     "overwrite": (
-        Annotated[bool, typer.Option("--overwrite", help="Replace existing files; by default complete ones are kept.")],
+        Annotated[bool, Option("--overwrite", help="Replace existing files; by default complete ones are kept.")],
         False,
     ),
-    "rebuild": (Annotated[bool, typer.Option("--rebuild", help="Rebuild cached inputs.")], False),
-    "resume": (Annotated[bool, typer.Option("--resume/--no-resume", hidden=True)], True),
-    "force": (Annotated[bool, typer.Option("--force", hidden=True)], False),
+    "rebuild": (Annotated[bool, Option("--rebuild", help="Rebuild cached inputs.")], False),
+    "resume": (Annotated[bool, Option("--resume/--no-resume", hidden=True)], True),
+    "force": (Annotated[bool, Option("--force", hidden=True)], False),
     "json_path": (JsonPath, None),
     "cache_dir": (CacheDir, None),
     "quiet": (Quiet, False),
