@@ -7,7 +7,20 @@ import typer
 from typer import Argument, Option
 
 from lgrasp_cli.interrupt import before_end
-from lgrasp_cli.options import CacheDir, Device, Hand, JsonPath, Physics, Settings, check_report, open_cache, warn
+from lgrasp_cli.options import (
+    CacheDir,
+    Device,
+    Hand,
+    JsonPath,
+    Settings,
+    Workers,
+    check_report,
+    choose_pipeline,
+    given,
+    open_cache,
+    split,
+    warn,
+)
 from lgrasp_cli.progress import say
 from lgrasp_cli.tables import Block, TextTable, print_report
 
@@ -23,7 +36,6 @@ _List = Annotated[str | None, Option(help="Names or files, separated by commas."
 _ObjectDir = Annotated[Path | None, Option(help="Folder where the names of objects are looked up first.")]
 _Repeat = Annotated[int, Option(min=1, help="Runs of each pipeline and object.")]
 _Seed = Annotated[int | None, Option(help="Base seed; default: the pipelines'.")]
-_Workers = Annotated[int, Option(min=0, help="Threads; 0: all cores (1 on a GPU).")]
 
 
 @app.callback()
@@ -38,7 +50,7 @@ def bench(
     settings: Settings = None,
     seed: _Seed = None,
     device: Device = "auto",
-    workers: _Workers = 0,
+    workers: Workers = 0,
     json_path: JsonPath = None,
 ) -> None:
     """Compare pipelines by strict-valid grasps per second, from placement through filter.
@@ -55,21 +67,11 @@ def bench(
     from lgrasp.config import parse_model
     from lgrasp.jobs.config import JobConfig
 
-    given = {
-        "hands": [hand],
-        "objects": _split(objects),
-        "object_dir": object_dir,
-        "pipelines": _split(pipelines),
-        "rows": rows,
-        "settings": settings or (),
-        "seed": seed,
-        "device": device,
-        "workers": workers,
-    }
-    config = parse_model(JobConfig, given, "bench")
+    what = given(hands=[hand], objects=split(objects), object_dir=object_dir, pipelines=split(pipelines), rows=rows)
+    how = given(settings=settings, seed=seed, device=device, workers=workers)
+    config = parse_model(JobConfig, what | how, "bench")
     check_report(json_path)
-    table = _measure(new_table(config, repeat=repeat, baseline_rows=rows), config, cache)
-    _print_comparison(table, json_path)
+    _print_comparison(_measure(new_table(config, repeat=repeat, baseline_rows=rows), config, cache), json_path)
 
 
 @app.command()
@@ -92,9 +94,10 @@ def table1(
     shard_rows: Annotated[
         int | None, Option(min=1, help="Rows of a shard; large ones fill a GPU.", show_default="10000")
     ] = None,
+    settings: Settings = None,
     seed: _Seed = None,
     device: Device = "auto",
-    workers: _Workers = 0,
+    workers: Workers = 0,
     json_path: JsonPath = None,
     plot: Annotated[Path | None, Option(metavar="FILE.png", help="Also draw the table as bars.")] = None,
     resume: Annotated[bool, Option("--resume", help="Keep the cells that --json PATH holds.")] = False,
@@ -108,26 +111,17 @@ def table1(
     """
     cache = open_cache(None)
     from lgrasp.bench.charts import check_plot, draw_table
-    from lgrasp.bench.comparison import new_table, read_table
+    from lgrasp.bench.comparison import new_table, read_table, without_missing
     from lgrasp.bench.page import load_published
     from lgrasp.config import parse_model
     from lgrasp.errors import ConfigError
     from lgrasp.jobs.config import JobConfig, load_config
 
-    changes = {
-        "hands": hands and _split(hands),
-        "objects": objects and _split(objects),
-        "hand_dir": hand_dir,
-        "object_dir": object_dir,
-        "pipelines": pipelines and _split(pipelines),
-        "rows": rows,
-        "shard_rows": shard_rows,
-        "seed": seed,
-        "device": device,
-        "workers": workers,
-    }
-    given = {name: value for name, value in changes.items() if value is not None}
-    config = parse_model(JobConfig, load_config("table1").model_dump() | given, "bench table1")
+    names = {"hands": hands, "objects": objects, "pipelines": pipelines}
+    what = {name: split(text) for name, text in names.items() if text}
+    what |= given(hand_dir=hand_dir, object_dir=object_dir, rows=rows, shard_rows=shard_rows)
+    how = given(settings=settings, seed=seed, device=device, workers=workers)
+    config = parse_model(JobConfig, load_config("table1").model_dump() | what | how, "bench table1")
     file = None if json_path in (None, "-") else json_path
     if resume and not file:
         raise ConfigError("--resume needs the file to continue: --json PATH")
@@ -135,7 +129,9 @@ def table1(
     if plot:
         check_plot(plot)
     if not objects:
-        config = _those_here(config)
+        config, missing = without_missing(config)
+        if missing:
+            warn(f"left out {', '.join(missing)}: not shipped with lgrasp; --object-dir names a folder that has them")
     baseline = baseline_rows or max(1, config.rows // 10)
     table = new_table(config, repeat=repeat, baseline_rows=baseline, published=load_published("lightning"))
     if resume and file:
@@ -163,14 +159,14 @@ def bench_sequence(
     ] = None,
     policy: Annotated[str, Option(help="uniform, as published, or lookahead.")] = "uniform",
     simulate: Annotated[str, Option(help="Protocol: seq6 (friction 2.0, as published) or seq6_mu06.")] = "seq6",
-    physics: Physics = None,
     scale: Annotated[str, Option(help="Factor to metres, or range of the longest side [m].")] = "0.06:0.10",
     pipeline: Annotated[
         str, Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.")
     ] = "sequence",
+    settings: Settings = None,
     seed: Annotated[int, Option(min=0, help="Seed of the sequences and the grasps.")] = 0,
     device: Device = "auto",
-    workers: _Workers = 0,
+    workers: Workers = 0,
     json_path: JsonPath = None,
     cache_dir: CacheDir = None,
 ) -> None:
@@ -186,29 +182,18 @@ def bench_sequence(
     from lgrasp.config import parse_model
     from lgrasp.jobs.sequence.job import SequenceJob
     from lgrasp.jobs.sets import SequenceSets, object_sequences
-    from lgrasp_cli.options import choose_pipeline, choose_protocol
 
     pool = objects or ["mug", "sphere", "box", "capsule", "bottle", "bowl"]
     sets = parse_model(SequenceSets, {"sets": sequences, "length": length, "permutations": 1}, "bench sequence")
-    chosen, protocol = choose_pipeline(pipeline, seed), choose_protocol(simulate, physics) or simulate
-    optimiser = chosen.params("sequence").optimiser.model_dump() | ({"iterations": iterations} if iterations else {})
+    chosen = choose_pipeline(pipeline, seed, settings=settings)
+    optimiser = chosen.params("sequence").optimiser.model_dump() | given(iterations=iterations)
     chosen = chosen.with_params("sequence", policy=policy, width=width, optimiser=optimiser)
+    how: dict[str, Any] = {"scale": scale, "simulate": simulate, "device": device, "workers": workers, "cache": cache}
     jobs = [
-        SequenceJob(
-            hand=hand,
-            objects=names,
-            rows=1,
-            pipeline=chosen,
-            out=Path("."),
-            scale=scale,
-            simulate=protocol,
-            device=device,
-            workers=workers,
-            cache=cache,
-        )
+        SequenceJob(hand=hand, objects=names, rows=1, pipeline=chosen, out=Path("."), **how)
         for names in object_sequences(pool, sets, seed)
     ]
-    result = bench_methods(jobs, _split(methods), baseline_width, say)
+    result = bench_methods(jobs, split(methods), baseline_width, say) | {"set": settings or []}
     _print(result, json_path, sequence_page(result))
 
 
@@ -218,8 +203,15 @@ def bench_refine(
     objects: Annotated[str, Option(help="Names or mesh files, separated by commas.")] = "bowl,box,bottle,mug",
     starts: Annotated[int, Option("--starts", "-n", min=1, help="Starts on each object.")] = 80,
     simulate: Annotated[str, Option(help="Protocol that decides which plans are valid.")] = "fc",
-    physics: Physics = None,
     noise: Annotated[bool, Option("--noise/--no-noise", help="Also measure table IV: clouds with noise.")] = True,
+    settings: Annotated[
+        list[str] | None,
+        Option(
+            "--set",
+            metavar="PART.KEY=VALUE",
+            help="Set a parameter of the plans, such as bounds.friction=0.8 or plan.finalists=5; repeatable.",
+        ),
+    ] = None,
     device: Device = "auto",
     json_path: JsonPath = None,
     cache_dir: CacheDir = None,
@@ -234,26 +226,19 @@ def bench_refine(
     check_report(json_path)
     cache = open_cache(cache_dir)
     from lgrasp.bench.refine import NOISES, bench_hands, refine_page
-    from lgrasp_cli.options import choose_protocol
+    from lgrasp.jobs.refine.settings import plan_params
 
-    noises, protocol = NOISES if noise else (), choose_protocol(simulate, physics) or simulate
-    result = bench_hands(
-        _split(hands), _split(objects), starts, protocol, noises=noises, device=device, cache=cache, progress=say
-    )
+    how = {"params": plan_params(settings or ()), "noises": NOISES if noise else (), "device": device, "cache": cache}
+    result = bench_hands(split(hands), split(objects), starts, simulate, progress=say, **how)
+    result["set"] = settings or []
     _print(result, json_path, refine_page(result))
-
-
-def _split(names: str) -> list[str]:
-    return [name.strip() for name in names.split(",")]
 
 
 def _print(result: Any, json_path: str | None, page: "Page") -> None:
     blocks: list[Block] = [*page.head]
     for table in page.tables:
-        blocks += [
-            f"\n{table.title}" if table.title else "",
-            TextTable(table.columns, table.rows, table.columns[table.texts :]),
-        ]
+        title = f"\n{table.title}" if table.title else ""
+        blocks += [title, TextTable(table.columns, table.rows, table.columns[table.texts :])]
     print_report(result, json_path, [*blocks, "", *page.notes])
 
 
@@ -263,16 +248,6 @@ def _refuse_options(context: typer.Context) -> None:
     if any(source is not None and source.name == "COMMANDLINE" for source in sources.values()):
         name = context.invoked_subcommand
         raise typer.BadParameter(f"options of 'bench {name}' come after its name: lgrasp bench {name} --device cpu")
-
-
-def _those_here(config: "JobConfig") -> "JobConfig":
-    """The config without the objects that are not here, with a warning."""
-    from lgrasp.bench.comparison import without_missing
-
-    config, missing = without_missing(config)
-    if missing:
-        warn(f"left out {', '.join(missing)}: not shipped with lgrasp; --object-dir names a folder that has them")
-    return config
 
 
 def _measure(table: "Comparison", config: "JobConfig", cache: "Cache", file: str | None = None) -> "Comparison":

@@ -1,23 +1,23 @@
-"""``lgrasp dataset``: look at, check and merge grasp files."""
+"""``lgrasp dataset`` and ``export``: look at, check, merge and convert grasp files."""
 
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
-from lgrasp_cli.options import Quiet, old_name, warn
+from lgrasp_cli.options import Quiet, Shards, old_name, split, warn
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, plural, reporting
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(help="Inspect, check and merge grasp files (shards).", no_args_is_help=True)
 
-_Paths = Annotated[list[Path], Argument(help="Shard files, or folders of *.h5 files.")]
-
 
 @app.command()
 @reporting
-def info(paths: _Paths) -> Answer:
+def info(paths: Shards) -> Answer:
     """Show rows, hand, objects, pipeline, size and metrics of each shard; for sequences, rows by number of objects.
 
     Example: lgrasp dataset info out/mug
@@ -35,7 +35,7 @@ def info(paths: _Paths) -> Answer:
 
 @app.command()
 @reporting
-def check(paths: _Paths) -> Answer:
+def check(paths: Shards) -> Answer:
     """Check every byte and value of each shard against the format; exit code 2 if one has a problem.
 
     Example: lgrasp dataset check out/mug
@@ -50,7 +50,7 @@ app.command("validate", hidden=True)(old_name(check, "lgrasp dataset validate", 
 
 @app.command()
 def merge(
-    paths: _Paths,
+    paths: Shards,
     out: Annotated[Path, Option("--out", "-o", help="File to write.")],
     manifest: Annotated[
         Path | None, Option(help="List of shards to check against; by default manifest.json of a single folder.")
@@ -69,7 +69,7 @@ def merge(
 @app.command()
 @working
 def metrics(
-    paths: _Paths,
+    paths: Shards,
     how: How,
     add: Annotated[str, Option(help="Metrics, separated by commas: volume, epsilon_exact.")],
     out: Annotated[Path, Option("--out", "-o", help="Folder of the new shards.")],
@@ -90,9 +90,8 @@ def metrics(
     """
     from lgrasp.jobs.metrics import MetricsJob
 
-    names = tuple(name.strip() for name in add.split(","))
-    job = how.job(MetricsJob, "dataset metrics", shards=paths, out=out, add=names, settings=settings)
-    how.run(job, _show_metrics)
+    what = {"shards": paths, "out": out, "add": split(add), "settings": settings}
+    how.run(how.job(MetricsJob, "dataset metrics", **what), _show_metrics)
 
 
 def _show_metrics(data: dict[str, Any]) -> list[Block]:
@@ -104,7 +103,7 @@ def _show_metrics(data: dict[str, Any]) -> list[Block]:
 @app.command()
 @reporting
 def report(
-    paths: _Paths,
+    paths: Shards,
     out: Annotated[Path, Option("--out", "-o", help="HTML file to write.")] = Path("report.html"),
     quiet: Quiet = False,
 ) -> Answer:
@@ -128,29 +127,30 @@ def report(
 
 def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
     groups = [group for hand in numbers["hands"] for group in hand["objects"]]
-    over = {}
-    for group in groups:
-        for name, metric in group["metrics"].items():
-            over[name] = over.get(name, 0) + (metric["over_bound"] or 0)
-    above = ", ".join(f"{name} {count:,}" for name, count in over.items() if count)
+    over = _sums({name: metric["over_bound"] or 0 for name, metric in group["metrics"].items()} for group in groups)
+    held = _sums({n: group["rows"] for n, group in hand["held"].items()} for hand in numbers["hands"])
     near = sum(group["near_duplicates"]["duplicates"] for group in groups)
     pairs = [
         ("grasps", f"{numbers['rows']:,} in {plural(numbers['shards'], 'shard')}, {numbers['bytes'] / 1e6:,.1f} MB"),
         ("hands", ", ".join(f"{h['hand']} ({plural(len(h['objects']), 'object')})" for h in numbers["hands"])),
-        ("above a strict bound", above or "none"),
+        ("above a strict bound", ", ".join(f"{name} {count:,}" for name, count in over.items() if count) or "none"),
         ("near-duplicates", f"{near:,}"),
         ("distinct poses", f"{sum(group['distinct_poses'] for group in groups):,}"),
     ]
-    held: dict[str, int] = {}
-    for hand in numbers["hands"]:
-        for n, group in hand["held"].items():
-            held[n] = held.get(n, 0) + group["rows"]
     if set(held) - {"1"}:
         pairs.append(("objects in the hand", ", ".join(f"{n}: {rows:,}" for n, rows in sorted(held.items()))))
     for name in sorted({name for group in groups for name in group["physics"]}):
         found = [group["physics"][name] for group in groups if name in group["physics"]]
         pairs.append((f"hold in {name}", f"{sum(f['held'] for f in found):,} of {sum(f['run'] for f in found):,}"))
     return [*pairs, ("where", str(out))]
+
+
+def _sums(parts: Iterable[dict[str, int]]) -> Counter[str]:
+    """The numbers of the parts by name, in the order in which the names come."""
+    total: Counter[str] = Counter()
+    for part in parts:
+        total.update(part)
+    return total
 
 
 def _shard_table(shards: list[dict[str, Any]]) -> TextTable:
@@ -188,8 +188,37 @@ def _metric_table(shards: list[dict[str, Any]]) -> TextTable:
 
 def _count_table(shards: list[dict[str, Any]], what: str, key: str) -> TextTable:
     """Rows of all shards by the names under ``key``."""
-    counts: dict[str, int] = {}
-    for s in shards:
-        for name, rows in (s[key] or {}).items():
-            counts[name] = counts.get(name, 0) + rows
+    counts = _sums(s[key] or {} for s in shards)
     return TextTable((what, "rows"), [(name, f"{rows:,}") for name, rows in counts.items()], right=("rows",))
+
+
+@working
+def export(
+    shards: Shards,
+    how: How,
+    to: Annotated[str, Option(help="dexgraspnet, dexgraspbench, isaac-grasp or mjcf.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write; it must be empty or not exist yet.")],
+    limit: Annotated[int | None, Option(help="Largest number of grasps.")] = None,
+    where: Annotated[
+        list[str] | None,
+        Option(
+            help="Only rows that meet a condition: a column, or COLUMN OP NUMBER, such as objects == 1; repeatable."
+        ),
+    ] = None,
+    only_holding: Annotated[
+        bool, Option("--only-holding", help="Only grasps that held in simulation; same as --where physics/fc_holds.")
+    ] = False,
+) -> None:
+    """Write grasps in the format of another program, with the hand's URDF and all meshes.
+
+    Example: lgrasp export grasps/allegro-mug --to isaac-grasp --out mug-isaac --where "metrics/epsilon > 0.01"
+    """
+    from lgrasp.dataset.exports import HOLDS
+    from lgrasp.jobs.export import ExportJob
+
+    conditions = [*(where or ()), *([HOLDS] if only_holding else ())]
+    how.run(how.job(ExportJob, "export", shards=shards, out=out, to=to, where=conditions, limit=limit), _show_export)
+
+
+def _show_export(data: dict[str, Any]) -> list[Block]:
+    return [f"{data['out']}: {data['grasps']:,} grasps of {plural(len(data['objects']), 'object')}, {data['format']}"]

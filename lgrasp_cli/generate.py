@@ -3,21 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from typer import Option
 
-from lgrasp_cli.options import (
-    Contacts,
-    Hand,
-    Mesh,
-    Physics,
-    PipelineName,
-    Scale,
-    Seed,
-    Settings,
-    choose_pipeline,
-    choose_protocol,
-)
+from lgrasp_cli.options import Contacts, DryRun, Hand, Mesh, PipelineName, Scale, Seed, Settings, choose_pipeline
 from lgrasp_cli.tables import Block, TextTable, counted, place, print_report
 from lgrasp_cli.working import How, working
 
@@ -25,11 +13,7 @@ if TYPE_CHECKING:
     from lgrasp.engine.run import Job
 
 
-def register(app: typer.Typer) -> None:
-    """Mount the commands of this file."""
-    app.command()(working(generate))
-
-
+@working
 def generate(
     mesh: Mesh,
     how: How,
@@ -45,7 +29,6 @@ def generate(
     simulate: Annotated[
         str | None, Option(help="Keep only grasps that hold in simulation, with protocol fc, gravity6 or gravity6_mu1.")
     ] = None,
-    physics: Physics = None,
     shard_rows: Annotated[
         int, Option(help="Grasps per shard. Changing it changes which grasps are generated.")
     ] = 10_000,
@@ -61,7 +44,7 @@ def generate(
         bool,
         Option("--reuse", help="Cache the state of shards, so that a later run with a larger -n continues from there."),
     ] = False,
-    dry_run: Annotated[bool, Option("--dry-run", help="Show what would be computed without computing it.")] = False,
+    dry_run: DryRun = False,
 ) -> None:
     """Generate grasps of an object and write them as shards.
 
@@ -73,21 +56,11 @@ def generate(
     from lgrasp.jobs.config import default_out
     from lgrasp.jobs.generate import GenerateJob
 
-    chosen, protocol = choose_pipeline(pipeline, seed, contacts, settings), choose_protocol(simulate, physics)
-    chosen = with_passes(chosen, passes, reuse)
-    job = how.job(
-        GenerateJob,
-        "generate",
-        hand=hand,
-        object=mesh,
-        rows=rows,
-        pipeline=chosen.with_simulation(protocol) if protocol else chosen,
-        out=out or default_out(hand, mesh, protocol),
-        scale=scale,
-        batch=batch,
-        shard_rows=shard_rows,
-        reuse=reuse,
-    )
+    chosen = with_passes(choose_pipeline(pipeline, seed, contacts, settings), passes, reuse)
+    chosen = chosen.with_simulation(simulate) if simulate else chosen
+    out = out or default_out(hand, mesh, simulate)
+    what = {"hand": hand, "object": mesh, "rows": rows, "pipeline": chosen, "out": out, "scale": scale}
+    job = how.job(GenerateJob, "generate", **what, batch=batch, shard_rows=shard_rows, reuse=reuse)
     if dry_run:
         show_plans([(job, how)], how)
     else:
@@ -112,19 +85,18 @@ def _show(data: dict[str, Any]) -> list[Block]:
             rates.append(("by own bounds", f"{data['grasps_per_s']:,.0f} /s ({data['grasps']:,})"))
         rates.append(("published count", f"{data['published_count_per_s']:,.0f} /s ({data['published_count']:,})"))
     device_memory = f", device {data['peak_device_mb']:,.0f} MB" if data["peak_device_mb"] else ""
-    return [
-        [
-            ("grasps", counted(data, "grasps")),
-            place(data),
-            ("hand, object", f"{data['hand']}, {data['object']}; pipeline {data['pipeline']}, seed {data['seed']}"),
-            ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it from placement through filter"),
-            *rates,
-            ("survivors", "  ".join(f"{name} {data['survivors'][name]:,}" for name in stages)),
-            ("thread-seconds", "  ".join(f"{name} {seconds[name]:.2f}" for name in stages)),
-            ("loading", "  ".join(f"{n} {seconds[n]:.2f} s" for n in ("hand", "object", "field", "kernels"))),
-            ("near-duplicates", f"{data['near_duplicates']:,}"),
-            ("distinct poses", f"{data['distinct_poses']:,}"),
-            ("peak memory", f"{data['peak_rss_mb']:,.0f} MB{device_memory}"),
-            ("device", data["device"]),
-        ]
+    pairs = [
+        ("grasps", counted(data, "grasps")),
+        place(data),
+        ("hand, object", f"{data['hand']}, {data['object']}; pipeline {data['pipeline']}, seed {data['seed']}"),
+        ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it from placement through filter"),
+        *rates,
+        ("survivors", "  ".join(f"{name} {data['survivors'][name]:,}" for name in stages)),
+        ("thread-seconds", "  ".join(f"{name} {seconds[name]:.2f}" for name in stages)),
+        ("loading", "  ".join(f"{n} {seconds[n]:.2f} s" for n in ("hand", "object", "field", "kernels"))),
+        ("near-duplicates", f"{data['near_duplicates']:,}"),
+        ("distinct poses", f"{data['distinct_poses']:,}"),
+        ("peak memory", f"{data['peak_rss_mb']:,.0f} MB{device_memory}"),
+        ("device", data["device"]),
     ]
+    return [pairs]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from lgrasp_cli.options import CacheDir, Device, PipelineName, Quiet, choose_pipeline, open_cache
+from lgrasp_cli.options import CacheDir, Device, HandArgument, PipelineName, Quiet, Workers, choose_pipeline, open_cache
 from lgrasp_cli.tables import Answer, Block, TextTable, plural, reporting
 
 if TYPE_CHECKING:
@@ -31,9 +31,7 @@ def list_hands() -> Answer:
 
 @app.command("show")
 @reporting
-def show_hand(
-    name: Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")],
-) -> Answer:
+def show_hand(name: HandArgument) -> Answer:
     """Show fingers, joints, limits and contact rules of a hand.
 
     Example: lgrasp hands show allegro
@@ -70,16 +68,15 @@ def add_hand(
     urdf: Annotated[Path, Argument(metavar="URDF", help="URDF file of the hand.")],
     name: Annotated[str | None, Option(help="Name of the hand; default: the file's.")] = None,
     out: Annotated[Path | None, Option(help="Folder of the hand; default: hands/NAME in your data folder.")] = None,
-    force: Annotated[bool, Option("--force", help="Replace the hand of that name.")] = False,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace the hand of that name.")] = False,
 ) -> None:
     """Draft a hand from its URDF: fingers, palmar surface, canonical box, open posture.
 
     Example: lgrasp hands add my_hand.urdf
     """
-
     from lgrasp.hand.drafting.import_urdf import import_urdf
 
-    made = import_urdf(urdf, name=name, out=out, force=force)
+    made = import_urdf(urdf, name=name, out=out, force=overwrite)
     for line in made.decisions:
         typer.echo(f"- {' '.join(line.split())}")
     typer.echo(f"\nwrote {made.folder}")
@@ -95,7 +92,7 @@ def check_hand(
     rows: Annotated[int, Option("-n", "--rows", min=1, help="Grasps requested per object.")] = 200,
     pipeline: PipelineName = "robust",
     device: Device = "auto",
-    workers: Annotated[int, Option(min=0, help="Threads; 0: all cores (1 on a GPU).")] = 0,
+    workers: Workers = 0,
     cache_dir: CacheDir = None,
     quiet: Quiet = False,
 ) -> Answer:
@@ -111,16 +108,8 @@ def check_hand(
 
     chosen, cache = choose_pipeline(pipeline), open_cache(cache_dir)
     folder = out or Path("check") / hand_source(name).name
-    found = check(
-        name,
-        chosen,
-        out=folder,
-        rows=rows,
-        device=device,
-        workers=workers,
-        cache=cache,
-        report=None if quiet else lambda line: say(f"trying {line}"),
-    )
+    tell = None if quiet else lambda line: say(f"trying {line}")
+    found = check(name, chosen, out=folder, rows=rows, device=device, workers=workers, cache=cache, report=tell)
     stages = list(found.objects[0].survivors)
     rated = [
         [o.name, *(f"{o.survivors[s]:,}" for s in stages), f"{o.rows:,} of {o.asked:,}", f"{o.seconds:.1f}"]
@@ -145,9 +134,7 @@ def _show_spaces(found: "HandCheck") -> list[Block]:
         return ["no opposition spaces: 'lgrasp sequence' cannot use this hand"]
     rows = []
     for space in found.spaces:
-        sides = [
-            text for side, area in zip(space.sides, space.areas, strict=True) for text in (side, f"{1e4 * area:.1f}")
-        ]
+        sides = [x for side, area in zip(space.sides, space.areas, strict=True) for x in (side, f"{1e4 * area:.1f}")]
         apart = "-" if space.low is None or space.high is None else f"{1e3 * space.low:.0f}-{1e3 * space.high:.0f}"
         rows.append([space.name, str(len(space.joints)), *sides, apart])
     columns = ("space", "joints", "side", "cm2", "other", "cm2", "apart, mm")

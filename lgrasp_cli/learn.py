@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from lgrasp_cli.options import CacheDir, Device, Quiet, open_cache
+from lgrasp_cli.options import CacheDir, Device, Quiet, given, open_cache
 from lgrasp_cli.tables import Answer, Block, reporting
 from lgrasp_cli.working import How, working
 
@@ -39,10 +39,9 @@ def fit(
     from lgrasp.jobs.learn.job import FitJob
     from lgrasp.learn.params import LearnParams
 
-    given = {"steps": steps, "joint_steps": joint_steps, "unrolled": unrolled, "batch": batch, "seed": seed}
-    params = parse_model(LearnParams, {k: v for k, v in given.items() if v is not None}, "learn fit")
-    job = how.job(FitJob, "learn fit", shards=shards, out=out, params=params)
-    how.run(job, _show_fit)
+    chosen = given(steps=steps, joint_steps=joint_steps, unrolled=unrolled, batch=batch, seed=seed)
+    params = parse_model(LearnParams, chosen, "learn fit")
+    how.run(how.job(FitJob, "learn fit", shards=shards, out=out, params=params), _show_fit)
 
 
 @app.command(name="eval")
@@ -68,10 +67,10 @@ def evaluate(
         ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
         ("poses", f"{data['poses']:,}"),
         ("coarse", f"{data['coarse']:.4f}"),
-    ]
-    pairs += [
-        (f"{steps}-step", f"{energy:.4f}  ({data['coarse'] / energy:.1f}x lower)")
-        for steps, energy in zip(data["rounds"], data["refined"], strict=True)
+        *(
+            (f"{steps}-step", f"{energy:.4f}  ({data['coarse'] / energy:.1f}x lower)")
+            for steps, energy in zip(data["rounds"], data["refined"], strict=True)
+        ),
     ]
     return Answer(data, [] if quiet else [pairs])
 
@@ -82,12 +81,12 @@ def _show_fit(data: dict[str, Any]) -> list[Block]:
         ("where", data["out"]),
         ("seconds", "  ".join(f"{name} {value:.1f}" for name, value in data["seconds"].items())),
     ]
-    words = {
-        "frozen": "trained on poses",
-        "longer": "on poses as many steps more",
-        "joint": "jointly through the refiner",
-    }
-    for name, what in words.items():
+    words = (
+        ("frozen", "trained on poses"),
+        ("longer", "on poses as many steps more"),
+        ("joint", "jointly through the refiner"),
+    )
+    for name, what in words:
         if found := data.get(name):
             pairs.append((what, f"energy {found['coarse']:.4f}, after the unrolled steps {found['unrolled']:.4f}"))
     if lowered := data.get("lowered"):

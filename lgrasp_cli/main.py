@@ -9,27 +9,16 @@ from typer import Option
 
 from lgrasp.judge.__main__ import command as judge
 from lgrasp.notices import on_notice
-from lgrasp_cli import (
-    bench,
-    cache,
-    dataset,
-    export,
-    generate,
-    hands,
-    learn,
-    objects,
-    pipelines,
-    plan,
-    prepare,
-    refine,
-    run,
-    scenes,
-    sequence,
-    simulate,
-    stages,
-)
+from lgrasp_cli import bench, cache, catalog, dataset, hands, learn, prepare, scenes
+from lgrasp_cli.generate import generate
 from lgrasp_cli.interrupt import Interrupted, on_interrupt, stop_asked, stop_now
-from lgrasp_cli.options import warn
+from lgrasp_cli.options import old_name, warn
+from lgrasp_cli.plan import plan
+from lgrasp_cli.refine import refine
+from lgrasp_cli.renamed import renew
+from lgrasp_cli.run import run
+from lgrasp_cli.sequence import sequence
+from lgrasp_cli.simulate import simulate
 
 app = typer.Typer(
     help="Generate grasps for dexterous hands.",
@@ -37,11 +26,33 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (prepare, generate, sequence, plan, refine, run, simulate, stages, export):
-    module.register(app)
+for command in (
+    prepare.build_field,
+    prepare.preprocess,
+    prepare.warm_up,
+    generate,
+    sequence,
+    plan,
+    refine,
+    run,
+    simulate,
+):
+    app.command()(command)
+for command in (*prepare.STAGES, dataset.export):
+    app.command()(command)
 app.command("judge")(judge)
-for group in (bench, hands, objects, pipelines, cache, dataset, scenes, learn):
-    app.add_typer(group.app, name=group.__name__.rpartition(".")[2])
+app.command("validate", hidden=True)(old_name(simulate, "lgrasp validate", "lgrasp simulate"))
+for name, group in {
+    "bench": bench.app,
+    "hands": hands.app,
+    "objects": catalog.objects,
+    "pipelines": catalog.pipelines,
+    "cache": cache.app,
+    "dataset": dataset.app,
+    "scenes": scenes.app,
+    "learn": learn.app,
+}.items():
+    app.add_typer(group, name=name)
 
 
 def _version(wanted: bool) -> None:
@@ -64,22 +75,10 @@ def _options(
     """
 
 
-def _with_json_path(arguments: list[str]) -> list[str]:
-    """``--json`` without a path, as some commands had it until 0.1, means standard output."""
-    out = []
-    for number, word in enumerate(arguments):
-        after = next(iter(arguments[number + 1 :]), None)
-        out.append(word)
-        if word == "--json" and (after is None or (after.startswith("-") and after != "-")):
-            warn("--json takes a path; - is standard output (without one it works in this release only)")
-            out.append("-")
-    return out
-
-
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 bad input or output, 3 too few grasps, 130 interrupted."""
     on_notice(warn)
-    sys.argv[1:] = _with_json_path(sys.argv[1:])
+    sys.argv[1:] = renew(sys.argv[1:])
     if os.environ.get("LGRASP_DEBUG"):
         code = app(prog_name="lgrasp", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
@@ -115,8 +114,7 @@ def _explain(error: BaseException) -> tuple[str, int]:
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
         return f"error: {where}{error.strerror}", 2
-    kind = type(error).__name__
-    return f"error: unexpected {kind}: {error} (set LGRASP_DEBUG=1 for the traceback)", 1
+    return f"error: unexpected {type(error).__name__}: {error} (set LGRASP_DEBUG=1 for the traceback)", 1
 
 
 def _leave(line: str, code: int) -> None:

@@ -3,23 +3,24 @@
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
-from typer import Option
+from typer import Argument, Option
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
     from lgrasp.engine.pipeline import Pipeline
 
-Hand = Annotated[str, Option("--hand", help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
+Hand = Annotated[str, Option(help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
+HandArgument = Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
 Mesh = Annotated[str, Option("--object", "-o", help="Mesh file, or the name of an object.")]
+Shards = Annotated[list[Path], Argument(help="Shard files, or folders of *.h5 files.")]
 PipelineName = Annotated[str, Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.")]
 Seed = Annotated[int | None, Option(help="Base seed; default: the pipeline's.")]
 Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
 Device = Annotated[str, Option(help="auto, cpu or cuda:N.")]
-Physics = Annotated[str | None, Option(hidden=True)]
-"""The name of ``--simulate`` in the release before."""
+Workers = Annotated[int, Option(min=0, help="Threads; 0: all cores (1 on a GPU).")]
 CacheDir = Annotated[Path | None, Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.")]
 Contacts = Annotated[str | None, Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.")]
 JsonPath = Annotated[
@@ -34,6 +35,7 @@ Settings = Annotated[
         help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.",
     ),
 ]
+DryRun = Annotated[bool, Option("--dry-run", help="Show what would be computed without computing it.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print no progress and no report, only warnings and errors.")]
 
 
@@ -54,6 +56,16 @@ def warn(line: str) -> None:
     typer.echo(f"warning: {line}", err=True)
 
 
+def given(**values: Any) -> dict[str, Any]:
+    """The options that have a value."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def split(names: str) -> tuple[str, ...]:
+    """Names that commas separate."""
+    return tuple(name.strip() for name in names.split(","))
+
+
 def open_cache(folder: Path | None, *, fresh: bool = False) -> "Cache":
     """The cache of this command; compiled kernels go to the same folder.
 
@@ -69,41 +81,34 @@ def open_cache(folder: Path | None, *, fresh: bool = False) -> "Cache":
     return Cache(folder, warn=warn, fresh=fresh)
 
 
-def parse_contacts(text: str) -> tuple[int, ...]:
-    """``3,3,4`` -> (3, 3, 4).
+def with_options(run: Callable[..., None], command: Callable[..., Any]) -> Callable[..., None]:
+    """``run`` with the name, help and options of a command, and then its own.
 
-    Raises:
-        ConfigError: not integers from 2 to 5.
+    The argument ``how`` of a command is no option: ``run`` gives it.
     """
-    from lgrasp.errors import ConfigError
-
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdecimal() and 2 <= int(part) <= 5 for part in parts):
-        raise ConfigError(f"--contacts '{text}': give numbers of fingers from 2 to 5, separated by commas, such as 3,4")
-    return tuple(int(part) for part in parts)
+    parameters = [
+        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[name])
+        for function in (command, run)
+        for hints in [get_type_hints(function, include_extras=True)]
+        for name, parameter in inspect.signature(function).parameters.items()
+        if name != "how" and parameter.kind is not inspect.Parameter.VAR_KEYWORD
+    ]
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run
 
 
 def old_name(command: Callable[..., None], old: str, new: str) -> Callable[..., None]:
     """A command under the name that it had in the release before, with a notice."""
 
-    def run(**given: Any) -> None:
+    def run(**options: Any) -> None:
         from lgrasp.notices import notice
 
         notice(f"'{old}' is now '{new}'; the old name works in this release only")
-        command(**given)
+        command(**options)
 
-    run.__name__, run.__doc__, run.__annotations__ = command.__name__, command.__doc__, command.__annotations__
-    run.__signature__ = inspect.signature(command)  # type: ignore[attr-defined]
-    return run
-
-
-def choose_protocol(simulate: str | None, physics: str | None) -> str | None:
-    """The protocol to simulate, by its option or by the option's old name, which says so."""
-    if physics is not None:
-        from lgrasp.notices import notice
-
-        notice("--physics is now --simulate; the old name works in this release only")
-    return physics or simulate
+    return with_options(run, command)
 
 
 def choose_pipeline(
@@ -123,7 +128,8 @@ def choose_pipeline(
             raise ConfigError(f"--seed {seed}: need 0 <= seed < 2^63")
         pipeline = pipeline.model_copy(update={"seed": seed})
     if contacts is not None:
-        pipeline = pipeline.with_params("search", contacts=parse_contacts(contacts))
-    if settings:
-        pipeline = pipeline.with_settings(settings)
-    return pipeline
+        if not all(part.isdecimal() and 2 <= int(part) <= 5 for part in split(contacts)):
+            reason = "give numbers of fingers from 2 to 5, separated by commas, such as 3,4"
+            raise ConfigError(f"--contacts '{contacts}': {reason}")
+        pipeline = pipeline.with_params("search", contacts=tuple(map(int, split(contacts))))
+    return pipeline.with_settings(settings or ())

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from typer import Option
 
 from lgrasp_cli.options import Scale, Settings
@@ -11,11 +10,7 @@ from lgrasp_cli.tables import Block
 from lgrasp_cli.working import How, working
 
 
-def register(app: typer.Typer) -> None:
-    """Mount the commands of this file."""
-    app.command()(working(plan))
-
-
+@working
 def plan(
     how: How,
     mesh: Annotated[
@@ -53,35 +48,20 @@ def plan(
     from lgrasp.jobs.refine.plan import PlanJob
     from lgrasp.jobs.refine.settings import plan_params
 
-    job = how.job(
-        PlanJob,
-        "plan",
-        hand=hand,
-        out=out,
-        starts=starts,
-        object=mesh,
-        scale=scale,
-        cloud=cloud,
-        mask=mask,
-        label=label,
-        viewpoint=_numbers(viewpoint),
-        stand_off=stand_off,
-        keep_invalid=keep_invalid,
-        params=plan_params(settings or (), distal=distal, other=other),
-    )
-    how.run(job, _show)
+    what = {"hand": hand, "object": mesh, "scale": scale, "cloud": cloud, "mask": mask, "label": label, "out": out}
+    what |= {"viewpoint": _numbers(viewpoint), "starts": starts, "stand_off": stand_off, "keep_invalid": keep_invalid}
+    params = plan_params(settings or (), distal=distal, other=other)
+    how.run(how.job(PlanJob, "plan", **what, params=params), _show)
 
 
 def _numbers(text: str | None) -> list[float] | None:
     from lgrasp.errors import ConfigError
 
-    if text is None:
-        return None
     try:
-        numbers = [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in text.split(",")] if text is not None else None
     except ValueError:
         numbers = []
-    if len(numbers) != 3:
+    if numbers is not None and len(numbers) != 3:
         raise ConfigError(f"--viewpoint '{text}': three numbers separated by commas, such as 0,0,0.7")
     return numbers
 
@@ -92,12 +72,11 @@ def _show(data: dict[str, Any]) -> list[Block]:
     if not data["grasps"]:
         return []
     seconds, lost = data["seconds_planning"], lost_starts(data["counts"]) or "none lost"
-    return [
-        [
-            ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({lost})"),
-            ("where", data["out"]),
-            ("hand, object", f"{data['hand']}, {data['object']}"),
-            ("quality", f"median epsilon {data['epsilon']:.3f}, unresisted load {data['unresisted_load']:.2f}"),
-            ("wall", f"{seconds:.1f} s, {seconds / data['grasps']:.3f} s a plan"),
-        ]
+    pairs = [
+        ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({lost})"),
+        ("where", data["out"]),
+        ("hand, object", f"{data['hand']}, {data['object']}"),
+        ("quality", f"median epsilon {data['epsilon']:.3f}, unresisted load {data['unresisted_load']:.2f}"),
+        ("wall", f"{seconds:.1f} s, {seconds / data['grasps']:.3f} s a plan"),
     ]
+    return [pairs]

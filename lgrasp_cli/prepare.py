@@ -1,36 +1,42 @@
-"""``lgrasp build-field``, ``preprocess`` and ``warm-up``: the preparations of a job."""
+"""``lgrasp build-field``, ``preprocess``, ``warm-up``, and a pipeline up to one stage: what ends in the cache."""
 
 from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
-from lgrasp_cli.options import CacheDir, Device, PipelineName, Scale, choose_pipeline, open_cache
-from lgrasp_cli.tables import Answer, reporting
+from lgrasp_cli.options import (
+    CacheDir,
+    Contacts,
+    Device,
+    Hand,
+    HandArgument,
+    Mesh,
+    PipelineName,
+    Scale,
+    Seed,
+    choose_pipeline,
+    open_cache,
+)
+from lgrasp_cli.tables import Answer, TextTable, reporting
 
-_Force = Annotated[bool, Option("--force", help="Rebuild it even if it is cached.")]
+_Rebuild = Annotated[bool, Option("--rebuild", help="Rebuild it even if it is cached.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Mount the commands of this file."""
-    app.command("build-field")(reporting(build_field))
-    app.command()(reporting(preprocess))
-    app.command("warm-up")(warm_up)
-
-
+@reporting
 def build_field(
-    hand: Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")],
+    hand: HandArgument,
     index: Annotated[str | None, Option(help="voxel or bvh; default: the pipeline's.")] = None,
     pipeline: PipelineName = "robust",
     device: Device = "auto",
     cache_dir: CacheDir = None,
-    force: _Force = False,
+    rebuild: _Rebuild = False,
 ) -> Answer:
     """Build and cache the contact field of a hand.
 
     Example: lgrasp build-field allegro
     """
-    cache = open_cache(cache_dir, fresh=force)
+    cache = open_cache(cache_dir, fresh=rebuild)
     from lgrasp.jobs.prepare import prepare_field
     from lgrasp_cli.progress import Bar
 
@@ -53,18 +59,19 @@ def build_field(
     return Answer(data, [pairs])
 
 
+@reporting
 def preprocess(
     mesh: Annotated[str, Argument(metavar="OBJECT", help="Mesh file, or the name of an object.")],
     scale: Scale = 1.0,
     pipeline: PipelineName = "robust",
     cache_dir: CacheDir = None,
-    force: _Force = False,
+    rebuild: _Rebuild = False,
 ) -> Answer:
     """Check and preprocess a mesh, report repairs, and cache the result.
 
     Example: lgrasp preprocess mug.obj --scale 0.001
     """
-    cache = open_cache(cache_dir, fresh=force)
+    cache = open_cache(cache_dir, fresh=rebuild)
     from lgrasp.jobs.prepare import prepare_object
 
     data = prepare_object(cache, mesh, choose_pipeline(pipeline).object, scale=scale)
@@ -99,3 +106,59 @@ def warm_up(device: Device = "auto", cache_dir: CacheDir = None) -> None:
     with Bar() as bar:
         load_kernels(chosen.alias, modules, bar.share)
     typer.echo(f"{len(modules)} modules ready on {chosen.alias} ({chosen.name})")
+
+
+_STAGES = {
+    "place": "Sample poses of the object in front of the palm, without collision.",
+    "domain": "Find the contacts that each finger can make at each pose.",
+    "ik": "Move fingers to their contacts and keep those that do not collide with the object.",
+    "search": "Combine contacts into sets that balance.",
+    "filter": "Complete the grasps and check them exactly.",
+}
+
+
+def _up_to(stage: str):
+    def run(
+        mesh: Mesh,
+        hand: Hand = "allegro",
+        pipeline: PipelineName = "robust",
+        candidates: Annotated[int, Option(help="Candidates in the batch.")] = 1024,
+        first: Annotated[int, Option(help="First candidate of the batch.")] = 0,
+        shard_index: Annotated[int, Option(help="Shard whose candidate stream is used.")] = 0,
+        seed: Seed = None,
+        contacts: Contacts = None,
+        scale: Scale = 1.0,
+        device: Device = "auto",
+        rebuild: Annotated[bool, Option("--rebuild", help="Run every stage again.")] = False,
+        cache_dir: CacheDir = None,
+    ) -> Answer:
+        cache = open_cache(cache_dir, fresh=rebuild)
+        from lgrasp.jobs.onestage import run_up_to
+
+        chosen = choose_pipeline(pipeline, seed, contacts)
+        runs = run_up_to(stage, chosen, hand, mesh, first, candidates, shard_index, cache, scale=scale, device=device)
+        rows = [
+            (
+                r.stage,
+                "hit" if r.hit else "miss",
+                f"{r.seconds:.3f}",
+                "  ".join(f"{n} {k:,}" for n, k in r.counts.items()),
+            )
+            for r in runs
+        ]
+        table = TextTable(("stage", "cache", "seconds", "survivors"), rows, right=("seconds",))
+        return Answer([{**vars(run), "path": str(run.path)} for run in runs], [table, str(runs[-1].path)])
+
+    run.__name__ = stage
+    run.__doc__ = f"""{_STAGES[stage]}
+
+    Runs the pipeline up to this stage on one batch of candidates and caches every table; stages with a cached table are
+    skipped.
+
+    Example: lgrasp {stage} --object mug.obj
+    """
+    return reporting(run)
+
+
+STAGES = [_up_to(stage) for stage in _STAGES]
+"""The commands named after stages."""

@@ -100,7 +100,7 @@ class JobProgress(Events):
 
 
 @contextmanager
-def interruptible(progress: JobProgress) -> Iterator[None]:
+def interruptible(progress: JobProgress) -> Iterator[JobProgress]:
     """The first Ctrl-C (or SIGTERM) ends the job as soon as it can, the second, or five seconds, at once.
 
     Whole files stay, what is being made is dropped.
@@ -117,6 +117,6 @@ def interruptible(progress: JobProgress) -> Iterator[None]:
 
     with on_interrupt(stop):
         try:
-            yield
+            yield progress
         finally:
             waiting.cancel()

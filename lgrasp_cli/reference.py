@@ -10,51 +10,27 @@ import typer
 
 _PAGE = Path(__file__).parents[1] / "docs" / "reference" / "cli.md"
 _MANY = 10  # commands from which on an option is listed once for all
-_HEAD = """\
-<!-- Made from the commands by `make docs`; do not edit. -->
-
-# Command line
-
-Reports go to standard output; progress, warnings and errors go to standard error. A failure is one line.
-[Running jobs](../guides/jobs.md) explains reports, resuming and arrays.
-
-| exit code | meaning |
-|---|---|
-| 0 | done |
-| 1 | an error in lgrasp; please report it |
-| 2 | bad input, or output that cannot be written; no partial file is left |
-| 3 | fewer grasps found than requested within the pipeline's effort; those found are on disk |
-| 130 | interrupted; finished files are on disk; run the same command again to resume |
-
-| variable | meaning |
-|---|---|
-| `LGRASP_CACHE_DIR` | folder of the cache |
-| `LGRASP_PATH` | folders with `hands`, `objects`, `pipelines`, `configs`, searched before the shipped ones |
-| `LGRASP_DEBUG` | 1: tracebacks |
-| `WARP_CACHE_PATH` | folder of compiled kernels |
-"""
+_MARK = "## Common options\n"
 
 
 def cli_page() -> str:
-    """The page: every command with its help, arguments and options."""
+    """The page: its head as it is, then every command with its help, arguments and options."""
     from lgrasp_cli.main import app
 
     commands = list(_commands(typer.main.get_command(app), None, "lgrasp"))
-    common = _common(commands)
-    lines = [
-        _HEAD,
-        "## Common options",
-        "",
-        "The commands below name these options without repeating their meaning.",
-        "",
-    ]
+    counts = Counter(row for command in commands for row in _options(*command))
+    common: dict[str, str] = {}
+    for (names, what), count in counts.most_common():
+        if count >= _MANY and _flag(names) not in map(_flag, common):
+            common[names] = what
+    lines = [_MARK, "The commands below name these options without repeating their meaning.", ""]
     lines += [*_table(common.items()), ""]
     for command, context in commands:
         if context.parent is not None:
             lines += _section(command, context, common)
         if context.command_path == "lgrasp run":
             lines += _config_keys()
-    return "\n".join(lines).rstrip() + "\n"
+    return _PAGE.read_text(encoding="utf-8").partition(_MARK)[0] + "\n".join(lines).rstrip() + "\n"
 
 
 def _commands(command: Any, parent: typer.Context | None, name: str) -> Iterator[tuple[Any, typer.Context]]:
@@ -70,16 +46,6 @@ def _options(command: Any, context: typer.Context) -> list[tuple[str, str]]:
     """Names and help of the options of a command."""
     records = [p.get_help_record(context) for p in command.get_params(context) if "--help" not in p.opts]
     return [(_cell(names), _cell(what)) for names, what in filter(None, records)]
-
-
-def _common(commands: list[tuple[Any, typer.Context]]) -> dict[str, str]:
-    """Options that many commands have with the same help: names -> help."""
-    counts = Counter(row for command in commands for row in _options(*command))
-    common: dict[str, str] = {}
-    for (names, what), count in counts.most_common():
-        if count >= _MANY and _flag(names) not in map(_flag, common):
-            common[names] = what
-    return common
 
 
 def _flag(names: str) -> str:
@@ -99,11 +65,9 @@ def _section(command: Any, context: typer.Context, common: dict[str, str]) -> li
     if example:
         lines += ["```", example.strip(), "```", ""]
     rows = _options(command, context)
-    own = [row for row in rows if common.get(row[0]) != row[1]]
-    if own:
+    if own := [row for row in rows if common.get(row[0]) != row[1]]:
         lines += [*_table(own), ""]
-    named = [f"`{_flag(names)}`" for names, what in rows if common.get(names) == what]
-    if named:
+    if named := [f"`{_flag(names)}`" for names, what in rows if common.get(names) == what]:
         lines += [f"[Common options](#common-options): {', '.join(named)}.", ""]
     return lines
 

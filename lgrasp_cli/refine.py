@@ -3,20 +3,14 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from typer import Argument, Option
 
-from lgrasp.notices import notice
 from lgrasp_cli.options import Settings
 from lgrasp_cli.tables import Block, TextTable
 from lgrasp_cli.working import How, working
 
 
-def register(app: typer.Typer) -> None:
-    """Mount the commands of this file."""
-    app.command()(working(refine))
-
-
+@working
 def refine(
     shards: Annotated[list[Path], Argument(help="Shard files, or folders of them; or one export.")],
     how: How,
@@ -37,7 +31,6 @@ def refine(
     keep_invalid: Annotated[
         bool, Option("--keep-invalid", help="Keep the refined posture of rows that never pass, with metric 'valid' 0.")
     ] = False,
-    always: Annotated[bool, Option("--always", hidden=True)] = False,
     settings: Settings = None,
 ) -> None:
     """Improve grasps by gradient descent on the surface matching energy, check them again, and write shards.
@@ -50,14 +43,10 @@ def refine(
     from lgrasp.jobs.refine.settings import refine_params
     from lgrasp.jobs.refine.shards import RefineJob
 
-    params = refine_params(
-        matching_rounds=matching_rounds, gradient_steps=gradient_steps, outer=outer, inner=inner, coarse=coarse
-    )
-    if always:
-        notice("--always is now called --keep-invalid; the old name works in this release only")
-    chosen = {"keep_invalid": keep_invalid or always, "settings": tuple(settings or ())}
-    job = how.job(RefineJob, "refine", shards=shards, out=out, form=form, hand=hand, params=params, **chosen)
-    how.run(job, _show)
+    rounds = {"matching_rounds": matching_rounds, "gradient_steps": gradient_steps, "outer": outer, "inner": inner}
+    params = refine_params(coarse=coarse, **rounds)
+    what = {"shards": shards, "out": out, "form": form, "hand": hand, "params": params, "settings": settings}
+    how.run(how.job(RefineJob, "refine", **what, keep_invalid=keep_invalid), _show)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

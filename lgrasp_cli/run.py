@@ -7,19 +7,15 @@ import typer
 from typer import Argument, Option
 
 from lgrasp_cli.generate import show_plans
-from lgrasp_cli.options import check_report
-from lgrasp_cli.tables import Block, TextTable, print_report
+from lgrasp_cli.options import DryRun, check_report, given
+from lgrasp_cli.tables import TextTable, print_report
 from lgrasp_cli.working import How, conclude, run_job, working
 
 if TYPE_CHECKING:
     from lgrasp.engine.run import Job
 
 
-def register(app: typer.Typer) -> None:
-    """Mount the commands of this file."""
-    app.command()(working(run))
-
-
+@working
 def run(
     config: Annotated[str, Argument(help="Config file, or the name of a config.")],
     how: How,
@@ -27,7 +23,7 @@ def run(
     out: Annotated[Path | None, Option(help="Replaces out.")] = None,
     object_dir: Annotated[Path | None, Option(help="Replaces object_dir.")] = None,
     seed: Annotated[int | None, Option(help="Replaces seed.")] = None,
-    dry_run: Annotated[bool, Option("--dry-run", help="Show what would be computed without computing it.")] = False,
+    dry_run: DryRun = False,
 ) -> None:
     """Run the job of a config, or one job for every hand, object and pipeline that it names.
 
@@ -38,10 +34,8 @@ def run(
     """
     from lgrasp.jobs.config import load_jobs
 
-    changes = {"rows": rows, "out": out, "object_dir": object_dir, "seed": seed}
-    changes |= {"device": how.device, "workers": how.workers}
-    jobs = load_jobs(config, {name: value for name, value in changes.items() if value is not None}, how.cache)
-    tasks = [(job, how.rotated(number)) for number, job in enumerate(jobs)]
+    changes = given(rows=rows, out=out, object_dir=object_dir, seed=seed, device=how.device, workers=how.workers)
+    tasks = [(job, how.rotated(number)) for number, job in enumerate(load_jobs(config, changes, how.cache))]
     if dry_run:
         show_plans(tasks, how)
         return
@@ -49,12 +43,14 @@ def run(
     results = []
     for number, (job, own) in enumerate(tasks, 1):
         if not how.quiet:
-            typer.echo(f"[{number}/{len(jobs)}] {job.title}", err=True)
+            typer.echo(f"[{number}/{len(tasks)}] {job.title}", err=True)
         results.append(_run_one(job, own))
         if results[-1]["exit_code"] == 130:
             break
     code = max(result["exit_code"] for result in results)
-    print_report({"jobs": results, "exit_code": code}, how.json_path, () if how.quiet else _show(results))
+    columns = ("job", "what", "requested", "present", "wall s", "strict/s", "status")
+    table = TextTable(columns, map(_row, results), right=columns[2:6])
+    print_report({"jobs": results, "exit_code": code}, how.json_path, () if how.quiet else [table])
     if code:
         raise typer.Exit(code)
 
@@ -65,25 +61,20 @@ def _run_one(job: "Job", how: How) -> dict[str, Any]:
     from lgrasp_cli.interrupt import Interrupted
 
     data: dict[str, Any] = {"title": job.title, "unit": job.unit}
+    status, text, code = "done", "", 0
     try:
         found, outcome = run_job(job, how)
         data |= found
         conclude(data, outcome)
     except LgraspError as error:
-        status = "starved" if error.exit_code == 3 else "failed"
+        status, text, code = "starved" if error.exit_code == 3 else "failed", str(error), error.exit_code
         typer.echo(f"error: {error}", err=True)
-        return data | {"status": status, "error": str(error), "exit_code": error.exit_code}
     except (MemoryError, OSError) as error:
+        status, text, code = "failed", str(error), 2
         typer.echo(f"error: {error or 'out of memory'}", err=True)
-        return data | {"status": "failed", "error": str(error), "exit_code": 2}
     except (Interrupted, typer.Exit):
-        return data | {"status": "interrupted", "error": "", "exit_code": 130}
-    return data | {"status": "done", "error": "", "exit_code": 0}
-
-
-def _show(results: list[dict[str, Any]]) -> list[Block]:
-    columns = ("job", "what", "requested", "present", "wall s", "strict/s", "status")
-    return [TextTable(columns, map(_row, results), right=columns[2:6])]
+        status, code = "interrupted", 130
+    return data | {"status": status, "error": text, "exit_code": code}
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from lgrasp_cli.options import given
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, counted, reporting
 from lgrasp_cli.working import How, working
 
@@ -45,16 +46,9 @@ def make(
     """
     from lgrasp.jobs.scenes.job import SceneJob
 
-    changes = {
-        "hand": hand,
-        "scenes": scenes,
-        "out": out,
-        "grasps": grasps,
-        "pipeline": pipeline,
-        "stock": stock,
-        "scale": scale,
-        "seed": seed,
-    }
+    changes = given(
+        hand=hand, scenes=scenes, out=out, grasps=grasps, pipeline=pipeline, stock=stock, scale=scale, seed=seed
+    )
     how.run(how.job(SceneJob, "scenes make", **_config(objects or [], changes, on_table, views)), _show)
 
 
@@ -93,10 +87,9 @@ def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, v
     config = next((name for name in objects if name.endswith((".yaml", ".yml"))), None)
     if config and len(objects) > 1:
         raise ConfigError(f"{', '.join(objects)}: the config {config} is named alone, or objects without it")
-    data: dict[str, Any] = {"objects": objects}
-    if len(objects) == 1 and (objects[0].endswith((".yaml", ".yml")) or objects[0] in scene_configs()):
-        data = read_scene_config(objects[0])
-    data |= {name: value for name, value in changes.items() if value is not None}
+    named = len(objects) == 1 and (config or objects[0] in scene_configs())
+    data: dict[str, Any] = read_scene_config(objects[0]) if named else {"objects": objects}
+    data |= changes
     scene = data.setdefault("scene", {})
     if on_table is not None:
         scene["objects"] = on_table
@@ -107,12 +100,8 @@ def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, v
 
 def _show(data: dict[str, Any]) -> list[Block]:
     speed = f", {data['scenes_per_minute']:.1f} scenes/min" if data["made"] else ""
-    head = [
-        ("scenes", counted(data, "scenes")),
-        ("where", data["out"]),
-        ("hand", data["hand"]),
-        ("wall", f"{data['seconds']['scenes']:.2f} s{speed}"),
-    ]
+    wall = f"{data['seconds']['scenes']:.2f} s{speed}"
+    head = [("scenes", counted(data, "scenes")), ("where", data["out"]), ("hand", data["hand"]), ("wall", wall)]
     return _blocks(data, head)
 
 

@@ -3,19 +3,14 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from typer import Argument, Option
 
-from lgrasp_cli.options import Hand, Physics, Seed, Settings, choose_pipeline, choose_protocol
+from lgrasp_cli.options import Hand, Seed, Settings, choose_pipeline
 from lgrasp_cli.tables import Block, TextTable, counted, place, share
 from lgrasp_cli.working import How, working
 
 
-def register(app: typer.Typer) -> None:
-    """Mount the commands of this file."""
-    app.command()(working(sequence))
-
-
+@working
 def sequence(
     objects: Annotated[list[str], Argument(help="Mesh files or names of objects, in the order of grasping.")],
     how: How,
@@ -29,7 +24,6 @@ def sequence(
     simulate: Annotated[
         str | None, Option(help="Continue only rows that hold in simulation: seq6 or seq6_mu06.")
     ] = None,
-    physics: Physics = None,
     pipeline: Annotated[
         str, Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.")
     ] = "sequence",
@@ -55,19 +49,10 @@ def sequence(
     if chosen.sequence is not None and (method or policy):
         changes = {"method": method, "policy": policy}
         chosen = chosen.with_params("sequence", **{name: value for name, value in changes.items() if value})
-    job = how.job(
-        SequenceJob,
-        "sequence",
-        hand=hand,
-        objects=tuple(objects),
-        rows=rows,
-        pipeline=chosen,
-        out=out or Path("grasps") / sequence_name(hand_source(hand).name, tuple(objects)),
-        scale=scale,
-        simulate=choose_protocol(simulate, physics),
-        shard_rows=shard_rows,
-    )
-    how.run(job, _show)
+    out = out or Path("grasps") / sequence_name(hand_source(hand).name, tuple(objects))
+    what = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen, "out": out}
+    what |= {"scale": scale, "simulate": simulate, "shard_rows": shard_rows}
+    how.run(how.job(SequenceJob, "sequence", **what), _show)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:
@@ -83,14 +68,9 @@ def _show(data: dict[str, Any]) -> list[Block]:
         ("device", data["device"]),
     ]
     columns = ("object", "space", "sequences", "continued", "share")
-    return [pairs, TextTable(columns, _shares(data), right=columns[2:])] if data["spaces"] else [pairs]
-
-
-def _shares(data: dict[str, Any]) -> list[tuple[str, ...]]:
-    """How many sequences of each space went on, step by step."""
     rows = []
     for name, spaces in zip(data["objects"], data["spaces"], strict=False):
         for space, counts in spaces.items():
             tried, held = counts["sequence"]["sequences"], counts["sequence"]["held"]
             rows.append((name, space, f"{tried:,}", f"{held:,}", share(held, tried)))
-    return rows
+    return [pairs, TextTable(columns, rows, right=columns[2:])] if data["spaces"] else [pairs]

@@ -1,26 +1,18 @@
 """``lgrasp simulate``: does each grasp hold its object in a physics simulation?"""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-from typer import Argument, Option
+from typer import Option
 
-from lgrasp_cli.options import old_name, warn
+from lgrasp_cli.options import Shards
 from lgrasp_cli.tables import Block, TextTable, place, share
 from lgrasp_cli.working import How, working
 
 
-def register(app: typer.Typer) -> None:
-    """Mount the commands of this file."""
-    command = working(simulate)
-    app.command()(command)
-    app.command("validate", hidden=True)(old_name(command, "lgrasp validate", "lgrasp simulate"))
-
-
+@working
 def simulate(
-    shards: Annotated[list[Path], Argument(help="Shard files, or folders of *.h5 files.")],
+    shards: Shards,
     how: How,
     protocol: Annotated[
         str, Option("--protocol", "-p", help="Protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06.")
@@ -28,7 +20,6 @@ def simulate(
     out: Annotated[
         Path | None, Option(help="Folder of the results; default: that of the shards with -PROTOCOL added.")
     ] = None,
-    threads: Annotated[int | None, Option(min=0, hidden=True)] = None,
     all_directions: Annotated[
         bool, Option("--all-directions", help="Continue after the first direction in which an object is lost.")
     ] = False,
@@ -44,13 +35,8 @@ def simulate(
     from lgrasp.jobs.simulate import SimulateJob
     from lgrasp.simulate.protocol import find_protocol
 
-    if threads is not None:
-        warn("--threads is now called --workers; the old name works in this release only")
-    chosen = replace(how, workers=how.workers if threads is None else threads)
-    job = chosen.job(
-        SimulateJob, "simulate", shards=shards, protocol=find_protocol(protocol), out=out, all_directions=all_directions
-    )
-    chosen.run(job, _show)
+    what = {"shards": shards, "protocol": find_protocol(protocol), "out": out, "all_directions": all_directions}
+    how.run(how.job(SimulateJob, "simulate", **what), _show)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:
@@ -64,11 +50,9 @@ def _show(data: dict[str, Any]) -> list[Block]:
             entry["hand"],
             entry["object"],
             f"{entry['rows']:,}",
-            share(entry["held"], entry["rows"]),
-            *(share(entry["stay"], entry["rows"]) for _ in stay),
+            *(share(entry[name], entry["rows"]) for name in ("held", *stay)),
             *map(share, entry["directions_held"], entry["directions_run"]),
-            share(entry["contact_at_q"], entry["rows"]),
-            share(entry["contact_at_grasp"], entry["rows"]),
+            *(share(entry[name], entry["rows"]) for name in ("contact_at_q", "contact_at_grasp")),
             f"{1e3 * entry['mass']:.0f} g",
             f"{entry['stiffness']:.3g}",
             "-" if entry["per_s"] is None else f"{entry['per_s']:.1f}",
@@ -78,13 +62,11 @@ def _show(data: dict[str, Any]) -> list[Block]:
     start = "q" if protocol["start"] == "grasp" else "q_pregrasp"
     lost = {name: sum(entry[name] for entry in entries) for name in ("pregrasp_too_deep", "diverged")}
     told = f"{protocol['name']}, friction {protocol['friction']:g}; shares of the grasps run in a direction"
-    return [
-        TextTable(names, rows, right=names[2:]),
-        [
-            ("protocol", told),
-            ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate too deeply at {start} and are not simulated"),
-            ("diverged", f"{lost['diverged']:,} count as lost"),
-            ("compiling", f"{data['seconds_compile']:.1f} s for models and kernels, not part of the rates"),
-            place(data),
-        ],
+    pairs = [
+        ("protocol", told),
+        ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate too deeply at {start} and are not simulated"),
+        ("diverged", f"{lost['diverged']:,} count as lost"),
+        ("compiling", f"{data['seconds_compile']:.1f} s for models and kernels, not part of the rates"),
+        place(data),
     ]
+    return [TextTable(names, rows, right=names[2:]), pairs]

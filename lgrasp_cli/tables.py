@@ -1,14 +1,13 @@
 """Reports on standard output: lines, pairs and tables in aligned columns, the same on a terminal and in a file."""
 
-import inspect
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, get_type_hints
+from typing import Any
 
 import typer
 
-from lgrasp_cli.options import JsonPath, check_report
+from lgrasp_cli.options import JsonPath, check_report, with_options
 
 
 @dataclass(frozen=True)
@@ -39,34 +38,14 @@ class Answer:
 def reporting(command: Callable[..., Answer]) -> Callable[..., None]:
     """A command that returns its report: it gets ``--json``, and the report is printed and written as that says."""
 
-    def run(json_path: str | None, **given: Any) -> None:
+    def run(*, json_path: JsonPath = None, **options: Any) -> None:
         check_report(json_path)
-        report = command(**given)
+        report = command(**options)
         print_report(report.data, json_path, report.blocks)
         if report.exit_code:
             raise typer.Exit(report.exit_code)
 
-    return with_options(command, {"json_path": (JsonPath, None)}, run)
-
-
-def with_options(
-    command: Callable[..., Any], options: dict[str, tuple[Any, Any]], run: Callable[..., None], without: str = ""
-) -> Callable[..., None]:
-    """``run`` with the name, help and options of a command, and more options: name -> (type, default).
-
-    Args:
-        without: an argument of the command that is none of its options.
-    """
-    hints = get_type_hints(command, include_extras=True)
-    own = {n: (hints[n], p.default) for n, p in inspect.signature(command).parameters.items() if n != without}
-    parameters = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-        for name, (kind, default) in (own | options).items()
-    ]
-    run.__name__, run.__doc__ = command.__name__, command.__doc__
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {p.name: p.annotation for p in parameters}
-    return run
+    return with_options(run, command)
 
 
 def print_report(data: Any, json_path: str | None, blocks: Iterable[Block]) -> None:
@@ -77,22 +56,17 @@ def print_report(data: Any, json_path: str | None, blocks: Iterable[Block]) -> N
     for block in blocks:
         if isinstance(block, str):
             typer.echo(block)
-        elif isinstance(block, TextTable):
-            right = {i for i, name in enumerate(block.columns) if name in block.right}
-            _print_rows([list(block.columns), *map(list, block.rows)], right)
-        else:
-            _print_rows([list(pair) for pair in block], set())
+            continue
+        rows: list[Any] = [block.columns, *block.rows] if isinstance(block, TextTable) else block
+        right = {i for i, n in enumerate(block.columns) if n in block.right} if isinstance(block, TextTable) else set()
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        for row in rows:
+            cells = [c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+            typer.echo("  ".join(cells).rstrip())
     if json_path:
         from lgrasp.engine.report import write_json
 
         write_json(json_path, data)
-
-
-def _print_rows(rows: list[list[str]], right: set[int]) -> None:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = [c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
-        typer.echo("  ".join(cells).rstrip())
 
 
 def plural(n: int, what: str) -> str:

@@ -2,41 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Option
 
-from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, open_cache, warn
-from lgrasp_cli.tables import Block, plural, print_report, with_options
+from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, given, open_cache, with_options
+from lgrasp_cli.tables import Block, plural, print_report
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
     from lgrasp.engine.run import Job, JobOutcome
-
-_OPTIONS: dict[str, tuple[Any, Any]] = {
-    "device": (Annotated[str | None, Option(help="auto, cpu or cuda:N.")], None),
-    "workers": (Annotated[int | None, Option(min=0, help="Threads or processes; 0: by device.")], None),
-    "shard_index": (
-        Annotated[
-            int | None,
-            Option(help="Number of this array task, which makes every NUMth file; default: SLURM_ARRAY_TASK_ID."),
-        ],
-        None,
-    ),
-    "num_shards": (Annotated[int | None, Option(help="Number of array tasks; default: SLURM_ARRAY_TASK_COUNT.")], None),
-    "overwrite": (
-        Annotated[bool, Option("--overwrite", help="Replace existing files; by default complete ones are kept.")],
-        False,
-    ),
-    "rebuild": (Annotated[bool, Option("--rebuild", help="Rebuild cached inputs.")], False),
-    "resume": (Annotated[bool, Option("--resume/--no-resume", hidden=True)], True),
-    "force": (Annotated[bool, Option("--force", hidden=True)], False),
-    "json_path": (JsonPath, None),
-    "cache_dir": (CacheDir, None),
-    "quiet": (Quiet, False),
-}
 
 
 @dataclass(frozen=True)
@@ -56,7 +32,7 @@ class How:
         index, tasks = self.array
         return replace(self, array=((index - number) % max(tasks, 1) if 0 <= index < tasks else index, tasks))
 
-    def job(self, kind: "type[Job]", where: str, /, **given: Any) -> "Job":
+    def job(self, kind: "type[Job]", where: str, /, **options: Any) -> "Job":
         """A job of some kind; options that are None are left to its defaults.
 
         Raises:
@@ -64,8 +40,7 @@ class How:
         """
         from lgrasp.config import parse_model
 
-        asked = given | {"device": self.device, "workers": self.workers, "cache": self.cache}
-        return parse_model(kind, {name: value for name, value in asked.items() if value is not None}, where)
+        return parse_model(kind, given(**options, device=self.device, workers=self.workers, cache=self.cache), where)
 
     def run(self, job: "Job", show: Callable[[dict[str, Any]], Sequence[Block]]) -> None:
         """Run a job with progress, report it, and leave with its exit code if it fell short.
@@ -82,34 +57,33 @@ class How:
 def working(command: Callable[..., None]) -> Callable[..., None]:
     """A command whose argument ``how`` is a :class:`How`: it gets the options that all jobs share."""
 
-    def run(**given: Any) -> None:
-        options = {name: given.pop(name) for name in _OPTIONS}
-        command(**given, how=_how(**options))
+    def run(
+        *,
+        device: Annotated[str | None, Option(help="auto, cpu or cuda:N.")] = None,
+        workers: Annotated[int | None, Option(min=0, help="Threads or processes; 0: by device.")] = None,
+        shard_index: Annotated[
+            int | None,
+            Option(help="Number of this array task, which makes every NUMth file; default: SLURM_ARRAY_TASK_ID."),
+        ] = None,
+        num_shards: Annotated[
+            int | None, Option(help="Number of array tasks; default: SLURM_ARRAY_TASK_COUNT.")
+        ] = None,
+        overwrite: Annotated[
+            bool, Option("--overwrite", help="Replace existing files; by default complete ones are kept.")
+        ] = False,
+        rebuild: Annotated[bool, Option("--rebuild", help="Rebuild cached inputs.")] = False,
+        json_path: JsonPath = None,
+        cache_dir: CacheDir = None,
+        quiet: Quiet = False,
+        **options: Any,
+    ) -> None:
+        cache = open_cache(cache_dir, fresh=rebuild)
+        from lgrasp.engine.run import array_task
 
-    return with_options(command, _OPTIONS, run, without="how")
+        array = array_task(shard_index, num_shards)
+        command(**options, how=How(cache, device, workers, array, overwrite, json_path, quiet))
 
-
-def _how(
-    *,
-    shard_index: int | None,
-    num_shards: int | None,
-    overwrite: bool,
-    rebuild: bool,
-    resume: bool,
-    force: bool,
-    cache_dir: Path | None,
-    **rest: Any,
-) -> How:
-    if not resume:
-        warn("--no-resume is now called --overwrite; the old name works in this release only")
-    if force:
-        warn(
-            "--force is now --overwrite (files that are there) and --rebuild (the cache); it works in this release only"
-        )
-    cache = open_cache(cache_dir, fresh=rebuild or force)
-    from lgrasp.engine.run import array_task
-
-    return How(cache, array=array_task(shard_index, num_shards), overwrite=overwrite or force or not resume, **rest)
+    return with_options(run, command)
 
 
 def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "JobOutcome"]:
@@ -118,10 +92,8 @@ def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "JobOutcome"]:
     from lgrasp.engine.run import run
     from lgrasp_cli.progress import Bar, JobProgress, interruptible
 
-    with Bar(quiet=how.quiet) as bar:
-        progress = JobProgress(bar, job.unit)
-        with interruptible(progress):
-            outcome = run(job, progress, array=how.array, resume=not how.overwrite)
+    with Bar(quiet=how.quiet) as bar, interruptible(JobProgress(bar, job.unit)) as progress:
+        outcome = run(job, progress, array=how.array, resume=not how.overwrite)
     return job_report(outcome), outcome
 
 
@@ -135,6 +107,5 @@ def conclude(data: dict[str, Any], outcome: "JobOutcome") -> None:
         files = plural(len(outcome.paths), "finished file")
         typer.echo(f"interrupted: {files} in {data['out']}. Run the same command again to resume", err=True)
         raise typer.Exit(130)
-    error = outcome.job.shortfall(outcome)
-    if error:
+    if error := outcome.job.shortfall(outcome):
         raise error

@@ -35,17 +35,12 @@ def draw_table(table: dict[str, Any], path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    import matplotlib
-
-    matplotlib.use("Agg", force=False)
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     hands = [mean["hand"] for mean in table["means"]]
     across = min(2, max(1, len(hands)))
     down = max(1, -(-len(hands) // across))
     figure = Figure(figsize=(1.6 + 6.4 * across, 1.2 + 3.6 * down), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
     for i, hand in enumerate(hands):
         axes = figure.add_subplot(down, across, i + 1)
         _draw_hand(axes, table, [cell for cell in table["cells"] if cell["hand"] == hand and not cell["error"]])

@@ -13,7 +13,6 @@ from lgrasp.bench.rate import Bench
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, LgraspError, ObjectError
 from lgrasp.jobs.config import JobConfig, in_folder, plan_jobs
-from lgrasp.jobs.generate import GenerateJob
 from lgrasp.object.find import find_object
 from lgrasp.runtime.device import resolve_device
 
@@ -32,41 +31,28 @@ def new_table(config: JobConfig, *, repeat: int, baseline_rows: int, published: 
         ConfigError: two hands, objects or pipelines of one name.
         DeviceError: the device does not exist.
     """
-    pipelines, hands, objects = (
-        _names(kind, given)
-        for kind, given in (("pipeline", config.pipelines), ("hand", config.hands), ("object", config.objects))
-    )
+    named = {kind: [Path(name).stem for name in getattr(config, kind)] for kind in ("pipelines", "hands", "objects")}
+    for kind, names in named.items():
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ConfigError(f"bench: {kind[:-1]} '{twice[0]}' is named twice; each needs a name of its own")
     settings = {
         "lgrasp": lgrasp.__version__,
         "device": resolve_device(config.device).name,
-        "pipelines": pipelines,
-        "rows": config.rows,
+        "pipelines": named["pipelines"],
         "baseline_rows": baseline_rows,
         "repeat": repeat,
-        "shard_rows": config.shard_rows,
-        "seed": config.seed,
         "set": list(config.settings),
-        "workers": config.workers,
-        "hand_dir": config.hand_dir and str(config.hand_dir),
-        "object_dir": config.object_dir and str(config.object_dir),
+        **config.model_dump(mode="json", include={"rows", "shard_rows", "seed", "workers", "hand_dir", "object_dir"}),
     }
     return {
         "settings": settings,
-        "hands": hands,
-        "objects": objects,
+        "hands": named["hands"],
+        "objects": named["objects"],
         "published": published and published.model_dump(mode="json"),
         "cells": [],
         "means": [],
         "complete": False,
     }
-
-
-def _names(kind: str, given: tuple[str, ...]) -> list[str]:
-    names = [Path(name).stem for name in given]
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise ConfigError(f"bench: {kind} '{twice[0]}' is named twice; each needs a name of its own")
-    return names
 
 
 def without_missing(config: JobConfig) -> tuple[JobConfig, list[str]]:
@@ -91,16 +77,20 @@ def read_table(path: Path, wanted: Table) -> Table:
         return wanted
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        was = found["settings"] | {"hands": found["hands"], "objects": found["objects"]}
+        was = _plan(found)
         cells = [cell for cell in found["cells"] if not cell["error"]]
     except (OSError, ValueError, TypeError, KeyError):
         raise ConfigError(f"--resume: {path} is no table of lgrasp bench table1; remove it or name another") from None
-    for name, value in (wanted["settings"] | {"hands": wanted["hands"], "objects": wanted["objects"]}).items():
+    for name, value in _plan(wanted).items():
         if was.get(name) != value:
             raise ConfigError(
                 f"--resume: {path} was measured with {name} {was.get(name)}, not {value}; name another file"
             )
     return with_ratios(wanted | {"cells": cells})
+
+
+def _plan(table: Table) -> dict[str, Any]:
+    return table["settings"] | {"hands": table["hands"], "objects": table["objects"]}
 
 
 def measure_table(
@@ -114,56 +104,56 @@ def measure_table(
     Raises:
         ConfigError: see :func:`plan_jobs`.
     """
-    settings = table["settings"]
-    count = len(config.pipelines)
-    jobs = plan_jobs(config, cache)
+    settings, jobs = table["settings"], plan_jobs(config, cache)
     # plan_jobs: pipeline, hand, object; here all pipelines of a hand and object go together
     pairs = [(hand, mesh) for hand in table["hands"] for mesh in table["objects"]]
     done = {(cell["hand"], cell["object"]) for cell in table["cells"]}
     for first, (hand, mesh) in enumerate(pairs):
         if (hand, mesh) in done:
             continue
-        cell_jobs = [
-            job.changed(rows=settings["baseline_rows"]) if 0 < k == count - 1 else job
-            for k, job in enumerate(jobs[first + k * len(pairs)] for k in range(count))
-        ]
-        cell = _cell(bench, cell_jobs, settings, progress) | {"hand": hand, "object": mesh}
+        ours = jobs[first :: len(pairs)]
+        if len(ours) > 1:
+            ours[-1] = ours[-1].changed(rows=settings["baseline_rows"])
+        runs, error = [], ""
+        try:
+            runs = bench.measure(ours, settings["repeat"], progress)
+        except LgraspError as problem:
+            error = str(problem)
+        cell = {
+            "hand": hand,
+            "object": mesh,
+            "hand_from": ours[0].hand,
+            "object_from": ours[0].object,
+            "asked": {name: job.rows for name, job in zip(settings["pipelines"], ours, strict=True)},
+            "error": error,
+            "pipelines": dict(zip(settings["pipelines"], runs, strict=False)),
+        }
         table = with_ratios(table | {"cells": [*table["cells"], cell]})
         yield table, cell
 
 
-def _cell(
-    bench: Bench, jobs: list[GenerateJob], settings: dict[str, Any], progress: Callable[[str], None] | None
-) -> Cell:
-    runs: list[dict[str, Any]] = []
-    error = ""
-    try:
-        runs = bench.measure(jobs, settings["repeat"], progress)
-    except LgraspError as problem:
-        error = str(problem)
-    source = {"hand_from": jobs[0].hand, "object_from": jobs[0].object}
-    asked = {name: job.rows for name, job in zip(settings["pipelines"], jobs, strict=True)}
-    by_name = dict(zip(settings["pipelines"], runs, strict=False))
-    return {"hand": "", "object": "", **source, "asked": asked, "error": error, "pipelines": by_name}
-
-
 def with_ratios(table: Table) -> Table:
     """The table with the ratios of its cells, the means of its hands and whether it is complete."""
-    names = table["settings"]["pipelines"]
+    names, hands, objects = table["settings"]["pipelines"], table["hands"], table["objects"]
     published = (table["published"] or {}).get("figures", {})
     cells = []
-    for cell in sorted(
-        table["cells"], key=lambda c: (table["hands"].index(c["hand"]), table["objects"].index(c["object"]))
-    ):
-        rates = {name: run["strict_valid_per_s"]["median"] for name, run in cell["pipelines"].items()}
+    for cell in sorted(table["cells"], key=lambda c: (hands.index(c["hand"]), objects.index(c["object"]))):
         figure = published.get(cell["hand"], {}).get(cell["object"])
+        rates = {name: _rate(cell, name) for name in cell["pipelines"]}
         cells.append(cell | {"published_per_s": figure} | _ratios(names, rates, figure))
-    means = [_means(hand, names, [c for c in cells if c["hand"] == hand and not c["error"]]) for hand in table["hands"]]
-    return table | {
-        "cells": cells,
-        "means": [mean for mean in means if mean],
-        "complete": len(cells) == len(table["hands"]) * len(table["objects"]),
-    }
+    means = []
+    for hand in hands:
+        if own := _measured(cells, hand):
+            rates = {name: trimmed_mean([_rate(cell, name) for cell in own]) for name in names}
+            figures = [cell["published_per_s"] for cell in own]
+            figure = None if None in figures else trimmed_mean(figures)  # over the same cells, if it has all of them
+            mean = {"hand": hand, "cells": len(own), "strict_valid_per_s": rates, "published_per_s": figure}
+            means.append(mean | _ratios(names, rates, figure))
+    return table | {"cells": cells, "means": means, "complete": len(cells) == len(hands) * len(objects)}
+
+
+def _measured(cells: list[Cell], hand: str) -> list[Cell]:
+    return [cell for cell in cells if cell["hand"] == hand and not cell["error"]]
 
 
 def _ratios(names: list[str], rates: dict[str, float], figure: float | None) -> dict[str, Any]:
@@ -172,17 +162,6 @@ def _ratios(names: list[str], rates: dict[str, float], figure: float | None) -> 
         "ratio": {name: over(rates.get(name), rates.get(names[-1])) for name in names[:-1]},
         "published_ratio": {name: over(rates.get(name), figure) for name in names},
     }
-
-
-def _means(hand: str, names: list[str], cells: list[Cell]) -> dict[str, Any]:
-    """Trimmed means of a hand over its cells; the published ones over the same cells, if it has all of them."""
-    if not cells:
-        return {}
-    rates = {name: trimmed_mean([_rate(cell, name) for cell in cells]) for name in names}
-    figures = [cell["published_per_s"] for cell in cells]
-    figure = None if None in figures else trimmed_mean(figures)
-    whole = {"hand": hand, "cells": len(cells), "strict_valid_per_s": rates, "published_per_s": figure}
-    return whole | _ratios(names, rates, figure)
 
 
 def _rate(cell: Cell, name: str) -> float:
@@ -206,26 +185,21 @@ def comparison_page(table: Table) -> Page:
     settings, published = table["settings"], table["published"]
     names = settings["pipelines"]
     baseline = f", {names[-1]} {settings['baseline_rows']:,}" if len(names) > 1 else ""
-    head = [
-        f"{settings['device']}: {settings['rows']:,} grasps{baseline}; strict-valid grasps per second, "
-        f"median of {settings['repeat']}"
-    ]
-    tables = [part for hand in table["hands"] for part in _hand_tables(table, hand)]
+    what = f"strict-valid grasps per second, median of {settings['repeat']}"
     notes = ["trimmed mean: without the highest and the lowest object"] if len(table["objects"]) > 1 else []
-    notes += [
+    notes.append(
         "thread-seconds by stage; object s, field s: made from nothing, not part of the rates; load s: from the cache"
-    ]
-    notes += [
-        f"{cell['hand']} {cell['object']} could not be measured: {cell['error']}"
-        for cell in table["cells"]
-        if cell["error"]
-    ]
-    return Page(head, tables, notes + (caveats(published) if published else []))
+    )
+    lost = [cell for cell in table["cells"] if cell["error"]]
+    notes += [f"{cell['hand']} {cell['object']} could not be measured: {cell['error']}" for cell in lost]
+    tables = [part for hand in table["hands"] for part in _hand_tables(table, hand)]
+    head = f"{settings['device']}: {settings['rows']:,} grasps{baseline}; {what}"
+    return Page([head], tables, notes + (caveats(published) if published else []))
 
 
 def _hand_tables(table: Table, hand: str) -> list[Texts]:
     names, published = table["settings"]["pipelines"], table["published"]
-    cells = [cell for cell in table["cells"] if cell["hand"] == hand and not cell["error"]]
+    cells = _measured(table["cells"], hand)
     if not cells:
         return []
     source = cells[0]["hand_from"]
@@ -237,23 +211,12 @@ def _hand_tables(table: Table, hand: str) -> list[Texts]:
         mean = next(mean for mean in table["means"] if mean["hand"] == hand)
         rows.append(_rates("trimmed mean", mean["strict_valid_per_s"], mean, published))
     runs = [(cell["object"], name, cell["pipelines"][name]) for cell in cells for name in names]
-    behind = (
-        "object",
-        "pipeline",
-        "grasps",
-        "strict",
-        "range/s",
-        "published count/s",
-        "near-dup",
-        "poses",
-        "survivors",
-    )
     stages = sorted({stage for *_, run in runs for stage in run["counts"]})
-    seconds = ("object", "pipeline", *stages, "wall s", "object s", "field s", "load s", "MB")
+    details = [{"object": mesh, "pipeline": name} | _rows(run) for mesh, name, run in runs]
+    seconds = [{"object": mesh, "pipeline": name} | _seconds(run, stages) for mesh, name, run in runs]
     return [
         Texts(hand + (f" ({source})" if source != hand else ""), columns, rows),
-        Texts("", behind, [_behind(*run) for run in runs], 2),
-        Texts("", seconds, [_seconds(*run, stages) for run in runs], 2),
+        *(Texts("", tuple(part[0]), [tuple(row.values()) for row in part], 2) for part in (details, seconds)),
     ]
 
 
@@ -262,23 +225,23 @@ def _rates(what: str, rates: dict[str, float], of: dict[str, Any], published: An
     return (*texts, number(of["published_per_s"]), *map(times, of["published_ratio"].values())) if published else texts
 
 
-def _behind(mesh: str, name: str, run: dict[str, Any]) -> tuple[str, ...]:
+def _rows(run: dict[str, Any]) -> dict[str, str]:
+    """What came out of a run, by column."""
     strict = run["strict_valid_per_s"]
-    return (
-        mesh,
-        name,
-        number(run["grasps"]) + (" starved" if run["starved"] else ""),
-        number(run["strict"]),
-        f"{strict['min']:,.0f}-{strict['max']:,.0f}",
-        number(run["published_count_per_s"]["median"]),
-        number(run["near_duplicates"]),
-        number(run["distinct_poses"]),
-        "  ".join(f"{stage} {count:,}" for stage, count in run["survivors"].items()),
-    )
+    return {
+        "grasps": number(run["grasps"]) + (" starved" if run["starved"] else ""),
+        "strict": number(run["strict"]),
+        "range/s": f"{strict['min']:,.0f}-{strict['max']:,.0f}",
+        "published count/s": number(run["published_count_per_s"]["median"]),
+        "near-dup": number(run["near_duplicates"]),
+        "poses": number(run["distinct_poses"]),
+        "survivors": "  ".join(f"{stage} {count:,}" for stage, count in run["survivors"].items()),
+    }
 
 
-def _seconds(mesh: str, name: str, run: dict[str, Any], stages: list[str]) -> tuple[str, ...]:
-    seconds, built = run["seconds"], run["build_seconds"]
-    parts = [*(seconds.get(stage, 0.0) for stage in stages), seconds["wall"], built["object"], built["field"]]
-    loaded = sum(run["load_seconds"].values())
-    return (mesh, name, *(f"{x:.2f}" for x in (*parts, loaded)), number(run["peak_rss_mb"]))
+def _seconds(run: dict[str, Any], stages: list[str]) -> dict[str, str]:
+    """What a run took, by column."""
+    parts = {stage: run["seconds"].get(stage, 0.0) for stage in stages} | {"wall s": run["seconds"]["wall"]}
+    parts |= {f"{what} s": run["build_seconds"][what] for what in ("object", "field")}
+    parts["load s"] = sum(run["load_seconds"].values())
+    return {name: f"{x:.2f}" for name, x in parts.items()} | {"MB": number(run["peak_rss_mb"])}

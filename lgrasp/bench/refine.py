@@ -13,7 +13,6 @@ import trimesh
 
 from lgrasp.bench.page import Page, Table, caveats, load_published, number, over
 from lgrasp.cloud.model import cloud_object
-from lgrasp.dataset import GraspRows, HandRecord
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import load_object, object_key
 from lgrasp.geometry.decompose import decompose
@@ -34,9 +33,9 @@ from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.refiner import Pose, Refiner, table_pose
 from lgrasp.refine.surface import hand_surface
 from lgrasp.runtime.device import Device, resolve_device
-from lgrasp.simulate.protocol import find_protocol
+from lgrasp.simulate.protocol import Protocol, find_protocol
 from lgrasp.simulate.run import verdicts
-from lgrasp.simulate.scene import Scene, scene_of
+from lgrasp.simulate.scene import scene_of
 
 NOISES = (0.0, 0.002, 0.005, 0.01)
 """Standard deviations of the points of clouds, besides meshes [m]."""
@@ -49,14 +48,6 @@ _POINTS = 6000
 _SHIFT, _TURN, _BEND = 0.01, 0.15, 0.15  # standard deviations of a coarse pose [m, rad] an axis, [rad] a joint
 
 
-@dataclass(frozen=True)
-class _Case:
-    """One object."""
-
-    model: ObjectModel
-    scene: Scene
-
-
 @dataclass
 class _Total:
     """Plans over some objects."""
@@ -64,18 +55,18 @@ class _Total:
     starts: int = 0
     planned: int = 0
     seconds: float = 0.0
-    epsilon: list[np.ndarray] = field(default_factory=list)
+    epsilon: list[float] = field(default_factory=list)
 
     def result(self) -> dict[str, Any]:
-        epsilon = np.concatenate([np.zeros(0), *self.epsilon])
+        valid = len(self.epsilon)
         return {
             "starts": self.starts,
             "planned": self.planned,
-            "valid": len(epsilon),
-            "share": len(epsilon) / max(self.starts, 1),
-            "epsilon": float(epsilon.mean()) if len(epsilon) else None,
+            "valid": valid,
+            "share": valid / max(self.starts, 1),
+            "epsilon": float(np.mean(self.epsilon)) if valid else None,
             "seconds": self.seconds,
-            "seconds_each": over(self.seconds, len(epsilon)),
+            "seconds_each": over(self.seconds, valid),
         }
 
 
@@ -85,6 +76,7 @@ def bench_hands(
     starts: int,
     protocol: str = "fc",
     *,
+    params: PlanParams | None = None,
     noises: Sequence[float] = NOISES,
     device: str = "auto",
     cache: Cache | None = None,
@@ -106,17 +98,22 @@ def bench_hands(
     Raises:
         LgraspError: hand, object, device or protocol are unknown.
     """
-    find_protocol(protocol)
+    rules, best = find_protocol(protocol), params or PlanParams()
     store, at = cache or Cache(), resolve_device(device)
+    planners = {
+        (_named(noise), hands): (noise, own if noise is None else cloud_params(own))
+        for noise in (None, *noises)
+        for hands, own in (("one", best.model_copy(update=ONE)), ("best", best))
+    }
     return {
         "device": at.name,
         "objects": list(objects),
         "starts": starts,
         "protocol": protocol,
-        "best_of": PlanParams().rolls,
+        "best_of": best.rolls,
         "steps": list(STEPS),
         "published": load_published("dipgrasp").model_dump(mode="json"),
-        "hands": {hand: _bench_hand(hand, objects, starts, protocol, noises, at, store, progress) for hand in hands},
+        "hands": {hand: _bench_hand(hand, objects, starts, rules, planners, at, store, progress) for hand in hands},
     }
 
 
@@ -124,8 +121,8 @@ def _bench_hand(
     hand: str,
     objects: Sequence[str],
     starts: int,
-    protocol: str,
-    noises: Sequence[float],
+    protocol: Protocol,
+    planners: dict[tuple[str, str], tuple[float | None, PlanParams]],
     at: Device,
     cache: Cache,
     progress: Callable[[str], None],
@@ -134,50 +131,40 @@ def _bench_hand(
     arrays, palmar = upload_hand(model, at.alias), visible_surface(source, model, at.alias)
     record = hand_record(model, mesh_blobs(source.urdf))
     stand_off = source.spec.stand_off or STAND_OFF
-    totals = {(noise, hands): _Total() for noise in (None, *noises) for hands in ("one", "best")}
+    totals = {name: _Total() for name in planners}
     coarse: list[tuple[ObjectModel, Pose]] = []
     for name in objects:
-        case = _case(name, record, cache, at.alias)
-        for (noise, hands), total in totals.items():
-            target = case.model if noise is None else _cloud(case.model, noise)
-            params = PlanParams(**ONE) if hands == "one" else PlanParams()
-            params = params if noise is None else cloud_params(params)
+        mesh, key = object_key(name, 1.0, ObjectParams())
+        found, _ = load_object(cache, mesh, key, 1.0, ObjectParams(), at.alias)
+        scene = scene_of(record, [object_record(found)], partial(decompose, store=cache), at.alias)
+        for (on, hands), (noise, params) in planners.items():
+            total, target = totals[on, hands], found if noise is None else _cloud(found, noise)
             planner = Planner(arrays, target, stand_off, params, palmar)
             if not any(t.starts for t in totals.values()):
                 planner.run(1)  # kernels are compiled outside of the clock
             begin = time.perf_counter()
             grasps, counts = planner.run(starts)
             seconds = time.perf_counter() - begin
-            rows = grasp_rows(press(grasps), model.tree, target.center)
-            holds = _holds(protocol, case.scene, rows) if len(grasps) else np.zeros(0, bool)
-            what = f"{hand}, {name}, {_named(noise)}, {'one hand' if hands == 'one' else f'best of {params.rolls}'}"
+            holds = np.zeros(0, bool)
+            if len(grasps):
+                rows = grasp_rows(press(grasps), model.tree, target.center)
+                verdict = verdicts(scene, rows, protocol, threads=os.cpu_count() or 1)
+                holds = verdict[f"{protocol.name}_holds"].astype(bool)
+            what = f"{hand}, {name}, {on}, {'one hand' if hands == 'one' else f'best of {params.rolls}'}"
             progress(f"{what}: {int(holds.sum())} of {starts}, {seconds:.1f} s")
             total.starts += counts["starts"]
             total.planned += len(grasps)
             total.seconds += seconds
-            total.epsilon.append(grasps.metrics["epsilon"][holds])
-            if noise is None and hands == "best":
-                coarse.append((case.model, _displaced(grasps, holds, at.alias)))
+            total.epsilon += grasps.metrics["epsilon"][holds].tolist()
+            if (on, hands) == ("mesh", "best"):
+                coarse.append((found, _displaced(grasps, holds, at.alias)))
     energy, milliseconds, poses = _falls(arrays.model, palmar, coarse, at.alias)
-    planning: dict[str, dict[str, Any]] = {}
-    for (noise, hands), total in totals.items():
-        planning.setdefault(_named(noise), {})[hands] = total.result()
+    planning = {on: {hands: totals[on, hands].result() for hands in ("one", "best")} for on, _ in planners}
     return {"planning": planning, "energy": energy, "milliseconds": milliseconds, "poses": poses}
 
 
 def _named(noise: float | None) -> str:
     return "mesh" if noise is None else f"cloud_{1e3 * noise:g}_mm"
-
-
-def _case(name: str, record: HandRecord, cache: Cache, device: str) -> _Case:
-    mesh, key = object_key(name, 1.0, ObjectParams())
-    model, _ = load_object(cache, mesh, key, 1.0, ObjectParams(), device)
-    return _Case(model, scene_of(record, [object_record(model)], partial(decompose, store=cache), device))
-
-
-def _holds(protocol: str, scene: Scene, rows: GraspRows) -> np.ndarray:
-    found = verdicts(scene, rows, find_protocol(protocol), threads=os.cpu_count() or 1)
-    return found[f"{protocol}_holds"].astype(bool)
 
 
 def _cloud(model: ObjectModel, noise: float) -> ObjectModel:
@@ -218,65 +205,50 @@ def _falls(
 
 def refine_page(result: dict[str, Any]) -> Page:
     """The tables as texts: the paper's figures stand beside one hand at each start."""
-    published, starts = result["published"], result["starts"]
-    head = [
-        f"{result['device']}: {starts} starts on each of {', '.join(result['objects'])}; valid by {result['protocol']}"
-    ]
-    columns = ("hand", "whose", "epsilon", "valid", "s each", "planned")
-    tables = [Table("Table I: plans on meshes", columns, _plans(result), 2)]
-    columns = ("hand", "whose", *map(str, result["steps"]), "falls", "ms")
-    tables.append(Table("Table III: energy of coarse poses after rounds of matching", columns, _energies(result), 2))
-    clouds = [name for one in result["hands"].values() for name in one["planning"] if name != "mesh"]
-    if clouds:
-        names = tuple(dict.fromkeys(clouds))
-        columns = ("hand", "whose", *(name[6:].replace("_", " ") for name in names), "kept", "s each")
-        rows = [row for hand in result["hands"] for row in _noisy(result, hand, names)]
-        tables.append(Table("Table IV: valid plans on points of the surface, by noise", columns, rows, 2))
-    return Page(head, tables, caveats(published))
-
-
-def _whose(result: dict[str, Any]) -> dict[str, str]:
-    return {"one": "ours, one hand", "best": f"ours, best of {result['best_of']}"}
-
-
-def _plans(result: dict[str, Any]) -> list[tuple[str, ...]]:
-    rows = []
+    starts, names, papers = result["starts"], ", ".join(result["objects"]), result["published"]["figures"]
+    whose = {"one": "ours, one hand", "best": f"ours, best of {result['best_of']}"}
+    plans, energies, noisy = [], [], []
+    clouds = tuple(dict.fromkeys(n for one in result["hands"].values() for n in one["planning"] if n != "mesh"))
     for hand, one in result["hands"].items():
-        for hands, whose in _whose(result).items():
-            plans = one["planning"]["mesh"][hands]
-            planned = f"{plans['planned'] / max(plans['starts'], 1):.1%}"
-            rows.append((hand, whose, *_plan(plans["epsilon"], plans["share"], plans["seconds_each"]), planned))
-            if hands == "one" and (paper := result["published"]["figures"].get(hand)):
-                rows.append((hand, "paper", *_plan(paper["epsilon"], paper["valid"][0], paper["seconds"][0]), "-"))
-    return rows
+        paper, planning, energy = papers.get(hand), one["planning"], one["energy"]
+        for hands, ours in whose.items():
+            own = planning["mesh"][hands]
+            planned = f"{own['planned'] / max(own['starts'], 1):.1%}"
+            plans.append((hand, ours, *_plan(own["epsilon"], own["share"], own["seconds_each"]), planned))
+            on_clouds = [planning[name][hands] for name in clouds]
+            if clouds:
+                noisy.append((hand, ours, *_noisy([p["share"] for p in on_clouds], on_clouds[-1]["seconds_each"])))
+            if paper and hands == "one":
+                plans.append((hand, "paper", *_plan(paper["epsilon"], paper["valid"][0], paper["seconds"][0]), "-"))
+                if clouds and len(paper["valid"]) == len(clouds):
+                    noisy.append((hand, "paper", *_noisy(paper["valid"], paper["seconds"][-1])))
+        fall, each = number(over(energy[0], energy[-1]), ".1f", "x"), f"{one['milliseconds'][-1]:.1f}"
+        energies.append((hand, f"ours, {one['poses']} poses", *(f"{e:.4f}" for e in energy), fall, each))
+        if paper:
+            energy = paper["energy"]
+            energies.append((hand, "paper", *(f"{e:.0f}" for e in energy), f"{energy[0] / energy[-1]:.1f}x", "-"))
+    columns = {
+        "Table I: plans on meshes": ("epsilon", "valid", "s each", "planned"),
+        "Table III: energy of coarse poses after rounds of matching": (*map(str, result["steps"]), "falls", "ms"),
+        "Table IV: valid plans on points of the surface, by noise": (
+            *(name[6:].replace("_", " ") for name in clouds),
+            "kept",
+            "s each",
+        ),
+    }
+    tables = [
+        Table(title, ("hand", "whose", *own), rows, 2)
+        for (title, own), rows in zip(columns.items(), (plans, energies, noisy), strict=True)
+        if rows
+    ]
+    head = f"{result['device']}: {starts} starts on each of {names}; valid by {result['protocol']}"
+    return Page([head], tables, caveats(result["published"]))
 
 
 def _plan(epsilon: float | None, share: float, seconds: float | None) -> tuple[str, str, str]:
     return number(epsilon, ".3f"), f"{share:.1%}", number(seconds, ".2g")
 
 
-def _energies(result: dict[str, Any]) -> list[tuple[str, ...]]:
-    rows = []
-    for hand, one in result["hands"].items():
-        energy, paper = one["energy"], result["published"]["figures"].get(hand)
-        ours = (f"ours, {one['poses']} poses", *(f"{e:.4f}" for e in energy))
-        rows.append((hand, *ours, number(over(energy[0], energy[-1]), ".1f", "x"), f"{one['milliseconds'][-1]:.1f}"))
-        if paper:
-            energy = paper["energy"]
-            rows.append((hand, "paper", *(f"{e:.0f}" for e in energy), f"{energy[0] / energy[-1]:.1f}x", "-"))
-    return rows
-
-
-def _noisy(result: dict[str, Any], hand: str, names: Sequence[str]) -> list[tuple[str, ...]]:
-    def row(whose: str, shares: list[float], seconds: float | None) -> tuple[str, ...]:
-        kept = number(over(shares[-1], shares[0]), ".0%")
-        return (hand, whose, *(f"{share:.1%}" for share in shares), kept, number(seconds, ".2g"))
-
-    rows, planning = [], result["hands"][hand]["planning"]
-    for hands, whose in _whose(result).items():
-        plans = [planning[name][hands] for name in names]
-        rows.append(row(whose, [p["share"] for p in plans], plans[-1]["seconds_each"]))
-        paper = result["published"]["figures"].get(hand)
-        if hands == "one" and paper and len(paper["valid"]) == len(names):
-            rows.append(row("paper", paper["valid"], paper["seconds"][-1]))
-    return rows
+def _noisy(shares: list[float], seconds: float | None) -> tuple[str, ...]:
+    kept = number(over(shares[-1], shares[0]), ".0%")
+    return (*(f"{share:.1%}" for share in shares), kept, number(seconds, ".2g"))

@@ -1,6 +1,7 @@
 """The tables of SeqGrasp, measured: success by opposition space and by number of objects, for several methods."""
 
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,11 +17,12 @@ from lgrasp.jobs.records import make_scene, mesh_blobs
 from lgrasp.jobs.sequence.inputs import SequenceInputs, load_sequence_inputs
 from lgrasp.jobs.sequence.job import SequenceJob, simulated
 from lgrasp.jobs.sequence.records import object_records
-from lgrasp.jobs.sequence.round import Round, Verdicts, run_round
+from lgrasp.jobs.sequence.round import Verdicts, run_round
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 
 _RATES = ("held_per_s", "strict_per_s")
+_SHARE = ".1f", " %"
 
 
 def bench_methods(
@@ -65,17 +67,13 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
         ``begun`` (attempts of each sequence), ``spaces`` (name -> sequences tried with it, rows found, rows that held)
         and ``objects`` (for each number of objects, see :class:`_Objects`).
     """
-    device = resolve_device(jobs[0].device)
-    bounds = jobs[0].pipeline.bounds
-    length = max(len(job.objects) for job in jobs)
+    device, bounds = resolve_device(jobs[0].device), jobs[0].pipeline.bounds
     spaces: dict[str, dict[str, int]] = {}
-    objects = [_Objects() for _ in range(length)]
+    objects = [_Objects() for _ in range(max(len(job.objects) for job in jobs))]
     for job in jobs:
-        pipeline, cache = _as_published(job.pipeline), job.cache
-        keys = job.keys
+        pipeline, cache, keys = _as_published(job.pipeline), job.cache, job.keys
         inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device)
-        meshes = mesh_blobs(keys.source.urdf)
-        scene = make_scene(cache, inputs.hand, object_records(inputs), meshes, device.alias)
+        scene = make_scene(cache, inputs.hand, object_records(inputs), mesh_blobs(keys.source.urdf), device.alias)
         inputs = replace(inputs, scene=scene)
         load_kernels(device.alias, kernel_modules("lgrasp.stages.", "lgrasp.grasp."))
         assert job.simulate
@@ -83,9 +81,12 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
         if progress:
             progress(f"{params.method}, {' '.join(inputs.object_ids)}: {params.width} attempts")
         seen: list[SequenceTable] = []
-        workers = job.workers or os.cpu_count() or 1
-        found = run_round(pipeline, inputs, 0, 0, workers, verdicts=_watched(simulated(inputs, job.simulate), seen))
-        _count_spaces(spaces, found)
+        watched = _watched(simulated(inputs, job.simulate), seen)
+        found = run_round(pipeline, inputs, 0, 0, job.workers or os.cpu_count() or 1, verdicts=watched)
+        for name, counts in ((name, counts) for step in found.spaces for name, counts in step.items()):
+            grown, ran = counts.get("sequence", {}), counts.get("simulate", {})
+            more = {"tried": grown.get("sequences", 0), "found": ran.get("tried", 0), "held": ran.get("held", 0)}
+            add_counts(spaces, {name: more})
         attempts = [params.width, *map(len, found.levels)]
         for step, entry in enumerate(objects):
             entry.begun += params.width
@@ -117,37 +118,23 @@ def _watched(simulate: Verdicts, seen: list[SequenceTable]) -> Verdicts:
     return run
 
 
-def _count_spaces(spaces: dict[str, dict[str, int]], found: Round) -> None:
-    for step in found.spaces:
-        for name, counts in step.items():
-            grown, simulated_ = counts.get("sequence", {}), counts.get("simulate", {})
-            more = {
-                "tried": grown.get("sequences", 0),
-                "found": simulated_.get("tried", 0),
-                "held": simulated_.get("held", 0),
-            }
-            add_counts(spaces, {name: more})
-
-
 class _Objects:
     """Rows of one number of objects, over the sequences."""
 
     def __init__(self) -> None:
         self.begun = self.attempts = 0  # with the first object; with this one, after rows that held
         self.seconds = self.total = 0.0  # of this step; of it and those before; simulation not counted
-        self._simulated = self._strict = self._held = self._consumed = 0
-        self._depth: list[np.ndarray] = []
+        self._rows: Counter[str] = Counter()
+        self._depth: list[float] = []
         self._q: list[np.ndarray] = []
 
     def add(self, tried: SequenceTable, held: SequenceTable, inputs: SequenceInputs, strict: int) -> None:
         """Count rows: those simulated, those of them that held, and how many were strict."""
-        self._simulated += len(tried)
-        self._strict += strict
-        self._held += len(held)
         pairs = zip(held.space, held.used, strict=True)
-        self._consumed += sum(consumed(inputs.spaces, frozenset(s.tolist()), used) for s, used in pairs)
-        self._depth.append(1e3 * tried.metrics["penetration"])
-        self._q.append(held.q[:, -1])
+        full = sum(consumed(inputs.spaces, frozenset(s.tolist()), used) for s, used in pairs)
+        self._rows.update(simulated=len(tried), strict=strict, held=len(held), consumed=full)
+        self._depth += (1e3 * tried.metrics["penetration"]).tolist()
+        self._q += [*held.q[:, -1]]
 
     def summary(self) -> dict[str, Any]:
         """The numbers.
@@ -157,26 +144,23 @@ class _Objects:
             rows simulated; rows per second of all steps so far; ``penetration_*`` [mm] of the rows simulated;
             ``diversity``, the standard deviation of the joints of held rows [rad].
         """
-        depth = np.concatenate([np.zeros(0), *self._depth])
-        q = np.concatenate(self._q) if self._q else np.zeros((0, 1))
+        depth, rows = self._depth, self._rows
         return {
             "begun": self.begun,
             "attempts": self.attempts,
-            "simulated": self._simulated,
-            "strict": self._strict,
-            "held": self._held,
-            "success": _percent(self._held, self.begun),
-            "success_of_attempts": _percent(self._held, self.attempts),
-            "success_of_simulated": _percent(self._held, self._simulated),
-            "consumed": _percent(self._consumed, self._held),
-            "penetration_mean": float(depth.mean()) if len(depth) else None,
-            "penetration_median": float(np.median(depth)) if len(depth) else None,
-            "penetration_max": float(depth.max()) if len(depth) else None,
+            **{name: rows[name] for name in ("simulated", "strict", "held")},
+            "success": _percent(rows["held"], self.begun),
+            "success_of_attempts": _percent(rows["held"], self.attempts),
+            "success_of_simulated": _percent(rows["held"], rows["simulated"]),
+            "consumed": _percent(rows["consumed"], rows["held"]),
+            "penetration_mean": float(np.mean(depth)) if depth else None,
+            "penetration_median": float(np.median(depth)) if depth else None,
+            "penetration_max": max(depth) if depth else None,
             "seconds": self.seconds,
             "seconds_per_256": over(256 * self.seconds, self.attempts),
-            "held_per_s": over(self._held, self.total),
-            "strict_per_s": over(self._strict, self.total),
-            "diversity": float(q.std(0).mean()) if len(q) > 1 else None,
+            "held_per_s": over(rows["held"], self.total),
+            "strict_per_s": over(rows["strict"], self.total),
+            "diversity": float(np.std(self._q, axis=0).mean()) if len(self._q) > 1 else None,
         }
 
 
@@ -192,7 +176,7 @@ def sequence_page(result: dict[str, Any]) -> Page:
     for method, found in result["methods"].items():
         title = f"{method}: {found['begun']} attempts started with each sequence"
         tables += [_space_table(title, found["spaces"], published["spaces"])]
-        tables += [_share_table(found["objects"], published), _measure_table(found["objects"], published)]
+        tables += _object_tables(found["objects"], published)
     tables.append(_rate_table(result))
     notes = [
         "hold/tried, hold/begun: of all attempts, as published; the other shares are of what was left of them",
@@ -207,44 +191,40 @@ def _space_table(title: str, spaces: dict[str, dict[str, int]], published: dict[
         (
             name,
             *(number(counts[key]) for key in ("tried", "found", "held")),
-            number(_percent(counts["held"], counts["tried"]), ".1f", " %"),
-            number(published.get(name), ".1f", " %"),
-            number(_percent(counts["held"], counts["found"]), ".1f", " %"),
+            number(_percent(counts["held"], counts["tried"]), *_SHARE),
+            number(published.get(name), *_SHARE),
+            number(_percent(counts["held"], counts["found"]), *_SHARE),
         )
         for name, counts in spaces.items()
     ]
     return Table(title, ("space", "tried", "found", "hold", "hold/tried", "published", "hold/found"), rows)
 
 
-def _share_table(entries: list[dict[str, Any]], published: dict[str, list[float]]) -> Table:
-    columns = ("objects", "begun", "attempts", "simulated", "strict", "hold", "hold/begun", "hold/attempts", "hold/sim")
-    rows = [
-        (
-            str(n + 1),
-            *(number(entry[key]) for key in ("begun", "attempts", "simulated", "strict", "held")),
-            _beside(entry["success"], published["success"], n, ".1f", " %"),
-            number(entry["success_of_attempts"], ".1f", " %"),
-            number(entry["success_of_simulated"], ".1f", " %"),
+def _object_tables(entries: list[dict[str, Any]], published: dict[str, list[float]]) -> list[Table]:
+    """Shares and measures by number of objects."""
+    shares, measures = [], []
+    for n, entry in enumerate(entries):
+        shares.append(
+            (
+                str(n + 1),
+                *(number(entry[key]) for key in ("begun", "attempts", "simulated", "strict", "held")),
+                _beside(entry["success"], published["success"], n, *_SHARE),
+                *(number(entry[key], *_SHARE) for key in ("success_of_attempts", "success_of_simulated")),
+            )
         )
-        for n, entry in enumerate(entries)
-    ]
-    return Table("", columns, rows)
-
-
-def _measure_table(entries: list[dict[str, Any]], published: dict[str, list[float]]) -> Table:
-    columns = ("objects", "penetration: mean mm", "median", "largest", "consumed", "s per 256 attempts", "diversity")
-    rows = [
-        (
-            str(n + 1),
-            _beside(entry["penetration_mean"], published["penetration"], n, ".2f"),
-            *(number(entry[key], ".2f") for key in ("penetration_median", "penetration_max")),
-            _beside(entry["consumed"], published["consumed"], n, ".1f", " %"),
-            _beside(entry["seconds_per_256"], published["seconds_per_256"], n, ".1f"),
-            _beside(entry["diversity"], published["diversity"], n, ".3f"),
+        measures.append(
+            (
+                str(n + 1),
+                _beside(entry["penetration_mean"], published["penetration"], n, ".2f"),
+                *(number(entry[key], ".2f") for key in ("penetration_median", "penetration_max")),
+                _beside(entry["consumed"], published["consumed"], n, *_SHARE),
+                _beside(entry["seconds_per_256"], published["seconds_per_256"], n, ".1f"),
+                _beside(entry["diversity"], published["diversity"], n, ".3f"),
+            )
         )
-        for n, entry in enumerate(entries)
-    ]
-    return Table("", columns, rows)
+    of = ("objects", "begun", "attempts", "simulated", "strict", "hold", "hold/begun", "hold/attempts", "hold/sim")
+    by = ("objects", "penetration: mean mm", "median", "largest", "consumed", "s per 256 attempts", "diversity")
+    return [Table("", of, shares), Table("", by, measures)]
 
 
 def _rate_table(result: dict[str, Any]) -> Table:

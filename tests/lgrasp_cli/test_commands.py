@@ -10,7 +10,7 @@ STAGES = ["place", "domain", "ik", "search", "filter"]
 
 
 def test_build_field(cli, quick):
-    first = json.loads(cli("build-field", "allegro", "-p", quick, "--force", "--json", "-").out)
+    first = json.loads(cli("build-field", "allegro", "-p", quick, "--rebuild", "--json", "-").out)
     assert not first["cached"]
     assert first["vectors"] == 80_000
     assert len(first["clear_share"]) == first["groups"] == 4
@@ -21,7 +21,7 @@ def test_build_field(cli, quick):
 
 
 def test_preprocess(cli, quick):
-    first = json.loads(cli("preprocess", "tiny", "-p", quick, "--force", "--json", "-").out)
+    first = json.loads(cli("preprocess", "tiny", "-p", quick, "--rebuild", "--json", "-").out)
     assert first["watertight"]
     assert first["faces"] == 168
     assert not first["cached"]
@@ -236,6 +236,17 @@ def test_interrupted_bench_leaves_nothing(process, quick, tmp_path, monkeypatch)
     _, errors = child.communicate(timeout=60)
     assert (child.returncode, errors.splitlines()[-1]) == (130, "interrupted")
     assert list(scratch.iterdir()) == []
+
+
+def test_bench_settings(cli, table1, tmp_path):
+    """--set reaches what is measured, and the table says so; a wrong one is refused before anything runs."""
+    result = table1("--objects", "tiny", "--set", "search.restarts=3", "--json", tmp_path / "t.json")
+    assert result.code == 0, result.err
+    assert json.loads((tmp_path / "t.json").read_text())["settings"]["set"] == ["search.restarts=3"]
+    for command in ("table1", "sequence", "refine"):
+        assert (
+            "--set 'bounds.frction=1'" in cli("bench", command, "--set", "bounds.frction=1", "--device", "cpu").error()
+        )
 
 
 def test_bench_table1_refuses(cli):

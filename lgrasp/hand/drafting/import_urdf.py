@@ -52,7 +52,7 @@ def import_urdf(urdf: Path, *, name: str | None = None, out: Path | None = None,
         raise HandError(f"hand name '{name}' may hold letters, digits, '.', '_' and '-' only, such as '{_slug(name)}'")
     folder = Path(out).expanduser() if out is not None else user_dir("hands") / name
     if os.path.lexists(folder) and not force:
-        raise HandError(f"hand folder {folder} exists; choose another --name or --out, or replace it with --force")
+        raise HandError(f"hand folder {folder} exists; choose another --name or --out, or replace it with --overwrite")
     if folder.exists() and not (folder / "hand.yaml").is_file() and any(folder.iterdir() if folder.is_dir() else [1]):
         raise HandError(f"{folder} holds something that is no hand (it has no hand.yaml); choose another --out")
     try:

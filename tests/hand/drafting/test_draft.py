@@ -155,7 +155,7 @@ def test_folder_is_whole_or_absent(tmp_path):
     made = import_urdf(path, out=folder)
     assert load_spec(folder / "hand.yaml") == made.spec
     before = (folder / "hand.yaml").read_bytes()
-    with pytest.raises(HandError, match=r"exists.*--name.*--force"):
+    with pytest.raises(HandError, match=r"exists.*--name.*--overwrite"):
         import_urdf(path, out=folder)
     import_urdf(path, out=folder, force=True)
     assert (folder / "hand.yaml").read_bytes() == before  # drafting twice gives the same

@@ -1,0 +1,82 @@
+"""``lgrasp objects`` and ``lgrasp pipelines``: what there is."""
+
+from typing import Annotated
+
+import typer
+from typer import Argument
+
+from lgrasp_cli.options import Scale
+from lgrasp_cli.tables import Answer, TextTable, reporting
+
+objects = typer.Typer(help="List and show objects.", no_args_is_help=True)
+pipelines = typer.Typer(help="List and show pipelines.", no_args_is_help=True)
+
+
+@objects.command("list")
+@reporting
+def list_objects() -> Answer:
+    """List the objects that can be used by name.
+
+    Example: lgrasp objects list
+    """
+    from lgrasp.jobs.listing import list_objects as listed
+
+    found = listed()
+    rows = [(o["name"], str(o["faces"] or ""), o["licence"], o["description"] or o["file"]) for o in found]
+    return Answer(found, [TextTable(("name", "faces", "licence", "description"), rows, right=("faces",))])
+
+
+@objects.command("show")
+@reporting
+def show_object(
+    mesh: Annotated[str, Argument(metavar="NAME", help="Mesh file, or the name of an object.")], scale: Scale = 1.0
+) -> Answer:
+    """Check a mesh; report its properties and needed repairs.
+
+    Example: lgrasp objects show mug
+    """
+    from lgrasp.jobs.listing import describe_object
+
+    data = describe_object(mesh, scale)
+    pairs = [
+        ("object", data["name"]),
+        ("file", data["file"]),
+        ("faces", f"{data['faces']:,}"),
+        ("size", " x ".join(f"{1000 * side:.1f}" for side in data["extents"]) + " mm"),
+        ("watertight", "yes" if data["watertight"] else "no"),
+        ("sha256", data["sha256"]),
+        *(("repaired", note) for note in data["notes"]),
+    ]
+    return Answer(data, [pairs])
+
+
+@pipelines.command("list")
+@reporting
+def list_pipelines() -> Answer:
+    """List the pipelines that can be used by name.
+
+    Example: lgrasp pipelines list
+    """
+    from lgrasp.jobs.listing import list_pipelines as listed
+
+    found = listed()
+    rows = [(p["name"], ", ".join(p["stages"]), p["description"]) for p in found]
+    return Answer(found, [TextTable(("name", "stages", "description"), rows)])
+
+
+@pipelines.command("show")
+@reporting
+def show_pipeline(name: Annotated[str, Argument(help="Name of a pipeline, or a YAML file.")]) -> Answer:
+    """Show every parameter of a pipeline with its value and meaning.
+
+    Example: lgrasp pipelines show swift
+    """
+    from lgrasp.jobs.listing import describe_pipeline
+
+    data = describe_pipeline(name)
+    head = f"{data['name']}: {data['description']}" if data["description"] else data["name"]
+    rows = [
+        (part, key, " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value), words)
+        for part, key, value, words in data["parameters"]
+    ]
+    return Answer(data, [head, TextTable(("part", "parameter", "value", "meaning"), rows, right=("value",))])

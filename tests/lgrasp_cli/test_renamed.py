@@ -1,0 +1,44 @@
+"""Options of the release before: they still work, and say what they are called now."""
+
+import json
+
+import pytest
+from support.urdfs import gripper
+
+from lgrasp_cli.renamed import renew
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("build-field allegro --force", "build-field allegro --rebuild"),
+        ("filter --object mug --force", "filter --object mug --rebuild"),
+        ("hands add my.urdf --force", "hands add my.urdf --overwrite"),
+        ("generate --force -n 3", "generate --overwrite --rebuild -n 3"),
+        ("generate --resume", "generate"),
+        ("bench table1 --resume", "bench table1 --resume"),
+        ("bench sequence --physics=seq6", "bench sequence --simulate=seq6"),
+        ("simulate x --threads 2", "simulate x --workers 2"),
+        ("refine x --always --json", "refine x --keep-invalid --json -"),
+        ("refine x --json - --quiet", "refine x --json - --quiet"),
+        ("", ""),
+    ],
+)
+def test_words(old, new):
+    assert renew(old.split()) == new.split()
+
+
+def test_force_of_preparations_is_rebuild(cli, quick):
+    base = ("preprocess", "tiny", "-p", quick, "--json", "-")
+    assert cli(*base).code == 0
+    result = cli(*base, "--force")
+    assert result.err == "warning: --force is now --rebuild; the old name works in this release only\n"
+    assert not json.loads(result.out)["cached"]
+
+
+def test_force_of_hands_add_is_overwrite(cli, tmp_path):
+    base = ("hands", "add", gripper(tmp_path), "--out", tmp_path / "made")
+    assert cli(*base).code == 0
+    assert "--overwrite" in cli(*base).error()
+    assert cli(*base, "--overwrite").err == ""
+    assert "--force is now --overwrite;" in cli(*base, "--force").err
