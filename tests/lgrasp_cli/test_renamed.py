@@ -32,7 +32,7 @@ def test_force_of_preparations_is_rebuild(cli, quick):
     base = ("preprocess", "tiny", "-p", quick, "--json", "-")
     assert cli(*base).code == 0
     result = cli(*base, "--force")
-    assert result.err == "warning: --force is now --rebuild; the old name works in this release only\n"
+    assert "warning: --force is now --rebuild; the old name works in this release only\n" in result.err
     assert not json.loads(result.out)["cached"]
 
 
