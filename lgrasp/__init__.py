@@ -82,44 +82,28 @@ __all__ = [
 ]
 
 _HOMES = {
-    "lgrasp.api": (
-        "Grasps",
-        "Hand",
-        "Object",
-        "generate",
-        "hands",
-        "load_hand",
-        "load_object",
-        "objects",
-        "open",
-        "pipelines",
-        "plan",
-        "read_cloud",
-        "refine",
-        "sequence",
-        "simulate",
-    ),
-    "lgrasp.dataset.exports": ("export_shards", "read_grasps"),
-    "lgrasp.dataset.merge": ("merge_shards",),
-    "lgrasp.dataset.reader": ("ShardReader", "read_shard"),
-    "lgrasp.dataset.torch_dataset": ("GraspDataset",),
-    "lgrasp.dataset.validate": ("validate_shard",),
-    "lgrasp.dataset.writer": ("write_shard",),
-    "lgrasp.engine.pipeline": ("load_pipeline",),
-    "lgrasp.errors": ("LgraspError",),
-    "lgrasp.geometry.poses": ("pose_matrix",),
-    "lgrasp.grasp.bounds": ("GraspBounds",),
-    "lgrasp.grasp.records": ("Shard",),
-    "lgrasp.jobs.learn.job": ("load_predictor",),
-    "lgrasp.judge.run": ("judge",),
-    "lgrasp.learn.network": ("best_answers",),
-    "lgrasp.refine.params": ("LocalSearch",),
-    "lgrasp.refine.refiner": ("Refiner",),
-    "lgrasp.scenes.files": ("SceneReader", "read_scene"),
+    "lgrasp.api": "Grasps Hand Object generate hands load_hand load_object objects open pipelines plan read_cloud "
+    "refine sequence simulate",
+    "lgrasp.dataset.exports": "export_shards read_grasps",
+    "lgrasp.dataset.merge": "merge_shards",
+    "lgrasp.dataset.reader": "ShardReader read_shard",
+    "lgrasp.dataset.torch_dataset": "GraspDataset",
+    "lgrasp.dataset.validate": "validate_shard",
+    "lgrasp.dataset.writer": "write_shard",
+    "lgrasp.engine.pipeline": "load_pipeline",
+    "lgrasp.errors": "LgraspError",
+    "lgrasp.geometry.poses": "pose_matrix",
+    "lgrasp.grasp.bounds": "GraspBounds",
+    "lgrasp.grasp.records": "Shard",
+    "lgrasp.jobs.learn.job": "load_predictor",
+    "lgrasp.judge.run": "judge",
+    "lgrasp.learn.network": "best_answers",
+    "lgrasp.refine.params": "LocalSearch",
+    "lgrasp.refine.refiner": "Refiner",
+    "lgrasp.scenes.files": "SceneReader read_scene",
 }
+_HOME = {name: module for module, names in _HOMES.items() for name in names.split()}
 """Module of every public name."""
-
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 
 class _Face(ModuleType):

@@ -48,18 +48,14 @@ class Grasps(GraspRows):
     @classmethod
     def of_shard(cls, shard: Shard) -> "Grasps":
         """The rows of a shard."""
-        rows = {f.name: getattr(shard.grasps, f.name) for f in fields(GraspRows)}
-        return cls(
-            **rows, hand=shard.hand, objects=shard.objects, header=shard.header, statistics=dict(shard.statistics)
-        )
+        more = {"hand": shard.hand, "objects": shard.objects, "header": shard.header}
+        return cls(**_rows(shard.grasps), **more, statistics=dict(shard.statistics))
 
     @property
     def shard(self) -> Shard:
         """The same as :func:`write_shard` takes it."""
-        rows = GraspRows(**{f.name: getattr(self, f.name) for f in fields(GraspRows)})
-        return Shard(
-            header=self.header, hand=self.hand, objects=self.objects, grasps=rows, statistics=dict(self.statistics)
-        )
+        more = {"hand": self.hand, "objects": self.objects, "header": self.header}
+        return Shard(grasps=GraspRows(**_rows(self)), **more, statistics=dict(self.statistics))
 
     def save(self, path: Name) -> Path:
         """Write one shard file.
@@ -84,6 +80,10 @@ class Grasps(GraspRows):
             place = changed.setdefault(group, {}) if slash else changed
             place[member if slash else name] = values[chosen]
         return replace(self, **changed)
+
+
+def _rows(of: GraspRows) -> dict[str, Any]:
+    return {field.name: getattr(of, field.name) for field in fields(GraspRows)}
 
 
 def generate(
@@ -113,9 +113,8 @@ def generate(
     """
     from lgrasp.jobs.generate import GenerateJob
 
-    with _folder(out) as folder:
-        what = _asked(hand, n, pipeline, seed, device, workers, folder, out is None)
-        return _made(run(_job(GenerateJob, object=str(object), scale=scale, **what)).paths, n)
+    what = _asked(hand, n, pipeline, seed, device, workers, out)
+    return _done(GenerateJob, out, n, object=str(object), scale=scale, **what)
 
 
 def sequence(
@@ -142,9 +141,8 @@ def sequence(
     """
     from lgrasp.jobs.sequence.job import SequenceJob
 
-    with _folder(out) as folder:
-        what = _asked(hand, n, pipeline, seed, device, workers, folder, out is None)
-        return _made(run(_job(SequenceJob, objects=tuple(map(str, objects)), scale=str(scale), **what)).paths)
+    what = _asked(hand, n, pipeline, seed, device, workers, out)
+    return _done(SequenceJob, out, objects=tuple(map(str, objects)), scale=str(scale), **what)
 
 
 def plan(
@@ -168,8 +166,7 @@ def plan(
     from lgrasp.jobs.refine.plan import PlanJob
 
     what: dict[str, Any] = {"cloud": object} if isinstance(object, Cloud) else {"object": str(object), "scale": scale}
-    with _folder(out) as folder:
-        return _made(run(_job(PlanJob, hand=str(hand), out=folder, starts=starts, device=device, **what)).paths)
+    return _done(PlanJob, out, hand=str(hand), starts=starts, device=device, **what)
 
 
 def refine(
@@ -196,10 +193,10 @@ def refine(
     from lgrasp.jobs.refine.settings import refine_params
     from lgrasp.jobs.refine.shards import RefineJob
 
-    chosen = {} if bounds is None else {"bounds": bounds}
-    with _files(grasps) as files, _folder(out) as folder:
-        chosen |= {"params": refine_params(coarse=coarse, **params), "device": device}
-        return _made(run(_job(RefineJob, shards=tuple(files), out=folder, **chosen)).paths)
+    what = {"params": refine_params(coarse=coarse, **params), "device": device}
+    what |= {} if bounds is None else {"bounds": bounds}
+    with _files(grasps) as files:
+        return _done(RefineJob, out, shards=files, **what)
 
 
 def simulate(
@@ -225,9 +222,9 @@ def simulate(
     from lgrasp.jobs.simulate import SimulateJob
 
     found = find_protocol(protocol) if isinstance(protocol, str) else protocol
-    with _files(grasps) as files, _folder(out) as folder:
-        what: dict[str, Any] = {"workers": threads, "device": device, "all_directions": all_directions}
-        return _made(run(_job(SimulateJob, shards=tuple(files), protocol=found, out=folder, **what)).paths)
+    what: dict[str, Any] = {"workers": threads, "device": device, "all_directions": all_directions}
+    with _files(grasps) as files:
+        return _done(SimulateJob, out, shards=files, protocol=found, **what)
 
 
 def open(path: Name) -> Grasps:
@@ -289,16 +286,16 @@ def pipelines() -> dict[str, str]:
 
 
 def _asked(
-    hand: Name, n: int, pipeline: Name | Pipeline, seed: int | None, device: str, workers: int, out: Path, whole: bool
+    hand: Name, n: int, pipeline: Name | Pipeline, seed: int | None, device: str, workers: int, out: Name | None
 ) -> dict[str, Any]:
-    """What jobs that search have in common; ``whole``: all rows in one shard."""
+    """What jobs that search have in common; without a folder all rows are in one shard."""
     chosen = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(str(pipeline))
-    if seed is not None and not 0 <= seed < 2**63:
-        raise ConfigError(f"seed {seed}: need 0 <= seed < 2^63")
     if seed is not None:
+        if not 0 <= seed < 2**63:
+            raise ConfigError(f"seed {seed}: need 0 <= seed < 2^63")
         chosen = chosen.model_copy(update={"seed": seed})
-    what = {"hand": str(hand), "rows": n, "pipeline": chosen, "device": device, "workers": workers, "out": out}
-    return what | ({"shard_rows": max(n, 1)} if whole else {})
+    what = {"hand": str(hand), "rows": n, "pipeline": chosen, "device": device, "workers": workers}
+    return what | ({"shard_rows": max(n, 1)} if out is None else {})
 
 
 @contextmanager
@@ -312,19 +309,21 @@ def _folder(out: Name | None) -> Iterator[Path]:
 
 
 @contextmanager
-def _files(grasps: Grasps | Name) -> Iterator[list[Path]]:
+def _files(grasps: Grasps | Name) -> Iterator[tuple[Path, ...]]:
     """Shards or folders of them that hold grasps."""
     if not isinstance(grasps, Grasps):
-        yield [Path(grasps)]
+        yield (Path(grasps),)
         return
     with _folder(None) as folder:
         folder.mkdir()
-        yield [grasps.save(folder / f"{grasps.hand.name}-{grasps.objects[0].id}-00000.h5")]
+        yield (grasps.save(folder / f"{grasps.hand.name}-{grasps.objects[0].id}-00000.h5"),)
 
 
-def _job(kind: type[Job], **fields: Any) -> Job:
-    """A job of some settings; ConfigError where one is out of range."""
-    return parse_model(kind, fields, kind.__name__.removesuffix("Job").lower())
+def _done(kind: type[Job], out: Name | None, asked: int = 0, **options: Any) -> Grasps:
+    """What a job makes in a folder; ConfigError where an option is out of range."""
+    with _folder(out) as folder:
+        job = parse_model(kind, options | {"out": folder}, kind.__name__.removesuffix("Job").lower())
+        return _made(run(job).paths, asked)
 
 
 def _made(paths: Sequence[Path], asked: int = 0) -> Grasps:
@@ -342,5 +341,5 @@ def _made(paths: Sequence[Path], asked: int = 0) -> Grasps:
     if not len(found):
         raise StarvedError("no grasp found")
     if len(found) < asked:
-        warnings.warn(f"{len(found):,} of {asked:,} grasps found", stacklevel=3)
+        warnings.warn(f"{len(found):,} of {asked:,} grasps found", stacklevel=4)
     return found

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from lgrasp_cli.interrupt import before_end
 from lgrasp_cli.options import (
     CacheDir,
     Device,
@@ -21,7 +20,7 @@ from lgrasp_cli.options import (
     split,
     warn,
 )
-from lgrasp_cli.progress import say
+from lgrasp_cli.progress import before_end, say
 from lgrasp_cli.tables import Block, TextTable, print_report
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
     from lgrasp.jobs.config import JobConfig
 
-app = typer.Typer(invoke_without_command=True, subcommand_metavar="[table1|sequence|refine [OPTIONS]]")
+app = typer.Typer(name="bench", invoke_without_command=True, subcommand_metavar="[table1|sequence|refine [OPTIONS]]")
 
 _List = Annotated[str | None, Option(help="Names or files, separated by commas.", show_default="the published")]
 _ObjectDir = Annotated[Path | None, Option(help="Folder where the names of objects are looked up first.")]

@@ -9,7 +9,7 @@ from typer import Option
 from lgrasp_cli.options import CacheDir, open_cache
 from lgrasp_cli.tables import Answer, TextTable, reporting
 
-app = typer.Typer(help="List and clear cached results.", no_args_is_help=True)
+app = typer.Typer(name="cache", help="List and clear cached results.", no_args_is_help=True)
 
 
 @app.command()

@@ -8,8 +8,8 @@ from typer import Argument
 from lgrasp_cli.options import Scale
 from lgrasp_cli.tables import Answer, TextTable, reporting
 
-objects = typer.Typer(help="List and show objects.", no_args_is_help=True)
-pipelines = typer.Typer(help="List and show pipelines.", no_args_is_help=True)
+objects = typer.Typer(name="objects", help="List and show objects.", no_args_is_help=True)
+pipelines = typer.Typer(name="pipelines", help="List and show pipelines.", no_args_is_help=True)
 
 
 @objects.command("list")

@@ -12,7 +12,7 @@ from lgrasp_cli.options import Quiet, Shards, old_name, split, warn
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, plural, reporting
 from lgrasp_cli.working import How, working
 
-app = typer.Typer(help="Inspect, check and merge grasp files (shards).", no_args_is_help=True)
+app = typer.Typer(name="dataset", help="Inspect, check and merge grasp files (shards).", no_args_is_help=True)
 
 
 @app.command()

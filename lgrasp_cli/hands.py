@@ -12,7 +12,7 @@ from lgrasp_cli.tables import Answer, Block, TextTable, plural, reporting
 if TYPE_CHECKING:
     from lgrasp.jobs.hand_check.check import HandCheck
 
-app = typer.Typer(help="List, show, add and check hands.", no_args_is_help=True)
+app = typer.Typer(name="hands", help="List, show, add and check hands.", no_args_is_help=True)
 
 
 @app.command("list")

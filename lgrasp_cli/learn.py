@@ -10,7 +10,9 @@ from lgrasp_cli.options import CacheDir, Device, Quiet, given, open_cache
 from lgrasp_cli.tables import Answer, Block, reporting
 from lgrasp_cli.working import How, working
 
-app = typer.Typer(help="Predict coarse grasps from partial point clouds with a small network.", no_args_is_help=True)
+app = typer.Typer(
+    name="learn", help="Predict coarse grasps from partial point clouds with a small network.", no_args_is_help=True
+)
 
 _Shards = Annotated[list[Path], Argument(help="Shard files, or folders of them.")]
 

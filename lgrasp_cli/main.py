@@ -7,13 +7,13 @@ from typing import Annotated
 import typer
 from typer import Option
 
-from lgrasp.judge.__main__ import command as judge
+from lgrasp.judge.__main__ import judge
 from lgrasp.notices import on_notice
 from lgrasp_cli import bench, cache, catalog, dataset, hands, learn, prepare, scenes
 from lgrasp_cli.generate import generate
-from lgrasp_cli.interrupt import Interrupted, on_interrupt, stop_asked, stop_now
 from lgrasp_cli.options import old_name, warn
 from lgrasp_cli.plan import plan
+from lgrasp_cli.progress import Interrupted, on_interrupt, stop_asked, stop_now
 from lgrasp_cli.refine import refine
 from lgrasp_cli.renamed import renew
 from lgrasp_cli.run import run
@@ -26,33 +26,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (
-    prepare.build_field,
-    prepare.preprocess,
-    prepare.warm_up,
-    generate,
-    sequence,
-    plan,
-    refine,
-    run,
-    simulate,
-):
+_jobs = (generate, sequence, plan, refine, run, simulate)
+for command in (*prepare.COMMANDS, *_jobs, *prepare.STAGES, dataset.export, judge):
     app.command()(command)
-for command in (*prepare.STAGES, dataset.export):
-    app.command()(command)
-app.command("judge")(judge)
 app.command("validate", hidden=True)(old_name(simulate, "lgrasp validate", "lgrasp simulate"))
-for name, group in {
-    "bench": bench.app,
-    "hands": hands.app,
-    "objects": catalog.objects,
-    "pipelines": catalog.pipelines,
-    "cache": cache.app,
-    "dataset": dataset.app,
-    "scenes": scenes.app,
-    "learn": learn.app,
-}.items():
-    app.add_typer(group, name=name)
+for group in (bench.app, hands.app, catalog.objects, catalog.pipelines, cache.app, dataset.app, scenes.app, learn.app):
+    app.add_typer(group)
 
 
 def _version(wanted: bool) -> None:

@@ -160,5 +160,6 @@ def _up_to(stage: str):
     return reporting(run)
 
 
+COMMANDS = (build_field, preprocess, warm_up)
 STAGES = [_up_to(stage) for stage in _STAGES]
 """The commands named after stages."""

@@ -58,7 +58,7 @@ def run(
 def _run_one(job: "Job", how: How) -> dict[str, Any]:
     """The report of a job with its status, one line of why, and exit code."""
     from lgrasp.errors import LgraspError
-    from lgrasp_cli.interrupt import Interrupted
+    from lgrasp_cli.progress import Interrupted
 
     data: dict[str, Any] = {"title": job.title, "unit": job.unit}
     status, text, code = "done", "", 0

@@ -10,7 +10,9 @@ from lgrasp_cli.options import given
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, counted, reporting
 from lgrasp_cli.working import How, working
 
-app = typer.Typer(help="Objects on tables, with point clouds, masks and feasible grasps.", no_args_is_help=True)
+app = typer.Typer(
+    name="scenes", help="Objects on tables, with point clouds, masks and feasible grasps.", no_args_is_help=True
+)
 
 _Paths = Annotated[list[Path], Argument(help="Scene files, or folders of *.h5 files.")]
 

@@ -11,7 +11,7 @@ import typer
 _PLAIN_INTERVAL = 10.0  # [s] between lines of progress where standard error is no terminal
 
 
-def command(
+def judge(
     shards: Annotated[list[Path], typer.Argument(help="Shards, or folders that hold some at any depth.")],
     rows: Annotated[int | None, typer.Option(help="Judge this many rows, drawn at random; default: all.")] = None,
     urdf: Annotated[Path | None, typer.Option(help="Original URDF in place of the stored one.")] = None,
@@ -43,9 +43,9 @@ def command(
         name, sign, file = given.partition("=")
         meshes |= {name: file} if sign else {"": given}
     try:
-        from lgrasp.judge.run import judge
+        from lgrasp.judge import run
 
-        report = judge(shards, urdf=urdf, mesh=meshes or None, rows=rows, progress=None if quiet else _Progress())
+        report = run.judge(shards, urdf=urdf, mesh=meshes or None, rows=rows, progress=None if quiet else _Progress())
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         if json_path and json_path != "-":
             Path(json_path).write_text(text + "\n", encoding="utf-8")
@@ -79,4 +79,4 @@ class _Progress:
 
 
 if __name__ == "__main__":
-    typer.run(command)
+    typer.run(judge)

@@ -5,6 +5,7 @@ import math
 from collections import Counter
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lgrasp.judge import bounds
 from lgrasp.judge.collision import PlacedSolids, hand_in_object, object_in_object
@@ -34,17 +35,10 @@ CHECKS: dict[str, tuple[str, float]] = {
 
 VALUES = (
     *(value for value, _ in CHECKS.values() if value),
-    "object_in_link_mm",
-    "link_in_object_mm",
-    "residual_stored_normals",
-    "residual_frictionless",
-    "force_balance",
-    "force_normal_sum_error",
-    "force_cone_excess",
-    "contacts",
-    "links_in_contact",
-    "epsilon",
+    *("object_in_link_mm", "link_in_object_mm", "residual_stored_normals", "residual_frictionless"),
+    *("force_balance", "force_normal_sum_error", "force_cone_excess", "contacts", "links_in_contact", "epsilon"),
 )
+"""The recomputed numbers by name."""
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -76,16 +70,16 @@ class RowChecks:
             T_objects = np.full((*poses.shape[:2], 4, 4), np.nan)
             for o in range(poses.shape[1]):
                 here = self.index[good, o] >= 0
-                T_objects[here, o] = pose_transforms(poses[here, o])
+                turns = Rotation.from_quat(poses[here, o, 3:], scalar_first=True)
+                T_objects[here, o] = pose_transforms(poses[here, o, :3], turns)
             self._self_penetration(T_links)
             self._penetration(T_links, T_objects)
             self._contacts(T_links, T_objects)
             for row in good:
                 self._wrenches(int(row), epsilon)
         if shard.steps:
-            touching = self.link_of, self.used
-            self.failed["frozen"] = check_frozen(shard, rows, self.index, *touching) & ~bad
-            self.failed["parent"] = check_parents(shard, rows) & ~bad
+            self.failed["frozen"] = self._frozen() & ~bad
+            self.failed["parent"] = self._parents() & ~bad
 
     def _set(self, check: str, value: np.ndarray) -> None:
         """Numbers of the good rows, in the unit of the check's bound."""
@@ -189,14 +183,10 @@ class RowChecks:
         length = np.linalg.norm(given, axis=1, keepdims=True)
         off = angle_deg((given / np.maximum(length, 1e-12))[:, None], object_normals).min(axis=1)
         off = np.where(np.abs(length[:, 0] - 1.0) <= bounds.UNIT_NORMAL, off, 180.0)
-        for check, found in (
-            ("contact_on_object", 1e3 * on_object),
-            ("contact_on_link", 1e3 * np.abs(on_link)),
-            ("normal", between.min(axis=(1, 2))),
-            ("stored_normal", off),
-        ):
+        found = {"contact_on_object": 1e3 * on_object, "contact_on_link": 1e3 * np.abs(on_link)}
+        for check, each in (found | {"normal": between.min(axis=(1, 2)), "stored_normal": off}).items():
             worst = np.zeros(len(self.good))
-            np.maximum.at(worst, i, found)
+            np.maximum.at(worst, i, each)
             self._set(check, worst)
         # the wrench uses the mesh normal; on an edge or vertex, the admissible one nearest the link's
         nominal = between[:, :, 0].min(axis=1) <= bounds.NORMAL_DEG
@@ -227,7 +217,14 @@ class RowChecks:
             links.append(self.link_of[row, o, used])
             points, stored = (np.asarray(self.g[k], float)[row, o, used] for k in ("contact_points", "contact_normals"))
             inward = -self.normals[row, o, used]
-            numbers = _residuals(points, inward, -stored) if used.any() else {"residual": math.inf}
+            numbers = {"residual": math.inf}
+            if used.any():
+                given = -stored / np.maximum(np.linalg.norm(stored, axis=1, keepdims=True), 1e-12)
+                numbers = {
+                    "residual": wrench_residual(points, inward)[0],
+                    "residual_frictionless": wrench_residual(points, inward, mu=0.0)[0],
+                    "residual_stored_normals": wrench_residual(points, given)[0],
+                }
             if used.any() and "contact_forces" in self.g:
                 names = ("force_balance", "force_normal_sum_error", "force_cone_excess")
                 forces = np.asarray(self.g["contact_forces"], float)[row, o, used]
@@ -244,55 +241,35 @@ class RowChecks:
         self.values["contacts"][row] = sum(len(x) for x in links)
         self.values["links_in_contact"][row] = len(np.unique(np.concatenate(links)))
 
-
-def _residuals(points: np.ndarray, inward: np.ndarray, given: np.ndarray) -> dict[str, float]:
-    """Of the mesh's normals, with and without friction, and of the normals given."""
-    given = given / np.maximum(np.linalg.norm(given, axis=1, keepdims=True), 1e-12)
-    return {
-        "residual": wrench_residual(points, inward)[0],
-        "residual_frictionless": wrench_residual(points, inward, mu=0.0)[0],
-        "residual_stored_normals": wrench_residual(points, given)[0],
-    }
-
-
-def check_frozen(
-    shard: JudgedShard, rows: np.ndarray, index: np.ndarray, link_of: np.ndarray, used: np.ndarray
-) -> np.ndarray:
-    """Rows (n,) whose steps move a joint that is not theirs, or that carries a link on an earlier object.
-
-    Args:
-        index: objects of the rows, shape [n, O], -1 where absent.
-        link_of, used: link of every contact and whether it is one, shape [n, O, C].
-    """
-    steps, g = {k: v[rows] for k, v in shard.steps.items()}, shard.grasps
-    present, free = index >= 0, np.asarray(steps["free_joints"], bool)  # (n, O), (n, O, K)
-    bad = (present[:, 1:] & ~present[:, :-1]).any(axis=1) | (free.sum(axis=1) > 1).any(axis=1)
-    bad |= (free.any(axis=2) != present).any(axis=1)
-    last = np.maximum(present.sum(axis=1) - 1, 0)
-    for name, held in (("q", "q"), ("q_pregrasp", "q"), ("q_squeeze", "q_squeeze")):
+    def _frozen(self) -> np.ndarray:
+        """Rows (n,) whose steps move a joint that is not theirs, or that carries a link on an earlier object."""
+        steps, g, index = {k: v[self.rows] for k, v in self.shard.steps.items()}, self.g, self.index
+        present, free = index >= 0, np.asarray(steps["free_joints"], bool)  # (n, O), (n, O, K)
+        bad = (present[:, 1:] & ~present[:, :-1]).any(axis=1) | (free.sum(axis=1) > 1).any(axis=1)
+        bad |= (free.any(axis=2) != present).any(axis=1)
+        last = np.maximum(present.sum(axis=1) - 1, 0)
         still = present[:, 1:, None] & ~free[:, 1:]
-        bad |= (still & (steps[name][:, 1:] != steps[held][:, :-1])).any(axis=(1, 2))
-        bad |= (steps[name][np.arange(len(rows)), last] != g[name][rows]).any(axis=1) if name in g else False
-    riders = shard.hand.riders(shard.joint_names)  # (K, L)
-    for o in range(index.shape[1] - 1):
-        later = free[:, o + 1 :].any(axis=1)  # (n, K)
-        carried = later.astype(int) @ riders.astype(int) > 0  # (n, L)
-        bad |= (np.take_along_axis(carried, np.maximum(link_of[:, o], 0), 1) & used[:, o]).any(axis=1)
-    return bad
+        for name, held in (("q", "q"), ("q_pregrasp", "q"), ("q_squeeze", "q_squeeze")):
+            bad |= (still & (steps[name][:, 1:] != steps[held][:, :-1])).any(axis=(1, 2))
+            bad |= (steps[name][np.arange(len(last)), last] != g[name]).any(axis=1) if name in g else False
+        riders = self.hand.riders(self.shard.joint_names)  # (K, L)
+        for o in range(index.shape[1] - 1):
+            later = free[:, o + 1 :].any(axis=1)  # (n, K)
+            carried = later.astype(int) @ riders.astype(int) > 0  # (n, L)
+            bad |= (np.take_along_axis(carried, np.maximum(self.link_of[:, o], 0), 1) & self.used[:, o]).any(axis=1)
+        return bad
 
-
-def check_parents(shard: JudgedShard, rows: np.ndarray) -> np.ndarray:
-    """Rows (n,) of several objects that do not extend an earlier row of one object less bit by bit."""
-    g, steps = shard.grasps, shard.steps
-    count, parent = (np.asarray(g["object_index"]) >= 0).sum(axis=1), np.asarray(steps["parent"], int)
-    names = ("object_index", "object_pose", "contact_points", "contact_normals", "contact_links", "contact_forces")
-    columns = [g[k] for k in names if k in g]
-    columns += [steps[k] for k in ("space", "free_joints", "q", "q_pregrasp", "q_squeeze")]
-    bad = np.zeros(len(rows), bool)
-    for i, r in enumerate(rows):
-        p, n = parent[r], count[r] - 1
-        good = p == -1 if n == 0 else 0 <= p < r and count[p] == n
-        if good and n > 0:
-            good = all(v[r, :n].tobytes() == v[p, :n].tobytes() for v in columns)
-        bad[i] = not (good and len(np.unique(steps["space"][r, : n + 1])) == n + 1)
-    return bad
+    def _parents(self) -> np.ndarray:
+        """Rows (n,) of several objects that do not extend an earlier row of one object less bit by bit."""
+        g, steps = self.shard.grasps, self.shard.steps
+        count, parent = (np.asarray(g["object_index"]) >= 0).sum(axis=1), np.asarray(steps["parent"], int)
+        names = ("object_index", "object_pose", "contact_points", "contact_normals", "contact_links", "contact_forces")
+        columns = [g[k] for k in names if k in g] + [v for k, v in steps.items() if k != "parent"]
+        bad = np.zeros(len(self.rows), bool)
+        for i, r in enumerate(self.rows):
+            p, n = parent[r], count[r] - 1
+            good = p == -1 if n == 0 else 0 <= p < r and count[p] == n
+            if good and n > 0:
+                good = all(v[r, :n].tobytes() == v[p, :n].tobytes() for v in columns)
+            bad[i] = not (good and len(np.unique(steps["space"][r, : n + 1])) == n + 1)
+        return bad

@@ -42,13 +42,17 @@ def floats(text: str | None, default: Sequence[float]) -> np.ndarray:
     return out
 
 
+def pose_transforms(p: np.ndarray, rotation: Rotation) -> np.ndarray:
+    """Positions (..., 3) and rotations as transforms (..., 4, 4)."""
+    T = np.zeros((*p.shape[:-1], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation.as_matrix(), p, 1.0
+    return T
+
+
 def origin(node: ET.Element | None) -> np.ndarray:
     """The transform (4, 4) of an ``<origin>``."""
-    T = np.eye(4)
-    if node is not None:
-        T[:3, :3] = Rotation.from_euler("xyz", floats(node.get("rpy"), (0, 0, 0))).as_matrix()
-        T[:3, 3] = floats(node.get("xyz"), (0, 0, 0))
-    return T
+    xyz, rpy = (floats(None if node is None else node.get(name), (0, 0, 0)) for name in ("xyz", "rpy"))
+    return pose_transforms(xyz, Rotation.from_euler("xyz", rpy))
 
 
 def parse(urdf: str) -> ET.Element:
@@ -77,8 +81,7 @@ def read_joint(node: ET.Element) -> UrdfJoint:
     name, kind = str(node.get("name")), str(node.get("type"))
     if kind not in ("revolute", "prismatic", "continuous", "fixed"):
         raise ValueError(f"joint {name!r}: type {kind!r} is not supported")
-    limit, mimic, axis = node.find("limit"), node.find("mimic"), node.find("axis")
-    parent, child = node.find("parent"), node.find("child")
+    limit, mimic, axis, parent, child = map(node.find, ("limit", "mimic", "axis", "parent", "child"))
     if parent is None or child is None:
         raise ValueError(f"joint {name!r} has no parent or no child")
     a = floats(axis.get("xyz") if axis is not None else None, (1, 0, 0))
@@ -105,34 +108,21 @@ def read_solids(link: int, node: ET.Element, resolve: Callable[[str], trimesh.Tr
     if shape.tag == "mesh":
         mesh, scale = resolve(str(shape.get("filename"))), floats(shape.get("scale"), (1, 1, 1))
         return mesh_solids(link, T, clean_mesh(np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces)))
-    if shape.tag == "box":
-        return [BoxSolid(link, T, _positive(floats(shape.get("size"), (0, 0, 0)) / 2.0))]
-    if shape.tag == "sphere":
-        return [SphereSolid(link, T, _positive(floats(shape.get("radius"), (0,))))]
-    if shape.tag not in ("cylinder", "capsule"):
+    kinds = {"box": BoxSolid, "sphere": SphereSolid, "cylinder": CylinderSolid, "capsule": CylinderSolid}
+    if shape.tag not in kinds:
         raise ValueError(f"collision geometry {shape.tag!r}: use box, sphere, cylinder, capsule or mesh")
-    size = _positive(np.append(floats(shape.get("radius"), (0,)), floats(shape.get("length"), (0,)) / 2.0))
-    out: list[JudgedSolid] = [CylinderSolid(link, T, size)]
-    if shape.tag == "capsule":
-        for end in (-size[1], size[1]):
-            shift = np.eye(4)
-            shift[2, 3] = end
-            out.append(SphereSolid(link, T @ shift, size[:1]))
-    return out
-
-
-def _positive(size: np.ndarray) -> np.ndarray:
+    if shape.tag == "box":
+        size = floats(shape.get("size"), (0, 0, 0)) / 2.0
+    else:
+        size = np.append(floats(shape.get("radius"), (0,)), floats(shape.get("length"), (0,)) / 2.0)
+    size = size[:1] if shape.tag == "sphere" else size
     if not (size > 0.0).all():
         raise ValueError(f"collision geometry of size {size.tolist()}: sizes are positive")
-    return size
-
-
-def pose_transforms(pose: np.ndarray) -> np.ndarray:
-    """Poses (n, 7) x y z qw qx qy qz as transforms (n, 4, 4)."""
-    T = np.tile(np.eye(4), (len(pose), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(pose[:, 3:], scalar_first=True).as_matrix()
-    T[:, :3, 3] = pose[:, :3]
-    return T
+    solids: list[JudgedSolid] = [kinds[shape.tag](link, T, size)]
+    if shape.tag == "capsule":
+        ends = pose_transforms(np.outer((-size[1], size[1]), (0, 0, 1)), Rotation.identity(2))
+        solids += [SphereSolid(link, T @ end, size[:1]) for end in ends]
+    return solids
 
 
 class LinkTree:
@@ -179,29 +169,24 @@ class LinkTree:
 
     def resolve_joints(self, values: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
         """Values (count,) of all movable joints; mimic joints follow, absent ones rest at 0 clamped to limits."""
-        out: dict[str, np.ndarray] = {}
 
         def value(joint: UrdfJoint) -> np.ndarray:
             if joint.mimic is not None:
                 source, multiplier, offset = joint.mimic
                 return multiplier * value(self.movable[source]) + offset
-            rest = min(max(0.0, joint.lower), joint.upper)
-            return np.asarray(values[joint.name], float) if joint.name in values else np.full(count, rest)
+            rest = np.full(count, min(max(0.0, joint.lower), joint.upper))
+            return np.asarray(values.get(joint.name, rest), float)
 
-        for joint in self.movable.values():
-            out[joint.name] = value(joint)
-        return out
+        return {name: value(joint) for name, joint in self.movable.items()}
 
     def forward(self, q: Mapping[str, np.ndarray], count: int) -> np.ndarray:
         """Poses of the links, (count, L, 4, 4), from every movable joint's values (count,)."""
         T = np.zeros((count, len(self.links), 4, 4))
         T[:, self.index[self.root]] = np.eye(4)
         for j in self.order:
-            motion = np.tile(np.eye(4), (count, 1, 1))
-            if j.kind == "prismatic":
-                motion[:, :3, 3] = q[j.name][:, None] * j.axis
-            elif j.kind != "fixed":
-                motion[:, :3, :3] = Rotation.from_rotvec(q[j.name][:, None] * j.axis).as_matrix()
+            way = np.zeros((count, 3)) if j.kind == "fixed" else q[j.name][:, None] * j.axis
+            moved, turned = (way, 0.0 * way) if j.kind == "prismatic" else (0.0 * way, way)
+            motion = pose_transforms(moved, Rotation.from_rotvec(turned))
             T[:, self.index[j.child]] = T[:, self.index[j.parent]] @ (j.T @ motion)
         return np.linalg.inv(T[:, self.index[self.base]])[:, None] @ T
 
@@ -217,7 +202,7 @@ class LinkTree:
         """Which joints of q (K of them) move which links against the base link, also by way of mimics, (K, L)."""
         path: dict[str, frozenset[str]] = {self.root: frozenset()}
         for j in self.order:
-            path[j.child] = path[j.parent] | ({j.name} if j.kind != "fixed" else set())
+            path[j.child] = path[j.parent] | ({j.name} & self.movable.keys())
         moves = np.zeros((len(joint_names), len(self.links)), bool)
         for link, name in ((k, name) for k, v in path.items() for name in v ^ path[self.base]):
             driver = self._driver(self.movable[name], joint_names).name
@@ -229,8 +214,7 @@ class LinkTree:
         """Pairs of links (lower index first) that some joint moves against each other and no joint connects."""
         rigid = {n: n for n in self.links}
         for j in self.order:
-            if j.kind == "fixed":
-                rigid[j.child] = rigid[j.parent]
+            rigid[j.child] = rigid[j.parent] if j.kind == "fixed" else j.child
         joined = {frozenset((j.parent, j.child)) for j in self.joints}
         return {
             (a, b)

@@ -12,7 +12,21 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 TESTS = 400_000  # points x triangles tested at once
+PAIRS = 1_000_000  # points x boxes held at once
 DIRECTIONS = 16  # lines through each point where the mesh is open
+CELLS = 48  # along the longest side of the grid that tells inside from outside away from the surface
+FEW = 256  # points that are decided without the grid
+FEATURE = 5e-5  # normals of all faces this close to the closest point are admissible [m]
+OUTSIDE, INSIDE, CROSSED = range(3)
+
+_ICO = trimesh.creation.icosahedron().vertices
+PROBES = np.vstack([np.zeros((1, 3)), _ICO / np.linalg.norm(_ICO, axis=1, keepdims=True) * FEATURE])  # (13, 3)
+
+
+def spread(first: np.ndarray, many: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges one after another, first + 0 .. many - 1 each: which range (m,), and the number (m,)."""
+    owner = np.repeat(np.arange(len(many)), many)
+    return owner, np.arange(len(owner)) + np.repeat(first - np.cumsum(many) + many, many)
 
 
 class Crossings:
@@ -38,9 +52,7 @@ class Crossings:
         self.cell = max(float(span.max()) / self.side, 1e-9)
         first, last = (self._cells(f) for f in (flat.min(axis=1), flat.max(axis=1)))
         wide = last - first + 1
-        count = wide.prod(axis=1)
-        face = np.repeat(np.arange(len(faces)), count)
-        k = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+        face, k = spread(np.zeros(len(faces), int), wide.prod(axis=1))
         cell = (first[face, 0] + k // wide[face, 1]) * self.side + first[face, 1] + k % wide[face, 1]
         self.members = face[np.argsort(cell, kind="stable")]
         self.start = np.searchsorted(np.sort(cell), np.arange(self.side**2 + 1))
@@ -57,9 +69,8 @@ class Crossings:
         many = self.start[cell + 1] - self.start[cell]
         blocks = np.searchsorted(np.cumsum(many), np.arange(0, many.sum(), TESTS))
         for rows in np.split(np.arange(len(p)), np.unique(blocks[1:])) if len(p) else []:
-            n = many[rows]
-            owner = np.repeat(rows, n)
-            k = np.arange(len(owner)) - np.repeat(np.cumsum(n) - n, n) + np.repeat(self.start[cell[rows]], n)
+            owner, k = spread(self.start[cell[rows]], many[rows])
+            owner = rows[owner]
             hit, sign, height = self._hits(p[owner], self.members[k])
             owner, up = owner[hit], height > p[owner[hit], 2]
             ahead += np.bincount(owner[up], sign[up], len(p))
@@ -97,19 +108,6 @@ class Inside:
         if self.closed:
             return self.lines[0].count(points)[0] > 0.5
         return np.mean([np.add(*line.count(points)) for line in self.lines], axis=0) > 1.0
-
-
-FEATURE = 5e-5
-"""Normals of all faces this close to the closest point are admissible [m]."""
-PAIRS = 1_000_000  # points x boxes held at once
-CELLS = 48
-"""Cells along the longest side of the grid that tells inside from outside away from the surface."""
-FEW = 256
-"""Points that are decided without the grid."""
-OUTSIDE, INSIDE, CROSSED = range(3)
-
-_ICO = trimesh.creation.icosahedron().vertices
-PROBES = np.vstack([np.zeros((1, 3)), _ICO / np.linalg.norm(_ICO, axis=1, keepdims=True) * FEATURE])  # (13, 3)
 
 
 def closest_on_triangles(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -170,9 +168,8 @@ class BoxTree:
                 parts = [self.near(points[rows], reach[rows]) for rows in (slice(half), slice(half, None))]
                 return np.concatenate([parts[0][0], parts[1][0] + half]), np.concatenate([p[1] for p in parts])
         first = self.starts[-1][node]
-        many = self.starts[-1][node + 1] - first
-        at = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many) + np.repeat(first, many)
-        return np.repeat(row, many), self.order[at]
+        pair, at = spread(first, self.starts[-1][node + 1] - first)
+        return row[pair], self.order[at]
 
 
 class MeshDistance:
@@ -243,8 +240,7 @@ class MeshDistance:
 
     def depth(self, points: np.ndarray) -> np.ndarray:
         """Depth of each point (n, 3) inside the mesh [m], 0 outside."""
-        out = np.zeros(len(points))
-        within = self.contains(points)
+        out, within = np.zeros(len(points)), self.contains(points)
         out[within] = self.closest(points[within])[0]
         return out
 

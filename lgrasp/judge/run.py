@@ -1,6 +1,7 @@
 """Judges shards: files, folders of them, all of their rows or some."""
 
 import math
+import re
 import tempfile
 import time
 from collections import Counter
@@ -77,17 +78,17 @@ def _judge_shard(shard: JudgedShard, rows: np.ndarray, step: Callable[[int], obj
         blocks.append(RowChecks(shard, rows[first : first + BLOCK], epsilon=stored and first < EPSILON_ROWS))
     values = {k: np.concatenate([np.zeros(0), *(b.values[k] for b in blocks)]) for k in VALUES}
     return ShardVerdict(
-        path=shard.path,
         total_rows=len(shard.kept_invalid),
-        rows=rows,
         kept_invalid=shard.kept_invalid[rows],
         values=values,
         failed={k: np.concatenate([np.zeros(0, bool), *(b.failed[k] for b in blocks)]) for k in CHECKS},
-        metrics=metric_errors(shard, rows, values),
         held=(np.asarray(shard.grasps["object_index"])[rows] >= 0).sum(axis=1),
-        self_pairs=sum((b.self_pairs for b in blocks), Counter()),
-        claims=shard.claims,
+        deviations=metric_errors(shard, rows, values),
+        pairs=sum((b.self_pairs for b in blocks), Counter()),
         notes=shard.notes,
+        path=shard.path,
+        rows=rows,
+        claims=shard.claims,
     )
 
 
@@ -112,30 +113,35 @@ def _existing(path: str | Path) -> Path:
     return Path(path)
 
 
+METRICS = {
+    "epsilon": "epsilon",
+    "fswo|frictionless": "residual_frictionless",
+    "gswo|residual": "residual",
+    "self.*penetration|penetration.*self": "self_penetration_mm",
+    "(object_object|between).*penetration|penetration.*(object_object|between)": "object_object_mm",
+    "penetration": "penetration_mm",
+    "gap": "contact_link_mm",
+    "normal": "normal_deg",
+    "links": "links_in_contact",
+    "^(contacts|contact_count|num_contacts)$": "contacts",
+}
+"""What the name of a stored metric holds, and the number that it is compared with; the first that fits counts."""
+
+
 def metric_errors(shard: JudgedShard, rows: np.ndarray, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Absolute deviation (n,) of stored metrics from recomputed values; metrics are recognised by name and unit."""
     out = {}
     for name, (data, unit) in shard.metrics.items():
-        key, stored = name.lower(), np.asarray(data, float)[rows]
-        to_mm = 1.0 if unit.strip().lower() == "mm" else 1e3
-        to_deg = 1.0 if unit.strip().lower().startswith("deg") else math.degrees(1.0)
-        if "epsilon" in key:
-            out[name] = stored - values["epsilon"]
-        elif "fswo" in key or "frictionless" in key:
-            out[name] = stored - values["residual_frictionless"]
-        elif "gswo" in key or "residual" in key:
-            out[name] = stored - values["residual"]
-            out[f"{name} (stored normals)"] = stored - values["residual_stored_normals"]
-        elif "penetration" in key:
-            which = "object_object" if "object_object" in key or "between" in key else "penetration"
-            which = "self_penetration" if "self" in key else which
-            out[f"{name} [mm]"] = np.maximum(stored, 0.0) * to_mm - values[f"{which}_mm"]
-        elif "gap" in key:
-            out[f"{name} [mm]"] = np.abs(stored) * to_mm - values["contact_link_mm"]
-        elif "normal" in key:
-            out[f"{name} [deg]"] = stored * to_deg - values["normal_deg"]
-        elif "links" in key:
-            out[name] = stored - values["links_in_contact"]
-        elif key in ("contacts", "contact_count", "num_contacts"):
-            out[name] = stored - values["contacts"]
-    return {name: np.abs(d) for name, d in out.items()}
+        stored, given = np.asarray(data, float)[rows], unit.strip().lower()
+        value = next((value for form, value in METRICS.items() if re.search(form, name.lower())), None)
+        if value is None:
+            continue
+        if value == "normal_deg":
+            name, stored = f"{name} [deg]", stored * (1.0 if given.startswith("deg") else math.degrees(1.0))
+        elif value.endswith("_mm"):
+            size = np.abs(stored) if value == "contact_link_mm" else np.maximum(stored, 0.0)
+            name, stored = f"{name} [mm]", size * (1.0 if given == "mm" else 1e3)
+        out[name] = np.abs(stored - values[value])
+        if value == "residual":
+            out[f"{name} (stored normals)"] = np.abs(stored - values["residual_stored_normals"])
+    return out

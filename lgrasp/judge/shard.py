@@ -189,63 +189,53 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
     unknown = [n for n in joint_names if n not in hand.movable]
     if unknown or len(set(joint_names)) < len(joint_names):
         raise JudgeError(f"joint_names: not movable in the URDF, or named twice: {', '.join(unknown or joint_names)}")
-    ids = sorted(f["objects"])
-    objects = [read_object(f["objects"][k], mesh.get(k, mesh.get(""))) for k in ids]
+    objects = {k: read_object(f["objects"][k], mesh.get(k, mesh.get(""))) for k in sorted(f["objects"])}
     g, sizes = f["grasps"], {"K": len(joint_names)}
     grasps = _columns(g, COLUMNS, sizes)
     steps = _columns(g["sequence"], STEPS, sizes) if "sequence" in g else {}
-    metrics = {}
-    for name in g.get("metrics", ()):
-        column = _columns(g["metrics"], {name: ()}, sizes)[name]
-        metrics[name] = column, _text(g[f"metrics/{name}"].attrs.get("unit", ""))
-    kept = metrics["valid"][0] == 0 if "valid" in metrics else np.zeros(sizes["N"], bool)
+    columns = _columns(g["metrics"], dict.fromkeys(g["metrics"], ()), sizes) if "metrics" in g else {}
+    metrics = {k: (column, _text(g[f"metrics/{k}"].attrs.get("unit", ""))) for k, column in columns.items()}
     claims = {k: _text(f.attrs[k]) for k in ("pipeline", "lgrasp_version") if k in f.attrs}
     told = json.loads(_text(f.attrs.get("config", "{}")))
     if isinstance(told, dict) and isinstance(told.get("bounds"), dict):
         claims["profile"] = str(told["bounds"].get("profile"))
-    shard = JudgedShard(
+    return JudgedShard(
         path=path,
         hand=hand,
         hand_key=hand_key,
         joint_names=joint_names,
         link_names=link_names,
-        objects=[obj for obj, _ in objects],
-        object_keys=[key for _, key in objects],
+        objects=[obj for obj, _ in objects.values()],
+        object_keys=[key for _, key in objects.values()],
         grasps=grasps,
         steps=steps,
         metrics=metrics,
-        kept_invalid=kept,
+        kept_invalid=columns["valid"] == 0 if "valid" in columns else np.zeros(sizes["N"], bool),
         claims=claims,
-        notes=[],
+        notes=_notes(hand, joint_names, f["hand"], {k: obj for k, (obj, _) in objects.items()}),
     )
-    shard.notes = _notes(shard, f["hand"], ids)
-    return shard
 
 
-def _notes(shard: JudgedShard, group: h5py.Group, ids: list[str]) -> list[str]:
+def _notes(hand: JudgedHand, names: list[str], group: h5py.Group, objects: dict[str, JudgedObject]) -> list[str]:
     """What a reader of the verdict must know about hand and objects."""
-    hand, names, notes = shard.hand, shard.joint_names, []
-    actuated = [j.name for j in hand.actuated]
+    notes, actuated = [], [j.name for j in hand.actuated]
     if [n for n in names if n in actuated] != [n for n in actuated if n in names]:
         notes.append("joint_names are not in the URDF's order")
-    missing = [n for n in actuated if n not in names]
-    if missing:
-        notes.append(f"joints absent from q, taken at 0 within limits: {', '.join(missing)}")
     for key, side in (("joint_lower", "lower"), ("joint_upper", "upper")):
         if key in group:
             stored, real = _array(group, key), np.array([getattr(hand.movable[n], side) for n in names])
             if stored.shape != real.shape or np.any(np.abs(stored - real)[np.isfinite(real)] > LIMIT_EXCESS):
                 notes.append(f"stored {key} differs from the URDF")
-    if hand.always_touching:
-        pairs = ", ".join(" x ".join(pair) for pair in hand.always_touching)
-        notes.append(f"links that touch in all of {POSTURES} random postures, left out: {pairs}")
-    dented = sorted({hand.links[s.link] for s in hand.solids if not s.convex})
-    if dented:
-        notes.append(f"links whose meshes are not convex, judged by their true surface: {', '.join(dented)}")
-    opened = [k for k, obj in zip(ids, shard.objects, strict=True) if not obj.mesh.is_watertight]
-    if opened:
-        notes.append(f"objects that are not watertight, inside by the winding number: {', '.join(opened)}")
-    return notes
+    dented = {hand.links[s.link] for s in hand.solids if not s.convex}
+    lists = {
+        "joints absent from q, taken at 0 within limits": [n for n in actuated if n not in names],
+        f"links that touch in all of {POSTURES} random postures, left out": [*map(" x ".join, hand.always_touching)],
+        "links whose meshes are not convex, judged by their true surface": sorted(dented),
+        "objects that are not watertight, inside by the winding number": [
+            k for k, obj in objects.items() if not obj.mesh.is_watertight
+        ],
+    }
+    return notes + [f"{what}: {', '.join(which)}" for what, which in lists.items() if which]
 
 
 _SIGNATURE = b"GCOL\x01\x00\x00\x00"

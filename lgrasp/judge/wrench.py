@@ -9,38 +9,30 @@ from scipy.spatial import ConvexHull, QhullError
 from lgrasp.judge.bounds import CONE_EDGES, MU, TORQUE_SCALE
 
 
-def cone_forces(inward: np.ndarray, mu: float = MU, edges: int = CONE_EDGES) -> np.ndarray:
-    """Edges of the friction pyramids about inward normals (C, 3), normal part 1: (C, edges, 3)."""
-    helper = np.eye(3)[np.abs(inward).argmin(axis=1)]
-    t1 = np.cross(inward, helper)
+def cone_forces(inward: np.ndarray, mu: float = MU) -> np.ndarray:
+    """Edges of the friction pyramids about inward normals (C, 3), normal part 1: (C, CONE_EDGES, 3)."""
+    t1 = np.cross(inward, np.eye(3)[np.abs(inward).argmin(axis=1)])
     t1 /= np.linalg.norm(t1, axis=1, keepdims=True)
     t2 = np.cross(inward, t1)
-    angle = np.arange(edges) * 2.0 * math.pi / edges
+    angle = np.arange(CONE_EDGES) * 2.0 * math.pi / CONE_EDGES
     side = np.cos(angle)[:, None] * t1[:, None] + np.sin(angle)[:, None] * t2[:, None]
     return inward[:, None] + mu * side
 
 
-def min_norm(generators: np.ndarray) -> tuple[float, float]:
-    """Least norm over the convex hull of the columns (d, m), and its optimality gap.
+def wrench_residual(points: np.ndarray, inward: np.ndarray, mu: float = MU) -> tuple[float, float]:
+    """Least norm of the summed wrench, sum of normal forces 1, and the optimality gap; mu 0 is frictionless.
 
     min |s G y|^2 + (s - 1)^2 over y in the simplex and s >= 0 is a non-negative least squares in x = s y whose y is the
     minimiser for every s > 0, so the exact active-set solver gives the exact answer. The gap |w|^2 - min_j g_j.w bounds
     |w|^2 from its optimum and is 0 at the optimum.
     """
-    m = generators.shape[1]
-    x, _ = nnls(np.vstack([generators, np.ones((1, m))]), np.append(np.zeros(len(generators)), 1.0), maxiter=50 * m)
-    w = generators @ (x / x.sum())
-    return float(np.linalg.norm(w)), float(w @ w - (generators.T @ w).min())
-
-
-def wrench_residual(
-    points: np.ndarray, inward: np.ndarray, mu: float = MU, edges: int = CONE_EDGES
-) -> tuple[float, float]:
-    """Least norm of the summed wrench, sum of normal forces 1, and the optimality gap; mu 0 is frictionless."""
-    forces = cone_forces(inward, mu, edges) if mu > 0 else inward[:, None]
+    forces = cone_forces(inward, mu) if mu > 0 else inward[:, None]
     arms = np.repeat(points - points.mean(axis=0), forces.shape[1], axis=0)
     f = forces.reshape(-1, 3)
-    return min_norm(np.vstack([f.T, TORQUE_SCALE * np.cross(arms, f).T]))
+    G = np.vstack([f.T, TORQUE_SCALE * np.cross(arms, f).T])
+    x, _ = nnls(np.vstack([G, np.ones((1, len(f)))]), np.append(np.zeros(6), 1.0), maxiter=50 * len(f))
+    w = G @ (x / x.sum())
+    return float(np.linalg.norm(w)), float(w @ w - (G.T @ w).min())
 
 
 def force_errors(points: np.ndarray, inward: np.ndarray, forces: np.ndarray) -> tuple[float, float, float]:
