@@ -51,15 +51,11 @@ class JudgedHand(LinkTree):
         kept, touching = [], []
         for (la, lb), pairs in by_links.items():
             far = [poses.far(a, b) for a, b in pairs]
-            always = (
-                pairs
-                and not np.all(far, axis=0).any()
-                and all(
-                    any(not far[k][i] and poses.depth(i, a, b, 0.0) >= 0.0 for k, (a, b) in enumerate(pairs))
-                    for i in range(POSTURES)
-                )
+            meet = (
+                any(not apart[i] and poses.depth(i, *pair, 0.0) >= 0.0 for apart, pair in zip(far, pairs, strict=True))
+                for i in range(POSTURES)
             )
-            if always:
+            if pairs and not np.all(far, axis=0).any() and all(meet):
                 touching.append((self.links[la], self.links[lb]))
             else:
                 kept += pairs
