@@ -14,7 +14,7 @@ from lgrasp.judge.checks import CHECKS
 from lgrasp.judge.duplicates import Repeats
 
 
-@dataclass
+@dataclass(repr=False, eq=False)
 class Verdict:
     """Findings over judged rows; arrays have one number a row.
 
@@ -56,13 +56,13 @@ class ShardVerdict(Verdict):
     """Findings over the judged rows of one shard; ``rows`` (n,) are their places in the file.
 
     Attributes:
-        deviations: of stored metrics from recomputed numbers, absolute, (n,) each.
-        pairs: pairs of links with self-penetration beyond the bound and their rows.
+        metrics: deviations of stored metrics from recomputed numbers, absolute, (n,) each.
+        self_pairs: pairs of links with self-penetration beyond the bound and their rows.
         claims: what the file says of itself.
     """
 
-    deviations: dict[str, np.ndarray]
-    pairs: Counter[str]
+    metrics: dict[str, np.ndarray]
+    self_pairs: Counter[str]
     notes: list[str]
     path: Path
     rows: np.ndarray
@@ -105,9 +105,9 @@ class Report(Verdict):
         self.valid_share = float(self.valid[claimed].mean()) if claimed.any() else 0.0
         self.passed = self.valid_share == 1.0
         self.failures = {k: int((v & claimed).sum()) for k, v in self.failed.items()}
-        self.self_pairs = dict(sum((s.pairs for s in shards), Counter()).most_common())
+        self.self_pairs = dict(sum((s.self_pairs for s in shards), Counter()).most_common())
         self.distributions = _spread(self.values)
-        self.metrics = _spread(_joined([s.deviations for s in shards]))
+        self.metrics = _spread(_joined([s.metrics for s in shards]))
         self.notes = list(dict.fromkeys(n for s in shards for n in s.notes))
 
     @property
