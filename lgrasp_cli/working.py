@@ -40,7 +40,8 @@ class How:
         """
         from lgrasp.config import parse_model
 
-        return parse_model(kind, given(**options, device=self.device, workers=self.workers, cache=self.cache), where)
+        shared = given(device=self.device, workers=self.workers, cache=self.cache)
+        return parse_model(kind, given(**options) | shared, where)
 
     def run(self, job: "Job", show: Callable[[dict[str, Any]], Sequence[Block]]) -> None:
         """Run a job with progress, report it, and leave with its exit code if it fell short.
