@@ -190,8 +190,7 @@ def refine(
     Raises:
         LgraspError: grasps that cannot be refined, or an option out of range.
     """
-    from lgrasp.jobs.refine.settings import refine_params
-    from lgrasp.jobs.refine.shards import RefineJob
+    from lgrasp.jobs.refine.shards import RefineJob, refine_params
 
     what = {"params": refine_params(coarse=coarse, **params), "device": device}
     what |= {} if bounds is None else {"bounds": bounds}

@@ -65,6 +65,19 @@ def yaml_files(kind: str) -> dict[str, Path]:
     return found
 
 
+def find_yaml(name: str, files: Mapping[str, Path], what: str) -> Path:
+    """A file by its name among some, or by path.
+
+    Raises:
+        ConfigError: neither.
+    """
+    path = files.get(name) or Path(name).expanduser()
+    if not path.is_file():
+        hint, known = did_you_mean(path.stem, files), ", ".join(files) or "none"
+        raise ConfigError(f"unknown {what} '{name}'; {hint}known: {known}, or give the path of a YAML file")
+    return path
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping that a YAML file holds.
 

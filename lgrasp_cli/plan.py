@@ -45,8 +45,7 @@ def plan(
 
     Example: lgrasp plan --cloud scene.ply --mask labels.npy --label 3 --hand barrett --starts 80
     """
-    from lgrasp.jobs.refine.plan import PlanJob
-    from lgrasp.jobs.refine.settings import plan_params
+    from lgrasp.jobs.refine.plan import PlanJob, plan_params
 
     what = {"hand": hand, "object": mesh, "scale": scale, "cloud": cloud, "mask": mask, "label": label, "out": out}
     what |= {"viewpoint": _numbers(viewpoint), "starts": starts, "stand_off": stand_off, "keep_invalid": keep_invalid}

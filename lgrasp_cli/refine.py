@@ -40,8 +40,7 @@ def refine(
 
     Example: lgrasp refine grasps/allegro-mug --out grasps/allegro-mug-refined
     """
-    from lgrasp.jobs.refine.settings import refine_params
-    from lgrasp.jobs.refine.shards import RefineJob
+    from lgrasp.jobs.refine.shards import RefineJob, refine_params
 
     rounds = {"matching_rounds": matching_rounds, "gradient_steps": gradient_steps, "outer": outer, "inner": inner}
     params = refine_params(coarse=coarse, **rounds)

@@ -75,7 +75,7 @@ def info(paths: _Paths) -> Answer:
     Example: lgrasp scenes info scenes
     """
     from lgrasp.dataset import find_shards
-    from lgrasp.jobs.scenes.report import describe_scenes
+    from lgrasp.jobs.scenes.job import describe_scenes
 
     data = describe_scenes(find_shards(paths))
     return Answer(data, _blocks(data, [("scenes", f"{data['scenes']:,}")]))
@@ -84,7 +84,7 @@ def info(paths: _Paths) -> Answer:
 def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, views: int | None) -> dict[str, Any]:
     """The config that is named, or one of the objects, with what the command line replaces."""
     from lgrasp.errors import ConfigError
-    from lgrasp.jobs.scenes.config import read_scene_config, scene_configs
+    from lgrasp.jobs.config import read_scene_config, scene_configs
 
     config = next((name for name in objects if name.endswith((".yaml", ".yml"))), None)
     if config and len(objects) > 1:

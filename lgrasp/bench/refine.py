@@ -14,7 +14,7 @@ import trimesh
 from lgrasp.bench.page import Page, Table, caveats, load_published, number, over
 from lgrasp.cloud.model import cloud_object
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.inputs import load_object, object_key
+from lgrasp.engine.inputs import Loader, object_key
 from lgrasp.geometry.decompose import decompose
 from lgrasp.geometry.rotations import so3_exp
 from lgrasp.grasp.rows import grasp_rows, press
@@ -24,7 +24,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.surface import ContactSurface
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
-from lgrasp.jobs.refine.settings import COARSE
+from lgrasp.jobs.refine.shards import COARSE
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
@@ -135,7 +135,7 @@ def _bench_hand(
     coarse: list[tuple[ObjectModel, Pose]] = []
     for name in objects:
         mesh, key = object_key(name, 1.0, ObjectParams())
-        found, _ = load_object(cache, mesh, key, 1.0, ObjectParams(), at.alias)
+        found = Loader(cache, at.alias).object(mesh, key, 1.0, ObjectParams())
         scene = scene_of(record, [object_record(found)], partial(decompose, store=cache), at.alias)
         for (on, hands), (noise, params) in planners.items():
             total, target = totals[on, hands], found if noise is None else _cloud(found, noise)

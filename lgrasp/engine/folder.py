@@ -1,26 +1,29 @@
-"""The output folder of a job: paths of its shards, which of them exist already, and whether they may stay."""
+"""The output folder of a job: paths of its shards, and what those that are there say of themselves."""
 
 import os
 import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from lgrasp.dataset import ShardReader, validate_shard
+from lgrasp.dataset import ShardReader
 from lgrasp.dataset.files import check_heaps, remove_leftovers
-from lgrasp.engine.events import Part
-from lgrasp.errors import OutputError, ShardError
+from lgrasp.errors import OutputError
+
+MADE_FROM = "made_from"
+"""Statistic of a shard that a job made of another: content key of the job and of the rows that it was made of."""
 
 _MAX_NAME_LENGTH = 120  # characters of a name; file systems allow 255 bytes
 
 
-class _Found(NamedTuple):
-    """What a whole shard says of itself."""
+class Found(NamedTuple):
+    """What a whole file says of itself."""
 
     key: str | None
     rows: int
-    tried: int  # candidates (or rounds), when they were all that the shard may try; else 0
+    tried: int = 0
+    """Candidates (or rounds), when they were all that the file may try; else 0."""
 
 
 def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
@@ -51,66 +54,29 @@ def clean_folder(files: Sequence[Path]) -> None:
         remove_leftovers(folder, f"{stem}-*.tmp")
 
 
-def present_parts(
-    parts: Sequence[Part], key: str, effort: Callable[[int], int], warn: Callable[[str], None]
-) -> dict[int, int]:
-    """Rows of the shards that are on disk and may stay, by number of the part.
+def neighbours(files: Sequence[Path]) -> list[Path]:
+    """Shards with other numbers beside files of one job."""
+    beside = (set(file.parent.glob(f"{_stem(file)}-[0-9][0-9][0-9][0-9][0-9].h5")) for file in files[:1])
+    return sorted(set().union(*beside) - set(files))
 
-    A shard stays when it holds what is asked (or more: nothing is thrown away when fewer are asked later), or when all
-    candidates that it may try were tried.
 
-    Args:
-        key: content key of the run.
-        effort: candidates that a shard of some number of rows may try.
-        warn: called with one line when a file is damaged.
+def found_shard(path: Path) -> Found:
+    """What a shard says of itself.
 
     Raises:
-        OutputError: a file, or the folder's first of that name, belongs to another run.
+        ShardError: it is no whole shard.
     """
-    if parts:
-        # one of the others is enough: whoever wrote into the folder looked as well
-        first, own = parts[0].file, {part.file for part in parts}
-        others = sorted(set(first.parent.glob(f"{_stem(first)}-[0-9][0-9][0-9][0-9][0-9].h5")) - own)
-        for path in others[:1]:
-            _check_run(path, _read(path), key)
-    present = {}
-    for part in parts:
-        if not os.path.lexists(part.file):
-            continue
-        problems = validate_shard(part.file)
-        found = None if problems else _read(part.file)
-        if found is None:
-            warn(f"shard {part.file} is damaged ({(problems or ['header'])[0]}); rebuilding it")
-            continue
-        _check_run(part.file, found, key)
-        if found.rows >= part.rows or found.tried >= effort(part.rows):
-            present[part.number] = found.rows
-    return present
+    check_heaps(path)
+    with ShardReader(path) as reader:
+        config, statistics = reader.header.config, reader.statistics
+        if MADE_FROM in statistics:
+            return Found(str(statistics[MADE_FROM]), len(reader))
+        # of a file with sequences only the whole ones count, and rounds are tried
+        rows = int(statistics.get("sequences", len(reader)))
+        tried = statistics.get("rounds" if "sequences" in statistics else "candidates", 0)
+        return Found(config.get("run_key"), rows, int(tried) if statistics.get("exhausted") else 0)
 
 
 def _stem(path: Path) -> str:
     """Name of a shard's file without its number."""
     return path.stem.rpartition("-")[0]
-
-
-def _check_run(path: Path, found: _Found | None, key: str) -> None:
-    if found is not None and found.key != key:
-        raise OutputError(
-            f"{path} belongs to another run (other hand, object, pipeline, seed or --shard-rows); "
-            "choose another --out, or --overwrite to replace it"
-        )
-
-
-def _read(path: Path) -> _Found | None:
-    """None when the file is no whole shard."""
-    try:
-        check_heaps(path)
-        with ShardReader(path) as reader:
-            config, statistics = reader.header.config, reader.statistics
-            key = config.get("run_key") if isinstance(config, dict) else None
-            # of a file with sequences only the whole ones count, and rounds are tried
-            rows = int(statistics.get("sequences", len(reader)))
-            effort = statistics.get("rounds" if "sequences" in statistics else "candidates", 0)
-            return _Found(key, rows, int(effort) if statistics.get("exhausted") else 0)
-    except (ShardError, ValueError):
-        return None

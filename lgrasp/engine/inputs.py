@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from dataclasses import field as with_default
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.errors import ObjectError
@@ -30,6 +30,7 @@ OBJECT_VERSION = 2
 """Raised whenever preprocessing gives other arrays."""
 
 Report = Callable[[str, float], None]
+Model = TypeVar("Model", HandModel, ObjectModel, ContactField)
 
 
 @dataclass(frozen=True)
@@ -88,46 +89,55 @@ def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str
     return path, content_key("object", OBJECT_VERSION, content=content, **described)
 
 
-def load_hand(cache: Cache, source: HandSource, key: str, device: Device) -> tuple[HandModel, bool]:
-    """The HandModel from the cache, or built and cached; and whether it was a hit."""
+class Loader:
+    """Hands, objects and fields from the cache, or made and cached.
 
-    def make():
-        from lgrasp.geometry.decompose import decompose
-        from lgrasp.hand.build import build_hand  # slow to load, as all that makes what is not cached
+    Args:
+        report: called with (what, share done).
+    """
 
-        cut = partial(decompose, store=cache)
-        return build_hand(source.urdf, source.spec, device.alias, decompose=cut).to_arrays()
+    def __init__(self, cache: Cache, device: str = "cpu", report: Report | None = None) -> None:
+        self.cache, self.device = cache, device
+        self.report: Report = report or (lambda what, share: None)
+        self.seconds: dict[str, float] = {}
+        """By kind."""
+        self.hits: dict[str, bool] = {}
+        """By kind: True if all came from the cache."""
 
-    arrays, hit = cache.get("hand", key, make)
-    return HandModel.from_arrays(arrays), hit
+    def hand(self, source: HandSource, key: str) -> HandModel:
+        def make() -> HandModel:
+            from lgrasp.geometry.decompose import decompose
+            from lgrasp.hand.build import build_hand  # slow to load, as all that makes what is not cached
 
+            return build_hand(source.urdf, source.spec, self.device, decompose=partial(decompose, store=self.cache))
 
-def load_object(
-    cache: Cache, mesh: Path, key: str, scale: float, params: ObjectParams, device: str = "cpu"
-) -> tuple[ObjectModel, bool]:
-    """The ObjectModel from the cache, or preprocessed and cached; and whether it was a hit."""
+        return self.get("hand", HandModel, key, make)
 
-    def make():
-        from lgrasp.object.preprocess import preprocess_object
+    def object(self, mesh: Path, key: str, scale: float, params: ObjectParams) -> ObjectModel:
+        def make() -> ObjectModel:
+            from lgrasp.object.preprocess import preprocess_object
 
-        return preprocess_object(mesh, scale=scale, params=params, device=device).to_arrays()
+            return preprocess_object(mesh, scale=scale, params=params, device=self.device)
 
-    arrays, hit = cache.get("object", key, make)
-    return ObjectModel.from_arrays(arrays), hit
+        return self.get("object", ObjectModel, key, make)
 
+    def field(self, hand: HandArrays, key: str, params: FieldParams) -> ContactField:
+        def make() -> ContactField:
+            from lgrasp.field.build import build_field
 
-def load_field(
-    cache: Cache, keys: InputKeys, hand: HandArrays, params: FieldParams, report: Report | None = None
-) -> tuple[ContactField, bool]:
-    """The ContactField from the cache, or built and cached; and whether it was a hit."""
+            return build_field(hand, params, self.report)
 
-    def make():
-        from lgrasp.field.build import build_field
+        return self.get("field", ContactField, key, make)
 
-        return build_field(hand, params, report).to_arrays()
-
-    arrays, hit = cache.get("field", keys.field, make)
-    return ContactField.from_arrays(arrays), hit
+    def get(self, kind: str, model: type[Model], key: str, make: Callable[[], Model]) -> Model:
+        """A model of a kind, which counts."""
+        start = time.perf_counter()
+        self.report(kind, 0.0)
+        arrays, hit = self.cache.get(kind, key, lambda: make().to_arrays())
+        found = model.from_arrays(arrays)
+        self.hits[kind] = self.hits.get(kind, True) and hit
+        self.seconds[kind] = self.seconds.get(kind, 0.0) + time.perf_counter() - start
+        return found
 
 
 def load_inputs(
@@ -140,27 +150,16 @@ def load_inputs(
     report: Report | None = None,
 ) -> Inputs:
     """Load or make hand, object and field, and put them on the device."""
-    report = report or (lambda what, share: None)
-    seconds, hits = {}, {}
-
-    def timed(name: str, load):
-        start = time.perf_counter()
-        report(name, 0.0)
-        model, hits[name] = load()
-        seconds[name] = time.perf_counter() - start
-        return model
-
     assert keys.mesh is not None
-    mesh = keys.mesh
-    hand_model = timed("hand", lambda: load_hand(cache, keys.source, keys.hand, device))
-    object_model = timed("object", lambda: load_object(cache, mesh, keys.object, scale, objects, device.alias))
-    hand = upload_hand(hand_model, device.alias)
-    field_model = timed("field", lambda: load_field(cache, keys, hand, fields, report))
+    load, alias = Loader(cache, device.alias, report), device.alias
+    hand_model = load.hand(keys.source, keys.hand)
+    object_model = load.object(keys.mesh, keys.object, scale, objects)
+    hand = upload_hand(hand_model, alias)
+    field_model = load.field(hand, keys.field, fields)
     start = time.perf_counter()
-    obj = upload_object(object_model, device.alias)
-    field_arrays = upload_field(field_model, hand_model, device.alias)
-    seconds["upload"] = time.perf_counter() - start
-    return Inputs(hand, obj, field_arrays, keys, device, seconds, hits)
+    obj, field = upload_object(object_model, alias), upload_field(field_model, hand_model, alias)
+    load.seconds["upload"] = time.perf_counter() - start
+    return Inputs(hand, obj, field, keys, device, load.seconds, load.hits)
 
 
 def run_key(pipeline: dict, keys: InputKeys, shard_rows: int) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field, SerializeAsAny
 
-from lgrasp.config import Params, Seed, apply_settings, did_you_mean, parse_model, read_yaml, yaml_files
+from lgrasp.config import Params, Seed, apply_settings, did_you_mean, find_yaml, parse_model, read_yaml, yaml_files
 from lgrasp.engine.migration import ALIASES, move_to_bounds, stage_name
 from lgrasp.engine.registry import SEQUENCE, STAGES, Stage, check_order
 from lgrasp.errors import ConfigError
@@ -66,7 +66,8 @@ class Pipeline(_Head):
 
     def with_params(self, stage: str, **changes: Any) -> "Pipeline":
         """A copy with some parameters of one stage, or of ``sequence``, replaced and checked."""
-        where, kind = f"pipeline {self.name}, {_section(stage)}", SEQUENCE if stage == SEQUENCE.name else STAGES[stage]
+        kind = SEQUENCE if stage == SEQUENCE.name else STAGES[stage]
+        where = f"pipeline {self.name}, {stage if kind is SEQUENCE else f'stage {stage}'}"
         changed = parse_model(kind.params, self.params(stage).model_dump() | changes, where)
         if kind is SEQUENCE:
             return self.model_copy(update={"sequence": changed})
@@ -89,14 +90,8 @@ class Pipeline(_Head):
         parts = {"bounds": self.bounds, "object": self.object, "field": self.field}
         parts |= {part.name: params for part, params in self.sections}
         made = apply_settings(parts, settings, f"pipeline {self.name}")
-        stages = tuple((name, made[name]) for name in self.order)
-        return self.model_copy(
-            update={
-                "stages": stages,
-                "sequence": made.get("sequence"),
-                **{name: made[name] for name in ("bounds", "object", "field")},
-            }
-        )
+        shared = {name: made[name] for name in ("bounds", "object", "field")} | {"sequence": made.get("sequence")}
+        return self.model_copy(update=shared | {"stages": tuple((name, made[name]) for name in self.order)})
 
     def with_simulation(self, protocol: str) -> "Pipeline":
         """A copy that keeps only grasps which hold under a protocol of :mod:`lgrasp.simulate.protocol`.
@@ -111,12 +106,8 @@ class Pipeline(_Head):
     def describe(self) -> dict[str, Any]:
         """JSON-serialisable description, the same for equal pipelines; execution settings are not in it."""
         return {
-            "name": self.name,
-            "seed": self.seed,
-            "effort": self.effort,
+            **self.model_dump(mode="json", include={"name", "seed", "effort", "object", "field"}),
             "bounds": self.bounds.describe(),
-            "object": self.object.model_dump(mode="json"),
-            "field": self.field.model_dump(mode="json"),
             "stages": [{s.name: {"version": s.version, **p.model_dump(mode="json")}} for s, p in self.sections],
         }
 
@@ -136,42 +127,27 @@ def load_pipeline(name: str) -> Pipeline:
     if name in ALIASES and name not in files:
         notice(f"pipeline '{name}' is now called '{ALIASES[name]}'; the old name works in this release only")
         name = ALIASES[name]
-    path = files.get(name) or Path(name).expanduser()
-    if not path.is_file():
-        hint = did_you_mean(name, files)
-        known = ", ".join(files)
-        raise ConfigError(f"unknown pipeline '{name}'; {hint}known: {known}, or give the path of a YAML file")
-    declared = parse_model(_Declared, read_yaml(path), f"pipeline {path}")
-    declared = declared.model_copy(update=move_to_bounds(declared.bounds, declared.stages, f"pipeline {path}"))
+    path = find_yaml(name, files, "pipeline")
+    where = f"pipeline {path}"
+    declared = parse_model(_Declared, read_yaml(path), where)
+    declared = declared.model_copy(update=move_to_bounds(declared.bounds, declared.stages, where))
     stages, sequence = [], declared.sequence
-    for entry in declared.stages:
-        for given, params in entry.items():
-            stage = stage_name(given, f"pipeline {path}")
-            if stage == SEQUENCE.name:
-                notice(
-                    f"pipeline {path}: write 'sequence:' beside 'stages:'; in the list it works in this release only"
-                )
-                sequence = params or {}
-                continue
-            if stage not in STAGES:
-                hint = did_you_mean(stage, STAGES)
-                raise ConfigError(f"pipeline {path}: unknown stage '{stage}'; {hint}stages: {', '.join(STAGES)}")
-            stages.append((stage, parse_model(STAGES[stage].params, params or {}, f"pipeline {path}, stage {stage}")))
-    check_order(tuple(n for n, _ in stages), f"pipeline {path}")
+    for given, params in (item for entry in declared.stages for item in entry.items()):
+        stage = stage_name(given, where)
+        if stage == SEQUENCE.name:
+            notice(f"{where}: write 'sequence:' beside 'stages:'; in the list it works in this release only")
+            sequence = params or {}
+            continue
+        if stage not in STAGES:
+            hint = did_you_mean(stage, STAGES)
+            raise ConfigError(f"{where}: unknown stage '{stage}'; {hint}stages: {', '.join(STAGES)}")
+        stages.append((stage, parse_model(STAGES[stage].params, params or {}, f"{where}, stage {stage}")))
+    check_order(tuple(n for n, _ in stages), where)
     return Pipeline(
-        name=declared.name,
-        description=declared.description,
-        seed=declared.seed,
-        effort=declared.effort,
-        bounds=parse_model(GraspBounds, declared.bounds, f"pipeline {path}, bounds"),
-        object=parse_model(ObjectParams, declared.object, f"pipeline {path}, object"),
-        field=parse_model(FieldParams, declared.field, f"pipeline {path}, field"),
+        **{name: getattr(declared, name) for name in _Head.model_fields},
+        bounds=parse_model(GraspBounds, declared.bounds, f"{where}, bounds"),
+        object=parse_model(ObjectParams, declared.object, f"{where}, object"),
+        field=parse_model(FieldParams, declared.field, f"{where}, field"),
         stages=tuple(stages),
-        sequence=None
-        if sequence is None
-        else parse_model(SEQUENCE.params, sequence, f"pipeline {path}, {_section(SEQUENCE.name)}"),
+        sequence=None if sequence is None else parse_model(SEQUENCE.params, sequence, f"{where}, {SEQUENCE.name}"),
     )
-
-
-def _section(name: str) -> str:
-    return name if name == SEQUENCE.name else f"stage {name}"

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -13,11 +14,11 @@ from typing import Any, ClassVar, Self
 from pydantic import ConfigDict, Field, PrivateAttr
 
 from lgrasp.config import DeviceName, Params, Workers
-from lgrasp.dataset import write_shard
+from lgrasp.dataset import validate_shard, write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError, Events, Made, Part, PartProgress
-from lgrasp.engine.folder import check_folder, clean_folder, present_parts
-from lgrasp.errors import ConfigError, LgraspError
+from lgrasp.engine.folder import Found, check_folder, clean_folder, found_shard, neighbours
+from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 
@@ -36,6 +37,10 @@ class Job(Params, ABC):
     """True if fewer rows than requested may be found. A part without any then ends the job."""
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.stages.", "lgrasp.grasp.")
     """Prefixes of the modules whose kernels the parts launch; empty: none."""
+    one_key: ClassVar[bool] = True
+    """True if all parts have the key of the job, and so have all files of their name in the folder."""
+    differs: ClassVar[str] = "other hand, object, pipeline, seed or --shard-rows"
+    """What may be other in a file with another key."""
 
     device: DeviceName = "auto"
     workers: Workers = 0
@@ -65,13 +70,52 @@ class Job(Params, ABC):
             LgraspError: an option is out of range, or an input is not found.
         """
 
+    def part_key(self, part: Part) -> str:
+        """Content key that the file of a part holds."""
+        return self.key()
+
     def present(self, parts: Sequence[Part]) -> dict[int, int]:
         """Rows of the parts that are on disk and may stay, by number.
 
+        A file stays when it holds what is asked (or more: nothing is thrown away when fewer are asked later), or when
+        all candidates that it may try were tried.
+
         Raises:
-            OutputError: a file belongs to another run.
+            OutputError: a file, or the folder's first of that name, belongs to another run.
         """
-        return present_parts(parts, self.key(), self.effort, self.cache.warn)
+        # one of the others is enough: whoever wrote into the folder looked as well
+        for path in neighbours([part.file for part in parts])[:1] if self.one_key else ():
+            with suppress(ShardError, ValueError):
+                self._check_run(path, found_shard(path), self.key())
+        present = {}
+        for part in parts:
+            if not os.path.lexists(part.file):
+                continue
+            try:
+                found = self.found(part)
+            except (ShardError, ValueError) as error:
+                self.cache.warn(f"{part.file} is damaged ({error}); rebuilding it")
+                continue
+            self._check_run(part.file, found, self.part_key(part))
+            if found.rows >= part.rows or found.tried >= self.effort(part.rows):
+                present[part.number] = found.rows
+        return present
+
+    def found(self, part: Part) -> Found:
+        """What the file of a part says of itself.
+
+        Raises:
+            ShardError: it is damaged.
+        """
+        if problems := validate_shard(part.file):
+            raise ShardError(problems[0])
+        return found_shard(part.file)
+
+    def _check_run(self, path: Path, found: Found, key: str) -> None:
+        if found.key != key:
+            raise OutputError(
+                f"{path} belongs to another run ({self.differs}); choose another --out, or --overwrite to replace it"
+            )
 
     def clean(self, parts: Sequence[Part]) -> None:
         """Remove leftovers of killed processes that wrote parts; files being written stay."""

@@ -12,15 +12,12 @@ from pydantic import Field
 from lgrasp.config import ShardPaths
 from lgrasp.dataset.files import remove_leftovers, shard_tree
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Part
+from lgrasp.engine.folder import MADE_FROM
 from lgrasp.engine.run import Job
 from lgrasp.errors import OutputError
 from lgrasp.grasp.records import Shard
-
-MADE_FROM = "made_from"
-"""Statistic of a shard that a job made of another: content key of the job and of the rows that it was made of."""
 
 _ROW = ("q", "q_pregrasp", "q_squeeze", "object_pose", "object_index", "candidate")
 _BATCH_ROWS = 65_536  # at a time
@@ -30,6 +27,8 @@ class ShardJob(Job):
     """A part is a shard, written under its place in the output folder."""
 
     kernels: ClassVar[tuple[str, ...]] = ()
+    one_key: ClassVar[bool] = False
+    differs: ClassVar[str] = "other grasps or parameters, or another protocol"
 
     shards: ShardPaths
     out: Path = Field(description="Folder of the files, under the places of the shards.")
@@ -55,25 +54,6 @@ class ShardJob(Job):
             if part.file.exists() and part.file.samefile(part.source):
                 raise OutputError(f"{part.source} would be overwritten; choose another folder with --out")
         return parts
-
-    def present(self, parts: Sequence[Part]) -> dict[int, int]:
-        present = {}
-        for part in parts:
-            if not part.file.exists():
-                continue
-            problems = validate_shard(part.file)
-            if problems:
-                self.cache.warn(f"{part.file}: {problems[0]}; rebuilding it")
-                continue
-            with ShardReader(part.file) as reader:
-                known, rows = reader.statistics.get(MADE_FROM), len(reader)
-            if known != self.part_key(part):
-                raise OutputError(
-                    f"{part.file} belongs to another run (other grasps or parameters, or another protocol); choose "
-                    "another --out, or --overwrite to replace it"
-                )
-            present[part.number] = rows
-        return present
 
     def clean(self, parts: Sequence[Part]) -> None:
         for folder in {part.file.parent for part in parts}:

@@ -1,5 +1,6 @@
 """On what and where: default folders and configs/*.yaml."""
 
+import itertools
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -7,7 +8,17 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from lgrasp.config import DeviceName, MeshScale, Params, Workers, did_you_mean, parse_model, read_yaml, yaml_files
+from lgrasp.config import (
+    DeviceName,
+    MeshScale,
+    Params,
+    Workers,
+    did_you_mean,
+    find_yaml,
+    parse_model,
+    read_yaml,
+    yaml_files,
+)
 from lgrasp.engine.bank import with_passes
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
@@ -55,30 +66,28 @@ def config_files() -> dict[str, Path]:
     return yaml_files("configs")
 
 
-def config_path(name: str) -> Path:
-    """File of a config by path or by name.
+def scene_configs() -> dict[str, Path]:
+    """Name -> file of every config of scenes on the search path."""
+    return yaml_files("configs/scenes")
+
+
+def read_scene_config(name: str) -> dict[str, Any]:
+    """Read a config of scenes, by name or by path.
 
     Raises:
         ConfigError: no such config.
     """
-    path = Path(name).expanduser()
-    if path.is_file():
-        return path
-    files = config_files()
-    if name not in files:
-        hint = did_you_mean(path.stem, files)
-        names = ", ".join(files) or "none"
-        raise ConfigError(f"unknown config '{name}'; {hint}known: {names}, or give the path of a YAML file")
-    return files[name]
+    data = read_yaml(find_yaml(name, scene_configs(), "config of scenes"))
+    return {key: value for key, value in data.items() if key not in ("description", "job")}
 
 
 def load_config(name: str) -> JobConfig:
-    """A config of grasps by path or by name.
+    """A config of grasps by name or by path.
 
     Raises:
         ConfigError: no such config, or a wrong key or value in it.
     """
-    path = config_path(name)
+    path = find_yaml(name, config_files(), "config")
     return parse_model(JobConfig, read_yaml(path), f"config {path}")
 
 
@@ -96,90 +105,55 @@ KINDS = {
 
 
 def load_jobs(name: str, changes: dict[str, Any], cache: Cache) -> list[Job]:
-    """The jobs of a config by path or by name, some keys replaced.
+    """The jobs of a config by name or by path, some keys replaced.
 
     Raises:
         ConfigError: no such config or kind of job, or a wrong key or value.
     """
-    path = config_path(name)
+    path = find_yaml(name, config_files(), "config")
     data = read_yaml(path)
     kind = data.pop("job", "generate")
     if kind not in ("generate", *KINDS):
         hint = did_you_mean(str(kind), ("generate", *KINDS))
         raise ConfigError(f"config {path}: unknown job '{kind}'; {hint}known: generate, {', '.join(KINDS)}")
     if kind == "generate" or "sequences" in data:
-        config = parse_model(JobConfig, data | changes, f"config {path}")
-        return list(plan_sequences(config, cache) if config.sequences else plan_jobs(config, cache))
+        return list(plan_jobs(parse_model(JobConfig, data | changes, f"config {path}"), cache))
     data.pop("description", None)
-    return [parse_model(job_kind(kind), data | changes | {"cache": cache}, f"config {path}")]
+    return [parse_model(_kind(kind), data | changes | {"cache": cache}, f"config {path}")]
 
 
-def job_kind(name: str) -> type[Job]:
+def _kind(name: str) -> Any:
     """The model of a kind of job, imported when it is asked for."""
     module, model = KINDS[name]
     return getattr(import_module(module), model)
 
 
-def plan_jobs(config: JobConfig, cache: Cache) -> list[GenerateJob]:
-    """One job for each pipeline, hand and object, in this order.
+def plan_jobs(config: JobConfig, cache: Cache) -> list[Any]:
+    """One job for each pipeline, hand, and object or sequence of objects, in this order.
 
     Raises:
-        ConfigError: a pipeline that cannot be used, a folder of hands or objects that does not exist.
+        ConfigError: a pipeline that cannot be used, a folder of hands or objects that does not exist, too few objects
+            for the sequences.
     """
-    objects = _objects(config)
+    objects, sets = _objects(config), config.sequences
+    drawn = object_sequences(objects, sets, config.seed or 0) if sets else [(mesh,) for mesh in objects]
     jobs = []
     for pipeline, out in _pipelines(config):
-        for hand in config.hands:
-            for mesh in objects:
-                jobs.append(
-                    GenerateJob(
-                        hand=_urdf_in_folder(config.hand_dir, hand),
-                        object=in_folder(config.object_dir, mesh),
-                        rows=config.rows,
-                        pipeline=with_passes(pipeline, config.passes, config.reuse),
-                        out=out / f"{Path(hand).stem}-{Path(mesh).stem}",
-                        scale=config.scale,
-                        device=config.device,
-                        workers=config.workers,
-                        batch=config.batch,
-                        shard_rows=config.shard_rows,
-                        reuse=config.reuse,
-                        cache=cache,
-                    )
-                )
+        for hand, names in itertools.product(config.hands, drawn):
+            meshes = tuple(in_folder(config.object_dir, mesh) for mesh in names)
+            shared = config.model_dump(include={"rows", "device", "workers", "shard_rows"})
+            shared |= {"hand": _urdf_in_folder(config.hand_dir, hand), "cache": cache}
+            shared["out"] = out / sequence_name(Path(hand).stem, names)
+            if sets:
+                changes = {name: value for name in ("method", "policy") if (value := getattr(sets, name))}
+                shared |= {"shard_rows": min(config.shard_rows, 1000), "scale": sets.scale, "simulate": sets.simulate}
+                own = pipeline.with_params("sequence", **changes) if changes else pipeline
+                jobs.append(_kind("sequence")(**shared, objects=meshes, pipeline=own))
+            else:
+                shared |= config.model_dump(include={"scale", "batch", "reuse"})
+                own = with_passes(pipeline, config.passes, config.reuse)
+                jobs.append(GenerateJob(**shared, object=meshes[0], pipeline=own))
     return jobs
-
-
-def plan_sequences(config: JobConfig, cache: Cache) -> list[Job]:
-    """One job for each pipeline, hand and sequence of objects.
-
-    Raises:
-        ConfigError: a config without ``sequences``, a pipeline or a folder that cannot be used, too few objects.
-    """
-    sets = config.sequences
-    if sets is None:
-        raise ConfigError("the config has no sequences")
-    drawn = object_sequences(_objects(config), sets, config.seed or 0)
-    changes = {name: value for name, value in (("method", sets.method), ("policy", sets.policy)) if value}
-    kind: Any = job_kind("sequence")
-    return [
-        kind(
-            hand=_urdf_in_folder(config.hand_dir, hand),
-            objects=tuple(in_folder(config.object_dir, mesh) for mesh in sequence),
-            rows=config.rows,
-            pipeline=pipeline.with_params("sequence", **changes) if changes else pipeline,
-            out=out / sequence_name(Path(hand).stem, sequence),
-            scale=sets.scale,
-            simulate=sets.simulate,
-            device=config.device,
-            workers=config.workers,
-            shard_rows=min(config.shard_rows, 1000),
-            cache=cache,
-        )
-        for pipeline, out in _pipelines(config)
-        for hand in config.hands
-        for sequence in drawn
-    ]
 
 
 def _pipelines(config: JobConfig) -> Iterator[tuple[Pipeline, Path]]:

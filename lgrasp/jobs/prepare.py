@@ -8,7 +8,7 @@ import numpy as np
 
 from lgrasp.config import parse_model
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.inputs import input_keys, load_field, load_hand, load_object, object_key
+from lgrasp.engine.inputs import Loader, input_keys, object_key
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.jobs.hands import hand_source
@@ -40,8 +40,9 @@ def prepare_field(
     where = resolve_device(device)
     keys = input_keys(hand_source(hand), None, 1.0, ObjectParams(), params)
     start = time.perf_counter()
-    model, _ = load_hand(cache, keys.source, keys.hand, where)
-    field, hit = load_field(cache, keys, upload_hand(model, where.alias), params, report)
+    load = Loader(cache, where.alias, report)
+    model = load.hand(keys.source, keys.hand)
+    field = load.field(upload_hand(model, where.alias), keys.field, params)
     clear = field.clear_share.reshape(-1, model.groups).mean(0)
     return {
         "hand": model.name,
@@ -58,7 +59,7 @@ def prepare_field(
         "settings": len(model.tree.settings),
         "clear_share": [None if np.isnan(share) else float(share) for share in clear],
         "seconds": time.perf_counter() - start,
-        "cached": hit,
+        "cached": load.hits["field"],
         "device": where.name,
         "file": str(cache.path("field", keys.field)),
     }
@@ -73,7 +74,8 @@ def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: floa
     start_warp()
     path, key = object_key(mesh, scale, params)
     start = time.perf_counter()
-    model, hit = load_object(cache, path, key, scale, params)
+    load = Loader(cache)
+    model = load.object(path, key, scale, params)
     return {
         "object": model.name,
         "faces": len(model.faces),
@@ -86,6 +88,6 @@ def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: floa
         "sdf_cells": int(np.prod(model.sdf.shape)),
         "sdf_cell": model.sdf_cell,
         "seconds": time.perf_counter() - start,
-        "cached": hit,
+        "cached": load.hits["object"],
         "file": str(cache.path("object", key)),
     }

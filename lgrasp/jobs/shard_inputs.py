@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from lgrasp.cloud.model import cloud_object
 from lgrasp.dataset import HandRecord, ObjectRecord, ShardReader
 from lgrasp.engine.cache import Cache, content_key
-from lgrasp.engine.inputs import OBJECT_VERSION, load_hand, load_object, object_key
+from lgrasp.engine.inputs import OBJECT_VERSION, Loader, object_key
 from lgrasp.errors import HandError, ShardError
 from lgrasp.grasp.hand_files import write_hand
 from lgrasp.hand.find import HandSource, rules_of_known
@@ -78,17 +78,16 @@ def object_of_shard(
     params = params or ObjectParams()
     described = {"content": mesh_hash(record), "params": params.model_dump(mode="json"), "name": record.id}
 
-    def make() -> dict[str, np.ndarray]:
+    def make() -> ObjectModel:
         import trimesh
 
         from lgrasp.object.preprocess import preprocess_object  # slow to load
 
         mesh = trimesh.Trimesh(np.asarray(record.vertices, float), np.asarray(record.faces), process=False)
         mesh.metadata["name"] = record.id
-        return preprocess_object(mesh, params=params, device=device.alias).to_arrays()
+        return preprocess_object(mesh, params=params, device=device.alias)
 
-    arrays, _ = cache.get("object", content_key("object", OBJECT_VERSION, **described), make)
-    return ObjectModel.from_arrays(arrays)
+    return Loader(cache).get("object", ObjectModel, content_key("object", OBJECT_VERSION, **described), make)
 
 
 def named_object(cache: Cache, name: str, scale: float, device: Device) -> ObjectModel:
@@ -99,7 +98,7 @@ def named_object(cache: Cache, name: str, scale: float, device: Device) -> Objec
     """
     if not name.endswith(".h5"):
         mesh, key = object_key(name, scale, ObjectParams())
-        return load_object(cache, mesh, key, scale, ObjectParams(), device.alias)[0]
+        return Loader(cache, device.alias).object(mesh, key, scale, ObjectParams())
     with ShardReader(Path(name).expanduser()) as reader:
         if len(reader.object_ids) != 1:
             raise ShardError(f"{name}: holds the objects {', '.join(reader.object_ids)}; a shard of one is accepted")
@@ -118,7 +117,7 @@ def mesh_hash(record: ObjectRecord) -> str:
 
 def _built(cache: Cache, source: HandSource, device: Device) -> tuple[HandSource, HandModel]:
     key = content_key("hand", HAND_VERSION, content=hand_digest(source.urdf, source.spec))
-    return source, load_hand(cache, source, key, device)[0]
+    return source, Loader(cache, device.alias).hand(source, key)
 
 
 def _files(record: HandRecord) -> Path:

@@ -16,8 +16,9 @@ from lgrasp.dataset import HandRecord, ObjectRecord, ShardReader, read_shard
 from lgrasp.dataset.extend import extend_shard
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.folder import MADE_FROM
 from lgrasp.engine.run import JobOutcome
-from lgrasp.engine.shard_job import MADE_FROM, ShardJob
+from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.jobs.shard_inputs import mesh_hash

@@ -14,9 +14,8 @@ from lgrasp.engine.events import Events
 from lgrasp.engine.run import JobOutcome, run
 from lgrasp.errors import CloudError, ConfigError, LgraspError, OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
-from lgrasp.jobs.scenes.config import read_scene_config, scene_configs
-from lgrasp.jobs.scenes.job import SceneJob
-from lgrasp.jobs.scenes.report import describe_scenes
+from lgrasp.jobs.config import read_scene_config, scene_configs
+from lgrasp.jobs.scenes.job import SceneJob, describe_scenes
 from lgrasp.scenes.files import SceneReader, check_scene, read_scene, scene_cloud, write_scene
 
 QUICK = Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml"

@@ -16,6 +16,7 @@ from lgrasp.config import ShardPaths
 from lgrasp.dataset.files import new_file, shard_tree
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.folder import Found
 from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import ConfigError, OutputError
@@ -45,6 +46,8 @@ class FitJob(Job):
 
     unit: ClassVar[str] = "steps"
     kernels: ClassVar[tuple[str, ...]] = ()
+    one_key: ClassVar[bool] = False
+    differs: ClassVar[str] = "other shards or parameters"
 
     shards: ShardPaths
     out: Path = Field(Path("coarse.pt"), description="File of the predictor.")
@@ -68,16 +71,8 @@ class FitJob(Job):
             raise OutputError(f"{self.out} is a folder; name a file with --out, such as coarse.pt")
         return [Part(0, self.out, self.params.steps + self.params.joint_steps)]
 
-    def present(self, parts: Sequence[Part]) -> dict[int, int]:
-        if not parts or not self.out.exists():
-            return {}
-        _, about = load_predictor(self.out)
-        if about.get("run_key") != self.key():
-            raise OutputError(
-                f"{self.out} is a predictor of another run (other shards or parameters); choose another --out, or "
-                "--overwrite to replace it"
-            )
-        return {0: parts[0].rows}
+    def found(self, part: Part) -> Found:
+        return Found(load_predictor(part.file)[1].get("run_key"), part.rows)
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, device = self.params, self.device_used.alias

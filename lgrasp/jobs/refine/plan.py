@@ -1,15 +1,17 @@
 """The job of ``lgrasp plan``: a hand before an object or a cloud -> one shard of grasps."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from pydantic import Field, InstanceOf, PrivateAttr
 
 from lgrasp.cloud.model import cloud_object
 from lgrasp.cloud.read import Cloud, read_cloud
+from lgrasp.config import apply_settings, parse_model
 from lgrasp.dataset import ObjectRecord, Shard, ShardHeader
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
@@ -212,6 +214,22 @@ class PlanJob(Job):
 
     def _record(self) -> ObjectRecord:
         return _record(self._models()[2], self._cloud)
+
+
+def plan_params(settings: Sequence[str] = (), **options: float) -> PlanParams:
+    """Parameters of plans.
+
+    Args:
+        settings: ``PART.KEY=VALUE`` each; a part is ``bounds``, ``search`` or ``plan``.
+        options: fields of :class:`PlanParams`.
+
+    Raises:
+        ConfigError: an unknown key, or a value out of range.
+    """
+    params = parse_model(PlanParams, options, "plan")
+    parts: dict[str, Any] = {"bounds": params.bounds, "search": params.search, "plan": params}
+    made = apply_settings(parts, settings, "lgrasp plan")
+    return cast(PlanParams, made["plan"]).model_copy(update={"bounds": made["bounds"], "search": made["search"]})
 
 
 def lost_starts(counts: dict[str, int]) -> str:

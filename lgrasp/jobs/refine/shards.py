@@ -1,6 +1,7 @@
 """The job of ``lgrasp refine``: shards, or grasps of other formats, moved by a local search and written again."""
 
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -8,9 +9,11 @@ from typing import Any, cast
 import numpy as np
 from pydantic import Field, PrivateAttr
 
-from lgrasp.config import apply_settings
-from lgrasp.dataset import ShardHeader, read_shard
+from lgrasp import __version__
+from lgrasp.config import apply_settings, parse_model
+from lgrasp.dataset import ObjectRecord, ShardHeader, read_shard
 from lgrasp.dataset.checks import row_problems
+from lgrasp.dataset.exports.formats import read_grasps
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
@@ -19,15 +22,22 @@ from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import ConfigError, HandError, ShardError
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
-from lgrasp.grasp.records import Shard
+from lgrasp.grasp.records import Shard, now
 from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.hand.find import HandSource
+from lgrasp.hand.model import HandModel
+from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs
 from lgrasp.jobs.refine.moved import move_rows
-from lgrasp.jobs.refine.sources import grasp_shards
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
+from lgrasp.object.load import load_mesh
+from lgrasp.refine.params import LocalSearch
 from lgrasp.stages.refine.params import RefineParams
 
 VERSION = 2
 """Raised whenever refined shards change for the same parameters."""
+
+COARSE = LocalSearch(matching_rounds=13, reach=0.05, reach_end=0.03)
+"""For poses as a network predicts them: off by centimetres."""
 
 
 class RefineJob(ShardJob):
@@ -71,7 +81,7 @@ class RefineJob(ShardJob):
             raise ConfigError(f"grasps in format {form}: give one folder or file, and their hand with --hand")
         source, model = named_hand(self.cache, self.hand, self.device_used)
         self._hands[model.sha256] = upload_hand(model, self.device_used.alias)
-        self._given = dict(enumerate(grasp_shards(self.shards[0], form, source, model)))
+        self._given = dict(enumerate(_grasp_shards(self.shards[0], form, source, model)))
         return [
             Part(number, shard_path(self.out, model.name, shard.objects[0].id, 0), len(shard.grasps), self.shards[0])
             for number, shard in self._given.items()
@@ -118,8 +128,7 @@ class RefineJob(ShardJob):
                 f"it: {part.source}"
             )
         if not len(moved.rows):
-            self.cache.warn(f"none of the {moved.failed:,} rows passed the checks; nothing is written: {part.source}")
-            return Made(0)
+            self.cache.warn(f"none of the {moved.failed:,} rows passed the checks: {part.source}")
         counts = {
             "refine_failed": moved.failed,
             "refine_tried": len(shard.grasps),
@@ -128,8 +137,9 @@ class RefineJob(ShardJob):
             "refine_energy_before": moved.energy[0] * len(shard.grasps),  # sums, for merged shards
             "seconds_refine": time.perf_counter() - begin,
         }
-        written = self.marked(part, replace(shard, header=_header(shard, bounds, params), grasps=moved.rows), counts)
-        return Made(len(moved.rows), written)
+        config = {**shard.header.config, "bounds": bounds.describe(), "refine": params.model_dump(mode="json")}
+        header = replace(shard.header, config=config, created=now(), lgrasp_version=__version__)
+        return Made(len(moved.rows), self.marked(part, replace(shard, header=header, grasps=moved.rows), counts))
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``results``: of each shard hand, object, rows, refined, valid before and after, mean energies, seconds."""
@@ -147,18 +157,6 @@ class RefineJob(ShardJob):
             _, model = hand_of_shard(self.cache, shard.hand, shard.header.config, device)
             self._hands[digest] = upload_hand(model, device.alias)
         return self._hands[digest]
-
-
-def _header(shard: Shard, bounds: GraspBounds, params: RefineParams) -> ShardHeader:
-    header = shard.header
-    config = {**header.config, "bounds": bounds.describe(), "refine": params.model_dump(mode="json")}
-    return ShardHeader(
-        pipeline=header.pipeline,
-        seed=header.seed,
-        shard_index=header.shard_index,
-        config=config,
-        merged_from=header.merged_from,
-    )
 
 
 def _entry(path: Path) -> dict[str, Any]:
@@ -197,3 +195,53 @@ def _check_rows(path: Path, shard: Shard) -> None:
     )
     if problems:
         raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset check' accepts them can be refined")
+
+
+def refine_params(*, coarse: bool = False, **options: int | None) -> RefineParams:
+    """The stage's parameters, or those for coarse poses, with the options that are given (not None) in their place.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+    given = parse_model(LocalSearch, {name: value for name, value in options.items() if value is not None}, "refine")
+    search = COARSE.model_dump() if coarse else {}
+    return parse_model(RefineParams, search | given.model_dump(exclude_unset=True), "refine")
+
+
+def _grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) -> Iterator[Shard]:
+    """Grasps in the format of another program as one shard an object; joints go by their names.
+
+    Raises:
+        ConfigError: an unknown format.
+        ShardError: a file is damaged, names other joints, has no grasps, or the mesh of an object is missing.
+        ObjectError: a mesh cannot be read.
+    """
+    found = read_grasps(path, form, joint_names=hand.tree.listed_names)
+    rows = found.grasps
+    if rows.object_index.shape[1] != 1:
+        raise ShardError(f"{path}: grasps of several objects cannot be refined")
+    if not len(rows):
+        raise ShardError(f"{path}: holds no grasps")
+    record = hand_record(hand, mesh_blobs(source.urdf))
+    for number, item in enumerate(found.objects):
+        chosen = np.flatnonzero(rows.object_index[:, 0] == number)
+        if item.mesh is None:
+            raise ShardError(f"{path}: no mesh of object '{item.code}' is known; an export folder with its meshes is")
+        if not (np.isfinite(item.scale) and item.scale > 0):
+            raise ShardError(f"{path}: object '{item.code}' has scale {item.scale:g}; a positive number is accepted")
+        mesh = load_mesh(item.mesh, scale=item.scale)
+        solid = ObjectRecord(
+            id=item.code,
+            name=item.code,
+            scale=item.scale,
+            sha256=mesh.sha256,
+            watertight=mesh.closed,
+            vertices=mesh.vertices.astype(np.float32),
+            faces=mesh.faces,
+        )
+        own = replace(rows, **{name: np.asarray(values)[chosen] for name, values in rows.columns().items()})
+        own = replace(own, object_index=np.zeros((len(chosen), 1), np.int32))
+        header = ShardHeader(
+            pipeline=form, seed=0, shard_index=0, config={"read_from": str(path), **hand_config(source)}
+        )
+        yield Shard(header=header, hand=record, objects=[solid], grasps=own)

@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-import os
 import time
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +14,11 @@ from pydantic import PrivateAttr
 from lgrasp.dataset.files import shard_tree
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, Made, Part, PartProgress
-from lgrasp.engine.folder import shard_path
+from lgrasp.engine.folder import Found, shard_path
 from lgrasp.engine.run import JobOutcome
-from lgrasp.errors import OutputError
+from lgrasp.errors import ShardError
 from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.scenes.config import SceneConfig
-from lgrasp.jobs.scenes.report import describe_scenes
-from lgrasp.jobs.scenes.stock import Stock, load_stock
+from lgrasp.jobs.scenes.stock import SceneConfig, Stock, load_stock
 from lgrasp.scenes.files import SceneReader, check_scene, write_scene
 from lgrasp.scenes.make import make_scene
 from lgrasp.simulate.builder import import_mujoco
@@ -31,6 +29,8 @@ class SceneJob(SceneConfig):
 
     unit: ClassVar[str] = "scenes"
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.scenes.",)
+    one_key: ClassVar[bool] = False
+    differs: ClassVar[str] = "other hand, objects, grasps, parameters or seed"
     _stock: Stock | None = PrivateAttr(None)
 
     @property
@@ -60,24 +60,11 @@ class SceneJob(SceneConfig):
         name = self.hand_name
         return [Part(index, shard_path(self.out, name, "scene", index), 1) for index in range(self.scenes)]
 
-    def present(self, parts: Sequence[Part]) -> dict[int, int]:
-        present = {}
-        for part in parts:
-            if not os.path.lexists(part.file):
-                continue
-            problems = check_scene(part.file)
-            if problems:
-                self.cache.warn(f"scene {part.file} is damaged ({problems[0]}); rebuilding it")
-                continue
-            with SceneReader(part.file) as reader:
-                found = reader.config.get("run_key")
-            if found != self.key():
-                raise OutputError(
-                    f"{part.file} belongs to another run (other hand, objects, grasps, parameters or seed); "
-                    "choose another --out, or --overwrite to replace it"
-                )
-            present[part.number] = 1
-        return present
+    def found(self, part: Part) -> Found:
+        if problems := check_scene(part.file):
+            raise ShardError(problems[0])
+        with SceneReader(part.file) as reader:
+            return Found(reader.config.get("run_key"), 1)
 
     def load(self, events: Events, missing: bool) -> None:
         if missing:
@@ -108,3 +95,28 @@ class SceneJob(SceneConfig):
     def _described(self) -> dict[str, Any]:
         """What decides the scenes."""
         return {"scene": self.scene.model_dump(mode="json"), "seed": self.seed, "stock": self.loaded.key}
+
+
+def describe_scenes(paths: Sequence[Path]) -> dict[str, Any]:
+    """Counts over scenes: ``scenes``, points, grasps tested, free and kept; of each object the same (``objects``).
+
+    Raises:
+        ShardError: a file is damaged.
+    """
+    names = ("points", "bytes", "drops", "grasps_tested", "grasps_free", "grasps_into_table", "grasps_into_objects")
+    total = Counter({"scenes": len(paths)} | dict.fromkeys(names, 0))
+    objects: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    for path in paths:
+        with SceneReader(path) as reader:
+            scene, statistics = reader.layout(), reader.statistics
+            grasps, labels = reader.grasps(), reader.cloud().labels
+        total.update(points=len(labels), bytes=path.stat().st_size)
+        total.update({name: int(statistics[name]) for name in names[2:]})
+        for k, index in enumerate(scene.object_index):
+            free = grasps.collision_free[grasps.target == k]
+            points, without = int((labels == k + 1).sum()), int(not free.any())
+            objects[scene.ids[index]].update(
+                scenes=1, points=points, kept=len(free), free=int(free.sum()), without=without
+            )
+    found = {name: dict(counts) for name, counts in sorted(objects.items())}
+    return {**total, "object_points": sum(counts["points"] for counts in found.values()), "objects": found}

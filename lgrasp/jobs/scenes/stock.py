@@ -7,17 +7,19 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from pydantic import Field
 
+from lgrasp.config import MeshScale, Seed
 from lgrasp.dataset import HandRecord
 from lgrasp.dataset.files import shard_tree
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import Job
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.scenes.config import SceneConfig
 from lgrasp.jobs.scenes.shards import Grasped, load_hand, read_parts
 from lgrasp.jobs.shard_inputs import mesh_hash, object_of_shard
 from lgrasp.object.arrays import upload_object
@@ -25,7 +27,24 @@ from lgrasp.object.find import find_object
 from lgrasp.object.load import load_mesh
 from lgrasp.runtime.device import Device
 from lgrasp.scenes.make import Item
+from lgrasp.scenes.params import SceneParams
 from lgrasp.simulate.scene import object_of_record
+
+
+class SceneConfig(Job):
+    """The scenes requested of one hand. Paths are relative to the current folder."""
+
+    hand: str | None = Field(None, description="Name or path; default: that of the grasps, else allegro.")
+    objects: tuple[str, ...] = Field((), description="Names or paths; default: all objects of the grasps.")
+    scale: MeshScale = 1.0
+    grasps: Path | None = Field(None, description="Folder of shards; default: grasps are generated.")
+    pipeline: str = Field("robust", description="Generates grasps where no folder of them is given.")
+    stock: int = Field(1000, ge=1, description="Grasps that are generated of each object.")
+    scenes: int = Field(100, ge=1)
+    seed: Seed = 0
+    out: Path = Field(Path("scenes"), description="Folder of the scenes.")
+    workers: int = Field(0, ge=0, description="Scenes made at once; 0: one a core.")
+    scene: SceneParams = Field(default_factory=lambda: SceneParams.model_validate({}))
 
 
 @dataclass(frozen=True)

@@ -2,21 +2,20 @@
 
 import hashlib
 import json
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from dataclasses import field as with_default
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lgrasp.engine.cache import Cache, content_key
-from lgrasp.engine.inputs import load_hand, load_object, object_key
+from lgrasp.engine.inputs import Loader, Report, object_key
 from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays, upload_field
-from lgrasp.field.build import build_field
-from lgrasp.field.model import FIELD_VERSION, ContactField
+from lgrasp.field.model import FIELD_VERSION
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.find import HandSource
@@ -30,8 +29,6 @@ from lgrasp.object.find import find_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device
 from lgrasp.simulate.scene import Scene
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
@@ -133,20 +130,8 @@ def load_sequence_inputs(
     Raises:
         ConfigError: more objects than the hand's opposition spaces can take one after another.
     """
-    report = report or (lambda what, share: None)
-    seconds: dict[str, float] = {}
-    hits: dict[str, bool] = {}
-
-    def timed(name: str, load: Callable[[], tuple[Any, bool]]) -> Any:
-        start = time.perf_counter()
-        report(name, 0.0)
-        model, hit = load()
-        hits[name] = hits.get(name, True) and hit
-        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
-        return model
-
-    source = keys.source
-    model = timed("hand", lambda: load_hand(cache, keys.source, keys.hand, device))
+    load, source, alias = Loader(cache, device.alias, report), keys.source, device.alias
+    model = load.hand(source, keys.hand)
     spaces = hand_spaces(source.spec, model.tree)
     most = longest(spaces, (), np.zeros(model.dofs, bool))
     if len(keys.meshes) > most:
@@ -155,27 +140,14 @@ def load_sequence_inputs(
             f"'{source.name}' ({', '.join(s.name for s in spaces)}) take at most {most} one after another"
         )
     views = []
-    for space in spaces:
-
-        def make_view(name: str = space.name) -> dict[str, np.ndarray]:
-            return space_view(source.urdf, source.spec, model, name, device.alias).to_arrays()
-
-        arrays = timed("hand", lambda name=space.name, make=make_view: cache.get("hand", keys.views[name], make))
-        view = HandModel.from_arrays(arrays)
-        hand = upload_hand(view, device.alias)
-
-        def make_field(hand: HandArrays = hand) -> dict[str, np.ndarray]:
-            return build_field(hand, fields, report).to_arrays()
-
-        found = timed("field", lambda name=space.name, make=make_field: cache.get("field", keys.fields[name], make))
-        views.append(SpaceView(hand, upload_field(ContactField.from_arrays(found), view, device.alias)))
+    for name in (space.name for space in spaces):
+        make = partial(space_view, source.urdf, source.spec, model, name, alias)
+        view = load.get("hand", HandModel, keys.views[name], make)
+        hand = upload_hand(view, alias)
+        views.append(SpaceView(hand, upload_field(load.field(hand, keys.fields[name], fields), view, alias)))
     made: dict[str, ObjectArrays] = {}
     for path, key, scale in zip(keys.meshes, keys.objects, keys.scales, strict=True):
         if key not in made:
-            loaded = timed(
-                "object",
-                lambda path=path, key=key, scale=scale: load_object(cache, path, key, scale, objects, device.alias),
-            )
-            made[key] = upload_object(loaded, device.alias)
+            made[key] = upload_object(load.object(path, key, scale, objects), alias)
     steps = tuple(made[key] for key in keys.objects)
-    return SequenceInputs(model, spaces, tuple(views), steps, keys, device, seconds, hits)
+    return SequenceInputs(model, spaces, tuple(views), steps, keys, device, load.seconds, load.hits)

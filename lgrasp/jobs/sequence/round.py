@@ -29,21 +29,33 @@ Verdicts = Callable[[list[SequenceTable]], dict[str, np.ndarray]]
 """Columns of a simulator for the rows of the last of some levels; the one whose name ends with ``_holds`` decides."""
 
 
+Spaces = list[dict[str, dict[str, dict[str, int]]]]
+"""Survivors by step, opposition space and stage."""
+
+
 @dataclass
 class Round:
     """Result of a round: level n holds the rows of n + 1 objects; their parents are rows of the level before."""
 
     levels: list[SequenceTable] = field(default_factory=list)
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    spaces: list[dict[str, dict[str, dict[str, int]]]] = field(default_factory=list)  # step, space, stage: survivors
+    seconds: dict[str, float] = field(default_factory=dict)  # thread-seconds per stage
+    spaces: Spaces = field(default_factory=list)
     walls: list[float] = field(default_factory=list)  # of each step, simulation not counted [s]
 
-    def add(self, space: str, counts: dict[str, dict[str, int]], seconds: Mapping[str, float] | None = None) -> None:
+    def count(self, space: str, counts: dict[str, dict[str, int]], seconds: Mapping[str, float] | None = None) -> None:
         """Count survivors of the step that is being made, and thread-seconds."""
         add_counts(self.counts, counts)
         add_counts(self.spaces[-1].setdefault(space, {}), counts)
         add_seconds(self.seconds, seconds or {})
+
+
+def add_spaces(total: Spaces, more: Spaces) -> None:
+    """Add survivors to a running total."""
+    total += [{} for _ in more[len(total) :]]
+    for into, found in zip(total, more, strict=False):
+        for space, counts in found.items():
+            add_counts(into.setdefault(space, {}), counts)
 
 
 def run_round(
@@ -62,16 +74,15 @@ def run_round(
         check: called before each step; what it raises ends the round.
         verdicts: simulates the rows of each step; only those that hold are continued.
     """
-    params, model = pipeline.params("sequence"), inputs.hand
+    model, result = inputs.hand, Round()
     seed = stage_seed(pipeline.seed, shard, "sequence", number)
-    rows = empty_sequences(params.width, model.dofs, model.groups + 1)
-    result = Round()
+    rows = empty_sequences(pipeline.params("sequence").width, model.dofs, model.groups + 1)
     with ThreadPoolExecutor(workers) as pool:
         while rows.steps < len(inputs.objects) and len(rows):
             check()
             result.spaces.append({})
             start = time.perf_counter()
-            rows = _step(pipeline, inputs, rows, seed, pool, result)
+            rows = _Step(pipeline, inputs, rows, seed, pool, result).run()
             result.walls.append(time.perf_counter() - start)
             result.levels.append(rows)
             if verdicts and len(rows):
@@ -79,33 +90,7 @@ def run_round(
     return result
 
 
-def _step(
-    pipeline: Pipeline,
-    inputs: SequenceInputs,
-    rows: SequenceTable,
-    seed: int,
-    pool: ThreadPoolExecutor,
-    result: Round,
-) -> SequenceTable:
-    """The rows that are one object longer, by the row that they extend."""
-    params, step = pipeline.params("sequence"), rows.steps
-    order = space_orders(rows, inputs.spaces, params.policy, len(inputs.objects) - step - 1, seed)
-    search = _Search(pipeline, inputs, rows, seed, pool, result)
-    if params.method != "field":
-        search.optimise(order[:, 0])
-    for wave in range(params.waves if params.method == "field" else 0):
-        space = order[np.arange(len(rows)), wave % np.maximum((order >= 0).sum(1), 1)]
-        for number in np.unique(space[space >= 0]):
-            search.go_on(np.flatnonzero((space == number) & search.wanting), int(number), wave)
-    parts = [search.longer(number) for number in search.tried]
-    if not parts:
-        return take_sequences(rows, np.zeros(0, int))
-    table = join_sequences(parts)
-    table = take_sequences(table, np.argsort(table.parent, kind="stable"))
-    return take_sequences(table, go_on(table.parent, table.metrics["room"], params))
-
-
-class _Search:
+class _Step:
     """Grasps of the next object for some sequences, wave by wave of candidates, until each has enough."""
 
     def __init__(
@@ -122,25 +107,41 @@ class _Search:
         self._params = pipeline.params("sequence")
         self._have = np.zeros(len(rows), int)
         self._found: dict[int, list[GraspTable]] = {}
-        self.tried: dict[int, np.ndarray] = {}
-        """Rows that were continued with each space, (N,) bool."""
+        self._tried: dict[int, np.ndarray] = {}  # rows that were continued with each space, (N,) bool
+
+    def run(self) -> SequenceTable:
+        """The rows that are one object longer, by the row that they extend."""
+        rows, params = self._rows, self._params
+        left = len(self._inputs.objects) - rows.steps - 1
+        order = space_orders(rows, self._inputs.spaces, params.policy, left, self._seed)
+        if params.method != "field":
+            self._optimise(order[:, 0])
+        for wave in range(params.waves if params.method == "field" else 0):
+            space = order[np.arange(len(rows)), wave % np.maximum((order >= 0).sum(1), 1)]
+            for number in np.unique(space[space >= 0]):
+                self._go_on(np.flatnonzero((space == number) & self._wanting), int(number), wave)
+        if not self._tried:
+            return take_sequences(rows, np.zeros(0, int))
+        table = join_sequences([self._longer(number) for number in self._tried])
+        table = take_sequences(table, np.argsort(table.parent, kind="stable"))
+        return take_sequences(table, go_on(table.parent, table.metrics["room"], params))
 
     @property
-    def wanting(self) -> np.ndarray:
+    def _wanting(self) -> np.ndarray:
         """Rows that have not enough grasps yet, (N,) bool."""
         return self._have < self._params.branch * (_LOOKAHEAD_CHOICES if self._params.policy == "lookahead" else 1)
 
-    def go_on(self, chosen: np.ndarray, number: int, wave: int) -> None:
+    def _go_on(self, chosen: np.ndarray, number: int, wave: int) -> None:
         """Give some rows a wave of candidates with a space."""
         if not len(chosen):
             return
         name, size = self._inputs.spaces[number].name, self._params.wave
         seed = stage_seed(self._seed, self._rows.steps, name, wave)
-        context = _context(self._pipeline, self._inputs, take_sequences(self._rows, chosen), number, size, seed)
-        grasps, meters = _from_field(self._pipeline, context, len(chosen) * size, self._pool)
+        context = self._context(chosen, number, size, seed)
+        grasps, meters = self._from_field(context, len(chosen) * size)
         self._take(grasps, meters, chosen, number, size, wave * size)
 
-    def optimise(self, space: np.ndarray) -> None:
+    def _optimise(self, space: np.ndarray) -> None:
         """One grasp of each row with its space, by the optimiser."""
         from lgrasp.sequence.optimiser.optimise import optimise  # torch
 
@@ -169,7 +170,7 @@ class _Search:
         for number in np.unique(space[able]):
             own = np.flatnonzero(space[able] == number)
             part = replace(grasps, **{f.name: getattr(grasps, f.name)[own] for f in fields(grasps)})
-            context = _context(self._pipeline, inputs, take_sequences(rows, able[own]), int(number), 1, self._seed)
+            context = self._context(able[own], int(number), 1, self._seed)
             meter = Meter(context.device)
             sets = optimised_sets(part, free[own], context)
             table = run_stage("filter", sets, self._pipeline, context, meter)
@@ -180,60 +181,52 @@ class _Search:
     ) -> None:
         """Keep grasps by candidates that continue ``chosen`` rows, ``size`` each, after ``before`` others."""
         for meter in meters:
-            self._result.add(self._inputs.spaces[number].name, meter.counts, meter.seconds)
+            self._result.count(self._inputs.spaces[number].name, meter.counts, meter.seconds)
         row = chosen[grasps.index // size]
         candidate = row * self._params.tries + before + grasps.index % size
         self._found.setdefault(number, []).append(replace(grasps, index=candidate))
-        self.tried.setdefault(number, np.zeros(len(self._rows), bool))[chosen] = True
+        self._tried.setdefault(number, np.zeros(len(self._rows), bool))[chosen] = True
         self._have += np.bincount(row, minlength=len(self._rows))
 
-    def longer(self, number: int) -> SequenceTable:
+    def _longer(self, number: int) -> SequenceTable:
         """The sequences that continue with a space; their candidates are numbered over all rows."""
-        tries, rows = self._params.tries, np.flatnonzero(self.tried[number])
+        tries, rows = self._params.tries, np.flatnonzero(self._tried[number])
         grasps = sort_grasps(join_grasps(self._found[number]))
         place = np.searchsorted(rows, grasps.index // tries) * tries + grasps.index % tries
-        before = take_sequences(self._rows, rows)
-        context = _context(self._pipeline, self._inputs, before, number, tries, self._seed)
+        context, before = self._context(rows, number, tries, self._seed), take_sequences(self._rows, rows)
         table, counts = grow((before, number, replace(grasps, index=place)), self._params, context)
-        self._result.add(self._inputs.spaces[number].name, {"sequence": counts})
+        self._result.count(self._inputs.spaces[number].name, {"sequence": counts})
         parent = rows[table.parent]
         return replace(table, parent=parent, candidate=parent * tries + table.candidate % tries)
 
+    def _context(self, chosen: np.ndarray, number: int, tries: int, seed: int) -> Context:
+        """Input of the stages that continue chosen rows with an opposition space."""
+        inputs, before = self._inputs, take_sequences(self._rows, chosen)
+        space, view, step = inputs.spaces[number], inputs.views[number], before.steps
+        posture, frozen = before.posture(inputs.hand.tree), before.used | ~space.joints
+        return Context(
+            view.hand,
+            inputs.objects[step],
+            view.field,
+            inputs.device.alias,
+            seed,
+            0,
+            self._pipeline.bounds,
+            space=space,
+            holding=hold(view.hand, posture, frozen, inputs.objects[:step], before.pose, tries=tries),
+            realised=self._pipeline.realised,
+        )
 
-def _context(
-    pipeline: Pipeline, inputs: SequenceInputs, before: SequenceTable, number: int, tries: int, seed: int
-) -> Context:
-    """Input of the stages that continue some sequences with an opposition space."""
-    space, view, step = inputs.spaces[number], inputs.views[number], before.steps
-    posture, frozen = before.posture(inputs.hand.tree), before.used | ~space.joints
-    holding = hold(view.hand, posture, frozen, inputs.objects[:step], before.pose, tries=tries)
-    alias = inputs.device.alias
-    return Context(
-        view.hand,
-        inputs.objects[step],
-        view.field,
-        alias,
-        seed,
-        0,
-        pipeline.bounds,
-        space=space,
-        holding=holding,
-        realised=pipeline.realised,
-    )
+    def _from_field(self, context: Context, candidates: int) -> tuple[GraspTable, list[Meter]]:
+        """Grasps of all candidates that continue the held rows; on a CPU several chunks of them at a time."""
+        size = _CPU_CHUNK if context.device == "cpu" else candidates
+        meters = [Meter(context.device) for _ in range(0, candidates, size)]
 
+        def run(number: int) -> GraspTable:
+            first, meter = number * size, meters[number]
+            return run_stages(self._pipeline, context, first, min(size, candidates - first), "filter", meter)
 
-def _from_field(
-    pipeline: Pipeline, context: Context, candidates: int, pool: ThreadPoolExecutor
-) -> tuple[GraspTable, list[Meter]]:
-    """Grasps of all candidates that continue the held rows; on a CPU several chunks of them at a time."""
-    size = _CPU_CHUNK if context.device == "cpu" else candidates
-    meters = [Meter(context.device) for _ in range(0, candidates, size)]
-
-    def run(number: int) -> GraspTable:
-        first = number * size
-        return run_stages(pipeline, context, first, min(size, candidates - first), "filter", meters[number])
-
-    return join_grasps(list(pool.map(run, range(len(meters))))), meters
+        return join_grasps(list(self._pool.map(run, range(len(meters))))), meters
 
 
 def _that_hold(
@@ -244,5 +237,5 @@ def _that_hold(
         own = rows.space[:, -1] == number
         if own.any():
             counts = {"tried": int(own.sum()), "held": int(holds[own].sum())}
-            result.add(space.name, {"simulate": counts})
+            result.count(space.name, {"simulate": counts})
     return take_sequences(rows, np.flatnonzero(holds), physics=columns)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 
 import numpy as np
 
@@ -12,19 +13,15 @@ from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.sequences import SequenceTable, join_sequences, take_sequences
 from lgrasp.jobs.sequence.inputs import SequenceInputs
-from lgrasp.jobs.sequence.round import Round, Verdicts, run_round
+from lgrasp.jobs.sequence.round import Round, Verdicts, add_spaces, run_round
 
 _EMPTY_ROUNDS = 4  # without any row of some length, before nothing more is expected
 
 
 @dataclass
-class SequenceResult:
-    """Sequences of a shard and how they came about."""
+class SequenceResult(Round):
+    """Sequences of a shard and how they came about: the rounds together."""
 
-    levels: list[SequenceTable] = field(default_factory=list)  # rows of 1, 2 ... objects
-    counts: dict[str, dict[str, int]] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)  # thread-seconds per stage
-    spaces: list[dict[str, dict[str, dict[str, int]]]] = field(default_factory=list)  # step, space, stage: survivors
     reached: list[int] = field(default_factory=list)  # rows of 1, 2 ... objects that were found
     wall: float = 0.0
     rounds: int = 0
@@ -35,26 +32,13 @@ class SequenceResult:
         """Whole sequences."""
         return len(self.levels[-1]) if self.levels else 0
 
-    def add(self, round_: Round) -> None:
+    def add(self, found: Round) -> None:
         """Count a further round."""
         self.rounds += 1
-        add_counts(self.counts, round_.counts)
-        add_seconds(self.seconds, round_.seconds)
-        add_spaces(self.spaces, round_.spaces)
-        for step, table in enumerate(round_.levels):
-            self.reached += [0] * (step + 1 - len(self.reached))
-            self.reached[step] += len(table)
-
-
-def add_spaces(
-    total: list[dict[str, dict[str, dict[str, int]]]], more: list[dict[str, dict[str, dict[str, int]]]]
-) -> None:
-    """Add survivors by step, space and stage to a running total."""
-    for step, found in enumerate(more):
-        if step == len(total):
-            total.append({})
-        for space, counts in found.items():
-            add_counts(total[step].setdefault(space, {}), counts)
+        add_counts(self.counts, found.counts)
+        add_seconds(self.seconds, found.seconds)
+        add_spaces(self.spaces, found.spaces)
+        self.reached = [a + b for a, b in zip_longest(self.reached, map(len, found.levels), fillvalue=0)]
 
 
 def most_rounds(pipeline: Pipeline, rows: int) -> int:
@@ -99,16 +83,12 @@ def make_sequences(
             parts.append(_lineage(found.levels, new))
         if progress:
             progress(kept.count, result)
-        hopeless = result.rounds >= _EMPTY_ROUNDS and _missing(result, objects)
+        missing = len(result.reached) < objects or min(result.reached) == 0
+        hopeless = result.rounds >= _EMPTY_ROUNDS and missing
         result.exhausted = kept.count < rows and (hopeless or result.rounds >= most_rounds(pipeline, rows))
     result.levels = _joined(parts)
     result.wall = time.perf_counter() - start
     return result
-
-
-def _missing(result: SequenceResult, objects: int) -> bool:
-    """True if no row of some length has been found yet."""
-    return len(result.reached) < objects or min(result.reached) == 0
 
 
 def _lineage(levels: list[SequenceTable], rows: np.ndarray) -> list[SequenceTable]:

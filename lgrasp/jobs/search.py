@@ -1,0 +1,166 @@
+"""What the jobs that search grasps by a pipeline share: of one object, and of several one after another."""
+
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import Field, PrivateAttr
+
+from lgrasp.config import HandName, ShardFolder
+from lgrasp.dataset import GraspRows, ObjectRecord, Shard, ShardHeader
+from lgrasp.dataset.info import survivors
+from lgrasp.engine.events import Events, Part, PartProgress
+from lgrasp.engine.folder import shard_path
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.shard import add_counts, add_seconds, flat_statistics
+from lgrasp.errors import ConfigError
+from lgrasp.hand.model import HandModel
+from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs
+from lgrasp.runtime.device import resolve_device
+
+
+class SearchJob(Job):
+    """Shards of grasps by one hand, perhaps of fewer rows than requested."""
+
+    asks: ClassVar[bool] = True
+
+    hand: HandName = "allegro"
+    rows: int = Field(default=1000, description="Rows requested.")
+    pipeline: Pipeline
+    out: ShardFolder
+    shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
+    _keys: Any = PrivateAttr(None)
+    _inputs: Any = PrivateAttr(None)
+    _meshes: dict[str, bytes] = PrivateAttr(default_factory=dict)
+
+    @property
+    def folder(self) -> Path:
+        return self.out
+
+    @property
+    @abstractmethod
+    def object_name(self) -> str:
+        """What is grasped, in the names of files."""
+
+    @property
+    @abstractmethod
+    def protocol(self) -> str | None:
+        """Protocol that rows must hold under, if any."""
+
+    @property
+    @abstractmethod
+    def keys(self) -> Any:
+        """Content keys of the inputs."""
+
+    @property
+    def inputs(self) -> Any:
+        """The inputs, once they are loaded."""
+        assert self._inputs is not None
+        return self._inputs
+
+    def parts(self) -> list[Part]:
+        rows, size = self.rows, self.shard_rows
+        if rows <= 0:
+            raise ConfigError(f"-n {rows}: request at least 1")
+        if size <= 0:
+            raise ConfigError(f"--shard-rows {size}: must be at least 1")
+        if self.workers < 0:
+            raise ConfigError(f"--workers {self.workers}: must be at least 0 (0: by device)")
+        if self.protocol:
+            from lgrasp.simulate.protocol import find_protocol
+            from lgrasp.simulate.run import check_installed
+
+            find_protocol(self.protocol)
+            check_installed(resolve_device(self.device).alias)
+        hand, name = self.keys.source.name, self.object_name
+        return [
+            Part(s, shard_path(self.out, hand, name, s), min(size, rows - s * size)) for s in range(-(-rows // size))
+        ]
+
+    def load(self, events: Events, missing: bool) -> None:
+        inputs = self.load_inputs(events)
+        self._meshes = mesh_blobs(self.keys.source.urdf)
+        if missing and self.protocol:
+            events.loading("scene")
+            scene = make_scene(self.cache, *self.records(inputs), self._meshes, self.device_used.alias)
+            inputs = replace(inputs, scene=scene)
+        self._inputs = inputs
+
+    @abstractmethod
+    def load_inputs(self, events: Events) -> Any:
+        """The inputs on the job's device."""
+
+    @abstractmethod
+    def records(self, inputs: Any) -> tuple[HandModel, list[ObjectRecord]]:
+        """The hand, and the objects as they are written."""
+
+    def shard(
+        self, part: Part, result: Any, grasps: GraspRows, config: dict[str, Any], statistics: dict[str, Any]
+    ) -> Shard:
+        """A result as records, with what the job says of it in ``config`` and ``statistics``."""
+        hand, objects = self.records(self.inputs)
+        described = {
+            "run_key": self.key(),
+            "pipeline": self.pipeline.describe(),
+            "bounds": self.pipeline.bounds.describe(),
+            "shard_rows": self.shard_rows,
+            **config,
+            **hand_config(self.keys.source),
+        }
+        told = {
+            "device": self.device_used.name,
+            "duplicates_dropped": result.duplicates,
+            "exhausted": int(result.exhausted),
+            "seconds_wall": result.wall,
+        }
+        return Shard(
+            header=ShardHeader(
+                pipeline=self.pipeline.name, seed=self.pipeline.seed, shard_index=part.number, config=described
+            ),
+            hand=hand_record(hand, self._meshes),
+            objects=objects,
+            grasps=grasps,
+            statistics=told | statistics | flat_statistics(result.counts, result.seconds),
+        )
+
+    def protocol_text(self) -> str:
+        """What was simulated, "" if nothing was."""
+        if not self.protocol or self.inputs.scene is None:
+            return ""
+        from lgrasp.simulate.protocol import find_protocol
+        from lgrasp.simulate.run import protocol_text
+
+        return protocol_text(self.inputs.scene, find_protocol(self.protocol), device=self.device_used.alias)
+
+    def sums(self, outcome: JobOutcome, stages: Sequence[str] = ()) -> dict[str, Any]:
+        """Of the shards that a call made: ``counts`` and ``seconds`` (``wall``, thread-seconds per stage, loading); and
+        ``hits``, ``hand``, ``pipeline``, ``seed``."""
+        counts: dict[str, dict[str, int]] = {stage: {} for stage in stages}
+        seconds = dict.fromkeys(stages, 0.0)
+        for result in outcome.results:
+            add_counts(counts, result.counts)
+            add_seconds(seconds, result.seconds)
+        loading = {name: self.inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field")}
+        return {
+            "counts": counts,
+            "seconds": seconds | loading | {"wall": sum(result.wall for result in outcome.results)},
+            "hits": self.inputs.hits,
+            "hand": self.records(self.inputs)[0].name,
+            "pipeline": self.pipeline.name,
+            "seed": self.pipeline.seed,
+        }
+
+
+def telling(progress: PartProgress) -> Callable[[int, Any], None]:
+    """Tells (rows, running result) with the rate and the survivors of each stage."""
+    start = time.monotonic()
+
+    def tell(rows: int, result: Any) -> None:
+        flow = "  ".join(f"{stage} {count:,}" for stage, count in survivors(result.counts).items())
+        progress(rows, f"{rows / max(time.monotonic() - start, 1e-9):,.0f}/s  {flow}")
+
+    return tell
