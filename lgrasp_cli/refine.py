@@ -55,7 +55,7 @@ def _show(data: dict[str, Any]) -> list[Block]:
             one["hand"],
             one["object"],
             *(f"{one[name]:,}" for name in ("rows", "refined", "valid_before", "valid")),
-            *(f"{one[name]:.4f}" for name in ("energy_before", "energy")),
+            *("" if one[name] is None else f"{one[name]:.4f}" for name in ("energy_before", "energy")),
             f"{one['seconds']:.1f}",
         )
         for one in data["results"]

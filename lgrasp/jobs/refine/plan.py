@@ -127,9 +127,6 @@ class PlanJob(Job):
             self.starts, lambda done, plans: progress(done, f"{plans:,} plans"), keep_invalid=self.keep_invalid
         )
         seconds = time.perf_counter() - begin
-        result = {"counts": counts, "seconds": seconds}
-        if not len(grasps):
-            return Made(0, None, result)
         header = ShardHeader(
             pipeline="plan",
             seed=0,
@@ -153,7 +150,7 @@ class PlanJob(Job):
         rows = grasp_rows(press(grasps), hand.tree, model.center)
         record = hand_record(hand, mesh_blobs(source.urdf))
         shard = Shard(header=header, hand=record, objects=[self._record()], grasps=rows, statistics=statistics)
-        return Made(len(rows), shard, result)
+        return Made(len(rows), shard, {"counts": counts, "seconds": seconds})
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``starts``, ``counts`` (what became of the starts), medians of ``epsilon`` and
@@ -166,21 +163,18 @@ class PlanJob(Job):
             data |= {"counts": result["counts"], "seconds_planning": result["seconds"]}
         for path in outcome.paths:
             with ShardReader(path) as reader:
-                data["valid"] = int(reader.column("metrics/valid").sum())
-                for name in ("epsilon", "unresisted_load"):
-                    data[name] = float(np.median(reader.column(f"metrics/{name}")))
                 statistics = reader.statistics
-            data["counts"] = {
-                name.removeprefix("plan_").replace("_", " "): n
-                for name, n in statistics.items()
-                if name.startswith("plan_")
-            }
+                if len(reader):
+                    data["valid"] = int(reader.column("metrics/valid").sum())
+                    data |= {n: float(np.median(reader.column(f"metrics/{n}"))) for n in ("epsilon", "unresisted_load")}
+            told = {name.removeprefix("plan_"): n for name, n in statistics.items() if name.startswith("plan_")}
+            data["counts"] = {name.replace("_", " "): n for name, n in told.items()}
         return data
 
     def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
         if outcome.rows or not outcome.parts:
             return None
-        lost = "; ".join(lost_starts(result["counts"]) for result in outcome.results)
+        lost = lost_starts(self.report(outcome)["counts"])
         hint = "; do its normals point out of it (--viewpoint), are there views of all sides?" if self.cloud else ""
         return StarvedError(f"no grasp planned from {self.starts} starts: {lost}{hint}")
 
