@@ -12,6 +12,7 @@ from support.jaws import mesh_record
 from lgrasp.cloud.read import Cloud
 from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.report import job_report
 from lgrasp.engine.run import JobOutcome, run
 from lgrasp.errors import ConfigError, ObjectError, OutputError
 from lgrasp.jobs.refine.plan import PlanJob
@@ -141,14 +142,17 @@ def test_plans_of_a_cloud_hold_what_was_seen(ball, tmp_path):
     assert judged(shard, tmp_path, slab).values["penetration_mm"].max() <= PENETRATION + 1.0
 
 
-def test_without_a_plan_there_is_no_file(plan, tmp_path):
-    """A bin that no hand reaches around."""
+def test_without_a_plan_the_shard_is_empty_and_stays(plan, tmp_path):
+    """A bin that no hand reaches around; it is not planned again."""
     n = np.asarray(trimesh.creation.icosphere(subdivisions=4).vertices)
     cloud = Cloud((0.8 * n).astype("f4"), n.astype("f4"), None, np.ones(len(n), bool), ())
     outcome = plan(tmp_path / "out", cloud=cloud, starts=2)
-    assert not outcome.paths
     assert outcome.rows == outcome.results[0]["counts"]["kept"] == 0
-    assert not (tmp_path / "out").exists()
+    assert not validate_shard(outcome.paths[0])
+    again = plan(tmp_path / "out", cloud=cloud, starts=2)
+    assert (again.results, again.paths) == ([], outcome.paths)
+    assert str(again.job.shortfall(again)) == str(outcome.job.shortfall(outcome))
+    assert job_report(again)["epsilon"] is None
 
 
 def test_what_is_there_is_replaced_only_if_asked(mug, plan):

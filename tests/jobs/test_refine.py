@@ -10,16 +10,20 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support.wrench import unresisted
 
-from lgrasp.dataset import GraspRows, Shard, read_shard, validate_shard, write_shard
+from lgrasp.dataset import GraspRows, Shard, merge_shards, read_shard, validate_shard, write_shard
+from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run
 from lgrasp.errors import ShardError
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.refine.shards import RefineJob
+from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.judge.run import judge
+from lgrasp.simulate.protocol import find_protocol
 from lgrasp.stages.refine.params import RefineParams
 
 ROWS = 40
@@ -225,6 +229,31 @@ def test_shards_without_rows_are_left_out(source, cache_root, tmp_path):
         run(RefineJob(shards=[tmp_path / "none.h5"], out=tmp_path / "out", device="cpu", cache=cache))
     assert not told
     assert not (tmp_path / "out").exists()
+
+
+def test_a_shard_of_which_no_row_passes_is_empty_and_stays(swift, cache_root, tmp_path):
+    """It conforms to the format, and is not computed again."""
+    cache = Cache(cache_root)
+    job = {"hand": "allegro", "object": "mug", "rows": 8, "shard_rows": 4, "pipeline": swift, "device": "cpu"}
+    last = generate(GenerateJob(**job, out=tmp_path / "made", workers=1, batch=128, cache=cache)).paths[1]
+    shard = read_shard(last)
+    pose = shard.grasps.object_pose + np.array([0.1, 0, 0, 0, 0, 0, 0], np.float32)
+    write_shard(last, replace(shard, grasps=replace(shard.grasps, object_pose=pose)))
+    params, out = RefineParams(matching_rounds=0), tmp_path / "out"
+    refined = RefineJob(shards=[tmp_path / "made"], out=out, device="cpu", params=params, cache=cache)
+    first = run(refined)
+    assert [part.rows for part, _ in first.made_parts] == [4, 4]
+    assert [made.rows for _, made in first.made_parts] == [4, 0]
+    assert not validate_shard(first.paths[1])
+    assert [one["energy"] is None for one in job_report(first)["results"]] == [False, True]
+    again = run(refined.changed())
+    assert (again.results, again.present, again.paths) == ([], 4, first.paths)
+    assert len(judge(out).valid) == 4
+    assert merge_shards(first.paths, tmp_path / "all.h5") == 4
+    assert len(GraspDataset(out)) == 4
+    simulated = run(SimulateJob(shards=[out], protocol=find_protocol("fc"), out=tmp_path / "simulated", cache=cache))
+    assert len(simulated.paths) == 2
+    job_report(simulated)
 
 
 @pytest.mark.parametrize(("name", "share"), [("sphere", 0.85), ("mug", 0.7)])
