@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from lgrasp.engine.fit import fit_params
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, reorder_grasps, select_poses
+from lgrasp.hand.model import HandModel
 from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
+from lgrasp.stages.search.params import SearchParams
 
 Search = Callable[[Context, int, int], tuple[ContactSets, Meter]]
 """(context, first candidate, number of candidates) -> what search makes of them, counted."""
@@ -47,11 +48,28 @@ def run_stages(
 
 def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter) -> Any:
     """The table that one stage makes of another."""
-    params = fit_params(stage, pipeline.params(stage), context.hand.model)
+    params = _fitted(stage, pipeline.params(stage), context.hand.model)
     start = meter.now()
     table, counts = STAGES[stage].run(table, params, context)
     meter.add(stage, counts, start, meter.now())
     return table
+
+
+def _fitted(stage: str, params: Any, hand: HandModel) -> Any:
+    """The parameters of a stage for a hand: how many finger contacts search asks for.
+
+    A hand's own wish (hand.yaml: contacts) stands in for the default of search, and no more contacts are asked for than
+    there are fingers: asking three of a gripper with two jaws would give nothing. A pure function of parameters and
+    hand, both of which are in the content keys.
+    """
+    if stage != "search":
+        return params
+    asked = params.contacts
+    if hand.contacts and asked == SearchParams.model_fields["contacts"].default:
+        asked = hand.contacts
+    fingers = int((np.diff(hand.contact_first[:-1]) > 0).sum())
+    contacts = tuple(min(k, max(2, fingers)) for k in asked)
+    return params if contacts == params.contacts else params.model_copy(update={"contacts": contacts})
 
 
 def run_batch(

@@ -5,7 +5,6 @@ import io
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.files import hold_file, remove_leftovers
-from lgrasp.errors import CacheError
+from lgrasp.dataset.files import new_file, remove_leftovers
+from lgrasp.errors import CacheError, OutputError
 from lgrasp.paths import cache_dir
 
 _FORMAT = 2
@@ -101,26 +100,16 @@ class Cache:
         if not self._writable:
             return
         path = self.path(kind, key)
-        name = ""
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(
-                dir=path.parent, prefix=f".{key[:16]}.", suffix=".tmp", delete=False
-            ) as file:
-                name = file.name
-                hold_file(file.fileno())
-                np.savez(file, allow_pickle=False, **arrays | {_NAMES: np.asarray(json.dumps(sorted(arrays)))})
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(name, path)
-            name = ""
+            with new_file(path) as file:
+                buffer = io.BufferedWriter(file)
+                np.savez(buffer, allow_pickle=False, **arrays | {_NAMES: np.asarray(json.dumps(sorted(arrays)))})
+                buffer.detach()
             self._stored.add(path)
-        except OSError as error:
+        except OutputError as error:
             self._writable = False
-            self.warn(f"cache folder {self.root} cannot be written ({error.strerror}); going on without it")
-        finally:
-            if name:
-                Path(name).unlink(missing_ok=True)
+            reason = getattr(error.__cause__, "strerror", error)
+            self.warn(f"cache folder {self.root} cannot be written ({reason}); going on without it")
 
     def get(self, kind: str, key: str, make: Callable[[], dict[str, np.ndarray]]) -> tuple[dict[str, np.ndarray], bool]:
         """The artifact and whether it was a hit; a miss is made and stored."""
@@ -149,7 +138,7 @@ class Cache:
             if (kinds is None or entry.kind in kinds) and (older_than is None or entry.modified < older_than):
                 entry.path.unlink(missing_ok=True)
                 files, size = files + 1, size + entry.size
-        remove_leftovers(self.root, "*/.*.tmp")
+        remove_leftovers(self.root, "*/*.tmp")
         return files, size
 
     def kernel_bytes(self) -> int:

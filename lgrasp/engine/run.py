@@ -306,12 +306,16 @@ def array_task(
 
 
 def _make_parts(job: Job, events: Events, outcome: JobOutcome) -> None:
-    """Make what is missing, in order; one part is written while the next is made."""
+    """Make what is missing, in order; one part is written, on another thread, while the next is made."""
+    writing: list[tuple[Part, Made, Future[None]]] = []
 
-    def written(part: Part, made: Made) -> None:
-        outcome.made_parts.append((part, made))
-        events.wrote(part, made)
-        made.contents = None  # memory must not grow with the parts
+    def settle() -> None:
+        while writing:
+            part, made, future = writing.pop()
+            future.result()
+            outcome.made_parts.append((part, made))
+            events.wrote(part, made)
+            made.contents = None  # memory must not grow with the parts
 
     def make(part: Part) -> Made:
         progress = PartProgress(events, part)
@@ -319,16 +323,22 @@ def _make_parts(job: Job, events: Events, outcome: JobOutcome) -> None:
         return job.make(part, progress)
 
     present = outcome.on_disk
-    with _Writer(job, written) as writer:
-        for part, made in _in_order(make, outcome.parts, present, job.at_once()):
-            rows = present[part.number] if made is None else made.rows
-            outcome.starved |= job.asks and rows < part.rows
-            if made is not None:
-                outcome.results.append(made.result)
-                if made.contents is not None:
-                    writer.put(part, made)
-            if job.asks and rows == 0:  # nor will the next parts give any
-                break
+    with ThreadPoolExecutor(1) as writer:
+        try:
+            for part, made in _in_order(make, outcome.parts, present, job.at_once()):
+                rows = present[part.number] if made is None else made.rows
+                outcome.starved |= job.asks and rows < part.rows
+                if made is not None:
+                    outcome.results.append(made.result)
+                    if made.contents is not None:
+                        settle()
+                        writing.append((part, made, writer.submit(job.write, part, made.contents)))
+                if job.asks and rows == 0:  # nor will the next parts give any
+                    break
+        except CancelledError:
+            settle()
+            raise
+        settle()
 
 
 def _in_order(make, parts: list[Part], present: Mapping[int, int], at_once: int) -> Iterator[tuple[Part, Made | None]]:
@@ -352,38 +362,3 @@ def _in_order(make, parts: list[Part], present: Mapping[int, int], at_once: int)
             for _, future in waiting:
                 if future:
                     future.cancel()
-
-
-class _Writer:
-    """A context that writes parts on another thread, one at a time and in order.
-
-    Args:
-        written: called on the caller's thread with (part, made) when a part is on disk.
-    """
-
-    def __init__(self, job: Job, written) -> None:
-        self._job, self._written = job, written
-        self._pool = ThreadPoolExecutor(1)
-        self._pending: tuple[Part, Made, Future[None]] | None = None
-
-    def put(self, part: Part, made: Made) -> None:
-        """Wait for the part before, then begin to write this one."""
-        self._settle()
-        self._pending = (part, made, self._pool.submit(self._job.write, part, made.contents))
-
-    def _settle(self) -> None:
-        if self._pending is not None:
-            part, made, future = self._pending
-            self._pending = None
-            future.result()
-            self._written(part, made)
-
-    def __enter__(self) -> "_Writer":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            if kind is None or issubclass(kind, CancelledError):
-                self._settle()
-        finally:
-            self._pool.shutdown(wait=True)

@@ -34,6 +34,13 @@ from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.runtime.tally import Meter
 
+_ARRAYS: dict[type, Callable[[Any], dict[str, np.ndarray]]] = {
+    PoseTable: pose_arrays,
+    CandidateTable: candidate_arrays,
+    ContactSets: set_arrays,
+    GraspTable: grasp_arrays,
+}
+
 
 @dataclass(frozen=True)
 class StageRun:
@@ -98,7 +105,7 @@ def run_up_to(
         table = run_stage(stage, table, pipeline, context, meter)
         counted = meter.counts[stage]
         seconds = time.perf_counter() - start
-        cache.store(stage, files[stage], _arrays(table) | {"counts": np.asarray(json.dumps(counted))})
+        cache.store(stage, files[stage], _ARRAYS[type(table)](table) | {"counts": np.asarray(json.dumps(counted))})
         runs.append(StageRun(stage, False, counted, seconds, cache.path(stage, files[stage])))
     return runs
 
@@ -115,14 +122,6 @@ def _stage_keys(
             stage, STAGES[stage].version, params=params, seed=pipeline.seed, shard=shard, input=before
         )
     return made
-
-
-def _arrays(table: PoseTable | CandidateTable | ContactSets | GraspTable) -> dict[str, np.ndarray]:
-    if isinstance(table, PoseTable):
-        return pose_arrays(table)
-    if isinstance(table, CandidateTable):
-        return candidate_arrays(table)
-    return set_arrays(table) if isinstance(table, ContactSets) else grasp_arrays(table)
 
 
 def _table(arrays: dict[str, np.ndarray], device: str) -> PoseTable | CandidateTable | ContactSets:
