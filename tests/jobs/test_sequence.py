@@ -13,11 +13,10 @@ from lgrasp.engine.run import run
 from lgrasp.errors import OutputError
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.jobs.sequence import round as round_module
-from lgrasp.jobs.sequence.inputs import load_sequence_inputs, sequence_keys
+from lgrasp.jobs.sequence.inputs import Size, load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.sequence.round import run_round
 from lgrasp.jobs.sequence.shard import make_sequences
-from lgrasp.jobs.sequence.size import Size
 from lgrasp.runtime.device import resolve_device
 
 OBJECTS = ("sphere", "mug")

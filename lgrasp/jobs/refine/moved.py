@@ -13,7 +13,7 @@ from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import Outcome
-from lgrasp.grasp.rows import grasp_rows, press
+from lgrasp.grasp.rows import CONTACTS, POSTURES, grasp_rows, press
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.grasp.tables import GraspTable, choose_grasps, join_grasps, widen_grasps
 from lgrasp.hand.arrays import HandArrays
@@ -199,15 +199,12 @@ def _kept(old: GraspRows, new: GraspRows, take: np.ndarray, measured: bool) -> G
 
     Verdicts of a simulator are dropped: they are of the old rows.
     """
-    changes = {}
-    for name in ("q", "q_pregrasp", "q_squeeze", "object_pose"):
-        keep = (~take).reshape(-1, *(1,) * (np.ndim(getattr(old, name)) - 1))
-        changes[name] = np.where(keep, getattr(old, name), getattr(new, name)).astype(np.float32)
-    names = ("contact_points", "contact_normals", "contact_links", "contact_forces")
-    width = max(np.shape(old.contact_links)[2], np.shape(new.contact_links)[2])
-    for name in names:
-        x, y = (_padded(np.asarray(getattr(rows, name)), width) for rows in (old, new))
-        changes[name] = np.where((~take).reshape(-1, *(1,) * (x.ndim - 1)), x, y).astype(x.dtype)
+    changes, width = {}, max(np.shape(rows.contact_links)[2] for rows in (old, new))
+    for name in (*POSTURES, "object_pose", *CONTACTS):
+        x, y = (np.asarray(getattr(rows, name)) for rows in (old, new))
+        if name in CONTACTS:
+            x, y = _padded(x, width), _padded(y, width)
+        changes[name] = np.where(take.reshape(-1, *(1,) * (x.ndim - 1)), y, x).astype(x.dtype)
     metrics = {
         name: np.where(take, values, old.metrics[name]) if measured and name in old.metrics else values
         for name, values in new.metrics.items()

@@ -2,12 +2,14 @@
 
 import hashlib
 import json
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from dataclasses import field as with_default
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,12 +25,19 @@ from lgrasp.hand.model import HAND_VERSION, HandModel
 from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, space_view
 from lgrasp.hand.spec import hand_digest
 from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.sequence.size import Size, object_scales
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device
+from lgrasp.seeding import stage_seed
 from lgrasp.simulate.scene import Scene
+
+
+class Size(NamedTuple):
+    """A factor on all meshes (``high`` 0), or the bounds of the longest side of each object [m]."""
+
+    low: float = 1.0
+    high: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -112,7 +121,7 @@ def sequence_keys(
     described = fields.model_dump(mode="json")
     field_keys = {n: content_key("field", FIELD_VERSION, hand=key, params=described) for n, key in views.items()}
     paths = tuple(find_object(mesh) for mesh in meshes)
-    scales = object_scales(paths, size, seed, objects)
+    scales = _object_scales(paths, size, seed, objects)
     keys = tuple(object_key(str(p), s, objects)[1] for p, s in zip(paths, scales, strict=True))
     return SequenceKeys(source, hand_key, views, field_keys, paths, scales, keys)
 
@@ -151,3 +160,42 @@ def load_sequence_inputs(
             made[key] = upload_object(load.object(path, key, scale, objects), alias)
     steps = tuple(made[key] for key in keys.objects)
     return SequenceInputs(model, spaces, tuple(views), steps, keys, device, load.seconds, load.hits)
+
+
+def parse_size(text: str) -> Size:
+    """``0.001`` (a factor) or ``0.06:0.10`` (longest side of the bounding box, drawn evenly [m]).
+
+    Raises:
+        ConfigError: neither.
+    """
+    parts = re.split(r"\s*:\s*", text.strip())
+    try:
+        low, high = float(parts[0]), float(parts[1]) if len(parts) > 1 else 0.0
+    except ValueError:
+        low = high = math.nan
+    fine = len(parts) <= 2 and math.isfinite(low) and low > 0 and (len(parts) == 1 or low <= high < math.inf)
+    if not fine:
+        raise ConfigError(
+            f"--scale '{text}': give a factor such as 0.001, or a range of the longest side in metres such as 0.06:0.10"
+        )
+    return Size(low, high)
+
+
+def _object_scales(meshes: Sequence[Path], size: Size, seed: int, params: ObjectParams) -> tuple[float, ...]:
+    """Factor from each mesh's unit to metres; the same mesh gets the same.
+
+    Raises:
+        ObjectError: a mesh whose size is needed cannot be read.
+    """
+    if not size.high:
+        return (size.low,) * len(meshes)
+    from lgrasp.object.load import load_mesh  # slow to load
+
+    rng = np.random.default_rng(stage_seed(seed, 0, "size"))
+    drawn: dict[Path, float] = {}
+    for path in meshes:
+        if path not in drawn:
+            any_size = params.model_copy(update={"min_extent": 0.0, "max_extent": math.inf})
+            side = float(np.ptp(load_mesh(path, params=any_size).vertices, axis=0).max())
+            drawn[path] = float(rng.uniform(*size)) / side
+    return tuple(drawn[path] for path in meshes)

@@ -18,11 +18,10 @@ from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.jobs.search import SearchJob, telling
-from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, sequence_keys
+from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, parse_size, sequence_keys
 from lgrasp.jobs.sequence.records import object_records, sequence_rows
 from lgrasp.jobs.sequence.round import Verdicts, add_spaces
 from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_rounds
-from lgrasp.jobs.sequence.size import parse_size
 from lgrasp.jobs.sets import sequence_name
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts
