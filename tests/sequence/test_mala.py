@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from lgrasp.geometry.rotations import so3_exp
-from lgrasp.sequence.optimiser.anneal import run_chain
-from lgrasp.sequence.optimiser.mala import Langevin
+from lgrasp.sequence.optimiser.anneal import Langevin, run_chain
 
 
 def sample(evaluate, moved, x: torch.Tensor, scale, T: float, steps: int) -> torch.Tensor:

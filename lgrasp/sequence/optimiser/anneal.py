@@ -1,16 +1,23 @@
-"""Chains of proposals that are accepted or not, one per row, and the published optimiser as such a chain."""
+"""Chains of proposals that are accepted or not, one per row; the published optimiser and a sampler as such chains."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import torch
 
-from lgrasp.runtime.streams import uniforms
+from lgrasp.runtime.streams import normals, uniforms
 from lgrasp.sequence.optimiser.culling import Culling
 from lgrasp.sequence.optimiser.params import OptimiserParams
 from lgrasp.sequence.optimiser.replay import replayed
 
+_NOISE_STREAM = 1 << 31
+"""Added to steps: streams of noise beside those of :func:`run_chain`."""
 _DRAWS_PER_STEP = 5  # uniform numbers of a row and step: acceptance, two switches, two contact points
+
+
+Evaluate = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+"""See :meth:`Proposals.evaluate`."""
 
 
 class Chain(NamedTuple):
@@ -120,7 +127,7 @@ class Annealing:
 
     def __init__(
         self,
-        evaluate: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
+        evaluate: Evaluate,
         retract: Callable[[torch.Tensor], torch.Tensor],
         free: torch.Tensor,
         params: OptimiserParams,
@@ -141,3 +148,39 @@ class Annealing:
 
     def temperature(self, step: torch.Tensor) -> torch.Tensor:
         return self._temperatures.take(step)
+
+
+@dataclass(frozen=True)
+class Langevin:
+    """The Metropolis-adjusted Langevin algorithm, which samples exp(-E / T) exactly at every step size.
+
+    Proposals x' = x - S grad E + sqrt(2 S T) noise with diagonal S, and the exact ratio of their densities. Coordinates
+    may be curved as long as the way back from ``moved(x, d)`` is -d, as it is with shifts and turns about an object's
+    own axes.
+
+    Args:
+        evaluate: see :meth:`Proposals.evaluate`; the gradient is by motions (N, G).
+        moved: coordinates (N, D) after motions (N, G).
+        seed: (N,) int64.
+        scale: S of a step: step size times preconditioner, broadcasts to (N, G); 0 keeps a coordinate fixed.
+        temperature: T of a step.
+    """
+
+    evaluate: Evaluate
+    moved: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+    seed: torch.Tensor
+    scale: Callable[[torch.Tensor], torch.Tensor]
+    temperature: Callable[[torch.Tensor], torch.Tensor | float]
+
+    def propose(self, step: torch.Tensor, chain: Chain) -> tuple[torch.Tensor, torch.Tensor]:
+        g, scale = chain.gradient, self.scale(step)
+        noise = normals(self.seed, step + _NOISE_STREAM, g.shape[1]).to(g.dtype)
+        motion = -scale * g + (2 * self.temperature(step) * scale).sqrt() * noise
+        return self.moved(chain.x, motion), motion
+
+    def log_ratio(self, step: torch.Tensor, chain: Chain, proposed: Chain) -> torch.Tensor:
+        scale, d = self.scale(step), proposed.memory
+        there, back = d + scale * chain.gradient, -d + scale * proposed.gradient
+        free = scale > 0
+        difference = torch.where(free, (there * there - back * back) / torch.where(free, scale, 1), 0)
+        return difference.sum(1) / (4 * self.temperature(step))

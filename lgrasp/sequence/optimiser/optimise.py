@@ -7,20 +7,14 @@ from typing import Literal
 import numpy as np
 import torch
 
-from lgrasp.geometry.rotations import (
-    matrix_from_sixd,
-    motion_from_pose,
-    pose_from_motion,
-    sixd_from_matrix,
-)
+from lgrasp.geometry.rotations import matrix_from_sixd, motion_from_pose, pose_from_motion, sixd_from_matrix
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.streams import uniforms
-from lgrasp.sequence.optimiser.anneal import Annealing, Proposals, run_chain, step_lengths, temperatures
+from lgrasp.sequence.optimiser.anneal import Annealing, Langevin, Proposals, run_chain, step_lengths, temperatures
 from lgrasp.sequence.optimiser.contacts import touching_points
 from lgrasp.sequence.optimiser.energy import TERMS, GraspEnergy
-from lgrasp.sequence.optimiser.mala import Langevin
 from lgrasp.sequence.optimiser.params import OptimiserParams
 from lgrasp.sequence.optimiser.problem import GraspProblem, Sides
 from lgrasp.sequence.optimiser.start import start_poses
@@ -90,12 +84,12 @@ def optimise(
     for number, block in enumerate(blocks):
         # on a GPU sums depend on the number of rows, so it is always the same there
         filled = block if device == "cpu" else np.resize(block, rows)
-        problem = GraspProblem(
-            energy,
-            sides,
-            torch.as_tensor(space[filled], dtype=torch.int64, device=device),
-            motion_from_pose(torch.as_tensor(held[filled], dtype=torch.float32, device=device)),
-        )
+
+        def put(values: np.ndarray, dtype: torch.dtype, filled: np.ndarray = filled) -> torch.Tensor:
+            return torch.as_tensor(values[filled], dtype=dtype, device=device)
+
+        at = motion_from_pose(put(held, torch.float32))
+        problem = GraspProblem(energy, sides, put(space, torch.int64), at)
 
         def report(step: int, before: int = number * params.iterations) -> None:
             if progress is not None:
@@ -105,9 +99,9 @@ def optimise(
             hand,
             objects,
             problem,
-            torch.as_tensor(q[filled], dtype=torch.float32, device=device),
-            torch.as_tensor(free[filled], device=device),
-            torch.as_tensor(seed[filled].astype(np.int64), device=device),
+            put(q, torch.float32),
+            put(free, torch.bool),
+            put(seed, torch.int64),
             params,
             method,
             report,
