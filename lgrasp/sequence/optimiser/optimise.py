@@ -101,7 +101,7 @@ def optimise(
             problem,
             put(q, torch.float32),
             put(free, torch.bool),
-            put(seed, torch.int64),
+            put(seed.astype(np.int64), torch.int64),
             params,
             method,
             report,
