@@ -1,11 +1,14 @@
 """What all jobs share: array tasks make the files of a single run, a cut run goes on, a stop leaves whole files."""
 
 import json
+import shutil
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import h5py
 import pytest
+import yaml
 
 from lgrasp.dataset import read_shard, write_shard
 from lgrasp.engine.cache import Cache
@@ -13,6 +16,7 @@ from lgrasp.engine.events import Events
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import Job, run
+from lgrasp.hand.find import find_hand
 from lgrasp.jobs.export import ExportJob
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.learn.job import FitJob, load_predictor
@@ -23,38 +27,61 @@ from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.learn.params import LearnParams
+from lgrasp.planning.planner import PlanParams
 from lgrasp.simulate.protocol import find_protocol
+from lgrasp.stages.refine.params import RefineParams
 
 NAMES = ("generate", "sequence", "refine", "plan", "simulate", "scenes", "learn", "metrics", "export")
 
 
 @pytest.fixture(scope="module")
-def source(swift, cache_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of three shards of six grasps."""
-    out = tmp_path_factory.mktemp("source")
-    given = {"object": "mug", "rows": 18, "shard_rows": 6, "batch": 128, "workers": 1, "device": "cpu"}
-    generate(GenerateJob(**given, pipeline=swift, out=out, cache=Cache(cache_root)))
-    return out
+def shards(swift, cache_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, int], Path]:
+    """shards(rows, shard_rows): a folder of grasps of a mug."""
+
+    @cache
+    def shards(rows: int, shard_rows: int) -> Path:
+        out = tmp_path_factory.mktemp("source")
+        given = {"object": "mug", "rows": rows, "shard_rows": shard_rows, "batch": 128, "workers": 1, "device": "cpu"}
+        generate(GenerateJob(**given, pipeline=swift, out=out, cache=Cache(cache_root)))
+        return out
+
+    return shards
 
 
 @pytest.fixture
-def jobs(swift, source: Path, cache_root: Path) -> Callable[[str, Path], Job]:
+def source(shards) -> Path:
+    """Two shards of three grasps."""
+    return shards(6, 3)
+
+
+@pytest.fixture(scope="module")
+def two_spaces(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A hand with two opposition spaces: each takes a while to prepare."""
+    folder = tmp_path_factory.mktemp("hands") / "allegro"
+    shutil.copytree(find_hand("allegro").urdf.parent, folder)
+    rules = yaml.safe_load((folder / "hand.yaml").read_text())
+    rules["opposition_spaces"] = {name: rules["opposition_spaces"][name] for name in ("thumb-index", "middle-ring")}
+    (folder / "hand.yaml").write_text(yaml.safe_dump(rules, sort_keys=False))
+    return str(folder)
+
+
+@pytest.fixture
+def jobs(swift, source: Path, shards, two_spaces: str, cache_root: Path) -> Callable[[str, Path], Job]:
     """jobs(name, out): a small job of each kind."""
 
     def make(name: str, out: Path) -> Job:
         base = {"out": out, "device": "cpu", "workers": 1, "cache": Cache(cache_root)}
-        shards = base | {"shards": (source,)}
+        made = base | {"shards": (source,)}
         if name == "simulate":
             pytest.importorskip("mujoco")
-            return SimulateJob(**shards, protocol=find_protocol("fc"))
+            return SimulateJob(**made, protocol=find_protocol("fc"))
         if name == "generate":
             return GenerateJob(**base, object="mug", rows=12, shard_rows=4, batch=128, pipeline=swift)
         if name == "sequence":
-            pipeline = load_pipeline("sequence").model_copy(update={"field": swift.field})
-            pipeline = pipeline.with_params("sequence", width=16, wave=64, waves=2)
-            return SequenceJob(
-                **base, objects=("sphere", "mug"), scale="0.06:0.08", rows=4, shard_rows=2, pipeline=pipeline
-            )
+            pipeline = load_pipeline("sequence").with_settings(["field.records=4000", "sequence.width=12"])
+            pipeline = pipeline.with_params("sequence", wave=64, waves=2)
+            given = base | {"objects": ("sphere", "mug"), "scale": "0.06:0.08", "rows": 2, "shard_rows": 1}
+            return SequenceJob(**given, hand=two_spaces, pipeline=pipeline)
         if name == "scenes":
             pytest.importorskip("mujoco")
             scene = {"objects": 1, "grasps": 4, "colliding": 2, "camera": {"views": 1, "width": 64, "height": 48}}
@@ -62,12 +89,14 @@ def jobs(swift, source: Path, cache_root: Path) -> Callable[[str, Path], Job]:
         if name == "learn":
             small = {"points": 32, "width": 8, "clouds": 2, "held_out": 1, "batch": 4, "steps": 3, "joint_steps": 1}
             params = LearnParams.model_validate(small | {"unrolled": 1})
-            return FitJob(**shards | {"out": out / "coarse.pt"}, params=params)
+            return FitJob(**made | {"shards": (shards(18, 18),), "out": out / "coarse.pt"}, params=params)
         if name == "plan":
-            return PlanJob(**base, object="sphere", starts=3)
+            return PlanJob(**base, object="sphere", starts=2, params=PlanParams(rolls=8, finalists=2))
         if name == "export":
-            return ExportJob(**shards, to="dexgraspnet")
-        return RefineJob(**shards) if name == "refine" else MetricsJob(**shards, add=("volume",))
+            return ExportJob(**made, to="dexgraspnet")
+        if name == "refine":
+            return RefineJob(**made, params=RefineParams(matching_rounds=1))
+        return MetricsJob(**made, add=("volume",))
 
     return make
 
