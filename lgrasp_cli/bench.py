@@ -225,7 +225,7 @@ def bench_refine(
     check_report(json_path)
     cache = open_cache(cache_dir)
     from lgrasp.bench.refine import NOISES, bench_hands, refine_page
-    from lgrasp.jobs.refine.settings import plan_params
+    from lgrasp.jobs.refine.plan import plan_params
 
     how = {"params": plan_params(settings or ()), "noises": NOISES if noise else (), "device": device, "cache": cache}
     result = bench_hands(split(hands), split(objects), starts, simulate, progress=say, **how)
