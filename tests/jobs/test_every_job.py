@@ -5,8 +5,10 @@ import shutil
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 import yaml
 
@@ -70,8 +72,8 @@ def jobs(swift, source: Path, shards, two_spaces: str, cache_root: Path) -> Call
     """jobs(name, out): a small job of each kind."""
 
     def make(name: str, out: Path) -> Job:
-        base = {"out": out, "device": "cpu", "workers": 1, "cache": Cache(cache_root)}
-        made = base | {"shards": (source,)}
+        base: dict[str, Any] = {"out": out, "device": "cpu", "workers": 1, "cache": Cache(cache_root)}
+        made: dict[str, Any] = base | {"shards": (source,)}
         if name == "simulate":
             pytest.importorskip("mujoco")
             return SimulateJob(**made, protocol=find_protocol("fc"))
@@ -117,7 +119,7 @@ def contents(folder: Path) -> dict[str, dict[str, bytes] | bytes]:
 
         def visit(key: str, node: object, rows: dict[str, bytes] = rows) -> None:
             if isinstance(node, h5py.Dataset):
-                rows[key] = node[()].tobytes()
+                rows[key] = np.asarray(node).tobytes()
 
         with h5py.File(path) as file:
             file["grasps"].visititems(visit)
