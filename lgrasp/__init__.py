@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         sequence,
         simulate,
     )
-    from lgrasp.dataset.exports import export_shards, read_grasps
+    from lgrasp.dataset.exports.formats import export_shards, read_grasps
     from lgrasp.dataset.merge import merge_shards
     from lgrasp.dataset.reader import ShardReader, read_shard
     from lgrasp.dataset.torch_dataset import GraspDataset
@@ -84,7 +84,7 @@ __all__ = [
 _HOMES = {
     "lgrasp.api": "Grasps Hand Object generate hands load_hand load_object objects open pipelines plan read_cloud "
     "refine sequence simulate",
-    "lgrasp.dataset.exports": "export_shards read_grasps",
+    "lgrasp.dataset.exports.formats": "export_shards read_grasps",
     "lgrasp.dataset.merge": "merge_shards",
     "lgrasp.dataset.reader": "ShardReader read_shard",
     "lgrasp.dataset.torch_dataset": "GraspDataset",

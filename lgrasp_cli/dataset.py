@@ -113,7 +113,7 @@ def report(
 
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """
-    from lgrasp.dataset.report import report_dataset
+    from lgrasp.dataset.report.write import report_dataset
     from lgrasp.engine.report import check_json
     from lgrasp_cli.progress import Bar
 
@@ -213,7 +213,7 @@ def export(
 
     Example: lgrasp export grasps/allegro-mug --to isaac-grasp --out mug-isaac --where "metrics/epsilon > 0.01"
     """
-    from lgrasp.dataset.exports import HOLDS
+    from lgrasp.dataset.exports.selection import HOLDS
     from lgrasp.jobs.export import ExportJob
 
     conditions = [*(where or ()), *([HOLDS] if only_holding else ())]

@@ -1,14 +1,46 @@
 """Conditions on the values of a shard; used before writing and when validating."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lgrasp.dataset.lineage import Column, check_parents, check_steps
-from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows
+from lgrasp.grasp.schema import CHUNK_ROWS
+
+Column = Callable[[str, int, int], np.ndarray]
+"""Rows of the whole file by flat name, first row and the row after the last, as :meth:`ShardReader.column`."""
+Require = Callable[[np.ndarray, str], None]
+"""Called with what is good, shape [n, ...], and the text of the problem if some is not."""
 
 _LIMIT_TOLERANCE = 1e-4  # rad or m
 _UNIT_TOLERANCE = 1e-3  # of quaternion and normal lengths, and of the sum of normal forces
+_HELD = {"q": "q", "q_pregrasp": "q", "q_squeeze": "q_squeeze"}
+"""Where joints that a step does not move are: in which control pose of the step before."""
+_INHERITED = (
+    *("object_index", "object_pose", "contact_points", "contact_normals", "contact_links", "contact_forces"),
+    *(f"sequence/{name}" for name in ("space", "free_joints", *_HELD)),
+)
+
+
+def requirer(problems: list[str], where: str = "", first_row: int = 0) -> Require:
+    """What adds a line on a condition that rows do not meet, naming the first such row."""
+
+    def require(good: np.ndarray, text: str) -> None:
+        bad = np.flatnonzero(~np.asarray(good).all(axis=tuple(range(1, np.ndim(good)))))
+        if len(bad):
+            problems.append(f"{where}{text} (row {first_row + bad[0]}, {len(bad)} rows)")
+
+    return require
+
+
+def are_unit(vectors: np.ndarray) -> np.ndarray:
+    """Which vectors (or quaternions), shape [..., d], have unit length; NaN has not."""
+    return np.abs(np.linalg.norm(vectors, axis=-1) - 1) <= _UNIT_TOLERANCE
+
+
+def accepted_limits(hand: HandRecord) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest joint positions that are accepted, shape [K] each."""
+    return np.asarray(hand.joint_lower) - _LIMIT_TOLERANCE, np.asarray(hand.joint_upper) + _LIMIT_TOLERANCE
 
 
 def hand_problems(hand: HandRecord) -> list[str]:
@@ -38,7 +70,7 @@ def object_problems(record: ObjectRecord) -> list[str]:
     if record.normals is not None:
         if np.shape(record.normals) != np.shape(record.vertices):
             problems.append(f"{where}/normals: {len(record.normals)} for {len(record.vertices)} vertices")
-        elif not (np.abs(np.linalg.norm(record.normals, axis=-1) - 1) <= _UNIT_TOLERANCE).all():  # NaN fails too
+        elif not are_unit(record.normals).all():
             problems.append(f"{where}/normals: not of unit length")
     if not 0 < record.scale < np.inf:
         problems.append(f"{where}: scale is {record.scale}, must be positive")
@@ -54,50 +86,34 @@ def row_problems(
         rows: Rows with the shapes and dtypes of the format.
         hand: The hand they belong to.
         object_ids: The shard's sorted object ids.
-        column: Rows of the whole shard by flat name, for rows of sequences, which refer to others.
-        first_row: Index of ``rows[0]`` in the shard, for the messages.
+        column: Rows of the whole shard, for rows of sequences, which refer to others.
+        first_row: Index of ``rows[0]`` in the shard.
     """
     problems: list[str] = []
-
-    def require(good: np.ndarray, text: str) -> None:
-        bad = np.flatnonzero(~good.all(axis=tuple(range(1, good.ndim))))
-        if len(bad):
-            problems.append(f"grasps/{text} (row {first_row + bad[0]}, {len(bad)} rows)")
-
+    require, limits = requirer(problems, "grasps/", first_row), accepted_limits(hand)
     with np.errstate(invalid="ignore", over="ignore"):
-        _check_joints(rows, hand, require)
+        for name in _HELD:
+            require(np.isfinite(getattr(rows, name)), f"{name}: not finite")
+        require(~((rows.q < limits[0]) | (rows.q > limits[1])), "q: outside the joint limits by more than 1e-4")
         _check_poses(rows, len(object_ids), require)
         _check_contacts(rows, len(hand.link_names), require)
         if rows.sequence is not None:
-            check_steps(rows, rows.sequence, *_limits(hand), require)
-            check_parents(rows, rows.sequence, column, first_row, require)
+            _check_steps(rows, rows.sequence, *limits, require)
+            _check_parents(rows, rows.sequence, column, first_row, require)
     return problems
 
 
-def _check_joints(rows: GraspRows, hand: HandRecord, require) -> None:
-    for name in ("q", "q_pregrasp", "q_squeeze"):
-        require(np.isfinite(getattr(rows, name)), f"{name}: not finite")
-    lower, upper = _limits(hand)
-    require(~((rows.q < lower) | (rows.q > upper)), "q: outside the joint limits by more than 1e-4")
-
-
-def _limits(hand: HandRecord) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest joint positions that are accepted, shape [K] each."""
-    return np.asarray(hand.joint_lower) - _LIMIT_TOLERANCE, np.asarray(hand.joint_upper) + _LIMIT_TOLERANCE
-
-
-def _check_poses(rows: GraspRows, objects: int, require) -> None:
+def _check_poses(rows: GraspRows, objects: int, require: Require) -> None:
     index, pose = rows.object_index, rows.object_pose
     present = index >= 0  # (n, o)
     require((index >= -1) & (index < objects), f"object_index: must be -1 to {objects - 1}")
     require(present.any(axis=1), "object_index: no object is present")
     require(np.where(present[..., None], np.isfinite(pose), np.isnan(pose)), "object_pose: NaN if and only if absent")
-    norm = np.linalg.norm(pose[..., 3:], axis=-1)
-    require(~present | (np.abs(norm - 1) <= _UNIT_TOLERANCE), "object_pose: quaternion is not of unit length")
+    require(~present | are_unit(pose[..., 3:]), "object_pose: quaternion is not of unit length")
     require(~present | (pose[..., 3] >= 0), "object_pose: quaternion has w < 0")
 
 
-def _check_contacts(rows: GraspRows, links: int, require) -> None:
+def _check_contacts(rows: GraspRows, links: int, require: Require) -> None:
     link = rows.contact_links
     contact = link >= 0  # (n, o, c)
     require((link >= -1) & (link < links), f"contact_links: must be -1 to {links - 1}")
@@ -106,9 +122,67 @@ def _check_contacts(rows: GraspRows, links: int, require) -> None:
         values = getattr(rows, name)
         good = np.where(contact[..., None], np.isfinite(values), np.isnan(values))
         require(good, f"{name}: NaN if and only if contact_links is -1")
-    norm = np.linalg.norm(rows.contact_normals, axis=-1)
-    require(~contact | (np.abs(norm - 1) <= _UNIT_TOLERANCE), "contact_normals: not of unit length")
+    require(~contact | are_unit(rows.contact_normals), "contact_normals: not of unit length")
     normal_part = -(rows.contact_forces * rows.contact_normals).sum(axis=-1)  # (n, o, c)
     total = np.where(contact, normal_part, 0).sum(axis=-1)
     good = ~contact.any(axis=-1) | (np.abs(total - 1) <= _UNIT_TOLERANCE)
     require(good, "contact_forces: normal parts (-force . normal) of an object's contacts do not sum to 1")
+
+
+def _check_steps(rows: GraspRows, steps: SequenceRows, lower: np.ndarray, upper: np.ndarray, require: Require) -> None:
+    """Check rows of sequences, each by itself."""
+    present = rows.object_index >= 0  # (n, o)
+    space, free, spaces = steps.space, steps.free_joints, len(steps.space_names)
+    require(present[:, :-1] | ~present[:, 1:], "object_index: in a sequence, absent objects must be the last")
+    require((space >= 0) == present, "sequence/space: -1 if and only if the object is absent")
+    require((space >= -1) & (space < spaces), f"sequence/space: must be -1 to {spaces - 1}")
+    if len(set(steps.space_names)) != spaces:
+        require(np.zeros(len(rows), bool), "sequence/space_names: names repeat")
+    order = np.sort(space, axis=1)
+    require((order[:, 1:] != order[:, :-1]) | (order[:, 1:] < 0), "sequence/space: a space is used twice")
+    require(free.any(2) == present, "sequence/free_joints: a step must move a joint, and an absent one none")
+    require(free.sum(1) <= 1, "sequence/free_joints: two steps move one joint")
+    frozen = present[:, 1:, None] & ~free[:, 1:]  # (n, o - 1, k)
+    last = np.maximum(present.sum(1) - 1, 0)
+    for name, held in _HELD.items():
+        values = getattr(steps, name)  # (n, o, k)
+        good = np.where(present[..., None], np.isfinite(values), np.isnan(values))
+        require(good, f"sequence/{name}: NaN if and only if the object is absent")
+        require(getattr(rows, name) == values[np.arange(len(last)), last], f"{name}: not that of the last step")
+        kept = ~frozen | (values[:, 1:] == getattr(steps, held)[:, :-1])
+        require(kept, f"sequence/{name}: a joint that the step does not move is not at {held} of the step before")
+    require(~((steps.q < lower) | (steps.q > upper)), "sequence/q: outside the joint limits by more than 1e-4")
+
+
+def _check_parents(rows: GraspRows, steps: SequenceRows, column: Column, first_row: int, require: Require) -> None:
+    """Check rows of sequences against the rows that they extend, and against the order of rows."""
+    count = (rows.object_index >= 0).sum(1)
+    before = (column("object_index", max(first_row - 1, 0), first_row) >= 0).sum(1)
+    order = np.concatenate([before if first_row else count[:1], count])
+    require(order[1:] >= order[:-1], "object_index: in sequences, rows of fewer objects must come first")
+    number = first_row + np.arange(len(count))
+    parent = steps.parent
+    require((parent >= 0) == (count > 1), "sequence/parent: -1 if and only if the row has one object")
+    require((parent >= -1) & (parent < number), "sequence/parent: must be an earlier row")
+    known = (parent >= 0) & (parent < number)
+    inherited = {name: np.ones(len(count), bool) for name in _INHERITED}
+    shorter = np.ones(len(count), bool)
+    mine = rows.columns()
+    for block in np.unique(parent[known] // CHUNK_ROWS):
+        start = int(block) * CHUNK_ROWS
+        some = np.flatnonzero(known & (parent // CHUNK_ROWS == block))
+        for name, good in inherited.items():
+            theirs = column(name, start, start + CHUNK_ROWS)[parent[some] - start]
+            if name == "object_index":
+                shorter[some] = (theirs >= 0).sum(1) == count[some] - 1
+            good[some] = _same_steps(mine[name][some], theirs, count[some] - 1)
+    require(shorter, "sequence/parent: must have one object less")
+    for name, good in inherited.items():
+        require(good, f"{name}: earlier steps differ from those of the parent")
+
+
+def _same_steps(a: np.ndarray, b: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Which rows agree in their first ``steps`` [n] slots, NaN with NaN; both are [n, O, ...]."""
+    same = (a == b) | ((a != a) & (b != b))
+    beyond = np.arange(a.shape[1]) >= steps[:, None]  # (n, o)
+    return (same.reshape(*a.shape[:2], -1).all(2) | beyond).all(1)

@@ -8,20 +8,8 @@ import numpy as np
 
 from lgrasp.dataset.files import new_shard_file
 from lgrasp.dataset.reader import open_hdf5, reading
-from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import create_rows, finish
 from lgrasp.errors import ShardError
-
-
-def check_shard(path: str | os.PathLike[str]) -> None:
-    """Fail at a shard that does not conform.
-
-    Raises:
-        ShardError: With its first problem.
-    """
-    problems = validate_shard(path)
-    if problems:
-        raise ShardError(f"{path}: {problems[0]}")
 
 
 def extend_shard(
@@ -41,7 +29,7 @@ def extend_shard(
     same input always gives the same bytes.
 
     Args:
-        source: A shard that conforms (see :func:`check_shard`); damage would be copied along.
+        source: A shard that conforms; damage would be copied along.
         out: The file to write.
         metrics: Numbers by name, each shape [N].
         units: Unit by name.
@@ -55,6 +43,9 @@ def extend_shard(
     """
     columns = {f"metrics/{name}": np.asarray(values, "f4") for name, values in (metrics or {}).items()}
     columns |= {f"physics/{name}": np.asarray(values) for name, values in (physics or {}).items()}
+    texts = dict.fromkeys(columns, protocol) | {
+        f"metrics/{name}": (units or {}).get(name, "") for name in metrics or ()
+    }
     with new_shard_file(out) as file, open_hdf5(source) as old, reading(source):
         n = old["grasps/q"].shape[0]
         for name, values in columns.items():
@@ -62,8 +53,9 @@ def extend_shard(
                 raise ShardError(f"{source}: {name} has shape {values.shape}, must have {n} rows")
         _copy(old, file, {f"grasps/{name}" for name in columns})
         for name, values in sorted(columns.items()):
-            unit = (units or {}).get(name.partition("/")[2], "")
-            dataset = create_rows(file, name, values.shape, values.dtype, unit=unit, protocol=protocol)
+            dataset = create_rows(
+                file, name, values.shape, values.dtype, protocol if name.startswith("physics/") else texts.get(name, "")
+            )
             if n:
                 dataset[...] = values
         file["statistics"].attrs.update(dict(statistics or {}))

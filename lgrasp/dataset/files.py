@@ -1,11 +1,11 @@
 """Whole-or-absent output files, which files are shards, and guards against damage that HDF5 does not notice."""
 
 import errno
-import hashlib
+import io
 import mmap
 import os
 import uuid
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from struct import unpack_from
@@ -25,28 +25,17 @@ Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 _LIBVER = ("v110", "v110")  # readable since HDF5 1.10; its metadata blocks carry checksums, the older layout's do not
 
 
-class _Sink:
+class _Sink(io.FileIO):
     """Binary file for HDF5 that remembers the first write error instead of raising it.
 
     The HDF5 library aborts the process when a write fails while it closes a file (disk full). Here it sees every
     write succeed, closes in peace, and :func:`new_shard_file` reports the error afterwards.
     """
 
-    def __init__(self, file) -> None:
-        self._file = file
-        self.error: OSError | None = None
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def read(self, size: int = -1) -> bytes:
-        return self._file.read(size)
+    error: OSError | None = None
 
     def readinto(self, buffer) -> int:
-        n = self._file.readinto(buffer)
+        n = super().readinto(buffer) or 0
         buffer[n:] = bytes(len(buffer) - n)  # only short after a failed write
         return len(buffer)
 
@@ -55,21 +44,18 @@ class _Sink:
         done = 0
         while done < len(view) and self.error is None:
             try:
-                done += self._file.write(view[done:])
+                done += super().write(view[done:]) or 0
             except OSError as error:
                 self.error = error
         return len(view)
 
-    def truncate(self, size: int) -> int:
+    def truncate(self, size: int | None = None) -> int:
         if self.error is None:
             try:
-                self._file.truncate(size)
+                super().truncate(size)
             except OSError as error:
                 self.error = error
-        return size
-
-    def flush(self) -> None:
-        """Nothing is buffered here; :func:`new_file` fsyncs once, at the end."""
+        return size or 0
 
 
 @contextmanager
@@ -88,9 +74,10 @@ def new_file(path: str | os.PathLike[str], *, flush: bool = True) -> Iterator:
     temporary = path.with_name(f"{path.stem}.{uuid.uuid4().hex[:12]}{path.suffix}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "x+b", buffering=0) as file:
+        with open(temporary, "x+b") as file:
             hold_file(file.fileno())
             yield file
+            file.flush()
             if flush:
                 os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -106,6 +93,12 @@ def new_file(path: str | os.PathLike[str], *, flush: bool = True) -> Iterator:
             temporary.unlink()
 
 
+def write_file(path: str | os.PathLike[str], data: bytes | str, *, flush: bool = True) -> None:
+    """Write a whole file; text is UTF-8. Arguments and errors as of :func:`new_file`."""
+    with new_file(path, flush=flush) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+
+
 @contextmanager
 def new_shard_file(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     """An empty HDF5 file, open for writing, that appears as ``path`` only when the block ends without an error.
@@ -114,7 +107,7 @@ def new_shard_file(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
         OutputError: As :func:`new_file`.
     """
     with new_file(path) as raw:
-        sink = _Sink(raw)
+        sink = _Sink(raw.fileno(), "r+", closefd=False)
         with h5py.File(sink, "w", libver=_LIBVER) as file:
             yield file
         if sink.error is not None:
@@ -146,45 +139,26 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+@contextmanager
+def parsing(path: str | os.PathLike[str], what: str = "", kinds: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Turn an error of the system, or one of some kinds that say that a file is not what it should be, into a
+    ShardError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise ShardError(f"{error.filename or path}: {error.strerror or error}") from error
+    except kinds as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ShardError(f"{path}: not {what}: {reason}") from error
+
+
 def find_shards(paths: Paths) -> list[Path]:
     """The shard files named by paths: a folder stands for its ``*.h5`` files, sorted by name, not recursive.
 
     Raises:
         ShardError: A path does not exist, or no shard is left.
     """
-    given = _listed(paths)
-    found: list[Path] = []
-    for path in given:
-        if path.is_dir():
-            found += sorted(path.glob("*.h5"))
-        elif path.exists():
-            found.append(path)
-        else:
-            raise ShardError(f"{path}: no such file or folder")
-    _require_some(found, given)
-    return found
-
-
-def _listed(paths: Paths) -> list[Path]:
-    return [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
-
-
-def _require_some(found: Sized, given: list[Path]) -> None:
-    if not found:
-        raise ShardError(f"no shard (*.h5) in {', '.join(map(str, given)) or 'an empty list of paths'}")
-
-
-def sha256_file(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a file's bytes, 64 lower-case hex digits.
-
-    Raises:
-        ShardError: The file cannot be read.
-    """
-    try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise ShardError(f"{path}: {error.strerror or error}") from error
+    return [file for file, _ in _found(paths, "*.h5")]
 
 
 def shard_tree(paths: Paths, *, leave_out: Path | None = None) -> dict[Path, Path]:
@@ -197,20 +171,27 @@ def shard_tree(paths: Paths, *, leave_out: Path | None = None) -> dict[Path, Pat
     Raises:
         ShardError: A path does not exist, no shard is left, or two of them have one place.
     """
-    given = _listed(paths)
     found: dict[Path, Path] = {}
+    for file, folder in _found(paths, "**/*.h5", leave_out):
+        place = file.relative_to(folder)
+        if place in found and not found[place].samefile(file):
+            raise ShardError(f"{file}: it has the same place {place} as {found[place]}; name one folder above both")
+        found[place] = file
+    return found
+
+
+def _found(paths: Paths, pattern: str, leave_out: Path | None = None) -> list[tuple[Path, Path]]:
+    """Shard files with the folders that were named; with its own for a file that was named."""
+    given = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
+    found: list[tuple[Path, Path]] = []
     for path in given:
         if not path.exists():
             raise ShardError(f"{path}: no such file or folder")
-        files = sorted(path.rglob("*.h5")) if path.is_dir() else [path]
-        for file in files:
-            if leave_out is not None and file.resolve().is_relative_to(leave_out.resolve()):
-                continue
-            place = file.relative_to(path) if path.is_dir() else Path(file.name)
-            if place in found and not found[place].samefile(file):
-                raise ShardError(f"{file}: it has the same place {place} as {found[place]}; name one folder above both")
-            found[place] = file
-    _require_some(found, given)
+        found += [(file, path) for file in sorted(path.glob(pattern))] if path.is_dir() else [(path, path.parent)]
+    if leave_out is not None:
+        found = [(file, top) for file, top in found if not file.resolve().is_relative_to(leave_out.resolve())]
+    if not found:
+        raise ShardError(f"no shard (*.h5) in {', '.join(map(str, given)) or 'an empty list of paths'}")
     return found
 
 
@@ -227,18 +208,15 @@ def check_heaps(path: str | os.PathLike[str]) -> None:
     Raises:
         ShardError: The file cannot be read, or an entry of a heap does not fit.
     """
-    try:
-        with open(path, "rb") as file:
-            if os.fstat(file.fileno()).st_size == 0:
-                return  # opening it reports this better
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                start = data.find(_SIGNATURE)
-                while start >= 0:
-                    if not _is_sound(data, start):
-                        raise ShardError(f"{path}: cannot be read, it is damaged: string heap at byte {start}")
-                    start = data.find(_SIGNATURE, start + _HEADER)
-    except OSError as error:
-        raise ShardError(f"{path}: {error.strerror or error}") from error
+    with parsing(path), open(path, "rb") as file:
+        if os.fstat(file.fileno()).st_size == 0:
+            return  # opening it reports this better
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            start = data.find(_SIGNATURE)
+            while start >= 0:
+                if not _is_sound(data, start):
+                    raise ShardError(f"{path}: cannot be read, it is damaged: string heap at byte {start}")
+                start = data.find(_SIGNATURE, start + _HEADER)
 
 
 def _is_sound(data: mmap.mmap, start: int) -> bool:

@@ -33,13 +33,16 @@ def _describe(path: Path) -> dict[str, Any]:
     with ShardReader(path) as reader:
         header = reader.header
         units = reader.rows(0, 0).metric_units
-        held = (reader.column("object_index") >= 0).sum(1)
+        held, by_space = (reader.column("object_index") >= 0).sum(1), None
+        if reader.space_names is not None:
+            last = np.take_along_axis(reader.column("sequence/space"), held[:, None] - 1, 1)
+            by_space = {name: int((last == number).sum()) for number, name in enumerate(reader.space_names)}
         return {
             "file": str(path),
             "bytes": path.stat().st_size,
             "rows": len(reader),
             "rows_by_objects": {str(n): int(rows) for n, rows in enumerate(np.bincount(held)) if rows},
-            "rows_by_space": _last_spaces(reader, held),
+            "rows_by_space": by_space,
             "hand": str(reader.attributes["hand"]),
             "objects": reader.object_ids,
             "pipeline": header.pipeline,
@@ -52,13 +55,6 @@ def _describe(path: Path) -> dict[str, Any]:
             "metrics": {n: {"unit": unit, **_range(reader.column(f"metrics/{n}"))} for n, unit in units.items()},
             "statistics": reader.statistics,
         }
-
-
-def _last_spaces(reader: ShardReader, held: np.ndarray) -> dict[str, int] | None:
-    if reader.space_names is None:
-        return None
-    last = np.take_along_axis(reader.column("sequence/space"), held[:, None] - 1, 1)
-    return {name: int((last == number).sum()) for number, name in enumerate(reader.space_names)}
 
 
 def _range(values: np.ndarray) -> dict[str, float | None]:

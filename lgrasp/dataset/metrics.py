@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -16,7 +15,7 @@ import trimesh
 from lgrasp.config import apply_settings
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.validate import validate_shard
-from lgrasp.errors import OutputError
+from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
@@ -42,8 +41,10 @@ def measure_shard(
         report: Called with rows done.
 
     Raises:
-        ShardError: The shard is damaged.
+        ShardError: The shard does not conform; with its first problem.
     """
+    for problem in validate_shard(path):
+        raise ShardError(f"{path}: {problem}")
     with ShardReader(path) as reader:
         frames = [mass_frame(record) for record in reader.objects()]
         bounds = stored_bounds(reader.header.config)
@@ -100,15 +101,12 @@ def is_extended(target: Path, source: Path, names: Sequence[str]) -> bool:
     if not os.path.lexists(target) or validate_shard(target):
         return False
     with ShardReader(source) as old, ShardReader(target) as new:
-        if _identity(old) != _identity(new) or not all(
+        mine, theirs = ({**reader.attributes, "text_sha256": ""} for reader in (old, new))
+        if mine != theirs or not all(
             np.array_equal(old.column(name), new.column(name), equal_nan=name != "candidate") for name in _ROW
         ):
             raise OutputError(f"{target} holds other rows than {source}; choose another --out, or --overwrite")
         return all(f"metrics/{name}" in new.columns for name in names)
-
-
-def _identity(reader: ShardReader) -> dict[str, Any]:
-    return {name: value for name, value in reader.attributes.items() if name != "text_sha256"}
 
 
 @contextmanager

@@ -12,18 +12,13 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.files import check_heaps
-from lgrasp.dataset.structure import expand, format_problems, structure_problems
+from lgrasp.dataset.structure import expand, shard_problems
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
 
-RENAMED = {"metrics/disturbance": "metrics/unresisted_load"}
+_RENAMED = {"metrics/disturbance": "metrics/unresisted_load"}
 """Flat names of columns in shards of earlier releases -> their names; readers give the columns by these."""
-
-
-def current_name(name: str) -> str:
-    """A column's name as readers give it."""
-    return RENAMED.get(name, name)
 
 
 @contextmanager
@@ -31,8 +26,6 @@ def reading(path: str | os.PathLike[str]) -> Iterator[None]:
     """Turn whatever HDF5 raises about a damaged file into a ShardError that names the file."""
     try:
         yield
-    except ShardError:
-        raise
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise ShardError(f"{path}: cannot be read, it is damaged: {reason}") from error
@@ -97,14 +90,36 @@ class FileReader:
     def hand(self) -> HandRecord:
         """The hand, with its mesh files."""
         with reading(self.path):
-            return read_hand(self._file)
+            group, attrs = self._file["hand"], self._file.attrs
+            blobs = [group["meshes"][name] for name in sorted(group.get("meshes", ()), key=lambda n: (len(n), n))]
+            return HandRecord(
+                name=attrs["hand"],
+                base_link=group.attrs["base_link"],
+                urdf=group["urdf"].asstr()[()],
+                joint_names=tuple(group["joint_names"].asstr()[()]),
+                joint_lower=group["joint_lower"][()],
+                joint_upper=group["joint_upper"][()],
+                link_names=tuple(group["link_names"].asstr()[()]),
+                sha256=attrs["hand_sha256"],
+                meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
+            )
 
     def object(self, object_id: str) -> ObjectRecord:
         """One object with its mesh."""
         with reading(self.path):
             if object_id not in self.object_ids:
                 raise ShardError(f"{self.path}: no object {object_id!r}; it has {', '.join(self.object_ids)}")
-            return read_object(self._file, object_id)
+            group = self._file["objects"][object_id]
+            return ObjectRecord(
+                id=object_id,
+                name=group.attrs["name"],
+                scale=float(group.attrs["scale"]),
+                sha256=group.attrs["sha256"],
+                watertight=bool(group.attrs["watertight"]),
+                vertices=group["vertices"][()],
+                faces=group["faces"][()],
+                normals=group["normals"][()] if "normals" in group else None,
+            )
 
     def objects(self) -> tuple[ObjectRecord, ...]:
         """All objects, sorted by id."""
@@ -122,7 +137,7 @@ class ShardReader(FileReader):
     """One open shard; rows are read on demand."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        super().__init__(path, lambda file: format_problems(file) or structure_problems(file))
+        super().__init__(path, shard_problems)
 
     def __len__(self) -> int:
         return self._dataset("q").shape[0]
@@ -138,9 +153,15 @@ class ShardReader(FileReader):
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
         """Shape and dtype of every row dataset by its flat name (``q``, ``metrics/gap``, ...)."""
         names = [*GRASP_FIELDS, *(SEQUENCE_FIELDS if self.space_names is not None else ())]
-        for group in ("metrics", "physics"):
-            names += [current_name(path.removeprefix("grasps/")) for path in expand(self._file, f"grasps/{group}/*")]
+        for path in (path for group in ("metrics", "physics") for path in expand(self._file, f"grasps/{group}/*")):
+            name = path.removeprefix("grasps/")
+            names.append(_RENAMED.get(name, name))
         return {name: (self._dataset(name).shape, self._dataset(name).dtype) for name in names}
+
+    @property
+    def object_keys(self) -> list[tuple[str, str, float]]:
+        """Id, hash and scale of every object, sorted by id."""
+        return [(o.id, o.sha256, o.scale) for o in self.objects()]
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows ``start`` to ``stop`` of one dataset by its flat name; names of earlier releases do too.
@@ -148,7 +169,7 @@ class ShardReader(FileReader):
         Raises:
             ShardError: The shard has no such dataset, or its bytes are damaged.
         """
-        name = current_name(name)
+        name = _RENAMED.get(name, name)
         if name not in self.columns:
             raise ShardError(f"{self.path}: no dataset {name!r}; it has {', '.join(self.columns)}")
         with reading(self.path):
@@ -193,40 +214,8 @@ class ShardReader(FileReader):
     def _dataset(self, name: str) -> h5py.Dataset:
         with reading(self.path):
             path = GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"
-            old = next((f"grasps/{was}" for was, now in RENAMED.items() if now == name), path)
+            old = next((f"grasps/{was}" for was, now in _RENAMED.items() if now == name), path)
             return self._file[old if old in self._file and path not in self._file else path]
-
-
-def read_hand(file: h5py.File) -> HandRecord:
-    """The hand of an open file, with its mesh files."""
-    group = file["hand"]
-    blobs = [group["meshes"][name] for name in sorted(group.get("meshes", ()), key=lambda n: (len(n), n))]
-    return HandRecord(
-        name=file.attrs["hand"],
-        base_link=group.attrs["base_link"],
-        urdf=group["urdf"].asstr()[()],
-        joint_names=tuple(group["joint_names"].asstr()[()]),
-        joint_lower=group["joint_lower"][()],
-        joint_upper=group["joint_upper"][()],
-        link_names=tuple(group["link_names"].asstr()[()]),
-        sha256=file.attrs["hand_sha256"],
-        meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
-    )
-
-
-def read_object(file: h5py.File, object_id: str) -> ObjectRecord:
-    """One object of an open file, with its mesh."""
-    group = file["objects"][object_id]
-    return ObjectRecord(
-        id=object_id,
-        name=group.attrs["name"],
-        scale=float(group.attrs["scale"]),
-        sha256=group.attrs["sha256"],
-        watertight=bool(group.attrs["watertight"]),
-        vertices=group["vertices"][()],
-        faces=group["faces"][()],
-        normals=group["normals"][()] if "normals" in group else None,
-    )
 
 
 def read_shard(path: str | os.PathLike[str]) -> Shard:
@@ -244,14 +233,3 @@ def read_shard(path: str | os.PathLike[str]) -> Shard:
             grasps=reader.rows(),
             statistics=reader.statistics,
         )
-
-
-def iter_grasps(path: str | os.PathLike[str]) -> Iterator[GraspRows]:
-    """All rows of a shard in blocks of at most 4096, in bounded memory.
-
-    Raises:
-        ShardError: As :func:`read_shard`.
-    """
-    with ShardReader(path) as reader:
-        for _, rows in reader.blocks():
-            yield rows

@@ -21,9 +21,7 @@ from lgrasp.grasp.schema import (
 )
 
 
-def format_problems(
-    file: h5py.File, name: str = "grasp shard", form: str = FORMAT, version: str = FORMAT_VERSION
-) -> list[str]:
+def format_problems(file: h5py.File, name: str, form: str, version: str) -> list[str]:
     """Why a file is no whole file of a version that this package reads, in one line; empty when it is."""
     attrs, major = file.attrs, version.partition(".")[0]
     if attrs.get("format") != form:
@@ -36,16 +34,19 @@ def format_problems(
     return []
 
 
+def shard_problems(file: h5py.File) -> list[str]:
+    """Why a file is no whole shard, or all differences to the schema, one line each; empty when it conforms."""
+    return format_problems(file, "grasp shard", FORMAT, FORMAT_VERSION) or structure_problems(file)
+
+
 def structure_problems(file: h5py.File) -> list[str]:
-    """All differences between a file and the schema, one line each; empty = the structure conforms."""
-    problems: list[str] = []
-    if not expand(file, "objects/*"):
-        problems.append("objects: no object")
+    """All differences between a file and the schema of shards, one line each; empty when it conforms."""
     sequences = SEQUENCE_DATASETS if any(spec.path in file for spec in SEQUENCE_DATASETS) else ()
-    problems += schema_problems(file, (*DATASETS, *sequences), ATTRIBUTES)
-    if "statistics" not in file:
-        problems.append("statistics: missing group")
-    return problems
+    return [
+        *([] if expand(file, "objects/*") else ["objects: no object"]),
+        *schema_problems(file, (*DATASETS, *sequences), ATTRIBUTES),
+        *([] if "statistics" in file else ["statistics: missing group"]),
+    ]
 
 
 def schema_problems(file: h5py.File, datasets: Sequence[DatasetSpec], attributes: Sequence[AttributeSpec]) -> list[str]:
@@ -54,9 +55,8 @@ def schema_problems(file: h5py.File, datasets: Sequence[DatasetSpec], attributes
     dims: dict[str, int] = {}
     for spec in datasets:
         for path in expand(file, spec.path):
-            if not spec.required and path not in file:
-                continue
-            problems += _dataset_problems(file, path, spec, dims)
+            if spec.required or path in file:
+                problems += _dataset_problems(file, path, spec, dims)
     for attribute in attributes:
         for path in expand(file, attribute.path):
             if attribute.path in ("", *file) or path in file:
@@ -108,37 +108,27 @@ def _attribute_problems(attrs: Any, path: str, spec: AttributeSpec) -> list[str]
     where = f"{path or '/'}: attribute {spec.name}"
     if spec.name not in attrs:
         return [f"{where} is missing"] if spec.required else []
-    value = attrs[spec.name]
-    if not _kind_matches(value, spec.kind):
-        return [f"{where} is {str(value)[:80]!r}, must be {_KINDS[spec.kind]}"]
-    return []
+    value, (what, reads) = attrs[spec.name], _KINDS[spec.kind]
+    if isinstance(reads, str):
+        good = np.ndim(value) == 0 and np.asarray(value).dtype.kind in reads
+    else:
+        try:
+            good = isinstance(value, str) and reads(value) is not None
+        except ValueError:
+            good = False
+    return [] if good else [f"{where} is {str(value)[:80]!r}, must be {what}"]
 
 
 _KINDS = {
-    "text": "a string",
-    "json": "a JSON document",
-    "time": "an ISO 8601 time",
-    "sha256": "64 lower-case hex digits",
-    "int": "an integer",
-    "float": "a number",
-    "bool": "true or false",
+    "text": ("a string", str),
+    "json": ("a JSON document", lambda text: [json.loads(text)]),
+    "time": ("an ISO 8601 time", datetime.fromisoformat),
+    "sha256": ("64 lower-case hex digits", re.compile("[0-9a-f]{64}").fullmatch),
+    "int": ("an integer", "iu"),
+    "float": ("a number", "iuf"),
+    "bool": ("true or false", "biu"),
 }
-
-
-def _kind_matches(value: Any, kind: str) -> bool:
-    if kind in ("int", "float", "bool"):
-        allowed = {"int": "iu", "float": "iuf", "bool": "biu"}[kind]
-        return np.ndim(value) == 0 and np.asarray(value).dtype.kind in allowed
-    if not isinstance(value, str):
-        return False
-    try:
-        if kind == "json":
-            json.loads(value)
-        elif kind == "time":
-            datetime.fromisoformat(value)
-    except ValueError:
-        return False
-    return kind != "sha256" or re.fullmatch("[0-9a-f]{64}", value) is not None
+"""Kinds of attributes: what to call one; kinds of NumPy dtypes, or what reads it, or fails, or gives None."""
 
 
 def text_sha256(file: h5py.File) -> str:

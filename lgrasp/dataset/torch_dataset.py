@@ -49,13 +49,7 @@ class GraspDataset(torch.utils.data.Dataset):
         ShardError: A shard cannot be read, hands differ, or a shard lacks a column.
     """
 
-    def __init__(
-        self,
-        paths: Paths,
-        *,
-        columns: Sequence[str] | None = None,
-        cache_bytes: int = 1 << 29,
-    ) -> None:
+    def __init__(self, paths: Paths, *, columns: Sequence[str] | None = None, cache_bytes: int = 1 << 29) -> None:
         self._sources = [_survey(path) for path in find_shards(paths)]
         first = self._sources[0]
         for source in self._sources:
@@ -137,10 +131,13 @@ class GraspDataset(torch.utils.data.Dataset):
         key = (shard, number)
         if key not in self._cache:
             self._cache[key] = self._read_block(shard, number)
-            while len(self._cache) > 1 and sum(map(_bytes, self._cache.values())) > self._cache_bytes:
+            while len(self._cache) > 1 and self._held_bytes() > self._cache_bytes:
                 self._cache.popitem(last=False)
         self._cache.move_to_end(key)
         return self._cache[key]
+
+    def _held_bytes(self) -> int:
+        return sum(values.nbytes for block in self._cache.values() for values in block.values())
 
     def _read_block(self, shard: int, number: int) -> dict[str, torch.Tensor]:
         source = self._sources[shard]
@@ -159,13 +156,7 @@ class GraspDataset(torch.utils.data.Dataset):
         return block
 
 
-def _bytes(block: dict[str, torch.Tensor]) -> int:
-    return sum(values.nbytes for values in block.values())
-
-
 def _survey(path: Path) -> _Source:
     with ShardReader(path) as reader:
-        objects = [(o.id, o.sha256, o.scale) for o in reader.objects()]
-        return _Source(
-            path, len(reader), str(reader.attributes["hand_sha256"]), objects, reader.space_names, reader.columns
-        )
+        hand = str(reader.attributes["hand_sha256"])
+        return _Source(path, len(reader), hand, reader.object_keys, reader.space_names, reader.columns)

@@ -1,13 +1,15 @@
 """Checks a shard file against every MUST of the format."""
 
 import os
+from collections.abc import Callable
 
+import h5py
 import numpy as np
 
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.reader import ShardReader, open_hdf5, reading
-from lgrasp.dataset.structure import format_problems, structure_problems, text_sha256
+from lgrasp.dataset.structure import shard_problems, text_sha256
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import object_set_sha256
 
@@ -18,35 +20,36 @@ def validate_shard(path: str | os.PathLike[str]) -> list[str]:
     Reads every byte of every dataset of the format, in bounded memory, so checksums are verified. A file that cannot
     be read at all gives one problem, not an error.
     """
+    return file_problems(path, shard_problems, _content_problems)
+
+
+def file_problems(
+    path: str | os.PathLike[str], structure: Callable[[h5py.File], list[str]], content: Callable[..., list[str]]
+) -> list[str]:
+    """Problems of a file, those of its structure before those of what it holds, by functions of the file and its path;
+    what cannot be read is a problem too."""
     try:
         check_heaps(path)
         with open_hdf5(path) as file, reading(path):
-            problems = format_problems(file) or structure_problems(file)
+            problems = structure(file)
             if not problems and file.attrs.get("text_sha256", text_sha256(file)) != text_sha256(file):
                 problems = ["/: attributes or texts were changed after writing (text_sha256 differs)"]
-        if problems:
-            return problems
-        with ShardReader(path) as reader, reading(path):
-            return _content_problems(reader)
+        return problems or content(path)
     except ShardError as error:
         return [str(error).removeprefix(f"{path}: ")]
 
 
-def _content_problems(reader: ShardReader) -> list[str]:
-    hand, objects = reader.hand(), reader.objects()
-    problems = hand_problems(hand)
-    for record in objects:
-        problems += object_problems(record)
-    if reader.attributes["object_sha256"] != object_set_sha256(objects):
-        problems.append("/: attribute object_sha256 does not belong to the objects")
-    for name, value in reader.statistics.items():
-        if np.ndim(value) or not isinstance(value, int | float | str):
-            problems.append(f"statistics: attribute {name} is neither a number nor a string")
-    seen: set[str] = set()
-    for first_row, rows in reader.blocks():
-        for problem in row_problems(rows, hand, reader.object_ids, reader.column, first_row=first_row):
-            kind = problem.rpartition(" (row ")[0]
-            if kind not in seen:  # the first block that shows it is enough
-                seen.add(kind)
-                problems.append(problem)
-    return problems
+def _content_problems(path: str | os.PathLike[str]) -> list[str]:
+    with ShardReader(path) as reader, reading(path):
+        hand, objects = reader.hand(), reader.objects()
+        problems = [*hand_problems(hand), *(problem for record in objects for problem in object_problems(record))]
+        if reader.attributes["object_sha256"] != object_set_sha256(objects):
+            problems.append("/: attribute object_sha256 does not belong to the objects")
+        for name, value in reader.statistics.items():
+            if np.ndim(value) or not isinstance(value, int | float | str):
+                problems.append(f"statistics: attribute {name} is neither a number nor a string")
+        seen: dict[str, str] = {}  # the first block that shows a problem is enough
+        for first_row, rows in reader.blocks():
+            for problem in row_problems(rows, hand, reader.object_ids, reader.column, first_row=first_row):
+                seen.setdefault(problem.rpartition(" (row ")[0], problem)
+    return [*problems, *seen.values()]

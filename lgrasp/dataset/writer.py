@@ -13,7 +13,7 @@ from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.files import new_shard_file
 from lgrasp.dataset.structure import structure_problems, text_sha256
 from lgrasp.errors import ShardError
-from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, object_set_sha256
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, object_set_sha256
 from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, DatasetSpec
 
 
@@ -27,34 +27,38 @@ def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
         OutputError: The folder cannot be written or is full; no file is left behind.
     """
     rows = _as_format(shard.grasps, where=path)
+    columns, texts = rows.columns(), column_texts(rows)
     with new_shard_file(path) as file:
-        write_context(file, shard.header, shard.hand, shard.objects, shard.statistics)
-        if rows.sequence is not None:
-            write_spaces(file, rows.sequence.space_names)
-        for name, values in rows.columns().items():
-            unit = rows.metric_units.get(name.removeprefix("metrics/"), "")
-            protocol = rows.physics_protocols.get(name.removeprefix("physics/"), "")
-            dataset = create_rows(file, name, values.shape, values.dtype, unit=unit, protocol=protocol)
+        write_context(file, shard)
+        for name, values in columns.items():
+            dataset = create_rows(file, name, values.shape, values.dtype, texts.get(name, ""))
             if values.size:
                 dataset[...] = values
         finish(file)
+        ids = [o.id for o in shard.objects]
         problems = structure_problems(file) or [
             *hand_problems(shard.hand),
             *(problem for record in shard.objects for problem in object_problems(record)),
-            *row_problems(
-                rows, shard.hand, [o.id for o in shard.objects], lambda name, a, b: rows.columns()[name][a:b]
-            ),
+            *row_problems(rows, shard.hand, ids, lambda name, a, b: columns[name][a:b]),
         ]
         if problems:
             raise ShardError(f"cannot write {path}: {problems[0]}")
 
 
-def write_context(file: h5py.File, header: ShardHeader, hand: HandRecord, objects: Any, statistics: Any) -> None:
-    """Write all that is not a row: header attributes, hand, objects, statistics, and the empty row groups.
+def column_texts(rows: GraspRows) -> dict[str, str]:
+    """Units of metrics and protocols of verdicts, by flat name."""
+    groups = (("metrics", rows.metric_units), ("physics", rows.physics_protocols))
+    return {f"{group}/{name}": text for group, texts in groups for name, text in texts.items()}
+
+
+def write_context(file: h5py.File, shard: Shard) -> None:
+    """Write all but the rows: header attributes, hand, objects, statistics, the empty row groups, and the opposition
+    spaces of sequences.
 
     Raises:
         ShardError: The object ids are not sorted, not unique or not usable as a group name.
     """
+    header, hand, objects, steps = shard.header, shard.hand, shard.objects, shard.grasps.sequence
     ids = [o.id for o in objects]
     if ids != sorted(set(ids)) or any(not i or "/" in i or i == "." for i in ids):
         raise ShardError(f"object ids must be unique, sorted and without '/': {ids}")
@@ -73,44 +77,35 @@ def write_context(file: h5py.File, header: ShardHeader, hand: HandRecord, object
     )
     if header.merged_from:
         file.attrs["merged_from"] = json.dumps([dict(m) for m in header.merged_from])
-    write_hand(file.create_group("hand"), hand)
-    for record in objects:
-        write_object(file.create_group(f"objects/{record.id}"), record)
+    write_models(file, hand, objects)
     for name in ("metrics", "physics", "provenance"):
         file.create_group(f"grasps/{name}")
-    file.create_group("statistics").attrs.update(dict(statistics))
+    file.create_group("statistics").attrs.update(dict(shard.statistics))
+    if steps is not None:
+        _create_texts(file.create_group("sequence"), "space_names", steps.space_names)
 
 
-def write_spaces(file: h5py.File, space_names: Sequence[str]) -> None:
-    """Write the opposition spaces that ``sequence/space`` indexes, which make a file one of sequences."""
-    _create_texts(file.create_group("sequence"), "space_names", space_names)
-
-
-def write_hand(group: h5py.Group, hand: HandRecord) -> None:
-    """Write a hand into its empty group."""
+def write_models(file: h5py.File, hand: HandRecord, objects: Sequence[ObjectRecord]) -> None:
+    """Write the groups of a hand and of objects."""
+    group = file.create_group("hand")
     group.attrs["base_link"] = hand.base_link
     group.create_dataset("urdf", data=hand.urdf, dtype=h5py.string_dtype())
     _create_texts(group, "joint_names", hand.joint_names)
     _create_texts(group, "link_names", hand.link_names)
-    create_array(group, "joint_lower", np.asarray(hand.joint_lower, dtype="f4"))
-    create_array(group, "joint_upper", np.asarray(hand.joint_upper, dtype="f4"))
+    create_array(group, "joint_lower", hand.joint_lower, "f4")
+    create_array(group, "joint_upper", hand.joint_upper, "f4")
     for number, (mesh_path, blob) in enumerate(hand.meshes.items()):
-        dataset = create_array(group, f"meshes/{number}", np.frombuffer(blob, dtype="u1"))
-        dataset.attrs["path"] = mesh_path
+        create_array(group, f"meshes/{number}", np.frombuffer(blob, "u1"), "u1").attrs["path"] = mesh_path
+    for o in objects:
+        group = file.create_group(f"objects/{o.id}")
+        group.attrs.update(name=o.name, scale=float(o.scale), sha256=o.sha256, watertight=bool(o.watertight))
+        create_array(group, "vertices", o.vertices, "f4")
+        create_array(group, "faces", o.faces, "i4")
+        if o.normals is not None:
+            create_array(group, "normals", o.normals, "f4")
 
 
-def write_object(group: h5py.Group, record: ObjectRecord) -> None:
-    """Write an object into its empty group."""
-    group.attrs.update(
-        name=record.name, scale=float(record.scale), sha256=record.sha256, watertight=bool(record.watertight)
-    )
-    create_array(group, "vertices", np.asarray(record.vertices, dtype="f4"))
-    create_array(group, "faces", np.asarray(record.faces, dtype="i4"))
-    if record.normals is not None:
-        create_array(group, "normals", np.asarray(record.normals, dtype="f4"))
-
-
-def create_rows(file: h5py.File, name: str, shape, dtype, *, unit: str = "", protocol: str = "") -> h5py.Dataset:
+def create_rows(file: h5py.File, name: str, shape: Sequence[int], dtype: np.dtype, text: str = "") -> h5py.Dataset:
     """Make one empty row dataset, chunked along its rows.
 
     Args:
@@ -118,16 +113,13 @@ def create_rows(file: h5py.File, name: str, shape, dtype, *, unit: str = "", pro
         name: Flat name as in :meth:`GraspRows.columns`.
         shape: Full shape, rows first.
         dtype: NumPy dtype.
-        unit: Unit, for a metric.
-        protocol: Protocol, for a physics verdict.
+        text: Unit of a metric, protocol of a physics verdict.
     """
     path = GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"
     chunks = (min(shape[0], CHUNK_ROWS), *shape[1:])
     dataset = file.create_dataset(path, shape, dtype, **(_filters(chunks) if np.prod(shape) else {}))
-    if name.startswith("metrics/"):
-        dataset.attrs["unit"] = unit
-    elif name.startswith("physics/"):
-        dataset.attrs["protocol"] = protocol
+    if name.startswith(("metrics/", "physics/")):
+        dataset.attrs["unit" if name.startswith("metrics/") else "protocol"] = text
     return dataset
 
 
@@ -137,20 +129,20 @@ def finish(file: h5py.File) -> None:
     file.attrs["text_sha256"] = text_sha256(file)
 
 
+def create_array(group: h5py.Group, name: str, data: Any, dtype: Any) -> h5py.Dataset:
+    """A dataset in one chunk (HDF5 allows none for an empty one)."""
+    data = np.asarray(data, dtype)
+    return group.create_dataset(name, data=data, **(_filters(data.shape) if data.size else {}))
+
+
 def _filters(chunks: tuple[int, ...]) -> dict[str, Any]:
     return {"chunks": chunks, "compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 
 
-def create_array(group: h5py.Group, name: str, data: np.ndarray) -> h5py.Dataset:
-    """A dataset in one chunk (HDF5 allows none for an empty one)."""
-    return group.create_dataset(name, data=data, **(_filters(data.shape) if data.size else {}))
-
-
-def _create_texts(group: h5py.Group, name: str, texts: Any) -> None:
+def _create_texts(group: h5py.Group, name: str, texts: Sequence[str]) -> None:
     """Strings of fixed length, which the checksum covers (those of variable length live outside the chunk)."""
     encoded = [text.encode() for text in texts]
-    dtype = h5py.string_dtype("utf-8", max((len(e) for e in encoded), default=1) or 1)
-    create_array(group, name, np.array(encoded, dtype=dtype))
+    create_array(group, name, encoded, h5py.string_dtype("utf-8", max((len(e) for e in encoded), default=1) or 1))
 
 
 def _as_format(rows: GraspRows, *, where: Any) -> GraspRows:

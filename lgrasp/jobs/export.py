@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from lgrasp.dataset import ObjectRecord, find_shards
-from lgrasp.dataset.exports import export_shards
+from lgrasp.dataset.exports.formats import export_shards
 from lgrasp.dataset.exports.mjcf import Cut
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field, PrivateAttr
 
-from lgrasp.dataset.extend import check_shard, extend_shard
+from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.metrics import METRICS, TASK_ROWS, is_extended, measure_shard, process_map
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
@@ -46,7 +46,6 @@ class MetricsJob(ShardJob):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
-        check_shard(part.source)
         workers = self.workers or os.cpu_count() or 1
         if self._each is None:
             self._each = self._open.enter_context(process_map(workers))

@@ -9,9 +9,10 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.files import check_heaps, new_shard_file
-from lgrasp.dataset.reader import FileReader, open_hdf5, reading
-from lgrasp.dataset.structure import format_problems, schema_problems, text_sha256
-from lgrasp.dataset.writer import create_array, finish, write_hand, write_object
+from lgrasp.dataset.reader import FileReader, reading
+from lgrasp.dataset.structure import format_problems, schema_problems
+from lgrasp.dataset.validate import file_problems
+from lgrasp.dataset.writer import create_array, finish, write_models
 from lgrasp.errors import ShardError
 from lgrasp.scenes.camera import Intrinsics
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord, scene_problems
@@ -106,15 +107,7 @@ def read_scene(path: str | os.PathLike[str]) -> SceneRecord:
 
 def check_scene(path: str | os.PathLike[str]) -> list[str]:
     """All problems of a scene, one line each; an empty list means that it conforms. Every byte is read."""
-    try:
-        check_heaps(path)
-        with open_hdf5(path) as file, reading(path):
-            problems = _structure_problems(file)
-            if not problems and file.attrs["text_sha256"] != text_sha256(file):
-                problems = ["/: attributes or texts were changed after writing (text_sha256 differs)"]
-        return problems or scene_problems(read_scene(path))
-    except ShardError as error:
-        return [str(error).removeprefix(f"{path}: ")]
+    return file_problems(path, _structure_problems, lambda path: scene_problems(read_scene(path)))
 
 
 def _structure_problems(file: h5py.File) -> list[str]:
@@ -161,11 +154,14 @@ def write_scene(path: str | os.PathLike[str], scene: SceneRecord) -> None:
             hand=scene.hand.name,
             hand_sha256=scene.hand.sha256,
         )
-        write_hand(file.create_group("hand"), scene.hand)
-        for record in scene.objects:
-            write_object(file.create_group(f"objects/{record.id}"), record)
+        write_models(file, scene.hand, scene.objects)
         for name in ("scene", "views", "cloud", "grasps"):
-            _write_group(file.create_group(name), scene if name == "scene" else getattr(scene, name))
+            file.create_group(name)
+        for spec in DATASETS:
+            group, _, name = spec.path.partition("/")
+            if group in ("scene", "views", "cloud", "grasps"):
+                values = getattr(scene if group == "scene" else getattr(scene, group), name)
+                create_array(file[group], name, values, spec.numpy)
         file["scene"].attrs["table"] = float(scene.table)
         camera = scene.views.intrinsics
         file["views"].attrs.update(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
@@ -175,11 +171,3 @@ def write_scene(path: str | os.PathLike[str], scene: SceneRecord) -> None:
         problems = schema_problems(file, DATASETS, ATTRIBUTES)
         if problems:
             raise ShardError(f"cannot write {path}: {problems[0]}")
-
-
-def _write_group(group: h5py.Group, record: Any) -> None:
-    """Write the arrays of a record that the format names in this group."""
-    for spec in DATASETS:
-        where, _, name = spec.path.partition("/")
-        if where == group.name[1:]:
-            create_array(group, name, np.asarray(getattr(record, name)).astype(spec.numpy))

@@ -10,9 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from lgrasp.dataset import GraspDataset, ShardReader, describe, merge_shards, read_shard, validate_shard, write_shard
+from lgrasp.dataset import ShardReader, describe, merge_shards, read_shard, validate_shard, write_shard
 from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.metrics import METRICS
+from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.engine.run import run
 from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import SEQUENCE_DATASETS

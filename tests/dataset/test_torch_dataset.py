@@ -7,7 +7,8 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from lgrasp.dataset import GraspDataset, read_shard, write_shard
+from lgrasp.dataset import read_shard, write_shard
+from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.errors import ShardError
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from lgrasp.dataset.exports.folder import GRASPS, OBJECTS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_object
-from lgrasp.dataset.exports.reading import GraspSet, ReadObject, open_folder, order_of
+from lgrasp.dataset.exports.reading import GraspSet, open_folder
 from lgrasp.dataset.exports.selection import Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import compose, inverse
@@ -36,7 +36,7 @@ def write_dexgraspbench(selection: Selection, frames: HandFrames, out: Path, adv
     """Write ``grasps/CODE/NUMBER.npy`` for every row, numbered over the whole export."""
     for batch in selection.batches():
         pose = frames.root_in_object(batch.object_pose[:, 0], batch.q)  # (n, 7)
-        postures = [np.concatenate([pose, q], -1) for q in (batch.q, batch.q_pregrasp, batch.q_squeeze)]
+        postures = [np.concatenate([pose, q], -1) for q in batch.postures]
         for row, number in enumerate(batch.number):
             code = selection.objects[batch.object_index[row, 0]].code
             entry = {
@@ -53,41 +53,31 @@ def write_dexgraspbench(selection: Selection, frames: HandFrames, out: Path, adv
 def read_dexgraspbench(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
     """Read an export, a folder of .npy files of one grasp each, or one such file, by whichever program it was written.
 
-    The hand's pose is that of ``grasp_qpos``; a hand that moves between the postures is not represented.
-
-    Files without ``joint_names`` are taken to be in the order wanted. Arguments and errors as of
+    The hand's pose is that of ``grasp_qpos``; a hand that moves between the postures is not represented. Files without
+    ``joint_names`` are taken to be in the order wanted. Arguments and errors as of
     :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
-    folder = open_folder(Path(path), ".npy", "dexgraspbench")
-    names = tuple(joint_names or folder.joint_names or ())
-    objects: list[ReadObject] = []
+    folder = open_folder(path, ".npy", "dexgraspbench", joint_names)
     index, root, q, world = [], [], [], []
     for file in folder.files:
         entry = next(iter(load_objects(file)), None)
         if not isinstance(entry, dict):
             raise ShardError(f"{file}: no dictionary of one grasp")
-        listed = tuple(map(str, entry.get("joint_names", folder.joint_names or names)))
-        names = names or listed
-        if not names:
+        listed = tuple(map(str, entry.get("joint_names", folder.joint_names or folder.wanted)))
+        if not listed and not folder.wanted:
             raise ShardError(f"{file}: does not name its joints; give joint_names")
-        order = order_of(listed, names, file)
-        postures = [_numbers(entry, posture, 7 + len(names), file) for posture in _POSTURES]
+        order = folder.order(listed, file)
+        postures = [_numbers(entry, posture, 7 + len(order), file) for posture in _POSTURES]
         root.append(postures[0][:7])
         q.append([values[7:][order] for values in postures])
         world.append(_numbers(entry, "obj_pose", 7, file))
         if not (world[-1][3:].any() and root[-1][3:].any()):
             raise ShardError(f"{file}: a quaternion is 0 0 0 0; one of unit length is accepted")
-        scale = float(_numbers(entry, "obj_scale", 1, file)[0])
-        index.append(folder.place(objects, _code(entry, file), scale))
-    in_object = compose(inverse(np.array(world)), np.array(root))
-    return folder.rows(names, objects, np.array(q), in_object, index)
-
-
-def _code(entry: dict[str, Any], file: Path) -> str:
-    path = entry.get("obj_path")
-    if not isinstance(path, str):
-        raise ShardError(f"{file}: obj_path is {path!r}, expected the path of a mesh")
-    return Path(path).stem
+        scale, mesh = float(_numbers(entry, "obj_scale", 1, file)[0]), entry.get("obj_path")
+        if not isinstance(mesh, str):
+            raise ShardError(f"{file}: obj_path is {mesh!r}, expected the path of a mesh")
+        index.append(folder.place(Path(mesh).stem, scale))
+    return folder.single(np.array(q), compose(inverse(np.array(world)), np.array(root)), index)
 
 
 def _numbers(entry: dict[str, Any], key: str, count: int, file: Path) -> np.ndarray:

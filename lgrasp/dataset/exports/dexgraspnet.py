@@ -9,7 +9,7 @@ import numpy as np
 from lgrasp.dataset.exports.folder import GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_objects
-from lgrasp.dataset.exports.reading import GraspSet, ReadObject, open_folder, order_of
+from lgrasp.dataset.exports.reading import GraspSet, open_folder
 from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import euler_from_quaternion, quaternion_from_euler
@@ -42,8 +42,7 @@ def _entries(batch: Batch, frames: HandFrames) -> Iterator[dict[str, Any]]:
     pose = frames.root_in_object(batch.object_pose[:, 0], batch.q)  # (n, 7)
     wrist = np.concatenate([pose[:, :3], euler_from_quaternion(pose[:, 3:])], -1)  # (n, 6)
     names = (*_WRIST, *frames.joint_names)
-    postures = [np.concatenate([wrist, q], -1).tolist() for q in (batch.q, batch.q_pregrasp, batch.q_squeeze)]
-    for values in zip(*postures, strict=True):
+    for values in zip(*(np.concatenate([wrist, q], -1).tolist() for q in batch.postures), strict=True):
         qpos = (dict(zip(names, v, strict=True)) for v in values)
         yield {"scale": 1.0} | dict(zip(_POSTURES, qpos, strict=True))
 
@@ -51,45 +50,33 @@ def _entries(batch: Batch, frames: HandFrames) -> Iterator[dict[str, Any]]:
 def read_dexgraspnet(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
     """Read an export, a folder of ``CODE.npy``, or one such file, by whichever program it was written.
 
-    What lacks ``qpos_pregrasp`` or ``qpos_squeeze`` gets the joints of the grasp there.
-
-    Arguments and errors as of :func:`~lgrasp.dataset.exports.formats.read_grasps`.
+    What lacks ``qpos_pregrasp`` or ``qpos_squeeze`` gets the joints of the grasp there. Arguments and errors as of
+    :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
-    folder = open_folder(Path(path), ".npy", "dexgraspnet")
-    names = tuple(joint_names or folder.joint_names or ())
-    objects: list[ReadObject] = []
+    folder = open_folder(path, ".npy", "dexgraspnet", joint_names)
     index, values = [], []
     for file in folder.files:
         for number, entry in enumerate(load_objects(file)):
             where = f"{file}: entry {number}"
-            names = names or _joints(entry, where)
-            values.append([_row(entry, posture, names, where) for posture in _POSTURES])
-            index.append(folder.place(objects, file.stem, _scale(entry, where)))
-    table = np.array(values, np.float64).reshape(len(values), 3, len(_WRIST) + len(names))
+            if not isinstance(entry, dict) or not isinstance(entry.get("qpos"), dict):
+                raise ShardError(f"{where}: no dictionary with 'qpos', a dictionary of joint values")
+            folder.order([name for name in entry["qpos"] if name not in _WRIST], where)
+            values.append([_row(entry, posture, (*_WRIST, *folder.wanted), where) for posture in _POSTURES])
+            try:
+                scale = float(entry.get("scale", 1.0))
+            except (TypeError, ValueError):
+                raise ShardError(f"{where}: scale is {entry['scale']!r}, expected a number") from None
+            index.append(folder.place(file.stem, scale))
+    table = np.array(values, np.float64).reshape(len(values), 3, len(_WRIST) + len(folder.wanted))
     wrist, q = table[:, 0, :6], table[:, :, 6:]
-    pose = np.concatenate([wrist[:, :3], quaternion_from_euler(wrist[:, 3:])], -1)
-    return folder.rows(names, objects, q, pose, index)
+    return folder.single(q, np.concatenate([wrist[:, :3], quaternion_from_euler(wrist[:, 3:])], -1), index)
 
 
-def _joints(entry: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(entry, dict) or not isinstance(entry.get("qpos"), dict):
-        raise ShardError(f"{where}: no dictionary with 'qpos', a dictionary of joint values")
-    return tuple(name for name in entry["qpos"] if name not in _WRIST)
-
-
-def _scale(entry: Any, where: str) -> float:
-    try:
-        return float(entry.get("scale", 1.0))
-    except (TypeError, ValueError):
-        raise ShardError(f"{where}: scale is {entry['scale']!r}, expected a number") from None
-
-
-def _row(entry: Any, posture: str, names: tuple[str, ...], where: str) -> list[float]:
+def _row(entry: dict[str, Any], posture: str, names: tuple[str, ...], where: str) -> list[float]:
     """Wrist and joints of one posture."""
-    order_of(_joints(entry, where), names, where)
     values = entry.get(posture, entry["qpos"])
     try:
-        row = [float(values[name]) for name in (*_WRIST, *names)]
+        row = [float(values[name]) for name in names]
     except KeyError as error:
         raise ShardError(f"{where}: {posture} has no {error}") from None
     except (TypeError, ValueError) as error:

@@ -1,9 +1,7 @@
 """The parts of an export other than its grasps: the hand, the meshes, a README, and an index that is written last."""
 
 import json
-import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 from trimesh import Trimesh
@@ -12,7 +10,7 @@ from trimesh.exchange.obj import export_obj
 import lgrasp
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.selection import ExportObject, Selection
-from lgrasp.dataset.files import new_file
+from lgrasp.dataset.files import write_file
 from lgrasp.errors import OutputError
 
 
@@ -22,45 +20,16 @@ def check_empty(out: Path) -> None:
     Raises:
         OutputError: It holds something, is a file, or cannot be read.
     """
+    rule = "--out needs an empty folder, or one that does not exist"
     try:
-        first = next(iter(sorted(os.listdir(out))), None)
+        for first in sorted(path.name for path in out.iterdir()):
+            raise OutputError(f"{out} is not empty (it holds {first}); {rule}")
     except FileNotFoundError:
         return
     except NotADirectoryError:
-        raise OutputError(f"{out} is a file; --out needs an empty folder, or one that does not exist") from None
+        raise OutputError(f"{out} is a file; {rule}") from None
     except OSError as error:
         raise OutputError(f"{out}: {error.strerror or error}") from error
-    if first is not None:
-        raise OutputError(
-            f"{out} is not empty (it holds {first}); --out needs an empty folder, or one that does not exist"
-        )
-
-
-@contextmanager
-def writing(path: Path, *, flush: bool = True) -> Iterator[Callable[[bytes], None]]:
-    """A function that appends bytes to a file, which appears under its name when the block ends without an error.
-
-    Raises:
-        OutputError: The folder cannot be written or is full.
-    """
-    with new_file(path, flush=flush) as file:
-
-        def write(data: bytes) -> None:
-            rest = memoryview(data)
-            while rest:  # an unbuffered file may take a part only
-                rest = rest[file.write(rest) :]
-
-        yield write
-
-
-def write_file(path: Path, data: bytes | str, *, flush: bool = True) -> None:
-    """Write a whole file; text is UTF-8. ``flush`` as of :func:`~lgrasp.dataset.files.new_file`.
-
-    Raises:
-        OutputError: The folder cannot be written or is full.
-    """
-    with writing(path, flush=flush) as write:
-        write(data.encode() if isinstance(data, str) else data)
 
 
 HAND, OBJECTS, GRASPS = "hand", "objects", "grasps"
@@ -75,23 +44,22 @@ def write_assets(out: Path, selection: Selection) -> None:
         ShardError: A shard lacks a mesh of its hand.
         OutputError: The folder cannot be written.
     """
-    files = hand_files(selection.hand, selection.shards[0])
-    for name, data in files.items():
+    for name, data in hand_files(selection.hand, selection.shards[0]).items():
         write_file(out / HAND / name, data)
     for item in selection.objects:
         write_file(out / OBJECTS / f"{item.code}.obj", object_text(item))
 
 
 def object_text(item: ExportObject) -> str:
-    """The mesh of an object as OBJ, in metres.
-
-    Raises:
-        ShardError: The shard is damaged.
-    """
+    """The mesh of an object as OBJ, in metres."""
     record = item.mesh()
-    mesh = Trimesh(record.vertices, record.faces, process=False)
     header = f"{record.name}, metres, as grasped"
-    return export_obj(mesh, include_normals=False, include_texture=False, header=header, digits=9)
+    return mesh_text(Trimesh(record.vertices, record.faces, process=False), header=header)
+
+
+def mesh_text(mesh: Trimesh, **options: str) -> str:
+    """A mesh as OBJ: vertices and faces only."""
+    return export_obj(mesh, include_normals=False, include_texture=False, digits=9, **options)
 
 
 def write_index(
@@ -164,12 +132,9 @@ def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Seq
     """
     width = max(map(len, frames.joint_names))
     limits = zip(frames.joint_names, selection.hand.joint_lower, selection.hand.joint_upper, strict=True)
-    joints = [
-        f"  {i:3d}  {name:{width}s}  {lower:8.4f} to {upper:.4f}" for i, (name, lower, upper) in enumerate(limits)
-    ]
     mimics = [f"  {name} = {m:g} * {source} + {b:g}" for name, (source, m, b) in frames.mimics.items()]
     heading = "Joints that follow others (<mimic> in hand.urdf), which have no value of their own:"
-    counts = (f"{item.code} ({count:,})" for item, count in zip(selection.objects, selection.counts, strict=True))
+    counts = zip(selection.objects, selection.counts, strict=True)
     return _TEXT.format(
         rows=selection.rows,
         hand=selection.hand.name,
@@ -177,9 +142,9 @@ def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Seq
         chosen=f", only rows with {' and '.join(conditions)}" if conditions else "",
         hand_folder=HAND,
         objects_folder=OBJECTS,
-        objects=_few(list(counts)),
+        objects=_few([f"{item.code} ({count:,})" for item, count in counts]),
         notes=notes.format(root=frames.root, base=frames.base),
-        joints="\n".join(joints),
+        joints="\n".join(f"  {i:3d}  {name:{width}s}  {a:8.4f} to {b:.4f}" for i, (name, a, b) in enumerate(limits)),
         mimics="\n".join(["", heading, *mimics, ""]) if mimics else "",
     )
 

@@ -8,20 +8,19 @@ from typing import NamedTuple
 
 from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgraspbench, write_dexgraspbench
 from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
-from lgrasp.dataset.exports.folder import check_empty, readme, write_assets, write_file, write_index
+from lgrasp.dataset.exports.folder import check_empty, readme, write_assets, write_index
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
 from lgrasp.dataset.exports.reading import GraspSet
 from lgrasp.dataset.exports.selection import Selection, parse_condition, select_rows
-from lgrasp.dataset.files import Paths, find_shards
+from lgrasp.dataset.files import Paths, find_shards, write_file
 from lgrasp.errors import ConfigError
 
 
 class Format(NamedTuple):
     """A format of another program."""
 
-    summary: str
     single: bool
     """True if every grasp has one object."""
     notes: str
@@ -40,20 +39,10 @@ def _plain(write: Callable[[Selection, HandFrames, Path, Callable[[int], None]],
 
 
 FORMATS = {
-    "dexgraspnet": Format(
-        "one .npy per object, Euler angles", True, DEXGRASPNET_NOTES, _plain(write_dexgraspnet), read_dexgraspnet
-    ),
-    "dexgraspbench": Format(
-        "one .npy per grasp, the layout of BODex",
-        True,
-        DEXGRASPBENCH_NOTES,
-        _plain(write_dexgraspbench),
-        read_dexgraspbench,
-    ),
-    "isaac-grasp": Format(
-        "one YAML per object, isaac_grasp 1.0", True, ISAAC_GRASP_NOTES, _plain(write_isaac_grasp), read_isaac_grasp
-    ),
-    "mjcf": Format("one MuJoCo scene per grasp", False, MJCF_NOTES, MjcfWriter, read_mjcf),
+    "dexgraspnet": Format(True, DEXGRASPNET_NOTES, _plain(write_dexgraspnet), read_dexgraspnet),
+    "dexgraspbench": Format(True, DEXGRASPBENCH_NOTES, _plain(write_dexgraspbench), read_dexgraspbench),
+    "isaac-grasp": Format(True, ISAAC_GRASP_NOTES, _plain(write_isaac_grasp), read_isaac_grasp),
+    "mjcf": Format(False, MJCF_NOTES, MjcfWriter, read_mjcf),
 }
 """Formats by the name that ``--to`` takes."""
 

@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -52,9 +52,13 @@ def _file_name(path: str, taken: dict[str, str]) -> str:
     """``meshes/`` and the last part of a mesh's path, with a number if another mesh has that name."""
     pure = PurePosixPath(path.replace("\\", "/"))
     stem = re.sub(r"[^A-Za-z0-9_.-]+", "_", pure.stem).lstrip(".") or "mesh"
-    suffix = re.sub(r"[^A-Za-z0-9.]+", "", pure.suffix)
-    used = {name.casefold() for name in taken.values()}
-    tries = (f"meshes/{stem}{number}{suffix}" for number in ("", *(f"_{n}" for n in range(2, len(taken) + 3))))
+    return free_name(f"meshes/{stem}", re.sub(r"[^A-Za-z0-9.]+", "", pure.suffix), set(taken.values()))
+
+
+def free_name(stem: str, suffix: str, taken: Iterable[str]) -> str:
+    """The first of STEM, STEM_2, STEM_3, ... with a suffix that is not taken, in whatever case."""
+    used = {name.casefold() for name in taken}
+    tries = (f"{stem}{number}{suffix}" for number in ("", *(f"_{n}" for n in range(2, len(used) + 3))))
     return next(name for name in tries if name.casefold() not in used)
 
 
@@ -89,9 +93,9 @@ class HandFrames:
         joints = self._urdf.joint_map
         if self.base not in self._urdf.link_map:
             raise ShardError(f"{where}: its URDF has no link {self.base!r}, the base link")
-        missing = [name for name in joint_names if name not in joints]
-        if missing:
-            raise ShardError(f"{where}: its URDF has no joint {missing[0]!r}, a column of q")
+        for name in joint_names:
+            if name not in joints:
+                raise ShardError(f"{where}: its URDF has no joint {name!r}, a column of q")
         self.mimics: dict[str, tuple[str, float, float]] = {
             name: (j.mimic.joint, 1.0 if j.mimic.multiplier is None else j.mimic.multiplier, j.mimic.offset or 0.0)
             for name, j in joints.items()
@@ -113,8 +117,7 @@ class HandFrames:
             Shape [n, 7], x y z [m] qw qx qy qz.
         """
         if not self._columns:
-            identity = np.broadcast_to(np.eye(4), (1, 4, 4)) if self.base == self.root else self._transform({})
-            return np.repeat(pose_from_matrix(identity), len(q), axis=0)
+            return np.repeat(pose_from_matrix(self._transform({})), len(q), axis=0)
         settings, which = np.unique(q[:, self._columns], axis=0, return_inverse=True)
         names = [self.joint_names[i] for i in self._columns]
         transforms = [self._transform(dict(zip(names, setting, strict=True))) for setting in settings]

@@ -3,15 +3,15 @@
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
 
-from lgrasp.dataset.exports.folder import GRASPS, writing
+from lgrasp.dataset.exports.folder import GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.dataset.exports.reading import GraspSet, ReadObject, make_set, open_folder, order_of
+from lgrasp.dataset.exports.reading import GraspSet, open_folder
 from lgrasp.dataset.exports.selection import Batch, Selection
+from lgrasp.dataset.files import new_file, parsing
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 
@@ -38,10 +38,10 @@ def write_isaac_grasp(selection: Selection, frames: HandFrames, out: Path, advan
         head = {"format": "isaac_grasp", "format_version": 1.0}
         head |= {"object_frame_link": item.code, "gripper_frame_link": frames.base}
         head |= {"object_frame": item.code, "gripper_frame": frames.base}
-        with writing(out / GRASPS / f"{item.code}.yaml") as write:
-            write(yaml.safe_dump(head, sort_keys=False, allow_unicode=True).encode() + b"grasps:\n")
+        with new_file(out / GRASPS / f"{item.code}.yaml") as file:
+            file.write(yaml.safe_dump(head, sort_keys=False, allow_unicode=True).encode() + b"grasps:\n")
             for batch in selection.batches(place, advance):
-                write(_entries(batch, frames).encode())
+                file.write(_entries(batch, frames).encode())
 
 
 def _entries(batch: Batch, frames: HandFrames) -> str:
@@ -56,35 +56,36 @@ def _entries(batch: Batch, frames: HandFrames) -> str:
             f"    confidence: {batch.holds[row]:.1f}",
             f"    position: [{x}, {y}, {z}]",
             f"    orientation: {{w: {w}, xyz: [{', '.join(v)}]}}",
+            *(f"    {name}: {{{form % tuple(q[row])}}}" for name, q in zip(_POSTURES, batch.postures, strict=True)),
         ]
-        postures = (batch.q[row], batch.q_pregrasp[row], batch.q_squeeze[row])
-        lines += [f"    {name}: {{{form % tuple(q)}}}" for name, q in zip(_POSTURES, postures, strict=True)]
     return "\n".join(lines) + "\n"
 
 
 def read_isaac_grasp(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
     """Read an export, a folder of YAML files, or one such file, by whichever program it was written.
 
-    What lacks a posture gets the joints of the grasp there. Names and confidences of grasps are not kept.
-
-    Arguments and errors as of :func:`~lgrasp.dataset.exports.formats.read_grasps`.
+    What lacks a posture gets the joints of the grasp there. Names and confidences of grasps are not kept. Arguments
+    and errors as of :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
-    folder = open_folder(Path(path), ".yaml", "isaac-grasp")
-    names = tuple(joint_names or folder.joint_names or ())
-    objects: list[ReadObject] = []
+    folder = open_folder(path, ".yaml", "isaac-grasp", joint_names)
     index, poses, q = [], [], []
     for file in folder.files:
-        place = folder.place(objects, file.stem, 1.0)
-        for name, entry in _load(file).items():
+        with parsing(file, "an isaac_grasp file", (yaml.YAMLError, KeyError, TypeError, ValueError)):
+            document = yaml.load(file.read_bytes(), Loader=_Loader)
+            version = document["format"], float(document["format_version"])
+            grasps = document["grasps"]
+        if version != ("isaac_grasp", 1.0) or not isinstance(grasps, dict):
+            raise ShardError(f"{file}: is {version[0]} {version[1]}, expected isaac_grasp 1.0 with a mapping of grasps")
+        place = folder.place(file.stem)
+        for name, entry in grasps.items():
             where = f"{file}: {name}"
             try:
-                names = names or tuple(map(str, entry["cspace_position"]))
-                turn = entry["orientation"]
+                turn, at_grasp = entry["orientation"], entry["cspace_position"]
                 poses.append([float(x) for x in (*entry["position"], turn["w"], *turn["xyz"])])
-                postures = [entry.get(posture, entry["cspace_position"]) for posture in _POSTURES]
+                postures = [entry.get(posture, at_grasp) for posture in _POSTURES]
                 for joints in postures:
-                    order_of(list(joints), names, where)
-                q.append([[float(joints[joint]) for joint in names] for joints in postures])
+                    folder.order(list(map(str, joints)), where)
+                q.append([[float(joints[joint]) for joint in folder.wanted] for joints in postures])
             except KeyError as error:
                 raise ShardError(f"{where}: has no {error}") from None
             except (TypeError, ValueError, AttributeError) as error:
@@ -94,20 +95,6 @@ def read_isaac_grasp(path: Path | str, *, joint_names: Sequence[str] | None = No
             if not any(poses[-1][3:]):
                 raise ShardError(f"{where}: orientation is 0 0 0 0; a quaternion of unit length is accepted")
             index.append([place])
-    joints = np.array(q, np.float64).reshape(-1, 3, len(names))
     pose = inverse(np.array(poses, np.float64).reshape(-1, 7))
-    return make_set(names, objects, joints, pose[:, None], np.array(index, int).reshape(-1, 1))
-
-
-def _load(file: Path) -> dict[str, Any]:
-    try:
-        document = yaml.load(file.read_bytes(), Loader=_Loader)
-        version = document["format"], float(document["format_version"])
-        grasps = document["grasps"]
-    except OSError as error:
-        raise ShardError(f"{file}: {error.strerror or error}") from error
-    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-        raise ShardError(f"{file}: not an isaac_grasp file: {' '.join(str(error).split())[:200]}") from None
-    if version != ("isaac_grasp", 1.0) or not isinstance(grasps, dict):
-        raise ShardError(f"{file}: is {version[0]} {version[1]}, expected isaac_grasp 1.0 with a mapping of grasps")
-    return grasps
+    joints = np.array(q, np.float64).reshape(-1, 3, len(folder.wanted))
+    return folder.rows(joints, pose[:, None], np.array(index, int).reshape(-1, 1))

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 from trimesh import Trimesh
-from trimesh.exchange.obj import export_obj
 
-from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, object_text, write_file
+from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, mesh_text, object_text
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.mjcf_scene import Keyframe, MjcfScene, SceneObject
-from lgrasp.dataset.exports.reading import GraspSet, ReadObject, make_set, open_folder, order_of
-from lgrasp.dataset.exports.selection import Batch, Selection
+from lgrasp.dataset.exports.reading import GraspSet, open_folder, order_of
+from lgrasp.dataset.exports.selection import Selection
+from lgrasp.dataset.files import parsing, write_file
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 from lgrasp.grasp.records import ObjectRecord
@@ -50,11 +50,12 @@ class MjcfWriter:
     Args:
         selection: Rows of one or several objects.
         frames: The selection's hand.
-        cut: Convex pieces of an object, vertices [m] of each, shape [V, 3]; without it the hull of its mesh collides.
+        cut: Convex pieces of an object; without it the hull of its mesh collides.
 
     Raises:
-        PhysicsError: MuJoCo is not installed, or refuses the hand or an object of the first row.
+        PhysicsError: MuJoCo is not installed, or refuses the hand or an object, of the first row at once.
         ShardError: A shard is damaged.
+        OutputError: The folder cannot be written.
     """
 
     def __init__(self, selection: Selection, frames: HandFrames, cut: Cut | None = None) -> None:
@@ -66,31 +67,22 @@ class MjcfWriter:
         self._scene(tuple(index[index >= 0].tolist()))
 
     def __call__(self, out: Path, advance: Callable[[int], None]) -> None:
-        """Write into the folder of an export.
-
-        Args:
-            out: The folder.
-            advance: Called with numbers of rows that are done.
-
-        Raises:
-            PhysicsError: MuJoCo refuses an object.
-            ShardError: A shard is damaged.
-            OutputError: The folder cannot be written.
-        """
+        """Write into the folder of an export, calling ``advance`` with numbers of rows that are done."""
+        frames = self._frames
         for place in range(len(self._selection.objects)):
             for name, data in self._object(place).pieces.items():
                 write_file(out / name, data)
         for batch in self._selection.batches():
-            poses = _in_root(batch, self._frames)  # (n, O, 7)
-            joints = [self._frames.all_joints(values) for values in (batch.q, batch.q_pregrasp)]
+            in_root = [inverse(frames.root_in_object(pose, batch.q)) for pose in np.moveaxis(batch.object_pose, 1, 0)]
+            poses = np.stack(in_root, axis=1)  # (n, O, 7), NaN where absent
+            joints = [frames.all_joints(values) for values in (batch.q, batch.q_pregrasp)]
             for row, number in enumerate(batch.number):
                 present = batch.object_index[row] >= 0
                 pose, objects = poses[row, present], tuple(batch.object_index[row, present].tolist())
                 at, before = ({name: float(v[row]) for name, v in values.items()} for values in joints)
                 keys = [
-                    Keyframe(_KEYS[0], at, batch.q[row], pose),
-                    Keyframe(_KEYS[1], before, batch.q_pregrasp[row], pose),
-                    Keyframe(_KEYS[2], at, batch.q_squeeze[row], pose),
+                    Keyframe(name, posture, targets[row], pose)
+                    for name, posture, targets in zip(_KEYS, (at, before, at), batch.postures, strict=True)
                 ]
                 write_file(out / GRASPS / f"{number:08d}.xml", self._scene(objects).text(keys), flush=False)
                 advance(1)
@@ -100,64 +92,42 @@ class MjcfWriter:
 
     def _make_object(self, place: int) -> SceneObject:
         item = self._selection.objects[place]
-        found = self._cut(item.mesh()) if self._cut else ()
-        hulls = [Trimesh(vertices).convex_hull for vertices in found]
-        names = [f"{OBJECTS}/{item.code}/piece_{number:02d}.obj" for number in range(len(hulls))]
+        hulls = [Trimesh(vertices).convex_hull for vertices in (self._cut(item.mesh()) if self._cut else ())]
         return SceneObject(
             code=item.code,
             mesh=f"{OBJECTS}/{item.code}.obj",
             text=object_text(item).encode(),
-            pieces={name: _obj(hull) for name, hull in zip(names, hulls, strict=True)},
+            pieces={f"{OBJECTS}/{item.code}/piece_{i:02d}.obj": mesh_text(h).encode() for i, h in enumerate(hulls)},
             volumes=[float(hull.volume) for hull in hulls],
         )
 
 
-def _obj(mesh: Trimesh) -> bytes:
-    return export_obj(mesh, include_normals=False, include_texture=False, digits=9).encode()
-
-
-def _in_root(batch: Batch, frames: HandFrames) -> np.ndarray:
-    """``T_root_object``, shape [n, O, 7]; NaN where absent."""
-    columns = np.moveaxis(batch.object_pose, 1, 0)
-    return np.stack([inverse(frames.root_in_object(pose, batch.q)) for pose in columns], axis=1)
-
-
 def read_mjcf(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
-    """Read an export's scenes.
+    """Read an export's scenes; those by others say too little.
 
-    Args:
-        path: Export of lgrasp; scenes by others say too little.
-        joint_names: Wanted order of q; by default that of the export.
-
-    Raises:
-        ShardError: No whole export, a scene is damaged, or other joints are wanted.
+    Arguments and errors as of :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
-    folder = open_folder(Path(path), ".xml", "mjcf")
-    if folder.frames is None or folder.joint_names is None:
+    folder = open_folder(path, ".xml", "mjcf", joint_names)
+    if folder.joint_names is None:
         raise ShardError(f"{path}: no export.json in it; only scenes of a whole export can be read")
-    names = tuple(joint_names or folder.joint_names)
-    wanted = order_of(folder.joint_names, names, path)
-    objects: list[ReadObject] = []
-    q, poses, index = [], [], []
-    for file in folder.files:
-        values, seen = _read(file, folder.joint_names)
-        q.append(values)
-        poses.append([pose for _, pose in seen])
-        index.append([folder.place(objects, code, 1.0) for code, _ in seen])
-    joints = np.array(q)  # (n, 3, K)
-    width = max(map(len, index))
-    pose, place = np.full((len(index), width, 7), np.nan), np.full((len(index), width), -1)
-    for row, (some, where) in enumerate(zip(poses, index, strict=True)):
-        pose[row, : len(some)], place[row, : len(some)] = some, where
-    for column in range(width):
+    wanted = order_of(folder.joint_names, folder.wanted, path)
+    read = [_read(file, folder.joint_names) for file in folder.files]
+    joints = np.array([values for values, _ in read])  # (n, 3, K)
+    shape = len(read), max(len(seen) for _, seen in read)
+    pose, place = np.full((*shape, 7), np.nan), np.full(shape, -1)
+    for row, (_, seen) in enumerate(read):
+        for column, (code, at) in enumerate(seen):
+            pose[row, column], place[row, column] = at, folder.place(code)
+    for column in range(shape[1]):
         present = place[:, column] >= 0
         pose[present, column] = folder.object_pose(inverse(pose[present, column]), joints[present, 0])
-    return make_set(names, objects, joints[:, :, wanted], pose, place)
+    return folder.rows(joints[:, :, wanted], pose, place)
 
 
 def _read(file: Path, joint_names: Sequence[str]) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
     """Joints of grasp, pregrasp and squeeze, shape [3, K]; code and pose in the world of every object."""
-    try:
+    kinds = (etree.XMLSyntaxError, AttributeError, IndexError, KeyError, TypeError, ValueError)
+    with parsing(file, "a scene of an export", kinds):
         root = etree.fromstring(file.read_bytes(), etree.XMLParser(resolve_entities=False, no_network=True))
         keys = {key.get("name"): key for key in root.iter("key")}
         at, before = (np.array(keys[name].get("qpos").split(), float) for name in _KEYS[:2])
@@ -174,7 +144,3 @@ def _read(file: Path, joint_names: Sequence[str]) -> tuple[np.ndarray, list[tupl
         columns = [places[name] for name in joint_names]
         squeeze = targets[[drives.index(name) for name in joint_names]]
         return np.stack([at[columns], before[columns], squeeze]), objects
-    except OSError as error:
-        raise ShardError(f"{file}: {error.strerror or error}") from error
-    except (etree.XMLSyntaxError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise ShardError(f"{file}: not a scene of an export: {' '.join(str(error).split())[:200]}") from None

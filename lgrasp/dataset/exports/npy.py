@@ -9,17 +9,14 @@ import os
 import pickle
 from collections.abc import Iterable
 from io import BytesIO
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.exports.folder import write_file, writing
-from lgrasp.errors import ShardError
+from lgrasp.dataset.files import new_file, parsing, write_file
 
 _PROTOCOL = 3  # names are plain text in it, and every Python 3 reads it
-_BATCH = 1024  # objects written at once
 
 
 def save_object(path: Path, value: Any) -> None:
@@ -39,12 +36,11 @@ def save_objects(path: Path, count: int, values: Iterable[Any]) -> None:
         OutputError: The file cannot be written.
     """
     head, tail = _frame((count,))
-    rest = iter(values)
-    with writing(path) as write:
-        write(head)
-        while batch := b"".join(map(_words, islice(rest, _BATCH))):
-            write(batch)
-        write(tail)
+    with new_file(path) as file:
+        file.write(head)
+        for value in values:
+            file.write(_words(value))
+        file.write(tail)
 
 
 def load_objects(path: str | os.PathLike[str]) -> list[Any]:
@@ -53,22 +49,16 @@ def load_objects(path: str | os.PathLike[str]) -> list[Any]:
     Raises:
         ShardError: No such file, damaged, no .npy, or it holds more than numbers, texts, lists, dictionaries, arrays.
     """
-    try:
-        with open(path, "rb") as file:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(file)
-            if not dtype.hasobject:
-                raise ValueError(f"it holds numbers of type {dtype}, not objects")
-            values = _Unpickler(file, encoding="latin1").load()
-    except OSError as error:
-        raise ShardError(f"{path}: {error.strerror or error}") from error
-    except Exception as error:  # damaged pickles fail in many ways
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ShardError(f"{path}: not a .npy file of grasps: {reason}") from error
-    if not isinstance(values, np.ndarray) or values.shape != shape:
-        raise ShardError(f"{path}: not a .npy file of grasps: what it holds is not of the promised shape {shape}")
-    return values.ravel().tolist()
+    with parsing(path, "a .npy file of grasps", (Exception,)), open(path, "rb") as file:  # pickles fail in many ways
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+        if not dtype.hasobject:
+            raise ValueError(f"it holds numbers of type {dtype}, not objects")
+        values = _Unpickler(file, encoding="latin1").load()
+        if not isinstance(values, np.ndarray) or values.shape != shape:
+            raise ValueError(f"what it holds is not of the promised shape {shape}")
+        return values.ravel().tolist()
 
 
 def _frame(shape: tuple[int, ...]) -> tuple[bytes, bytes]:

@@ -2,14 +2,15 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from lgrasp.dataset.exports.folder import GRASPS, HAND, INDEX, INDEX_FORMAT, OBJECTS
 from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.files import parsing
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import canonical, inverse
 from lgrasp.grasp.records import GraspRows
@@ -37,40 +38,6 @@ class GraspSet(NamedTuple):
     link's frame where the folder names one (an export of lgrasp), else in the frame that the format gives poses of."""
 
 
-def make_set(
-    joint_names: Sequence[str],
-    objects: Sequence[ReadObject],
-    q: np.ndarray,
-    object_pose: np.ndarray,
-    object_index: np.ndarray,
-) -> GraspSet:
-    """Rows in the dtypes of a shard.
-
-    Args:
-        joint_names: Length K.
-        objects: What ``object_index`` counts in.
-        q: Joints [rad or m] at the grasp, before closing, and as targets that press, shape [n, 3, K].
-        object_pose: In the hand's frame, x y z [m] qw qx qy qz, shape [n, O, 7]; NaN where absent.
-        object_index: Shape [n, O]; -1 where absent.
-    """
-    n, width = object_index.shape
-    pose = np.concatenate([object_pose[..., :3], canonical(object_pose[..., 3:])], -1).astype(np.float32)
-    nothing = np.zeros((n, width, 0, 3), np.float32)
-    rows = GraspRows(
-        q=q[:, 0].astype(np.float32),
-        q_pregrasp=q[:, 1].astype(np.float32),
-        q_squeeze=q[:, 2].astype(np.float32),
-        object_pose=pose,
-        object_index=object_index.astype(np.int32),
-        contact_points=nothing,
-        contact_normals=nothing,
-        contact_links=np.zeros((n, width, 0), np.int16),
-        contact_forces=nothing,
-        candidate=np.arange(n, dtype=np.uint64),
-    )
-    return GraspSet(tuple(joint_names), tuple(objects), rows)
-
-
 def order_of(names: Sequence[str], wanted: Sequence[str], where: object) -> list[int]:
     """Place in ``names`` of each wanted joint.
 
@@ -84,77 +51,98 @@ def order_of(names: Sequence[str], wanted: Sequence[str], where: object) -> list
     return [list(names).index(name) for name in wanted]
 
 
-@dataclass(frozen=True)
+@dataclass
 class ExportFolder:
-    """A folder to read grasps from: an export of lgrasp, or one that another program wrote, which tells less."""
+    """A folder that grasps are read from: an export of lgrasp, or one that another program wrote, which tells less."""
 
     path: Path
     files: tuple[Path, ...]
     """Files of grasps, sorted."""
-    joint_names: tuple[str, ...] | None
+    wanted: tuple[str, ...]
+    """Order of q; those of the first grasp where nobody says."""
+    joint_names: tuple[str, ...] | None = None
     """Joints in the order of q, where the folder says so."""
-    frames: HandFrames | None
-    meshes: Mapping[str, Path]
+    frames: HandFrames | None = None
+    meshes: Mapping[str, Path] = field(default_factory=dict)
     """Mesh of each object by its code."""
+    objects: list[ReadObject] = field(default_factory=list)
+    """Those that grasps named so far."""
 
-    def place(self, objects: list[ReadObject], code: str, scale: float) -> int:
-        """Place of an object in a list, which it is added to if it is not there."""
+    def order(self, names: Sequence[str], where: object) -> list[int]:
+        """As :func:`order_of` the joints that are wanted."""
+        self.wanted = self.wanted or tuple(names)
+        return order_of(names, self.wanted, where)
+
+    def place(self, code: str, scale: float = 1.0) -> int:
+        """Place of an object in ``objects``, which it is added to if it is not there."""
         known = ReadObject(code, scale, self.meshes.get(code))
-        if known not in objects:
-            objects.append(known)
-        return objects.index(known)
-
-    def rows(
-        self, names: Sequence[str], objects: Sequence[ReadObject], q: np.ndarray, pose: np.ndarray, index: Sequence[int]
-    ) -> GraspSet:
-        """Rows of single objects: ``q`` [n, 3, K] as of :func:`make_set`, root links in the objects' frames [n, 7].
-
-        Raises:
-            ShardError: The folder has other joints.
-        """
-        order = order_of(names, self.joint_names or names, self.path)
-        in_hand = self.object_pose(pose, q[:, 0][:, order])
-        return make_set(names, objects, q, in_hand[:, None], np.array(index, int).reshape(-1, 1))
+        if known not in self.objects:
+            self.objects.append(known)
+        return self.objects.index(known)
 
     def object_pose(self, pose: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Objects in the hand's base frame, for root links in the objects' frames; both [n, 7]; q is [n, K]."""
         return inverse(pose) if self.frames is None else self.frames.object_in_base(pose, q)
 
+    def single(self, q: np.ndarray, pose: np.ndarray, index: Sequence[int]) -> GraspSet:
+        """Rows of single objects: ``q`` as of :meth:`rows`, root links in the objects' frames [n, 7].
 
-def open_folder(path: Path, suffix: str, layout: str) -> ExportFolder:
+        Raises:
+            ShardError: The folder has other joints.
+        """
+        order = order_of(self.wanted, self.joint_names or self.wanted, self.path)
+        return self.rows(q, self.object_pose(pose, q[:, 0][:, order])[:, None], np.array(index, int).reshape(-1, 1))
+
+    def rows(self, q: np.ndarray, object_pose: np.ndarray, object_index: np.ndarray) -> GraspSet:
+        """Rows in the dtypes of a shard.
+
+        Args:
+            q: Joints [rad or m] at the grasp, before closing, and as targets that press, shape [n, 3, K].
+            object_pose: In the hand's frame, x y z [m] qw qx qy qz, shape [n, O, 7]; NaN where absent.
+            object_index: Shape [n, O]; -1 where absent.
+        """
+        n, width = object_index.shape
+        pose = np.concatenate([object_pose[..., :3], canonical(object_pose[..., 3:])], -1)
+        nothing = np.zeros((n, width, 0, 3), np.float32)
+        grasps = GraspRows(
+            **dict(zip(("q", "q_pregrasp", "q_squeeze"), np.moveaxis(q, 1, 0).astype(np.float32), strict=True)),
+            object_pose=pose.astype(np.float32),
+            object_index=object_index.astype(np.int32),
+            contact_points=nothing,
+            contact_normals=nothing,
+            contact_links=np.zeros((n, width, 0), np.int16),
+            contact_forces=nothing,
+            candidate=np.arange(n, dtype=np.uint64),
+        )
+        return GraspSet(self.wanted, tuple(self.objects), grasps)
+
+
+def open_folder(path: Path | str, suffix: str, layout: str, wanted: Sequence[str] | None) -> ExportFolder:
     """Find the files of grasps in an export, in any other folder, or take a single file.
 
     Raises:
         ShardError: No such folder, no file with the suffix, an export of another format, or one that is not whole.
     """
+    path, order = Path(path), tuple(wanted or ())
     if path.is_file():
-        return ExportFolder(path, (path,), None, None, {})
+        return ExportFolder(path, (path,), order)
     if not path.is_dir():
         raise ShardError(f"{path}: no such file or folder")
-    index = path / INDEX
-    if not index.exists() and (path / HAND / "hand.urdf").exists():
+    index, urdf = path / INDEX, path / HAND / "hand.urdf"
+    if not index.exists() and urdf.exists():
         raise ShardError(f"{path}: the export is incomplete, it has no {INDEX}; export again")
     files = tuple(sorted((path / GRASPS if index.exists() else path).rglob(f"*{suffix}")))
     if not files:
         raise ShardError(f"{path}: no {suffix} file in it")
     if not index.exists():
-        return ExportFolder(path, files, None, None, {})
-    try:
+        return ExportFolder(path, files, order)
+    with parsing(index, "an index of an export", (ValueError, KeyError, TypeError)):
         document = json.loads(index.read_bytes())
-        _require(document, layout)
+        for key, value in (("format", INDEX_FORMAT), ("layout", layout)):
+            if document[key] != value:
+                raise ValueError(f"{key} is {document[key]!r}, expected {value!r}")
         hand = document["hand"]
-        urdf = (path / HAND / "hand.urdf").read_text(encoding="utf-8")
         names = tuple(map(str, hand["joint_names"]))
-        frames = HandFrames(urdf, hand["base_link"], names, path / HAND / "hand.urdf")
+        frames = HandFrames(urdf.read_text(encoding="utf-8"), hand["base_link"], names, urdf)
         meshes = {code: path / OBJECTS / f"{code}.obj" for code in document["objects"]}
-    except OSError as error:
-        raise ShardError(f"{error.filename}: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise ShardError(f"{index}: not an index of an export: {error}") from error
-    return ExportFolder(path, files, names, frames, meshes)
-
-
-def _require(document: Any, layout: str) -> None:
-    for key, value in (("format", INDEX_FORMAT), ("layout", layout)):
-        if document[key] != value:
-            raise ValueError(f"{key} is {document[key]!r}, expected {value!r}")
+    return ExportFolder(path, files, order or names, names, frames, meshes)

@@ -1,14 +1,14 @@
 """The contents of an export: which rows of which shards, chosen by conditions, in which order, of which objects."""
 
-import operator
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from lgrasp.dataset.exports.hand import free_name
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
@@ -17,16 +17,10 @@ from lgrasp.grasp.schema import CHUNK_ROWS
 OBJECTS_HELD = "objects"
 """The number of objects in the hand, as if it were a column."""
 
-_OPERATORS = {
-    ">=": operator.ge,
-    "<=": operator.le,
-    "==": operator.eq,
-    "!=": operator.ne,
-    ">": operator.gt,
-    "<": operator.lt,
-}
+_OPERATORS = {">=": np.greater_equal, "<=": np.less_equal, "==": np.equal, "!=": np.not_equal}
+_OPERATORS |= {">": np.greater, "<": np.less}
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_PATTERN = re.compile(rf"\s*([\w/.-]+?)\s*(?:(>=|<=|==|!=|>|<)\s*({_NUMBER})\s*)?", re.ASCII)
+_PATTERN = re.compile(rf"\s*([\w/.-]+?)\s*(?:({'|'.join(_OPERATORS)})\s*({_NUMBER})\s*)?", re.ASCII)
 
 
 class Condition(NamedTuple):
@@ -50,11 +44,9 @@ class Condition(NamedTuple):
             hint = " (lgrasp simulate adds physics columns)" if self.column.startswith("physics/") else ""
             known = ", ".join(single)
             raise ShardError(f"{reader.path}: no column {self.column!r}{hint}; with one number per row it has {known}")
-        if self.column == OBJECTS_HELD:
-            values = (reader.column("object_index") >= 0).sum(1)
-        else:
-            values = reader.column(self.column)
-        return np.asarray(_OPERATORS[self.operator](values, self.value)) & ~np.isnan(values.astype(np.float64))
+        held = self.column == OBJECTS_HELD
+        values = (reader.column("object_index") >= 0).sum(1) if held else reader.column(self.column)
+        return _OPERATORS[self.operator](values, self.value) & ~np.isnan(values.astype(np.float64))
 
 
 def parse_condition(text: str) -> Condition:
@@ -67,7 +59,7 @@ def parse_condition(text: str) -> Condition:
     if match is None:
         raise ConfigError(f"--where '{text}': expected COLUMN or COLUMN OP NUMBER, such as 'metrics/epsilon > 0.01'")
     column, sign, number = match.groups()
-    return Condition(column) if sign is None else Condition(column, sign, float(number))
+    return Condition(column, sign, float(number)) if sign else Condition(column)
 
 
 HOLDS = "physics/fc_holds"
@@ -106,9 +98,13 @@ class Batch(NamedTuple):
     holds: np.ndarray
     """1 where a simulator saw the grasp hold or none ran, 0 where it saw it fail, shape [n]."""
 
+    @property
+    def postures(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Joints at the grasp, before closing, and as targets that press."""
+        return self.q, self.q_pregrasp, self.q_squeeze
 
-@dataclass(frozen=True)
-class _Source:
+
+class _Source(NamedTuple):
     path: Path
     rows: np.ndarray  # chosen, ascending
     index: np.ndarray  # (n, O) of the chosen rows, in the selection's objects
@@ -189,15 +185,22 @@ def select_rows(
     """
     hand: HandRecord | None = None
     known: dict[tuple[str, str, float], ExportObject] = {}
-    parts: list[tuple[Path, np.ndarray, np.ndarray, list[int]]] = []
-    left, seen = limit, 0
+    sources: list[_Source] = []
+    chosen = seen = 0
     for path in paths:
         with ShardReader(path) as reader:
             this = reader.hand()
             hand = hand or this
-            columns = _columns(path, this, paths[0], hand)
-            keys = _objects(reader, path, known)
-            rows = _choose(reader, where)[:left]
+            if this.sha256 != hand.sha256 or sorted(this.joint_names) != sorted(hand.joint_names):
+                raise ShardError(
+                    f"{path}: another hand ({this.name}) than {paths[0]} ({hand.name}); export one at a time"
+                )
+            columns = [list(this.joint_names).index(name) for name in hand.joint_names]
+            places = np.array([*(_place(record, path, known) for record in reader.objects()), -1])  # -1: absent
+            good = np.ones(len(reader), bool)
+            for condition in where:
+                good &= condition.holds(reader)
+            rows = np.flatnonzero(good)[: None if limit is None else limit - chosen]
             seen += len(reader)
             index = reader.column("object_index")[rows]
         several = np.flatnonzero((index >= 0).sum(1) != 1)
@@ -205,81 +208,36 @@ def select_rows(
             count = int((index[several[0]] >= 0).sum())
             hint = f"choose rows with --where '{OBJECTS_HELD} == 1', or --to mjcf"
             raise ShardError(f"{path}: row {rows[several[0]]} holds {count} objects, this format one; {hint}")
-        parts.append((path, rows, keys[index], columns))
-        left = None if left is None else left - len(rows)
-        if left == 0:
+        sources.append(_Source(path, rows, places[index], columns, chosen))
+        chosen += len(rows)
+        if chosen == limit:
             break
     assert hand is not None
-    if not any(len(rows) for _, rows, *_ in parts):
+    if not chosen:
         why = f"none satisfies {' and '.join(map(str, where))}" if where and seen else "there are none"
-        of = f"{len(parts)} shard{'s' * (len(parts) > 1)}, {seen:,} rows"
+        of = f"{len(sources)} shard{'s' * (len(sources) > 1)}, {seen:,} rows"
         raise ShardError(f"{paths[0]}: no rows to export; {why} ({of})")
-    return _assemble(hand, list(known.values()), parts, single)
-
-
-def _columns(path: Path, hand: HandRecord, first_path: Path, first: HandRecord) -> list[int]:
-    """Column of q of each joint of the first shard's hand."""
-    if hand.sha256 != first.sha256 or sorted(hand.joint_names) != sorted(first.joint_names):
-        raise ShardError(f"{path}: another hand ({hand.name}) than {first_path} ({first.name}); export one at a time")
-    order = list(hand.joint_names)
-    return [order.index(name) for name in first.joint_names]
-
-
-def _objects(reader: ShardReader, path: Path, known: dict[tuple[str, str, float], ExportObject]) -> np.ndarray:
-    """Position in ``known`` of each object of a shard, which is added; -1 for the last, absent one."""
-    places = []
-    for record in reader.objects():
-        key = (record.id, record.sha256, record.scale)
-        if key not in known:
-            taken = {o.code.casefold() for o in known.values()}
-            bare = ObjectRecord(
-                id=record.id,
-                name=record.name,
-                scale=record.scale,
-                sha256=record.sha256,
-                watertight=record.watertight,
-                vertices=np.zeros((0, 3), np.float32),
-                faces=np.zeros((0, 3), np.int32),
-            )
-            known[key] = ExportObject(_code(record.id, taken), bare, path)
-        places.append(list(known).index(key))
-    return np.array([*places, -1])
-
-
-def _code(name: str, taken: set[str]) -> str:
-    safe = re.sub(r"[^A-Za-z0-9_-]+", "_", name)[:100].strip("_") or "object"
-    tries = (f"{safe}{number}" for number in ("", *(f"_{n}" for n in range(2, len(taken) + 3))))
-    return next(code for code in tries if code.casefold() not in taken)
-
-
-def _choose(reader: ShardReader, where: Sequence[Condition]) -> np.ndarray:
-    good = np.ones(len(reader), bool)
-    for condition in where:
-        good &= condition.holds(reader)
-    return np.flatnonzero(good)
-
-
-def _assemble(
-    hand: HandRecord,
-    known: list[ExportObject],
-    parts: list[tuple[Path, np.ndarray, np.ndarray, list[int]]],
-    single: bool,
-) -> Selection:
-    """Leave out objects that no chosen row holds, order the others by code, number the rows."""
-    count = np.bincount(np.concatenate([index[index >= 0] for _, _, index, _ in parts]), minlength=len(known))
-    order = sorted(np.flatnonzero(count), key=lambda i: known[i].code)
-    place = np.full(len(known) + 1, -1)
+    objects = list(known.values())
+    counts = np.bincount(np.concatenate([s.index[s.index >= 0] for s in sources]), minlength=len(objects))
+    order = sorted(np.flatnonzero(counts), key=lambda i: objects[i].code)
+    place = np.full(len(objects) + 1, -1)
     place[order] = np.arange(len(order))
-    sources, first = [], 0
-    for path, rows, index, columns in parts:
-        if len(rows):
-            sources.append(_Source(path, rows, place[index], columns, first))
-            first += len(rows)
     return Selection(
         hand=hand,
-        objects=tuple(known[i] for i in order),
-        counts=tuple(int(count[i]) for i in order),
-        rows=first,
+        objects=tuple(objects[i] for i in order),
+        counts=tuple(int(counts[i]) for i in order),
+        rows=chosen,
         single=single,
-        _sources=tuple(sources),
+        _sources=tuple(s._replace(index=place[s.index]) for s in sources if len(s.rows)),
     )
+
+
+def _place(record: ObjectRecord, path: Path, known: dict[tuple[str, str, float], ExportObject]) -> int:
+    """Position in ``known`` of an object of a shard, which is added without its mesh."""
+    key = (record.id, record.sha256, record.scale)
+    if key not in known:
+        nothing = {"vertices": np.zeros((0, 3), np.float32), "faces": np.zeros((0, 3), np.int32), "normals": None}
+        safe = re.sub(r"[^A-Za-z0-9_-]+", "_", record.id)[:100].strip("_") or "object"
+        code = free_name(safe, "", {o.code for o in known.values()})
+        known[key] = ExportObject(code, replace(record, **nothing), path)
+    return list(known).index(key)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lgrasp.dataset.exports import FORMATS, export_shards, read_grasps
+from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp_cli.main import main
 
 GENERATED = Path(__file__).parent / "allegro-tiny.h5"  # lgrasp generate --object tiny -n 10

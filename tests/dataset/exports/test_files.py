@@ -10,15 +10,11 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset import GraspRows, Shard, ShardHeader, read_shard, validate_shard, write_shard
-from lgrasp.dataset.exports import (
-    FORMATS,
-    export_shards,
-    read_dexgraspbench,
-    read_dexgraspnet,
-    read_grasps,
-    read_isaac_grasp,
-    read_mjcf,
-)
+from lgrasp.dataset.exports.dexgraspbench import read_dexgraspbench
+from lgrasp.dataset.exports.dexgraspnet import read_dexgraspnet
+from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
+from lgrasp.dataset.exports.isaac_grasp import read_isaac_grasp
+from lgrasp.dataset.exports.mjcf import read_mjcf
 from lgrasp.dataset.exports.npy import load_objects, save_object, save_objects
 from lgrasp.errors import ConfigError, ShardError
 

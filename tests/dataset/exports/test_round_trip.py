@@ -12,7 +12,7 @@ import yaml
 import yourdfpy
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset.exports import FORMATS, export_shards, read_grasps
+from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.geometry.poses import pose_matrix
 
 SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp"]

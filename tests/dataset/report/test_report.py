@@ -15,10 +15,10 @@ from support.near import new_rows
 from typer.testing import CliRunner
 
 from lgrasp.dataset import merge_shards, read_shard, write_shard
-from lgrasp.dataset.report import read_dataset, report_dataset
 from lgrasp.dataset.report.coverage import Coverage, principal_postures
 from lgrasp.dataset.report.gather import EvenSample
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
+from lgrasp.dataset.report.write import read_dataset, report_dataset
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp_cli.dataset import app

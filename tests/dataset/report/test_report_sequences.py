@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lgrasp.dataset import merge_shards, read_shard, write_shard
-from lgrasp.dataset.report import report_dataset
+from lgrasp.dataset.report.write import report_dataset
 from lgrasp_cli.dataset import app
 
 COUNTS = (30, 25, 12)
