@@ -1,6 +1,7 @@
 """Conditions on the values of a shard; used before writing and when validating."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from lgrasp.grasp.schema import CHUNK_ROWS
 
 Column = Callable[[str, int, int], np.ndarray]
 """Rows of the whole file by flat name, first row and the row after the last, as :meth:`ShardReader.column`."""
-Require = Callable[[np.ndarray, str], None]
+Require = Callable[[Any, str], None]
 """Called with what is good, shape [n, ...], and the text of the problem if some is not."""
 
 _LIMIT_TOLERANCE = 1e-4  # rad or m
@@ -25,7 +26,7 @@ _INHERITED = (
 def requirer(problems: list[str], where: str = "", first_row: int = 0) -> Require:
     """What adds a line on a condition that rows do not meet, naming the first such row."""
 
-    def require(good: np.ndarray, text: str) -> None:
+    def require(good: Any, text: str) -> None:
         bad = np.flatnonzero(~np.asarray(good).all(axis=tuple(range(1, np.ndim(good)))))
         if len(bad):
             problems.append(f"{where}{text} (row {first_row + bad[0]}, {len(bad)} rows)")

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from trimesh import Trimesh
 from trimesh.exchange.obj import export_obj
@@ -57,7 +58,7 @@ def object_text(item: ExportObject) -> str:
     return mesh_text(Trimesh(record.vertices, record.faces, process=False), header=header)
 
 
-def mesh_text(mesh: Trimesh, **options: str) -> str:
+def mesh_text(mesh: Trimesh, **options: Any) -> str:
     """A mesh as OBJ: vertices and faces only."""
     return export_obj(mesh, include_normals=False, include_texture=False, digits=9, **options)
 

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from functools import reduce
 
 import numpy as np
 
@@ -16,17 +16,20 @@ from lgrasp.grasp.duplicates import KeptRows, near_pairs
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 
 _MAX_ROWS = 2_000_000  # rows held for comparison
+_BLOCK_ROWS = 16_384
+_SAMPLE_ROWS = 50_000
 
 
 class NearRows:
-    """Rows that are near-duplicates of a row before them.
+    """Rows that are near-duplicates of a row before them, found on a device of Warp.
 
     With one object every row is compared with all rows kept so far, up to two million. With several, all of which must
     be near, it is compared within the rows of one call.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, device: str) -> None:
         self.compared = self.duplicates = self.poses = 0
+        self._device = device
         self._kept: KeptRows | None = None
         self._last: np.ndarray | None = None
 
@@ -43,7 +46,7 @@ class NearRows:
         if pose.shape[1] > 1:
             self._compare_sets(pose, q)
             return
-        self._kept = self._kept or KeptRows(q.shape[1])
+        self._kept = self._kept or KeptRows(q.shape[1], self._device)
         room = _MAX_ROWS - self._kept.count
         if room > 0:
             kept, near = self._kept.add(pose[:, 0], q, room)
@@ -56,12 +59,9 @@ class NearRows:
 
     def _compare_sets(self, pose: np.ndarray, q: np.ndarray) -> None:
         n = len(q)
-        near = [i * n + j for i, j in (near_pairs(pose[:, o], q).T for o in range(pose.shape[1]))]
-        shared = near[0]
-        for pairs in near[1:]:
-            shared = np.intersect1d(shared, pairs)
+        near = [i * n + j for i, j in (near_pairs(pose[:, o], q, self._device).T for o in range(pose.shape[1]))]
         drop = np.zeros(n, bool)
-        for i, j in sorted((int(p // n), int(p % n)) for p in shared):  # by the earlier row, so it is decided
+        for i, j in np.stack(np.divmod(reduce(np.intersect1d, near), n), 1):  # by the earlier row, so it is decided
             drop[j] |= not drop[i]
         self.compared += n
         self.duplicates += int(drop.sum())
@@ -75,11 +75,7 @@ class NearRows:
 
 
 class EvenSample:
-    """Every k-th row of a stream, however it is cut; k doubles whenever more than ``limit`` rows are held.
-
-    Args:
-        limit: Most rows held.
-    """
+    """Every k-th row of a stream, however it is cut; k doubles whenever more than ``limit`` rows are held."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
@@ -95,23 +91,14 @@ class EvenSample:
         self._seen += n
         if first < n:
             self._parts.append({name: values[first :: self.step] for name, values in columns.items()})
-        while self._count() > self.limit:
-            held = self.columns()
-            self._parts = [{name: values[::2] for name, values in held.items()}]
+        while sum(len(next(iter(part.values()))) for part in self._parts) > self.limit:
+            self._parts = [{name: values[::2] for name, values in self.columns().items()}]
             self.step *= 2
-
-    def _count(self) -> int:
-        return sum(len(next(iter(part.values()))) for part in self._parts)
 
     def columns(self) -> dict[str, np.ndarray]:
         """The rows held; empty if there were none."""
-        if not self._parts:
-            return {}
-        return {name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]}
-
-
-BLOCK_ROWS = 16_384
-_SAMPLE_ROWS = 50_000
+        names = self._parts[0] if self._parts else ()
+        return {name: np.concatenate([part[name] for part in self._parts]) for name in names}
 
 
 @dataclass
@@ -119,11 +106,11 @@ class ObjectRows:
     """Rows of one hand with one object, or one set of objects at once."""
 
     names: tuple[str, ...]
+    near: NearRows
     rows: int = 0
     quantities: dict[str, Distribution] = field(default_factory=lambda: {q.name: Distribution(q) for q in QUANTITIES})
     contacts: Counter[int] = field(default_factory=Counter)
     """Rows by number of contacts."""
-    near: NearRows = field(default_factory=NearRows)
     coverage: dict[str, Coverage] = field(default_factory=dict)
     """By object."""
     verdicts: dict[str, Verdicts] = field(default_factory=dict)
@@ -135,9 +122,10 @@ class HandRows:
 
     Args:
         hand: From one of its shards.
+        device: Where near-duplicates are looked for, a name of Warp.
     """
 
-    def __init__(self, hand: HandRecord) -> None:
+    def __init__(self, hand: HandRecord, device: str) -> None:
         k = len(hand.joint_names)
         self.hand = hand
         self.rows = 0
@@ -149,6 +137,7 @@ class HandRows:
         """By the number of objects in the hand."""
         self.sample = EvenSample(_SAMPLE_ROWS)
         """q [K], position of the (first) object's middle in the hand's frame [3], place of its group in ``objects``."""
+        self._device = device
 
     def add(self, reader: ShardReader, labels: list[str], advanced: Callable[[int], None]) -> None:
         """Take all rows of a shard.
@@ -162,13 +151,16 @@ class HandRows:
             ShardError: The file is damaged.
         """
         records = reader.objects()
-        for start in range(0, len(reader), BLOCK_ROWS):
-            rows = reader.rows(start, start + BLOCK_ROWS)
-            self._add_postures(rows)
+        for start in range(0, len(reader), _BLOCK_ROWS):
+            rows = reader.rows(start, start + _BLOCK_ROWS)
+            q, links = rows.q.astype(float), rows.contact_links
+            self.rows += len(q)
+            self.sum_q += q.sum(0)
+            self.sum_qq += q.T @ q
+            self.links += np.bincount(links[links >= 0], minlength=len(self.links))
             add_held(self.held, rows)
             for index in np.unique(rows.object_index, axis=0):
-                chosen = np.flatnonzero((rows.object_index == index).all(1))
-                self._add_rows(_take(rows, chosen), index, records, labels)
+                self._add_rows(rows, np.flatnonzero((rows.object_index == index).all(1)), index, records, labels)
             advanced(start + len(rows))
 
     def together(self) -> dict[str, Distribution]:
@@ -192,45 +184,33 @@ class HandRows:
         for group in self.objects.values():
             group.near.close()
 
-    def _add_postures(self, rows: GraspRows) -> None:
-        q = rows.q.astype(float)
-        self.rows += len(q)
-        self.sum_q += q.sum(0)
-        self.sum_qq += q.T @ q
-        links = rows.contact_links
-        self.links += np.bincount(links[links >= 0], minlength=len(self.links))
-
     def _add_rows(
-        self, rows: GraspRows, index: np.ndarray, records: tuple[ObjectRecord, ...], labels: list[str]
+        self,
+        rows: GraspRows,
+        chosen: np.ndarray,
+        index: np.ndarray,
+        records: tuple[ObjectRecord, ...],
+        labels: list[str],
     ) -> None:
-        """Rows that hold the same objects in the same order, ``index`` [O]."""
+        """Some rows, by their numbers, that hold the same objects in the same order, ``index`` [O]."""
         present = np.flatnonzero(index >= 0)
         names = tuple(labels[index[o]] for o in present)
-        group = self.objects.setdefault(names, ObjectRows(names))
-        group.rows += len(rows)
+        group = self.objects.setdefault(names, ObjectRows(names, NearRows(self._device)))
+        group.rows += len(chosen)
         for name, distribution in group.quantities.items():
             if name in rows.metrics:
-                distribution.add(rows.metrics[name])
+                distribution.add(rows.metrics[name][chosen])
             else:
-                distribution.missing += len(rows)
-        group.contacts.update((rows.contact_links >= 0).sum((1, 2)).tolist())
-        group.near.add(rows.object_pose[:, present], rows.q)
+                distribution.missing += len(chosen)
+        group.contacts.update((rows.contact_links[chosen] >= 0).sum((1, 2)).tolist())
+        q, pose = rows.q[chosen], rows.object_pose[chosen]
+        group.near.add(pose[:, present], q)
         middles = []
         for o, name in zip(present, names, strict=True):
             vertices = np.asarray(records[index[o]].vertices, float)
             middle = (vertices.min(0) + vertices.max(0)) / 2
-            T = pose_matrix(rows.object_pose[:, o].astype(float))
+            T = pose_matrix(pose[:, o].astype(float))
             middles.append(group.coverage.setdefault(name, Coverage()).add(T, middle))
-        add_verdicts(group.verdicts, rows.physics, rows.physics_protocols)
-        place = list(self.objects).index(names)
-        self.sample.add({"q": rows.q, "position": middles[0].astype(np.float32), "group": np.full(len(rows), place)})
-
-
-def _take(rows: GraspRows, chosen: np.ndarray) -> GraspRows:
-    """Some of the rows, by index [n]."""
-    if len(chosen) == len(rows):
-        return rows
-    values: dict[str, Any] = {name: column[chosen] for name, column in rows.columns().items() if "/" not in name}
-    for group in ("metrics", "physics"):
-        values[group] = {name: column[chosen] for name, column in getattr(rows, group).items()}
-    return GraspRows(**values, metric_units=rows.metric_units, physics_protocols=rows.physics_protocols)
+        add_verdicts(group.verdicts, rows, chosen)
+        place = np.full(len(chosen), list(self.objects).index(names))
+        self.sample.add({"q": q, "position": middles[0].astype(np.float32), "group": place})

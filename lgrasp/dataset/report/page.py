@@ -1,5 +1,6 @@
 """The report as one HTML page: charts inline, no script, no other file."""
 
+from collections import Counter
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -36,27 +37,20 @@ def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows]) -> 
         numbers: Of :func:`lgrasp.dataset.report.write.summary`.
         hands: What it was made of, for the samples.
     """
-    title = f"Grasps: {number(numbers['rows'])} of {_hands(numbers)}"
+    objects = [" + ".join(group["objects"]) for hand in numbers["hands"] for group in hand["objects"]]
+    names = [hand["hand"] for hand in numbers["hands"]]
+    what = names[0] if len(names) == 1 else f"{len(names)} hands"
+    whole = objects[0] if len(names) == len(objects) == 1 else f"{len(objects)} object{'s' * (len(objects) != 1)}"
+    title = f"Grasps: {number(numbers['rows'])} of {what} with {whole}"
     css = files("lgrasp.dataset.report").joinpath("page.css").read_text(encoding="utf-8")
-    sections = [_head(title, numbers)]
-    for data, rows in zip(numbers["hands"], hands.values(), strict=True):
-        sections.append(_hand(data, rows))
+    hand_sections = [_hand(data, rows) for data, rows in zip(numbers["hands"], hands.values(), strict=True)]
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n"
-        + "\n".join(sections)
+        + "\n".join([_head(title, numbers), *hand_sections])
         + "\n</body>\n</html>\n"
     )
-
-
-def _hands(numbers: dict[str, Any]) -> str:
-    names = [hand["hand"] for hand in numbers["hands"]]
-    objects = sum(len(hand["objects"]) for hand in numbers["hands"])
-    what = f"{names[0]} with " if len(names) == 1 else f"{len(names)} hands with "
-    if len(names) == 1 and objects == 1:
-        return what + " + ".join(numbers["hands"][0]["objects"][0]["objects"])
-    return what + f"{objects} object{'s' if objects != 1 else ''}"
 
 
 def _groups(groups: list[dict[str, Any]]) -> str:
@@ -93,18 +87,21 @@ def _hand(data: dict[str, Any], hand: HandRows) -> str:
     parts = [f"<h2>{escape(data['hand'])}</h2>", run_tables(data)]
     if not data["rows"]:
         return "\n".join([*parts, "<p>No rows.</p>"])
-    sample = hand.sample.columns()
-    every = data["sample"]["every"]
-    dots = f"Dots: {number(data['sample']['rows'])} of {number(data['rows'])} grasps"
-    dots += f", one in {every}." if every > 1 else "."
-    parts += ["<h3>Validity</h3>", validity_table(data), *_histograms(hand), *_held(data), *_physics(data)]
-    parts += _contacts(data)
-    parts += ["<h3>Diversity</h3>", diversity_table(data), *_poses(hand, sample, dots)]
-    return "\n".join([*parts, *_postures(data, hand, sample, dots)])
-
-
-def _names(hand: HandRows) -> list[str]:
-    return [" + ".join(names) for names in hand.objects]
+    held = held_tables(data)
+    contacts: Counter[int] = Counter()
+    for group in data["objects"]:
+        contacts.update({int(n): rows for n, rows in group["contacts"].items()})
+    return "\n".join(
+        [
+            *parts,
+            *("<h3>Validity</h3>", validity_table(data), *_histograms(hand)),
+            *(("<h3>Objects in the hand</h3>", held) if held else ()),
+            *(_physics(data) if any(group["physics"] for group in data["objects"]) else ()),
+            *("<h3>Contacts</h3>", figure(contact_chart(contacts, data["contact_links"]), "")),
+            *("<h3>Diversity</h3>", diversity_table(data)),
+            *_dots(data, hand),
+        ]
+    )
 
 
 def _histograms(hand: HandRows) -> list[str]:
@@ -124,60 +121,43 @@ def _histograms(hand: HandRows) -> list[str]:
     return out
 
 
-def _held(data: dict[str, Any]) -> list[str]:
-    tables = held_tables(data)
-    return ["<h3>Objects in the hand</h3>", tables] if tables else []
-
-
-def _contacts(data: dict[str, Any]) -> list[str]:
-    counts: dict[int, int] = {}
-    for group in data["objects"]:
-        for contacts, rows in group["contacts"].items():
-            counts[int(contacts)] = counts.get(int(contacts), 0) + rows
-    return ["<h3>Contacts</h3>", figure(contact_chart(counts, data["contact_links"]), "")]
-
-
 def _physics(data: dict[str, Any]) -> list[str]:
-    if not any(group["physics"] for group in data["objects"]):
-        return []
-    out = ["<h3>Physics</h3>", physics_table(data)]
     total: dict[str, dict[str, dict[str, int]]] = {}
     for group in data["objects"]:
         for name, verdicts in group["physics"].items():
             into = total.setdefault(name, {})
             for way, counts in verdicts["directions"].items():
-                place = into.setdefault(way, {"run": 0, "failed": 0})
-                for key in place:
-                    place[key] += counts[key]
+                found = into.get(way, {"run": 0, "failed": 0})
+                into[way] = {key: found[key] + counts[key] for key in found}
     tried = [(name, ways) for name, ways in total.items() if any(way["run"] for way in ways.values())]
-    if tried:
-        text = "Of the grasps run in a direction; a grasp that failed in one may not have been run in the others."
-        out.append(figure(failure_chart(tried), text))
-    return [*out, protocol_list(data)]
+    text = "Of the grasps run in a direction; a grasp that failed in one may not have been run in the others."
+    chart = [figure(failure_chart(tried), text)] if tried else []
+    return ["<h3>Physics</h3>", physics_table(data), *chart, protocol_list(data)]
 
 
-def _postures(data: dict[str, Any], hand: HandRows, sample: dict[str, Any], dots: str) -> list[str]:
-    posture, found = principal_postures(hand.rows, hand.sum_q, hand.sum_qq), data["posture"]
-    text = (
-        f"Principal components of the {len(data['joints'])} joint positions. Effective dimension "
-        f"{found['effective_dimension']:.1f} (squared sum of the variances over the sum of their squares); "
-        f"{found['components_for_95_percent']} components explain 95 %. {dots}"
-    )
-    chart = posture_chart(posture, posture.scores(sample["q"]), sample["group"], _names(hand))
-    return ["<h3>Postures</h3>", figure(chart, text)]
-
-
-def _poses(hand: HandRows, sample: dict[str, Any], dots: str) -> list[str]:
-    where = figure(
-        position_chart(sample["position"], sample["group"], _names(hand)),
-        f"Middle of the object's bounding box in the frame of the hand's base (+: its origin). {dots}",
-    )
+def _dots(data: dict[str, Any], hand: HandRows) -> list[str]:
+    """Where objects are, from where hands come, and the postures: charts of the sampled rows."""
+    sample, every, names = hand.sample.columns(), data["sample"]["every"], [" + ".join(names) for names in hand.objects]
+    dots = f"Dots: {number(data['sample']['rows'])} of {number(data['rows'])} grasps"
+    dots += f", one in {every}." if every > 1 else "."
+    where = f"Middle of the object's bounding box in the frame of the hand's base (+: its origin). {dots}"
     maps = hand.directions()
-    text = (
+    ways = (
         "Direction from the object's middle to the origin of the hand's base, in the object's frame: where the hand "
         "stands around the object. Equal-area map: +x in the middle, +y a quarter turn to the right, +z on top, -x at "
         "both ends; bins without colour are empty."
     )
     if len(maps) > MAPS:
-        text += f" The first {MAPS} of {len(maps)} objects."
-    return ["<h3>Object positions</h3>", where, "<h3>Approach directions</h3>", figure(direction_maps(maps), text)]
+        ways += f" The first {MAPS} of {len(maps)} objects."
+    posture, found = principal_postures(hand.rows, hand.sum_q, hand.sum_qq), data["posture"]
+    postures = (
+        f"Principal components of the {len(data['joints'])} joint positions. Effective dimension "
+        f"{found['effective_dimension']:.1f} (squared sum of the variances over the sum of their squares); "
+        f"{found['components_for_95_percent']} components explain 95 %. {dots}"
+    )
+    return [
+        *("<h3>Object positions</h3>", figure(position_chart(sample["position"], sample["group"], names), where)),
+        *("<h3>Approach directions</h3>", figure(direction_maps(maps), ways)),
+        "<h3>Postures</h3>",
+        figure(posture_chart(posture, posture.scores(sample["q"]), sample["group"], names), postures),
+    ]

@@ -4,6 +4,7 @@ import io
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from lgrasp.dataset.report.quantity import Distribution
 
 MAPS = 12
 
-_INK = "#010203"  # replaced by currentColor
+_INK = "#010203"  # of charts.mplstyle; replaced by currentColor
 _BAR = "#2f86c9"
 _BOUND = "#d55e00"
 _COLOURS = ("#2f86c9", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#b3a100", "#7f7f7f")  # after Okabe, Ito
@@ -27,24 +28,6 @@ def _figure(width: float, height: float) -> Iterator[tuple[Any, Callable[[], str
     import matplotlib
     from matplotlib.figure import Figure
 
-    style: Any = {
-        "svg.fonttype": "none",
-        "svg.hashsalt": "lgrasp",
-        "font.size": 9.0,
-        "axes.titlesize": 9.5,
-        "axes.titleweight": "bold",
-        "axes.titlelocation": "left",
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.axisbelow": True,
-        "grid.alpha": 0.18,
-        "legend.frameon": False,
-        "text.parse_math": False,  # a name may hold a dollar sign
-        **dict.fromkeys(("figure.facecolor", "axes.facecolor"), "none"),
-        **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "axes.titlecolor"), _INK),
-        **dict.fromkeys(("xtick.color", "ytick.color", "grid.color"), _INK),
-    }
-
     def svg() -> str:
         data = io.StringIO()
         with warnings.catch_warnings():
@@ -53,7 +36,7 @@ def _figure(width: float, height: float) -> Iterator[tuple[Any, Callable[[], str
         text = data.getvalue()
         return text[text.index("<svg") :].replace(_INK, "currentColor")
 
-    with matplotlib.rc_context(style):
+    with matplotlib.rc_context(fname=str(Path(__file__).with_name("charts.mplstyle"))):
         figure = Figure(figsize=(width, height), layout="constrained")
         yield figure, svg
 
@@ -73,9 +56,7 @@ def _draw_distribution(axes: Any, distribution: Distribution) -> None:
     axes.stairs(counts, edges, fill=True, color=_BAR)
     axes.set_title(quantity.title, pad=17)
     axes.set_xlabel(f"{quantity.name} [{quantity.unit}]" if quantity.unit else quantity.name)
-    axes.set_ylabel("grasps")
-    axes.set_xlim(0, edges[-1])
-    axes.set_ylim(0, max(1.05 * counts.max(), 1))
+    axes.set(ylabel="grasps", xlim=(0, edges[-1]), ylim=(0, max(1.05 * counts.max(), 1)))
     axes.grid(axis="y")
     notes = []
     if quantity.bound is not None:
@@ -91,17 +72,13 @@ def contact_chart(group: dict[int, int], links: dict[str, float]) -> str:
     shown = list(links.items())[:_LINKS]
     with _figure(10, max(2.6, 0.8 + 0.19 * len(shown))) as (figure, svg):
         left, right = figure.subplots(1, 2, width_ratios=(1, 2))
-        numbers = range(min(group, default=0), max(group, default=0) + 1)
-        left.bar(list(numbers), [group.get(n, 0) for n in numbers], color=_BAR, width=0.8)
-        left.set_xticks(list(numbers))
-        left.set_title("Contacts per grasp")
-        left.set_xlabel("contacts")
-        left.set_ylabel("grasps")
+        numbers = list(range(min(group, default=0), max(group, default=0) + 1))
+        left.bar(numbers, [group.get(n, 0) for n in numbers], color=_BAR, width=0.8)
+        left.set(xticks=numbers, title="Contacts per grasp", xlabel="contacts", ylabel="grasps")
         left.grid(axis="y")
-        names = [name for name, _ in shown][::-1]
-        right.barh(names, [100 * share for _, share in shown][::-1], color=_BAR, height=0.75)
-        right.set_title("Contacts by link" + (f", the first {_LINKS} of {len(links)}" if len(links) > _LINKS else ""))
-        right.set_xlabel("share of all contacts [%]")
+        right.barh([name for name, _ in shown][::-1], [100 * s for _, s in shown][::-1], color=_BAR, height=0.75)
+        more = f", the first {_LINKS} of {len(links)}" if len(links) > _LINKS else ""
+        right.set(title=f"Contacts by link{more}", xlabel="share of all contacts [%]")
         right.grid(axis="x")
         right.set_ylim(-0.6, max(len(shown), 1) - 0.4)
         return svg()
@@ -117,8 +94,7 @@ def failure_chart(rows: list[tuple[str, dict[str, dict[str, int]]]]) -> str:
             at = np.arange(len(shares)) + (k + 0.5) * width - 0.4
             axes.bar(at, shares, 0.92 * width, color=_COLOURS[k % len(_COLOURS)], label=f" {name}")
         axes.set_xticks(range(len(rows[0][1])), list(rows[0][1]))
-        axes.set_title("Failures by direction of the load")
-        axes.set_xlabel("direction in the frame of the hand's base")
+        axes.set(title="Failures by direction of the load", xlabel="direction in the frame of the hand's base")
         axes.set_ylabel("failed of those run [%]")
         axes.grid(axis="y")
         axes.legend()
@@ -141,18 +117,16 @@ def posture_chart(posture: Posture, scores: np.ndarray, group: np.ndarray, names
         left.bar(at, share, color=_BAR, width=0.8, label="each")
         left.plot(at, np.cumsum(share), color=_BOUND, marker="o", markersize=3, linewidth=1.2, label="together")
         left.xaxis.get_major_locator().set_params(integer=True)
-        left.set_title("Variance of the joints explained")
-        left.set_xlabel("principal component")
-        left.set_ylabel("share [%]")
+        left.set(title="Variance of the joints explained", xlabel="principal component", ylabel="share [%]")
         left.set_ylim(0, 104)
         left.grid(axis="y")
         left.legend(loc="center right")
         _scatter(right, scores[:, 0], scores[:, 1], group, names)
-        right.set_title("Postures on the first two components")
-        right.set_xlabel(f"component 1 [rad], {share[0]:.0f} %" if len(share) else "component 1 [rad]")
-        right.set_ylabel(f"component 2 [rad], {share[1]:.0f} %" if len(share) > 1 else "component 2 [rad]")
+        one, two = (f", {share[i]:.0f} %" if len(share) > i else "" for i in (0, 1))
+        right.set(title="Postures on the first two components")
+        right.set(xlabel=f"component 1 [rad]{one}", ylabel=f"component 2 [rad]{two}")
         right.set_aspect("equal", adjustable="datalim")
-        _legend(right, group, names)
+        _legend(right, names)
         return svg()
 
 
@@ -165,15 +139,12 @@ def position_chart(position: np.ndarray, group: np.ndarray, names: list[str]) ->
         names: Of the objects.
     """
     with _figure(10, 3.7) as (figure, svg):
-        views = figure.subplots(1, 3)
-        for axes, (i, j) in zip(views, ((0, 1), (0, 2), (1, 2)), strict=True):
+        for axes, (i, j) in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
             _scatter(axes, 1000 * position[:, i], 1000 * position[:, j], group, names)
             axes.plot(0, 0, marker="+", color=_INK, markersize=9, markeredgewidth=1.5)
-            axes.set_title(f"Seen along {'xyz'[3 - i - j]}")
-            axes.set_xlabel(f"{'xyz'[i]} [mm]")
-            axes.set_ylabel(f"{'xyz'[j]} [mm]")
+            axes.set(title=f"Seen along {'xyz'[3 - i - j]}", xlabel=f"{'xyz'[i]} [mm]", ylabel=f"{'xyz'[j]} [mm]")
             axes.set_aspect("equal", adjustable="datalim")
-        _legend(figure, group, names, loc="outside lower center", ncols=4)
+        _legend(figure, names, loc="outside lower center", ncols=4)
         return svg()
 
 
@@ -185,14 +156,12 @@ def _scatter(axes: Any, x: np.ndarray, y: np.ndarray, group: np.ndarray, names: 
     axes.grid()
 
 
-def _legend(where: Any, group: np.ndarray, names: list[str], **place: Any) -> None:
+def _legend(where: Any, names: list[str], **place: Any) -> None:
     from matplotlib.lines import Line2D
 
     if 1 < len(names) <= len(_COLOURS):
-        marks = [
-            Line2D([], [], marker="o", linestyle="", color=_COLOURS[i], markersize=4, label=f" {names[i]}")
-            for i in range(len(names))
-        ]
+        style: Any = {"marker": "o", "linestyle": "", "markersize": 4}
+        marks = [Line2D([], [], color=c, label=f" {name}", **style) for name, c in zip(names, _COLOURS, strict=False)]
         where.legend(handles=marks, **place)
 
 

@@ -4,7 +4,7 @@ import json
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lgrasp.dataset.files import Paths, check_heaps, shard_tree
 from lgrasp.dataset.reader import ShardReader
@@ -54,8 +54,11 @@ def _head(path: Path) -> Head:
         header, attributes = reader.header, reader.attributes
         run = header.config.get("run_key") or json.dumps(dict(header.config), sort_keys=True)
         indices = [part["shard_index"] for part in header.merged_from] or [header.shard_index]
-        hand = (str(attributes["hand"]), str(attributes["hand_sha256"]))
-        keys = [(o.id, o.sha256, o.scale) for o in reader.objects()]
+        hand, keys = (str(attributes["hand"]), str(attributes["hand_sha256"])), reader.object_keys
+        try:
+            stages = [next(iter(stage)) for stage in header.config["pipeline"]["stages"]]
+        except (KeyError, TypeError, StopIteration):  # of another writer
+            stages = []
         return Head(
             path=path,
             bytes=path.stat().st_size,
@@ -68,16 +71,9 @@ def _head(path: Path) -> Head:
             created=header.created,
             version=header.lgrasp_version,
             parts=[(f"{hand} {keys} {header.pipeline} {header.seed} {run}", index) for index in indices],
-            stages=_stages(header.config),
+            stages=stages,
             statistics=reader.statistics,
         )
-
-
-def _stages(config: Mapping[str, Any]) -> list[str]:
-    try:
-        return [next(iter(stage)) for stage in config["pipeline"]["stages"]]
-    except (KeyError, TypeError, StopIteration):  # of another writer
-        return []
 
 
 def _label(key: tuple[str, str, float], others: set[tuple[str, str, float]]) -> str:
@@ -91,17 +87,16 @@ def _label(key: tuple[str, str, float], others: set[tuple[str, str, float]]) -> 
 
 def _remarks(heads: list[Head]) -> list[str]:
     """Rows that are there twice; empty shards."""
-    holder: dict[Any, Path] = {}
-    twice, empty = [], [head.path.name for head in heads if not head.rows]
+    holder: dict[tuple[str, int], Path] = {}
+    twice: set[str] = set()
     for head in heads:
+        twice |= {f"{head.path.name} and {holder[part].name}" for part in head.parts if part in holder}
         for part in head.parts:
-            if part in holder:
-                twice.append(f"{head.path.name} and {holder[part].name}")
             holder.setdefault(part, head.path)
+    empty = [head.path.name for head in heads if not head.rows]
     remarks = []
     if twice:
-        pairs = sorted(set(twice))
-        remarks.append(f"The same shard of a run is in {_listed(pairs)}: its rows are counted twice.")
+        remarks.append(f"The same shard of a run is in {_listed(sorted(twice))}: its rows are counted twice.")
     if empty:
         remarks.append(f"No rows are in {_listed(empty)}.")
     return remarks

@@ -53,15 +53,14 @@ def table(
     return f'{title}<div class="wide"><table><thead>{head}</thead><tbody{plain}>{body}</tbody></table></div>'
 
 
-def _kind(column: int, text: Sequence[int]) -> str:
-    return ' class="text"' if column in text else ""
+def _kind(column: int, text: Sequence[int], more: str = "") -> str:
+    return f' class="text{more}"' if column in text else ""
 
 
 def _cell(column: int, cell: str, text: Sequence[int]) -> str:
     if cell.startswith("!"):
         return f'<td class="bad">{escape(cell[1:])}</td>'
-    kind = ' class="text wrap"' if column in text and len(cell) > 60 else _kind(column, text)
-    return f"<td{kind}>{escape(cell)}</td>"
+    return f"<td{_kind(column, text, ' wrap' if len(cell) > 60 else '')}>{escape(cell)}</td>"
 
 
 _METRIC_COLUMNS = (  # metric, head, format
@@ -94,25 +93,21 @@ def run_tables(data: dict[str, Any]) -> str:
     for run in data["runs"]:
         seeds = ", ".join(map(str, run["seeds"][:8])) + ("…" if len(run["seeds"]) > 8 else "")
         wall = run["seconds"].get("wall")
-        about.append(
-            (
-                f"pipeline {run['pipeline']}",
-                f"{number(run['rows'])} rows, seed {seeds}"
-                + (f", on {run['device']}" if run["device"] else "")
-                + (f", {run['rows'] / wall:,.0f} rows/s" if wall else ""),
-            )
-        )
-        if run["survivors"]:
-            rows = [_stage(name, left, run) for name, left in run["survivors"].items()]
+        told = f"{number(run['rows'])} rows, seed {seeds}" + (f", on {run['device']}" if run["device"] else "")
+        about.append((f"pipeline {run['pipeline']}", told + (f", {run['rows'] / wall:,.0f} rows/s" if wall else "")))
+        rows = []
+        for name, left in run["survivors"].items():
+            counts = sorted(run["counts"][name].items(), key=lambda c: -c[1])
+            told = ", ".join(f"{what} {number(n)}" for what, n in counts)
+            rows.append([name, number(left), _number(run["seconds"].get(name), ",.1f"), told])
+        if rows:
             caption = f"Survivors per stage of {run['pipeline']}, all shards together"
             out.append(table(("stage", "survivors", "seconds", "counts"), rows, caption=caption, text=(3,)))
     return table(("", ""), about, text=(1,)) + "".join(out)
 
 
-def _stage(name: str, left: int, run: dict[str, Any]) -> list[str]:
-    seconds = run["seconds"].get(name)
-    counts = ", ".join(f"{what} {number(n)}" for what, n in sorted(run["counts"][name].items(), key=lambda c: -c[1]))
-    return [name, number(left), "-" if seconds is None else f"{seconds:,.1f}", counts]
+def _number(value: float | None, style: str) -> str:
+    return "-" if value is None else f"{value:{style}}"
 
 
 def validity_table(data: dict[str, Any]) -> str:
@@ -165,29 +160,27 @@ def held_tables(data: dict[str, Any]) -> str:
     if counts in ([], ["1"]) and not spaces:
         return ""
     protocols = sorted({name for group in held.values() for name in group["physics"]})
-    columns = ["objects", "rows", "penetration [mm]: median", "max", *(f"hold ({name})" for name in protocols)]
+    holds = [f"hold ({name})" for name in protocols]
+
+    def shares(group: dict[str, Any]) -> list[str]:
+        return [_number(group["physics"].get(name, {}).get("share"), ".1%") for name in protocols]
+
     rows = []
     for n, group in held.items():
         deep = group["penetration"]
         depth = [f"{deep['median']:.2f}", f"{'!' * bool(deep['over_bound'])}{deep['max']:.2f}"] if deep else ["-", "-"]
-        rows.append([n, number(group["rows"]), *depth, *(_share(group, name) for name in protocols)])
-    out = table(columns, rows, caption="By the number of objects in the hand. Orange: above the strict bound.")
+        rows.append([n, number(group["rows"]), *depth, *shares(group)])
+    caption = "By the number of objects in the hand. Orange: above the strict bound."
+    out = table(["objects", "rows", "penetration [mm]: median", "max", *holds], rows, caption=caption)
     if spaces:
-        heads = ["rows", *(f"hold ({name})" for name in protocols)]
         rows = []
         for name in spaces:
             found = [held[n]["spaces"].get(name, {"rows": 0, "physics": {}}) for n in counts]
-            cells = [[number(part["rows"]), *(_share(part, p) for p in protocols)] for part in found]
-            rows.append([name, *(cell for part in cells for cell in part)])
-        groups = [("", 1), *((f"as object {n}", len(heads)) for n in counts)]
+            rows.append([name, *(cell for part in found for cell in (number(part["rows"]), *shares(part)))])
+        groups = [("", 1), *((f"as object {n}", 1 + len(holds)) for n in counts)]
         caption = "Rows by the opposition space that took their last object, by which object it is."
-        out += table(["space", *heads * len(counts)], rows, groups=groups, caption=caption)
+        out += table(["space", *["rows", *holds] * len(counts)], rows, groups=groups, caption=caption)
     return out
-
-
-def _share(group: dict[str, Any], protocol: str) -> str:
-    found = group["physics"].get(protocol, {"run": 0})
-    return f"{found['share']:.1%}" if found["run"] else "-"
 
 
 def physics_table(data: dict[str, Any]) -> str:
@@ -196,11 +189,11 @@ def physics_table(data: dict[str, Any]) -> str:
     columns = ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in _VERDICT_COLUMNS)]
     for group in data["objects"]:
         for name, found in sorted(group["physics"].items()):
-            share = f"{found['share']:.1%}" if found["run"] else "-"
-            cells = [" + ".join(group["objects"]), name, number(found["run"]), share, _mass(found["protocols"])]
+            cells = [" + ".join(group["objects"]), name, number(found["run"]), _number(found["share"], ".1%")]
+            cells.append(_mass(found["protocols"]))
             for column, _, factor, style in _VERDICT_COLUMNS:
                 mean = found["means"].get(column)
-                cells.append("-" if mean is None else f"{factor * mean:{style}}")
+                cells.append(_number(None if mean is None else factor * mean, style))
             rows.append(cells)
     caption = "Means over the grasps that were run; links: of the hand, in contact with the object."
     return table(columns, rows, caption=caption, text=(1,))
@@ -208,13 +201,14 @@ def physics_table(data: dict[str, Any]) -> str:
 
 def _mass(protocols: list[Any]) -> str:
     """Mass of the object [g], if the protocols say one."""
-    masses = []
+    masses: dict[str, None] = {}
     for protocol in protocols:
-        found = protocol if isinstance(protocol, dict) else {}
-        found = found | found["resolved"] if isinstance(found.get("resolved"), dict) else found
-        if isinstance(found.get("mass"), int | float):
-            masses.append(f"{1000 * found['mass']:.0f}")
-    return ", ".join(dict.fromkeys(masses)) or "-"
+        said = protocol if isinstance(protocol, dict) else {}
+        resolved = said.get("resolved")
+        mass = (said | resolved if isinstance(resolved, dict) else said).get("mass")
+        if isinstance(mass, int | float):
+            masses[f"{1000 * mass:.0f}"] = None
+    return ", ".join(masses) or "-"
 
 
 def protocol_list(data: dict[str, Any]) -> str:

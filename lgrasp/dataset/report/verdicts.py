@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -55,33 +56,33 @@ class Verdicts:
         }
 
 
-def add_verdicts(into: dict[str, Verdicts], columns: Mapping[str, np.ndarray], texts: Mapping[str, str]) -> None:
+def add_verdicts(into: dict[str, Verdicts], rows: GraspRows, chosen: np.ndarray) -> None:
     """Count the columns of ``physics/`` of some rows, by protocol; what belongs to no ``P_holds`` is passed over.
 
     Where one protocol's name begins another's, a column is of the longer one.
 
     Args:
         into: Counts so far, by protocol.
-        columns: Verdicts [N, ...] by name.
-        texts: Protocol of each.
+        rows: Rows with verdicts.
+        chosen: Which of them, by index.
     """
-    names = [column.removesuffix(_HOLDS) for column in columns if column.endswith(_HOLDS)]
-    for column, values in columns.items():
+    names = [column.removesuffix(_HOLDS) for column in rows.physics if column.endswith(_HOLDS)]
+    for column, values in rows.physics.items():
         name = max((name for name in names if column.startswith(f"{name}_")), key=len, default=None)
         if name is not None:
-            into.setdefault(name, Verdicts()).add(column.removeprefix(name), values)
+            into.setdefault(name, Verdicts()).add(column.removeprefix(name), values[chosen])
     for name in names:
-        if texts[name + _HOLDS] not in into[name].protocols:
-            into[name].protocols.append(texts[name + _HOLDS])
+        text = rows.physics_protocols[name + _HOLDS]
+        if text not in into[name].protocols:
+            into[name].protocols.append(text)
 
 
 def _parsed(text: str) -> Any:
     """A protocol's settings if it is a JSON object, else its text."""
-    try:
+    with suppress(ValueError):
         settings = json.loads(text)
-    except ValueError:
-        return text
-    return settings if isinstance(settings, dict) else text
+        return settings if isinstance(settings, dict) else text
+    return text
 
 
 (_PENETRATION,) = (q for q in QUANTITIES if q.name == "penetration")
@@ -103,38 +104,29 @@ class HeldRows:
         self.rows += len(chosen)
         if _PENETRATION.name in rows.metrics:
             self.penetration.add(rows.metrics[_PENETRATION.name][chosen])
-        columns = {name: values[chosen] for name, values in rows.physics.items()}
-        add_verdicts(self.verdicts, columns, rows.physics_protocols)
+        add_verdicts(self.verdicts, rows, chosen)
 
     def numbers(self) -> dict[str, Any]:
         """JSON-serialisable."""
+        shown = ("run", "held", "share")
         return {
             "rows": self.rows,
             "penetration": self.penetration.numbers() if self.penetration.rows else None,
-            "physics": {
-                name: {key: value for key, value in verdicts.numbers().items() if key in ("run", "held", "share")}
-                for name, verdicts in self.verdicts.items()
-            },
+            "physics": {name: {key: found.numbers()[key] for key in shown} for name, found in self.verdicts.items()},
         }
 
 
 def add_held(into: dict[int, HeldRows], rows: GraspRows) -> None:
-    """Count rows by their number of objects.
-
-    Args:
-        into: Counts so far, by number of objects.
-        rows: Further rows.
-    """
+    """Count rows by their number of objects."""
     count = (rows.object_index >= 0).sum(1)
     for n in np.unique(count):
         chosen = np.flatnonzero(count == n)
         group = into.setdefault(int(n), HeldRows())
         group.add(rows, chosen)
-        if rows.sequence is None:
-            continue
-        last = rows.sequence.space[chosen, n - 1]
-        for number, name in enumerate(rows.sequence.space_names):
-            group.spaces.setdefault(name, HeldRows()).add(rows, chosen[last == number])
+        if rows.sequence is not None:
+            last = rows.sequence.space[chosen, n - 1]
+            for number, name in enumerate(rows.sequence.space_names):
+                group.spaces.setdefault(name, HeldRows()).add(rows, chosen[last == number])
 
 
 def held_numbers(held: Mapping[int, HeldRows]) -> dict[str, Any]:

@@ -4,16 +4,18 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lgrasp.dataset.files import Paths, new_file
+from lgrasp.dataset.files import Paths, write_file
 from lgrasp.dataset.info import SURVIVORS, stage_counts, survivors
 from lgrasp.dataset.merge import sum_statistics
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.report.coverage import principal_postures
 from lgrasp.dataset.report.gather import HandRows, ObjectRows
 from lgrasp.dataset.report.page import page
+from lgrasp.dataset.report.quantity import Distribution
 from lgrasp.dataset.report.survey import Head, survey
 from lgrasp.dataset.report.verdicts import held_numbers
 from lgrasp.errors import OutputError
+from lgrasp.runtime.device import resolve_device
 
 
 def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
@@ -34,9 +36,7 @@ def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], No
     if out.exists() and not out.is_file():
         raise OutputError(f"report {out} cannot be written: it is no regular file; name another")
     numbers, hands = read_dataset(paths, progress=progress)
-    text = page(numbers, hands)
-    with new_file(out) as file:
-        file.write(text.encode())
+    write_file(out, page(numbers, hands))
     return numbers
 
 
@@ -47,13 +47,13 @@ def read_dataset(
 
     Shards are read once, some thousand rows at a time; of the rows stay counts, an even sample of at most 50,000 per
     hand for the scatter plots, and poses and joints of one hand with one object at a time to find near-duplicates (some
-    200 bytes a row, at most two million rows).
+    200 bytes a row, at most two million rows), on a GPU if there is one.
 
     Raises:
         ShardError: No shard is found, or one cannot be read.
     """
     heads, remarks = survey(paths)
-    total, done = sum(head.rows for head in heads), 0
+    total, done, device = sum(head.rows for head in heads), 0, resolve_device().alias
     hands: dict[tuple[str, str], HandRows] = {}
     before = None
 
@@ -64,28 +64,23 @@ def read_dataset(
     for head in heads:
         with ShardReader(head.path) as reader:
             if head.hand not in hands:
-                hands[head.hand] = HandRows(reader.hand())
+                hands[head.hand] = HandRows(reader.hand(), device)
             if before is not None and (head.hand, head.labels) != (before.hand, before.labels):
                 hands[before.hand].close()
             hands[head.hand].add(reader, head.labels, advanced)
         before = head
         done += head.rows
-    return summary(heads, remarks, hands), hands
-
-
-def summary(heads: Sequence[Head], remarks: list[str], hands: Mapping[tuple[str, str], HandRows]) -> dict[str, Any]:
-    """Everything that the page shows but the sampled dots."""
-    return {
+    summary = {
         "shards": len(heads),
-        "rows": sum(head.rows for head in heads),
+        "rows": total,
         "bytes": sum(head.bytes for head in heads),
         "remarks": remarks,
         "hands": [_hand(key, rows, [h for h in heads if h.hand == key]) for key, rows in hands.items()],
     }
+    return summary, hands
 
 
 def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, Any]:
-    posture = principal_postures(hand.rows, hand.sum_q, hand.sum_qq)
     contacts = int(hand.links.sum())
     shares = {name: int(n) / contacts for name, n in zip(hand.hand.link_names, hand.links, strict=True) if n}
     return {
@@ -97,21 +92,24 @@ def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, 
         "created": [min(h.created for h in heads), max(h.created for h in heads)],
         "lgrasp_versions": sorted({h.version for h in heads}),
         "runs": [_run(name, [h for h in heads if h.pipeline == name]) for name in sorted({h.pipeline for h in heads})],
-        "metrics": {name: d.numbers() for name, d in hand.together().items() if d.rows},
+        "metrics": _metrics(hand.together()),
         "objects": [_objects(group) for group in hand.objects.values()],
         "held": held_numbers(hand.held),
         "contact_links": dict(sorted(shares.items(), key=lambda item: -item[1])),
-        "posture": posture.numbers(),
+        "posture": principal_postures(hand.rows, hand.sum_q, hand.sum_qq).numbers(),
         "sample": {"rows": len(hand.sample.columns().get("group", ())), "every": hand.sample.step},
     }
 
 
-def _run(pipeline: str, heads: list[Head]) -> dict[str, Any]:
+def _metrics(distributions: Mapping[str, Distribution]) -> dict[str, Any]:
+    return {name: found.numbers() for name, found in distributions.items() if found.rows}
+
+
+def _run(pipeline: str, heads: Sequence[Head]) -> dict[str, Any]:
     """What one pipeline counted on its way, over all shards."""
     statistics = sum_statistics([head.statistics for head in heads])
     counts = stage_counts(statistics)
-    timed = {name: value for name, value in statistics.items() if name.startswith("seconds_")}
-    seconds = {n.removeprefix("seconds_"): float(value) for n, value in timed.items() if not isinstance(value, str)}
+    seconds = {name.removeprefix("seconds_"): v for name, v in statistics.items() if name.startswith("seconds_")}
     return {
         "pipeline": pipeline,
         "rows": sum(head.rows for head in heads),
@@ -119,7 +117,7 @@ def _run(pipeline: str, heads: list[Head]) -> dict[str, Any]:
         "device": str(statistics.get("device", "")),
         "survivors": survivors({stage: counts[stage] for stage in heads[0].stages or SURVIVORS if stage in counts}),
         "counts": counts,
-        "seconds": seconds,
+        "seconds": {name: float(value) for name, value in seconds.items() if not isinstance(value, str)},
     }
 
 
@@ -128,7 +126,7 @@ def _objects(group: ObjectRows) -> dict[str, Any]:
     return {
         "objects": list(group.names),
         "rows": group.rows,
-        "metrics": {name: d.numbers() for name, d in group.quantities.items() if d.rows},
+        "metrics": _metrics(group.quantities),
         "contacts": {str(n): rows for n, rows in sorted(group.contacts.items())},
         "distinct_poses": near.poses,
         "near_duplicates": {
