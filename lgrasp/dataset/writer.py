@@ -87,7 +87,12 @@ def write_context(file: h5py.File, shard: Shard) -> None:
 
 def write_models(file: h5py.File, hand: HandRecord, objects: Sequence[ObjectRecord]) -> None:
     """Write the groups of a hand and of objects."""
-    group = file.create_group("hand")
+    _write_hand(file.create_group("hand"), hand)
+    for record in objects:
+        _write_object(file.create_group(f"objects/{record.id}"), record)
+
+
+def _write_hand(group: h5py.Group, hand: HandRecord) -> None:
     group.attrs["base_link"] = hand.base_link
     group.create_dataset("urdf", data=hand.urdf, dtype=h5py.string_dtype())
     _create_texts(group, "joint_names", hand.joint_names)
@@ -95,14 +100,18 @@ def write_models(file: h5py.File, hand: HandRecord, objects: Sequence[ObjectReco
     create_array(group, "joint_lower", hand.joint_lower, "f4")
     create_array(group, "joint_upper", hand.joint_upper, "f4")
     for number, (mesh_path, blob) in enumerate(hand.meshes.items()):
-        create_array(group, f"meshes/{number}", np.frombuffer(blob, "u1"), "u1").attrs["path"] = mesh_path
-    for o in objects:
-        group = file.create_group(f"objects/{o.id}")
-        group.attrs.update(name=o.name, scale=float(o.scale), sha256=o.sha256, watertight=bool(o.watertight))
-        create_array(group, "vertices", o.vertices, "f4")
-        create_array(group, "faces", o.faces, "i4")
-        if o.normals is not None:
-            create_array(group, "normals", o.normals, "f4")
+        dataset = create_array(group, f"meshes/{number}", np.frombuffer(blob, "u1"), "u1")
+        dataset.attrs["path"] = mesh_path
+
+
+def _write_object(group: h5py.Group, record: ObjectRecord) -> None:
+    group.attrs.update(
+        name=record.name, scale=float(record.scale), sha256=record.sha256, watertight=bool(record.watertight)
+    )
+    create_array(group, "vertices", record.vertices, "f4")
+    create_array(group, "faces", record.faces, "i4")
+    if record.normals is not None:
+        create_array(group, "normals", record.normals, "f4")
 
 
 def create_rows(file: h5py.File, name: str, shape: Sequence[int], dtype: np.dtype, text: str = "") -> h5py.Dataset:
