@@ -1,9 +1,8 @@
 """Files of point clouds and masks: bytes to arrays, nothing judged but their form."""
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -42,7 +41,7 @@ def read_arrays(path: Path, read_scene: SceneCloud | None = None) -> dict[str, n
             raise CloudError(str(error)) from None
     try:
         with quiet_parsers():
-            found = _parse_ply(data) if kind == ".ply" else _parse_xyz(data) if kind == ".xyz" else _parse_numpy(data)
+            found = _PARSERS[kind](data)
     except Exception as error:  # the parsers raise anything on garbage
         raise CloudError(f"{path}: not a readable {kind} cloud ({short_reason(error)})") from None
     points = found["points"]
@@ -52,19 +51,15 @@ def read_arrays(path: Path, read_scene: SceneCloud | None = None) -> dict[str, n
             "(n, 6) with normals, or (h, w, 3) are accepted"
         )
     flat = points.reshape(-1, points.shape[-1]).astype(np.float64)
-    out = {"points": flat[:, :3]} | {name: found[name] for name in found if name == "faces"}
-    if flat.shape[1] == 6:
-        out["normals"] = flat[:, 3:]
-    for name, width in (("normals", 3), ("labels", 1)):
-        if name not in found:
-            continue
-        values = np.asarray(found[name])
-        if values.size != len(flat) * width:
+    out = {"points": flat[:, :3]} | ({"normals": flat[:, 3:]} if flat.shape[1] == 6 else {})
+    for name in found.keys() - {"points", "faces"}:
+        values, shape = np.asarray(found[name]), (len(flat), 3) if name == "normals" else (len(flat),)
+        if values.size != np.prod(shape):
             raise CloudError(
                 f"{path}: {name} have shape {values.shape}, the points {points.shape}; one for each is accepted"
             )
-        out[name] = values.reshape(len(flat), 3).astype(np.float64) if width == 3 else values.ravel()
-    return out
+        out[name] = values.reshape(shape).astype(np.float64 if name == "normals" else values.dtype)
+    return out | ({"faces": found["faces"]} if "faces" in found else {})
 
 
 def read_mask(path: Path, count: int) -> np.ndarray:
@@ -75,9 +70,8 @@ def read_mask(path: Path, count: int) -> np.ndarray:
     """
     data = read_bytes(path, _MASK_SUFFIXES, "a mask", CloudError)
     try:
-        values = _load_numpy(data)
-        if not isinstance(values, np.ndarray):
-            values = values[_named(values, (*_LABELS, "mask"), "labels")]
+        values = _load_numpy(data, (*_LABELS, "mask"), "labels")
+        values = next(values[name] for name in (*_LABELS, "mask", "") if name in values)
     except Exception as error:  # the parsers raise anything on garbage
         raise CloudError(f"{path}: not a readable mask ({short_reason(error)})") from None
     return check_labels(np.asarray(values), count, str(path))
@@ -89,8 +83,7 @@ def check_labels(values: np.ndarray, count: int, where: str) -> np.ndarray:
     Raises:
         CloudError: not integers or flags, or of another length.
     """
-    whole = values.dtype.kind in "biu" or (values.dtype.kind == "f" and bool((values == np.round(values)).all()))
-    if not whole:
+    if values.dtype.kind not in "biuf" or (values.dtype.kind == "f" and (values != np.round(values)).any()):
         raise CloudError(f"{where}: labels are {values.dtype}, whole numbers or flags are accepted")
     if values.size != count:
         raise CloudError(f"{where}: {values.size:,} labels for a cloud of {count:,} points; one for each is accepted")
@@ -121,34 +114,34 @@ def _parse_ply(data: bytes) -> dict[str, np.ndarray]:
         out |= {"faces": np.asarray(loaded.faces), "normals": np.asarray(loaded.vertex_normals)}
     if {"nx", "ny", "nz"} <= set(names):
         out["normals"] = stack(("nx", "ny", "nz"))
-    label = next((name for name in _LABELS if name in names), None)
-    return out if label is None else out | {"labels": np.ravel(columns[label])}
-
-
-def _parse_xyz(data: bytes) -> dict[str, np.ndarray]:
-    return {"points": np.atleast_2d(np.loadtxt(io.StringIO(data.decode()), comments="#"))}
+    for name in (name for name in _LABELS[::-1] if name in names):
+        out["labels"] = np.ravel(columns[name])
+    return out
 
 
 def _parse_numpy(data: bytes) -> dict[str, np.ndarray]:
-    loaded = _load_numpy(data)
-    if isinstance(loaded, np.ndarray):
-        return {"points": loaded}
-    _named(loaded, ("points",), "points")
-    found = {name: loaded[name] for name in ("points", "normals") if name in loaded}
-    label = next((name for name in _LABELS if name in loaded), None)
-    return found if label is None else found | {"labels": loaded[label]}
+    found = _load_numpy(data, ("points",), "points")
+    if "" in found:
+        return {"points": found[""]}
+    names = {"points": "points", "normals": "normals", **dict.fromkeys(_LABELS, "labels")}
+    return {names[name]: found[name] for name in (*_LABELS[::-1], "points", "normals") if name in found}
 
 
-def _load_numpy(data: bytes) -> Any:
-    """An array, or a mapping of arrays."""
+_PARSERS: dict[str, Callable[[bytes], dict[str, np.ndarray]]] = {
+    ".ply": _parse_ply,
+    ".xyz": lambda data: {"points": np.atleast_2d(np.loadtxt(io.StringIO(data.decode()), comments="#"))},
+    ".npy": _parse_numpy,
+    ".npz": _parse_numpy,
+}
+
+
+def _load_numpy(data: bytes, wanted: tuple[str, ...], what: str) -> Mapping[str, np.ndarray]:
+    """The arrays of an .npz file, one of which has a wanted name; that of an .npy file has none."""
     if not data.startswith((b"\x93NUMPY", b"PK")):
         raise ValueError("it is no NumPy file")
-    return np.load(io.BytesIO(data), allow_pickle=False)
-
-
-def _named(arrays: Any, wanted: tuple[str, ...], what: str) -> str:
-    """The first of the names that an .npz file has."""
-    name = next((name for name in wanted if name in arrays), None)
-    if name is None:
-        raise ValueError(f"it has {', '.join(arrays) or 'nothing'}; an array '{what}' is needed")
-    return name
+    loaded = np.load(io.BytesIO(data), allow_pickle=False)
+    if isinstance(loaded, np.ndarray):
+        return {"": loaded}
+    if not any(name in loaded for name in wanted):
+        raise ValueError(f"it has {', '.join(loaded) or 'nothing'}; an array '{what}' is needed")
+    return loaded

@@ -98,11 +98,9 @@ def sdf_object(values: np.ndarray, origin: np.ndarray, cell: float, *, name: str
 
 
 def _check_size(what: str, points: np.ndarray) -> None:
-    size = float(np.ptp(points, axis=0).max())
-    if not _EXTENT[0] <= size <= _EXTENT[1]:
-        raise ObjectError(
-            f"{what} is {size:.3g} m long; accepted: {_EXTENT[0]:g} to {_EXTENT[1]:g} m (are its units metres?)"
-        )
+    size, (least, most) = float(np.ptp(points, axis=0).max()), _EXTENT
+    if not least <= size <= most:
+        raise ObjectError(f"{what} is {size:.3g} m long; accepted: {least:g} to {most:g} m (are its units metres?)")
 
 
 def _model(

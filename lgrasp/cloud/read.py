@@ -11,38 +11,9 @@ from scipy.spatial import KDTree
 from lgrasp.cloud.files import SceneCloud, check_labels, read_arrays, read_mask
 from lgrasp.errors import CloudError
 
-NEIGHBOURS = 24
-"""Points, the point itself among them, through which a plane is laid."""
-
+_MIN_POINTS = 50  # fewer do not show a surface
+_NEIGHBOURS = 24  # points, the point itself among them, through which a plane is laid
 _BLOCK = 65_536  # points at a time, for memory
-
-
-def estimate_normals(points: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:
-    """Unit normals of the planes that fit each point and its nearest neighbours best; either side may be meant.
-
-    Args:
-        points: [m], shape (n, 3), n >= 3.
-
-    Returns:
-        Shape (n, 3), f64.
-    """
-    tree, k = KDTree(points), min(neighbours, len(points))
-    out = np.empty((len(points), 3))
-    for at in range(0, len(points), _BLOCK):
-        near = points[tree.query(points[at : at + _BLOCK], k)[1]]  # (b, k, 3)
-        near = near - near.mean(axis=1, keepdims=True)
-        out[at : at + _BLOCK] = np.linalg.eigh(np.einsum("bki,bkj->bij", near, near))[1][:, :, 0]
-    return out
-
-
-def face_viewpoint(points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
-    """Which normals point away from a viewpoint (3,) [m]: flags, shape (n,)."""
-    return np.einsum("nd,nd->n", normals, viewpoint - points) < 0.0
-
-
-MIN_POINTS = 50
-"""Fewer points do not show a surface."""
-
 _LARGEST = 20.0  # [m] side of a whole cloud
 _LARGEST_TARGET, _LEAST_TARGET = 2.0, 0.005  # [m] side of what is to be grasped
 _UNITS = ((0.01, "centimetres"), (0.001, "millimetres"), (1e-6, "micrometres"))
@@ -139,9 +110,9 @@ def _seen(path: Path, points: np.ndarray, notes: list[str], hint: str) -> np.nda
     if zero.any():
         notes.append(f"dropped {int(zero.sum()):,} of {len(points):,} points at 0 0 0: no depth")
     keep = finite & ~zero
-    if keep.sum() < MIN_POINTS:
+    if keep.sum() < _MIN_POINTS:
         raise CloudError(
-            f"{path}: {int(keep.sum())} usable points; at least {MIN_POINTS} are needed to show a surface{hint}"
+            f"{path}: {int(keep.sum())} usable points; at least {_MIN_POINTS} are needed to show a surface{hint}"
         )
     return keep
 
@@ -157,9 +128,9 @@ def _target(
     if labels is None:
         raise CloudError(f"{where}: has no labels; give --mask with one for each point, or leave out --label {label}")
     target = labels == label
-    if target.sum() < MIN_POINTS:
+    if target.sum() < _MIN_POINTS:
         raise CloudError(
-            f"{where}: label {label} selects {int(target.sum())} points, at least {MIN_POINTS} are needed; "
+            f"{where}: label {label} selects {int(target.sum())} points, at least {_MIN_POINTS} are needed; "
             f"{_histogram(labels)}"
         )
     return target
@@ -186,30 +157,23 @@ def _without_strays(points: np.ndarray, target: np.ndarray, notes: list[str]) ->
 
 def _check_size(path: Path, points: np.ndarray, target: np.ndarray, scale: float, *, chosen: bool, scene: bool) -> None:
     """Refuse extents that a unit mistake explains; a hundredth of the points may be stray."""
-    whole = float(np.ptp(np.percentile(points, [1.0, 99.0], axis=0), axis=0).max())
-    part = float(np.ptp(np.percentile(points[target], [1.0, 99.0], axis=0), axis=0).max())
+    whole, part = (float(np.ptp(np.percentile(p, [1.0, 99.0], axis=0), axis=0).max()) for p in (points, points[target]))
     at = "" if scale == 1.0 else f" at scale {scale:g}"
-    long = [("cloud", whole, _LARGEST)] if whole > _LARGEST else []
+    other_unit = "--scale turns other units into metres"
+    what, extent, most = "cloud", whole, _LARGEST
     if part > _LARGEST_TARGET and (chosen or not scene):
         what = "target" if chosen else "cloud, all of which is to be grasped without --label,"
-        long = [(what, part, _LARGEST_TARGET)]
-    for what, extent, most in long:
-        hint = _unit(extent / scale, most)
+        extent, most = part, _LARGEST_TARGET
+    if extent > most:
+        told = extent / scale  # a file is probably in the first unit that makes it small enough
+        units = ((factor, unit) for factor, unit in _UNITS[told > _CENTIMETRES :] if told * factor <= most)
+        hint = next((f"if the file is in {unit} use --scale {factor:g}" for factor, unit in units), other_unit)
         raise CloudError(f"{path}: the {what} is {extent:.4g} m long{at}; at most {most:g} m is accepted; {hint}")
     if part < _LEAST_TARGET:
-        metres = "it is in metres already: use --scale 1"
-        hint = metres if part / scale >= _LEAST_TARGET else "--scale turns other units into metres"
+        hint = "it is in metres already: use --scale 1" if part / scale >= _LEAST_TARGET else other_unit
         raise CloudError(
             f"{path}: what is to be grasped is {part:.2g} m long{at}; at least {_LEAST_TARGET:g} m is accepted; {hint}"
         )
-
-
-def _unit(extent: float, most: float) -> str:
-    """The unit that a file with coordinates so far apart is probably in."""
-    for factor, unit in _UNITS:
-        if extent * factor <= most and (factor != _UNITS[0][0] or extent <= _CENTIMETRES):
-            return f"if the file is in {unit} use --scale {factor:g}"
-    return "--scale turns other units into metres"
 
 
 def _normals(
@@ -225,29 +189,38 @@ def _normals(
         raise CloudError(f"viewpoint {viewpoint} cannot be used; x y z of the camera in metres is accepted")
     normals = np.zeros_like(points) if given is None else np.nan_to_num(given, nan=0.0, posinf=0.0, neginf=0.0)
     length = np.linalg.norm(normals, axis=1)
-    normals = normals / np.where(length > 1e-6, length, 1.0)[:, None]
     missing = length <= 1e-6
+    normals = normals / np.where(missing, 1.0, length)[:, None]
+    share = f"all {len(points):,}" if missing.all() else f"{int(missing.sum()):,} of {len(points):,}"
+    origin = np.zeros(3) if seen_from is None else seen_from
     if missing.any():
-        if seen_from is None:
-            low, high = points.min(axis=0), points.max(axis=0)
-            if (low <= 0.0).all() and (high >= 0.0).all():
-                raise CloudError(
-                    f"{path}: {_share(missing)} points have no normals, and the origin lies inside the cloud, so it is "
-                    "no camera; give its position as --viewpoint X,Y,Z"
-                )
-        origin = np.zeros(3) if seen_from is None else seen_from
-        normals[missing] = estimate_normals(points)[missing]
-        normals[missing & face_viewpoint(points, normals, origin)] *= -1.0
+        if seen_from is None and (points.min(axis=0) <= 0.0).all() and (points.max(axis=0) >= 0.0).all():
+            raise CloudError(
+                f"{path}: {share} points have no normals, and the origin lies inside the cloud, so it is no camera; "
+                "give its position as --viewpoint X,Y,Z"
+            )
+        normals[missing] = _estimated(points)[missing]
+        normals[missing & _facing_away(points, normals, origin)] *= -1.0
         told = "the origin, where a camera is supposed" if seen_from is None else "the viewpoint"
-        notes.append(f"normals of {_share(missing)} points estimated from neighbours and turned to {told}")
+        notes.append(f"normals of {share} points estimated from neighbours and turned to {told}")
     if seen_from is not None:
-        away = face_viewpoint(points, normals, seen_from)
+        away = _facing_away(points, normals, origin)
         normals[away] *= -1.0
         if away.any():
             notes.append(f"turned {int(away.sum()):,} normals that pointed away from the viewpoint")
     return normals
 
 
-def _share(flags: np.ndarray) -> str:
-    count = int(flags.sum())
-    return f"all {count:,}" if flags.all() else f"{count:,} of {len(flags):,}"
+def _estimated(points: np.ndarray) -> np.ndarray:
+    """Unit normals of the planes that fit each point and its nearest neighbours best; either side may be meant."""
+    tree, k = KDTree(points), min(_NEIGHBOURS, len(points))
+    out = np.empty((len(points), 3))
+    for at in range(0, len(points), _BLOCK):
+        near = points[tree.query(points[at : at + _BLOCK], k)[1]]  # (b, k, 3)
+        near = near - near.mean(axis=1, keepdims=True)
+        out[at : at + _BLOCK] = np.linalg.eigh(np.einsum("bki,bkj->bij", near, near))[1][:, :, 0]
+    return out
+
+
+def _facing_away(points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
+    return np.einsum("nd,nd->n", normals, viewpoint - points) < 0.0

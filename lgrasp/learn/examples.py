@@ -1,6 +1,6 @@
 """Training data of the predictor: partial clouds of objects by simulated cameras, and grasps with their palm points."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,8 +20,7 @@ _CAMERA = CameraParams.model_validate(
 _CAMERA_DISTANCE = 4.0  # of a camera, in radii of the object
 
 
-@dataclass(frozen=True)
-class Examples:
+class Examples(NamedTuple):
     """One object with G grasps and V clouds of n points, all in its internal frame."""
 
     model: ObjectModel
@@ -61,13 +60,9 @@ def make_examples(
     R, t = T[:, :3, :3], T[:, :3, 3] - model.center
     palm = t + R @ palm_point(hand)
     away = np.linalg.norm(palm[:, None] - model.contact_points[None], axis=2)
-    points, normals = partial_clouds(model, clouds, params.points, rng, device)
-
-    def put(a: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32)
-
     anchor = model.contact_points[away.argmin(1)] if len(q) else np.zeros((0, 3))
-    return Examples(model, put(points), put(normals), put(R), put(t), put(q), put(anchor))
+    arrays = (*partial_clouds(model, clouds, params.points, rng, device), R, t, q, anchor)
+    return Examples(model, *(torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32) for a in arrays))
 
 
 def palm_point(hand: HandModel) -> np.ndarray:

@@ -39,12 +39,7 @@ class CoarseNet(nn.Module):
         super().__init__()
         self.scale, self.points = params.scale, params.points
         w, joints = params.width, len(lower)
-        self.point = nn.Sequential(
-            nn.Linear(6, w // 2), nn.ReLU(), nn.Linear(w // 2, w), nn.ReLU(), nn.Linear(w, 2 * w)
-        )
-        self.whole = nn.Sequential(
-            nn.Linear(2 * w, 2 * w), nn.ReLU(), nn.Linear(2 * w, 2 * w), nn.ReLU(), nn.Linear(2 * w, 10 + joints)
-        )
+        self.point, self.whole = _layers(6, w // 2, w, 2 * w), _layers(2 * w, 2 * w, 2 * w, 10 + joints)
         self.register_buffer("lower", lower)
         self.register_buffer("upper", upper)
 
@@ -63,6 +58,10 @@ class CoarseNet(nn.Module):
         t = p + (F @ (2 * self.scale * out[:, 6:9])[..., None])[..., 0]
         q = self.lower + out[:, 10:].sigmoid() * (self.upper - self.lower)
         return Coarse(F @ matrix_from_sixd(turn), t, q, out[:, 9])
+
+
+def _layers(a: int, b: int, c: int, d: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(a, b), nn.ReLU(), nn.Linear(b, c), nn.ReLU(), nn.Linear(c, d))
 
 
 @torch.no_grad()

@@ -1,7 +1,6 @@
 """Training of the coarse predictor, on poses alone, then jointly through unrolled steps of the refiner; its quality."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -17,13 +16,8 @@ from lgrasp.refine.refiner import Pose, Refiner
 _ANY_REACH = 10.0  # [m]
 
 
-@dataclass(frozen=True)
-class _Batch:
-    """Seeds on clouds of one object."""
-
-    points: torch.Tensor  # (N, n, 3)
-    normals: torch.Tensor  # (N, n, 3)
-    seeds: torch.Tensor  # (N,)
+_Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+"""Points (N, n, 3) and normals (N, n, 3) of clouds of one object, and a seed on each (N,)."""
 
 
 def pose_loss(coarse: Coarse, points: torch.Tensor, examples: Examples, params: LearnParams) -> torch.Tensor:
@@ -74,11 +68,7 @@ class Trainer:
         torch.random.set_rng_state(state)
 
     def fit_poses(self, steps: int, rate: float, told: Callable[[int, float], None] | None = None) -> None:
-        """Steps on poses alone, the learning rate falling to a tenth.
-
-        Args:
-            told: called with (step, loss).
-        """
+        """Steps on poses alone, the learning rate falling to a tenth; ``told`` is called with (step, loss)."""
         optimiser = torch.optim.Adam(self.net.parameters(), lr=rate)
         fall = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(steps, 1), 0.1 * rate)
         for step in range(steps):
@@ -96,19 +86,15 @@ class Trainer:
         """``joint_steps`` steps on the energy after K unrolled steps of the refiner.
 
         The loss is the mean of log(1 + E*), so that a few hopeless answers do not drown the others, and
-        ``pose_weight`` times the loss on poses.
-
-        Args:
-            told: called with (step, mean energy after the unrolled steps).
+        ``pose_weight`` times the loss on poses. ``told`` is called with (step, mean energy after the unrolled steps).
         """
         p = self.params
         optimiser = torch.optim.Adam(self.net.parameters(), lr=p.joint_rate)
         for step in range(p.joint_steps):
             examples = self._train[step % len(self._train)]
             batch = self._draw(examples)
-            coarse = self.net(batch.points, batch.normals, batch.seeds)
             refiner = self.refiner(examples)
-            pose = refiner.unrolled(coarse.R, coarse.t, coarse.q, steps=p.unrolled)
+            pose = refiner.unrolled(*self.net(*batch)[:3], steps=p.unrolled)
             total = whole_energy(refiner, pose)
             loss = total.clamp_min(0).log1p().mean()
             if p.pose_weight:
@@ -137,19 +123,19 @@ class Trainer:
         return self.net(examples.points[which], examples.normals[which], seed)
 
     def _pose_loss(self, batch: _Batch, examples: Examples) -> torch.Tensor:
-        coarse = self.net(batch.points, batch.normals, batch.seeds)
-        rows = torch.arange(len(batch.seeds), device=self.device)
-        return pose_loss(coarse, batch.points[rows, batch.seeds], examples, self.params)
+        points, _, seeds = batch
+        here = points[torch.arange(len(seeds), device=self.device), seeds]
+        return pose_loss(self.net(*batch), here, examples, self.params)
 
     def _draw(self, examples: Examples) -> _Batch:
         clouds, n = examples.points.shape[:2]
-        which = torch.randint(clouds, (self.params.batch,), generator=self._random).to(self.device)
-        seeds = torch.randint(n, (self.params.batch,), generator=self._random).to(self.device)
-        return _Batch(examples.points[which], examples.normals[which], seeds)
+        drawn = (torch.randint(most, (self.params.batch,), generator=self._random) for most in (clouds, n))
+        which, seeds = (numbers.to(self.device) for numbers in drawn)
+        return examples.points[which], examples.normals[which], seeds
 
 
 def _moved(e: Examples, device: torch.device) -> Examples:
-    return Examples(e.model, *(x.to(device) for x in (e.points, e.normals, e.R, e.t, e.q, e.anchor)))
+    return Examples(e.model, *(x.to(device) for x in e[1:]))
 
 
 class Measured(NamedTuple):
@@ -174,7 +160,7 @@ def measure(trainer: Trainer, examples: Sequence[Examples], *, seeds: int = 4, r
     parts: list[torch.Tensor] = []
     for e in examples:
         coarse, refiner = trainer.predict(e, seeds), trainer.refiner(e)
-        start = Pose(coarse.R, coarse.t, coarse.q)
+        start = Pose(*coarse[:3])
         poses = [start, Pose(*(x.detach() for x in refiner.unrolled(*start, steps=trainer.params.unrolled)))]
         poses += [refiner(*start, rounds=steps).pose for steps in rounds]
         with torch.no_grad():

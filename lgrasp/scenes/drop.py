@@ -1,8 +1,7 @@
 """Objects dropped on a table, simulated by MuJoCo until they lie still."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,8 +18,7 @@ _THICK = 0.1  # [m] of the table
 _SINK = 2.0e-3  # [m] an object may sink into the table at rest
 
 
-@dataclass(frozen=True)
-class Settled:
+class Settled(NamedTuple):
     """Objects at rest on a table."""
 
     pose: np.ndarray
@@ -42,11 +40,10 @@ def drop(solids: Sequence[Solid], table: float, params: DropParams, rng: np.rand
     Raises:
         PhysicsError: MuJoCo is missing or refuses an object, or the objects never came to rest on the table.
     """
-    mujoco = import_mujoco()
+    mujoco, names = import_mujoco(), ", ".join(f"'{solid.name}'" for solid in solids)
     try:
         model = _model(mujoco, solids, table, params)
     except (ValueError, RuntimeError) as error:
-        names = ", ".join(f"'{solid.name}'" for solid in solids)
         raise PhysicsError(f"MuJoCo refuses objects {names}: {' '.join(str(error).split())[:300]}") from None
     data = mujoco.MjData(model)
     for number in range(1, params.tries + 1):
@@ -56,7 +53,6 @@ def drop(solids: Sequence[Solid], table: float, params: DropParams, rng: np.rand
         pose = data.qpos.reshape(-1, 7).copy()
         if seconds is not None and _on_table(solids, pose, table):
             return Settled(np.hstack([pose[:, :3], canonical(pose[:, 3:])]), number, seconds)
-    names = ", ".join(f"'{solid.name}'" for solid in solids)
     raise PhysicsError(
         f"objects {names} did not come to rest on a table of {table:g} m in {params.tries} tries; "
         "use fewer objects, a larger table or a longer drop"
@@ -95,8 +91,7 @@ def _start(solids: Sequence[Solid], params: DropParams, rng: np.random.Generator
             if rest > 0.0:
                 height = max(height, centre[i, 2] + np.sqrt(rest))
         centre[k] = x, y, height
-        pose[k, 3:] = turn
-        pose[k, :3] = 0.0
+        pose[k] = 0.0, 0.0, 0.0, *turn
         pose[k, :3] = centre[k] - pose_matrix(pose[k])[:3, :3] @ solid.center
     return pose
 

@@ -14,6 +14,7 @@ from lgrasp.dataset.structure import format_problems, schema_problems
 from lgrasp.dataset.validate import file_problems
 from lgrasp.dataset.writer import create_array, finish, write_models
 from lgrasp.errors import ShardError
+from lgrasp.grasp.schema import DatasetSpec
 from lgrasp.scenes.camera import Intrinsics
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord, scene_problems
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
@@ -32,6 +33,14 @@ class Layout(NamedTuple):
     """T_scene_object, x y z [m] qw qx qy qz, shape [M, 7]."""
 
 
+_GROUPS = ("scene", "views", "cloud", "grasps")
+
+
+def _members(group: str) -> list[tuple[DatasetSpec, str]]:
+    """Datasets of a group, each with its name there."""
+    return [(spec, spec.path.partition("/")[2]) for spec in DATASETS if spec.path.startswith(f"{group}/")]
+
+
 class SceneReader(FileReader):
     """One open scene."""
 
@@ -47,8 +56,7 @@ class SceneReader(FileReader):
     def layout(self) -> Layout:
         """The objects on the table, and their poses."""
         with reading(self.path):
-            table = float(self._file["scene"].attrs["table"])
-            return Layout(tuple(self.object_ids), table=table, **self._arrays("scene"))
+            return Layout(tuple(self.object_ids), float(self._file["scene"].attrs["table"]), **self._arrays("scene"))
 
     def views(self) -> ViewsRecord:
         """Images of the cameras."""
@@ -60,8 +68,7 @@ class SceneReader(FileReader):
 
     def cloud(self) -> CloudRecord:
         """The merged cloud."""
-        with reading(self.path):
-            return CloudRecord(**self._arrays("cloud"))
+        return CloudRecord(**self._arrays("cloud"))
 
     def grasps(self) -> SceneGrasps:
         """All grasps, those that collide included."""
@@ -70,28 +77,27 @@ class SceneReader(FileReader):
 
     def scene(self) -> SceneRecord:
         """Everything."""
-        layout = self.layout()
+        attributes, layout = self.attributes, self.layout()._asdict()
+        layout.pop("ids")
         with reading(self.path):
             return SceneRecord(
-                seed=int(self.attributes["seed"]),
-                index=int(self.attributes["scene_index"]),
+                seed=int(attributes["seed"]),
+                index=int(attributes["scene_index"]),
                 hand=self.hand(),
                 objects=self.objects(),
-                table=layout.table,
-                object_index=layout.object_index,
-                object_pose=layout.object_pose,
+                **layout,
                 views=self.views(),
                 cloud=self.cloud(),
                 grasps=self.grasps(),
                 config=self.config,
                 statistics=self.statistics,
-                created=self.attributes["created"],
-                lgrasp_version=self.attributes["lgrasp_version"],
+                created=attributes["created"],
+                lgrasp_version=attributes["lgrasp_version"],
             )
 
     def _arrays(self, group: str) -> dict[str, np.ndarray]:
-        names = [spec.path.partition("/")[2] for spec in DATASETS if spec.path.startswith(f"{group}/")]
-        return {name: self._file[group][name][()] for name in names}
+        with reading(self.path):
+            return {name: self._file[group][name][()] for _, name in _members(group)}
 
 
 def read_scene(path: str | os.PathLike[str]) -> SceneRecord:
@@ -117,7 +123,7 @@ def _structure_problems(file: h5py.File) -> list[str]:
         return problems
     if not isinstance(file.get("objects"), h5py.Group) or not len(file["objects"]):
         return ["objects: no object"]
-    missing = [f"{name}: missing group" for name in ("hand", "scene", "views", "cloud", "grasps") if name not in file]
+    missing = [f"{name}: missing group" for name in ("hand", *_GROUPS) if name not in file]
     return missing or schema_problems(file, DATASETS, ATTRIBUTES)
 
 
@@ -155,13 +161,10 @@ def write_scene(path: str | os.PathLike[str], scene: SceneRecord) -> None:
             hand_sha256=scene.hand.sha256,
         )
         write_models(file, scene.hand, scene.objects)
-        for name in ("scene", "views", "cloud", "grasps"):
-            file.create_group(name)
-        for spec in DATASETS:
-            group, _, name = spec.path.partition("/")
-            if group in ("scene", "views", "cloud", "grasps"):
-                values = getattr(scene if group == "scene" else getattr(scene, group), name)
-                create_array(file[group], name, values, spec.numpy)
+        for name in _GROUPS:
+            group, record = file.create_group(name), scene if name == "scene" else getattr(scene, name)
+            for spec, member in _members(name):
+                create_array(group, member, getattr(record, member), spec.numpy)
         file["scene"].attrs["table"] = float(scene.table)
         camera = scene.views.intrinsics
         file["views"].attrs.update(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)

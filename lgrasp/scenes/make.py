@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -29,8 +30,7 @@ from lgrasp.seeding import stage_seed
 from lgrasp.simulate.solid import Solid
 
 
-@dataclass(frozen=True)
-class Collisions:
+class Collisions(NamedTuple):
     """How deep the hand of n grasps sinks into the table and into other objects, at q_pregrasp and at q.
 
     Depths above the limit that was asked for may be given too small, but not below it.
@@ -74,12 +74,12 @@ def find_collisions(
     """
     n, device = len(q), hand.device
     if not n:
-        return Collisions(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+        return Collisions(*np.zeros((2, 0, 2), np.float32))
     inward = inverse(object_pose)
     inward[:, :3] -= np.stack([o.model.center for o in objects])  # to the internal frames
     body = body_poses(hand, np.concatenate([q_pregrasp, q]))
     with wp.ScopedDevice(device):
-        table, obstacle = wp.zeros(2 * n, dtype=wp.float32), wp.zeros(2 * n, dtype=wp.float32)
+        table, obstacle = (wp.zeros(2 * n, dtype=wp.float32) for _ in range(2))
         inputs = [
             hand.struct,
             wp.array([o.struct for o in objects], dtype=Object),
@@ -90,7 +90,7 @@ def find_collisions(
             limit,
         ]
         wp.launch(kernels.hand_depths, body.shape[:2], inputs, [table, obstacle])
-        return Collisions(table.numpy().reshape(2, n).T.copy(), obstacle.numpy().reshape(2, n).T.copy())
+        return Collisions(*(depth.numpy().reshape(2, n).T.copy() for depth in (table, obstacle)))
 
 
 @dataclass(frozen=True)
@@ -106,12 +106,6 @@ class Item:
     q_pregrasp: np.ndarray
     q_squeeze: np.ndarray
     candidate: np.ndarray
-
-
-def draw_items(items: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``count`` of ``items`` objects, shape (count,); none comes again before all others have come."""
-    rounds = [rng.permutation(items) for _ in range(-(-count // items))]
-    return np.concatenate(rounds)[:count]
 
 
 def make_scene(
@@ -132,13 +126,18 @@ def make_scene(
     def stream(what: str) -> np.random.Generator:
         return np.random.default_rng(stage_seed(seed, index, what))
 
-    chosen = [items[i] for i in draw_items(len(items), params.objects, stream("draw"))]
+    draw = stream("draw")  # no object comes again before all others have come
+    rounds = [draw.permutation(len(items)) for _ in range(-(-params.objects // len(items)))]
+    chosen = [items[i] for i in np.concatenate(rounds)[: params.objects]]
     settled = drop([item.solid for item in chosen], params.table, params.drop, stream("drop"))
     pose = settled.pose.astype(np.float32).astype(np.float64)  # as the file has it
     objects = sorted({item.record.id: item.record for item in chosen}.values(), key=lambda record: record.id)
     place = {record.id: at for at, record in enumerate(objects)}
-    surfaces = [table_surface(params.table), *_surfaces(chosen, pose)]
-    views, cloud = observe(join_surfaces(surfaces), params.camera, stream("cameras"), device)
+    surfaces = [table_surface(params.table)]
+    for label, (item, T) in enumerate(zip(chosen, pose_matrix(pose), strict=True), 1):
+        vertices = np.asarray(item.record.vertices, float) @ T[:3, :3].T + T[:3, 3]
+        surfaces.append(LabelledMesh(vertices, np.asarray(item.record.faces), np.full(len(item.record.faces), label)))
+    views, cloud = _observe(join_surfaces(surfaces), params.camera, stream("cameras"), device)
     grasps, counts = _transfer(hand, chosen, pose, params, stream("grasps"))
     return SceneRecord(
         seed=seed,
@@ -155,14 +154,13 @@ def make_scene(
     )
 
 
-def observe(
-    surface: LabelledMesh, params: CameraParams, rng: np.random.Generator, device: str = "cpu"
+def _observe(
+    surface: LabelledMesh, params: CameraParams, rng: np.random.Generator, device: str
 ) -> tuple[ViewsRecord, CloudRecord]:
     """Images of a surface by cameras around the table, and the cloud made from them."""
     camera, pose = intrinsics_of(params), place_cameras(params, rng).astype(np.float32)
     offsets = draw_offsets(params, rng).astype(np.float32)
     images = add_noise(render(surface, camera, pose, device), params, rng)
-    merged = merge_views(images, offsets, params, device)
     views = ViewsRecord(
         intrinsics=camera,
         pose=pose,
@@ -170,17 +168,7 @@ def observe(
         depth=np.rint(images.depth / DEPTH_UNIT).astype(np.uint16),
         labels=images.labels.astype(np.int16),
     )
-    labels, view = merged.labels.astype(np.int16), merged.view.astype(np.int16)
-    return views, CloudRecord(points=merged.points, normals=merged.normals, labels=labels, view=view)
-
-
-def _surfaces(chosen: Sequence[Item], pose: np.ndarray) -> list[LabelledMesh]:
-    """The objects' meshes where they lie, labelled from 1 on."""
-    found = []
-    for label, (item, T) in enumerate(zip(chosen, pose_matrix(pose), strict=True), 1):
-        vertices = np.asarray(item.record.vertices, float) @ T[:3, :3].T + T[:3, 3]
-        found.append(LabelledMesh(vertices, np.asarray(item.record.faces), np.full(len(item.record.faces), label)))
-    return found
+    return views, merge_views(images, offsets, params, device)
 
 
 def _transfer(
@@ -199,9 +187,8 @@ def _transfer(
         free = np.logical_not(table | objects)
         for name, flags in zip(counts, (np.ones_like(free), free, table, objects), strict=True):
             counts[name] += int(flags.sum())
-        kept = np.sort(
-            np.concatenate([np.flatnonzero(free)[: params.grasps], np.flatnonzero(~free)[: params.colliding]])
-        )
+        kept = np.flatnonzero(free)[: params.grasps], np.flatnonzero(~free)[: params.colliding]
+        kept = np.sort(np.concatenate(kept))
         parts.append(
             {
                 "target": np.full(len(kept), target, np.int32),

@@ -2,15 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
-from lgrasp.geometry.poses import pose_matrix
+from lgrasp.geometry.poses import device_from_stored, pose_matrix
 from lgrasp.runtime.device import start
 from lgrasp.scenes import render_kernels as kernels
 from lgrasp.scenes.camera import Intrinsics
 from lgrasp.scenes.params import CameraParams
+from lgrasp.scenes.records import CloudRecord
 from lgrasp.scenes.schema import DEPTH_UNIT
 
 NOTHING, TABLE = -1, 0
@@ -20,8 +22,7 @@ _FAR = 10.0  # [m]
 _SLOPE = 6.0  # tangent of the steepest angle to the image plane at which neighbouring pixels still lie on one surface
 
 
-@dataclass(frozen=True)
-class LabelledMesh:
+class LabelledMesh(NamedTuple):
     """A triangle mesh in the scene frame, every face with a label."""
 
     vertices: np.ndarray
@@ -55,11 +56,8 @@ def table_surface(side: float) -> LabelledMesh:
 def join_surfaces(surfaces: Sequence[LabelledMesh]) -> LabelledMesh:
     """Several surfaces as one."""
     first = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
-    return LabelledMesh(
-        np.concatenate([s.vertices for s in surfaces]),
-        np.concatenate([s.faces + at for s, at in zip(surfaces, first, strict=False)]),
-        np.concatenate([s.labels for s in surfaces]),
-    )
+    moved = (s._replace(faces=s.faces + at) for s, at in zip(surfaces, first, strict=False))
+    return LabelledMesh(*map(np.concatenate, zip(*moved, strict=True)))
 
 
 def render(surface: LabelledMesh, intrinsics: Intrinsics, pose: np.ndarray, device: str = "cpu") -> Images:
@@ -76,14 +74,13 @@ def render(surface: LabelledMesh, intrinsics: Intrinsics, pose: np.ndarray, devi
         )
         shape = (len(pose), intrinsics.height, intrinsics.width)
         depth, label = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.int32)
-        camera = np.asarray(pose, np.float32)[:, [0, 1, 2, 4, 5, 6, 3]]  # Warp writes quaternions x y z w
         inputs = [
             mesh.id,
             wp.array(np.asarray(surface.labels, np.int32), dtype=wp.int32),
             wp.vec2(intrinsics.fx, intrinsics.fy),
             wp.vec2(intrinsics.cx, intrinsics.cy),
             _FAR,
-            wp.array(np.ascontiguousarray(camera), dtype=wp.transform),
+            wp.array(device_from_stored(pose), dtype=wp.transform),
         ]
         wp.launch(kernels.cast_rays, shape, inputs, [depth, label])
         return Images(intrinsics, np.asarray(pose, float), depth.numpy(), label.numpy())
@@ -112,20 +109,6 @@ def image_normals(images: Images, window: int, device: str = "cpu") -> np.ndarra
 _MOST_STEPS = 2**16 - 1  # that a file can hold
 
 
-@dataclass(frozen=True)
-class Merged:
-    """The cloud of several views; n points in the scene frame."""
-
-    points: np.ndarray
-    """[m], shape (n, 3), f32."""
-    normals: np.ndarray
-    """Unit, estimated from the depth image, towards the camera, shape (n, 3), f32."""
-    labels: np.ndarray
-    """0 table, k + 1 object k, shape (n,), int32."""
-    view: np.ndarray
-    """Camera that saw each point, shape (n,), int32."""
-
-
 def add_noise(images: Images, params: CameraParams, rng: np.random.Generator) -> Images:
     """Images with Gaussian noise of ``noise + noise_square * depth^2`` [m] on every depth, in steps of DEPTH_UNIT."""
     error = rng.standard_normal(images.depth.shape).astype(np.float32)
@@ -140,7 +123,7 @@ def draw_offsets(params: CameraParams, rng: np.random.Generator) -> np.ndarray:
     return params.calibration * way / np.linalg.norm(way, axis=1)[:, None]
 
 
-def merge_views(images: Images, offsets: np.ndarray, params: CameraParams, device: str = "cpu") -> Merged:
+def merge_views(images: Images, offsets: np.ndarray, params: CameraParams, device: str = "cpu") -> CloudRecord:
     """All points of all views with a normal, each view displaced; of a cube of side ``voxel`` one point is kept.
 
     Args:
@@ -153,8 +136,11 @@ def merge_views(images: Images, offsets: np.ndarray, params: CameraParams, devic
     points = np.einsum("nab,nb->na", T[v, :3, :3], local) + (T[:, :3, 3] + offsets)[v]
     kept = _one_per_voxel(points, params.voxel)
     v, i, j = v[kept], i[kept], j[kept]
-    return Merged(
-        points[kept].astype(np.float32), normals[v, i, j], images.labels[v, i, j].astype(np.int32), v.astype(np.int32)
+    return CloudRecord(
+        points=points[kept].astype(np.float32),
+        normals=normals[v, i, j],
+        labels=images.labels[v, i, j].astype(np.int16),
+        view=v.astype(np.int16),
     )
 
 
