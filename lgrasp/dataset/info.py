@@ -11,17 +11,14 @@ from lgrasp.dataset.reader import ShardReader
 
 
 def describe(paths: Paths) -> list[dict[str, Any]]:
-    """Summaries of shards, JSON-serialisable, one per file.
-
-    Args:
-        paths: Shard files or folders of them.
+    """Summaries of shard files, or folders of them, JSON-serialisable, one per file.
 
     Returns:
         For each shard: ``file``, ``bytes``, ``rows``, ``rows_by_objects`` (rows by the number of objects held),
         ``rows_by_space`` (of sequences: rows by the opposition space of their last step; else None), ``hand``,
-        ``objects`` (ids), ``pipeline``, ``seed``,
-        ``shard_index``, ``created``, ``lgrasp_version``, ``joints`` (names), ``columns`` (shape of each row dataset),
-        ``metrics`` (unit, min, mean, max of the finite values; None if there are none) and ``statistics``.
+        ``objects`` (ids), ``pipeline``, ``seed``, ``shard_index``, ``created``, ``lgrasp_version``, ``joints`` (names),
+        ``columns`` (shape of each row dataset), ``metrics`` (unit, min, mean, max of the finite values; None if there
+        are none) and ``statistics``.
 
     Raises:
         ShardError: No shard is found, or one cannot be read.
@@ -59,9 +56,8 @@ def _describe(path: Path) -> dict[str, Any]:
 
 def _range(values: np.ndarray) -> dict[str, float | None]:
     values = values[np.isfinite(values)].astype(np.float64)
-    if not len(values):
-        return {"min": None, "mean": None, "max": None}
-    return {"min": float(values.min()), "mean": float(values.mean()), "max": float(values.max())}
+    ends = {"min": np.min, "mean": np.mean, "max": np.max}
+    return {name: float(end(values)) if len(values) else None for name, end in ends.items()}
 
 
 Counts = dict[str, dict[str, int]]

@@ -31,14 +31,12 @@ _Map = Callable[..., Iterable[np.ndarray]]
 def measure_shard(
     path: Path, settings: Sequence[str], each: _Map, step: int, report: Callable[[int], None]
 ) -> dict[str, np.ndarray]:
-    """All metrics of a shard by name, each shape [N].
+    """All metrics of a shard by name, each shape [N]; ``step`` rows at a time, ``report`` is called with rows done.
 
     Args:
         path: The shard.
         settings: ``bounds.KEY=VALUE`` each, in place of what the rows passed.
         each: As of :func:`row_metrics`.
-        step: Rows at a time.
-        report: Called with rows done.
 
     Raises:
         ShardError: The shard does not conform; with its first problem.

@@ -123,14 +123,7 @@ Joint order, where values have no names:
 
 
 def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Sequence[str]) -> str:
-    """The text.
-
-    Args:
-        selection: What is exported.
-        frames: The selection's hand.
-        notes: What is special about the format, with ``{root}`` and ``{base}`` for the names of the two links.
-        conditions: What the rows satisfy.
-    """
+    """The text; ``notes`` on the format may hold ``{root}`` and ``{base}`` for the names of the two links."""
     width = max(map(len, frames.joint_names))
     limits = zip(frames.joint_names, selection.hand.joint_lower, selection.hand.joint_upper, strict=True)
     mimics = [f"  {name} = {m:g} * {source} + {b:g}" for name, (source, m, b) in frames.mimics.items()]

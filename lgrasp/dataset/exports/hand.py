@@ -78,7 +78,7 @@ class HandFrames:
 
     def __init__(self, urdf: str, base_link: str | None, joint_names: Sequence[str], where: Path) -> None:
         robot, _ = parse_robot(where, urdf.encode())
-        for shape in [*robot.iter("visual"), *robot.iter("collision")]:
+        for shape in [*robot.iter("visual", "collision")]:
             shape.getparent().remove(shape)
         for limit in robot.iter("limit"):
             for key in ("effort", "velocity"):
@@ -106,15 +106,9 @@ class HandFrames:
         self._columns = [i for i, name in enumerate(self.joint_names) if name in moving]
 
     def base_from_root(self, q: np.ndarray) -> np.ndarray:
-        """``T_base_root``: poses of the URDF's root link in the base link's frame.
+        """``T_base_root``: poses [n, 7] of the URDF's root link in the base link's frame; q is [n, K].
 
         Only joints held at a value can lie between the two, so that it is the same for all rows of a shard as a rule.
-
-        Args:
-            q: Joint positions [rad or m], shape [n, K].
-
-        Returns:
-            Shape [n, 7], x y z [m] qw qx qy qz.
         """
         if not self._columns:
             return np.repeat(pose_from_matrix(self._transform({})), len(q), axis=0)

@@ -132,11 +132,8 @@ class Selection:
         return [source.path for source in self._sources]
 
     def batches(self, holding: int | None = None, advance: Callable[[int], None] | None = None) -> Iterator[Batch]:
-        """The rows in order, at most 4096 at a time.
-
-        Args:
-            holding: Only rows with this one of the objects.
-            advance: Called with the number of rows of each batch when the caller is done with it.
+        """The rows in order, at most 4096 at a time, or only those with one of the objects; ``advance`` is called with
+        the number of rows of each batch when the caller is done with it.
 
         Raises:
             ShardError: A shard is damaged.

@@ -4,9 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-BANDS, TURNS = 12, 24  # of the sphere: bands of equal height, sectors of equal angle
-_ROTATION = (6, 12, 12)  # cos(theta), phi, psi of Rz(phi) Ry(theta) Rz(psi)
-
 
 class Coverage:
     """Bins of approach directions and of rotations, each of equal solid angle or rotation volume.
@@ -18,27 +15,21 @@ class Coverage:
     """
 
     def __init__(self) -> None:
-        self.directions = np.zeros((BANDS, TURNS), np.int64)
+        self.directions = np.zeros((12, 24), np.int64)
         """Rows per band (from z = -1 up) and sector (from the object's -x axis, about +z)."""
-        self.rotations = np.zeros(_ROTATION, np.int64)
+        self.rotations = np.zeros((6, 12, 12), np.int64)
+        """Rows per bin of cos(theta), phi, psi."""
 
     def add(self, T: np.ndarray, middle: np.ndarray) -> np.ndarray:
-        """Count poses.
-
-        Args:
-            T: T_hand_object, shape [n, 4, 4].
-            middle: The object's middle in its own frame [m], shape [3].
-
-        Returns:
-            The middle in the hand's base frame [m], shape [n, 3].
-        """
+        """Count poses T_hand_object [n, 4, 4] of an object with its middle [3] in its own frame [m]; gives the middles
+        in the hand's base frame [m], shape [n, 3]."""
         R = T[:, :3, :3]
         p_base = T[:, :3, 3] + R @ middle
         way = -np.einsum("nij,ni->nj", R, p_base)  # object frame
         way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
-        _count(self.directions, [(way[:, 2] + 1) / 2, _turn(way[:, 1], way[:, 0])])
-        angles = [(R[:, 2, 2] + 1) / 2, _turn(R[:, 1, 2], R[:, 0, 2]), _turn(R[:, 2, 1], -R[:, 2, 0])]
-        _count(self.rotations, angles)
+        _count(self.directions, (way[:, 2] + 1) / 2, _turn(way[:, 1], way[:, 0]))
+        turns = _turn(R[:, 1, 2], R[:, 0, 2]), _turn(R[:, 2, 1], -R[:, 2, 0])
+        _count(self.rotations, (R[:, 2, 2] + 1) / 2, *turns)
         return p_base
 
     def numbers(self, poses: int) -> dict[str, Any]:
@@ -56,7 +47,7 @@ def _turn(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     return (np.arctan2(y, x) + np.pi) / (2 * np.pi)
 
 
-def _count(bins: np.ndarray, shares: list[np.ndarray]) -> None:
+def _count(bins: np.ndarray, *shares: np.ndarray) -> None:
     """Add one to the bin of each row; a share runs from 0 to 1 along its axis."""
     index = [np.clip((s * n).astype(int), 0, n - 1) for s, n in zip(shares, bins.shape, strict=True)]
     np.add.at(bins, tuple(index), 1)
@@ -92,13 +83,7 @@ class Posture(NamedTuple):
 
 
 def principal_postures(rows: int, sum_q: np.ndarray, sum_qq: np.ndarray) -> Posture:
-    """Components of rows of which only sums are known.
-
-    Args:
-        rows: Their number.
-        sum_q: Sum of q, shape [K].
-        sum_qq: Sum of q q^T, shape [K, K].
-    """
+    """Components of rows of which only their number and the sums of q [K] and of q q^T [K, K] are known."""
     mean = sum_q / max(rows, 1)
     covariance = sum_qq / max(rows, 1) - np.outer(mean, mean)
     variance, vectors = np.linalg.eigh(covariance)

@@ -34,12 +34,7 @@ class NearRows:
         self._last: np.ndarray | None = None
 
     def add(self, pose: np.ndarray, q: np.ndarray) -> None:
-        """Compare further rows.
-
-        Args:
-            pose: Object poses, shape [n, o, 7]; the same ones present in every row.
-            q: Joints, shape [n, K].
-        """
+        """Compare further rows: object poses [n, o, 7], of the same objects in every row, and joints [n, K]."""
         if not len(pose):
             return
         self._count_poses(np.ascontiguousarray(pose.reshape(len(pose), -1)))
@@ -118,12 +113,7 @@ class ObjectRows:
 
 
 class HandRows:
-    """All rows of one hand.
-
-    Args:
-        hand: From one of its shards.
-        device: Where near-duplicates are looked for, a name of Warp.
-    """
+    """All rows of one hand; near-duplicates are looked for on a device of Warp."""
 
     def __init__(self, hand: HandRecord, device: str) -> None:
         k = len(hand.joint_names)
@@ -140,12 +130,10 @@ class HandRows:
         self._device = device
 
     def add(self, reader: ShardReader, labels: list[str], advanced: Callable[[int], None]) -> None:
-        """Take all rows of a shard.
+        """Take all rows of a shard, calling ``advanced`` with the number of rows taken so far.
 
         Args:
-            reader: The shard.
             labels: What to call its objects, in the order of ``object_index``.
-            advanced: Called with the number of rows taken so far.
 
         Raises:
             ShardError: The file is damaged.

@@ -31,12 +31,7 @@ from lgrasp.dataset.report.tables import (
 
 
 def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows]) -> str:
-    """The page.
-
-    Args:
-        numbers: Of :func:`lgrasp.dataset.report.write.summary`.
-        hands: What it was made of, for the samples.
-    """
+    """The page of the numbers of a report, and of the hands that they were made of, for the samples."""
     objects = [" + ".join(group["objects"]) for hand in numbers["hands"] for group in hand["objects"]]
     names = [hand["hand"] for hand in numbers["hands"]]
     what = names[0] if len(names) == 1 else f"{len(names)} hands"

@@ -102,14 +102,8 @@ def failure_chart(rows: list[tuple[str, dict[str, dict[str, int]]]]) -> str:
 
 
 def posture_chart(posture: Posture, scores: np.ndarray, group: np.ndarray, names: list[str]) -> str:
-    """Explained variance of the principal components, and the sample's first two scores.
-
-    Args:
-        posture: Components of the hand's joints.
-        scores: First two scores of sampled rows, shape [n, 2].
-        group: Place in ``names`` of each row, shape [n].
-        names: Of the objects.
-    """
+    """Explained variance of the principal components, and the first two scores [n, 2] of sampled rows, of which
+    ``group`` [n] says the place in the names of the objects."""
     with _figure(10, 3.7) as (figure, svg):
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.25))
         share = 100 * posture.share
@@ -131,13 +125,8 @@ def posture_chart(posture: Posture, scores: np.ndarray, group: np.ndarray, names
 
 
 def position_chart(position: np.ndarray, group: np.ndarray, names: list[str]) -> str:
-    """The object's middle in the frame of the hand's base, seen along each axis.
-
-    Args:
-        position: Sampled rows [m], shape [n, 3].
-        group: Place in ``names`` of each row, shape [n].
-        names: Of the objects.
-    """
+    """The object's middle in the frame of the hand's base, seen along each axis: sampled rows [m], shape [n, 3], of
+    which ``group`` [n] says the place in the names of the objects."""
     with _figure(10, 3.7) as (figure, svg):
         for axes, (i, j) in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
             _scatter(axes, 1000 * position[:, i], 1000 * position[:, j], group, names)
@@ -166,11 +155,8 @@ def _legend(where: Any, names: list[str], **place: Any) -> None:
 
 
 def direction_maps(counts_by_object: dict[str, np.ndarray]) -> str:
-    """Where the hand stands around each object, in equal-area (Mollweide) maps of the first twelve.
-
-    Args:
-        counts_by_object: Rows per bin of the sphere, as :attr:`Coverage.directions`, by name.
-    """
+    """Where the hand stands around each object (:attr:`Coverage.directions` by name), in equal-area (Mollweide) maps of
+    the first twelve."""
     import matplotlib
     from matplotlib.colors import ListedColormap, LogNorm
 

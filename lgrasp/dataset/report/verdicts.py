@@ -59,12 +59,7 @@ class Verdicts:
 def add_verdicts(into: dict[str, Verdicts], rows: GraspRows, chosen: np.ndarray) -> None:
     """Count the columns of ``physics/`` of some rows, by protocol; what belongs to no ``P_holds`` is passed over.
 
-    Where one protocol's name begins another's, a column is of the longer one.
-
-    Args:
-        into: Counts so far, by protocol.
-        rows: Rows with verdicts.
-        chosen: Which of them, by index.
+    Where one protocol's name begins another's, a column is of the longer one. ``chosen`` [n] are indices.
     """
     names = [column.removesuffix(_HOLDS) for column in rows.physics if column.endswith(_HOLDS)]
     for column, values in rows.physics.items():
