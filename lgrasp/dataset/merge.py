@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -131,11 +131,9 @@ def _require_one_run(sources: Sequence[_Source]) -> None:
 
 
 def _write_head(file: h5py.File, sources: Sequence[_Source]) -> HandRecord:
-    header = ShardHeader(
-        pipeline=sources[0].header.pipeline,
-        seed=sources[0].header.seed,
+    header = replace(
+        sources[0].header,
         shard_index=-1,
-        config=sources[0].header.config,
         created=max(source.header.created for source in sources),
         lgrasp_version=", ".join(sorted({source.header.lgrasp_version for source in sources})),
         merged_from=[part for source in sources for part in source.parts()],
@@ -183,17 +181,10 @@ def _checked(source: _Source, hand: HandRecord, part: int) -> Iterator[GraspRows
 
 
 def pad_column(name: str, values: np.ndarray, tail: tuple[int, ...]) -> np.ndarray:
-    """Values of one row dataset, padded at the end of each axis with the fill value of the format.
+    """Values [n, ...] of one row dataset by its flat name, padded at the end of each axis with the fill value of the
+    format to [n, *tail]; the values themselves if nothing is to be padded.
 
     Verdicts of a simulator, which may have a number per object, are padded with what means not run: NaN, -1 or false.
-
-    Args:
-        name: Flat name, as in :meth:`GraspRows.columns`.
-        values: Shape [n, ...].
-        tail: Wanted lengths of all axes but the first; none is shorter than in ``values``.
-
-    Returns:
-        Shape [n, *tail]; ``values`` itself if nothing is to be padded.
     """
     if values.shape[1:] == tail:
         return values

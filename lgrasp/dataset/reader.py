@@ -202,12 +202,9 @@ class ShardReader(FileReader):
         attrs = self.attributes
         with reading(self.path):
             return ShardHeader(
-                pipeline=attrs["pipeline"],
-                seed=int(attrs["seed"]),
-                shard_index=int(attrs["shard_index"]),
+                **{name: attrs[name] for name in ("pipeline", "created", "lgrasp_version")},
+                **{name: int(attrs[name]) for name in ("seed", "shard_index")},
                 config=json.loads(attrs["config"]),
-                created=attrs["created"],
-                lgrasp_version=attrs["lgrasp_version"],
                 merged_from=tuple(json.loads(attrs.get("merged_from", "[]"))),
             )
 

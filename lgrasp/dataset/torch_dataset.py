@@ -15,7 +15,7 @@ from lgrasp.dataset.merge import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
+from lgrasp.grasp.schema import CHUNK_ROWS, SEQUENCE_FIELDS
 
 
 class _Source(NamedTuple):
@@ -102,18 +102,11 @@ class GraspDataset(torch.utils.data.Dataset):
             return reader.object(key[0])
 
     def _choose(self, columns: Sequence[str] | None) -> list[str]:
-        def kind(source: _Source, name: str) -> Any:
-            shape, dtype = source.columns[name]
-            if name in SEQUENCE_FIELDS:
-                return dtype, source.space_names
-            return dtype if name in GRASP_FIELDS else (dtype, len(shape))
-
-        first = self._sources[0]
-        common = [
-            name
-            for name in first.columns
-            if all(name in s.columns and kind(s, name) == kind(first, name) for s in self._sources)
+        kinds = [  # what must agree for a column to be stacked
+            {n: (t, len(shape), n in SEQUENCE_FIELDS and s.space_names) for n, (shape, t) in s.columns.items()}
+            for s in self._sources
         ]
+        common = [name for name, kind in kinds[0].items() if all(other.get(name) == kind for other in kinds)]
         for name in columns or ():
             if name not in common:
                 raise ShardError(f"no column {name!r} that all {len(self._sources)} shards have: {', '.join(common)}")

@@ -115,15 +115,8 @@ def _write_object(group: h5py.Group, record: ObjectRecord) -> None:
 
 
 def create_rows(file: h5py.File, name: str, shape: Sequence[int], dtype: np.dtype, text: str = "") -> h5py.Dataset:
-    """Make one empty row dataset, chunked along its rows.
-
-    Args:
-        file: The shard being written.
-        name: Flat name as in :meth:`GraspRows.columns`.
-        shape: Full shape, rows first.
-        dtype: NumPy dtype.
-        text: Unit of a metric, protocol of a physics verdict.
-    """
+    """Make one empty row dataset by its flat name, chunked along its rows; the text is the unit of a metric, the
+    protocol of a verdict."""
     path = GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"
     chunks = (min(shape[0], CHUNK_ROWS), *shape[1:])
     dataset = file.create_dataset(path, shape, dtype, **(_filters(chunks) if np.prod(shape) else {}))

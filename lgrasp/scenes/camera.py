@@ -32,22 +32,14 @@ class Intrinsics:
 
 def intrinsics_of(params: CameraParams) -> Intrinsics:
     """Square pixels, the optical axis through the middle of the image."""
-    f = 0.5 * params.width / np.tan(np.radians(0.5 * params.angle))
-    return Intrinsics(
-        params.width, params.height, float(f), float(f), 0.5 * (params.width - 1), 0.5 * (params.height - 1)
-    )
+    width, height = params.width, params.height
+    f = float(0.5 * width / np.tan(np.radians(0.5 * params.angle)))
+    return Intrinsics(width, height, f, f, 0.5 * (width - 1), 0.5 * (height - 1))
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Poses T_scene_camera of cameras that look at a point with the image's upper edge up, z of the scene.
-
-    Args:
-        eye: positions [m], shape (v, 3), not straight above or below the target.
-        target: [m], shape (3,).
-
-    Returns:
-        x y z [m] qw qx qy qz, shape (v, 7).
-    """
+    """Poses T_scene_camera, x y z [m] qw qx qy qz, shape (v, 7), of cameras at ``eye`` [m], shape (v, 3), that look at
+    a point [m], shape (3,), neither straight above nor below, with the image's upper edge up, z of the scene."""
     forward = target - eye
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(forward, [0.0, 0.0, 1.0])

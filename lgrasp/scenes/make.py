@@ -1,7 +1,6 @@
 """One scene from start to end: objects drawn, dropped, seen by cameras, grasps moved there and tested."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -43,12 +42,8 @@ class Collisions(NamedTuple):
 
 
 def hand_poses(scene_object: np.ndarray, hand_object: np.ndarray) -> np.ndarray:
-    """T_scene_hand of grasps, x y z [m] qw qx qy qz with qw >= 0, shape (n, 7), f64.
-
-    Args:
-        scene_object: T_scene_object, shape (7,).
-        hand_object: T_hand_object of each grasp, as shards have it, shape (n, 7).
-    """
+    """T_scene_hand of grasps, x y z [m] qw qx qy qz with qw >= 0, shape (n, 7), f64, of T_scene_object, shape (7,), and
+    the T_hand_object of each, as shards have it, shape (n, 7)."""
     return compose(np.broadcast_to(scene_object, hand_object.shape), inverse(hand_object))
 
 
@@ -62,14 +57,13 @@ def find_collisions(
     q: np.ndarray,
     limit: float,
 ) -> Collisions:
-    """The whole hand against the half space z < 0 and all objects but one, by the exact tests of generation.
+    """The whole hand against the half space z < 0 and all objects but the one that is grasped, ``own``, by the exact
+    tests of generation.
 
     Args:
-        objects: what lies in the scene.
-        object_pose: T_scene_object of their own frames, x y z [m] qw qx qy qz, shape (m, 7).
-        own: the object that is grasped.
+        object_pose: T_scene_object of the objects' own frames, x y z [m] qw qx qy qz, shape (m, 7).
         hand_pose: T_scene_hand, shape (n, 7).
-        q_pregrasp: actuated joints [rad or m], shape (n, K); q: the same at the grasp.
+        q_pregrasp, q: actuated joints [rad or m], shape (n, K).
         limit: depth [m] that decides.
     """
     n, device = len(q), hand.device
@@ -93,8 +87,7 @@ def find_collisions(
         return Collisions(*(depth.numpy().reshape(2, n).T.copy() for depth in (table, obstacle)))
 
 
-@dataclass(frozen=True)
-class Item:
+class Item(NamedTuple):
     """An object that may lie on the table, and its grasps by one hand."""
 
     record: ObjectRecord

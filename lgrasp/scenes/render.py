@@ -61,11 +61,7 @@ def join_surfaces(surfaces: Sequence[LabelledMesh]) -> LabelledMesh:
 
 
 def render(surface: LabelledMesh, intrinsics: Intrinsics, pose: np.ndarray, device: str = "cpu") -> Images:
-    """Exact depths and labels from v cameras.
-
-    Args:
-        pose: T_scene_camera, x y z [m] qw qx qy qz, shape (v, 7).
-    """
+    """Exact depths and labels from v cameras at T_scene_camera, x y z [m] qw qx qy qz, shape (v, 7)."""
     start()
     with wp.ScopedDevice(device):
         mesh = wp.Mesh(
@@ -87,13 +83,8 @@ def render(surface: LabelledMesh, intrinsics: Intrinsics, pose: np.ndarray, devi
 
 
 def image_normals(images: Images, window: int, device: str = "cpu") -> np.ndarray:
-    """Unit normals in the scene frame from the depths alone, towards the camera, shape (v, h, w, 3), f32.
-
-    Zero where too few pixels around lie on the same surface.
-
-    Args:
-        window: Pixels to each side through which a plane is laid.
-    """
+    """Unit normals in the scene frame from the depths alone, towards the camera, shape (v, h, w, 3), f32: of the plane
+    through ``window`` pixels to each side; zero where too few of them lie on the same surface."""
     start()
     points = images.intrinsics.points(images.depth).astype(np.float32)
     with wp.ScopedDevice(device):
@@ -106,14 +97,11 @@ def image_normals(images: Images, window: int, device: str = "cpu") -> np.ndarra
     return np.einsum("vab,vhwb->vhwa", R, normals)
 
 
-_MOST_STEPS = 2**16 - 1  # that a file can hold
-
-
 def add_noise(images: Images, params: CameraParams, rng: np.random.Generator) -> Images:
     """Images with Gaussian noise of ``noise + noise_square * depth^2`` [m] on every depth, in steps of DEPTH_UNIT."""
     error = rng.standard_normal(images.depth.shape).astype(np.float32)
     depth = images.depth + error * (params.noise + params.noise_square * images.depth**2)
-    steps = np.clip(np.rint(depth / DEPTH_UNIT), 1, _MOST_STEPS) * DEPTH_UNIT
+    steps = np.clip(np.rint(depth / DEPTH_UNIT), 1, 2**16 - 1) * DEPTH_UNIT  # as a file can hold them
     return replace(images, depth=np.where(images.depth > 0.0, steps, 0.0).astype(np.float32))
 
 
@@ -124,11 +112,8 @@ def draw_offsets(params: CameraParams, rng: np.random.Generator) -> np.ndarray:
 
 
 def merge_views(images: Images, offsets: np.ndarray, params: CameraParams, device: str = "cpu") -> CloudRecord:
-    """All points of all views with a normal, each view displaced; of a cube of side ``voxel`` one point is kept.
-
-    Args:
-        offsets: displacement of each view [m], shape (v, 3).
-    """
+    """All points of all views with a normal, each view displaced by its offset [m], shape (v, 3); of a cube of side
+    ``voxel`` one point is kept."""
     normals = image_normals(images, params.window, device)
     v, i, j = np.nonzero((images.depth > 0.0) & (np.abs(normals).sum(-1) > 0.5))
     T = pose_matrix(images.pose)

@@ -59,12 +59,20 @@ class MjcfScene:
         mujoco = import_mujoco("mjcf")
         self._mujoco = mujoco
         self._objects = [f"object_{place}_{item.code}" for place, item in enumerate(objects)]
+        robot = etree.fromstring(hand["hand/hand.urdf"])
+        for mesh in robot.iter("mesh"):
+            mesh.set("filename", f"hand/{mesh.get('filename')}")
+        set_compiler(robot, meshdir="../")  # of the export, seen from the scenes
         files = dict(hand)
         for item in objects:
             files |= {item.mesh: item.text, **item.pieces}
         try:
-            spec = _hand_spec(mujoco, files)
-            _add_drives(mujoco, spec, frames.joint_names)
+            spec = mujoco.MjSpec.from_string(etree.tostring(robot, encoding="unicode"), assets=files)
+            set_options(mujoco, spec, _PROTOCOL)
+            for joint in spec.joints:
+                set_joint(mujoco, joint, _PROTOCOL)
+            for name in frames.joint_names:  # controls come in the order of q
+                add_drive(mujoco, spec, spec.joint(name), _PROTOCOL, _PROTOCOL.stiffness)
             for name, item in zip(self._objects, objects, strict=True):
                 _add_object(mujoco, spec, name, item)
             for geom in spec.geoms:
@@ -120,16 +128,6 @@ class MjcfScene:
         return found
 
 
-def _hand_spec(mujoco, files: dict[str, bytes]) -> "mujoco.MjSpec":
-    robot = etree.fromstring(files["hand/hand.urdf"])
-    for mesh in robot.iter("mesh"):
-        mesh.set("filename", f"hand/{mesh.get('filename')}")
-    set_compiler(robot, meshdir="../")  # of the export, seen from the scenes
-    spec = mujoco.MjSpec.from_string(etree.tostring(robot, encoding="unicode"), assets=files)
-    set_options(mujoco, spec, _PROTOCOL)
-    return spec
-
-
 def _add_object(mujoco, spec: "mujoco.MjSpec", name: str, item: SceneObject) -> None:
     """The mesh is what is seen; its pieces collide and weigh."""
     body = spec.worldbody.add_body(name=name)
@@ -145,14 +143,6 @@ def _add_object(mujoco, spec: "mujoco.MjSpec", name: str, item: SceneObject) -> 
         spec.add_mesh(name=piece, file=file)
         mass = _PROTOCOL.mass * volume / sum(item.volumes)
         body.add_geom(name=piece, meshname=piece, mass=mass, group=3, **shape)
-
-
-def _add_drives(mujoco, spec: "mujoco.MjSpec", joint_names: Sequence[str]) -> None:
-    """Position control of the joints of q; controls come in their order."""
-    for joint in spec.joints:
-        set_joint(mujoco, joint, _PROTOCOL)
-    for name in joint_names:
-        add_drive(mujoco, spec, spec.joint(name), _PROTOCOL, _PROTOCOL.stiffness)
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:

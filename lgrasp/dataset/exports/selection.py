@@ -152,18 +152,17 @@ class Selection:
                         advance(len(some))
 
     def _read(self, reader: ShardReader, source: _Source, some: np.ndarray, start: int) -> Batch:
-        rows = source.rows[some] - start
-        q = [reader.column(n, start, start + CHUNK_ROWS)[rows] for n in ("q", "q_pregrasp", "q_squeeze")]
-        pose, index = reader.column("object_pose", start, start + CHUNK_ROWS)[rows], source.index[some]
+        def read(name: str) -> np.ndarray:
+            return reader.column(name, start, start + CHUNK_ROWS)[source.rows[some] - start].astype(np.float64)
+
+        pose, index = read("object_pose"), source.index[some]
         if self.single:
             present = np.argmax(index >= 0, axis=1)[:, None]
             pose = np.take_along_axis(pose, present[..., None], 1)
             index = np.take_along_axis(index, present, 1)
-        holds = np.ones(len(rows))
-        if HOLDS in reader.columns:
-            holds = (reader.column(HOLDS, start, start + CHUNK_ROWS)[rows] > 0).astype(np.float64)
-        q, q_pregrasp, q_squeeze = (values[:, source.columns].astype(np.float64) for values in q)
-        return Batch(source.first + some, q, q_pregrasp, q_squeeze, pose.astype(np.float64), index, holds)
+        holds = (read(HOLDS) > 0).astype(np.float64) if HOLDS in reader.columns else np.ones(len(some))
+        postures = (read(name)[:, source.columns] for name in ("q", "q_pregrasp", "q_squeeze"))
+        return Batch(source.first + some, *postures, pose, index, holds)
 
 
 def select_rows(

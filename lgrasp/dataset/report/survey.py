@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from lgrasp.dataset.files import Paths, check_heaps, shard_tree
 from lgrasp.dataset.reader import ShardReader
+from lgrasp.grasp.records import ShardHeader
 
 
 class Head(NamedTuple):
@@ -22,10 +23,7 @@ class Head(NamedTuple):
     """Id, hash and scale; sorted by id."""
     labels: list[str]
     """What to call the objects: the id, and more where one id stands for several things."""
-    pipeline: str
-    seed: int
-    created: str
-    version: str
+    header: ShardHeader
     parts: list[tuple[str, int]]
     """Run and shard index of the rows; several in a merged file."""
     stages: list[str]
@@ -51,10 +49,10 @@ def survey(paths: Paths) -> tuple[list[Head], list[str]]:
 def _head(path: Path) -> Head:
     check_heaps(path)
     with ShardReader(path) as reader:
-        header, attributes = reader.header, reader.attributes
+        header, attributes, keys = reader.header, reader.attributes, reader.object_keys
         run = header.config.get("run_key") or json.dumps(dict(header.config), sort_keys=True)
         indices = [part["shard_index"] for part in header.merged_from] or [header.shard_index]
-        hand, keys = (str(attributes["hand"]), str(attributes["hand_sha256"])), reader.object_keys
+        hand = (str(attributes["hand"]), str(attributes["hand_sha256"]))
         try:
             stages = [next(iter(stage)) for stage in header.config["pipeline"]["stages"]]
         except (KeyError, TypeError, StopIteration):  # of another writer
@@ -66,10 +64,7 @@ def _head(path: Path) -> Head:
             hand=hand,
             objects=keys,
             labels=[],
-            pipeline=header.pipeline,
-            seed=header.seed,
-            created=header.created,
-            version=header.lgrasp_version,
+            header=header,
             parts=[(f"{hand} {keys} {header.pipeline} {header.seed} {run}", index) for index in indices],
             stages=stages,
             statistics=reader.statistics,

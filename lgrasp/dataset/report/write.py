@@ -81,7 +81,7 @@ def read_dataset(
 
 
 def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, Any]:
-    contacts = int(hand.links.sum())
+    contacts, pipelines = int(hand.links.sum()), sorted({h.header.pipeline for h in heads})
     shares = {name: int(n) / contacts for name, n in zip(hand.hand.link_names, hand.links, strict=True) if n}
     return {
         "hand": key[0],
@@ -89,9 +89,9 @@ def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, 
         "joints": list(hand.hand.joint_names),
         "rows": hand.rows,
         "shards": len(heads),
-        "created": [min(h.created for h in heads), max(h.created for h in heads)],
-        "lgrasp_versions": sorted({h.version for h in heads}),
-        "runs": [_run(name, [h for h in heads if h.pipeline == name]) for name in sorted({h.pipeline for h in heads})],
+        "created": [min(h.header.created for h in heads), max(h.header.created for h in heads)],
+        "lgrasp_versions": sorted({h.header.lgrasp_version for h in heads}),
+        "runs": [_run(name, [h for h in heads if h.header.pipeline == name]) for name in pipelines],
         "metrics": _metrics(hand.together()),
         "objects": [_objects(group) for group in hand.objects.values()],
         "held": held_numbers(hand.held),
@@ -113,7 +113,7 @@ def _run(pipeline: str, heads: Sequence[Head]) -> dict[str, Any]:
     return {
         "pipeline": pipeline,
         "rows": sum(head.rows for head in heads),
-        "seeds": sorted({head.seed for head in heads}),
+        "seeds": sorted({head.header.seed for head in heads}),
         "device": str(statistics.get("device", "")),
         "survivors": survivors({stage: counts[stage] for stage in heads[0].stages or SURVIVORS if stage in counts}),
         "counts": counts,
