@@ -274,6 +274,7 @@ def test_info(path):
     grasps = read_shard(path).grasps
     (shard,) = describe(path)
     assert shard["rows_by_objects"] == {"1": 4, "2": 5, "3": 3}
+    assert grasps.sequence is not None
     last = [grasps.sequence.space[row, n - 1] for row, n in enumerate(held(grasps))]
     assert shard["rows_by_space"] == {f"finger {s}": last.count(s) for s in range(4)}
     text = CliRunner().invoke(app, ["info", str(path)]).stdout
@@ -292,9 +293,10 @@ def test_info_of_single_objects(tmp_path, make_shard):
 
 def test_added_metrics_are_of_the_worst_object(path, tmp_path, make_sequence, same_rows):
     """A row is never better than its parent, and what is copied stays as it is."""
-    run(MetricsJob(shards=[path], out=tmp_path / "more", add=tuple(METRICS), device="cpu", workers=1))
+    run(MetricsJob(shards=[path], out=tmp_path / "more", add=tuple(METRICS), settings=(), device="cpu", workers=1))
     assert validate_shard(tmp_path / "more" / "s.h5") == []
     grasps = read_shard(tmp_path / "more" / "s.h5").grasps
+    assert grasps.sequence is not None
     parent = grasps.sequence.parent
     for values in (grasps.metrics[name] for name in METRICS):
         assert (values[parent >= 0] <= values[parent[parent >= 0]]).all()
@@ -304,8 +306,9 @@ def test_added_metrics_are_of_the_worst_object(path, tmp_path, make_sequence, sa
 
 
 def test_reader_has_the_steps(path):
-    grasps = read_shard(path).grasps
+    steps = read_shard(path).grasps.sequence
+    assert steps is not None
     with ShardReader(path) as reader:
-        np.testing.assert_array_equal(reader.column("sequence/q", 2, 5), grasps.sequence.q[2:5])
+        np.testing.assert_array_equal(reader.column("sequence/q", 2, 5), steps.q[2:5])
         assert reader.columns["sequence/free_joints"] == ((12, 3, 6), np.dtype(bool))
         assert reader.space_names == tuple(f"finger {s}" for s in range(4))

@@ -97,7 +97,9 @@ def test_without_mujoco(cli, tmp_path, shards, monkeypatch):
 
 def test_a_flat_object_is_refused_by_name(cli, tmp_path, shards):
     flat = shards.object()
-    shards.make(tmp_path / "a.h5", n=1, objects=[replace(flat, vertices=flat.vertices * np.float32([1, 1, 0]))])
+    shards.make(
+        tmp_path / "a.h5", n=1, objects=[replace(flat, vertices=flat.vertices * np.array([1, 1, 0], np.float32))]
+    )
     code, _, err = cli("a.h5", "--to", "mjcf", "--out", "made")
     assert (code, len(err.splitlines())) == (2, 1)
     assert "cup" in err

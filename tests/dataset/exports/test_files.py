@@ -3,6 +3,7 @@
 import os
 import pickle
 import pickletools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def names(path) -> set[str]:
     """What a pickle would import."""
     data = path.read_bytes()
     start = data.index(b"\n", 10) + 1
-    return {arg for op, arg, _ in pickletools.genops(data[start:]) if op.name == "GLOBAL"}
+    return {str(arg) for op, arg, _ in pickletools.genops(data[start:]) if op.name == "GLOBAL"}
 
 
 def test_pickles_are_those_of_every_numpy(tmp_path):
@@ -58,6 +59,8 @@ def test_what_numpy_wrote_is_read(tmp_path, protocol):
 
 
 class Evil:
+    path = Path()
+
     def __reduce__(self):
         return os.mkdir, (str(self.path),)
 
@@ -102,7 +105,8 @@ def test_others_dexgraspbench(tmp_path):
     world = np.array([0.3, -0.1, 0.5, 0.5, -0.5, 0.5, 0.5])
     keys = ("grasp_qpos", "pregrasp_qpos", "squeeze_qpos")
     entry = dict(zip(keys, q.astype("f4"), strict=True))
-    np.save(tmp_path / "0.npy", entry | {"obj_pose": world, "obj_scale": 0.06, "obj_path": "assets/x/core_mug"})
+    entry |= {"obj_pose": world, "obj_scale": 0.06, "obj_path": "assets/x/core_mug"}
+    np.save(tmp_path / "0.npy", np.array(entry, object))
     with pytest.raises(ShardError, match=r"0\.npy: does not name its joints"):
         read_dexgraspbench(tmp_path)
     with pytest.raises(ShardError, match="has 9 numbers, expected 10"):

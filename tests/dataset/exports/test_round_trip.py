@@ -92,7 +92,7 @@ def test_read_back(tmp_path, shards, hand, form):
     assert read.joint_names == tuple(shard.hand.joint_names)
     assert_same(read, shard, form)
     assert [(o.code, o.scale) for o in read.objects] == [("cup", 1.0)]
-    mesh = trimesh.load(read.objects[0].mesh, process=False)
+    mesh = trimesh.load_mesh(read.objects[0].mesh, process=False)
     np.testing.assert_allclose(mesh.vertices, shard.objects[0].vertices, atol=1e-8)
     np.testing.assert_array_equal(mesh.faces, shard.objects[0].faces)
     turned = tuple(reversed(read.joint_names))
@@ -179,7 +179,7 @@ def test_real_hands_can_be_used_alone(tmp_path, shards, hand):
     shapes = [shape for link in urdf.link_map.values() for shape in (*link.visuals, *link.collisions)]
     files = {shape.geometry.mesh.filename for shape in shapes if shape.geometry.mesh}
     assert {f"meshes/{path.name}" for path in (tmp_path / "elsewhere" / "hand" / "meshes").iterdir()} == files
-    assert all(len(trimesh.load(tmp_path / "elsewhere" / "hand" / name, force="mesh").faces) for name in files)
+    assert all(len(trimesh.load_mesh(tmp_path / "elsewhere" / "hand" / name).faces) for name in files)
     text = (tmp_path / "elsewhere" / "README.txt").read_text()
     assert all(
         f"{name} = " in text

@@ -110,7 +110,7 @@ def test_generated_grasps(run, make, tmp_path, grasps):
     names = read_shard(next((tmp_path / "out").glob("*.h5"))).hand.link_names
     top, share = next(iter(hand["contact_links"].items()))
     assert share == pytest.approx(max(np.bincount(links[links >= 0])) / (links >= 0).sum())
-    assert names[np.bincount(links[links >= 0]).argmax()] == top
+    assert names[int(np.bincount(links[links >= 0]).argmax())] == top
     assert group["distinct_poses"] == len(np.unique(columns["object_pose"][:, 0], axis=0))
     variance = np.linalg.svd(columns["q"] - columns["q"].mean(0), compute_uv=False) ** 2
     np.testing.assert_allclose(hand["posture"]["explained_variance"], variance / variance.sum(), atol=1e-6)

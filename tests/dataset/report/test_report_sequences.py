@@ -44,6 +44,7 @@ def test_numbers_are_those_of_the_rows(folder, tmp_path):
         assert group["penetration"]["over_bound"] == (deep > 2).sum()
         p = group["physics"]["p"]
         assert (p["run"], p["held"]) == ((holds[mine] >= 0).sum(), (holds[mine] == 1).sum())
+        assert grasps.sequence is not None
         for number, name in enumerate(grasps.sequence.space_names):
             ours = mine & (grasps.sequence.space[:, int(n) - 1] == number)
             found = group["spaces"][name]
