@@ -202,8 +202,11 @@ class ShardReader(FileReader):
         attrs = self.attributes
         with reading(self.path):
             return ShardHeader(
-                **{name: attrs[name] for name in ("pipeline", "created", "lgrasp_version")},
-                **{name: int(attrs[name]) for name in ("seed", "shard_index")},
+                pipeline=attrs["pipeline"],
+                seed=int(attrs["seed"]),
+                shard_index=int(attrs["shard_index"]),
+                created=attrs["created"],
+                lgrasp_version=attrs["lgrasp_version"],
                 config=json.loads(attrs["config"]),
                 merged_from=tuple(json.loads(attrs.get("merged_from", "[]"))),
             )

@@ -293,7 +293,7 @@ def test_info_of_single_objects(tmp_path, make_shard):
 
 def test_added_metrics_are_of_the_worst_object(path, tmp_path, make_sequence, same_rows):
     """A row is never better than its parent, and what is copied stays as it is."""
-    run(MetricsJob(shards=[path], out=tmp_path / "more", add=tuple(METRICS), settings=(), device="cpu", workers=1))
+    run(MetricsJob(shards=(path,), out=tmp_path / "more", add=tuple(METRICS), settings=(), device="cpu", workers=1))
     assert validate_shard(tmp_path / "more" / "s.h5") == []
     grasps = read_shard(tmp_path / "more" / "s.h5").grasps
     assert grasps.sequence is not None

@@ -161,8 +161,8 @@ class Selection:
             pose = np.take_along_axis(pose, present[..., None], 1)
             index = np.take_along_axis(index, present, 1)
         holds = (read(HOLDS) > 0).astype(np.float64) if HOLDS in reader.columns else np.ones(len(some))
-        postures = (read(name)[:, source.columns] for name in ("q", "q_pregrasp", "q_squeeze"))
-        return Batch(source.first + some, *postures, pose, index, holds)
+        q, before, squeeze = (read(name)[:, source.columns] for name in ("q", "q_pregrasp", "q_squeeze"))
+        return Batch(source.first + some, q, before, squeeze, pose, index, holds)
 
 
 def select_rows(
