@@ -8,11 +8,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_ARGUMENTS = 10
-NOT_YET = (
-    "lgrasp/grasp/near_kernels",
-    "lgrasp/simulate/worlds",
-)
-"""Modules whose kernels are still to be given structs."""
 
 
 def decorated(tree: ast.Module, what: str) -> list[ast.FunctionDef | ast.ClassDef]:
@@ -27,13 +22,11 @@ MODULES = {
 KERNELS = [
     pytest.param(kernel, id=f"{name}:{kernel.name}")
     for name, text in MODULES.items()
-    if name not in NOT_YET
     for kernel in decorated(ast.parse(text), "wp.kernel")
 ]
 STRUCTS = [
     pytest.param(struct, text.splitlines(), id=f"{name}:{struct.name}")
     for name, text in MODULES.items()
-    if name not in NOT_YET
     for struct in decorated(ast.parse(text), "wp.struct")
 ]
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
-from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_grasps, reorder_grasps, select_poses
+from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_rows, select_poses, take_rows
 from lgrasp.hand.model import HandModel
 from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
@@ -99,7 +99,7 @@ def run_batch(
         for salt in range(1, passes):
             found = _run_through(again, table, pipeline, context.with_salt(salt), meter)
             parts.append(replace(found, index=found.index + (salt << PASS_SHIFT)))
-        grasps = _by_blocks(join_grasps(parts))
+        grasps = _by_blocks(join_rows(parts))
     return BatchResult(grasps, meter.counts, meter.seconds)
 
 
@@ -119,4 +119,4 @@ def _yielding(table: CandidateTable, grasps: GraspTable, device: str) -> Candida
 def _by_blocks(grasps: GraspTable) -> GraspTable:
     """Rows in the order of their blocks, within a block as they are: pass by pass."""
     block = (grasps.index & ((1 << PASS_SHIFT) - 1)) // PASS_BLOCK
-    return reorder_grasps(grasps, np.argsort(block, kind="stable"))
+    return take_rows(grasps, np.argsort(block, kind="stable"))

@@ -19,7 +19,7 @@ from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
-from lgrasp.grasp.tables import GraspTable, join_grasps, no_grasps, take_grasps
+from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_grasps
 from lgrasp.stages.context import Context
 
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
@@ -226,7 +226,7 @@ def make_shard(
                 progress(found.count, result)
             if found.count >= rows:
                 break
-    result.grasps = join_grasps(found.parts)
+    result.grasps = join_rows(found.parts)
     result.wall = earlier + time.perf_counter() - start
     result.exhausted = found.count < rows
     if bank:
@@ -284,5 +284,5 @@ class _Rows:
     def account(self) -> Account:
         """How far the shard has come."""
         r = self.result
-        table = join_grasps([r.grasps, self._aside] if self._aside else [r.grasps])
+        table = join_rows([r.grasps, self._aside] if self._aside else [r.grasps])
         return Account(table, self.count, r.candidates, r.duplicates, r.counts, r.seconds, r.wall)

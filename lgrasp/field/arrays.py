@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from lgrasp.field.kernels import stored_posture
 from lgrasp.field.model import ContactField
 from lgrasp.hand.model import HandModel
-from lgrasp.math.kinematics import Kinematics, vec_dof
+from lgrasp.math.kinematics import Kinematics
 from lgrasp.math.transforms import decode_normal, normal_bin
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
@@ -175,14 +176,4 @@ def boxes_pick(b: Boxes, f: Field, slot: wp.int32, p: wp.vec3, n: wp.vec3, cosin
 def field_seed(f: Field, h: Kinematics, slot: wp.int32, record: wp.int32):
     """Joint seed of a contact vector of a slot [rad or m]; shared joints have exactly their value in the setting."""
     setting = slot // h.groups
-    group = slot - setting * h.groups
-    first = h.dof_first[group]
-    free = h.dof_free[group]
-    q = vec_dof()
-    for d in range(h.dof_first[group + 1] - first):
-        if d >= free:
-            q[d] = h.dof_setting[setting, first + d]
-            continue
-        low = h.dof_lower[first + d]
-        q[d] = low + (h.dof_upper[first + d] - low) * float(int(f.posture[record, d])) / 255.0
-    return q
+    return stored_posture(h, slot - setting * h.groups, setting, f.posture, record)

@@ -14,6 +14,7 @@ from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.model import HandModel
 from lgrasp.math.transforms import NORMAL_BINS
+from lgrasp.runtime.structs import empty_struct
 
 
 def box_index(position: np.ndarray, patch: np.ndarray, patches: int, params: FieldParams) -> dict[str, Any]:
@@ -25,18 +26,13 @@ def box_index(position: np.ndarray, patch: np.ndarray, patches: int, params: Fie
         patches: number of patches of the hand.
     """
     if params.index != "bvh":
-        empty = np.zeros(0, np.int32)
-        return {
-            "box_edge": params.box,
-            "patch_first": np.zeros(patches + 1, np.int32),
-            "box": np.zeros((0, 3), np.float32),
-            "leaf_first": np.zeros(1, np.int32),
-            "leaf_record": empty,
-        }
+        first, box = np.zeros(patches + 1, np.int32), np.zeros((0, 3), np.float32)
+        none = {"leaf_first": first[:1], "leaf_record": first[:0]}
+        return {"box_edge": params.box, "patch_first": first, "box": box, **none}
     place = np.floor(position / params.box).astype(np.int64)
     low = place.min(0)
     size = place.max(0) - low + 1
-    key = ((patch * size[0] + place[:, 0] - low[0]) * size[1] + place[:, 1] - low[1]) * size[2] + place[:, 2] - low[2]
+    key = np.ravel_multi_index((patch, *(place - low).T), (patches, *size))
     order = np.argsort(key, kind="stable")
     boxes, first, number = np.unique(key[order], return_index=True, return_counts=True)
     # at most leaf_normals vectors a box, spread over those there are
@@ -44,14 +40,11 @@ def box_index(position: np.ndarray, patch: np.ndarray, patches: int, params: Fie
     leaf_first = np.concatenate([[0], np.cumsum(kept)])
     inside = np.arange(leaf_first[-1]) - np.repeat(leaf_first[:-1], kept)
     spread = inside * np.repeat(number, kept) // np.repeat(kept, kept)
-    corner = (
-        np.column_stack([boxes // (size[1] * size[2]) % size[0], boxes // size[2] % size[1], boxes % size[2]]) + low
-    )
-    owner = boxes // (size[0] * size[1] * size[2])
+    owner, *corner = np.unravel_index(boxes, (patches, *size))
     return {
         "box_edge": params.box,
         "patch_first": np.searchsorted(owner, np.arange(patches + 1)).astype(np.int32),
-        "box": (corner * params.box).astype(np.float32),
+        "box": ((np.column_stack(corner) + low) * params.box).astype(np.float32),
         "leaf_first": leaf_first.astype(np.int32),
         "leaf_record": order[np.repeat(first, kept) + spread].astype(np.int32),
     }
@@ -74,8 +67,7 @@ def build_field(
     Raises:
         HandError: a group that no posture frees from the palm.
     """
-    parts = []
-    groups = hand.model.groups
+    parts, groups = [], hand.model.groups
     slots = len(hand.model.tree.settings) * groups
     for slot in range(slots):
         if progress:
@@ -85,8 +77,9 @@ def build_field(
     cell = _bounded_cell([p["position"] for p in parts], params)
     origins, shapes, keys, base = [], [], [], 0
     for p in parts:
-        origin = p["position"].min(0) - 1e-4 if len(p["position"]) else np.zeros(3, np.float32)
-        top = p["position"].max(0) if len(p["position"]) else np.zeros(3, np.float32)
+        origin = top = np.zeros(3, np.float32)
+        if len(p["position"]):
+            origin, top = p["position"].min(0) - 1e-4, p["position"].max(0)
         shape = np.floor((top - origin) / cell).astype(np.int64) + 1
         place = (p["position"] - origin) / cell
         index = np.minimum(place.astype(np.int64), shape - 1)
@@ -108,6 +101,9 @@ def build_field(
     def gather(name: str, dtype) -> np.ndarray:
         return np.concatenate([p[name] for p in parts])[order].astype(dtype)
 
+    index = np.arange(*hand.model.contact_first[groups : groups + 2])
+    palm = {"position": hand.model.contact_points[index], "direction": hand.model.contact_normals[index]}
+    palm["index"] = index
     position, point = gather("position", np.float32), gather("point", np.int32)
     setting = np.repeat(np.arange(slots) // groups, [len(p["point"]) for p in parts])[order]
     patch = setting * hand.model.patches + hand.model.contact_patch[point]
@@ -125,14 +121,9 @@ def build_field(
         normal=gather("normal", np.uint16),
         posture=gather("posture", np.uint8),
         clear_share=np.array([p["clear"] for p in parts], np.float32),
-        **opposed_pairs(parts, groups, _palm_part(hand.model), params.seed),
+        **opposed_pairs(parts, groups, palm, params.seed),
         **boxes,
     )
-
-
-def _palm_part(model: HandModel) -> dict[str, np.ndarray]:
-    index = np.arange(model.contact_first[model.groups], model.contact_first[model.groups + 1])
-    return {"position": model.contact_points[index], "direction": model.contact_normals[index], "index": index}
 
 
 def _bounded_cell(positions: list[np.ndarray], params: FieldParams) -> float:
@@ -150,29 +141,23 @@ def _bounded_cell(positions: list[np.ndarray], params: FieldParams) -> float:
 def _check_clear(model: HandModel, clear: np.ndarray) -> None:
     """Raises HandError when a group is clear of the palm in no setting; ``clear`` (V, G) are shares of postures."""
     for group in np.flatnonzero((clear == 0.0).all(0)):
-        links = [
-            n
-            for n, b in zip(model.tree.link_names, model.tree.link_body, strict=True)
-            if model.tree.body_group[b] == group
-        ]
+        links = np.array(model.tree.link_names)[model.tree.body_group[model.tree.link_body] == group]
         raise HandError(
             f"hand '{model.name}': no posture of finger ({', '.join(links)}) is clear of the palm and of itself"
         )
 
 
 def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, np.ndarray]:
-    """Contact vectors of a group in a setting; none when no posture is clear."""
+    """Contact vectors of a group in a setting; none when it has no contact surface, or no posture is clear."""
     model, device = hand.model, hand.device
     settings = len(model.tree.settings)
     setting, group = divmod(slot, model.groups)
-    width = int(np.diff(model.tree.dof_first).max())
-    if model.contact_first[group + 1] == model.contact_first[group]:
-        return _no_vectors(width)
     # vectors may fill half of the memory bound, the table the rest
     room = int(0.5e6 * params.max_mb / _VECTOR_BYTES / (model.groups * settings))
     records = params.records if settings == 1 else max(params.records // settings, min(params.records, _LEAST_RECORDS))
-    postures = max(1000, int(1.5 * records / _PER_POSTURE))
-    posture = wp.zeros((postures, width), dtype=wp.uint8, device=device)
+    touches = model.contact_first[group + 1] > model.contact_first[group]
+    postures = max(1000, int(1.5 * records / _PER_POSTURE)) if touches else 0
+    posture = wp.zeros((postures, int(np.diff(model.tree.dof_first).max())), dtype=wp.uint8, device=device)
     clear = wp.empty(postures, dtype=wp.int32, device=device)
     seed = params.seed * 1009 + slot
     inputs = [hand.struct, group, setting, seed, _CLEARANCE]
@@ -180,30 +165,12 @@ def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, 
     good = np.flatnonzero(clear.numpy())
     count = min(records, room) if len(good) else 0
     chosen = np.resize(np.repeat(good, _PER_POSTURE), count).astype(np.int32)
-    kinds = {"point": wp.int32, "position": wp.vec3, "bin": wp.int32, "normal": wp.int32, "direction": wp.vec3}
-    columns = {name: wp.empty(count, dtype=kind, device=device) for name, kind in kinds.items()}
-    vectors = Vectors()
-    for name, column in columns.items():
-        setattr(vectors, name, column)
+    vectors = empty_struct(Vectors, device, count)
     indices = wp.array(chosen, dtype=wp.int32, device=device)
-    if count:
-        inputs = [hand.struct, group, setting, seed + 500_009, posture, indices]
-        wp.launch(contact_vectors, count, inputs, [vectors], device=device)
+    inputs = [hand.struct, group, setting, seed + 500_009, posture, indices]
+    wp.launch(contact_vectors, count, inputs, [vectors], device=device)
     return {
-        **{name: column.numpy() for name, column in columns.items()},
+        **{name: getattr(vectors, name).numpy() for name in Vectors.vars},
         "posture": posture.numpy()[chosen],
-        "clear": np.asarray(len(good) / postures, np.float32),
-    }
-
-
-def _no_vectors(width: int) -> dict[str, np.ndarray]:
-    """What _sample_slot gives for a group without contact surface."""
-    return {
-        "point": np.zeros(0, np.int32),
-        "position": np.zeros((0, 3), np.float32),
-        "bin": np.zeros(0, np.int32),
-        "normal": np.zeros(0, np.int32),
-        "direction": np.zeros((0, 3), np.float32),
-        "posture": np.zeros((0, width), np.uint8),
-        "clear": np.asarray(np.nan, np.float32),
+        "clear": np.asarray(len(good) / postures if touches else np.nan, np.float32),
     }

@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
-from lgrasp.math.kinematics import MAX_JOINTS, group_forward, vec_dof
+from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_forward, vec_dof
 from lgrasp.math.transforms import encode_normal, normal_bin
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -23,12 +23,18 @@ class Vectors:
 
 
 @wp.func
-def _shared_values(hand: Hand, group: wp.int32, setting: wp.int32):
-    """The group's dofs with the shared joints at their values, its own at 0."""
-    first = hand.kin.dof_first[group]
+def stored_posture(h: Kinematics, group: wp.int32, setting: wp.int32, codes: wp.array2d(dtype=wp.uint8), row: wp.int32):
+    """Posture of a group [rad or m] that row ``row`` of codes (N, D) stands for, 8 bits a joint over its range; shared
+    joints have exactly their value in the setting."""
+    first = h.dof_first[group]
+    free = h.dof_free[group]
     q = vec_dof()
-    for d in range(hand.kin.dof_free[group], hand.kin.dof_first[group + 1] - first):
-        q[d] = hand.kin.dof_setting[setting, first + d]
+    for d in range(h.dof_first[group + 1] - first):
+        if d >= free:
+            q[d] = h.dof_setting[setting, first + d]
+            continue
+        low = h.dof_lower[first + d]
+        q[d] = low + (h.dof_upper[first + d] - low) * float(int(codes[row, d])) / 255.0
     return q
 
 
@@ -39,7 +45,6 @@ def sample_postures(
     setting: wp.int32,
     seed: wp.int32,
     margin: wp.float32,
-    # out
     posture_out: wp.array2d(dtype=wp.uint8),
     clear_out: wp.array(dtype=wp.int32),
 ):
@@ -51,22 +56,15 @@ def sample_postures(
     """
     i = wp.tid()
     state = wp.rand_init(seed, i)
-    first = hand.kin.dof_first[group]
-    free = hand.kin.dof_free[group]
-    q = _shared_values(hand, group, setting)
-    for d in range(free):
-        code = wp.min(int(wp.randf(state) * 256.0), 255)
-        posture_out[i, d] = wp.uint8(code)
-        low = hand.kin.dof_lower[first + d]
-        q[d] = low + (hand.kin.dof_upper[first + d] - low) * float(code) / 255.0
+    for d in range(hand.kin.dof_free[group]):
+        posture_out[i, d] = wp.uint8(wp.min(int(wp.randf(state) * 256.0), 255))
+    q = stored_posture(hand.kin, group, setting, posture_out, i)
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     group_forward(hand.kin, group, q, X, 0)
-    clear = int(1)
-    if not group_pairs_clear(hand, 0, group + 1, X, 0, X, 0, margin):
-        clear = 0
-    if clear == 1 and not group_pairs_clear(hand, group + 1, group + 1, X, 0, X, 0, margin):
-        clear = 0
-    clear_out[i] = clear
+    clear = group_pairs_clear(hand, 0, group + 1, X, 0, X, 0, margin)
+    if clear:
+        clear = group_pairs_clear(hand, group + 1, group + 1, X, 0, X, 0, margin)
+    clear_out[i] = int(clear)
 
 
 @wp.kernel
@@ -77,7 +75,6 @@ def contact_vectors(
     seed: wp.int32,
     posture: wp.array2d(dtype=wp.uint8),
     chosen: wp.array(dtype=wp.int32),
-    # out
     vectors_out: Vectors,
 ):
     """Contact vector of a random contact point at each chosen posture (CF, Def. 4.1).
@@ -88,17 +85,12 @@ def contact_vectors(
     """
     i = wp.tid()
     state = wp.rand_init(seed, i)
-    first = hand.kin.dof_first[group]
-    q = _shared_values(hand, group, setting)
-    for d in range(hand.kin.dof_free[group]):
-        low = hand.kin.dof_lower[first + d]
-        q[d] = low + (hand.kin.dof_upper[first + d] - low) * float(int(posture[chosen[i], d])) / 255.0
+    q = stored_posture(hand.kin, group, setting, posture, chosen[i])
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     j0 = group_forward(hand.kin, group, q, X, 0)
     c0 = hand.contacts.first[group]
-    c = c0 + wp.min(
-        int(wp.randf(state) * float(hand.contacts.first[group + 1] - c0)), hand.contacts.first[group + 1] - c0 - 1
-    )
+    points = hand.contacts.first[group + 1] - c0
+    c = c0 + wp.min(int(wp.randf(state) * float(points)), points - 1)
     T = X[hand.contacts.body[c] - 1 - j0]
     n = wp.transform_vector(T, hand.contacts.normals[c])
     vectors_out.point[i] = c

@@ -39,10 +39,7 @@ class GraspBounds(Params):
         default=17.0, gt=0, le=90, description="Largest angle of the normals of link and object at a contact [deg]."
     )
     max_normal_spread: float = Field(
-        default=20.0,
-        gt=0,
-        le=180,
-        description="Largest angle of the object's normals about a contact [deg].",
+        default=20.0, gt=0, le=180, description="Largest angle of the object's normals about a contact [deg]."
     )
     max_penetration: float = Field(default=0.0008, ge=0, le=0.02, description="Largest penetration of hand and object.")
     allowed_penetration: float = Field(
@@ -69,16 +66,10 @@ class GraspBounds(Params):
         default=0.001, ge=0, le=0.05, description="Least distance of touching fingers and object in q_pregrasp."
     )
     squeeze_force: float = Field(
-        default=15.0,
-        ge=0,
-        le=1000,
-        description="Normal forces together that q_squeeze presses with [N].",
+        default=15.0, ge=0, le=1000, description="Normal forces together that q_squeeze presses with [N]."
     )
     squeeze_stiffness: float = Field(
-        default=DRIVE_STIFFNESS,
-        gt=0,
-        le=1e6,
-        description="Position control that q_squeeze is meant for [N m/rad].",
+        default=DRIVE_STIFFNESS, gt=0, le=1e6, description="Position control that q_squeeze is meant for [N m/rad]."
     )
 
     @model_validator(mode="before")

@@ -4,7 +4,7 @@ Stage filter hands over hands whose contacts it knows, on a device; everybody el
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -18,7 +18,6 @@ from lgrasp.grasp.check_kernels import (
     measure_held_penetration,
     measure_penetration,
     pack_rows,
-    self_overlap,
 )
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
 from lgrasp.grasp.control_kernels import control_poses, open_poses
@@ -31,6 +30,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.runtime.scan import running_sums
+from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally, read_tallies
 
 _MAX_RANKED_PENETRATION = 0.03  # [m] penetrations above this are not distinguished
@@ -85,66 +85,44 @@ class Check:
         """
         tally, upto = self.decide()
         running_sums(upto)
-        row = wp.empty(len(self), dtype=wp.int32, device=self.hand.device)
+        row = wp.full(len(self), -1, dtype=wp.int32, device=self.hand.device)
         wp.launch(list_kept, len(self), [self.found, upto], [row], device=self.hand.device)
-        columns = self._columns(seed, tally.device[:1], row)
+        columns = self._columns(seed, row)
         fetched = read_tallies([tally], list(columns.values()))
-        count = tally["kept"]
-        return _table(dict(zip(columns, fetched, strict=True)), count), tally
+        return _table(dict(zip(columns, fetched, strict=True)), tally["kept"]), tally
 
     def every(self, seed: wp.array) -> tuple[GraspTable, np.ndarray]:
         """All hands as rows in their order, and their outcomes (:class:`~lgrasp.grasp.outcomes.Outcome`), (n,)."""
-        d, n = self.hand.device, len(self)
         self.decide()
-        row = wp.array(np.arange(n, dtype=np.int32), dtype=wp.int32, device=d)
-        columns = self._columns(seed, wp.full(1, n, dtype=wp.int32, device=d), row)
-        return _table({name: values.numpy() for name, values in columns.items()}, n), self.found.outcome.numpy()
+        columns = self._columns(seed, wp.array(np.arange(len(self)), dtype=wp.int32, device=self.hand.device))
+        return _table({n: values.numpy() for n, values in columns.items()}, len(self)), self.found.outcome.numpy()
 
-    def _columns(self, seed: wp.array, rows: wp.array, row: wp.array) -> dict[str, wp.array]:
-        """What is stored of the first ``rows[0]`` of the hands ``row``, arrays as long as there are hands."""
+    def _columns(self, seed: wp.array, row: wp.array) -> dict[str, wp.array]:
+        """What is stored of the hands ``row`` (-1: none), arrays as long as there are hands."""
         d, m, model = self.hand.device, len(self), self.hand.model
-        width, hand, obj = self.at.contact.shape[1], self.hand.struct, self.obj.struct
-        limits, places, at, found = self.limits, self.places, self.at, self.found
-        q, pregrasp, squeeze = (wp.empty((m, model.dofs), dtype=wp.float32, device=d) for _ in range(3))
+        hand, obj, limits, places = self.hand.struct, self.obj.struct, self.limits, self.places
+        at, found = self.at, self.found
+        postures = {n: wp.empty((m, model.dofs), dtype=wp.float32, device=d) for n in ("q", "q_pregrasp", "q_squeeze")}
+        numbers = wp.empty((len(MEASURED), m), dtype=wp.float32, device=d)
+        packed = empty_struct(Packed, d, m, at.contact.shape[1], numbers=numbers, **postures)
         opened = wp.empty((m, model.groups), dtype=vec_dof, device=d)
-        epsilon, overlap = (wp.empty(m, dtype=wp.float32, device=d) for _ in range(2))
-        wp.launch(center_forces, m, [limits, places, at, rows, row], [found], device=d)
-        inputs = [hand, limits, places, at, found, rows, row]
-        wp.launch(control_poses, (m, model.groups), inputs, [q, squeeze, opened], device=d)
-        inputs = [hand, obj, self.held.struct, limits, at, opened, rows, row]
-        wp.launch(open_poses, m, inputs, [pregrasp], device=d)
-        wp.launch(grasp_epsilon, m, [obj, seed, limits, places, at, rows, row], [epsilon], device=d)
-        wp.launch(self_overlap, m, [hand, at.body, rows, row], [overlap], device=d)
-        p = Packed()
-        p.pose = wp.empty(m, dtype=wp.transform, device=d)
-        p.point, p.normal, p.force = (wp.empty((m, width), dtype=wp.vec3, device=d) for _ in range(3))
-        p.link = wp.empty((m, width), dtype=wp.int32, device=d)
-        p.index, p.slot = (wp.empty(m, dtype=wp.int32, device=d) for _ in range(2))
-        p.numbers = wp.empty((len(MEASURED), m), dtype=wp.float32, device=d)
-        wp.launch(pack_rows, m, [places, at, found, rows, row], [p], device=d)
-        own = {"q": q, "q_pregrasp": pregrasp, "q_squeeze": squeeze, "epsilon": epsilon, "self_penetration": overlap}
-        return own | {name: getattr(p, name) for name in Packed.vars}
+        wp.launch(center_forces, m, [limits, places, at, row], [found], device=d)
+        inputs = [hand, limits, places, at, found, row]
+        wp.launch(control_poses, (m, model.groups), inputs, [packed, opened], device=d)
+        wp.launch(open_poses, m, [hand, obj, self.held.struct, limits, at, opened, row], [packed], device=d)
+        wp.launch(grasp_epsilon, m, [obj, seed, limits, places, at, row], [packed], device=d)
+        wp.launch(pack_rows, m, [hand, places, at, found, row], [packed], device=d)
+        return {name: getattr(packed, name) for name in Packed.vars}
 
 
 def _table(columns: dict[str, np.ndarray], count: int) -> GraspTable:
     """The first ``count`` rows of what :meth:`Check._columns` gave."""
+    x: dict[str, Any] = {name: values[:count] for name, values in columns.items() if name != "numbers"}
     numbers = dict(zip(MEASURED, columns["numbers"][:, :count], strict=True))
-    x = {name: values[:count] for name, values in columns.items() if name != "numbers"}
-    numbers |= {"epsilon": x["epsilon"], "self_penetration": x["self_penetration"]}
+    numbers |= {name: x.pop(name) for name in ("epsilon", "self_penetration")}
     numbers["normal_error"] = np.arccos(np.clip(numbers["facing"], -1, 1))
-    return GraspTable(
-        index=x["index"].astype(np.int64),
-        slot=x["slot"],
-        q=x["q"],
-        q_pregrasp=x["q_pregrasp"],
-        q_squeeze=x["q_squeeze"],
-        pose=x["pose"].reshape(-1, 7),
-        contact_points=x["point"],
-        contact_normals=x["normal"],
-        contact_links=x["link"],
-        contact_forces=x["force"],
-        metrics={name: numbers[name] for name in METRICS},
-    )
+    x["index"] = x["index"].astype(np.int64)
+    return GraspTable(**x, metrics={name: numbers[name] for name in METRICS})
 
 
 class ContactTable(NamedTuple):
@@ -160,8 +138,8 @@ class ContactTable(NamedTuple):
 
 def known_contacts(links: np.ndarray, points: np.ndarray, normals: np.ndarray, device: str) -> ContactTable:
     """Contacts as a table has them: links (n, C), -1 for none, points and outward normals (n, C, 3)."""
-    flat = (np.nan_to_num(np.ascontiguousarray(a, np.float32)).reshape(-1, 3) for a in (points, normals))
-    own = wp.array(np.ascontiguousarray(links, np.int32), dtype=wp.int32, device=device)
+    flat = (np.nan_to_num(a).reshape(-1, 3) for a in (points, normals))
+    own = wp.array(links, dtype=wp.int32, device=device)
     return ContactTable(own, *(wp.array(a, dtype=wp.vec3, device=device) for a in flat))
 
 
@@ -187,34 +165,31 @@ def check_grasps(
         index: candidate of each row; default: the row.
         seed: of the random rays of epsilon; default: 0.
     """
-    d, n, width = hand.device, len(q), contacts.link.shape[1]
-    groups, bodies = hand.model.groups, len(hand.model.piece_first) - 1
-    rows = wp.array(np.arange(n, dtype=np.int32), dtype=wp.int32, device=d)
-    at = CheckedPostures()
-    at.pose = wp.array(np.ascontiguousarray(pose, np.float32), dtype=wp.transform, device=d)
-    at.of, at.index, at.slot = rows, wp.zeros(n, dtype=wp.int32, device=d), wp.zeros(n, dtype=wp.int32, device=d)
-    at.chosen = wp.empty((n, groups), dtype=wp.int32, device=d)
-    at.body = wp.empty((n, bodies - 1), dtype=wp.transform, device=d)
-    at.posture = wp.empty((n, groups), dtype=vec_dof, device=d)
-    places = link_places(hand.model, contacts, d)
-    at.contact = contacts.link
-    surface = np.arange(n * width, dtype=np.int32).reshape(n, width)
-    at.surface = wp.array(np.where(contacts.link.numpy() >= 0, surface, -1), dtype=wp.int32, device=d)
-    found = new_findings(n, width, d)
-    found.facing.fill_(1.0)
-    check = Check(
-        hand, obj, hold_nothing(hand), device_limits(bounds, deepest=_MAX_RANKED_PENETRATION), places, at, found
+    d, n, width, model = hand.device, len(q), contacts.link.shape[1], hand.model
+    zeros, rows = wp.zeros(n, dtype=wp.int32, device=d), np.arange(n)
+    surface = np.where(contacts.link.numpy() >= 0, np.arange(n * width).reshape(n, width), -1)
+    at = empty_struct(
+        CheckedPostures,
+        d,
+        *(n, model.groups),
+        pose=wp.array(pose, dtype=wp.transform, device=d),
+        of=wp.array(rows, dtype=wp.int32, device=d),
+        index=zeros,
+        slot=zeros,
+        body=wp.empty((n, len(model.piece_first) - 2), dtype=wp.transform, device=d),
+        contact=contacts.link,
+        surface=wp.array(surface, dtype=wp.int32, device=d),
     )
-    joints = wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=d)
-    inputs = [hand.struct, check.held.struct, check.limits, places, joints]
+    limits, places = device_limits(bounds, deepest=_MAX_RANKED_PENETRATION), link_places(model, contacts, d)
+    found = new_findings(n, width, d)
+    check = Check(hand, obj, hold_nothing(hand), limits, places, at, found)
+    inputs = [hand.struct, check.held.struct, limits, places, wp.array(q, dtype=wp.float32, device=d)]
     wp.launch(check_postures, n, inputs, [at, found], device=d)
     for solid in (obj, around):
         if solid is not None:
             check.measure(ALL, solid)
     table, outcome = check.every(wp.zeros(1, dtype=wp.int32, device=d) if seed is None else seed)
-    if index is None:
-        index = np.arange(n)
-    table.index[:] = index
+    table.index[:] = rows if index is None else index
     return table, outcome
 
 
@@ -223,11 +198,6 @@ def link_places(model: HandModel, contacts: ContactTable, device: str) -> Places
     links = len(model.tree.link_names)
     grid = np.full(links, -1)
     grid[model.grid_link] = np.arange(len(model.grid_link))
-
-    def put(a: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(a, np.int32), dtype=wp.int32, device=device)
-
-    places = Places()
-    places.link, places.body, places.grid = put(np.arange(links)), put(model.tree.link_body), put(grid)
-    places.points, places.normals = contacts.points, contacts.normals
-    return places
+    on_hand = {"link": np.arange(links), "body": model.tree.link_body, "grid": grid}
+    put = {name: wp.array(values, dtype=wp.int32, device=device) for name, values in on_hand.items()}
+    return make_struct(Places, points=contacts.points, normals=contacts.normals, **put)

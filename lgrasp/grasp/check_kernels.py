@@ -55,6 +55,24 @@ def contact_fit(hand: Hand, grid: wp.int32, B: wp.transform, p: wp.vec3, inward:
     return out
 
 
+@wp.func
+def fit_contacts(hand: Hand, places: Places, at: CheckedPostures, i: wp.int32):
+    """Of all contacts of a hand whose bodies are placed: largest distance and least cosines of :func:`contact_fit`."""
+    T = at.pose[at.of[i]]
+    worst = wp.vec3(0.0, 1.0, 1.0)
+    for k in range(at.contact.shape[1]):
+        c = at.contact[i, k]
+        if c >= 0 and places.grid[wp.max(c, 0)] >= 0:
+            B = wp.transform_identity()
+            if places.body[c] > 0:
+                B = at.body[i, places.body[c] - 1]
+            p = wp.transform_point(T, places.points[at.surface[i, k]])
+            inward = -wp.transform_vector(T, places.normals[at.surface[i, k]])
+            fit = contact_fit(hand, places.grid[c], B, p, inward)
+            worst = wp.vec3(wp.max(worst[0], fit[0]), wp.min(worst[1], fit[1]), wp.min(worst[2], fit[2]))
+    return worst
+
+
 @wp.kernel
 def check_postures(
     hand: Hand,
@@ -67,8 +85,7 @@ def check_postures(
 ):
     """One thread per hand: its bodies, the fit of its contacts, and whether it is clear of itself.
 
-    Reads pose, contact and surface of ``at_out``; writes the rest of it, and outcome, gap and facing of ``found_out``,
-    of which gap and facing continue from the present values.
+    Reads pose, contact and surface of ``at_out``; writes the rest of it, and outcome, gap and facing of ``found_out``.
 
     Args:
         q: (n, K) joint positions [rad or m].
@@ -82,38 +99,23 @@ def check_postures(
         at_out.posture[i, g] = x
         at_out.chosen[i, g] = -1
         group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
-    T = at_out.pose[at_out.of[i]]
-    gap = found_out.gap[i]
-    facing = found_out.facing[i]
-    least = float(1.0)
-    palm = int(0)
+    touching = int(0)
     for k in range(at_out.contact.shape[1]):
         c = at_out.contact[i, k]
         if c >= 0:
-            B = wp.transform_identity()
-            b = places.body[c]
-            g = hand.body_group[b]
+            g = hand.body_group[places.body[c]]
             if g >= 0:
-                B = X[b - 1]
                 at_out.chosen[i, g] = k
             else:
-                palm = int(1)
-            if places.grid[c] >= 0:
-                s = at_out.surface[i, k]
-                p = wp.transform_point(T, places.points[s])
-                inward = -wp.transform_vector(T, places.normals[s])
-                fit = contact_fit(hand, places.grid[c], B, p, inward)
-                gap = wp.max(gap, fit[0])
-                facing = wp.min(facing, fit[1])
-                least = wp.min(least, fit[2])
-    found_out.gap[i] = gap
-    found_out.facing[i] = facing
-    touching = palm
+                touching = int(1)
     for g in range(G):
         if at_out.chosen[i, g] >= 0:
             touching += 1
+    fit = fit_contacts(hand, places, at_out, i)
+    found_out.gap[i] = fit[0]
+    found_out.facing[i] = fit[1]
     outcome = KEPT
-    if touching < 2 or gap > limits.max_gap or wp.min(facing, least) < limits.min_cosine:
+    if touching < 2 or fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
         outcome = CONTACT
     for b in range(G):
         for a in range(b + 2):
@@ -128,12 +130,7 @@ def check_postures(
 
 @wp.kernel
 def measure_penetration(
-    hand: Hand,
-    obj: Object,
-    limits: Limits,
-    part: wp.int32,
-    at: CheckedPostures,
-    found_out: Findings,
+    hand: Hand, obj: Object, limits: Limits, part: wp.int32, at: CheckedPostures, found_out: Findings
 ):
     """Largest penetration [m] of a part of the hand (TOUCHING, OTHERS or ALL) and the object.
 
@@ -162,12 +159,7 @@ def measure_penetration(
 
 @wp.kernel
 def measure_held_penetration(
-    hand: Hand,
-    obj: Object,
-    held: Held,
-    limits: Limits,
-    at: CheckedPostures,
-    found_out: Findings,
+    hand: Hand, obj: Object, held: Held, limits: Limits, at: CheckedPostures, found_out: Findings
 ):
     """Largest penetration [m] of what may move and the held objects, which the new object must keep apart from.
 
@@ -193,10 +185,7 @@ def measure_held_penetration(
 
 @wp.kernel
 def count_outcomes(
-    limits: Limits,
-    found_out: Findings,
-    kept_out: wp.array(dtype=wp.int32),
-    counts_out: wp.array(dtype=wp.int32),
+    limits: Limits, found_out: Findings, kept_out: wp.array(dtype=wp.int32), counts_out: wp.array(dtype=wp.int32)
 ):
     """1 for hands that passed, the load included, (n,); ``counts_out`` grows by the hands of each outcome.
 
@@ -225,61 +214,34 @@ def list_kept(found: Findings, upto: wp.array(dtype=wp.int32), row_out: wp.array
 
 
 @wp.kernel
-def self_overlap(
-    hand: Hand,
-    body: wp.array2d(dtype=wp.transform),
-    rows: wp.array(dtype=wp.int32),
-    row: wp.array(dtype=wp.int32),
-    depth_out: wp.array(dtype=wp.float32),
-):
-    """Overlap [m] of links in the rows kept, (m,): of pairs that nearly always touch; all others are apart.
-
-    Args:
-        body: (n, B - 1) T_hand_body.
-        rows: (1,) how many of ``row`` are in use.
-        row: (m,) hand of each row.
-        depth_out: (m,) overlap [m].
-    """
-    i = wp.tid()
-    if i >= rows[0]:
-        return
-    depth_out[i] = overlap_depth(hand, body, row[i])
-
-
-@wp.kernel
 def pack_rows(
-    places: Places,
-    at: CheckedPostures,
-    found: Findings,
-    rows: wp.array(dtype=wp.int32),
-    row: wp.array(dtype=wp.int32),
-    packed_out: Packed,
+    hand: Hand, places: Places, at: CheckedPostures, found: Findings, row: wp.array(dtype=wp.int32), packed_out: Packed
 ):
-    """Pose, contacts and numbers of the rows kept, as they are stored.
+    """Pose, contacts and numbers of the rows kept, and overlap of links that nearly always touch: others are apart.
 
     Args:
-        rows: (1,) how many of ``row`` are in use.
-        row: (m,) hand of each row.
+        row: (m,) hand of each row, -1 none.
     """
     i = wp.tid()
-    if i >= rows[0]:
-        return
     s = row[i]
+    if s < 0:
+        return
     packed_out.pose[i] = at.pose[at.of[s]]
     packed_out.index[i] = at.index[at.of[s]]
     packed_out.slot[i] = at.slot[s]
+    packed_out.self_penetration[i] = overlap_depth(hand, at.body, s)
     for k in range(found.numbers.shape[0]):
         packed_out.numbers[k, i] = found.numbers[k, s]
     for k in range(at.contact.shape[1]):
         c = at.contact[s, k]
         if c >= 0:
-            packed_out.point[i, k] = places.points[at.surface[s, k]]
-            packed_out.normal[i, k] = places.normals[at.surface[s, k]]
-            packed_out.link[i, k] = places.link[c]
-            packed_out.force[i, k] = found.force[s, k]
+            packed_out.contact_points[i, k] = places.points[at.surface[s, k]]
+            packed_out.contact_normals[i, k] = places.normals[at.surface[s, k]]
+            packed_out.contact_links[i, k] = places.link[c]
+            packed_out.contact_forces[i, k] = found.force[s, k]
         else:
             none = wp.vec3(wp.nan, wp.nan, wp.nan)
-            packed_out.point[i, k] = none
-            packed_out.normal[i, k] = none
-            packed_out.force[i, k] = none
-            packed_out.link[i, k] = -1
+            packed_out.contact_points[i, k] = none
+            packed_out.contact_normals[i, k] = none
+            packed_out.contact_forces[i, k] = none
+            packed_out.contact_links[i, k] = -1

@@ -5,7 +5,9 @@ import math
 import warp as wp
 
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.outcomes import MEASURED
 from lgrasp.math.kinematics import vec_dof
+from lgrasp.runtime.structs import make_struct
 
 
 @wp.struct
@@ -74,16 +76,21 @@ class Findings:
 
 @wp.struct
 class Packed:
-    """Rows as they are stored, m of them."""
+    """m rows as they are stored, called as in :class:`~lgrasp.grasp.tables.GraspTable`."""
 
-    pose: wp.array(dtype=wp.transform)  # (m,)
-    point: wp.array2d(dtype=wp.vec3)  # (m, C) NaN where there is no contact
-    normal: wp.array2d(dtype=wp.vec3)  # (m, C)
-    force: wp.array2d(dtype=wp.vec3)  # (m, C)
-    link: wp.array2d(dtype=wp.int32)  # (m, C) -1 where there is no contact
     index: wp.array(dtype=wp.int32)  # (m,)
     slot: wp.array(dtype=wp.int32)  # (m,)
-    numbers: wp.array2d(dtype=wp.float32)  # (6, m)
+    q: wp.array2d(dtype=wp.float32)  # (m, K) [rad or m]
+    q_pregrasp: wp.array2d(dtype=wp.float32)  # (m, K)
+    q_squeeze: wp.array2d(dtype=wp.float32)  # (m, K)
+    pose: wp.array(dtype=wp.transform)  # (m,)
+    contact_points: wp.array2d(dtype=wp.vec3)  # (m, C) NaN where there is no contact
+    contact_normals: wp.array2d(dtype=wp.vec3)  # (m, C)
+    contact_links: wp.array2d(dtype=wp.int32)  # (m, C) -1 where there is no contact
+    contact_forces: wp.array2d(dtype=wp.vec3)  # (m, C)
+    numbers: wp.array2d(dtype=wp.float32)  # (6, m) MEASURED
+    epsilon: wp.array(dtype=wp.float32)  # (m,)
+    self_penetration: wp.array(dtype=wp.float32)  # (m,) [m]
 
 
 def device_limits(bounds: GraspBounds, *, deepest: float | None = None) -> Limits:
@@ -92,22 +99,23 @@ def device_limits(bounds: GraspBounds, *, deepest: float | None = None) -> Limit
     Args:
         deepest: measure every row to the end, penetrations up to this [m]; None: a row's first failure ends it.
     """
-    s = Limits()
-    for name in Limits.vars:
-        if name in GraspBounds.model_fields:
-            setattr(s, name, getattr(bounds, name))
-    s.min_cosine = math.cos(math.radians(bounds.max_normal_angle))
-    s.min_spread_cosine = math.cos(math.radians(bounds.max_normal_spread))
-    s.deepest = bounds.max_penetration if deepest is None else deepest
-    s.whole = int(deepest is not None)
-    return s
+    return make_struct(
+        Limits,
+        bounds,
+        min_cosine=math.cos(math.radians(bounds.max_normal_angle)),
+        min_spread_cosine=math.cos(math.radians(bounds.max_normal_spread)),
+        deepest=bounds.max_penetration if deepest is None else deepest,
+        whole=int(deepest is not None),
+    )
 
 
 def new_findings(n: int, width: int, device: str) -> Findings:
     """Room for the findings on n hands with ``width`` contacts at most."""
-    f = Findings()
-    f.outcome = wp.zeros(n, dtype=wp.int32, device=device)
-    f.numbers = wp.zeros((6, max(n, 1)), dtype=wp.float32, device=device)
-    f.gap, f.facing, f.fswo, f.gswo, f.unresisted_load, f.penetration = (f.numbers[i] for i in range(6))
-    f.force = wp.zeros((n, width), dtype=wp.vec3, device=device)
-    return f
+    numbers = wp.zeros((len(MEASURED), max(n, 1)), dtype=wp.float32, device=device)
+    return make_struct(
+        Findings,
+        outcome=wp.zeros(n, dtype=wp.int32, device=device),
+        numbers=numbers,
+        force=wp.zeros((n, width), dtype=wp.vec3, device=device),
+        **{name: numbers[i] for i, name in enumerate(MEASURED)},
+    )

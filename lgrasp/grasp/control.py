@@ -5,6 +5,7 @@ import warp as wp
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.constants import SLIDING_ARM
 from lgrasp.math.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.math.transforms import transforms
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -45,14 +46,7 @@ def shift_contact(hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, point: wp.v
 
 @wp.func
 def press_contact(
-    hand: Hand,
-    g: wp.int32,
-    q0: vec_dof,
-    j: wp.int32,
-    body: wp.array(dtype=wp.transform),
-    p: wp.vec3,
-    f: wp.vec3,
-    k: wp.float32,
+    hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, body: transforms, p: wp.vec3, f: wp.vec3, k: wp.float32
 ):
     """q + J^T f / stiffness: targets at which position control presses with force f [N] on point p of body j."""
     j0 = hand.kin.joint_first[g]

@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.grasp.check_kernels import hand_pairs_clear
-from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Places
+from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.grasp.collision import body_apart
 from lgrasp.grasp.control import press_contact, shift_contact
 from lgrasp.grasp.held import Held, body_clear_of_held
@@ -24,10 +24,8 @@ def control_poses(
     places: Places,
     at: CheckedPostures,
     found: Findings,
-    rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
-    q_out: wp.array2d(dtype=wp.float32),
-    squeeze_out: wp.array2d(dtype=wp.float32),
+    packed_out: Packed,
     opened_out: wp.array2d(dtype=vec_dof),
 ):
     """One thread per (row kept, group): q, q that presses, and the posture with its first contact off the object.
@@ -35,16 +33,13 @@ def control_poses(
     The squeeze presses with the balancing forces, ``squeeze_force`` [N] in all along the normals.
 
     Args:
-        rows: (1,) how many of ``row`` are in use.
-        row: (m,) hand of each row.
-        q_out: (m, K) [rad or m].
-        squeeze_out: (m, K) [rad or m].
+        row: (m,) hand of each row, -1 none.
         opened_out: (m, G) [rad or m].
     """
     i, g = wp.tid()
-    if i >= rows[0]:
-        return
     s = row[i]
+    if s < 0:
+        return
     x = at.posture[s, g]
     opened = x
     pressed = x
@@ -70,8 +65,8 @@ def control_poses(
     first = hand.kin.dof_first[g]
     for d in range(hand.kin.dof_first[g + 1] - first):
         column = hand.kin.dof_index[first + d]
-        q_out[i, column] = x[d]
-        squeeze_out[i, column] = pressed[d]
+        packed_out.q[i, column] = x[d]
+        packed_out.q_squeeze[i, column] = pressed[d]
     opened_out[i, g] = opened
 
 
@@ -83,24 +78,21 @@ def open_poses(
     limits: Limits,
     at: CheckedPostures,
     opened: wp.array2d(dtype=vec_dof),
-    rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
-    pregrasp_out: wp.array2d(dtype=wp.float32),
+    packed_out: Packed,
 ):
-    """The touching fingers as far open as leaves them apart from the objects and the rest of the hand, (m, K).
+    """The touching fingers as far open as leaves them apart from the objects and the rest of the hand.
 
     Shares of the way from q to ``opened`` are tried from all of it down; q itself when none is clear.
 
     Args:
         opened: (m, G) [rad or m].
-        rows: (1,) how many of ``row`` are in use.
-        row: (m,) hand of each row.
-        pregrasp_out: (m, K) [rad or m].
+        row: (m,) hand of each row, -1 none.
     """
     i = wp.tid()
-    if i >= rows[0]:
-        return
     s = row[i]
+    if s < 0:
+        return
     h = at.index[at.of[s]] // held.tries
     G = hand.kin.groups
     T_object = wp.transform_inverse(at.pose[at.of[s]])
@@ -130,4 +122,4 @@ def open_poses(
         first = hand.kin.dof_first[g]
         x = at.posture[s, g] + share * (opened[i, g] - at.posture[s, g])
         for d in range(hand.kin.dof_first[g + 1] - first):
-            pregrasp_out[i, hand.kin.dof_index[first + d]] = x[d]
+            packed_out.q_pregrasp[i, hand.kin.dof_index[first + d]] = x[d]

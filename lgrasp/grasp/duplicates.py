@@ -3,8 +3,9 @@
 import numpy as np
 import warp as wp
 
-from lgrasp.grasp.near_kernels import list_near
+from lgrasp.grasp.near_kernels import Near, list_near
 from lgrasp.runtime.device import start
+from lgrasp.runtime.structs import upload_struct
 
 NEAR_DISTANCE = 0.005  # [m]
 NEAR_ANGLE = np.radians(5.0)
@@ -83,19 +84,16 @@ class _NearRows:
     def before(self, pose: np.ndarray, q: np.ndarray, first: int) -> np.ndarray:
         """Pairs (i < j), shape (n, 2), of near-duplicates of which j is at least ``first``, by rising j."""
         d = self._device
-        position = wp.array(np.ascontiguousarray(pose[:, :3], np.float32), dtype=wp.vec3, device=d)
-        rotation = wp.array(np.ascontiguousarray(pose[:, 3:], np.float32), dtype=wp.vec4, device=d)
-        joints = wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=d)
-        self._grid.build(position, _LOOKUP_REACH)
+        # with some slack for rounding: pairs are decided in double precision below
+        limits = {"reach": _LOOKUP_REACH, "cosine": np.cos(NEAR_ANGLE / 2) - 1e-6, "joint": NEAR_JOINT * 1.00001}
+        x = upload_struct(Near, d, {"position": pose[:, :3], "rotation": pose[:, 3:], "q": q, **limits})
+        self._grid.build(x.position, _LOOKUP_REACH)
 
         def listed(asked: np.ndarray, places: np.ndarray, room: int) -> tuple[np.ndarray, np.ndarray]:
             """How many rows are near before each one asked and, given places for them, which."""
             number, others = (wp.empty(n, dtype=wp.int32, device=d) for n in (len(asked), room))
-            # with some slack for rounding: pairs are decided in double precision below
-            limits = [_LOOKUP_REACH, float(np.cos(NEAR_ANGLE / 2)) - 1e-6, NEAR_JOINT * 1.00001]
-            given = [wp.array(a.astype(np.int32), dtype=wp.int32, device=d) for a in (asked, places)]
-            inputs = [self._grid.id, position, rotation, joints, given[0], *limits, given[1]]
-            wp.launch(list_near, len(asked), inputs, [number, others], device=d)
+            given = [wp.array(a, dtype=wp.int32, device=d) for a in (asked, places)]
+            wp.launch(list_near, len(asked), [self._grid.id, x, *given], [number, others], device=d)
             return number.numpy(), others.numpy()
 
         rows = np.arange(first, len(pose))

@@ -2,11 +2,12 @@
 
 import warp as wp
 
-from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Places
+from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.grasp.outcomes import BALANCE, KEPT, OBJECT_COLLISION
 from lgrasp.math.constants import BALANCED, CONE_EDGES
 from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted
 from lgrasp.math.quality import epsilon_bound
+from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -19,12 +20,7 @@ _RESIDUAL_TOLERANCE = wp.constant(1.0e-3)  # by which their residual may be larg
 
 
 @wp.func
-def _contacts(
-    places: Places,
-    surfaces: wp.array(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-):
+def _contacts(places: Places, surfaces: wp.array(dtype=wp.int32), points: vec3s, normals: vec3s):
     """Points and inward normals of a hand's contacts in the object's frame; returns their number."""
     k = int(0)
     for c in range(surfaces.shape[0]):
@@ -37,14 +33,14 @@ def _contacts(
 
 @wp.func
 def _balanced(
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
+    points: vec3s,
+    normals: vec3s,
     k: wp.int32,
     friction: wp.float32,
     edges: wp.int32,
     torque_scale: wp.float32,
     stop: wp.float32,
-    forces: wp.array(dtype=wp.vec3),
+    forces: vec3s,
 ):
     """:func:`balance` about the contacts' centroid."""
     centroid = wp.vec3(0.0)
@@ -109,23 +105,17 @@ def resist_loads(obj: Object, limits: Limits, places: Places, at: CheckedPosture
 
 @wp.kernel
 def center_forces(
-    limits: Limits,
-    places: Places,
-    at: CheckedPostures,
-    rows: wp.array(dtype=wp.int32),
-    row: wp.array(dtype=wp.int32),
-    found_out: Findings,
+    limits: Limits, places: Places, at: CheckedPostures, row: wp.array(dtype=wp.int32), found_out: Findings
 ):
     """Balancing forces of the rows kept in the narrowest of a few round cones that balances as well.
 
     Args:
-        rows: (1,) how many of ``row`` are in use.
-        row: (m,) hand of each row.
+        row: (m,) hand of each row, -1 none.
     """
     i = wp.tid()
-    if i >= rows[0]:
-        return
     s = row[i]
+    if s < 0:
+        return
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
@@ -148,27 +138,24 @@ def grasp_epsilon(
     limits: Limits,
     places: Places,
     at: CheckedPostures,
-    rows: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int32),
-    epsilon_out: wp.array(dtype=wp.float32),
+    packed_out: Packed,
 ):
-    """Ferrari-Canny bound of the rows kept, (m,), about the object's centre of mass.
+    """Ferrari-Canny bound of the rows kept about the object's centre of mass.
 
     Args:
         seed: (1,) random seed.
-        rows: (1,) how many of ``row`` are in use.
-        row: (m,) hand of each row.
-        epsilon_out: (m,) the bound.
+        row: (m,) hand of each row, -1 none.
     """
     i = wp.tid()
-    if i >= rows[0]:
+    if row[i] < 0:
         return
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     k = _contacts(places, at.surface[row[i]], points, normals)
     if k < 2:
-        epsilon_out[i] = 0.0
+        packed_out.epsilon[i] = 0.0
         return
     for c in range(k):
         points[c] = points[c] - obj.com
-    epsilon_out[i] = epsilon_bound(points, normals, k, limits.friction, obj.radius, wp.rand_init(seed[0]))
+    packed_out.epsilon[i] = epsilon_bound(points, normals, k, limits.friction, obj.radius, wp.rand_init(seed[0]))

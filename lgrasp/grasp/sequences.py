@@ -1,16 +1,14 @@
 """Sequences of grasps: a table that grows by one object a step, as NumPy arrays."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from lgrasp.grasp.rows import CONTACTS
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.tree import Tree
 
-_FAMILIES = ("metrics", "physics")
-_STEPS = ("space", "free", "q", "q_pregrasp", "q_squeeze", "pose")
-_CONTACTS = ("contact_points", "contact_normals", "contact_links", "contact_forces")
 _WORST = {"epsilon": np.fmin}
 """How a metric of several steps becomes one of the row; the largest unless stated otherwise."""
 
@@ -103,7 +101,7 @@ def extend(
         "q_pregrasp": np.where(free, grasps.q_pregrasp, last),
         "q_squeeze": np.where(free, grasps.q_squeeze, pressing),
         "pose": grasps.pose,
-        **{name: getattr(grasps, name) for name in _CONTACTS},
+        **{name: getattr(grasps, name) for name in CONTACTS},
     }
     longer: dict[str, Any] = {
         n: np.concatenate([getattr(before, n)[row], values[:, None]], 1) for n, values in step.items()
@@ -112,26 +110,3 @@ def extend(
     for name, values in before.metrics.items():
         metrics[name] = _WORST.get(name, np.fmax)(values[row], metrics[name])
     return SequenceTable(parent=row.astype(np.int64), candidate=grasps.index, metrics=metrics, **longer)
-
-
-def take_sequences(table: SequenceTable, rows: np.ndarray, **changes: Any) -> SequenceTable:
-    """Some rows, by index, after ``changes`` of the table."""
-    if changes:
-        table = replace(table, **changes)
-    own: dict[str, Any] = {f.name: getattr(table, f.name)[rows] for f in fields(table) if f.name not in _FAMILIES}
-    families = {f: {name: values[rows] for name, values in getattr(table, f).items()} for f in _FAMILIES}
-    own |= families
-    return replace(table, **own)
-
-
-def join_sequences(tables: list[SequenceTable]) -> SequenceTable:
-    """Several tables of equally long sequences one after another."""
-    first = tables[0]
-    own = {
-        f.name: np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(first) if f.name not in _FAMILIES
-    }
-    families = {
-        f: {name: np.concatenate([getattr(t, f)[name] for t in tables]) for name in getattr(first, f)}
-        for f in _FAMILIES
-    }
-    return replace(first, **own, **families)

@@ -4,78 +4,112 @@ Tables made on a device are as long as they may get, and tell on the device how 
 waits for its number of rows.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import warp as wp
 
 from lgrasp.grasp.structs import Candidates, Poses, Sets
-from lgrasp.math.kinematics import MAX_DOFS, vec_dof
-from lgrasp.runtime.structs import make_struct
+from lgrasp.runtime.structs import empty_arrays, make_struct
 
-_FAMILIES = ("metrics", "physics")  # columns of a GraspTable that come by name
+_FAMILIES = ("metrics", "physics")  # columns of a table in memory that come by name
+
+
+class DeviceTable:
+    """Arrays on one device as the struct KIND describes them, and perhaps the table that they refer to."""
+
+    KIND: ClassVar[Any]
+    INNER: ClassVar[dict[str, type["DeviceTable"]]] = {}
+    rows: wp.array  # (1,) i32 how many rows are in use: the first ones
+
+    @cached_property
+    def struct(self) -> Any:
+        """The table as kernels read it."""
+        return make_struct(self.KIND, self, **{n: getattr(self, n).struct for n in self.INNER if n in self.KIND.vars})
+
+    def __len__(self) -> int:
+        """Rows in use; waits for the device."""
+        return int(self.rows.numpy()[0])
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """Columns, one row each."""
+        return [name for name in cls.KIND.vars if name not in (*cls.INNER, "rows")]
+
+    @classmethod
+    def empty(cls, device: str, *shape: int, **given: Any) -> Self:
+        """As many rows as there may be, none in use; columns have the first sizes of ``shape`` or are given."""
+        if "rows" in cls.KIND.vars:
+            given = {"rows": wp.zeros(1, dtype=wp.int32, device=device)} | given
+        return cls(**empty_arrays(cls.KIND, device, *shape, **given))
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray], device: str) -> Self:
+        """Inverse of :meth:`arrays`."""
+        kinds = {name: cls.KIND.vars[name].type.dtype for name in cls.names()}
+        made: dict[str, Any] = {name: wp.array(arrays[name], dtype=kind, device=device) for name, kind in kinds.items()}
+        for name, kind in cls.INNER.items():
+            own = {key.removeprefix(f"{name}."): a for key, a in arrays.items() if key.startswith(f"{name}.")}
+            made[name] = kind.of(own, device)
+        if "rows" in cls.KIND.vars:
+            made["rows"] = wp.full(1, len(arrays[cls.names()[0]]), dtype=wp.int32, device=device)
+        return cls(**made)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The rows in use as NumPy arrays, those of the table that they refer to as ``TABLE.NAME``."""
+        n = len(self)
+        out = {name: getattr(self, name).numpy()[:n] for name in self.names()}
+        for inner in self.INNER:
+            out |= {f"{inner}.{name}": values for name, values in getattr(self, inner).arrays().items()}
+        return out
 
 
 @dataclass(frozen=True)
-class PoseTable:
+class PoseTable(DeviceTable):
     """Object poses in the hand base frame; P rows."""
 
-    index: wp.array  # (P,) i32 candidate index inside the shard's stream
-    pose: wp.array  # (P,) transform T_hand_object of the object's internal frame
-    palm_point: wp.array  # (P,) i32 hand contact point that touches, -1 without palm contact
-    palm_surface: wp.array  # (P,) i32 object contact point that touches, -1
-    setting: wp.array  # (P,) i32 setting of the hand's shared joints
-    anchor: wp.array  # (P, G) i32 object contact point that each group can surely touch about, -1 unknown
-    rows: wp.array  # (1,) i32 how many of the P rows are in use: the first ones
-
-    @cached_property
-    def struct(self) -> Any:
-        """The table as kernels read it."""
-        return make_struct(Poses, self)
-
-    def __len__(self) -> int:
-        """Rows in use; waits for the device."""
-        return int(self.rows.numpy()[0])
+    KIND = Poses
+    index: wp.array
+    pose: wp.array
+    palm_point: wp.array
+    palm_surface: wp.array
+    setting: wp.array
+    anchor: wp.array
+    rows: wp.array
 
 
 @dataclass(frozen=True)
-class CandidateTable:
+class CandidateTable(DeviceTable):
     """Up to M contacts that each of G groups can make at each of P poses, possibly realised."""
 
+    KIND = Candidates
+    INNER: ClassVar = {"poses": PoseTable}
     poses: PoseTable
-    count: wp.array  # (P, G) i32 candidates drawn
-    surface: wp.array  # (P, G, M) i32 object contact point
-    record: wp.array  # (P, G, M) i32 contact vector of the field
-    state: wp.array  # (P, G, M) i32 State
-    q: wp.array  # (P, G, M) vec_dof: joint seed, or the realised posture [rad or m]
+    count: wp.array
+    surface: wp.array
+    record: wp.array
+    state: wp.array
+    q: wp.array
 
-    @cached_property
-    def struct(self) -> Any:
-        """The table as kernels read it."""
-        return make_struct(Candidates, self, poses=self.poses.struct)
+    def __len__(self) -> int:
+        return len(self.poses)
 
 
 @dataclass(frozen=True)
-class ContactSets:
+class ContactSets(DeviceTable):
     """Sets of contacts that balance; S rows."""
 
+    KIND = Sets
+    INNER: ClassVar = {"candidates": CandidateTable}
     candidates: CandidateTable
-    pose: wp.array  # (S,) i32 row of the PoseTable
-    slot: wp.array  # (S,) i32 number of the set within its pose
-    chosen: wp.array  # (S, G) i32 candidate of each group, -1 = unused
-    score: wp.array  # (S,) f32 norm of the frictionless residual
-    rows: wp.array  # (1,) i32 how many of the S rows are in use: the first ones
-
-    @cached_property
-    def struct(self) -> Any:
-        """The table as kernels read it."""
-        return make_struct(Sets, self)
-
-    def __len__(self) -> int:
-        """Rows in use; waits for the device."""
-        return int(self.rows.numpy()[0])
+    pose: wp.array
+    slot: wp.array
+    chosen: wp.array
+    score: wp.array
+    rows: wp.array
 
 
 @dataclass(frozen=True)
@@ -99,90 +133,54 @@ class GraspTable:
         return len(self.index)
 
 
-def pose_arrays(table: PoseTable) -> dict[str, np.ndarray]:
-    """The rows in use of a PoseTable as NumPy arrays; ``pose`` holds device poses (P, 7)."""
-    found = {f.name: getattr(table, f.name).numpy()[: len(table)] for f in fields(table) if f.name != "rows"}
-    return found | {"pose": found["pose"].reshape(-1, 7)}
-
-
-def pose_table(arrays: dict[str, np.ndarray], device: str) -> PoseTable:
-    """Inverse of :func:`pose_arrays`."""
-    dtypes = dict.fromkeys((f.name for f in fields(PoseTable) if f.name != "rows"), wp.int32) | {"pose": wp.transform}
-    own = {name: wp.array(arrays[name], dtype=dtype, device=device) for name, dtype in dtypes.items()}
-    return PoseTable(**own, rows=wp.full(1, len(arrays["index"]), dtype=wp.int32, device=device))
-
-
-def candidate_arrays(table: CandidateTable) -> dict[str, np.ndarray]:
-    """The rows in use of a CandidateTable as NumPy arrays; ``q`` is (P, G, M, MAX_DOFS)."""
-    n = len(table.poses)
-    own = {name: getattr(table, name).numpy()[:n] for name in ("count", "surface", "record", "state", "q")}
-    return own | {f"poses.{name}": values for name, values in pose_arrays(table.poses).items()}
-
-
-def candidate_table(arrays: dict[str, np.ndarray], device: str) -> CandidateTable:
-    """Inverse of :func:`candidate_arrays`."""
-    poses = {name.removeprefix("poses."): a for name, a in arrays.items() if name.startswith("poses.")}
-    integers = {
-        name: wp.array(arrays[name], dtype=wp.int32, device=device) for name in ("count", "surface", "record", "state")
-    }
-    q = wp.array(np.reshape(arrays["q"], (*arrays["surface"].shape, MAX_DOFS)), dtype=vec_dof, device=device)
-    return CandidateTable(pose_table(poses, device), q=q, **integers)
-
-
-def set_arrays(table: ContactSets) -> dict[str, np.ndarray]:
-    """The rows in use of ContactSets as NumPy arrays."""
-    n = len(table)
-    own = {name: getattr(table, name).numpy()[:n] for name in ("pose", "slot", "chosen", "score")}
-    return own | {f"candidates.{name}": values for name, values in candidate_arrays(table.candidates).items()}
-
-
-def set_table(arrays: dict[str, np.ndarray], device: str) -> ContactSets:
-    """Inverse of :func:`set_arrays`."""
-    inner = {name.removeprefix("candidates."): a for name, a in arrays.items() if name.startswith("candidates.")}
-    own = {name: wp.array(arrays[name], dtype=wp.int32, device=device) for name in ("pose", "slot", "chosen")}
-    score = wp.array(arrays["score"], dtype=wp.float32, device=device)
-    rows = wp.full(1, len(arrays["score"]), dtype=wp.int32, device=device)
-    return ContactSets(candidates=candidate_table(inner, device), score=score, rows=rows, **own)
-
-
 def trim_sets(table: ContactSets) -> ContactSets:
     """Views of the rows in use; waits for the device."""
     n = len(table)
     if n == table.pose.shape[0]:
         return table
-    return replace(table, pose=table.pose[:n], slot=table.slot[:n], chosen=table.chosen[:n], score=table.score[:n])
+    return replace(table, **{name: getattr(table, name)[:n] for name in table.names()})
 
 
 def select_poses(table: CandidateTable, rows: np.ndarray, device: str) -> CandidateTable:
     """The candidates of some poses, in the order given; copied on the device."""
     chosen = wp.array(rows, dtype=wp.int32, device=device)
 
-    def take(values: wp.array) -> wp.array:
+    def take(part: DeviceTable) -> dict[str, wp.array]:
+        columns = {name: getattr(part, name) for name in part.names()}
         if len(rows) == 0:
-            return wp.empty((0, *values.shape[1:]), dtype=values.dtype, device=device)
-        return wp.indexedarray(values, [chosen] + [None] * (values.ndim - 1)).contiguous()
+            return {n: wp.empty((0, *a.shape[1:]), dtype=a.dtype, device=device) for n, a in columns.items()}
+        return {n: wp.indexedarray(a, [chosen] + [None] * (a.ndim - 1)).contiguous() for n, a in columns.items()}
 
-    poses = {f.name: take(getattr(table.poses, f.name)) for f in fields(PoseTable) if f.name != "rows"}
-    own = {name: take(getattr(table, name)) for name in ("count", "surface", "record", "state", "q")}
-    return CandidateTable(PoseTable(rows=wp.full(1, len(rows), dtype=wp.int32, device=device), **poses), **own)
+    poses = PoseTable(**take(table.poses), rows=wp.full(1, len(rows), dtype=wp.int32, device=device))
+    return CandidateTable(poses, **take(table))
 
 
-def grasp_arrays(table: GraspTable) -> dict[str, np.ndarray]:
-    """A GraspTable as flat NumPy arrays (metrics as ``metrics.NAME``, verdicts as ``physics.NAME``)."""
+Rows = TypeVar("Rows")
+"""A table in memory: a dataclass of arrays of N rows and of mappings of such, ``metrics`` and ``physics``."""
+
+
+def grasp_arrays(table: Any) -> dict[str, np.ndarray]:
+    """A table in memory as flat NumPy arrays (metrics as ``metrics.NAME``, verdicts as ``physics.NAME``)."""
     out = {f.name: getattr(table, f.name) for f in fields(table) if f.name not in _FAMILIES}
     for family in _FAMILIES:
         out |= {f"{family}.{name}": values for name, values in getattr(table, family).items()}
     return out
 
 
-def grasps_from_arrays(arrays: dict[str, np.ndarray]) -> GraspTable:
-    """Inverse of :func:`grasp_arrays`."""
-    own: dict[str, np.ndarray] = {}
-    families: dict[str, dict[str, np.ndarray]] = {family: {} for family in _FAMILIES}
+def _of_arrays(kind: type[Rows], arrays: dict[str, np.ndarray]) -> Rows:
+    own: dict[str, Any] = {family: {} for family in _FAMILIES}
     for name, values in arrays.items():
         family, dot, member = name.partition(".")
-        (families[family] if dot else own)[member or name] = values
-    return GraspTable(**own, metrics=families["metrics"], physics=families["physics"])
+        if dot:
+            own[family][member] = values
+        else:
+            own[name] = values
+    return kind(**own)
+
+
+def grasps_from_arrays(arrays: dict[str, np.ndarray]) -> GraspTable:
+    """Inverse of :func:`grasp_arrays`."""
+    return _of_arrays(GraspTable, arrays)
 
 
 def no_grasps() -> GraspTable:
@@ -190,11 +188,23 @@ def no_grasps() -> GraspTable:
     return grasps_from_arrays({f.name: np.zeros(0) for f in fields(GraspTable) if f.name not in _FAMILIES})
 
 
+def take_rows(table: Rows, rows: np.ndarray | slice) -> Rows:
+    """Some rows of a table in memory, by index or mask (n,)."""
+    return _of_arrays(type(table), {name: values[rows] for name, values in grasp_arrays(table).items()})
+
+
 def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:
     """Some rows of a GraspTable, by rising index (n,): views when these are its first, else copies."""
-    if len(rows) and rows[-1] == len(rows) - 1:
-        return grasps_from_arrays({name: values[: len(rows)] for name, values in grasp_arrays(table).items()})
-    return grasps_from_arrays({name: values[rows] for name, values in grasp_arrays(table).items()})
+    first = len(rows) and rows[-1] == len(rows) - 1
+    return take_rows(table, slice(len(rows)) if first else rows)
+
+
+def join_rows(tables: Sequence[Rows]) -> Rows:
+    """Several tables in memory with the same columns, one after another."""
+    if len(tables) == 1:
+        return tables[0]
+    parts = [grasp_arrays(t) for t in tables]
+    return _of_arrays(type(tables[0]), {name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
 
 
 def choose_grasps(old: GraspTable, new: GraspTable, into: np.ndarray, rows: np.ndarray) -> GraspTable:
@@ -218,21 +228,3 @@ def widen_grasps(table: GraspTable, width: int) -> GraspTable:
         none = -1 if name == "contact_links" else np.nan
         out[name] = np.pad(x, [(0, 0), (0, missing)] + [(0, 0)] * (x.ndim - 2), constant_values=none)
     return grasps_from_arrays(out)
-
-
-def sort_grasps(table: GraspTable) -> GraspTable:
-    """The rows in candidate order."""
-    return reorder_grasps(table, np.argsort(table.index, kind="stable"))
-
-
-def reorder_grasps(table: GraspTable, order: np.ndarray) -> GraspTable:
-    """The rows in another order, (N,)."""
-    return grasps_from_arrays({name: values[order] for name, values in grasp_arrays(table).items()})
-
-
-def join_grasps(tables: list[GraspTable]) -> GraspTable:
-    """Several GraspTables one after another."""
-    if len(tables) == 1:
-        return tables[0]
-    parts = [grasp_arrays(t) for t in tables]
-    return grasps_from_arrays({name: np.concatenate([p[name] for p in parts]) for name in parts[0]})

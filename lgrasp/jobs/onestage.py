@@ -16,30 +16,11 @@ from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
 from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
-from lgrasp.grasp.tables import (
-    CandidateTable,
-    ContactSets,
-    GraspTable,
-    PoseTable,
-    candidate_arrays,
-    candidate_table,
-    grasp_arrays,
-    pose_arrays,
-    pose_table,
-    set_arrays,
-    set_table,
-)
+from lgrasp.grasp.tables import CandidateTable, ContactSets, DeviceTable, PoseTable, grasp_arrays
 from lgrasp.jobs.hands import hand_source
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.runtime.tally import Meter
-
-_ARRAYS: dict[type, Callable[[Any], dict[str, np.ndarray]]] = {
-    PoseTable: pose_arrays,
-    CandidateTable: candidate_arrays,
-    ContactSets: set_arrays,
-    GraspTable: grasp_arrays,
-}
 
 
 @dataclass(frozen=True)
@@ -105,7 +86,8 @@ def run_up_to(
         table = run_stage(stage, table, pipeline, context, meter)
         counted = meter.counts[stage]
         seconds = time.perf_counter() - start
-        cache.store(stage, files[stage], _ARRAYS[type(table)](table) | {"counts": np.asarray(json.dumps(counted))})
+        arrays = table.arrays() if isinstance(table, DeviceTable) else grasp_arrays(table)
+        cache.store(stage, files[stage], arrays | {"counts": np.asarray(json.dumps(counted))})
         runs.append(StageRun(stage, False, counted, seconds, cache.path(stage, files[stage])))
     return runs
 
@@ -124,7 +106,6 @@ def _stage_keys(
     return made
 
 
-def _table(arrays: dict[str, np.ndarray], device: str) -> PoseTable | CandidateTable | ContactSets:
-    if "chosen" in arrays:
-        return set_table(arrays, device)
-    return candidate_table(arrays, device) if "surface" in arrays else pose_table(arrays, device)
+def _table(arrays: dict[str, np.ndarray], device: str) -> DeviceTable:
+    kind = ContactSets if "chosen" in arrays else CandidateTable if "surface" in arrays else PoseTable
+    return kind.of(arrays, device)

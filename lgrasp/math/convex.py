@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from lgrasp.math.triangles import closest_part
+
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 
@@ -79,40 +81,6 @@ def _closest_on_segment(a: wp.vec3, b: wp.vec3):
 
 
 @wp.func
-def _closest_on_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Closest point to the origin on a triangle by Voronoi regions, and the mask of kept points (a 1, b 2, c 4)."""
-    ab = b - a
-    ac = c - a
-    d1 = -wp.dot(ab, a)
-    d2 = -wp.dot(ac, a)
-    if d1 <= 0.0 and d2 <= 0.0:
-        return wp.vec4(a[0], a[1], a[2], 1.0)
-    d3 = -wp.dot(ab, b)
-    d4 = -wp.dot(ac, b)
-    if d3 >= 0.0 and d4 <= d3:
-        return wp.vec4(b[0], b[1], b[2], 2.0)
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        p = a + ab * (d1 / (d1 - d3))
-        return wp.vec4(p[0], p[1], p[2], 3.0)
-    d5 = -wp.dot(ab, c)
-    d6 = -wp.dot(ac, c)
-    if d6 >= 0.0 and d5 <= d6:
-        return wp.vec4(c[0], c[1], c[2], 4.0)
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        p = a + ac * (d2 / (d2 - d6))
-        return wp.vec4(p[0], p[1], p[2], 5.0)
-    va = d3 * d6 - d5 * d4
-    if va <= 0.0 and (d4 - d3) >= 0.0 and (d5 - d6) >= 0.0:
-        p = b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
-        return wp.vec4(p[0], p[1], p[2], 6.0)
-    s = 1.0 / (va + vb + vc)
-    p = a + ab * (vb * s) + ac * (vc * s)
-    return wp.vec4(p[0], p[1], p[2], 7.0)
-
-
-@wp.func
 def _face(a: wp.vec3, b: wp.vec3, c: wp.vec3, mask: wp.int32):
     """The points that a mask keeps (a 1, b 2, c 4), moved to the front, and how many they are."""
     x = a
@@ -182,7 +150,7 @@ def pieces_clear(c: Pieces, i: wp.int32, j: wp.int32, T: wp.transform, margin: w
                 n = 2
         elif n == 2:
             d = w
-            r = _closest_on_triangle(a, b, d)
+            r = closest_part(a, b, d, wp.vec3(0.0))
             m = int(r[3])
             v = wp.vec3(r[0], r[1], r[2])
             a, b, d, n = _face(a, b, d, m)
@@ -214,7 +182,7 @@ def pieces_clear(c: Pieces, i: wp.int32, j: wp.int32, T: wp.transform, margin: w
                 side_0 = -wp.dot(normal, p)
                 if side_o * side_0 <= 0.0:
                     inside = 0
-                    r = _closest_on_triangle(p, q, s)
+                    r = closest_part(p, q, s, wp.vec3(0.0))
                     t = wp.vec3(r[0], r[1], r[2])
                     n2 = wp.dot(t, t)
                     if n2 < best:

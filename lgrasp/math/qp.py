@@ -7,7 +7,7 @@ cones. So is the resistance to an outside force, of a hull moved by that force.
 import warp as wp
 
 from lgrasp.math.constants import LOAD_ARM, LOAD_FORCE
-from lgrasp.math.transforms import tangent
+from lgrasp.math.transforms import tangent, vec3s
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -57,41 +57,47 @@ def _best_direction(a: wp.vec3, n: wp.vec3, mu: wp.float32, edges: wp.int32):
 
 
 @wp.func
-def _affine_weights(G: mat8, m: wp.int32):
-    """Weights (sum 1) of the least-norm point of the affine hull of m points, Gram matrix G; regularised Cholesky."""
+def solve_spd(A: mat8, b: vec8, n: wp.int32, shift: wp.float32, floor: wp.float32):
+    """x with (A + shift I) x = b for the leading n x n block, by Cholesky; squared pivots are ``floor`` at least."""
     L = mat8()
+    for i in range(n):
+        for j in range(i + 1):
+            s = A[i, j]
+            if i == j:
+                s += shift
+            for c in range(j):
+                s -= L[i, c] * L[j, c]
+            if i == j:
+                L[i, i] = wp.sqrt(wp.max(s, floor))
+            else:
+                L[i, j] = s / L[j, j]
+    x = vec8()
+    for i in range(n):
+        s = b[i]
+        for c in range(i):
+            s -= L[i, c] * x[c]
+        x[i] = s / L[i, i]
+    for r in range(n):
+        i = n - 1 - r
+        s = x[i]
+        for c in range(i + 1, n):
+            s -= L[c, i] * x[c]
+        x[i] = s / L[i, i]
+    return x
+
+
+@wp.func
+def _affine_weights(G: mat8, m: wp.int32):
+    """Weights (sum 1) of the least-norm point of the affine hull of m points, Gram matrix G, regularised."""
     trace = float(0.0)
     for i in range(m):
         trace += G[i, i]
     eps = 1.0e-6 * trace / float(m) + 1.0e-12
-    for i in range(m):
-        for j in range(i + 1):
-            s = G[i, j]
-            if i == j:
-                s += eps
-            for c in range(j):
-                s -= L[i, c] * L[j, c]
-            if i == j:
-                L[i, i] = wp.sqrt(wp.max(s, eps * 0.01))
-            else:
-                L[i, j] = s / L[j, j]
-    z = vec8()
-    for i in range(m):
-        s = float(1.0)
-        for c in range(i):
-            s -= L[i, c] * z[c]
-        z[i] = s / L[i, i]
+    z = solve_spd(G, vec8(1.0), m, eps, eps * 0.01)
     total = float(0.0)
-    for b in range(m):
-        i = m - 1 - b
-        s = z[i]
-        for c in range(i + 1, m):
-            s -= L[c, i] * z[c]
-        z[i] = s / L[i, i]
-        total += z[i]
-    for i in range(m):
-        z[i] = z[i] / total
-    return z
+    for r in range(m):
+        total += z[m - 1 - r]
+    return z / total
 
 
 @wp.struct
@@ -110,88 +116,64 @@ class Program:
 
 
 @wp.func
-def _least_norm(
-    arms: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    k: wp.int32,
-    p: Program,
-    forces: wp.array(dtype=wp.vec3),
-):
+def _least_norm(arms: vec3s, normals: vec3s, k: wp.int32, p: Program, forces: vec3s):
     """Point of least norm of ``p.load`` plus wrenches with f_i in the friction cone of n_i, by Wolfe's algorithm.
 
     Args:
         forces: (local, MAX_CONTACTS) receives the optimal forces.
     """
-    mu = p.friction
-    edges = p.edges
-    torque_scale = p.torque_scale
-    load = p.load
-    total = p.total
-    less = p.less
-    stop = p.stop
-    limit = p.limit
-    exact = p.exact
     P = mat86()
     F = mat83()
     owner = vec8()
     w = vec8()
     G = mat8()
     # start at no force at all, or at the first contact's normal wrench
-    x = load
+    x = p.load
     m = int(1)
     owner[0] = -1.0
-    if less == 0:
-        x = load + wrench(arms[0], normals[0] * total, torque_scale)
-        F[0, 0] = normals[0][0] * total
-        F[0, 1] = normals[0][1] * total
-        F[0, 2] = normals[0][2] * total
+    if p.less == 0:
+        x = p.load + wrench(arms[0], normals[0] * p.total, p.torque_scale)
+        F[0] = normals[0] * p.total
         owner[0] = 0.0
-    for c in range(6):
-        P[0, c] = x[c]
+    P[0] = x
     w[0] = 1.0
     G[0, 0] = wp.dot(x, x)
     norm2 = G[0, 0]
     for _major in range(32):
-        if norm2 <= stop * stop:
+        if norm2 <= p.stop * p.stop:
             break
         # the hull point that goes farthest towards the origin: a linear problem over the cones
         xf = wp.vec3(x[0], x[1], x[2])
-        xt = wp.vec3(x[3], x[4], x[5]) * torque_scale
+        xt = wp.vec3(x[3], x[4], x[5]) * p.torque_scale
         best = float(1.0e30)
         bi = int(-1)
         bf = wp.vec3(0.0)
-        if less == 1:
+        if p.less == 1:
             best = 0.0
         for i in range(k):
             a = xf + wp.cross(xt, arms[i])
-            f = _best_direction(a, normals[i], mu, edges)
+            f = _best_direction(a, normals[i], p.friction, p.edges)
             s = wp.dot(a, f)
             if s < best:
                 best = s
                 bi = i
                 bf = f
-        best = best * total + wp.dot(x, load)
-        if best > norm2 - 1.0e-6 - exact * norm2 or m >= _CORRAL_C:
+        best = best * p.total + wp.dot(x, p.load)
+        if best > norm2 - 1.0e-6 - p.exact * norm2 or m >= _CORRAL_C:
             break
-        if best > 0.0 and best * best > limit * limit * norm2:
+        if best > 0.0 and best * best > p.limit * p.limit * norm2:
             break
-        y = load
+        y = p.load
         if bi >= 0:
-            bf = bf * total
-            y = load + wrench(arms[bi], bf, torque_scale)
-        for c in range(6):
-            P[m, c] = y[c]
-        F[m, 0] = bf[0]
-        F[m, 1] = bf[1]
-        F[m, 2] = bf[2]
+            bf = bf * p.total
+            y = p.load + wrench(arms[bi], bf, p.torque_scale)
+        P[m] = y
+        F[m] = bf
         owner[m] = float(bi)
         w[m] = 0.0
         for j in range(m + 1):
-            s = float(0.0)
-            for c in range(6):
-                s += P[m, c] * P[j, c]
-            G[m, j] = s
-            G[j, m] = s
+            G[m, j] = wp.dot(P[m], P[j])
+            G[j, m] = G[m, j]
         m += 1
         # inner loop: least-norm point of the affine hull; leave it at the boundary of the simplex, drop, repeat
         for _minor in range(_MAX_CORRAL):
@@ -218,11 +200,8 @@ def _least_norm(
             if drop != m:
                 w[drop] = w[m]
                 owner[drop] = owner[m]
-                for c in range(6):
-                    P[drop, c] = P[m, c]
-                F[drop, 0] = F[m, 0]
-                F[drop, 1] = F[m, 1]
-                F[drop, 2] = F[m, 2]
+                P[drop] = P[m]
+                F[drop] = F[m]
                 for j in range(m):
                     G[drop, j] = G[m, j]
                     G[j, drop] = G[j, m]
@@ -251,20 +230,20 @@ def _least_norm(
     for j in range(m):
         i = int(owner[j])
         if i >= 0:
-            forces[i] = forces[i] + wp.vec3(F[j, 0], F[j, 1], F[j, 2]) * (w[j] / share)
+            forces[i] = forces[i] + F[j] * (w[j] / share)
     return wp.sqrt(norm2)
 
 
 @wp.func
 def balance(
-    arms: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
+    arms: vec3s,
+    normals: vec3s,
     k: wp.int32,
     mu: wp.float32,
     edges: wp.int32,
     torque_scale: wp.float32,
     stop: wp.float32,
-    forces: wp.array(dtype=wp.vec3),
+    forces: vec3s,
 ):
     """min |sum_i (f_i, torque_scale * arm_i x f_i)| with f_i in the friction cone of n_i and sum_i f_i . n_i = 1.
 
@@ -290,8 +269,8 @@ def balance(
 
 @wp.func
 def unresisted(
-    arms: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
+    arms: vec3s,
+    normals: vec3s,
     k: wp.int32,
     mu: wp.float32,
     turn: wp.quat,
@@ -327,14 +306,7 @@ def unresisted(
 
 
 @wp.func
-def unresisted_load(
-    arms: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    k: wp.int32,
-    mu: wp.float32,
-    turn: wp.quat,
-    limit: wp.float32,
-):
+def unresisted_load(arms: vec3s, normals: vec3s, k: wp.int32, mu: wp.float32, turn: wp.quat, limit: wp.float32):
     """The worst of six directions of :func:`unresisted`; some value above the limit when it is above."""
     worst = float(0.0)
     for direction in range(6):
@@ -345,9 +317,7 @@ def unresisted_load(
 
 
 @wp.func
-def frictionless(
-    points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), k: wp.int32, torque_scale: wp.float32
-):
+def frictionless(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.float32):
     """FSWO (eq. 1) by active sets on the k x k Gram matrix, for the inner loop of the search.
 
     The full-support solution is exact when all its shares are positive. Otherwise the smallest share is dropped and the

@@ -6,7 +6,7 @@ import warp as wp
 
 from lgrasp.math.constants import CONE_EDGES
 from lgrasp.math.qp import MAX_CONTACTS, vec6
-from lgrasp.math.transforms import tangent
+from lgrasp.math.transforms import tangent, vec3s
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -16,8 +16,7 @@ _STEP = wp.constant(2.0 * math.pi / CONE_EDGES)  # [rad] between edges
 _STARTS = wp.constant(12)
 _SHOTS = wp.constant(20)
 _WALKS = wp.constant(12)
-_CORE = 1.0e-4
-_CORE_C = wp.constant(_CORE)
+_CORE = wp.constant(1.0e-4)
 
 mat66 = wp.types.matrix((6, 6), wp.float32)
 
@@ -36,21 +35,40 @@ def _pivot(B: mat66, r: wp.int32, d: vec6):
 
 
 @wp.func
-def _edge_wrench(arms: wp.array(dtype=wp.vec3), cones: wp.array(dtype=wp.vec3), e: wp.int32, scale: wp.float32):
+def _edge_wrench(arms: vec3s, cones: vec3s, e: wp.int32, scale: wp.float32):
     f = cones[e]
     t = wp.cross(arms[e // _EDGES], f) * scale
     return vec6(f[0], f[1], f[2], t[0], t[1], t[2])
 
 
 @wp.func
-def epsilon_bound(
-    arms: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    k: wp.int32,
-    mu: wp.float32,
-    radius: wp.float32,
-    state: wp.uint32,
-):
+def _plane(B: mat66):
+    """The plane y . w = 1 through the vectors of a basis."""
+    y = B[0]
+    for i in range(1, 6):
+        y = y + B[i]
+    return y
+
+
+@wp.func
+def _farthest(y: vec6, arms: vec3s, cones: vec3s, k: wp.int32, scale: wp.float32):
+    """(y . w, number) of the edge wrench w that lies farthest along y."""
+    yf = wp.vec3(y[0], y[1], y[2])
+    yt = wp.vec3(y[3], y[4], y[5]) * scale
+    top = float(-1.0e30)
+    at = int(0)
+    for i in range(k):
+        a = yf + wp.cross(yt, arms[i])
+        for e in range(_EDGES):
+            z = wp.dot(a, cones[i * _EDGES + e])
+            if z > top:
+                top = z
+                at = i * _EDGES + e
+    return top, at
+
+
+@wp.func
+def epsilon_bound(arms: vec3s, normals: vec3s, k: wp.int32, mu: wp.float32, radius: wp.float32, state: wp.uint32):
     """Ferrari-Canny epsilon (L1 hull of 8-edge cones with unit normal force, torque / radius), from above; >= 0.
 
     epsilon is the distance of the hull's nearest facet. From each start a ray is shot at the hull (simplex method; a
@@ -78,23 +96,13 @@ def epsilon_bound(
         x = vec6()
         y = vec6()
         for c in range(6):
-            B[c, c] = wp.where(v[c] >= 0.0, 1.0, -1.0) / _CORE_C
-            x[c] = wp.abs(v[c]) / _CORE_C
+            B[c, c] = wp.where(v[c] >= 0.0, 1.0, -1.0) / _CORE
+            x[c] = wp.abs(v[c]) / _CORE
             y[c] = B[c, c]
         ok = int(0)
         for _t in range(_SHOTS):
             # the wrench farthest beyond the plane y . w = 1 enters
-            yf = wp.vec3(y[0], y[1], y[2])
-            yt = wp.vec3(y[3], y[4], y[5]) * scale
-            top = float(-1.0e30)
-            at = int(0)
-            for i in range(k):
-                a = yf + wp.cross(yt, arms[i])
-                for e in range(_EDGES):
-                    z = wp.dot(a, cones[i * _EDGES + e])
-                    if z > top:
-                        top = z
-                        at = i * _EDGES + e
+            top, at = _farthest(y, arms, cones, k, scale)
             least = wp.min(least, top / wp.length(y))
             if least < 2.5e-4:
                 return 0.0
@@ -114,9 +122,7 @@ def epsilon_bound(
             for c in range(6):
                 x[c] = wp.max(x[c] - low * d[c], 0.0)
             x[r] = low
-            y = vec6()
-            for i in range(6):
-                y = y + B[i]
+            y = _plane(B)
         if ok == 0:
             continue
         for _t in range(_WALKS):
@@ -150,17 +156,9 @@ def epsilon_bound(
             if at < 0:
                 break
             B = _pivot(B, r, B * _edge_wrench(arms, cones, at, scale))
-            y = vec6()
-            for i in range(6):
-                y = y + B[i]
+            y = _plane(B)
             # rounding may leave wrenches beyond the plane: the bound is their support, not the plane
-            yf = wp.vec3(y[0], y[1], y[2])
-            yt = wp.vec3(y[3], y[4], y[5]) * scale
-            top = float(-1.0e30)
-            for i in range(k):
-                a = yf + wp.cross(yt, arms[i])
-                for e in range(_EDGES):
-                    top = wp.max(top, wp.dot(a, cones[i * _EDGES + e]))
+            top, at = _farthest(y, arms, cones, k, scale)
             least = wp.min(least, top / wp.length(y))
     if least < 2.5e-4:
         return 0.0

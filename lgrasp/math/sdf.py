@@ -46,8 +46,8 @@ def _clamped(s: Sdf, x: wp.vec3):
 
 @wp.func
 def _edges(s: Sdf, c: wp.vec3):
-    """Of the cell at grid coordinates c: values at the low ends of its four edges along z, their rises [m], and where
-    in the cell c lies.
+    """Of the cell at grid coordinates c: values on its four edges along z at c's height, their rises [m], and where in
+    the cell c lies.
 
     Edges by (x, y): (0, 0), (0, 1), (1, 0), (1, 1).
     """
@@ -60,7 +60,15 @@ def _edges(s: Sdf, c: wp.vec3):
     d = e + s.nz
     low = wp.vec4(s.values[a], s.values[b], s.values[e], s.values[d])
     high = wp.vec4(s.values[a + 1], s.values[b + 1], s.values[e + 1], s.values[d + 1])
-    return low, high - low, wp.vec3(c[0] - float(i), c[1] - float(j), c[2] - float(k))
+    rise = high - low
+    f = wp.vec3(c[0] - float(i), c[1] - float(j), c[2] - float(k))
+    return low + rise * f[2], rise, f
+
+
+@wp.func
+def _along_y(v: wp.vec4, y: wp.float32):
+    """Values of four edges, interpolated along y: at x = 0 and 1."""
+    return wp.vec2(v[0] + (v[1] - v[0]) * y, v[2] + (v[3] - v[2]) * y)
 
 
 @wp.func
@@ -68,11 +76,9 @@ def sdf_value(s: Sdf, p: wp.vec3):
     """Signed distance at p [m]; beyond the grid a lower bound of the distance."""
     x = (p - s.origin) * s.inv_cell
     c = _clamped(s, x)
-    low, rise, f = _edges(s, c)
-    v = low + rise * f[2]
-    v0 = v[0] + (v[1] - v[0]) * f[1]
-    v1 = v[2] + (v[3] - v[2]) * f[1]
-    d = v0 + (v1 - v0) * f[0]
+    v, _rise, f = _edges(s, c)
+    ends = _along_y(v, f[1])
+    d = ends[0] + (ends[1] - ends[0]) * f[0]
     o = x - c
     o2 = o[0] * o[0] + o[1] * o[1] + o[2] * o[2]
     if o2 > 0.0:
@@ -87,18 +93,12 @@ def sdf_gradient(s: Sdf, p: wp.vec3):
     """Unit gradient (3) and signed distance [m] at p, as a vec4 (gx, gy, gz, distance); p is clamped into the grid."""
     x = (p - s.origin) * s.inv_cell
     c = _clamped(s, x)
-    low, rise, f = _edges(s, c)
-    v = low + rise * f[2]
-    v0 = v[0] + (v[1] - v[0]) * f[1]
-    v1 = v[2] + (v[3] - v[2]) * f[1]
-    d = v0 + (v1 - v0) * f[0]
-    r0 = rise[0] + (rise[1] - rise[0]) * f[1]
-    r1 = rise[2] + (rise[3] - rise[2]) * f[1]
-    g = wp.vec3(
-        v1 - v0,
-        (v[1] - v[0]) * (1.0 - f[0]) + (v[3] - v[2]) * f[0],
-        r0 + (r1 - r0) * f[0],
-    )
+    v, rise, f = _edges(s, c)
+    ends = _along_y(v, f[1])
+    d = ends[0] + (ends[1] - ends[0]) * f[0]
+    r = _along_y(rise, f[1])
+    by_y = (v[1] - v[0]) * (1.0 - f[0]) + (v[3] - v[2]) * f[0]
+    g = wp.vec3(ends[1] - ends[0], by_y, r[0] + (r[1] - r[0]) * f[0])
     n = wp.length(g)
     if n > 1.0e-12:
         g = g / n

@@ -10,6 +10,9 @@ NORMAL_BINS = _RES * _RES
 
 _R = wp.constant(_RES)
 
+vec3s, transforms = wp.array(dtype=wp.vec3), wp.array(dtype=wp.transform)
+"""Types of local arrays that functions are given."""
+
 
 @wp.func
 def _sign(x: wp.float32):
@@ -17,17 +20,18 @@ def _sign(x: wp.float32):
 
 
 @wp.func
+def _folded(u: wp.float32, v: wp.float32, z: wp.float32):
+    """The lower half of the octahedron (z < 0) folded outwards, and back."""
+    if z < 0.0:
+        return wp.vec2((1.0 - wp.abs(v)) * _sign(u), (1.0 - wp.abs(u)) * _sign(v))
+    return wp.vec2(u, v)
+
+
+@wp.func
 def octahedral(n: wp.vec3):
     """Unit vector -> point of the square [-1, 1]^2."""
     s = 1.0 / (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2]))
-    u = n[0] * s
-    v = n[1] * s
-    if n[2] < 0.0:
-        a = (1.0 - wp.abs(v)) * _sign(u)
-        b = (1.0 - wp.abs(u)) * _sign(v)
-        u = a
-        v = b
-    return wp.vec2(u, v)
+    return _folded(n[0] * s, n[1] * s, n[2])
 
 
 @wp.func
@@ -45,12 +49,8 @@ def decode_normal(code: wp.int32):
     u = float(code // 256) / 127.5 - 1.0
     v = float(code % 256) / 127.5 - 1.0
     z = 1.0 - wp.abs(u) - wp.abs(v)
-    if z < 0.0:
-        a = (1.0 - wp.abs(v)) * _sign(u)
-        b = (1.0 - wp.abs(u)) * _sign(v)
-        u = a
-        v = b
-    return wp.normalize(wp.vec3(u, v, z))
+    e = _folded(u, v, z)
+    return wp.normalize(wp.vec3(e[0], e[1], z))
 
 
 @wp.func

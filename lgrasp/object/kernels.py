@@ -14,7 +14,6 @@ def draw_opposite(
     normals: wp.array(dtype=wp.vec3),
     cosine: float,
     seed: int,
-    # out
     opposite_out: wp.array(dtype=wp.int32),
 ):
     """One of the points that face point i: both outward normals within the cone of the line between the two.
@@ -45,7 +44,6 @@ def nearest_face_band(
     cell: float,
     dims: wp.vec3i,
     band: float,
-    # out
     key_out: wp.array(dtype=wp.uint64),
 ):
     """Every triangle offers itself to the cells within ``band`` of it; a cell keeps the smallest (distance², face).
@@ -97,7 +95,6 @@ def lattice_crossings(
     origin: wp.vec3d,
     cell: wp.float64,
     dims: wp.vec3i,
-    # out
     step_out: wp.array3d(dtype=wp.int32),
 ):
     """Steps of the winding number along every z column of cells: +1 where it enters the object, -1 where it leaves.
@@ -147,7 +144,6 @@ def winding_sign(
     cell: float,
     dims: wp.vec3i,
     reach: float,
-    # out
     inside_out: wp.array(dtype=wp.int32),
 ):
     """1 where the generalised winding number of an open mesh says inside, at the given cells only.
@@ -177,7 +173,6 @@ def far_distance(
     cell: float,
     dims: wp.vec3i,
     exact: float,
-    # out
     distance_out: wp.array(dtype=float),
 ):
     """Unsigned distance of every cell to the nearest of the faces that it and its six neighbours were handed.
@@ -217,7 +212,6 @@ def fold_spread(
     point_face: wp.array(dtype=wp.int32),
     radius: float,
     queue: wp.array2d(dtype=wp.int32),
-    # out
     dot_out: wp.array(dtype=float),
 ):
     """Smallest dot product of a point's normal with the faces reached over the surface within ``radius``.

@@ -16,7 +16,7 @@ from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps
 from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import REASONS, Outcome
-from lgrasp.grasp.tables import GraspTable, join_grasps, take_grasps
+from lgrasp.grasp.tables import GraspTable, join_rows, take_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.surface import ContactSurface, palm_axis
 from lgrasp.object.arrays import ObjectArrays, upload_object
@@ -153,7 +153,7 @@ class Planner:
                         progress(counts["starts"], counts["kept"])
             finally:
                 pool.shutdown(cancel_futures=True)
-        return Planned(join_grasps(tables), counts)
+        return Planned(join_rows(tables), counts)
 
     @cached_property
     def _scene(self) -> "_Scene":

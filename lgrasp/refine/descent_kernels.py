@@ -35,15 +35,7 @@ class Moments:
 
 
 @wp.func
-def _moved(
-    moments: Moments,
-    row: wp.int32,
-    k: wp.int32,
-    g: wp.float32,
-    square: wp.float32,
-    step: wp.int32,
-    s: Search,
-):
+def _moved(moments: Moments, row: wp.int32, k: wp.int32, g: wp.float32, square: wp.float32, step: wp.int32, s: Search):
     """Share of the largest step, down, of coordinate k: adam's, or that of sgd with momentum."""
     mean = s.momentum * moments.first[row, k] + (1.0 - s.momentum) * g
     moments.first[row, k] = mean
@@ -57,14 +49,7 @@ def _moved(
 
 
 @wp.func
-def _three_moved(
-    moments: Moments,
-    row: wp.int32,
-    k: wp.int32,
-    g: wp.vec3,
-    step: wp.int32,
-    s: Search,
-):
+def _three_moved(moments: Moments, row: wp.int32, k: wp.int32, g: wp.vec3, step: wp.int32, s: Search):
     """Of three coordinates; one scale for all: steps do not depend on the frame."""
     square = wp.length_sq(g) / 3.0
     v = g
@@ -197,7 +182,6 @@ def penetration(
     points: Points,
     solids: Solids,
     body: wp.array2d(dtype=wp.transform),
-    # out
     penetration_out: wp.array(dtype=wp.float32),
 ):
     """Depth of the deepest point of hands in anything, or of that in them, at their matches [m]; over hands.

@@ -9,6 +9,7 @@ import math
 import warp as wp
 
 from lgrasp.math.kinematics import Kinematics
+from lgrasp.math.transforms import transforms, vec3s
 from lgrasp.refine.match_kernels import Correspondences, Points, Solids
 from lgrasp.refine.params import LENGTH, STEEPEST
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
@@ -78,14 +79,7 @@ def beyond(plane: wp.vec4, x: wp.vec3):
 
 @wp.func
 def wrench_pulls(
-    points: Points,
-    own: Volume,
-    s: Search,
-    m: Correspondences,
-    row: wp.int32,
-    X: wp.array(dtype=wp.transform),
-    F: wp.array(dtype=wp.vec3),
-    M: wp.array(dtype=wp.vec3),
+    points: Points, own: Volume, s: Search, m: Correspondences, row: wp.int32, X: transforms, F: vec3s, M: vec3s
 ):
     """Of the net wrench of the contacts."""
     force = wp.vec3()
@@ -109,15 +103,7 @@ def wrench_pulls(
 
 
 @wp.func
-def point_pulls(
-    points: Points,
-    s: Search,
-    m: Correspondences,
-    row: wp.int32,
-    X: wp.array(dtype=wp.transform),
-    F: wp.array(dtype=wp.vec3),
-    M: wp.array(dtype=wp.vec3),
-):
+def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, X: transforms, F: vec3s, M: vec3s):
     """Of the planes that points are drawn to and kept beyond."""
     for block in range(points.body.shape[0]):
         b = points.body[block]
@@ -146,15 +132,7 @@ def point_pulls(
 
 
 @wp.func
-def solid_pulls(
-    solids: Solids,
-    s: Search,
-    m: Correspondences,
-    row: wp.int32,
-    X: wp.array(dtype=wp.transform),
-    F: wp.array(dtype=wp.vec3),
-    M: wp.array(dtype=wp.vec3),
-):
+def solid_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, X: transforms, F: vec3s, M: vec3s):
     """Of the object's points, and other links' points, that links are kept off."""
     links = solids.body.shape[0]
     each = m.deep.shape[1] // links
@@ -186,13 +164,7 @@ def solid_pulls(
 
 @wp.func
 def joint_pulls(
-    h: Kinematics,
-    s: Search,
-    q: wp.array2d(dtype=wp.float32),
-    row: wp.int32,
-    X: wp.array(dtype=wp.transform),
-    F: wp.array(dtype=wp.vec3),
-    M: wp.array(dtype=wp.vec3),
+    h: Kinematics, s: Search, q: wp.array2d(dtype=wp.float32), row: wp.int32, X: transforms, F: vec3s, M: vec3s
 ):
     """Derivatives by the joints; F and M of a body become those of all that rides on it."""
     g = _vec_joints()

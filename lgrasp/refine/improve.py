@@ -11,7 +11,7 @@ from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps
 from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import Outcome
-from lgrasp.grasp.tables import GraspTable, choose_grasps, join_grasps
+from lgrasp.grasp.tables import GraspTable, choose_grasps, join_rows
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.refine.descent import Descent
@@ -55,7 +55,7 @@ def improve(
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         jobs = [pool.submit(_improved, search, hand, obj, pose[p], q[p], bounds, tries[p], index[p]) for p in parts]
         tables, outcomes = zip(*(job.result() for job in jobs), strict=True)
-    return join_grasps(list(tables)), np.concatenate(outcomes)
+    return join_rows(list(tables)), np.concatenate(outcomes)
 
 
 def _improved(

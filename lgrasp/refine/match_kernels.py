@@ -71,7 +71,6 @@ def place_bodies(
     h: Kinematics,
     pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),
-    # out
     body_out: wp.array2d(dtype=wp.transform),
 ):
     """Bodies of hands in the object's frame; launched over hands.

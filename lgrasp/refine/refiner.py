@@ -14,14 +14,7 @@ from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.descent import Descent
-from lgrasp.refine.energy import (
-    Energies,
-    Matches,
-    intrusion_energies,
-    limit_energy,
-    matching_energies,
-    wrench_energy,
-)
+from lgrasp.refine.energy import Energies, Matches, intrusion_energies, limit_energy, matching_energies, wrench_energy
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.links import LinkSolids
 from lgrasp.refine.params import LocalSearch

@@ -38,3 +38,16 @@ def upload_struct(kind: Any, device: str, values: Mapping[str, Any]) -> Any:
             value = declared(*map(float, value))
         setattr(struct, name, value)
     return struct
+
+
+def empty_arrays(kind: Any, device: str, *shape: int, **given: Any) -> dict[str, Any]:
+    """Values for the fields of a Warp struct: arrays to be written, each with the first sizes of ``shape``, or those
+    given."""
+    arrays = {name: var.type for name, var in kind.vars.items() if isinstance(var.type, wp.array)}
+    made = {n: wp.empty(shape[: a.ndim], dtype=a.dtype, device=device) for n, a in arrays.items() if n not in given}
+    return made | given
+
+
+def empty_struct(kind: Any, device: str, *shape: int, **given: Any) -> Any:
+    """A Warp struct of :func:`empty_arrays`."""
+    return make_struct(kind, **empty_arrays(kind, device, *shape, **given))

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lgrasp.grasp.tables import ContactSets, set_table
+from lgrasp.grasp.tables import ContactSets
 from lgrasp.math.kinematics import MAX_DOFS
 from lgrasp.stages.context import Context
 
@@ -65,4 +65,4 @@ def optimised_sets(grasps: "Optimised", free: np.ndarray, context: Context) -> C
         "candidates.poses.setting": setting[kept].astype(np.int32),
         "candidates.poses.anchor": np.full((len(kept), groups), -1, np.int32),
     }
-    return set_table(arrays, context.device)
+    return ContactSets.of(arrays, context.device)

@@ -95,11 +95,7 @@ _ALMOST_ALWAYS = 0.95  # of all postures; links that touch so often are left to 
 
 
 def assemble(
-    mujoco: Any,
-    hand: HandSolids,
-    objects: Sequence[Solid],
-    protocol: Protocol,
-    held: Mapping[str, float],
+    mujoco: Any, hand: HandSolids, objects: Sequence[Solid], protocol: Protocol, held: Mapping[str, float]
 ) -> Any:
     """The MjSpec of a hand with some objects; the drives are as stiff as the object needs that needs the stiffest.
 

@@ -11,7 +11,7 @@ import numpy as np
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.trial import Trial
-from lgrasp.simulate.verdict import AXES, CHUNK, REST, Bounds, Closed, Look, Pulls, Verdict, conclude
+from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude
 from lgrasp.simulate.worlds import Worlds
 
 
@@ -85,8 +85,7 @@ class WorldTrials:
         alive = np.array([look.depth for look in looks]) <= self._protocol.most_penetration
         hands = self._close(rows, index, looks)
         slip = self._slip(rows, index, looks, hands.state["qpos"][:n])
-        speed = hands.state["qvel"][:n, self._model.object_velocity]  # (n, O, 6)
-        rest = (np.linalg.norm(speed[..., :3], axis=2) < REST[0]) & (np.linalg.norm(speed[..., 3:], axis=2) < REST[1])
+        rest = at_rest(hands.state["qvel"][:n, self._model.object_velocity])
         lost = hands.wild | self._bounds.lost(hands.worst)
         good = alive & ~lost
         hands.worst[hands.wild | ~alive] = np.nan
@@ -100,7 +99,7 @@ class WorldTrials:
             closed = Closed(
                 int(hands.contacts[i]) if alive[i] else 0,
                 float(slip[i]) if good[i] else np.nan,
-                bool(good[i] and rest[i].all()),
+                bool(good[i] and rest[i]),
                 hands.worst[i],
                 float(hands.depth[i]) if alive[i] else looks[i].object_depth,
             )

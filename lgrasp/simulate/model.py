@@ -11,8 +11,7 @@ from lgrasp.errors import PhysicsError
 from lgrasp.simulate.assemble import OBJECT, assemble, welded_joints
 from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.protocol import Protocol
-from lgrasp.simulate.scene import HandSolids, Scene
-from lgrasp.simulate.solid import Solid
+from lgrasp.simulate.scene import Scene
 
 _NEAR_DISTANCE = 1.0e-3  # [m]
 
@@ -69,16 +68,15 @@ def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequen
     joints = scene.hand.joint_names
     carried = [name for name in welded_joints(scene.hand.urdf, scene.hand.base_link) if name in joints]
     held = tuple((name, float(q[joints.index(name)])) for name in carried)
-    return _build(scene, protocol.model_dump_json(), held, tuple(objects))
+    return _build(scene, protocol, held, tuple(objects))
 
 
 @lru_cache(maxsize=8)
-def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects: tuple[int, ...]) -> Model:
-    mujoco = import_mujoco()
-    protocol = Protocol.model_validate_json(text)
+def _build(scene: Scene, protocol: Protocol, held: tuple[tuple[str, float], ...], objects: tuple[int, ...]) -> Model:
+    mujoco, hand = import_mujoco(), scene.hand
     solids = [scene.objects[index] for index in objects]
     try:
-        spec = assemble(mujoco, scene.hand, solids, protocol, dict(held))
+        spec = assemble(mujoco, hand, solids, protocol, dict(held))
         model = spec.compile()
         for geom in spec.geoms:
             if geom.parent.name.startswith(OBJECT):
@@ -87,19 +85,7 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
     except (ValueError, KeyError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:300]
         names = ", ".join(f"'{solid.name}'" for solid in solids)
-        raise PhysicsError(f"MuJoCo refuses hand '{scene.hand.name}' with object {names}: {reason}") from None
-    return _tables(mujoco, model, near, scene.hand, protocol, solids, held)
-
-
-def _tables(
-    mujoco: Any,
-    model: Any,
-    near: Any,
-    hand: HandSolids,
-    protocol: Protocol,
-    solids: list[Solid],
-    held: tuple[tuple[str, float], ...],
-) -> Model:
+        raise PhysicsError(f"MuJoCo refuses hand '{hand.name}' with object {names}: {reason}") from None
     column = {name: k for k, name in enumerate(hand.joint_names)}
     joints = np.flatnonzero(model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
     follows = {

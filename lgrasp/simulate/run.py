@@ -1,6 +1,5 @@
 """Verdicts of many grasps: on the CPU one thread per grasp at a time, on a GPU all side by side."""
 
-import queue
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
@@ -113,7 +112,7 @@ def verdicts(
         PhysicsError: MuJoCo is missing or refuses the scene, or a row has an object that the scene lacks.
     """
     slots = np.full(np.shape(rows.object_index), -1)
-    found: list[Verdict | None] = [None] * len(rows)
+    found: dict[int, Verdict] = {}
     options = {"all_directions": all_directions, "settled_stop": settled_stop}
     before = [0, 0]  # rows done and held
 
@@ -133,10 +132,9 @@ def verdicts(
         else:
             some = worlds.run(group.rows, advanced)
         slots[group.index] = group.slots
-        for row, verdict in zip(group.index, some, strict=True):
-            found[row] = verdict
+        found |= zip(group.index.tolist(), some, strict=True)
         before = [before[0] + len(some), before[1] + sum(verdict.holds for verdict in some)]
-    return stack_verdicts(protocol, [verdict for verdict in found if verdict is not None], slots)
+    return stack_verdicts(protocol, [found[row] for row in range(len(rows))], slots)
 
 
 def check_installed(device: str) -> None:
@@ -163,33 +161,24 @@ def _on_threads(
     model: Model, rows: GraspRows, threads: int, progress: Callable[[int, int], None], options: dict[str, bool]
 ) -> list[Verdict]:
     """A verdict of every row, by MuJoCo."""
-    found: list[Verdict | None] = [None] * len(rows)
-    trials: queue.SimpleQueue[Trial] = queue.SimpleQueue()
-    for _ in range(threads):
-        trials.put(Trial(model, **options))
-    stop = threading.Event()
+    own = threading.local()
 
-    def judge(i: int) -> bool:
-        if stop.is_set():
-            return False
-        trial = trials.get()
-        try:
-            found[i] = verdict = trial.run(rows, i)
-            return verdict.holds
-        finally:
-            trials.put(trial)
+    def judge(i: int) -> Verdict:
+        if not hasattr(own, "trial"):
+            own.trial = Trial(model, **options)
+        return own.trial.run(rows, i)
 
-    done = held = 0
+    held = 0
     with _silence(), ThreadPoolExecutor(threads) as pool:
+        found = [pool.submit(judge, i) for i in range(len(rows))]
         try:
-            for future in as_completed([pool.submit(judge, i) for i in range(len(rows))]):
-                done += 1
-                held += future.result()
+            for done, verdict in enumerate(as_completed(found), 1):
+                held += verdict.result().holds
                 progress(done, held)
         except BaseException:
-            stop.set()
+            pool.shutdown(cancel_futures=True)
             raise
-    return [verdict for verdict in found if verdict is not None]
+    return [verdict.result() for verdict in found]
 
 
 @contextmanager

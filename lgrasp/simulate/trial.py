@@ -10,13 +10,13 @@ from lgrasp.simulate.model import Model
 from lgrasp.simulate.verdict import (
     AXES,
     CHUNK,
-    REST,
     WILD,
     Bounds,
     Closed,
     Look,
     Pulls,
     Verdict,
+    at_rest,
     conclude,
     links_touching,
     moved,
@@ -98,9 +98,8 @@ class Trial:
                     depth = max(depth, self._deepest())
                     if self._bounds.lost(worst):
                         return Closed(contacts, np.nan, False, worst, depth)
-        speed = self._data.qvel[self._model.object_velocity]  # (O, 6)
-        rest = (np.linalg.norm(speed[:, :3], axis=1) < REST[0]) & (np.linalg.norm(speed[:, 3:], axis=1) < REST[1])
-        return Closed(contacts, self._slip(rows, i, look.points), bool(rest.all()), worst, depth)
+        rest = bool(at_rest(self._data.qvel[self._model.object_velocity]))
+        return Closed(contacts, self._slip(rows, i, look.points), rest, worst, depth)
 
     def _touching_at_rest(self) -> int:
         """Fewest links on any object, at rest at the targets; the trial then continues from the previous state."""

@@ -14,11 +14,10 @@ CHUNK = 0.1
 """[s] between looks at the objects."""
 WILD = 1.0e3
 """[m/s or rad/s]: no hand and no object is so fast, the simulation has diverged."""
-REST = (0.01, 0.1)
-"""[m/s], [rad/s]: slower is at rest."""
 AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
 """Directions of the load in the hand's base frame."""
 
+_REST = (0.01, 0.1)  # [m/s], [rad/s]: slower is at rest
 _LOST_DISTANCE = 0.5  # [m]: an object that got so far from its start will not touch the hand again
 
 
@@ -176,6 +175,12 @@ def _turned(quaternion: np.ndarray, point: np.ndarray) -> np.ndarray:
     return point + quaternion[..., :1] * t + np.cross(quaternion[..., 1:], t)
 
 
+def at_rest(velocity: np.ndarray) -> np.ndarray:
+    """Whether objects with linear and angular velocities (..., O, 6) are all at rest (...)."""
+    speed = np.linalg.norm(velocity.reshape(*velocity.shape[:-1], 2, 3), axis=-1)
+    return (speed < _REST).all((-2, -1))
+
+
 def links_touching(
     bodies: np.ndarray, objects: np.ndarray, count: int, world: np.ndarray | int = 0, worlds: int = 1
 ) -> np.ndarray:
@@ -215,7 +220,7 @@ COLUMNS: dict[str, str] = {
     "settled": "bool [N]: objects at rest when the pull begins (below 1 cm/s and 0.1 rad/s)",
     "diverged": "bool [N]: the simulation ran away; counts as lost",
 }
-"""Name (without the protocol's) -> what it says."""
+"""Name (without the protocol's) -> type, shape and what it says."""
 
 OBJECT_COLUMNS: dict[str, str] = {
     "stays": "bool [N]: every object stays within the bounds in all six directions",
@@ -229,18 +234,6 @@ OBJECT_COLUMNS: dict[str, str] = {
 }
 """The same for what is written where rows may have several objects, and by protocols whose success is to touch."""
 
-_TYPES = {
-    "holds": np.bool_,
-    "directions": np.int8,
-    "contact_at_q": np.int16,
-    "contact_at_grasp": np.int16,
-    "settled": np.bool_,
-    "diverged": np.bool_,
-    "stays": np.bool_,
-    "object_touches": np.int8,
-}
-_PER_DIRECTION = {"directions", "displacement", "rotation"}  # a column per direction
-
 
 def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.ndarray) -> dict[str, np.ndarray]:
     """Columns NAME_... of one protocol from the verdicts of its rows.
@@ -250,14 +243,14 @@ def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.nd
     """
     several = slots.shape[1] > 1 or protocol.success == "touches"
     out = {}
-    for column in COLUMNS | (OBJECT_COLUMNS if several else {}):
+    for column, text in (COLUMNS | (OBJECT_COLUMNS if several else {})).items():
         values = [getattr(verdict, column) for verdict in verdicts]
-        dtype = _TYPES.get(column, np.float32)
-        if column.startswith("object_"):
-            stacked = np.full(slots.shape, -1 if dtype is np.int8 else np.nan, dtype)
+        dtype = np.dtype(text.partition(" ")[0])
+        if "[N, O]" in text:
+            stacked = np.full(slots.shape, -1 if dtype == np.int8 else np.nan, dtype)
             for row, found, slot in zip(stacked, values, slots, strict=True):
                 row[slot >= 0] = found[slot[slot >= 0]]
         else:
-            stacked = np.array(values, dtype).reshape((len(verdicts), 6) if column in _PER_DIRECTION else len(verdicts))
+            stacked = np.array(values, dtype).reshape((len(verdicts), 6) if "[N, 6]" in text else len(verdicts))
         out[f"{protocol.name}_{column}"] = stacked
     return out

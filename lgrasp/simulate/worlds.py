@@ -18,23 +18,33 @@ _BUFFER_WARNINGS = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EP
 _CONSTRAINTS_PER_OBJECT = 640  # rows per world and object: four a contact, limits, couplings
 
 
+@wp.struct
+class _Targets:
+    """Where the drives of W worlds go, and how far they are."""
+
+    start: wp.array2d(dtype=wp.float32)  # (W, nu)
+    end: wp.array2d(dtype=wp.float32)  # (W, nu)
+    step: wp.array(dtype=wp.float32)  # (W,) steps since the start
+    ramp: wp.float32  # steps from start to end
+
+
 @wp.kernel
-def _drive(
-    start: wp.array2d(dtype=wp.float32),
-    end: wp.array2d(dtype=wp.float32),
-    ramp: wp.float32,
-    step: wp.array(dtype=wp.float32),
-    ctrl_out: wp.array2d(dtype=wp.float32),
-):
-    """Targets of the next step, evenly from start to end over ``ramp`` steps."""
+def _drive(targets: _Targets, ctrl_out: wp.array2d(dtype=wp.float32)):
+    """Targets of the next step, evenly from start to end over ``ramp`` steps.
+
+    Args:
+        ctrl_out: (W, nu).
+    """
     world, u = wp.tid()
-    share = wp.min((step[world] + 1.0) / ramp, 1.0)
-    ctrl_out[world, u] = start[world, u] + (end[world, u] - start[world, u]) * share
+    share = wp.min((targets.step[world] + 1.0) / targets.ramp, 1.0)
+    ctrl_out[world, u] = targets.start[world, u] + (targets.end[world, u] - targets.start[world, u]) * share
 
 
 @wp.kernel
-def _count(step_out: wp.array(dtype=wp.float32)):
-    step_out[wp.tid()] = step_out[wp.tid()] + 1.0
+def _count(targets_out: _Targets):
+    """One step more."""
+    world = wp.tid()
+    targets_out.step[world] = targets_out.step[world] + 1.0
 
 
 class Worlds:
@@ -56,9 +66,12 @@ class Worlds:
                 "njmax": _CONSTRAINTS_PER_OBJECT * len(model.object_body),
             }
             self._d = mujoco_warp.make_data(m, nworld=worlds, **room)
-            shape = (worlds, m.nu)
-            self._start, self._end, self._step = (wp.zeros(s, dtype=wp.float32) for s in (shape, shape, (worlds,)))
-        self._ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
+            self._targets = t = _Targets()
+            t.start, t.end, t.step = (wp.zeros((worlds, m.nu)[:n], dtype=wp.float32) for n in (2, 2, 1))
+            t.ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
+        d = self._d
+        self._state = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
+        self._state |= {"start": t.start, "end": t.end, "step": t.step}
         self.chunk = max(1, round(CHUNK / m.opt.timestep))
         self._graph: Any = None
         self._full = sum(int(mujoco_warp.OverflowType[name]) for name in _BUFFER_WARNINGS)
@@ -88,23 +101,17 @@ class Worlds:
         self.steps += self.chunk * self.worlds
 
     def _one_step(self) -> None:
-        wp.launch(_drive, self._start.shape, [self._start, self._end, self._ramp, self._step], [self._d.ctrl])
-        wp.launch(_count, self.worlds, [], [self._step])
+        wp.launch(_drive, self._d.ctrl.shape, [self._targets], [self._d.ctrl])
+        wp.launch(_count, self.worlds, [], [self._targets])
         self._lib.step(self._m, self._d)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that decides what comes next, one row a world."""
-        d = self._d
-        arrays = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
-        own = {"start": self._start, "end": self._end, "step": self._step}
-        return {name: a.numpy().copy() for name, a in (arrays | own).items()}
+        return {name: a.numpy().copy() for name, a in self._state.items()}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Inverse of :meth:`state`."""
-        d = self._d
-        arrays = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
-        own = {"start": self._start, "end": self._end, "step": self._step}
-        for name, a in (arrays | own).items():
+        for name, a in self._state.items():
             a.assign(state[name])
 
     def moved(self, state: dict[str, np.ndarray], home: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from lgrasp.engine import shard as shard_module
 from lgrasp.engine.batch import run_batch
 from lgrasp.engine.shard import Execution, make_shard
 from lgrasp.errors import ConfigError
-from lgrasp.grasp.tables import grasp_arrays, join_grasps
+from lgrasp.grasp.tables import grasp_arrays, join_rows
 from lgrasp.jobs.generate import generate
 from lgrasp.stages.context import Context
 
@@ -86,7 +86,7 @@ def test_cut_of_the_stream(pipeline, source):
     own = Context(source.hand, source.object, source.field, "cpu", 0, 0)
     whole = run_batch(pipeline, own, 0, 400)
     parts = [run_batch(pipeline, own, first, count) for first, count in ((0, 1), (1, 149), (150, 250))]
-    assert_same(grasp_arrays(whole.grasps), grasp_arrays(join_grasps([p.grasps for p in parts])))
+    assert_same(grasp_arrays(whole.grasps), grasp_arrays(join_rows([p.grasps for p in parts])))
     for stage, counts in whole.counts.items():
         for name, value in counts.items():
             assert value == sum(p.counts[stage][name] for p in parts), (stage, name)

@@ -15,7 +15,7 @@ from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import Outcome
 from lgrasp.grasp.rows import CONTACTS, POSTURES, grasp_rows, press
 from lgrasp.grasp.schema import GRASP_FIELDS
-from lgrasp.grasp.tables import GraspTable, choose_grasps, join_grasps, widen_grasps
+from lgrasp.grasp.tables import GraspTable, choose_grasps, join_rows, widen_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.math.qp import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays, upload_object
@@ -82,7 +82,7 @@ def move_rows(
         parts.append(_moved_part(refiner, hand, arrays, rows, part, params, bounds, stored))
         if progress:
             progress(min(first + _BATCH_ROWS, len(rows)))
-    table = join_grasps([p.table for p in parts])
+    table = join_rows([p.table for p in parts])
     first_energy, last_energy = (np.concatenate(x, 1) for x in zip(*(p.energy for p in parts), strict=True))
     was, known, taken, good = (np.concatenate([p.marks[k] for p in parts]) for k in range(4))
     terms = {f"energy_{name}": values for name, values in zip(Energies._fields, last_energy, strict=True)}

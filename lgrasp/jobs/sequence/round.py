@@ -11,8 +11,8 @@ from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.grasp.held import hold
-from lgrasp.grasp.sequences import SequenceTable, empty_sequences, join_sequences, take_sequences
-from lgrasp.grasp.tables import GraspTable, join_grasps, sort_grasps
+from lgrasp.grasp.sequences import SequenceTable, empty_sequences
+from lgrasp.grasp.tables import GraspTable, join_rows, take_rows
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.runtime.tally import Meter
 from lgrasp.seeding import stage_seed
@@ -121,10 +121,10 @@ class _Step:
             for number in np.unique(space[space >= 0]):
                 self._go_on(np.flatnonzero((space == number) & self._wanting), int(number), wave)
         if not self._tried:
-            return take_sequences(rows, np.zeros(0, int))
-        table = join_sequences([self._longer(number) for number in self._tried])
-        table = take_sequences(table, np.argsort(table.parent, kind="stable"))
-        return take_sequences(table, go_on(table.parent, table.metrics["room"], params))
+            return take_rows(rows, np.zeros(0, int))
+        table = join_rows([self._longer(number) for number in self._tried])
+        table = take_rows(table, np.argsort(table.parent, kind="stable"))
+        return take_rows(table, go_on(table.parent, table.metrics["room"], params))
 
     @property
     def _wanting(self) -> np.ndarray:
@@ -191,9 +191,10 @@ class _Step:
     def _longer(self, number: int) -> SequenceTable:
         """The sequences that continue with a space; their candidates are numbered over all rows."""
         tries, rows = self._params.tries, np.flatnonzero(self._tried[number])
-        grasps = sort_grasps(join_grasps(self._found[number]))
+        grasps = join_rows(self._found[number])
+        grasps = take_rows(grasps, np.argsort(grasps.index, kind="stable"))
         place = np.searchsorted(rows, grasps.index // tries) * tries + grasps.index % tries
-        context, before = self._context(rows, number, tries, self._seed), take_sequences(self._rows, rows)
+        context, before = self._context(rows, number, tries, self._seed), take_rows(self._rows, rows)
         table, counts = grow((before, number, replace(grasps, index=place)), self._params, context)
         self._result.count(self._inputs.spaces[number].name, {"sequence": counts})
         parent = rows[table.parent]
@@ -201,7 +202,7 @@ class _Step:
 
     def _context(self, chosen: np.ndarray, number: int, tries: int, seed: int) -> Context:
         """Input of the stages that continue chosen rows with an opposition space."""
-        inputs, before = self._inputs, take_sequences(self._rows, chosen)
+        inputs, before = self._inputs, take_rows(self._rows, chosen)
         space, view, step = inputs.spaces[number], inputs.views[number], before.steps
         posture, frozen = before.posture(inputs.hand.tree), before.used | ~space.joints
         return Context(
@@ -226,7 +227,7 @@ class _Step:
             first, meter = number * size, meters[number]
             return run_stages(self._pipeline, context, first, min(size, candidates - first), "filter", meter)
 
-        return join_grasps(list(self._pool.map(run, range(len(meters))))), meters
+        return join_rows(list(self._pool.map(run, range(len(meters))))), meters
 
 
 def _that_hold(
@@ -238,4 +239,4 @@ def _that_hold(
         if own.any():
             counts = {"tried": int(own.sum()), "held": int(holds[own].sum())}
             result.count(space.name, {"simulate": counts})
-    return take_sequences(rows, np.flatnonzero(holds), physics=columns)
+    return take_rows(replace(rows, physics=columns), np.flatnonzero(holds))

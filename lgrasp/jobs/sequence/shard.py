@@ -11,7 +11,8 @@ from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
-from lgrasp.grasp.sequences import SequenceTable, join_sequences, take_sequences
+from lgrasp.grasp.sequences import SequenceTable
+from lgrasp.grasp.tables import join_rows, take_rows
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.jobs.sequence.round import Round, Verdicts, add_spaces, run_round
 
@@ -95,7 +96,7 @@ def _lineage(levels: list[SequenceTable], rows: np.ndarray) -> list[SequenceTabl
     """Some rows of the last level and those that they extend; parents are renumbered."""
     out: list[SequenceTable] = []
     for table in reversed(levels):
-        taken = take_sequences(table, rows)
+        taken = take_rows(table, rows)
         rows, parent = np.unique(taken.parent, return_inverse=True)
         out.append(replace(taken, parent=parent if table.steps > 1 else np.full(len(parent), -1)))
     return out[::-1]
@@ -109,5 +110,5 @@ def _joined(parts: list[list[SequenceTable]]) -> list[SequenceTable]:
     for step in range(len(parts[0])):
         shifts = np.cumsum([0, *(len(levels[step - 1]) for levels in parts)]) if step else [0] * len(parts)
         parents = zip(parts, shifts, strict=False)
-        joined.append(join_sequences([replace(p[step], parent=p[step].parent + shift) for p, shift in parents]))
+        joined.append(join_rows([replace(p[step], parent=p[step].parent + shift) for p, shift in parents]))
     return joined

@@ -36,60 +36,17 @@ class DomainValues:
     stride: wp.int32  # coprime to the number of contact points: multiples of it visit every one
 
 
-@wp.func
-def _voxel_row(field: Field, slot: wp.int32, p: wp.vec3, normal: wp.vec3):
-    return field_has(field, slot, p, normal)
-
-
-@wp.func
-def _any_row(field: Field, slot: wp.int32, p: wp.vec3, normal: wp.vec3):
-    return int(0)
-
-
-@wp.func
-def _from_voxel(
-    field: Field,
-    boxes: Boxes,
-    slot: wp.int32,
-    row: wp.int32,
-    p: wp.vec3,
-    normal: wp.vec3,
-    cosine: wp.float32,
-    state: wp.uint32,
-):
-    pick = field_pick(field, slot, row, p, normal, state)
-    if float(pick[1]) * 0.0001 < cosine:
-        return int(-1)
-    return pick[0]
-
-
-@wp.func
-def _from_boxes(
-    field: Field,
-    boxes: Boxes,
-    slot: wp.int32,
-    row: wp.int32,
-    p: wp.vec3,
-    normal: wp.vec3,
-    cosine: wp.float32,
-    state: wp.uint32,
-):
-    return boxes_pick(boxes, field, slot, p, normal, cosine, state)
-
-
-def _drawing(row_at: Any, pick_at: Any, looks_near: bool) -> Any:
-    """The drawing kernel for one index: which row of it holds a place, and which contact vector there is taken."""
+def _drawing(voxels: bool) -> Any:
+    """The drawing kernel for one index."""
 
     @wp.kernel
     def draw_domains(
-        # in
         hand: Hand,
         field: Field,
         boxes: Boxes,
         obj: Object,
         params: DomainValues,
         seed: wp.array(dtype=wp.int32),
-        # out
         candidates_out: Candidates,
     ):
         """Contact domain of each (pose, group): surface points that a contact vector of the group meets.
@@ -108,12 +65,12 @@ def _drawing(row_at: Any, pick_at: Any, looks_near: bool) -> Any:
         n = int(0)
         i = int(0)
         attempts = params.attempts
-        if wp.static(not looks_near):
+        if wp.static(not voxels):
             # every point once at most, spread over the surface
             i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
             attempts = wp.min(attempts, obj.contacts)
         for a in range(attempts):
-            if wp.static(looks_near):
+            if wp.static(voxels):
                 near = poses.anchor[row, g]
                 if n > 0:
                     near = candidates_out.surface[row, g, a % n]
@@ -127,37 +84,33 @@ def _drawing(row_at: Any, pick_at: Any, looks_near: bool) -> Any:
                 i = (i + params.stride) % obj.contacts
             p = wp.quat_rotate(R, obj.contact_points[i]) + t
             normal = -wp.quat_rotate(R, obj.contact_normals[i])
-            at = row_at(field, slot, p, normal)
-            if at >= 0:
-                own = wp.rand_init(wp.randi(state))
-                record = pick_at(field, boxes, slot, at, p, normal, params.cosine, own)
-                if record >= 0:
-                    candidates_out.surface[row, g, n] = i
-                    candidates_out.record[row, g, n] = record
-                    candidates_out.q[row, g, n] = field_seed(field, hand.kin, slot, record)
-                    n += 1
-                    if n == params.keep:
-                        break
+            record = int(-1)
+            if wp.static(voxels):
+                at = field_has(field, slot, p, normal)
+                if at >= 0:
+                    pick = field_pick(field, slot, at, p, normal, wp.rand_init(wp.randi(state)))
+                    if float(pick[1]) * 0.0001 >= params.cosine:
+                        record = pick[0]
+            else:
+                record = boxes_pick(boxes, field, slot, p, normal, params.cosine, wp.rand_init(wp.randi(state)))
+            if record >= 0:
+                candidates_out.surface[row, g, n] = i
+                candidates_out.record[row, g, n] = record
+                candidates_out.q[row, g, n] = field_seed(field, hand.kin, slot, record)
+                n += 1
+                if n == params.keep:
+                    break
         candidates_out.count[row, g] = n
 
     return draw_domains
 
 
-draw_domains = {
-    "voxel": _drawing(_voxel_row, _from_voxel, True),
-    "bvh": _drawing(_any_row, _from_boxes, False),
-}
+draw_domains = {"voxel": _drawing(True), "bvh": _drawing(False)}
 """Kernels by index. ``bvh``, as published, asks every patch of the group about points all over the surface."""
 
 
 @wp.kernel
-def keep_frozen(
-    # in
-    hand: Hand,
-    held: Held,
-    # out
-    candidates_out: Candidates,
-):
+def keep_frozen(hand: Hand, held: Held, candidates_out: Candidates):
     """Groups that must stay as they are lose their candidates; seeds of others take over what is frozen."""
     row, g = wp.tid()
     if row >= candidates_out.poses.rows[0]:
@@ -170,13 +123,7 @@ def keep_frozen(
 
 
 @wp.kernel
-def drop_poor(
-    # in
-    params: DomainValues,
-    # out
-    candidates_out: Candidates,
-    counts_out: wp.array(dtype=wp.int32),
-):
+def drop_poor(params: DomainValues, candidates_out: Candidates, counts_out: wp.array(dtype=wp.int32)):
     """Poses where too few fingers (and the palm) can touch lose their candidates.
 
     Args:

@@ -6,7 +6,6 @@ import warp as wp
 
 from lgrasp.field.arrays import Boxes
 from lgrasp.grasp.tables import CandidateTable, PoseTable
-from lgrasp.math.kinematics import vec_dof
 from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
@@ -23,15 +22,8 @@ def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[Cand
         The candidates, and counts ``poses``, ``rich`` (poses where enough fingers can touch), ``candidates``.
     """
     d, groups, n = context.device, context.hand.model.groups, inputs.index.shape[0]
-    surface, record = (wp.empty((n, groups, params.keep), dtype=wp.int32, device=d) for _ in range(2))
-    table = CandidateTable(
-        poses=inputs,
-        count=wp.zeros((n, groups), dtype=wp.int32, device=d),
-        surface=surface,
-        record=record,
-        state=wp.zeros((n, groups, params.keep), dtype=wp.int32, device=d),
-        q=wp.empty((n, groups, params.keep), dtype=vec_dof, device=d),
-    )
+    count, state = (wp.zeros((n, groups, params.keep)[:axes], dtype=wp.int32, device=d) for axes in (2, 3))
+    table = CandidateTable.empty(d, n, groups, params.keep, poses=inputs, count=count, state=state)
     hand, field, boxes = context.hand.struct, context.field.struct, context.field.boxes
     cosine, stride = math.cos(math.radians(params.angle)), _stride(len(context.object.model.contact_points))
     values = make_struct(DomainValues, params, cosine=cosine, stride=stride)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.field.arrays import Field, field_seed
-from lgrasp.grasp.check_kernels import contact_fit, hand_pairs_clear
+from lgrasp.grasp.check_kernels import fit_contacts, hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Places
 from lgrasp.grasp.collision import body_clear
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
@@ -52,24 +52,17 @@ def place_touching(
         if group_fixed(hand, held, h, g):
             at_out.posture[i, g] = held.posture[h, g]
             group_forward(hand.kin, g, held.posture[h, g], X, hand.kin.joint_first[g])
-    T = at_out.pose[row]
     k = int(0)
-    gap = float(0.0)
-    facing = float(1.0)
-    least = float(1.0)
     for g in range(G + 1):
         at_out.contact[i, g] = -1
         at_out.surface[i, g] = -1
     for g in range(G + 1):
         s = int(-1)
         c = int(-1)
-        B = wp.transform_identity()
         if g == G:
             if sets.palm_point[row] >= 0:
                 s = sets.palm_surface[row]
                 c = sets.palm_point[row]
-                if places.body[c] > 0:
-                    B = X[places.body[c] - 1]
         elif at_out.chosen[i, g] >= 0:
             m = at_out.chosen[i, g]
             x = clamp_dofs(hand.kin, g, sets.q[row, g, m])
@@ -77,20 +70,14 @@ def place_touching(
             group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
             s = sets.surface[row, g, m]
             c = field.point[sets.record[row, g, m]]
-            B = X[places.body[c] - 1]
         if s >= 0:
-            p = wp.transform_point(T, places.points[s])
-            inward = -wp.transform_vector(T, places.normals[s])
-            fit = contact_fit(hand, places.grid[c], B, p, inward)
-            gap = wp.max(gap, fit[0])
-            facing = wp.min(facing, fit[1])
-            least = wp.min(least, fit[2])
             at_out.contact[i, k] = c
             at_out.surface[i, k] = s
             k += 1
-    found_out.gap[i] = gap
-    found_out.facing[i] = facing
-    if gap > limits.max_gap or wp.min(facing, least) < limits.min_cosine:
+    fit = fit_contacts(hand, places, at_out, i)
+    found_out.gap[i] = fit[0]
+    found_out.facing[i] = fit[1]
+    if fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
         found_out.outcome[i] = CONTACT
         return
     for g in range(G):

@@ -6,7 +6,7 @@ from lgrasp.grasp.check import Check
 from lgrasp.grasp.check_kernels import OTHERS, TOUCHING
 from lgrasp.grasp.check_structs import CheckedPostures, Places, device_limits, new_findings
 from lgrasp.grasp.tables import ContactSets, GraspTable, trim_sets
-from lgrasp.math.kinematics import vec_dof
+from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.params import FilterParams
@@ -28,7 +28,9 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     d, n = context.device, inputs.pose.shape[0]
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
     limits, held = device_limits(context.bounds), context.held.struct
-    sets, at, places = _sets(inputs), _postures(inputs, context), _places(context)
+    at = _postures(inputs, context)
+    sets = make_struct(SetCandidates, inputs.candidates.poses, inputs.candidates)
+    places = make_struct(Places, hand.contacts, points=obj.contact_points, normals=obj.contact_normals)
     found = new_findings(n, at.contact.shape[1], d)
     check = Check(context.hand, context.object, context.held, limits, places, at, found)
     wp.launch(place_touching, n, [hand, field, held, limits, places, sets], [at, found], device=d)
@@ -41,27 +43,9 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     return check.kept(context.seed("filter", 1))
 
 
-def _sets(inputs: ContactSets) -> SetCandidates:
-    table, poses = inputs.candidates, inputs.candidates.poses
-    s = SetCandidates()
-    s.palm_point, s.palm_surface, s.setting = poses.palm_point, poses.palm_surface, poses.setting
-    s.surface, s.record, s.q = table.surface, table.record, table.q
-    return s
-
-
 def _postures(inputs: ContactSets, context: Context) -> CheckedPostures:
     d, n, model, poses = context.device, inputs.pose.shape[0], context.hand.model, inputs.candidates.poses
-    at = CheckedPostures()
-    at.pose, at.index, at.of, at.slot, at.chosen = poses.pose, poses.index, inputs.pose, inputs.slot, inputs.chosen
-    at.body = wp.empty((n, len(model.piece_first) - 2), dtype=wp.transform, device=d)
-    at.posture = wp.empty((n, model.groups), dtype=vec_dof, device=d)
-    at.contact, at.surface = (wp.empty((n, model.groups + 1), dtype=wp.int32, device=d) for _ in range(2))
-    return at
-
-
-def _places(context: Context) -> Places:
-    contacts, obj = context.hand.struct.contacts, context.object.struct
-    places = Places()
-    places.link, places.body, places.grid = contacts.link, contacts.body, contacts.grid
-    places.points, places.normals = obj.contact_points, obj.contact_normals
-    return places
+    contact, surface = (wp.empty((n, model.groups + 1), dtype=wp.int32, device=d) for _ in range(2))
+    body = wp.empty((n, len(model.piece_first) - 2), dtype=wp.transform, device=d)
+    given = {"pose": poses.pose, "index": poses.index, "of": inputs.pose, "slot": inputs.slot, "chosen": inputs.chosen}
+    return empty_struct(CheckedPostures, d, n, model.groups, body=body, contact=contact, surface=surface, **given)

@@ -11,6 +11,7 @@ from lgrasp.grasp.structs import Candidates, Sets, State
 from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.math.qp import mat8, solve_spd
 from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -18,8 +19,6 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 wp.set_module_options(KERNEL_OPTIONS)
 
 _EARLY_GAP = wp.constant(0.25)  # share of the allowed gap at which iteration stops, if the normals agree as well
-
-mat_dof = wp.types.matrix((MAX_DOFS, MAX_DOFS), wp.float32)
 
 
 class IkCount(IntEnum):
@@ -49,44 +48,14 @@ class IkValues:
     min_self_distance: wp.float32  # [m]
 
 
-@wp.func
-def _solve(A: mat_dof, b: vec_dof, n: wp.int32):
-    """x with A x = b for the leading n x n block, by Cholesky."""
-    L = mat_dof()
-    for i in range(n):
-        for j in range(i + 1):
-            s = A[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                L[i, i] = wp.sqrt(wp.max(s, 1.0e-12))
-            else:
-                L[i, j] = s / L[j, j]
-    x = vec_dof()
-    for i in range(n):
-        s = b[i]
-        for k in range(i):
-            s -= L[i, k] * x[k]
-        x[i] = s / L[i, i]
-    for r in range(n):
-        i = n - 1 - r
-        s = x[i]
-        for k in range(i + 1, n):
-            s -= L[k, i] * x[k]
-        x[i] = s / L[i, i]
-    return x
-
-
 @wp.kernel
 def realise_contacts(
-    # in
     hand: Hand,
     field: Field,
     obj: Object,
     held: Held,
     params: IkValues,
     wanted: wp.array3d(dtype=wp.int32),
-    # out
     candidates_out: Candidates,
     counts_out: wp.array(dtype=wp.int32),
 ):
@@ -142,7 +111,7 @@ def realise_contacts(
         p = wp.transform_point(B, point)
         e1 = target + normal * params.contact_indentation - p
         e2 = e1 + (normal - n) * params.lever
-        A = mat_dof()
+        A = mat8()
         b = vec_dof()
         J1 = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
         J2 = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
@@ -160,7 +129,7 @@ def realise_contacts(
             for k in range(a + 1):
                 A[a, k] = wp.dot(J1[a], J1[k]) + w2 * wp.dot(J2[a], J2[k])
             A[a, a] = A[a, a] + params.damping
-        step = _solve(A, b, dofs)
+        step = solve_spd(A, b, dofs, 0.0, 1.0e-12)
         for a in range(dofs):
             q[a] = q[a] + wp.clamp(step[a], -params.step, params.step)
         q = clamp_dofs(hand.kin, g, q)
@@ -192,13 +161,7 @@ def realise_contacts(
 
 @wp.kernel
 def avoid_held(
-    # in
-    hand: Hand,
-    held: Held,
-    params: IkValues,
-    # out
-    candidates_out: Candidates,
-    counts_out: wp.array(dtype=wp.int32),
+    hand: Hand, held: Held, params: IkValues, candidates_out: Candidates, counts_out: wp.array(dtype=wp.int32)
 ):
     """Realised candidates whose finger meets a held object, or a finger that stays as it is, are blocked.
 
@@ -229,12 +192,7 @@ def avoid_held(
 
 
 @wp.kernel
-def mark_chosen(
-    # in
-    sets: Sets,
-    # out
-    wanted_out: wp.array3d(dtype=wp.int32),
-):
+def mark_chosen(sets: Sets, wanted_out: wp.array3d(dtype=wp.int32)):
     """1 at every candidate that a set has chosen.
 
     Args:
@@ -249,13 +207,7 @@ def mark_chosen(
 
 
 @wp.kernel
-def flag_realised(
-    # in
-    sets: Sets,
-    candidates: Candidates,
-    # out
-    whole_out: wp.array(dtype=wp.int32),
-):
+def flag_realised(sets: Sets, candidates: Candidates, whole_out: wp.array(dtype=wp.int32)):
     """1 for sets whose every contact was realised, else 0.
 
     Args:
@@ -273,14 +225,7 @@ def flag_realised(
 
 
 @wp.kernel
-def take_realised(
-    # in
-    upto: wp.array(dtype=wp.int32),
-    sets: Sets,
-    # out
-    whole_out: Sets,
-    counts_out: wp.array(dtype=wp.int32),
-):
+def take_realised(upto: wp.array(dtype=wp.int32), sets: Sets, whole_out: Sets, counts_out: wp.array(dtype=wp.int32)):
     """The whole sets.
 
     Args:

@@ -10,11 +10,7 @@ from lgrasp.config import Params
 class IkParams(Params):
     """Two-point damped least squares on the contact; lengths in metres."""
 
-    RENAMED: ClassVar = {
-        "touch": "contact_indentation",
-        "apart": "min_held_distance",
-        "clearance": "check_collision",
-    }
+    RENAMED: ClassVar = {"touch": "contact_indentation", "apart": "min_held_distance", "clearance": "check_collision"}
 
     iterations: int = Field(3, ge=1, le=200, description="Damped least-squares steps.")
     lever: float = Field(0.01, gt=0, le=0.1, description="Distance of the second point along the normal.")

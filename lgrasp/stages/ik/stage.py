@@ -51,14 +51,7 @@ def run(
     upto = wp.empty(n, dtype=wp.int32, device=d)
     wp.launch(flag_realised, n, [inputs.struct, table.struct], [upto], device=d)
     running_sums(upto)
-    kept = ContactSets(
-        candidates=table,
-        pose=wp.empty_like(inputs.pose),
-        slot=wp.empty_like(inputs.slot),
-        chosen=wp.empty_like(inputs.chosen),
-        score=wp.empty_like(inputs.score),
-        rows=wp.zeros(1, dtype=wp.int32, device=d),
-    )
+    kept = ContactSets.empty(d, *inputs.chosen.shape, candidates=table)
     wp.launch(take_realised, n, [upto, inputs.struct], [kept.struct, tally.device], device=d)
     return kept, tally
 

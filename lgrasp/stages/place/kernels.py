@@ -202,14 +202,12 @@ def _rate(
 
 @wp.kernel
 def propose_poses(
-    # in
     hand: Hand,
     field: Field,
     obj: Object,
     params: PlaceValues,
     seed: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
-    # out
     proposals_out: ProposedPoses,
 ):
     """One of several poses per candidate, and its rating.
@@ -284,12 +282,10 @@ def propose_poses(
 
 @wp.kernel
 def choose_poses(
-    # in
     hand: Hand,
     obj: Object,
     params: PlaceValues,
     proposals: ProposedPoses,
-    # out
     chosen_out: wp.array(dtype=wp.int32),
     kept_out: wp.array(dtype=wp.int32),
     counts_out: wp.array(dtype=wp.int32),
@@ -339,12 +335,10 @@ def choose_poses(
 
 @wp.kernel
 def take_poses(
-    # in
     upto: wp.array(dtype=wp.int32),
     chosen: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
     proposals: ProposedPoses,
-    # out
     poses_out: Poses,
 ):
     """Rows of the PoseTable: the chosen proposals.

@@ -117,7 +117,6 @@ def _clear(hand: Hand, obj: Object, held: Held, h: wp.int32, params: PlaceValues
 
 @wp.kernel
 def propose_opposed(
-    # in
     hand: Hand,
     field: Field,
     obj: Object,
@@ -126,7 +125,6 @@ def propose_opposed(
     sides: wp.vec2i,
     seed: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
-    # out
     proposals_out: ProposedPoses,
 ):
     """One of several poses per candidate between the groups ``sides`` (-1: static links), and its rating.

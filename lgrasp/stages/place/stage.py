@@ -5,17 +5,10 @@ import warp as wp
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import PoseTable
 from lgrasp.runtime.scan import running_sums
-from lgrasp.runtime.structs import make_struct
+from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.place.kernels import (
-    PlaceCount,
-    PlaceValues,
-    ProposedPoses,
-    choose_poses,
-    propose_poses,
-    take_poses,
-)
+from lgrasp.stages.place.kernels import PlaceCount, PlaceValues, ProposedPoses, choose_poses, propose_poses, take_poses
 from lgrasp.stages.place.opposed_kernels import propose_opposed
 from lgrasp.stages.place.params import PlaceParams
 
@@ -45,11 +38,7 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
         first = wp.full(1, first, dtype=wp.int32, device=d)
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
     groups, shape = context.hand.model.groups, (count, params.proposals)
-    proposals = ProposedPoses()
-    proposals.pose = wp.empty(shape, dtype=wp.transform, device=d)
-    for name in ("palm_point", "surface", "setting", "rating"):
-        setattr(proposals, name, wp.empty(shape, dtype=wp.int32, device=d))
-    proposals.anchor = wp.empty((*shape, groups), dtype=wp.int32, device=d)
+    proposals = empty_struct(ProposedPoses, d, *shape, groups)
     shares = {name: getattr(params, name) / total for name in ("canonical", "pinch", "palm")}
     values = make_struct(PlaceValues, params, context.bounds, **shares)
     asked = [values, context.seed("place"), first]
@@ -61,14 +50,6 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     tally = empty_tally(PlaceCount, d)
     wp.launch(choose_poses, count, [hand, obj, values, proposals], [chosen, upto, tally.device], device=d)
     running_sums(upto)
-    table = PoseTable(
-        index=wp.empty(count, dtype=wp.int32, device=d),
-        pose=wp.empty(count, dtype=wp.transform, device=d),
-        palm_point=wp.empty(count, dtype=wp.int32, device=d),
-        palm_surface=wp.empty(count, dtype=wp.int32, device=d),
-        setting=wp.empty(count, dtype=wp.int32, device=d),
-        anchor=wp.empty((count, groups), dtype=wp.int32, device=d),
-        rows=wp.zeros(1, dtype=wp.int32, device=d),
-    )
+    table = PoseTable.empty(d, count, groups)
     wp.launch(take_poses, count, [upto, chosen, first, proposals], [table.struct], device=d)
     return table, tally

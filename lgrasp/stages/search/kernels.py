@@ -28,14 +28,7 @@ class SearchCount(IntEnum):
 
 
 @wp.kernel
-def list_usable(
-    # in
-    obj: Object,
-    state: wp.int32,
-    candidates: Candidates,
-    # out
-    usable_out: Usable,
-):
+def list_usable(obj: Object, state: wp.int32, candidates: Candidates, usable_out: Usable):
     """Candidates of each (pose, group) in one State."""
     row, g = wp.tid()
     n = int(0)
@@ -49,13 +42,7 @@ def list_usable(
 
 
 @wp.kernel
-def list_hits(
-    # in
-    tried: TriedSets,
-    # out
-    number_out: wp.array(dtype=wp.int32),
-    hits_out: wp.array(dtype=wp.int32),
-):
+def list_hits(tried: TriedSets, number_out: wp.array(dtype=wp.int32), hits_out: wp.array(dtype=wp.int32)):
     """The starts that found a set, in any order.
 
     Args:
@@ -69,7 +56,6 @@ def list_hits(
 
 @wp.kernel
 def check_starts(
-    # in
     number: wp.array(dtype=wp.int32),
     hits: wp.array(dtype=wp.int32),
     hand: Hand,
@@ -77,7 +63,6 @@ def check_starts(
     params: SearchValues,
     realised: wp.int32,
     candidates: Candidates,
-    # out
     tried_out: TriedSets,
 ):
     """Scores of hits go below 0 when friction does not balance them or lets go of the object, or when fingers meet.
@@ -158,14 +143,7 @@ def _repeats(
 
 
 @wp.kernel
-def keep_sets(
-    # in
-    params: SearchValues,
-    candidates: Candidates,
-    tried: TriedSets,
-    # out
-    found_out: FoundSets,
-):
+def keep_sets(params: SearchValues, candidates: Candidates, tried: TriedSets, found_out: FoundSets):
     """One thread per pose: the first ``per_pose`` sets in the order of the starts, without near-repetitions."""
     row = wp.tid()
     n = found_out.number[row]
@@ -185,12 +163,10 @@ def keep_sets(
 
 @wp.kernel
 def take_sets(
-    # in
     upto: wp.array(dtype=wp.int32),
     candidates: Candidates,
     slot: wp.int32,
     found: FoundSets,
-    # out
     sets_out: Sets,
     counts_out: wp.array(dtype=wp.int32),
 ):

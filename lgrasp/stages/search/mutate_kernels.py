@@ -41,7 +41,6 @@ def _mutating(measure: Any) -> Any:
 
     @wp.kernel
     def mutate_contacts(
-        # in
         obj: Object,
         params: SearchValues,
         seed: wp.array(dtype=wp.int32),
@@ -49,7 +48,6 @@ def _mutating(measure: Any) -> Any:
         candidates: Candidates,
         usable: Usable,
         found: FoundSets,
-        # out
         tried_out: TriedSets,
     ):
         """One thread per (pose, start): finger contacts (and the palm's) with small residual J (Alg. 2 for eq. 6).

@@ -6,6 +6,7 @@ from lgrasp.grasp.structs import Candidates
 from lgrasp.math.constants import INSCRIBED
 from lgrasp.math.kinematics import MAX_GROUPS
 from lgrasp.math.qp import MAX_CONTACTS, balance, frictionless
+from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.search.params import MAX_KINDS, MAX_RESTARTS
@@ -68,7 +69,7 @@ class FoundSets:
 
 
 @wp.func
-def centred(points: wp.array(dtype=wp.vec3), k: wp.int32, arms: wp.array(dtype=wp.vec3)):
+def centred(points: vec3s, k: wp.int32, arms: vec3s):
     """Arms of contact points about their centroid."""
     centroid = wp.vec3(0.0)
     for i in range(k):
@@ -79,25 +80,13 @@ def centred(points: wp.array(dtype=wp.vec3), k: wp.int32, arms: wp.array(dtype=w
 
 
 @wp.func
-def _frictionless(
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    k: wp.int32,
-    friction: wp.float32,
-    torque_scale: wp.float32,
-):
+def _frictionless(points: vec3s, normals: vec3s, k: wp.int32, friction: wp.float32, torque_scale: wp.float32):
     """(FSWO residual norm, smallest share of the normal force)."""
     return frictionless(points, normals, k, torque_scale)
 
 
 @wp.func
-def _with_friction(
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    k: wp.int32,
-    friction: wp.float32,
-    torque_scale: wp.float32,
-):
+def _with_friction(points: vec3s, normals: vec3s, k: wp.int32, friction: wp.float32, torque_scale: wp.float32):
     """(GSWO residual norm, smallest share of the normal force)."""
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
@@ -121,9 +110,7 @@ def any_usable(usable: Usable, row: wp.int32, g: wp.int32, u: wp.float32):
 
 
 @wp.func
-def put_contact(
-    obj: Object, surface: wp.int32, i: wp.int32, points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3)
-):
+def put_contact(obj: Object, surface: wp.int32, i: wp.int32, points: vec3s, normals: vec3s):
     """Make object contact point ``surface`` contact i of a set: points [m] and inward normals, local arrays."""
     points[i] = obj.contact_points[surface]
     normals[i] = -obj.contact_normals[surface]
@@ -138,8 +125,8 @@ def start_set(
     usable: Usable,
     row: wp.int32,
     state: wp.uint32,
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
+    points: vec3s,
+    normals: vec3s,
 ):
     """Random contacts of random groups, in ``points`` and ``normals``: those of the groups first, then the palm's.
 

@@ -10,17 +10,10 @@ from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.math.kinematics import MAX_GROUPS
 from lgrasp.runtime.scan import running_sums
-from lgrasp.runtime.structs import make_struct
+from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.search.kernels import (
-    SearchCount,
-    check_starts,
-    keep_sets,
-    list_hits,
-    list_usable,
-    take_sets,
-)
+from lgrasp.stages.search.kernels import SearchCount, check_starts, keep_sets, list_hits, list_usable, take_sets
 from lgrasp.stages.search.mutate_kernels import mutate_contacts
 from lgrasp.stages.search.params import MAX_KINDS, SearchParams
 from lgrasp.stages.search.sets import FoundSets, SearchValues, TriedSets, Usable, vec_kinds
@@ -45,14 +38,11 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     n, groups, keep = inputs.surface.shape
     if groups > MAX_GROUPS:
         raise ConfigError(f"search: {groups} fingers; at most {MAX_GROUPS} are supported")
-    found, usable, tried = FoundSets(), Usable(), TriedSets()
-    found.number = wp.zeros(n, dtype=wp.int32, device=d)
-    found.chosen = wp.full((n, params.per_pose, groups), -1, dtype=wp.int32, device=d)
-    found.score = wp.zeros((n, params.per_pose), dtype=wp.float32, device=d)
-    usable.size = wp.empty((n, groups), dtype=wp.int32, device=d)
-    usable.candidate = wp.empty((n, groups, keep), dtype=wp.int32, device=d)
+    number = wp.zeros(n, dtype=wp.int32, device=d)
+    found = empty_struct(FoundSets, d, n, params.per_pose, groups, number=number)
     swap = params.method == "swap"
-    usable.point = wp.empty((0, 0, 0) if swap else (n, groups, keep), dtype=wp.vec3, device=d)
+    points = {"point": wp.empty((0, 0, 0), dtype=wp.vec3, device=d)} if swap else {}
+    usable = empty_struct(Usable, d, n, groups, keep, **points)
     hand, obj, values = context.hand.struct, context.object.struct, _values(params, context)
     state = State.REALISED if context.realised else State.DRAWN
     wp.launch(list_usable, (n, groups), [obj, int(state), inputs.struct], [usable], device=d)
@@ -60,8 +50,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
     few = _CPU_STARTS if d == "cpu" else _GPU_STARTS
     lanes = min(params.restarts, few if params.per_pose < params.restarts else params.restarts)
-    tried.chosen = wp.empty((n, lanes, groups), dtype=wp.int32, device=d)
-    tried.score = wp.empty((n, lanes), dtype=wp.float32, device=d)
+    tried = empty_struct(TriedSets, d, n, lanes, groups)
     for first in range(0, params.restarts, lanes):
         if first + lanes > params.restarts:
             tried.score = tried.score[:, : params.restarts - first]
@@ -77,15 +66,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
         wp.launch(keep_sets, n, [values, inputs.struct, tried], [found], device=d)
     upto = wp.clone(found.number)
     running_sums(upto)
-    most = n * params.per_pose
-    table = ContactSets(
-        candidates=inputs,
-        pose=wp.empty(most, dtype=wp.int32, device=d),
-        slot=wp.empty(most, dtype=wp.int32, device=d),
-        chosen=wp.empty((most, groups), dtype=wp.int32, device=d),
-        score=wp.empty(most, dtype=wp.float32, device=d),
-        rows=wp.zeros(1, dtype=wp.int32, device=d),
-    )
+    table = ContactSets.empty(d, n * params.per_pose, groups, candidates=inputs)
     tally = empty_tally(SearchCount, d)
     asked = [upto, inputs.struct, context.salt * params.per_pose, found]
     wp.launch(take_sets, n, asked, [table.struct, tally.device], device=d)

@@ -28,7 +28,6 @@ def _swapping(measure: Any) -> Any:
 
     @wp.kernel
     def swap_contacts(
-        # in
         obj: Object,
         params: SearchValues,
         seed: wp.array(dtype=wp.int32),
@@ -36,7 +35,6 @@ def _swapping(measure: Any) -> Any:
         candidates: Candidates,
         usable: Usable,
         found: FoundSets,
-        # out
         tried_out: TriedSets,
     ):
         """One thread per (pose, start): finger contacts (and the palm's) with small residual (Alg. 2 for eq. 6).

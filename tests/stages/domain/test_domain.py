@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lgrasp.grasp.tables import candidate_arrays, pose_arrays, pose_table
+from lgrasp.grasp.tables import PoseTable
 from lgrasp.stages.domain.params import DomainParams
 from lgrasp.stages.domain.stage import run
 
@@ -10,7 +10,7 @@ from lgrasp.stages.domain.stage import run
 def test_counts_and_poor_poses(context, tables):
     params = DomainParams(keep=7)
     table, counts = run(tables.place, params, context)
-    arrays = candidate_arrays(table)
+    arrays = table.arrays()
     assert arrays["surface"].shape == (len(tables.place), context.hand.model.groups, 7)
     assert counts["poses"] == len(tables.place)
     assert counts["candidates"] == arrays["count"].sum()
@@ -19,7 +19,7 @@ def test_counts_and_poor_poses(context, tables):
     palm = arrays["poses.palm_point"] >= 0
     assert counts["rich"] == (fingers > 0).sum()
     assert (fingers + palm)[fingers > 0].min() >= params.fingers
-    for name, values in candidate_arrays(tables.domain).items():
+    for name, values in tables.domain.arrays().items():
         if name.startswith("poses."):
             np.testing.assert_array_equal(values, arrays[name])
 
@@ -27,7 +27,7 @@ def test_counts_and_poor_poses(context, tables):
 def test_fingers_touch_near_the_surface_point(context, tables, inputs, finger_posture, link_poses, device_matrix):
     """The seed posture puts its contact vector into the voxel of the surface point, along its normal."""
     table = run(tables.place, DomainParams(), context)[0]
-    arrays, hand, obj, field = candidate_arrays(table), inputs.hand.model, inputs.object.model, inputs.field.model
+    arrays, hand, obj, field = table.arrays(), inputs.hand.model, inputs.object.model, inputs.field.model
     row, group, slot = np.nonzero(np.arange(arrays["q"].shape[2]) < arrays["count"][:, :, None])
     assert len(row) > 500
     T = device_matrix(arrays["poses.pose"])[row]
@@ -47,7 +47,7 @@ def test_fingers_touch_near_the_surface_point(context, tables, inputs, finger_po
 
 
 def test_seeds_lie_within_the_limits(context, tables, inputs):
-    arrays, tree = candidate_arrays(run(tables.place, DomainParams(), context)[0]), inputs.hand.model.tree
+    arrays, tree = run(tables.place, DomainParams(), context)[0].arrays(), inputs.hand.model.tree
     for g in range(tree.groups):
         columns = tree.dof_index[tree.dof_first[g] : tree.dof_first[g + 1]]
         filled = np.arange(arrays["q"].shape[2]) < arrays["count"][:, g, None]
@@ -57,10 +57,10 @@ def test_seeds_lie_within_the_limits(context, tables, inputs):
 
 
 def test_a_pose_gives_the_same_alone(context, tables):
-    whole = candidate_arrays(run(tables.place, DomainParams(), context)[0])
+    whole = run(tables.place, DomainParams(), context)[0].arrays()
     for i in (0, 5):
-        one = pose_table({n: v[i : i + 1] for n, v in pose_arrays(tables.place).items()}, "cpu")
-        alone = candidate_arrays(run(one, DomainParams(), context)[0])
+        one = PoseTable.of({n: v[i : i + 1] for n, v in tables.place.arrays().items()}, "cpu")
+        alone = run(one, DomainParams(), context)[0].arrays()
         np.testing.assert_array_equal(alone["count"][0], whole["count"][i])
         for g, n in enumerate(whole["count"][i]):
             np.testing.assert_array_equal(alone["surface"][0, g, :n], whole["surface"][i, g, :n])

@@ -9,7 +9,7 @@ from support.wrench import residual
 
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.outcomes import REASONS
-from lgrasp.grasp.tables import set_arrays, set_table
+from lgrasp.grasp.tables import ContactSets
 from lgrasp.stages.filter.stage import run
 
 
@@ -23,7 +23,7 @@ def test_counts_and_order(finished, tables):
     assert tuple(counts) == REASONS
     assert sum(counts.values()) == len(tables.search)
     assert counts["kept"] == len(grasps) > 30
-    sets = set_arrays(tables.search)
+    sets = tables.search.arrays()
     asked = list(zip(sets["candidates.poses.index"][sets["pose"]].tolist(), sets["slot"].tolist(), strict=True))
     given = list(zip(grasps.index.tolist(), grasps.slot.tolist(), strict=True))
     assert given == sorted(given)
@@ -161,10 +161,10 @@ def test_bounds_bind(tables, context, swift):
 
 
 def test_sets_alone_give_the_same(finished, tables, context, swift):
-    arrays = set_arrays(tables.search)
+    arrays = tables.search.arrays()
     rows = np.arange(len(arrays["pose"]))[::3]
     part = arrays | {name: arrays[name][rows] for name in ("pose", "slot", "chosen", "score")}
-    grasps = run(set_table(part, "cpu"), swift.params("filter"), context)[0]
+    grasps = run(ContactSets.of(part, "cpu"), swift.params("filter"), context)[0]
     whole = finished[0]
     known = {(int(i), int(s)): k for k, (i, s) in enumerate(zip(whole.index, whole.slot, strict=True))}
     assert len(grasps) > 5

@@ -6,14 +6,13 @@ import trimesh
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.shard import shard_context
-from lgrasp.grasp.tables import candidate_arrays, set_arrays
 from lgrasp.stages.ik.stage import run
 
 
 @pytest.fixture(scope="module")
 def realised(tables, inputs, finger_posture, link_poses, device_matrix):
     """(postures' link poses, contact link, target and inward object normal in the base frame, row, group)."""
-    arrays, hand, obj = candidate_arrays(tables.ik), inputs.hand.model, inputs.object.model
+    arrays, hand, obj = tables.ik.arrays(), inputs.hand.model, inputs.object.model
     row, group, slot = np.nonzero(arrays["state"] == 1)
     assert len(row) > 200
     T = device_matrix(arrays["poses.pose"])[row]
@@ -31,7 +30,7 @@ def local(T, points):
 
 def test_counts(context, swift):
     table, counts = run(run_stages(swift, context, 0, 100, "domain"), swift.params("ik"), context)
-    arrays = candidate_arrays(table)
+    arrays = table.arrays()
     filled = np.arange(arrays["state"].shape[2]) < arrays["count"][:, :, None]
     assert (arrays["state"][~filled] == 0).all()
     assert (arrays["state"][filled] != 0).all()
@@ -89,10 +88,10 @@ def test_only_chosen_candidates_of_sets(lightning, load):
     source = load(pipeline=lightning)
     context = shard_context(lightning, source, 0)
     sets = run_stages(lightning, context, 0, 600, "search")
-    before = set_arrays(sets)
+    before = sets.arrays()
     before = {name: values.copy() for name, values in before.items()}
     kept, counts = run(sets, lightning.params("ik"), context)
-    after = set_arrays(kept)
+    after = kept.arrays()
     state, chosen, pose = after["candidates.state"], before["chosen"], before["pose"]
     row, group = np.nonzero(chosen >= 0)
     wanted = np.zeros_like(state)

@@ -5,7 +5,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support.field import query_field
 
-from lgrasp.grasp.tables import pose_arrays
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
 from lgrasp.stages.place.params import PlaceParams
@@ -15,7 +14,7 @@ from lgrasp.stages.place.stage import run
 def test_two_fingers_can_touch_both_anchors(context, inputs):
     params = PlaceParams(canonical=0, exhaustive=0, palm=0, pinch=1, proposals=1)
     table, counts = run((0, 400), params, context)
-    arrays, hand, obj = pose_arrays(table), inputs.hand.model, inputs.object.model
+    arrays, hand, obj = table.arrays(), inputs.hand.model, inputs.object.model
     assert counts["kept"] == len(table) > 40
     R, t = Rotation.from_quat(arrays["pose"][:, 3:]), arrays["pose"][:, :3]
     reached = []

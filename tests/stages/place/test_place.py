@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.grasp.tables import pose_arrays
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.stage import run
@@ -20,7 +19,7 @@ def place(context, first=0, count=300, **params):
 
 def test_counts_and_order(context):
     table, counts = place(context, 50, 300)
-    arrays = pose_arrays(table)
+    arrays = table.arrays()
     assert counts["tried"] == 300
     assert counts["kept"] == len(table) > 10
     assert counts["kept"] + counts["blocked"] <= 300
@@ -38,7 +37,7 @@ def test_palm_is_free(context, tables, solids, mesh, device_matrix, inputs):
     static = copy(solids)
     static.solids = [s for s in solids.solids if tree.link_body[s.link] == 0]
     assert static.solids
-    T = np.linalg.inv(device_matrix(pose_arrays(tables.place)["pose"][:50]))[:, None]
+    T = np.linalg.inv(device_matrix(tables.place.arrays()["pose"][:50]))[:, None]
     names = inputs.hand.model.tree.joint_names
     zero = solids.forward(solids.resolve_joints({n: np.zeros(1) for n in names}, 1), 1)
     depth = np.max(hand_in_object(static, JudgedObject(mesh), T @ zero), axis=0)
@@ -47,15 +46,15 @@ def test_palm_is_free(context, tables, solids, mesh, device_matrix, inputs):
 
 def test_kept_candidates_are_what_the_kernel_kept(context):
     """Each candidate alone gives what it gave among the others."""
-    whole = pose_arrays(place(context, 0, 60)[0])
-    single = [pose_arrays(place(context, i, 1)[0]) for i in range(60)]
+    whole = place(context, 0, 60)[0].arrays()
+    single = [place(context, i, 1)[0].arrays() for i in range(60)]
     for name, values in whole.items():
         np.testing.assert_array_equal(values, np.concatenate([s[name] for s in single]), err_msg=name)
 
 
 def test_palm_contact(context, inputs):
     table, _ = place(context, 0, 1500, canonical=0, exhaustive=0, pinch=0, palm=1)
-    arrays, hand, obj = pose_arrays(table), inputs.hand.model, inputs.object.model
+    arrays, hand, obj = table.arrays(), inputs.hand.model, inputs.object.model
     assert len(table) > 10
     palm, surface = arrays["palm_point"], arrays["palm_surface"]
     assert (palm >= hand.contact_first[hand.groups]).all()
@@ -68,15 +67,15 @@ def test_palm_contact(context, inputs):
 @pytest.mark.parametrize("source", ["canonical", "exhaustive", "pinch"])
 def test_other_sources_claim_no_palm(context, source):
     weights = {"canonical": 0.0, "exhaustive": 0.0, "pinch": 0.0, "palm": 0.0, source: 1.0}
-    arrays = pose_arrays(place(context, **weights)[0])
+    arrays = place(context, **weights)[0].arrays()
     assert len(arrays["index"]) > 5
     assert (arrays["palm_point"] == -1).all()
     assert (arrays["palm_surface"] == -1).all()
 
 
 def test_weights_need_not_sum_to_one(context):
-    a = pose_arrays(place(context, canonical=0.6, exhaustive=0.3, pinch=0.3, palm=0.1)[0])
-    b = pose_arrays(place(context, canonical=6, exhaustive=3, pinch=3, palm=1)[0])
+    a = place(context, canonical=0.6, exhaustive=0.3, pinch=0.3, palm=0.1)[0].arrays()
+    b = place(context, canonical=6, exhaustive=3, pinch=3, palm=1)[0].arrays()
     np.testing.assert_array_equal(a["index"], b["index"])
 
 
@@ -87,7 +86,7 @@ def test_all_weights_zero(context):
 
 def test_shards_differ(context):
     other = Context(context.hand, context.object, context.field, "cpu", 0, 1)
-    a, b = (pose_arrays(place(c)[0])["pose"] for c in (context, other))
+    a, b = (place(c)[0].arrays()["pose"] for c in (context, other))
     assert not (a[:, None] == b[None]).all(2).any()
 
 

@@ -7,7 +7,6 @@ import pytest
 import warp as wp
 
 from lgrasp.engine.batch import run_stages
-from lgrasp.grasp.tables import candidate_arrays, set_arrays
 from lgrasp.math.qp import MAX_CONTACTS, frictionless
 from lgrasp.math.transforms import tangent
 from lgrasp.seeding import stage_seed
@@ -76,14 +75,14 @@ def domains(lightning, load):
 
 def found(domains, **changes):
     context, table = domains
-    arrays = set_arrays(run(table, PARAMS.model_copy(update=changes), context)[0])
+    arrays = run(table, PARAMS.model_copy(update=changes), context)[0].arrays()
     return {(int(p), tuple(c)): s for p, c, s in zip(arrays["pose"], arrays["chosen"], arrays["score"], strict=True)}
 
 
 def reference(domains, params, row, start):
     """Chosen candidates and residual of one start, or None."""
     context, table = domains
-    obj, a = context.object, candidate_arrays(table)
+    obj, a = context.object, table.arrays()
     groups = a["count"].shape[1]
     random = Random(stage_seed(0, 0, "search"), int(a["poses.index"][row]) * MAX_RESTARTS + start)
     size, palm = a["count"][row], int(a["poses.palm_surface"][row])
@@ -160,7 +159,7 @@ def test_sweeps_only_improve(domains):
 
 
 def test_contacts_lie_in_their_domains(domains):
-    count = candidate_arrays(domains[1])["count"]
+    count = domains[1].arrays()["count"]
     for pose, chosen in found(domains):
         used = [(g, m) for g, m in enumerate(chosen) if m >= 0]
         assert all(m < count[pose, g] for g, m in used)

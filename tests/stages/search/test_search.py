@@ -7,7 +7,6 @@ from support.wrench import cone_forces, residual, wrenches
 
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.grasp.tables import set_arrays
 from lgrasp.stages.search.params import SearchParams
 from lgrasp.stages.search.stage import run
 
@@ -30,7 +29,7 @@ BOUNDS = GraspBounds()
 def found(tables, context, swift):
     params = swift.params("search")
     table, counts = run(tables.ik, params, context)
-    return set_arrays(table), counts, params
+    return table.arrays(), counts, params
 
 
 def test_counts(found, tables):
@@ -123,7 +122,7 @@ def test_fingers_do_not_meet(found, inputs, solids, link_poses, finger_posture):
 
 def test_later_passes_draw_others(tables, context, swift):
     params = swift.params("search")
-    first, second = (set_arrays(run(tables.ik, params, context.with_salt(s))[0]) for s in (0, 1))
+    first, second = (run(tables.ik, params, context.with_salt(s))[0].arrays() for s in (0, 1))
     assert second["slot"].min() >= params.per_pose
     rows = [{(int(p), tuple(c)) for p, c in zip(a["pose"], a["chosen"], strict=True)} for a in (first, second)]
     assert len(rows[1] - rows[0]) > 10
@@ -132,7 +131,7 @@ def test_later_passes_draw_others(tables, context, swift):
 def test_gswo_score(tables, context, swift, inputs, device_matrix):
     """With friction in the score more sets count as balanced; each still meets the bound."""
     params = swift.params("search").model_copy(update={"score": "gswo"})
-    arrays = set_arrays(run(tables.ik, params, context)[0])
+    arrays = run(tables.ik, params, context)[0].arrays()
     assert len(arrays["pose"]) > 50
     T = device_matrix(arrays["candidates.poses.pose"])
     for i in range(0, len(arrays["pose"]), 3):
@@ -144,7 +143,7 @@ def test_gswo_score(tables, context, swift, inputs, device_matrix):
 
 
 def test_k_is_as_asked(tables, context):
-    arrays = set_arrays(run(tables.ik, SearchParams(contacts=(2,)), context)[0])
+    arrays = run(tables.ik, SearchParams(contacts=(2,)), context)[0].arrays()
     assert ((arrays["chosen"] >= 0).sum(1) <= 2).all()
     assert len(arrays["pose"]) > 5
 
