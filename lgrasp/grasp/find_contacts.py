@@ -11,6 +11,7 @@ from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.surface import ContactSurface, contact_surface
 from lgrasp.math.qp import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays
+from lgrasp.runtime.structs import empty_struct, upload_struct
 
 
 def find_contacts(
@@ -31,23 +32,17 @@ def find_contacts(
     d, n, side = hand.device, len(q), palmar or contact_surface(hand.model)
     first, width = _runs(side.link), contact_width(side.link)
 
-    def put(a: np.ndarray, dtype: type) -> wp.array:
-        return wp.array(np.ascontiguousarray(a), dtype=dtype, device=d)
-
-    runs = PalmarRuns()
-    runs.points, runs.normals = (put(a.astype(np.float32), wp.vec3) for a in (side.points, side.normals))
     link = side.link[first[:-1]]
     known = {int(x): k for k, x in enumerate(hand.model.grid_link)}
     grid = np.array([known.get(int(x), -1) for x in link])
-    runs.first, runs.body, runs.link, runs.grid = (
-        put(a.astype(np.int32), wp.int32) for a in (first, side.body[first[:-1]], link, grid)
+    points = {"points": side.points, "normals": side.normals}
+    runs = upload_struct(
+        PalmarRuns, d, points | {"first": first, "body": side.body[first[:-1]], "link": link, "grid": grid}
     )
-    found = RunContacts()
-    found.gap = wp.empty((n, len(link)), dtype=wp.float32, device=d)
-    found.point, found.normal = (wp.empty((n, len(link)), dtype=wp.vec3, device=d) for _ in range(2))
-    inputs = [hand.struct, obj.struct, device_limits(bounds), runs, put(pose.astype(np.float32), wp.transform)]
-    joints = put(q.astype(np.float32), wp.float32)
-    wp.launch(link_contacts, (len(link), n), [*inputs, joints], [found], device=d)
+    found = empty_struct(RunContacts, d, n, len(link))
+    at = [wp.array(pose, dtype=wp.transform, device=d), wp.array(q, dtype=wp.float32, device=d)]
+    inputs = [hand.struct, obj.struct, device_limits(bounds), runs, *at]
+    wp.launch(link_contacts, (len(link), n), inputs, [found], device=d)
     out = ContactTable(
         wp.empty((n, width), dtype=wp.int32, device=d),
         *(wp.zeros(n * width, dtype=wp.vec3, device=d) for _ in range(2)),

@@ -10,6 +10,7 @@ from lgrasp.hand.arrays import Hand, HandArrays
 from lgrasp.math.kinematics import MAX_DOFS, vec_dof
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -71,15 +72,10 @@ def hold(
         posture[:, g, : len(columns)] = q[:, columns]
         bits[:, g] = (frozen[:, columns] << np.arange(len(columns))).sum(1)
     setting = np.full(rows, -1) if any_setting else _settings(q, tree.settings)
-    held = Held()
-    held.tries = tries
-    held.posture = wp.array(posture, dtype=vec_dof, device=d)
-    held.frozen = wp.array(bits, dtype=wp.int32, device=d)
-    held.setting = wp.array(setting.astype(np.int32), dtype=wp.int32, device=d)
+    held = upload_struct(Held, d, {"tries": tries, "posture": posture, "frozen": bits, "setting": setting})
     held.objects = len(objects)
     held.object = wp.array([o.struct for o in objects], dtype=Object, device=d)
-    flat = np.ascontiguousarray(pose, np.float32).reshape(-1, 7)
-    held.pose = wp.array(flat, dtype=wp.transform, device=d).reshape((rows, len(objects)))
+    held.pose = wp.array(np.reshape(pose, (-1, 7)), dtype=wp.transform, device=d).reshape((rows, len(objects)))
     return HeldArrays(held, objects)
 
 

@@ -130,10 +130,13 @@ def lattice_crossings(
                 z = wp.clamp(z, wp.min(wp.min(a[2], b[2]), c[2]), wp.max(wp.max(a[2], b[2]), c[2]))
                 k = wp.max(int(wp.ceil((z - origin[2]) / cell)), 0)
                 if k < dims[2]:
-                    if ab:
-                        wp.atomic_add(step_out, i, j, k, -1)
-                    else:
-                        wp.atomic_add(step_out, i, j, k, 1)
+                    wp.atomic_add(step_out, i, j, k, wp.where(ab, -1, 1))
+
+
+@wp.func
+def node_of(at: int, dims: wp.vec3i):
+    """Place in the grid of the cell with flat index ``at``."""
+    return wp.vec3i(at / (dims[2] * dims[1]), (at / dims[2]) % dims[1], at % dims[2])
 
 
 @wp.kernel
@@ -154,15 +157,10 @@ def winding_sign(
     """
     t = wp.tid()
     at = band_cells[t]
-    k = at % dims[2]
-    j = (at / dims[2]) % dims[1]
-    i = at / (dims[2] * dims[1])
-    p = origin + cell * wp.vec3(float(i), float(j), float(k))
+    node = node_of(at, dims)
+    p = origin + cell * wp.vec3(float(node[0]), float(node[1]), float(node[2]))
     hit = wp.mesh_query_point_sign_winding_number(mesh, p, reach, 2.0, 0.5)
-    if hit.result and hit.sign < 0.0:
-        inside_out[t] = 1
-    else:
-        inside_out[t] = 0
+    inside_out[t] = wp.where(hit.result and hit.sign < 0.0, 1, 0)
 
 
 @wp.kernel
@@ -183,10 +181,8 @@ def far_distance(
         distance_out: [m], (cells,).
     """
     at = wp.tid()
-    k = at % dims[2]
-    j = (at / dims[2]) % dims[1]
-    i = at / (dims[2] * dims[1])
-    p = origin + cell * wp.vec3(float(i), float(j), float(k))
+    node = node_of(at, dims)
+    p = origin + cell * wp.vec3(float(node[0]), float(node[1]), float(node[2]))
     f = nearest_face[at]
     best = wp.length_sq(p - closest_on_triangle(corners[f, 0], corners[f, 1], corners[f, 2], p))
     if best > exact * exact:  # band cells know their face already
@@ -194,7 +190,7 @@ def far_distance(
             axis = s / 2
             step = wp.vec3i(0, 0, 0)
             step[axis] = 2 * (s % 2) - 1
-            m = wp.vec3i(i, j, k) + step
+            m = node + step
             if m[axis] >= 0 and m[axis] < dims[axis]:
                 g = nearest_face[(m[0] * dims[1] + m[1]) * dims[2] + m[2]]
                 if g != f:

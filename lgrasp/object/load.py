@@ -241,7 +241,9 @@ def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.nda
             if turned:
                 notes.append(f"turned {turned} faces to a consistent winding")
             faces = np.asarray(mesh.faces, np.int64)
-    body = _bodies(faces, len(vertices))
+    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    label = trimesh.graph.connected_component_labels(edges, len(vertices))[faces[:, 0]]
+    body = np.unique(label, return_inverse=True)[1]
     count = int(body.max()) + 1
     corners = vertices[faces] - vertices.mean(axis=0)
     volume = np.bincount(body, np.linalg.det(corners) / 6.0, count)
@@ -257,17 +259,6 @@ def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.nda
         notes.append(f"turned {int(flip.sum())} of {count} bodies that were inside out")
         faces = np.where(flip[body][:, None], faces[:, ::-1], faces)
     return faces
-
-
-def _bodies(faces: np.ndarray, count: int) -> np.ndarray:
-    """Index of the connected body of every face, shape (f,)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    rows, cols = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
-    graph = coo_array((np.ones(len(rows), np.int8), (rows, cols)), shape=(count, count))
-    label = connected_components(graph, directed=False)[1][faces[:, 0]]
-    return np.unique(label, return_inverse=True)[1]
 
 
 def _close_holes(

@@ -27,7 +27,7 @@ from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
 from lgrasp.refine.resolve_penetration import resolve_penetration
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
-from lgrasp.runtime.structs import make_struct, upload_struct
+from lgrasp.runtime.structs import empty_struct, make_struct, upload_struct
 
 _MAX_ADVANCES = 30
 _BLOCK_ROWS = 32  # hands of a block of threads: few hands spread over many processors
@@ -59,10 +59,8 @@ class Descent:
                 f"hand '{model.name}' has {model.dofs} joints; the local search takes {MAX_COLUMNS} at most"
             )
         self.params, self._hand, self._target, self.device = params, hand, target, hand.device
-        self._points, self._solids = (
-            _points(surface, self.device),
-            _solids(solids or hand_solids(model, LINK_POINTS), self.device),
-        )
+        self._points = _points(surface, self.device)
+        self._solids = _solids(solids or hand_solids(model, LINK_POINTS), self.device)
         self._bodies = len(model.tree.joint_dof) + 1
         self._search = self._settings(surface)
         self._back = -palm_axis(model)[1]
@@ -106,8 +104,7 @@ class Descent:
         d, t, rows = self.device, self._target, at.pose.shape[0]
         body = self._body(rows)
         self._place(at, body)
-        ways = wp.array(np.ascontiguousarray(direction, np.float32), dtype=wp.vec3, device=d)
-        most = wp.array(np.ascontiguousarray(travel, np.float32), dtype=wp.float32, device=d)
+        ways, most = wp.array(direction, dtype=wp.vec3, device=d), wp.array(travel, dtype=wp.float32, device=d)
         inputs = [self._points, t.own, t.around, int(t.has_around), _MAX_ADVANCES, clearance, ways, most, body]
         wp.launch(advance, dim=rows, inputs=inputs, outputs=[at.pose], device=d)
 
@@ -124,42 +121,39 @@ class Descent:
 
     def _settings(self, surface: HandSurface) -> "Search":
         p, tree, t = self.params, self._hand.model.tree, self._target
-        total = float(surface.weight.sum())
-        s = Search()
-        s.points, s.normals = p.points / total, p.normals / total
-        s.force, s.barrier, s.limits = p.force / p.contacts**2, p.barrier, p.limits / len(tree.joint_lower)
-        s.margin, s.link_margin, s.contacts, s.gradient_steps = p.margin, p.link_margin, p.contacts, p.gradient_steps
-        s.sgd, s.momentum, s.decay = int(p.optimizer == "sgd"), p.momentum, p.decay
-        s.max_translation_step, s.max_rotation_step = p.max_translation_step, p.max_rotation_step
-        s.max_joint_step = p.max_joint_step
-        s.middle = wp.vec3(*map(float, _middle(self._hand, surface)))
-        s.com, s.radius = t.com, t.radius
-
-        def put(a: np.ndarray) -> wp.array:
-            return wp.array(np.ascontiguousarray(a, np.float32), dtype=wp.float32, device=self.device)
-
-        s.lower, s.upper = put(tree.joint_lower), put(tree.joint_upper)
-        s.near = put(LIMIT_SHARE * np.maximum(tree.joint_upper - tree.joint_lower, 1e-6))
-        return s
+        total, span = float(surface.weight.sum()), np.maximum(tree.joint_upper - tree.joint_lower, 1e-6)
+        ends = {"lower": tree.joint_lower, "upper": tree.joint_upper, "near": LIMIT_SHARE * span}
+        return make_struct(
+            Search,
+            p,
+            t,
+            points=p.points / total,
+            normals=p.normals / total,
+            force=p.force / p.contacts**2,
+            limits=p.limits / len(tree.joint_lower),
+            sgd=int(p.optimizer == "sgd"),
+            middle=wp.vec3(*map(float, _middle(self._hand, surface))),
+            **{name: wp.array(x, dtype=wp.float32, device=self.device) for name, x in ends.items()},
+        )
 
     def _matches(self, rows: int) -> "Correspondences":
-        def room(n: int, dtype: type) -> wp.array:
-            return wp.empty((rows, n), dtype=dtype, device=self.device)
-
-        n = self._points.points.shape[0]
         links, pairs = self._solids.body.shape[0], self._solids.pairs.shape[0]
-        m = Correspondences()
-        m.plane, m.pull, m.distance = room(n, wp.vec4), room(n, wp.float32), room(n, wp.float32)
-        m.block = room(n, wp.vec4) if self._target.has_around else m.plane
-        m.contacts = room(self.params.contacts, wp.int32)
-        m.deep, m.deep_plane = room(links * DEEPEST, wp.vec3), room(links * DEEPEST, wp.vec4)
-        m.link_deep, m.link_plane = room(pairs * LINK_DEEPEST, wp.vec3), room(pairs * LINK_DEEPEST, wp.vec4)
-        return m
+        wide = {
+            "contacts": (self.params.contacts, wp.int32),
+            "deep": (links * DEEPEST, wp.vec3),
+            "deep_plane": (links * DEEPEST, wp.vec4),
+            "link_deep": (pairs * LINK_DEEPEST, wp.vec3),
+            "link_plane": (pairs * LINK_DEEPEST, wp.vec4),
+        }
+        given = {name: wp.empty((rows, n), dtype=kind, device=self.device) for name, (n, kind) in wide.items()}
+        plane = wp.empty((rows, self._points.points.shape[0]), dtype=wp.vec4, device=self.device)
+        block = wp.empty_like(plane) if self._target.has_around else plane
+        return empty_struct(Correspondences, self.device, *plane.shape, plane=plane, block=block, **given)
 
     def _moments(self, rows: int) -> "Moments":
         shape = (rows, 6 + self._hand.model.dofs)
-        zeros = (wp.zeros(shape, dtype=wp.float32, device=self.device) for _ in range(2))
-        return make_struct(Moments, **dict(zip(("first", "second"), zeros, strict=True)))
+        first, second = (wp.zeros(shape, dtype=wp.float32, device=self.device) for _ in range(2))
+        return make_struct(Moments, first=first, second=second)
 
     def _body(self, rows: int) -> wp.array:
         return wp.empty((rows, self._bodies), dtype=wp.transform, device=self.device)

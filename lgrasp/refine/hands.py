@@ -18,8 +18,8 @@ class Hands:
     @classmethod
     def put(cls, pose: np.ndarray, q: np.ndarray, device: str) -> "Hands":
         """Of device poses (N, 7), and joint positions (N, K)."""
-        poses = wp.array(np.ascontiguousarray(pose, np.float32), dtype=wp.transform, device=device)
-        return cls(poses, wp.array(np.ascontiguousarray(q, np.float32), dtype=wp.float32, device=device))
+        poses = wp.array(pose, dtype=wp.transform, device=device)
+        return cls(poses, wp.array(q, dtype=wp.float32, device=device))
 
     def numpy(self) -> tuple[np.ndarray, np.ndarray]:
         """Base (N, 7) and joint positions (N, K)."""

@@ -7,6 +7,7 @@ import warp as wp
 
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
+from lgrasp.runtime.structs import upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -69,13 +70,11 @@ def surface_radius(model: ObjectModel) -> float:
 
 def _volume(model: ObjectModel, device: str) -> "Volume":
     slopes = np.gradient(model.sdf, float(model.sdf_cell))
-    nodes = np.stack([*slopes, model.sdf], -1).reshape(-1, 4).astype(np.float32)
-    v = Volume()
-    v.nodes = wp.array(nodes, dtype=wp.vec4, device=device)
-    v.nx, v.ny, v.nz = (int(n) for n in model.sdf.shape)
-    v.origin = wp.vec3(*map(float, model.sdf_origin))
-    v.cell = float(model.sdf_cell)
-    return v
+    nodes = np.stack([*slopes, model.sdf], -1).reshape(-1, 4)
+    shape = dict(zip(("nx", "ny", "nz"), map(int, model.sdf.shape), strict=True))
+    return upload_struct(
+        Volume, device, {"nodes": nodes, "origin": model.sdf_origin, "cell": float(model.sdf_cell), **shape}
+    )
 
 
 @wp.struct
