@@ -27,9 +27,9 @@ OBJECTS = {
     "shadow": "mug",
 }
 """Hand -> what it is good at."""
-PIPELINES = {"swift": 300, "robust": 1000, "lightning": 400, "swift-refine": 60}
+PIPELINES = {"swift": 300, "robust": 1000, "lightning": 600, "swift-refine": 150}
 """Pipeline -> candidates."""
-SMALLER = {"lightning": ("domain.attempts=1000", "search.restarts=32", "search.per_pose=8")}
+SMALLER = {"lightning": ("domain.attempts=1000", "search.restarts=64", "search.per_pose=16")}
 """Settings with which a pipeline is faster; the checks stay."""
 
 FEW = {("schunk_svh", "lightning")}

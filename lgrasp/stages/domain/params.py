@@ -8,7 +8,9 @@ from lgrasp.config import Params
 class DomainParams(Params):
     """How contact domains are drawn."""
 
-    attempts: int = Field(128, ge=1, le=65536, description="Surface points looked up per pose and finger.")
-    keep: int = Field(16, ge=1, le=4096, description="Most contacts kept per pose and finger.")
-    angle: float = Field(20.0, gt=0, le=90, description="Largest angle of hand and object normal before IK [deg].")
-    fingers: int = Field(2, ge=1, le=8, description="Poses at which fewer fingers can touch are dropped.")
+    attempts: int = Field(default=128, ge=1, le=65536, description="Surface points looked up per pose and finger.")
+    keep: int = Field(default=16, ge=1, le=4096, description="Most contacts kept per pose and finger.")
+    angle: float = Field(
+        default=20.0, gt=0, le=90, description="Largest angle of hand and object normal before IK [deg]."
+    )
+    fingers: int = Field(default=2, ge=1, le=8, description="Poses at which fewer fingers can touch are dropped.")

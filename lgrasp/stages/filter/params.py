@@ -8,4 +8,4 @@ from lgrasp.config import Params
 class FilterParams(Params):
     """How contact sets are finished; the bounds of a finished grasp are under ``bounds`` of the pipeline."""
 
-    draws: int = Field(12, ge=1, le=1000, description="Postures tried for each unused finger.")
+    draws: int = Field(default=12, ge=1, le=1000, description="Postures tried for each unused finger.")

@@ -12,17 +12,17 @@ class IkParams(Params):
 
     RENAMED: ClassVar = {"touch": "contact_indentation", "apart": "min_held_distance", "clearance": "check_collision"}
 
-    iterations: int = Field(3, ge=1, le=200, description="Damped least-squares steps.")
-    lever: float = Field(0.01, gt=0, le=0.1, description="Distance of the second point along the normal.")
-    normal_weight: float = Field(0.15, gt=0, le=10, description="Weight of the second point.")
-    damping: float = Field(2e-6, gt=0, le=1, description="Damping of the least squares.")
-    step: float = Field(0.3, gt=0, le=3, description="Largest joint change in one step [rad or m].")
+    iterations: int = Field(default=3, ge=1, le=200, description="Damped least-squares steps.")
+    lever: float = Field(default=0.01, gt=0, le=0.1, description="Distance of the second point along the normal.")
+    normal_weight: float = Field(default=0.15, gt=0, le=10, description="Weight of the second point.")
+    damping: float = Field(default=2e-6, gt=0, le=1, description="Damping of the least squares.")
+    step: float = Field(default=0.3, gt=0, le=3, description="Largest joint change in one step [rad or m].")
     contact_indentation: float = Field(
-        0.0003, ge=0, le=0.002, description="How far the finger aims to press in at the contact."
+        default=0.0003, ge=0, le=0.002, description="How far the finger aims to press in at the contact."
     )
-    gap: float = Field(0.001, gt=0, le=0.01, description="Largest difference from that.")
-    angle: float = Field(15.0, gt=0, le=60, description="Largest angle of the normals at the contact [deg].")
+    gap: float = Field(default=0.001, gt=0, le=0.01, description="Largest difference from that.")
+    angle: float = Field(default=15.0, gt=0, le=60, description="Largest angle of the normals at the contact [deg].")
     min_held_distance: float = Field(
-        0.0003, ge=0, le=0.05, description="Least distance of the finger from objects held."
+        default=0.0003, ge=0, le=0.05, description="Least distance of the finger from objects held."
     )
-    check_collision: bool = Field(True, description="Also require the whole finger to be clear of the object.")
+    check_collision: bool = Field(default=True, description="Also require the whole finger to be clear of the object.")

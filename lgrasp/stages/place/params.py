@@ -16,26 +16,31 @@ class PlaceParams(Params):
     RENAMED: ClassVar = {"reach": "max_com_distance"}
 
     canonical: float = Field(
-        0.6, ge=0, description="Weight of surface point to point of the canonical box, any rotation."
+        default=0.6, ge=0, description="Weight of surface point to point of the canonical box, any rotation."
     )
     exhaustive: float = Field(
-        0.2, ge=0, description="Weight of surface point on a contact vector of the field, any roll."
+        default=0.2, ge=0, description="Weight of surface point on a contact vector of the field, any roll."
     )
     pinch: float = Field(
-        0.6, ge=0, description="Weight of two opposite surface points between two opposed fingers, any roll."
+        default=0.6, ge=0, description="Weight of two opposite surface points between two opposed fingers, any roll."
     )
-    palm: float = Field(0.1, ge=0, le=1e6, description="Weight of surface point pressed on the palm, any roll.")
+    palm: float = Field(default=0.1, ge=0, le=1e6, description="Weight of surface point pressed on the palm, any roll.")
     proposals: int = Field(
-        8, ge=1, le=256, description="Poses tried per candidate; the one with the richest contacts stays."
+        default=8, ge=1, le=256, description="Poses tried per candidate; the one with the richest contacts stays."
     )
-    samples: int = Field(24, ge=0, le=256, description="Surface points per finger that rate a pose; 0: no rating.")
+    samples: int = Field(
+        default=24, ge=0, le=256, description="Surface points per finger that rate a pose; 0: no rating."
+    )
     max_com_distance: float = Field(
-        NO_BOUND,
+        default=NO_BOUND,
         gt=0,
         le=NO_BOUND,
         description="Contacts rate a pose when the line between two passes this near the centre of mass [m]; "
         "10, farther than any object is large, bounds nothing.",
     )
     spins: int = Field(
-        16, ge=1, le=360, description="Rolls about the contact normal tried for two points in an opposition space."
+        default=16,
+        ge=1,
+        le=360,
+        description="Rolls about the contact normal tried for two points in an opposition space.",
     )

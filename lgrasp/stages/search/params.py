@@ -16,45 +16,47 @@ class SearchParams(Params):
     """How contacts are combined into sets that balance."""
 
     method: Literal["swap", "mutate"] = Field(
-        "swap",
+        default="swap",
         description="swap: contacts are replaced by others of their finger, and sets tested for friction, fingers for "
         "collision; mutate: as published, contacts move to the best of several mutations.",
     )
     contacts: tuple[int, ...] = Field(
-        (3, 3, 3, 3, 4),
+        default=(3, 3, 3, 3, 4),
         min_length=1,
         max_length=MAX_KINDS,
         description="Finger contacts k of the first round, drawn evenly; the largest bounds later rounds.",
     )
     score: Literal["fswo", "gswo"] = Field(
-        "fswo", description="Residual that the search lowers: frictionless or with friction."
+        default="fswo", description="Residual that the search lowers: frictionless or with friction."
     )
-    threshold: float = Field(0.1, gt=0, le=1, description="Squared residual at which a set is taken.")
+    threshold: float = Field(default=0.1, gt=0, le=1, description="Squared residual at which a set is taken.")
     gswo_share: float = Field(
-        6 / 7, gt=0, le=1, description="Largest gswo residual of a set, in round cones, over bounds.max_gswo."
+        default=6 / 7, gt=0, le=1, description="Largest gswo residual of a set, in round cones, over bounds.max_gswo."
     )
-    least_force: float = Field(0.03, ge=0, le=0.5, description="Smallest share of the normal force on a contact.")
-    sweeps: int = Field(5, ge=0, le=1000, description="mutate: passes over the contacts of a start.")
-    pivots: int = Field(3, ge=1, le=64, description="mutate: contacts moved in a sweep, one after another.")
+    least_force: float = Field(
+        default=0.03, ge=0, le=0.5, description="Smallest share of the normal force on a contact."
+    )
+    sweeps: int = Field(default=5, ge=0, le=1000, description="mutate: passes over the contacts of a start.")
+    pivots: int = Field(default=3, ge=1, le=64, description="mutate: contacts moved in a sweep, one after another.")
     mutations: int = Field(
-        6, ge=1, le=1024, description="mutate: points tried for a contact, of which the best counts."
+        default=6, ge=1, le=1024, description="mutate: points tried for a contact, of which the best counts."
     )
     mutation_sigma: float = Field(
-        5.0,
+        default=5.0,
         ge=0,
         le=1000,
         description="mutate: standard deviation of these in the tangent plane, over sqrt(area / contact points).",
     )
-    restarts: int = Field(20, ge=1, le=MAX_RESTARTS, description="Random starts per pose.")
-    moves: int = Field(12, ge=0, le=1000, description="swap: replacements of one contact per start and round.")
+    restarts: int = Field(default=20, ge=1, le=MAX_RESTARTS, description="Random starts per pose.")
+    moves: int = Field(default=12, ge=0, le=1000, description="swap: replacements of one contact per start and round.")
     rounds: int = Field(
-        2,
+        default=2,
         ge=1,
         le=4,
         description="swap: rounds per start; each after the first adds a finger if that is needed and k allows.",
     )
-    per_pose: int = Field(3, ge=1, le=MAX_RESTARTS, description="Most sets per pose.")
-    passes: int = Field(1, ge=1, le=64, description="Rounds over the same candidates (multi-pass generation).")
+    per_pose: int = Field(default=3, ge=1, le=MAX_RESTARTS, description="Most sets per pose.")
+    passes: int = Field(default=1, ge=1, le=64, description="Rounds over the same candidates (multi-pass generation).")
     separation: float = Field(
-        0.12, ge=0, le=3, description="Sets of one pose with the same fingers differ by this [rad]."
+        default=0.12, ge=0, le=3, description="Sets of one pose with the same fingers differ by this [rad]."
     )

@@ -9,7 +9,7 @@ from lgrasp.simulate.protocol import PROTOCOLS
 class SimulateParams(Params):
     """Under which protocol a grasp must hold."""
 
-    protocol: str = Field("fc", description="Named protocol under which every grasp must hold.")
+    protocol: str = Field(default="fc", description="Named protocol under which every grasp must hold.")
 
     @field_validator("protocol")
     @classmethod
