@@ -1,5 +1,8 @@
 """search: sets that balance, recomputed exactly."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import nnls
@@ -149,8 +152,6 @@ def test_k_is_as_asked(tables, context):
 
 
 def test_too_many_candidates(tables, context, swift):
-    from types import SimpleNamespace
-
-    table = SimpleNamespace(surface=SimpleNamespace(shape=(3, 99, 16)))
+    table: Any = SimpleNamespace(surface=SimpleNamespace(shape=(3, 99, 16)))
     with pytest.raises(ConfigError, match="99 fingers"):
         run(table, swift.params("search"), context)
