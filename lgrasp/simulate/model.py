@@ -68,12 +68,12 @@ def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequen
     joints = scene.hand.joint_names
     carried = [name for name in welded_joints(scene.hand.urdf, scene.hand.base_link) if name in joints]
     held = tuple((name, float(q[joints.index(name)])) for name in carried)
-    return _build(scene, protocol, held, tuple(objects))
+    return _build(scene, protocol.model_dump_json(), held, tuple(objects))
 
 
 @lru_cache(maxsize=8)
-def _build(scene: Scene, protocol: Protocol, held: tuple[tuple[str, float], ...], objects: tuple[int, ...]) -> Model:
-    mujoco, hand = import_mujoco(), scene.hand
+def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects: tuple[int, ...]) -> Model:
+    mujoco, hand, protocol = import_mujoco(), scene.hand, Protocol.model_validate_json(text)
     solids = [scene.objects[index] for index in objects]
     try:
         spec = assemble(mujoco, hand, solids, protocol, dict(held))

@@ -154,7 +154,7 @@ def test_bounds_bind(tables, context, swift):
         ({"max_gswo": 1e-7}, "balance"),
         ({"min_self_distance": 0.01}, "self-collision"),
     ):
-        counts = run(tables.search, params, replace(context, bounds=GraspBounds(**changes)))[1]
+        counts = run(tables.search, params, replace(context, bounds=GraspBounds().changed(**changes)))[1]
         assert counts[reason] > base[reason], changes
         assert counts["kept"] < base["kept"]
         assert sum(counts.values()) == sum(base.values())

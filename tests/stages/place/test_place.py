@@ -1,6 +1,7 @@
 """place: poses that the palm does not block."""
 
 from copy import copy
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,7 +67,7 @@ def test_palm_contact(context, inputs):
 
 @pytest.mark.parametrize("source", ["canonical", "exhaustive", "pinch"])
 def test_other_sources_claim_no_palm(context, source):
-    weights = {"canonical": 0.0, "exhaustive": 0.0, "pinch": 0.0, "palm": 0.0, source: 1.0}
+    weights: dict[str, Any] = {"canonical": 0.0, "exhaustive": 0.0, "pinch": 0.0, "palm": 0.0, source: 1.0}
     arrays = place(context, **weights)[0].arrays()
     assert len(arrays["index"]) > 5
     assert (arrays["palm_point"] == -1).all()
