@@ -15,11 +15,8 @@ class BodyKinematics:
 
     def __init__(self, tree: Tree, *, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu") -> None:
         joints = len(tree.joint_dof)
-        group = np.repeat(np.arange(tree.groups), np.diff(tree.joint_first))
-        parent = np.where(tree.joint_parent < 0, -1, tree.joint_parent + tree.joint_first[group])
-        depth = np.zeros(joints, int)
-        for j in range(joints):  # parents come before children
-            depth[j] = 0 if parent[j] < 0 else depth[parent[j]] + 1
+        parent = tree.body_parent[1:] - 1  # joint of each joint
+        depth = np.array([len(tree.path(1 + j)) - 1 for j in range(joints)])
         order = np.argsort(depth, kind="stable")
         place = np.argsort(order)  # of joint j among the sorted ones
 
@@ -38,8 +35,7 @@ class BodyKinematics:
         turn = np.concatenate([np.where(slides, 0.0, R0 @ K), none], 2)
         bend = np.concatenate([np.where(slides, 0.0, R0 @ K @ K), none], 2)
         slide = np.concatenate([np.zeros((joints, 3, 3)), np.where(slides, R0 @ axis[..., None], 0.0)], 2)
-        column = tree.dof_index[tree.dof_first[group] + tree.joint_dof]
-        self._column = index(column[order])
+        self._column = index(tree.joint_column[order])
         self._mult, self._offset = put(tree.joint_mult[order]), put(tree.joint_offset[order])
         self._rest, self._turn, self._bend = put(rest[order]), put(turn[order]), put(bend[order])
         self._slide = put(slide[order]) if slides.any() else None

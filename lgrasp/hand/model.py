@@ -5,11 +5,23 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from lgrasp.hand.geometry import Piece
 from lgrasp.hand.tree import Tree
 
 HAND_VERSION = 13
 """Raised whenever the arrays of a HandModel change meaning."""
+
+
+def csr(counts: ArrayLike) -> np.ndarray:
+    """(n + 1,) i32: first entry of each of n runs, and their total."""
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+
+
+def stack_rows(parts: list[np.ndarray], width: int, dtype: type = np.float32) -> np.ndarray:
+    """(n, width): all rows of ``parts``, of which there may be none."""
+    return np.vstack(parts).astype(dtype) if parts else np.zeros((0, width), dtype)
 
 
 @dataclass(frozen=True)
@@ -87,26 +99,30 @@ class HandModel:
     @property
     def patch_first(self) -> np.ndarray:
         """(G + 2,) i32: first patch of each group, palm last."""
-        firsts = [self.contact_patch[a:b] for a, b in zip(self.contact_first[:-1], self.contact_first[1:], strict=True)]
-        return np.concatenate([[0], np.cumsum([len(np.unique(p)) for p in firsts])]).astype(np.int32)
+        parts = np.split(self.contact_patch, self.contact_first[1:-1])
+        return np.cumsum([0, *(len(np.unique(part)) for part in parts)]).astype(np.int32)
 
     @property
     def dofs(self) -> int:
         return len(self.tree.joint_names)
+
+    def random_postures(self, count: int, seed: int = 0) -> np.ndarray:
+        """Postures (count, K) [rad or m], uniform inside the limits."""
+        return np.random.default_rng(seed).uniform(self.tree.joint_lower, self.tree.joint_upper, (count, self.dofs))
+
+    def piece(self, i: int) -> Piece:
+        """Convex piece i, body frame."""
+        vertices = self.vertices[self.vertex_first[i] : self.vertex_first[i + 1]]
+        planes = self.planes[self.plane_first[i] : self.plane_first[i + 1]]
+        return Piece(vertices.astype(float), planes.astype(float), float(self.piece_radius[i]))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Flat arrays for the cache; inverse of :meth:`from_arrays`."""
         out = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
         tree = {f.name: getattr(self.tree, f.name) for f in fields(self.tree)}
         out |= {f"tree.{k}": v for k, v in tree.items() if isinstance(v, np.ndarray)}
-        text = {
-            "name": self.name,
-            "sha256": self.sha256,
-            "urdf_text": self.urdf_text,
-            "notes": self.notes,
-            "contacts": self.contacts,
-            "tree": {k: v for k, v in tree.items() if not isinstance(v, np.ndarray)},
-        }
+        text = {key: getattr(self, key) for key in ("name", "sha256", "urdf_text", "notes", "contacts")}
+        text["tree"] = {k: v for k, v in tree.items() if not isinstance(v, np.ndarray)}
         out["text"] = np.frombuffer(json.dumps(text).encode(), np.uint8)
         return out
 

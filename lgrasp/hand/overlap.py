@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
+from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.hand.contacts import LinkGrid, box_grid
+from lgrasp.hand.model import csr, stack_rows
 from lgrasp.hand.self_collision import OVERLAP
 
 _POINT_SPACING = 8.0e-4  # [m]
@@ -40,8 +42,7 @@ def _surface(meshes: Sequence[trimesh.Trimesh]) -> np.ndarray:
         count = int(np.clip(4 * mesh.area / _POINT_SPACING**2, 64, 8 * _MAX_POINTS))
         parts.append(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
     points = np.vstack(parts)
-    _, first = np.unique(np.floor(points / _POINT_SPACING).astype(np.int64), axis=0, return_index=True)
-    return points[np.sort(first)][:_MAX_POINTS]
+    return points[one_per_cell(points, _POINT_SPACING)][:_MAX_POINTS]
 
 
 def _lookup(grid: LinkGrid, p: np.ndarray) -> np.ndarray:
@@ -130,22 +131,17 @@ def overlap_depth(
 
 def overlap_arrays(sides: Sequence[OverlapSide], key: Sequence[int], keys: int) -> dict[str, np.ndarray]:
     """The ``overlap_*`` arrays of a HandModel; ``key`` is the group pair of each side, of ``keys``."""
-    order = np.argsort(np.asarray(key, int), kind="stable")
-    chosen = [sides[i] for i in order]
+    chosen = [sides[i] for i in np.argsort(np.asarray(key, int), kind="stable")]
     ends = np.cumsum([0, *(len(s.points) for s in chosen)])
     rows = [(s.body, s.grid_body, ends[i], ends[i + 1]) for i, s in enumerate(chosen)]
-    counts = np.bincount(np.asarray(key, int), minlength=keys) if len(chosen) else np.zeros(keys, int)
-
-    def joined(parts: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-        return np.concatenate([np.zeros((0, *shape), np.float32), *(p.astype(np.float32) for p in parts)])
-
+    grids = [s.grid for s in chosen]
     return {
-        "overlap_first": np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
+        "overlap_first": csr(np.bincount(np.asarray(key, int), minlength=keys)),
         "overlap_sides": np.array(rows, np.int32).reshape(-1, 4),
-        "overlap_points": joined([s.points for s in chosen], (3,)),
-        "overlap_grid_first": np.cumsum([0, *(s.grid.values.size for s in chosen)]).astype(np.int32),
-        "overlap_grid_shape": np.array([s.grid.values.shape for s in chosen], np.int32).reshape(-1, 3),
-        "overlap_grid_origin": joined([s.grid.origin[None] for s in chosen], (3,)),
-        "overlap_grid_cell": np.array([s.grid.cell for s in chosen], np.float32),
-        "overlap_grid_values": joined([s.grid.values.ravel() for s in chosen], ()),
+        "overlap_points": stack_rows([s.points for s in chosen], 3),
+        "overlap_grid_first": csr([grid.values.size for grid in grids]),
+        "overlap_grid_shape": np.array([grid.values.shape for grid in grids], np.int32).reshape(-1, 3),
+        "overlap_grid_origin": np.array([grid.origin for grid in grids], np.float32).reshape(-1, 3),
+        "overlap_grid_cell": np.array([grid.cell for grid in grids], np.float32),
+        "overlap_grid_values": np.concatenate([np.zeros(0, np.float32), *(grid.values.ravel() for grid in grids)]),
     }

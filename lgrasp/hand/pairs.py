@@ -66,18 +66,6 @@ def pieces_touch(
     return out.numpy().astype(bool)
 
 
-def _rigid(model: HandModel, adjacent: set[tuple[str, str]]) -> set[tuple[int, int]]:
-    """Link index pairs that never need a test: joined by a joint, or riding on one body."""
-    index = {name: i for i, name in enumerate(model.tree.link_names)}
-    out = {(index[a], index[b]) for a, b in adjacent}
-    return out | {(b, a) for a, b in out}
-
-
-def _postures(model: HandModel, count: int) -> np.ndarray:
-    rng = np.random.default_rng(1)
-    return rng.uniform(model.tree.joint_lower, model.tree.joint_upper, (count, model.dofs))
-
-
 def with_pairs(
     model: HandModel,
     adjacent: set[tuple[str, str]],
@@ -95,23 +83,23 @@ def with_pairs(
         meshes: solids of each link, body frame.
         dented: links with bodies that differ much from their hulls.
     """
-    skip = _rigid(model, adjacent)
-    group = model.tree.body_group + 1
-    candidates = []
-    for i in range(len(model.piece_body)):
-        for j in range(i + 1, len(model.piece_body)):
-            bi, bj = model.piece_body[i], model.piece_body[j]
-            if bi != bj and (int(model.piece_link[i]), int(model.piece_link[j])) not in skip:
-                candidates.append((i, j) if group[bi] <= group[bj] else (j, i))
-    if not candidates:
+    names, group = model.tree.link_names, model.tree.body_group + 1
+    joined = np.zeros((len(names), len(names)), bool)
+    for a, b in adjacent:
+        joined[names.index(a), names.index(b)] = joined[names.index(b), names.index(a)] = True
+    i, j = np.triu_indices(len(model.piece_body), 1)
+    free = (model.piece_body[i] != model.piece_body[j]) & ~joined[model.piece_link[i], model.piece_link[j]]
+    if not free.any():
         return model
-    pairs = np.array(candidates, np.int32)
-    q = _postures(model, _SAMPLED_POSTURES)
+    pairs = np.column_stack([i, j])[free].astype(np.int32)
+    swapped = group[model.piece_body[pairs[:, 0]]] > group[model.piece_body[pairs[:, 1]]]
+    pairs[swapped] = pairs[swapped, ::-1]
+    q = model.random_postures(_SAMPLED_POSTURES, 1)
     touch = pieces_touch(model, q, pairs, device=device)
     # links, not pieces, are what touches: a link pair is left out when some pieces of it touch in every posture
     links = np.sort(model.piece_link[pairs], axis=1)
     keep = np.ones(len(pairs), bool)
-    names, notes, sides, keys = model.tree.link_names, list(model.notes), [], []
+    notes, sides, keys = list(model.notes), [], []
     groups = model.groups + 1
     for pair in np.unique(links, axis=0):
         members = (links == pair).all(1)
@@ -126,7 +114,9 @@ def with_pairs(
             notes += [note] if note else []
         elif (
             share == 1.0
-            and pieces_touch(model, _postures(model, _CONFIRMING_POSTURES), pairs[members], device=device).any(1).all()
+            and pieces_touch(model, model.random_postures(_CONFIRMING_POSTURES, 1), pairs[members], device=device)
+            .any(1)
+            .all()
         ):
             keep[members] = False
     pairs = pairs[keep]
@@ -141,8 +131,7 @@ def _true_overlap(
     model: HandModel, pair: tuple[str, str], meshes: Mapping[str, Sequence[trimesh.Trimesh]], q: np.ndarray, device: str
 ) -> tuple[list[OverlapSide], str]:
     """Both sides of a link pair's test on the true surfaces, none when it is pointless, and what to tell the user."""
-    index = [model.tree.link_names.index(name) for name in pair]
-    bodies = (int(model.tree.link_body[index[0]]), int(model.tree.link_body[index[1]]))
+    bodies = (model.tree.body_of(pair[0]), model.tree.body_of(pair[1]))
     hand = upload_hand(model, device)
 
     def placed(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -155,7 +144,7 @@ def _true_overlap(
     depth = np.max([side.depth for side in sides], 0)
     note = f"links '{pair[0]}' and '{pair[1]}' overlap"
     if (depth > _GRID_ERROR).all():
-        depth = overlap_depth(sides, bodies, placed(_postures(model, _CONFIRMING_POSTURES)))
+        depth = overlap_depth(sides, bodies, placed(model.random_postures(_CONFIRMING_POSTURES, 1)))
         # a pair that comes apart in a few odd postures only could never be used if it were kept apart
         if (depth > _GRID_ERROR).all() or (depth > OVERLAP).mean() > _UNUSABLE_SHARE:
             return [], f"{note} in every posture; they are not kept apart"

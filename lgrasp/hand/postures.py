@@ -10,6 +10,8 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
 from lgrasp.runtime.device import start
 
+_Index = int | slice | list[int] | np.ndarray
+
 
 @dataclass(frozen=True)
 class Postures:
@@ -21,19 +23,22 @@ class Postures:
     clear: np.ndarray  # (N, G) of the static base and of itself
     touching: np.ndarray  # (N,) do any two parts touch?
 
+    def turn(self, rows: _Index, bodies: _Index, normals: np.ndarray) -> np.ndarray:
+        """Directions (n, 3) of bodies in the base frame; postures, bodies and directions broadcast."""
+        return np.einsum("...ij,...j->...i", self.R[rows, bodies], normals)
+
+    def place(self, rows: _Index, bodies: _Index, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) [m] of bodies in the base frame; postures, bodies and points broadcast."""
+        return self.turn(rows, bodies, points) + self.t[rows, bodies]
+
 
 def sample_bodies(model: HandModel, q: np.ndarray, device: str = "cpu") -> Postures:
     """Body poses at postures q (N, K), and which of them are clear."""
     start()
     poses = body_poses(upload_hand(model, device), q)
     R = device_rotation(poses.reshape(-1, 7)).as_matrix().reshape(*poses.shape[:2], 3, 3)
-    clear = np.ones((len(q), model.groups), bool)
-    touching: np.ndarray = np.zeros(len(q), bool)
-    if len(model.pairs):
-        touch = pieces_touch(model, q, model.pairs, device=device)
-        group = model.tree.body_group[model.piece_body[model.pairs]]  # (Q, 2), the base is -1
-        for g in range(model.groups):
-            own = (group[:, 1] == g) & ((group[:, 0] == -1) | (group[:, 0] == g))
-            clear[:, g] = ~touch[:, own].any(1)
-        touching = np.asarray(touch.any(1))
-    return Postures(q, R, poses[..., :3].astype(float), clear, touching)
+    touch = pieces_touch(model, q, model.pairs, device=device)
+    group = model.tree.body_group[model.piece_body[model.pairs]]  # (Q, 2), the base is -1
+    own = [(group[:, 1] == g) & ((group[:, 0] == -1) | (group[:, 0] == g)) for g in range(model.groups)]
+    clear = np.stack([~touch[:, pairs].any(1) for pairs in own], 1)
+    return Postures(q, R, poses[..., :3].astype(float), clear, np.asarray(touch.any(1)))

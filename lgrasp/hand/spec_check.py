@@ -16,10 +16,8 @@ def check_size(spec: HandSpec, tree: Tree) -> None:
     Raises:
         HandError: naming the numbers of joints and drives and the largest that are supported.
     """
-    if len(tree.joint_dof) > MAX_BODIES:
-        raise HandError(
-            f"hand '{spec.name}' has {len(tree.joint_dof)} movable joints, at most {MAX_BODIES} are supported"
-        )
+    if (moving := len(tree.joint_dof)) > MAX_BODIES:
+        raise HandError(f"hand '{spec.name}' has {moving} movable joints, at most {MAX_BODIES} are supported")
     joints, dofs = int(np.diff(tree.joint_first).max()), int(np.diff(tree.dof_first).max())
     if joints > MAX_JOINTS or dofs > MAX_DOFS:
         raise HandError(
@@ -50,18 +48,6 @@ def side_links(space: OppositionSpace) -> tuple[tuple[str, ...], tuple[str, ...]
     return tuple(first), tuple(second)
 
 
-def moving_joints(tree: Tree, body: int) -> np.ndarray:
-    """(K,) bool: actuated joints that move a body, shared ones included."""
-    moved = np.zeros(len(tree.joint_names), bool)
-    group = int(tree.body_group[body])
-    j = body - 1
-    while group >= 0 and j >= 0:
-        moved[tree.dof_index[tree.dof_first[group] + tree.joint_dof[j]]] = True
-        up = int(tree.joint_parent[j])
-        j = -1 if up < 0 else int(tree.joint_first[group]) + up
-    return moved
-
-
 def check_spaces(spec: HandSpec, tree: Tree, geometry: Mapping[str, object]) -> None:
     """Links and joints of the opposition spaces exist and fit together.
 
@@ -84,29 +70,25 @@ def space_problem(spec: HandSpec, tree: Tree, space: OppositionSpace, geometry: 
         held = "locked" if joint in spec.locked else "shared" if joint in spec.shared else "no driven joint"
         if joint not in driven:
             return f"joint '{joint}' is {held}; driven joints: {', '.join(driven)}"
-    body = dict(zip(tree.link_names, tree.link_body, strict=True))
-    groups, moved = [], np.zeros(len(tree.joint_names), bool)
-    both = side_links(space)
-    for links in both:
-        for link in links:
-            if link not in body:
-                return f"link '{link}' does not exist; links: {', '.join(tree.link_names)}"
-            if not geometry.get(link):
-                return f"link '{link}' has no collision geometry; name links that have"
-            if (both[0] + both[1]).count(link) > 1:
-                return f"link '{link}' is in it twice; name it once"
-            moved |= moving_joints(tree, int(body[link]))
-        of_link = [int(tree.body_group[body[link]]) for link in links]
-        other = next((link for link, group in zip(links, of_link, strict=True) if group != of_link[0]), None)
+    first, second = side_links(space)
+    for link in (*first, *second):
+        if link not in tree.link_names:
+            return f"link '{link}' does not exist; links: {', '.join(tree.link_names)}"
+        if not geometry.get(link):
+            return f"link '{link}' has no collision geometry; name links that have"
+        if (first + second).count(link) > 1:
+            return f"link '{link}' is in it twice; name it once"
+    for links in (first, second):
+        other = next((link for link in links if tree.group_of(link) != tree.group_of(links[0])), None)
         if other is not None:
             return (
                 f"links '{links[0]}' and '{other}' of one side do not move with one finger; all links of a side ride "
                 "on one finger, or all are static"
             )
-        groups.append(of_link[0])
-    if groups[0] == groups[1]:
-        return "both sides are static" if groups[0] < 0 else "both sides ride on one finger; name surface of two"
-    able = [n for n in driven if moved[tree.joint_names.index(n)]]
+    if (group := tree.group_of(first[0])) == tree.group_of(second[0]):
+        return "both sides are static" if group < 0 else "both sides ride on one finger; name surface of two"
+    moved = np.any([tree.moving_joints(tree.body_of(link)) for link in (*first, *second)], axis=0)
+    able = [n for n, moves in zip(tree.joint_names, moved, strict=True) if moves and n in driven]
     for joint in space.joints:
         if joint not in able:
             return f"joint '{joint}' moves neither side; joints that do: {', '.join(able)}"

@@ -9,20 +9,10 @@ import trimesh
 
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import LinkGrid, cover_patches, link_grid
-from lgrasp.hand.model import HandModel
+from lgrasp.hand.model import HandModel, csr, stack_rows
 from lgrasp.hand.tree import Tree
 
 _MIN_AXIS = 0.01  # [m] between the middle of the first joints and that of the canonical box
-
-
-def csr(counts: list[int]) -> np.ndarray:
-    """(n + 1,) i32: first entry of each of n runs, and their total."""
-    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-
-
-def stack_rows(parts: list[np.ndarray], width: int, dtype: type = np.float32) -> np.ndarray:
-    """(n, width): all rows of ``parts``, of which there may be none."""
-    return np.vstack(parts).astype(dtype) if parts else np.zeros((0, width), dtype)
 
 
 @dataclass(frozen=True)
@@ -34,6 +24,7 @@ class ContactLink:
     points: np.ndarray  # (n, 3) [m]
     normals: np.ndarray  # (n, 3)
     rules: np.ndarray  # (r, 4) forbidden cones: axis, cosine
+    area: float = 0.0  # [m^2], of a side of an opposition space
 
 
 @dataclass(frozen=True)
@@ -70,26 +61,20 @@ def contact_arrays(
         meshes: solids of each link, body frame. known: distance grids that need not be made.
     """
     made: dict[bytes, LinkGrid] = {}
-
-    def grid(link: str) -> LinkGrid:
-        if known and link in known:
-            return known[link]
+    grids: list[LinkGrid] = []
+    for entry in links:
         # fingertips of one shape share one grid's work
-        key = b"".join(np.round(m.vertices, 9).tobytes() for m in meshes[link])
-        if key not in made:
-            made[key] = link_grid(meshes[link], device)
-        return made[key]
-
-    grids = [grid(entry.link) for entry in links]
+        key = b"".join(np.round(m.vertices, 9).tobytes() for m in meshes[entry.link])
+        grid = (known or {}).get(entry.link) or made.get(key)
+        grids.append(grid or made.setdefault(key, link_grid(meshes[entry.link], device)))
     joined = [joined_mesh(meshes[entry.link]) for entry in links]
     # grids in the order given, points group by group
     order = sorted(range(len(links)), key=lambda i: links[i].group)
     flat = [links[i] for i in order]
     patches, count = [], 0
     for entry in flat:
-        patch = cover_patches(entry.points, entry.normals, rng) if len(entry.points) else np.zeros(0, np.int32)
-        patches.append(patch + count)
-        count += int(patch.max()) + 1 if len(patch) else 0
+        patches.append(cover_patches(entry.points, entry.normals, rng) + count)
+        count = int(patches[-1].max(initial=count - 1)) + 1
     repeat = [len(entry.points) for entry in flat]
     index = {entry.link: tree.link_names.index(entry.link) for entry in links}
     of_point = np.repeat([index[entry.link] for entry in flat], repeat).astype(np.int32)
@@ -100,7 +85,7 @@ def contact_arrays(
         "contact_normals": stack_rows([e.normals for e in flat], 3),
         "contact_body": tree.link_body[of_point].astype(np.int32),
         "contact_link": of_point,
-        "contact_patch": np.concatenate(patches).astype(np.int32) if patches else np.zeros(0, np.int32),
+        "contact_patch": np.concatenate([np.zeros(0), *patches]).astype(np.int32),
         "contact_grid": np.repeat(order, repeat).astype(np.int32),
         "grid_first": csr([g.values.size for g in grids]),
         "grid_shape": np.array([g.values.shape for g in grids], np.int32),

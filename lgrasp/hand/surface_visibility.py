@@ -1,11 +1,13 @@
 """The gripper weighting map: surface of a hand visible from the mean fingertip, by rays, over many postures."""
 
+from dataclasses import replace
+
 import numpy as np
 import trimesh
 import warp as wp
 
 from lgrasp.hand.find import HandSource
-from lgrasp.hand.geometry import geometry_mesh
+from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import Postures, sample_bodies
 from lgrasp.hand.surface import ContactSurface, SurfaceSamples, joined_mesh
@@ -25,17 +27,12 @@ def link_surfaces(urdf: Urdf, model: HandModel) -> list[SurfaceSamples]:
     surfaces = []
     tree = model.tree
     for index, link in enumerate(tree.link_names):
-        if not urdf.links[link]:
-            continue
-        meshes = []
-        for geometry in urdf.links[link]:
-            mesh = geometry_mesh(urdf, geometry)
-            meshes.append(mesh.apply_transform(tree.T_body_link[index] @ geometry.T_link_geometry))
-        mesh = joined_mesh(meshes)
-        points, faces = trimesh.sample.sample_surface(mesh, _POINTS_PER_LINK, seed=index)[:2]
-        normals = np.asarray(mesh.face_normals)[faces]
-        T, body = tree.T_body_link[index], int(tree.link_body[index])
-        surfaces.append(SurfaceSamples(link, body, float(mesh.area), points, normals, np.zeros(len(points)), T, mesh))
+        if urdf.links[link]:
+            mesh = joined_mesh(link_meshes(urdf, tree, link))
+            points, faces = trimesh.sample.sample_surface(mesh, _POINTS_PER_LINK, seed=index)[:2]
+            normals, seen = np.asarray(mesh.face_normals)[faces], np.zeros(len(points))
+            T, body = tree.T_body_link[index], int(tree.link_body[index])
+            surfaces.append(SurfaceSamples(link, body, float(mesh.area), points, normals, seen, T, mesh))
     return surfaces
 
 
@@ -48,56 +45,45 @@ def surface_visibility(
         tips: tip body -> fingertip in its body frame [m].
     """
     start()
-    body = np.concatenate([np.full(len(s.mesh.vertices), s.body) for s in surfaces])
-    vertices = np.concatenate([s.mesh.vertices for s in surfaces])
-    offsets = np.cumsum([0, *(len(s.mesh.vertices) for s in surfaces)])
-    faces = np.concatenate([s.mesh.faces + o for s, o in zip(surfaces, offsets, strict=False)])
-    point_body = np.concatenate([np.full(len(s.points), s.body) for s in surfaces])
+    whole = joined_mesh([s.mesh for s in surfaces])
+    body = np.repeat([s.body for s in surfaces], [len(s.mesh.vertices) for s in surfaces])
+    point_body = np.repeat([s.body for s in surfaces], [len(s.points) for s in surfaces])
     points, normals = (np.concatenate([getattr(s, k) for s in surfaces]) for k in ("points", "normals"))
     seen = np.zeros(len(points))
     chosen = np.argsort(postures.touching, kind="stable")[:_VIEWED_POSTURES]  # postures that collide come last
     handle = None
     for row in chosen:
-        R, t = postures.R[row], postures.t[row]
-
-        def place(p: np.ndarray, b: np.ndarray, R: np.ndarray = R, t: np.ndarray = t) -> np.ndarray:
-            return np.einsum("nij,nj->ni", R[b], p) + t[b]
-
-        world = wp.array(place(vertices, body).astype(np.float32), dtype=wp.vec3, device=device)
+        placed = postures.place(row, body, whole.vertices)
+        world = wp.array(placed.astype(np.float32), dtype=wp.vec3, device=device)
         if handle is None:
-            handle = wp.Mesh(world, wp.array(faces.ravel().astype(np.int32), dtype=wp.int32, device=device))
+            handle = wp.Mesh(world, wp.array(whole.faces.ravel().astype(np.int32), dtype=wp.int32, device=device))
         else:
             wp.copy(handle.points, world)
             handle.refit()
-        eye = np.mean([R[b] @ p + t[b] for b, p in tips.items()], 0)
-        target = place(points, point_body)
-        facing = np.einsum("ni,ni->n", np.einsum("nij,nj->ni", R[point_body], normals), eye - target) > 0
+        eye = np.mean([postures.R[row, b] @ p + postures.t[row, b] for b, p in tips.items()], 0)
+        target = postures.place(row, point_body, points)
+        facing = np.einsum("ni,ni->n", postures.turn(row, point_body, normals), eye - target) > 0
         free = wp.empty(len(target), dtype=wp.int32, device=device)
         targets = wp.array(target.astype(np.float32), dtype=wp.vec3, device=device)
         wp.launch(first_hits, len(target), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device)
         seen += facing & (free.numpy() == 1)
     parts = np.split(seen / len(chosen), np.cumsum([len(s.points) for s in surfaces])[:-1])
-    return [
-        SurfaceSamples(s.link, s.body, s.area, s.points, s.normals, part, s.T_body_link, s.mesh)
-        for s, part in zip(surfaces, parts, strict=True)
-    ]
+    return [replace(s, seen=part) for s, part in zip(surfaces, parts, strict=True)]
 
 
 def visible_surface(source: HandSource, model: HandModel, device: str = "cpu") -> ContactSurface:
     """The palmar side of a hand: what the mean fingertip sees. A ray from there meets it first, in three of ten random
     postures or more."""
-    tree = model.tree
-    q = np.random.default_rng(0).uniform(tree.joint_lower, tree.joint_upper, (_SAMPLED_POSTURES, model.dofs))
     surfaces = link_surfaces(read_urdf(source.urdf), model)
     tips = {b: tip_point([s for s in surfaces if s.body == b], 0.1) for b in last_bodies(model)}
-    seen = surface_visibility(surfaces, sample_bodies(model, q, device), tips, device)
+    postures = sample_bodies(model, model.random_postures(_SAMPLED_POSTURES), device)
+    seen = surface_visibility(surfaces, postures, tips, device)
     chosen = [s.seen >= _MIN_SEEN_SHARE for s in seen]
-    parts = [
-        (np.full(int(c.sum()), tree.link_names.index(s.link)), s.points[c], s.normals[c])
-        for s, c in zip(seen, chosen, strict=True)
-    ]
-    link, points, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return ContactSurface(link, tree.link_body[link], points, normals)
+    link = np.repeat([model.tree.link_names.index(s.link) for s in seen], [int(c.sum()) for c in chosen])
+    points, normals = (
+        np.concatenate([getattr(s, k)[c] for s, c in zip(seen, chosen, strict=True)]) for k in ("points", "normals")
+    )
+    return ContactSurface(link, model.tree.link_body[link], points, normals)
 
 
 def tip_point(surfaces: list[SurfaceSamples], share: float) -> np.ndarray:
@@ -113,17 +99,8 @@ def tip_point(surfaces: list[SurfaceSamples], share: float) -> np.ndarray:
 
 def last_bodies(model: HandModel) -> set[int]:
     """Bodies with geometry that no body with geometry rides on: the last links of fingers."""
-    tree = model.tree
-    group = np.repeat(np.arange(tree.groups), np.diff(tree.joint_first))
-    parent = np.where(tree.joint_parent < 0, -1, tree.joint_parent + tree.joint_first[group])  # joint of each joint
     solid = {int(b) for b in model.piece_body if b > 0}
-    inner = set()
-    for b in solid:
-        j = int(parent[b - 1])
-        while j >= 0:
-            inner.add(1 + j)
-            j = int(parent[j])
-    return solid - inner
+    return solid - {b for body in solid for b in model.tree.path(body)[:-1]}
 
 
 @wp.kernel

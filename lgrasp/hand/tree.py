@@ -1,7 +1,9 @@
 """Joint tree -> dependency groups, actuated joints and the flat tables of the Warp forward kinematics."""
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -73,20 +75,41 @@ class Tree:
     def groups(self) -> int:
         return len(self.joint_first) - 1
 
-    @property
+    @cached_property
     def body_group(self) -> np.ndarray:
         """(1 + J,) i32: group of each body, -1 for the base."""
         return np.concatenate([[-1], np.repeat(np.arange(self.groups), np.diff(self.joint_first))]).astype(np.int32)
 
+    @cached_property
+    def body_parent(self) -> np.ndarray:
+        """(1 + J,) i32: body that each is mounted on, -1 for the base."""
+        mounted = 1 + self.joint_parent + self.joint_first[self.body_group[1:]]
+        return np.concatenate([[-1], np.where(self.joint_parent < 0, 0, mounted)]).astype(np.int32)
 
-def _fixed_value(j: Joint, locked: dict[str, float], by_name: dict[str, Joint]) -> float | None:
-    """Coordinate of a joint that cannot move: locked itself, or mimicking a locked one."""
-    if j.name in locked:
-        return locked[j.name]
-    if j.mimic is not None:
-        source = _fixed_value(by_name[j.mimic[0]], locked, by_name)
-        return None if source is None else j.mimic[1] * source + j.mimic[2]
-    return None
+    @cached_property
+    def joint_column(self) -> np.ndarray:
+        """(J,) i32: column of q that drives each joint."""
+        return self.dof_index[self.dof_first[self.body_group[1:]] + self.joint_dof]
+
+    def path(self, body: int) -> list[int]:
+        """Bodies from the base (left out) to a body."""
+        return [*self.path(int(self.body_parent[body])), body] if body > 0 else []
+
+    def moving_joints(self, body: int) -> np.ndarray:
+        """(K,) bool: actuated joints that move a body, shared ones included."""
+        return np.isin(np.arange(len(self.joint_names)), self.joint_column[np.array(self.path(body), int) - 1])
+
+    def body_of(self, link: str) -> int:
+        """Body that a link rides on."""
+        return int(self.link_body[self.link_names.index(link)])
+
+    def group_of(self, link: str) -> int:
+        """Group that a link belongs to, -1 for static ones."""
+        return int(self.body_group[self.body_of(link)])
+
+    def links_on(self, body: int) -> list[str]:
+        """Links that ride on a body."""
+        return [name for name, b in zip(self.link_names, self.link_body, strict=True) if b == body]
 
 
 def _motion(j: Joint, x: float) -> np.ndarray:
@@ -111,29 +134,10 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     """
     stated = {j.name for j in urdf.joints if j.mimic is not None}
     urdf = _with_mimic(urdf, spec)
-    by_name = {j.name: j for j in urdf.joints}
-    for name, value in spec.locked.items():
-        if name not in by_name or not by_name[name].movable:
-            raise HandError(f"hand '{spec.name}': locked joint '{name}' is not a movable joint of {urdf.path}")
-        if not by_name[name].lower - 1e-6 <= value <= by_name[name].upper + 1e-6:
-            raise HandError(
-                f"hand '{spec.name}': locked joint '{name}' = {value} is outside its limits "
-                f"[{by_name[name].lower}, {by_name[name].upper}]"
-            )
-        if (mimic := by_name[name].mimic) is not None:
-            raise HandError(
-                f"hand '{spec.name}': joint '{name}' is locked but follows joint '{mimic[0]}'; lock that one instead"
-            )
-    for name in spec.open_posture:
-        if name not in by_name or not by_name[name].movable:
-            raise HandError(f"hand '{spec.name}': open_posture names '{name}', not a movable joint of {urdf.path}")
-    for link in (*spec.static_links, *(x for links in spec.fingers.values() for x in links)):
-        if link not in urdf.links:
-            raise HandError(f"hand '{spec.name}': '{link}' (static_links or fingers) is not a link of {urdf.path}")
     base = spec.base_link or urdf.root
-    if base not in urdf.links:
-        raise HandError(f"hand '{spec.name}': base_link '{base}' is not a link of {urdf.path}")
-
+    _check_names(urdf, spec, base)
+    drive = _drives(urdf)
+    fixed = {n: m * spec.locked[source] + b for n, (source, m, b) in drive.items() if source in spec.locked}
     # each link: the movable joint it rides on (None = static) and its pose in that joint's moving frame (or the root)
     rides: dict[str, tuple[str | None, np.ndarray]] = {urdf.root: (None, np.eye(4))}
     parent_of: dict[str, str | None] = {}
@@ -142,13 +146,12 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     for j in urdf.joints:
         carrier, T = rides[j.parent]
         T = T @ j.T_parent_joint
-        value = _fixed_value(j, spec.locked, by_name) if j.movable else 0.0
-        if value is not None:
-            rides[j.child] = (carrier, T @ _motion(j, value) if j.movable else T)
-        else:
+        if j.movable and j.name not in fixed:
             parent_of[j.name], pose_of[j.name] = carrier, T
             moving.append(j)
             rides[j.child] = (j.name, np.eye(4))
+        else:
+            rides[j.child] = (carrier, T @ _motion(j, fixed[j.name]) if j.movable else T)
     if not moving:
         raise HandError(f"hand '{spec.name}': every joint of {urdf.path} is locked; leave some to move")
     # the base frame: the base link must be static
@@ -157,14 +160,9 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
             f"hand '{spec.name}': base_link '{base}' is moved by joint '{rides[base][0]}'; name a static link"
         )
     T_base_root = np.linalg.inv(rides[base][1])
-    for link, (carrier, T) in rides.items():
-        if carrier is None:
-            rides[link] = (None, T_base_root @ T)
-    for name, carrier in parent_of.items():
-        if carrier is None:
-            pose_of[name] = T_base_root @ pose_of[name]
+    rides |= {link: (None, T_base_root @ T) for link, (carrier, T) in rides.items() if carrier is None}
+    pose_of |= {name: T_base_root @ pose_of[name] for name, carrier in parent_of.items() if carrier is None}
 
-    drive = {j.name: _drive(j, by_name) for j in moving}
     shared = _check_shared(spec, moving, urdf)
     groups = _group(moving, parent_of, drive, shared)
     actuated = [j for j in urdf.joints if j in moving and j.mimic is None]
@@ -187,14 +185,12 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         dof_free.append(len(own))
     order = [j for members in groups for j in members]
     lower, upper = _limits(actuated, moving, drive, spec)
-    opened = np.clip(np.array([spec.open_posture.get(j.name, 0.0) for j in actuated]), lower, upper)
-    settings = _settings(spec, shared, column, opened, lower, upper)
-    links = list(urdf.links)
+    settings = _settings(spec, column, lower, upper)
     # joints that the URDF by itself would leave at 0: locked ones, and those that only hand.yaml couples
     unstated = [j for j in urdf.joints if j.mimic is not None and j.name not in stated]
-    held = [(j, _fixed_value(j, spec.locked, by_name)) for j in urdf.joints if j.name in spec.locked or j in unstated]
-    locked = [(j, value) for j, value in held if value is not None]
-    coupled = [(j, drive[j.name]) for j in unstated if j.name in drive]
+    locked = [j for j in urdf.joints if j.name in fixed and (j.name in spec.locked or j in unstated)]
+    coupled = [j for j in unstated if j.name not in fixed]
+    coupling = [drive[j.name] for j in coupled]
     return Tree(
         base_link=base,
         joint_names=tuple(j.name for j in actuated),
@@ -214,18 +210,41 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         dof_free=np.array(dof_free, np.int32),
         shared_names=shared,
         settings=settings,
-        locked_names=tuple(j.name for j, _ in locked),
-        locked_values=np.array([value for _, value in locked], np.float32),
-        locked_limits=_own_limits([j for j, _ in locked]),
-        coupled_names=tuple(j.name for j, _ in coupled),
-        coupled_column=np.array([column[source] for _, (source, _, _) in coupled], np.int32),
-        coupled_mult=np.array([mult for _, (_, mult, _) in coupled], np.float32),
-        coupled_offset=np.array([offset for _, (_, _, offset) in coupled], np.float32),
-        coupled_limits=_own_limits([j for j, _ in coupled]),
-        link_names=tuple(links),
-        link_body=np.array([0 if (c := rides[n][0]) is None else body[c] for n in links], np.int32),
-        T_body_link=np.array([rides[n][1] for n in links]),
+        locked_names=tuple(j.name for j in locked),
+        locked_values=np.array([fixed[j.name] for j in locked], np.float32),
+        locked_limits=_own_limits(locked),
+        coupled_names=tuple(j.name for j in coupled),
+        coupled_column=np.array([column[source] for source, _, _ in coupling], np.int32),
+        coupled_mult=np.array([mult for _, mult, _ in coupling], np.float32),
+        coupled_offset=np.array([offset for _, _, offset in coupling], np.float32),
+        coupled_limits=_own_limits(coupled),
+        link_names=tuple(urdf.links),
+        link_body=np.array([0 if (c := rides[n][0]) is None else body[c] for n in urdf.links], np.int32),
+        T_body_link=np.array([rides[n][1] for n in urdf.links]),
     )
+
+
+def _check_names(urdf: Urdf, spec: HandSpec, base: str) -> None:
+    """The joints and links that the rules name exist, and locked joints may be where they are held."""
+    movable = {j.name: j for j in urdf.joints if j.movable}
+    for name, value in spec.locked.items():
+        joint = movable.get(name)
+        if joint is None:
+            raise HandError(f"hand '{spec.name}': locked joint '{name}' is not a movable joint of {urdf.path}")
+        if not joint.lower - 1e-6 <= value <= joint.upper + 1e-6:
+            limits = f"[{joint.lower}, {joint.upper}]"
+            raise HandError(f"hand '{spec.name}': locked joint '{name}' = {value} is outside its limits {limits}")
+        if joint.mimic is not None:
+            source = f"follows joint '{joint.mimic[0]}'; lock that one instead"
+            raise HandError(f"hand '{spec.name}': joint '{name}' is locked but {source}")
+    for name in spec.open_posture:
+        if name not in movable:
+            raise HandError(f"hand '{spec.name}': open_posture names '{name}', not a movable joint of {urdf.path}")
+    for link in (*spec.static_links, *itertools.chain(*spec.fingers.values())):
+        if link not in urdf.links:
+            raise HandError(f"hand '{spec.name}': '{link}' (static_links or fingers) is not a link of {urdf.path}")
+    if base not in urdf.links:
+        raise HandError(f"hand '{spec.name}': base_link '{base}' is not a link of {urdf.path}")
 
 
 def _with_mimic(urdf: Urdf, spec: HandSpec) -> Urdf:
@@ -277,27 +296,20 @@ def _check_shared(spec: HandSpec, moving: list[Joint], urdf: Urdf) -> tuple[str,
     return tuple(spec.shared)
 
 
-def _settings(
-    spec: HandSpec,
-    shared: tuple[str, ...],
-    column: dict[str, int],
-    opened: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-) -> np.ndarray:
-    rows = []
-    for values in itertools.product(*(spec.shared[name] for name in shared)):
-        row = opened.copy()
-        for name, value in zip(shared, values, strict=True):
-            k = column[name]
-            if not lower[k] - 1e-4 <= value <= upper[k] + 1e-4:
-                raise HandError(
-                    f"hand '{spec.name}': shared joint '{name}' = {value} is outside its limits "
-                    f"[{lower[k]:g}, {upper[k]:g}]"
-                )
-            row[k] = min(max(value, lower[k]), upper[k])
-        rows.append(row)
-    return np.array(rows, np.float32)
+def _settings(spec: HandSpec, column: dict[str, int], lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """The open posture with the shared joints at each combination of their values, (V, K) f32."""
+    names = list(column)
+    opened = np.clip([spec.open_posture.get(name, 0.0) for name in names], lower, upper)
+    for name, values in spec.shared.items():
+        low, high = lower[column[name]], upper[column[name]]
+        for value in values:
+            if not low - 1e-4 <= value <= high + 1e-4:
+                limits = f"[{low:g}, {high:g}]"
+                raise HandError(f"hand '{spec.name}': shared joint '{name}' = {value} is outside its limits {limits}")
+    rows = np.array([[*opened]] * int(np.prod([len(values) for values in spec.shared.values()])))
+    columns = [column[name] for name in spec.shared]
+    rows[:, columns] = list(itertools.product(*spec.shared.values()))
+    return np.clip(rows, lower, upper).astype(np.float32)
 
 
 def _group(
@@ -310,9 +322,14 @@ def _group(
 
     Joints driven by a shared one join no groups; each group gets a copy of those below which its joints are mounted.
     """
-    by_name = {j.name: j for j in moving}
     framing = {j.name for j in moving if drive[j.name][0] in shared}
     label = {j.name: j.name for j in moving if j.name not in framing}
+
+    def above(name: str) -> Iterator[str]:
+        up = parent_of[name]
+        while up is not None:
+            yield up
+            up = parent_of[up]
 
     def find(name: str) -> str:
         while label[name] != name:
@@ -320,60 +337,48 @@ def _group(
         return name
 
     for name in label:
-        up = parent_of[name]
-        while up is not None and up in framing:
-            up = parent_of[up]
-        for other in (up, drive[name][0]):
-            if other is not None:
-                label[find(name)] = find(other)
+        for other in (next((up for up in above(name) if up not in framing), name), drive[name][0]):
+            label[find(name)] = find(other)
     members: dict[str, set[str]] = {}
     for name in label:
-        members.setdefault(find(name), set()).add(name)
-    for names in members.values():
-        for name in list(names):
-            up = parent_of[name]
-            while up is not None:
-                names.add(up)
-                up = parent_of[up]
+        members.setdefault(find(name), set()).update((name, *above(name)))
     # links on framing joints that carry no finger go with the first group
     first = next(iter(members.values()))
     for name in framing - set().union(*members.values()):
-        up: str | None = name
-        while up is not None:
-            first.add(up)
-            up = parent_of[up]
-    position = {name: i for i, name in enumerate(by_name)}
-    return [[by_name[n] for n in sorted(names, key=position.__getitem__)] for names in members.values()]
+        first.update((name, *above(name)))
+    return [[j for j in moving if j.name in names] for names in members.values()]
 
 
-def _drive(j: Joint, by_name: dict[str, Joint]) -> tuple[str, float, float]:
-    """The actuated joint behind j, with multiplier and offset composed along the mimic chain."""
-    mult, offset = 1.0, 0.0
-    while j.mimic is not None:
-        source, m, b = j.mimic
-        # x_j = m * x_source + b
-        offset += mult * b
-        mult *= m
-        j = by_name[source]
-    return j.name, mult, offset
+def _drives(urdf: Urdf) -> dict[str, tuple[str, float, float]]:
+    """Of each movable joint: the one behind it, with multiplier and offset composed along the mimic chain."""
+    by_name = {j.name: j for j in urdf.joints}
+    drives = {}
+    for joint in (j for j in urdf.joints if j.movable):
+        at, mult, offset = joint, 1.0, 0.0
+        while at.mimic is not None:
+            source, m, b = at.mimic
+            # x_at = m * x_source + b
+            at, mult, offset = by_name[source], mult * m, offset + mult * b
+        drives[joint.name] = (at.name, mult, offset)
+    return drives
 
 
 def _limits(
     actuated: list[Joint], moving: list[Joint], drive: dict[str, tuple[str, float, float]], spec: HandSpec
 ) -> tuple[np.ndarray, np.ndarray]:
     """Limits of the actuated joints [rad or m], narrowed so that every mimic joint stays inside its own."""
-    lower = {j.name: j.lower for j in actuated}
-    upper = {j.name: j.upper for j in actuated}
+    limits = {j.name: (j.lower, j.upper) for j in actuated}
     for j in moving:
         source, mult, offset = drive[j.name]
         if j.mimic is None or mult == 0.0:
             continue
         a, b = sorted(((j.lower - offset) / mult, (j.upper - offset) / mult))
-        lower[source], upper[source] = max(lower[source], a), min(upper[source], b)
-    for j in actuated:
-        if lower[j.name] >= upper[j.name]:
+        limits[source] = max(limits[source][0], a), min(limits[source][1], b)
+    for name, (lower, upper) in limits.items():
+        if lower >= upper:
             raise HandError(
-                f"hand '{spec.name}': joint '{j.name}' has no room left; the limits of the joints that mimic it "
+                f"hand '{spec.name}': joint '{name}' has no room left; the limits of the joints that mimic it "
                 "exclude each other"
             )
-    return np.array([lower[j.name] for j in actuated]), np.array([upper[j.name] for j in actuated])
+    lower, upper = np.array(list(limits.values())).T
+    return lower, upper

@@ -2,7 +2,8 @@
 
 import math
 import os
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,9 +66,8 @@ def read_urdf(path: Path) -> Urdf:
     except OSError as error:
         raise HandError(f"URDF {path} cannot be read: {error.strerror}") from None
     tree, raw = parse_robot(path, raw)
-    for part in (*tree.findall("link"), *tree.findall("joint")):
-        if not part.get("name", "") or not part.get("name").isprintable():
-            name = part.get("name")
+    for name in (part.get("name") for part in (*tree.findall("link"), *tree.findall("joint"))):
+        if not name or not name.isprintable():
             raise HandError(f"URDF {path} has a link or joint named {name!r}; every one needs a printable name")
     links: dict[str, tuple[Geometry, ...]] = {}
     meshes: dict[str, Path] = {}
@@ -76,14 +76,12 @@ def read_urdf(path: Path) -> Urdf:
         if name in links:
             raise HandError(f"URDF {path}: link '{name}' is declared twice; names must be unique")
         links[name] = tuple(_geometry(path, name, c, meshes) for c in link.findall("collision"))
-    joints = [_joint(path, j, links) for j in tree.findall("joint")]
-    ordered, root = _order(path, links, joints)
-    if not any(j.movable for j in ordered):
+    joints, root = _order(path, links, [_joint(path, j, links) for j in tree.findall("joint")])
+    if not any(j.movable for j in joints):
         raise HandError(f"URDF {path} has no movable joint; a hand needs revolute, continuous or prismatic joints")
-    check_mimic(path, ordered)
-    return Urdf(
-        path, tree.get("name") or path.stem, raw.decode("utf-8", "replace"), root, links, tuple(ordered), meshes
-    )
+    check_mimic(path, joints)
+    name, text = tree.get("name") or path.stem, raw.decode("utf-8", "replace")
+    return Urdf(path, name, text, root, links, tuple(joints), meshes)
 
 
 def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
@@ -97,7 +95,7 @@ def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
     except (etree.XMLSyntaxError, ValueError) as error:
         tree = _without_prefixed(raw)
         if tree is None:
-            raise HandError(f"URDF {path} is not XML: {_one_line(error)}") from None
+            raise HandError(f"URDF {path} is not XML: {' '.join(str(error).split())[:200]}") from None
         raw = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
     if tree.getroottree().docinfo.doctype:
         raise HandError(f"URDF {path} declares a DOCTYPE; entity declarations are not accepted, remove them")
@@ -127,21 +125,22 @@ def _without_prefixed(raw: bytes) -> etree._Element | None:
     return tree
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200]
+def numbers(element: etree._Element | None, key: str, default: str) -> np.ndarray:
+    """The numbers of an attribute, separated by whitespace, (n,).
+
+    Raises:
+        ValueError: something else in it.
+    """
+    return np.array((default if element is None else element.get(key, default)).split(), float)
 
 
 def _numbers(path: Path, where: str, element: etree._Element, key: str, default: str | None = None) -> np.ndarray:
-    """The numbers of an attribute, separated by spaces or commas, (n,).
-
-    Raises:
-        HandError: no such attribute, or something else in it.
-    """
+    """As :func:`numbers`; without a default the attribute must be there."""
     text = element.get(key, default)
     if text is None:
         raise HandError(f"URDF {path} is malformed: <{element.tag}> of {where} has no {key}")
     try:
-        return np.array([float(word) for word in text.replace(",", " ").split()])
+        return numbers(element, key, text)
     except ValueError:
         raise HandError(f"URDF {path} is malformed: {where}: {key}={text[:80]!r}; numbers are needed") from None
 
@@ -156,8 +155,7 @@ def _number(path: Path, where: str, element: etree._Element, key: str, default: 
 def _origin(path: Path, where: str, element: etree._Element) -> np.ndarray:
     """The transform (4, 4) of the <origin> of an element: roll, pitch, yaw about fixed axes, then xyz."""
     T = np.eye(4)
-    origin = element.find("origin")
-    if origin is None:
+    if (origin := element.find("origin")) is None:
         return T
     xyz, rpy = (_numbers(path, where, origin, key, "0 0 0") for key in ("xyz", "rpy"))
     if xyz.shape != (3,) or rpy.shape != (3,) or not np.isfinite([xyz, rpy]).all():
@@ -189,12 +187,11 @@ def _geometry(path: Path, link: str, collision: etree._Element, meshes: dict[str
                 f"URDF {path}: mesh '{name}' has scale {scale.tolist()}; three numbers other than 0 are needed"
             )
         meshes[name] = find_mesh(path, link, name)
-        return Geometry(kind, tuple(float(x) for x in np.broadcast_to(scale, 3)), origin, name)
+        return Geometry(kind, tuple(np.broadcast_to(scale, 3).tolist()), origin, name)
+    keys = {"sphere": ("radius",), "cylinder": ("radius", "length")}.get(kind, ())
+    size = tuple(_number(path, where, shape, key) for key in keys)
     if kind == "box":
-        size = tuple(float(x) for x in _numbers(path, where, shape, "size"))
-    else:
-        keys = ("radius", "length") if kind == "cylinder" else ("radius",)
-        size = tuple(_number(path, where, shape, key) for key in keys)
+        size = tuple(_numbers(path, where, shape, "size").tolist())
     if (kind == "box" and len(size) != 3) or not all(x > 0 and math.isfinite(x) for x in size):
         raise HandError(f"URDF {path}: {where} has a {kind} of size {size}; sizes must be positive")
     return Geometry(kind, size, origin)
@@ -268,11 +265,10 @@ def _order(path: Path, links: dict[str, tuple[Geometry, ...]], joints: list[Join
     """Joints parents before children (file order among siblings), and the root link."""
     into: dict[str, str] = {}
     out: dict[str, list[Joint]] = {name: [] for name in links}
-    names = [j.name for j in joints]
-    for name in names:
-        if names.count(name) > 1:
-            raise HandError(f"URDF {path}: joint '{name}' is declared twice; names must be unique")
+    names = Counter(j.name for j in joints)
     for j in joints:
+        if names[j.name] > 1:
+            raise HandError(f"URDF {path}: joint '{j.name}' is declared twice; names must be unique")
         if j.child in into:
             raise HandError(
                 f"URDF {path}: link '{j.child}' has two parent joints ('{into[j.child]}', '{j.name}'); "
@@ -284,20 +280,18 @@ def _order(path: Path, links: dict[str, tuple[Geometry, ...]], joints: list[Join
     if len(roots) != 1:
         found = f"{len(roots)} root links ({', '.join(roots[:4])})" if roots else "a joint loop and no root link"
         raise HandError(f"URDF {path} has {found}; the links must form one tree")
-    ordered, stack = [], list(reversed(out[roots[0]]))
+    ordered, stack = [], out[roots[0]][::-1]
     while stack:
-        j = stack.pop()
-        ordered.append(j)
-        stack.extend(reversed(out[j.child]))
+        ordered.append(stack.pop())
+        stack += out[ordered[-1].child][::-1]
     if len(ordered) != len(joints):
         lost = next(j.name for j in joints if j not in ordered)
         raise HandError(f"URDF {path}: joint '{lost}' is part of a loop; the links must form a tree")
     return ordered, roots[0]
 
 
-def check_mimic(path: Path, joints: Iterable[Joint]) -> None:
+def check_mimic(path: Path, joints: Sequence[Joint]) -> None:
     """Raises HandError when a joint mimics none that moves, or itself through others."""
-    joints = list(joints)
     by_name = {j.name: j for j in joints}
     for j in joints:
         seen, at = {j.name}, j

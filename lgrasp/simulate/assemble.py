@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
 from lgrasp.hand.geometry import Piece
-from lgrasp.hand.urdf import parse_robot
+from lgrasp.hand.urdf import numbers, parse_robot
 from lgrasp.simulate.builder import add_drive, add_hull, add_solid, set_compiler, set_contact, set_joint, set_options
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import HandSolids
@@ -64,14 +64,10 @@ def _link(joint: etree._Element, end: str) -> str:
     return "" if element is None else element.get("link", "")
 
 
-def _numbers(element: etree._Element | None, key: str, default: str) -> np.ndarray:
-    return np.array((default if element is None else element.get(key, default)).split(), float)
-
-
 def _weld(joint: etree._Element, value: float) -> None:
     """Fix a joint where it is: its motion becomes part of its origin."""
-    origin, axis = joint.find("origin"), _numbers(joint.find("axis"), "xyz", "1 0 0")
-    xyz, turn = _numbers(origin, "xyz", "0 0 0"), Rotation.from_euler("xyz", _numbers(origin, "rpy", "0 0 0"))
+    origin, axis = joint.find("origin"), numbers(joint.find("axis"), "xyz", "1 0 0")
+    xyz, turn = numbers(origin, "xyz", "0 0 0"), Rotation.from_euler("xyz", numbers(origin, "rpy", "0 0 0"))
     step = axis / np.linalg.norm(axis) * value
     if joint.get("type") == "prismatic":
         xyz = xyz + turn.apply(step)

@@ -9,7 +9,7 @@ import pytest
 import yaml
 import yourdfpy
 
-from lgrasp.hand.contacts import finger_points, palm_points
+from lgrasp.hand.contacts import link_points
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.geometry import geometry_mesh
 from lgrasp.hand.spec import load_spec
@@ -112,11 +112,11 @@ def test_every_finger_and_palm_has_contact_points(name):
     assert {group[link] for rule in spec.contact for link in rule.links} == set(range(tree.groups))
     for rule in spec.contact:
         for link in rule.links:
-            assert len(finger_points(solids(link), np.eye(4), rule.forbidden, rng)[0]) > 100, link
+            assert len(link_points(solids(link), np.eye(4), rule.forbidden, rng)[0]) > 100, link
     assert bool(spec.palm.links) == (name != "dclaw")
     for link in spec.palm.links:
         assert group[link] < 0
-        assert len(palm_points(solids(link), np.eye(4), spec.palm.allowed, rng)[0]) > 100, link
+        assert len(link_points(solids(link), np.eye(4), spec.palm.allowed, rng, palm=True)[0]) > 100, link
 
 
 def test_names_limits_and_coupling_equal_the_real_model(name):

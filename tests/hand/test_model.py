@@ -10,7 +10,7 @@ from support.hands import HANDS, hand_model, hand_source, minimal_spec
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
-from lgrasp.hand.contacts import finger_points
+from lgrasp.hand.contacts import link_points
 from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
@@ -286,7 +286,7 @@ def test_recessed_surface_is_no_contact():
     """Between two ribs an object meets the ribs first; their tops and the plate's underside may touch."""
     plate = trimesh.creation.box((0.04, 0.04, 0.005))
     ribs = [trimesh.creation.box((0.005, 0.04, 0.005)).apply_translation((x, 0, 0.005)) for x in (-0.0075, 0.0075)]
-    points, normals = finger_points([plate, *ribs], np.eye(4), (), np.random.default_rng(0))
+    points, normals = link_points([plate, *ribs], np.eye(4), (), np.random.default_rng(0))
     up = normals[:, 2] > 0.99
     assert (points[up, 2] > 0.0074).mean() > 0.5
     assert not (up & (np.abs(points[:, 0]) < 0.005)).any()

@@ -1,5 +1,6 @@
 """Survey of a hand with given joints locked: palmar surface, contact cones, and the best place to hold something."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,7 +8,6 @@ import numpy as np
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.finger_structure import FingerStructure, probe_spec, tip_link
 from lgrasp.hand.drafting.reach import Hold, Touch, best_hold, finger_touches, still_touches
-from lgrasp.hand.geometry import Piece
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import Postures, sample_bodies
 from lgrasp.hand.surface import SurfaceSamples
@@ -56,11 +56,10 @@ def survey_contacts(
         jaws: (static link, moving link) of a gripper whose one drive closes them; nothing else touches then.
     """
     model = build_hand(urdf.path, probe_spec(name, tip_link(urdf, structure), locked, structure.base_link))
-    rng = np.random.default_rng(0)
     tree = model.tree
-    postures = sample_bodies(model, rng.uniform(tree.joint_lower, tree.joint_upper, (_SAMPLED_POSTURES, model.dofs)))
+    postures = sample_bodies(model, model.random_postures(_SAMPLED_POSTURES))
     surfaces = link_surfaces(urdf, model)
-    used = structure.tips if jaws is None else (int(tree.link_body[tree.link_names.index(jaws[1])]),)
+    used = structure.tips if jaws is None else (tree.body_of(jaws[1]),)
     tips = {b: tip_point([s for s in surfaces if s.body == b], 0.2) for b in used}
     if jaws is not None:
         tips[0] = tip_point([s for s in surfaces if s.link == jaws[0]] or [s for s in surfaces if s.body == 0], 0.2)
@@ -68,44 +67,30 @@ def survey_contacts(
         tips[0] = _nearest_static(surfaces, postures, used[0], tips[used[0]])
     surfaces = surface_visibility(surfaces, postures, tips)
     sides = {tip: found for tip in used if (found := _finger_sides(structure, model, surfaces, tip))}
-    touches = [
-        finger_touches(str(tip), postures, int(tree.body_group[tip]), tip, *_allowed(found, tip))
-        for tip, found in sides.items()
-    ]
-    touches = _one_per_group(touches, structure)
+    touches: dict[int, Touch] = {}
+    for tip, found in sides.items():
+        group = int(tree.body_group[tip])
+        touch = finger_touches(str(group), postures, group, tip, *_allowed(found, tip))
+        if group in touches:  # tips that one group moves together count as one holder: a finger makes one contact
+            pairs = zip(touches[group][1:], touch[1:], strict=True)
+            touch = Touch(touch.name, *(np.vstack(pair) for pair in pairs))
+        touches[group] = touch
     depth = static_depth(model)
-
-    def blocked(p: np.ndarray) -> np.ndarray:
-        return depth(p) < 0.016
-
-    hold = best_hold(touches, blocked)
+    hold = best_hold(touches.values(), depth)
     palm = _palm_sides([s for s in surfaces if s.body == 0], None if hold is None else hold.centre)
     if palm:
-        points, normals = _allowed(palm, 0)
-        hold = best_hold([*touches, still_touches("palm", points, normals, 8 * _SAMPLED_POSTURES)], blocked)
+        still = still_touches("palm", *_allowed(palm, 0), 8 * _SAMPLED_POSTURES)
+        hold = best_hold([*touches.values(), still], depth)
     return ContactSurvey(model, structure, locked, postures, surfaces, sides, palm, hold)
 
 
 def _nearest_static(surfaces: list[SurfaceSamples], postures: Postures, body: int, tip: np.ndarray) -> np.ndarray:
     """The point of the static links that a lone fingertip comes nearest to."""
     rows = np.flatnonzero(postures.clear.all(1))[:100]
-    way = np.einsum("nij,j->ni", postures.R[rows, body], tip) + postures.t[rows, body]
+    way = postures.place(rows, body, tip)
     still = np.vstack([s.points for s in surfaces if s.body == 0])
     gap = np.linalg.norm(still[:, None] - way[None], axis=2) if len(way) else np.zeros((len(still), 1))
     return still[np.argmin(gap.min(1))]
-
-
-def _one_per_group(touches: list[Touch], structure: FingerStructure) -> list[Touch]:
-    """Tips that one group moves together count as one holder: a finger makes one contact."""
-    merged: dict[str, Touch] = {}
-    for t in touches:
-        key = "palm" if t.name == "palm" else str(int(structure.tree.body_group[int(t.name)]))
-        if key in merged:
-            points, normals = np.vstack([merged[key].points, t.points]), np.vstack([merged[key].normals, t.normals])
-            merged[key] = Touch(key, points, normals)
-        else:
-            merged[key] = Touch(key, t.points, t.normals)
-    return list(merged.values())
 
 
 def _allowed(sides: list[Side], body: int) -> tuple[np.ndarray, np.ndarray]:
@@ -127,22 +112,20 @@ def _finger_sides(structure: FingerStructure, model: HandModel, surfaces: list[S
     along = _along(distal)
     across = _across(model, axis, along, tip)
     if across is not None and len(structure.driven_by(tip)) >= 3:
-        sides = [_side(s, [(-along, 91.0), (-across, 60.0)]) for s in distal]
-        sides = [side for side in sides if side.area >= _MIN_TIP_AREA]
+        sides = _sides(distal, [(-along, 91.0), (-across, 60.0)], _MIN_TIP_AREA)
         if sides:
             return sides
     if across is not None:
         axis = across + 0.5 * along
         axis /= np.linalg.norm(axis)
-    sides = [_side(s, [(-axis, 105.0)]) for s in distal]
-    sides = [side for side in sides if side.area >= _MIN_LINK_AREA]
-    before = structure.parent(tip)
+    sides = _sides(distal, [(-axis, 105.0)], _MIN_LINK_AREA)
+    before = int(structure.tree.body_parent[tip])
     if sides and structure.tree.groups > 1 and before > 0 and before not in structure.tips:
         inner = [s for s in surfaces if s.body == before]
-        siblings = [t for t in structure.tips if t != tip and before in structure.path(t)]
+        siblings = [t for t in structure.tips if t != tip and before in structure.tree.path(t)]
         axis = _palmar_axis(model, inner, before) if inner and not siblings else None
         if axis is not None:
-            more = [side for s in inner if (side := _side(s, [(-axis, 120.0)])).area >= _MIN_LINK_AREA]
+            more = _sides(inner, [(-axis, 120.0)], _MIN_LINK_AREA)
             shown = sum(s.samples.seen[s.chosen].mean() * s.area for s in more)
             if shown > 0.7 * sum(s.samples.seen[s.chosen].mean() * s.area for s in sides) and shown > 1e-4:
                 sides += more
@@ -205,6 +188,11 @@ def _side(samples: SurfaceSamples, forbidden: list[tuple[np.ndarray, float]]) ->
     return Side(samples, mean / np.linalg.norm(mean), cones, chosen, samples.area * float(chosen.mean()))
 
 
+def _sides(surfaces: list[SurfaceSamples], forbidden: list[tuple[np.ndarray, float]], least: float) -> list[Side]:
+    """What forbidden cones leave of the surface of links, where that is ``least`` [m^2] or more."""
+    return [side for s in surfaces if (side := _side(s, forbidden)).area >= least]
+
+
 def _palm_sides(surfaces: list[SurfaceSamples], centre: np.ndarray | None) -> list[Side]:
     """Static links whose surface the fingertips see, those that agree with the best one's direction in their own frame.
 
@@ -232,16 +220,9 @@ def _palm_sides(surfaces: list[SurfaceSamples], centre: np.ndarray | None) -> li
     return sides[:4]
 
 
-def static_depth(model: HandModel):
+def static_depth(model: HandModel) -> Callable[[np.ndarray], np.ndarray]:
     """Function of points (n, 3) [m] -> lower bound of their distance to the static links (n,) [m]."""
-    pieces = [
-        Piece(
-            model.vertices[model.vertex_first[p] : model.vertex_first[p + 1]],
-            model.planes[model.plane_first[p] : model.plane_first[p + 1]],
-            float(model.piece_radius[p]),
-        )
-        for p in range(model.piece_first[0], model.piece_first[1])
-    ]
+    pieces = [model.piece(i) for i in range(model.piece_first[1])]
 
     def depth(points: np.ndarray) -> np.ndarray:
         return np.min([np.full(len(points), np.inf), *(p.depth(points) for p in pieces)], 0)

@@ -1,5 +1,6 @@
 """URDF -> hand.yaml without a human: fingers, palmar surface, canonical box, open posture, and why."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
-from lgrasp.hand.drafting.contact_survey import ContactSurvey, survey_contacts
+from lgrasp.hand.drafting.contact_survey import ContactSurvey, Side, survey_contacts
 from lgrasp.hand.drafting.finger_structure import (
     FingerStructure,
     finger_names,
@@ -19,6 +20,7 @@ from lgrasp.hand.drafting.finger_structure import (
 )
 from lgrasp.hand.drafting.lateral_surfaces import rounded_axis
 from lgrasp.hand.drafting.propose import propose_spaces
+from lgrasp.hand.drafting.reach import Hold
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.spec import HandSpec
@@ -53,25 +55,30 @@ def draft_spec(
     survey = _best_survey(urdf, structure, name, jaws)
     _check_size(urdf, survey)
     _check_hold(urdf, survey)
-    decided: list[str] = []
-    data: dict[str, Any] = {"name": name, "urdf": urdf_path.name, "base_link": survey.model.tree.base_link}
-    if structure.base_link:
-        decided.append(f"base frame: '{structure.base_link}', which carries the fingers (base_link)")
-    else:
-        decided.append(f"base frame: the root link '{urdf.root}' (base_link)")
-    data["locked"] = survey.locked
-    decided += _say_locked(survey)
-    names = finger_names(structure)
-    data["static_links"] = [
-        n for n, b in zip(survey.model.tree.link_names, survey.model.tree.link_body, strict=True) if b == 0
-    ]
-    data["contact"] = _contact_rules(survey)
-    data["palm"] = _palm_rule(survey)
-    decided += _say_contacts(survey, names)
     assert survey.hold is not None
+    tree, names = survey.model.tree, finger_names(structure)
     low, high = np.round(survey.hold.low, 3), np.round(survey.hold.high, 3)
-    data["canonical_box"] = {"min": low.tolist(), "max": high.tolist()}
-    decided.append(_say_box(survey, names, low, high))
+    opened, clear = _open_posture(survey)
+    group = structure.tree.body_group
+    data: dict[str, Any] = {
+        "name": name,
+        "urdf": urdf_path.name,
+        "base_link": tree.base_link,
+        "locked": survey.locked,
+        "static_links": tree.links_on(0),
+        "contact": _contact_rules(survey),
+        "palm": _palm_rule(survey),
+        "canonical_box": {"min": low.tolist(), "max": high.tolist()},
+        "open_posture": opened,
+        "fingers": {
+            finger: [link for b in np.flatnonzero(group == g) for link in structure.tree.links_on(int(b))]
+            for g, finger in enumerate(names)
+        },
+    }
+    carrier = f"'{structure.base_link}', which carries the fingers"
+    base = carrier if structure.base_link else f"the root link '{urdf.root}'"
+    decided = [f"base frame: {base} (base_link)", *_say_locked(survey), *_say_contacts(survey, names)]
+    decided.append(_say_box(survey.hold, names, low, high))
     drives = [len(d) for tip, d in zip(structure.tips, structure.drives, strict=True) if tip in survey.sides]
     if structure.tree.groups > 1 and np.mean(drives) <= _FEW_DRIVES:
         data["contacts"] = (2, 3)
@@ -79,21 +86,8 @@ def draft_spec(
             "grasps touch with 2 or 3 fingers: fingers of one or two drives seldom meet an object more at "
             "a time (contacts)"
         )
-    opened, clear = _open_posture(survey)
-    data["open_posture"] = opened
-    decided.append(
-        "open posture: "
-        + (
-            "free of self-collision, "
-            if clear
-            else "NO sampled posture is free of self-collision, this is the best one; "
-        )
-        + "fingers away from the canonical box (open_posture)"
-    )
-    data["fingers"] = {
-        finger: [n for b in np.flatnonzero(structure.tree.body_group == g) for n in structure.links(int(b))]
-        for g, finger in enumerate(names)
-    }
+    free = "free of self-collision" if clear else "NO sampled posture is free of self-collision, this is the best one"
+    decided.append(f"open posture: {free}{',' if clear else ';'} fingers away from the canonical box (open_posture)")
     decided += [f"note: {note}" for note in survey.model.notes]
     spec = HandSpec.model_validate(data)
     if jaws is None:
@@ -124,14 +118,13 @@ def _with_shared(urdf: Urdf, survey: ContactSurvey, spec: HandSpec, decided: lis
 
 def _freed(urdf: Urdf, spec: HandSpec, shared: dict[str, tuple[float, ...]]) -> HandSpec | None:
     """The rules with locked joints shared; None where the palm would move or a mimic joint does not reach as far."""
-    free = spec.model_copy(
-        update={"locked": {n: v for n, v in spec.locked.items() if n not in shared}, "shared": shared}
-    )
+    locked = {n: v for n, v in spec.locked.items() if n not in shared}
+    free = spec.model_copy(update={"locked": locked, "shared": shared})
     try:
         tree = build_tree(urdf, free)
     except HandError:
         return None
-    static = {n for n, b in zip(tree.link_names, tree.link_body, strict=True) if b == 0}
+    static = set(tree.links_on(0))
     if not static.issuperset(spec.palm.links) or max(np.diff(tree.joint_first)) > MAX_JOINTS:
         return None
     return free.model_copy(update={"static_links": tuple(n for n in spec.static_links if n in static)})
@@ -146,7 +139,7 @@ def _around(best: float, lower: float, upper: float, count: int) -> tuple[float,
 
 def _check_coupled(urdf: Urdf, structure: FingerStructure) -> None:
     if structure.tree.groups == 1 and len(structure.tips) > 1:
-        tips = ", ".join(structure.links(b)[0] for b in structure.tips)
+        tips = structure.first_links(structure.tips)
         raise HandError(
             f"URDF {urdf.path}: one drive moves all fingers ({tips}) together; lgrasp places one contact per drive, so "
             f"they cannot oppose each other: 'lgrasp hands add {urdf.path}' makes one of the two jaws the base"
@@ -174,7 +167,9 @@ def _best_survey(urdf: Urdf, structure: FingerStructure, name: str, jaws: tuple[
     apart = _kept_apart(_unlocked(urdf, name, structure, best.locked)) if spread else set()
 
     def value(s: ContactSurvey) -> tuple[int, float]:
-        return -len(_stuck(s.model, apart)), s.hold.score if s.hold else 0.0
+        # link pairs on different bodies that are not kept apart: they touch in every posture
+        stuck = [a for a, b in apart - _kept_apart(s.model) if s.model.tree.body_of(a) != s.model.tree.body_of(b)]
+        return -len(stuck), s.hold.score if s.hold else 0.0
 
     for share in (0.0, 0.5, 1.0):
         locked = {**best.locked, **{n: held_value(by_name[n], share) for n in spread}}
@@ -202,13 +197,6 @@ def _kept_apart(model: HandModel | None) -> set[tuple[str, str]]:
     return {(names[min(pair)], names[max(pair)]) for pair in model.piece_link[model.pairs].tolist()}
 
 
-def _stuck(model: HandModel, apart: set[tuple[str, str]]) -> set[tuple[str, str]]:
-    """Link pairs of ``apart`` on different bodies that the model does not keep apart: they touch in every posture."""
-    tree = model.tree
-    body = dict(zip(tree.link_names, tree.link_body, strict=True))
-    return {(a, b) for a, b in apart - _kept_apart(model) if body[a] != body[b]}
-
-
 def _check_size(urdf: Urdf, survey: ContactSurvey) -> None:
     t = survey.postures.t.reshape(-1, 3)
     reach = survey.model.body_sphere[survey.model.body_sphere[:, 3] > 0, 3].max()
@@ -226,25 +214,21 @@ def _check_size(urdf: Urdf, survey: ContactSurvey) -> None:
 
 
 def _check_hold(urdf: Urdf, survey: ContactSurvey) -> None:
-    """Refuse what can hold nothing.
-
-    Raises:
-        HandError: with the reason and the remedy.
-    """
+    """Refuse what can hold nothing, with the reason and the remedy."""
     if survey.hold is not None:
         return
     structure = survey.structure
-    moved = int(structure.tree.groups)
-    tips = ", ".join(structure.links(b)[0] for b in structure.tips)
-    if moved == 1 and len(structure.tips) == 1:
+    tips = structure.first_links(structure.tips)
+    if structure.tree.groups == 1 and len(structure.tips) == 1:
         raise HandError(
             f"URDF {urdf.path} has one finger ({tips}) and no static surface opposite to it; a grasp needs two "
             "contacts that face each other: add the missing fingers, or a fixed link that the finger closes against"
         )
     shares = ", ".join(f"{100 * s:.0f} %" for s in survey.postures.clear.mean(0))
     raise HandError(
-        f"URDF {urdf.path}: no two of its {moved} fingers ({tips}) ever face each other across an object of 4 to 6 cm "
-        f"(postures clear of the palm, per finger: {shares}); check joint axes, limits (radians) and mesh scales"
+        f"URDF {urdf.path}: no two of its {structure.tree.groups} fingers ({tips}) ever face each other across an "
+        f"object of 4 to 6 cm (postures clear of the palm, per finger: {shares}); check joint axes, limits (radians) "
+        "and mesh scales"
     )
 
 
@@ -260,13 +244,12 @@ def _say_locked(survey: ContactSurvey) -> list[str]:
 
 def _contact_rules(survey: ContactSurvey) -> list[dict[str, Any]]:
     """One rule per set of links with the same forbidden cones."""
+    sides: dict[str, Side] = {}
+    for side in itertools.chain(*survey.sides.values()):
+        sides.setdefault(side.samples.link, side)
     rules: dict[tuple[tuple[float, ...], ...], list[str]] = {}
-    named: set[str] = set()
-    for side in (s for sides in survey.sides.values() for s in sides):
-        if side.samples.link not in named:
-            key = tuple((*rounded_axis(axis), angle) for axis, angle in side.forbidden)
-            rules.setdefault(key, []).append(side.samples.link)
-            named.add(side.samples.link)
+    for link, side in sides.items():
+        rules.setdefault(tuple((*rounded_axis(axis), angle) for axis, angle in side.forbidden), []).append(link)
     return [
         {"links": links, "forbidden": [{"axis": list(cone[:3]), "angle": cone[3]} for cone in cones]}
         for cones, links in rules.items()
@@ -282,49 +265,29 @@ def _palm_rule(survey: ContactSurvey) -> dict[str, Any]:
 
 def _say_contacts(survey: ContactSurvey, names: list[str]) -> list[str]:
     decided = []
-    group = survey.structure.tree.body_group
+    structure = survey.structure
     for g, finger in enumerate(names):
-        tips = [t for t in survey.structure.tips if group[t] == g]
+        tips = [t for t in structure.tips if structure.tree.body_group[t] == g]
         sides = {s.samples.link: s for t in tips for s in survey.sides.get(t, [])}
-        joints = len(
-            set().union(*(d for t, d in zip(survey.structure.tips, survey.structure.drives, strict=True) if t in tips))
-        )
-        if sides:
-            area = 1e4 * sum(s.area for s in sides.values())
-            decided.append(
-                f"finger '{finger}': {joints} drives, may touch with {', '.join(sides)} ({area:.1f} cm2; contact)"
-            )
-        else:
-            decided.append(
-                f"finger '{finger}': {joints} drives, shows the others no surface, so it touches nothing (contact)"
-            )
+        area = 1e4 * sum(s.area for s in sides.values())
+        touches = f"may touch with {', '.join(sides)} ({area:.1f} cm2; contact)"
+        nothing = "shows the others no surface, so it touches nothing (contact)"
+        joints = len(frozenset().union(*(structure.driven_by(tip) for tip in tips)))
+        decided.append(f"finger '{finger}': {joints} drives, {touches if sides else nothing}")
         if len(tips) > 1:
             decided.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
-    if survey.palm:
-        area = 1e4 * sum(s.area for s in survey.palm)
-        decided.append(
-            f"palm: {', '.join(s.samples.link for s in survey.palm)} ({area:.0f} cm2 face the fingertips; palm)"
-        )
-    else:
-        decided.append("palm: none; no static link shows the fingertips 3 cm2 or more (palm)")
-    return decided
+    if not survey.palm:
+        return [*decided, "palm: none; no static link shows the fingertips 3 cm2 or more (palm)"]
+    links, area = ", ".join(s.samples.link for s in survey.palm), 1e4 * sum(s.area for s in survey.palm)
+    return [*decided, f"palm: {links} ({area:.0f} cm2 face the fingertips; palm)"]
 
 
-def _say_box(survey: ContactSurvey, names: list[str], low: np.ndarray, high: np.ndarray) -> str:
-    hold = survey.hold
-    assert hold is not None
-
-    def label(key: str) -> str:
-        return "palm" if key == "palm" else names[int(key)]
-
-    pairs = [f"{label(a)}-{label(b)}" for (a, b), v in sorted(hold.opposing.items(), key=lambda x: -x[1]) if v > 0.3]
+def _say_box(hold: Hold, names: list[str], low: np.ndarray, high: np.ndarray) -> str:
+    label = {str(g): name for g, name in enumerate(names)} | {"palm": "palm"}
+    pairs = [f"{label[a]}-{label[b]}" for (a, b), v in sorted(hold.opposing.items(), key=lambda x: -x[1]) if v > 0.3]
     place = " x ".join(f"[{a:.3f}, {b:.3f}]" for a, b in zip(low, high, strict=True))
-    able = [label(k) for k, v in hold.able.items() if v > 0.3]
-    who = (
-        f"{', '.join(pairs[:6])} face each other there"
-        if pairs
-        else f"{', '.join(able)} reach it, none straight opposite"
-    )
+    able = ", ".join(label[k] for k, v in hold.able.items() if v > 0.3)
+    who = f"{', '.join(pairs[:6])} face each other there" if pairs else f"{able} reach it, none straight opposite"
     return f"canonical box: {place} m, where a 4-6 cm ball is held best: {who} (canonical_box)"
 
 
@@ -344,9 +307,8 @@ def _open_posture(survey: ContactSurvey) -> tuple[dict[str, float], bool]:
     q = np.clip(q, np.minimum(rest, lower + 0.01 * span), np.maximum(rest, upper - 0.01 * span))
     postures = sample_bodies(model, q)
     away = np.full(len(q), np.inf)
-    for side in (s for sides in survey.sides.values() for s in sides):
-        b = side.samples.body
-        p = np.einsum("nij,kj->nki", postures.R[:, b], side.samples.points[::8]) + postures.t[:, None, b]
+    for side in itertools.chain(*survey.sides.values()):
+        p = postures.place(slice(None), [side.samples.body], side.samples.points[::8])  # (N, k, 3)
         outside = np.maximum(np.maximum(survey.hold.low - p, p - survey.hold.high), 0.0)
         away = np.minimum(away, np.linalg.norm(outside, axis=2).min(1))
     cost = np.abs((q - rest) / span).mean(1)

@@ -1,11 +1,12 @@
 """Which parts of a kinematic tree are fingers, and which joints must be locked so that fingers move one by one."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lgrasp.errors import HandError
-from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Joint, Urdf
 
@@ -27,49 +28,26 @@ class FingerStructure:
     tips: tuple[int, ...]
     drives: tuple[frozenset[str], ...]  # actuated joints that move each tip
 
-    def parent(self, body: int) -> int:
-        """Body that a body is mounted on, 0 = static base."""
-        group = int(self.tree.body_group[body])
-        up = int(self.tree.joint_parent[body - 1])
-        return 0 if up < 0 else 1 + int(self.tree.joint_first[group]) + up
-
-    def path(self, body: int) -> list[int]:
-        """Bodies from the base (left out) to a body."""
-        out = []
-        while body > 0:
-            out.append(body)
-            body = self.parent(body)
-        return out[::-1]
-
     def driven_by(self, body: int) -> frozenset[str]:
         """Actuated joints that move a body."""
-        if body == 0:
-            return frozenset()
-        first = int(self.tree.dof_first[self.tree.body_group[body]])
-        columns = (int(self.tree.dof_index[first + self.tree.joint_dof[b - 1]]) for b in self.path(body))
-        return frozenset(self.tree.joint_names[c] for c in columns)
+        moved = self.tree.moving_joints(body)
+        return frozenset(name for name, moves in zip(self.tree.joint_names, moved, strict=True) if moves)
 
-    def links(self, body: int) -> list[str]:
-        """Links that ride on a body."""
-        return [n for n, b in zip(self.tree.link_names, self.tree.link_body, strict=True) if b == body]
+    def first_links(self, bodies: Iterable[int]) -> str:
+        """The first link of each body, in one line of text."""
+        return ", ".join(self.tree.links_on(body)[0] for body in bodies)
 
 
 def tip_link(urdf: Urdf, structure: FingerStructure) -> str:
     """A fingertip's link with collision geometry."""
-    return next(n for n in structure.links(structure.tips[0]) if urdf.links[n])
+    return next(n for n in structure.tree.links_on(structure.tips[0]) if urdf.links[n])
 
 
 def probe_spec(name: str, link: str, locked: dict[str, float], base_link: str | None) -> HandSpec:
     """The least rules that are needed to build a model: one contact link."""
-    box = {"min": (0.0, 0.0, 0.0), "max": (0.1, 0.1, 0.1)}
-    data = {
-        "name": name,
-        "contact": [{"links": [link]}],
-        "canonical_box": box,
-        "locked": locked,
-        "base_link": base_link,
-    }
-    return HandSpec.model_validate(data)
+    box = Box(min=(0.0, 0.0, 0.0), max=(0.1, 0.1, 0.1))
+    contact = (ContactRule(links=(link,)),)
+    return HandSpec(name=name, contact=contact, canonical_box=box, locked=locked, base_link=base_link)
 
 
 def held_value(joint: Joint, share: float | None = None) -> float:
@@ -98,7 +76,7 @@ def finger_structure(urdf: Urdf, name: str, mover: str | None = None) -> FingerS
     locked: list[str] = []
     if mover is not None:
         whole = _structure(urdf, name, {})
-        drive = whole.driven_by(int(whole.tree.link_body[whole.tree.link_names.index(mover)]))
+        drive = whole.driven_by(whole.tree.body_of(mover))
         locked = [n for n in whole.tree.joint_names if n not in drive]
     while mover is None:
         structure = _structure(urdf, name, {n: held_value(by_name[n]) for n in locked})
@@ -117,27 +95,23 @@ def finger_structure(urdf: Urdf, name: str, mover: str | None = None) -> FingerS
         raise HandError(f"URDF {urdf.path}: no moving link has collision geometry; add <collision> to the finger links")
     if structure.tree.groups > _MAX_FINGERS:
         raise HandError(
-            f"URDF {urdf.path} has {structure.tree.groups} parts that move by themselves ({_tip_names(structure)}), at "
-            f"most {_MAX_FINGERS} fingers are supported; cut the URDF down to one hand, or make joints that are no "
-            "fingers fixed"
+            f"URDF {urdf.path} has {structure.tree.groups} parts that move by themselves "
+            f"({structure.first_links(structure.tips[:12])}), at most {_MAX_FINGERS} fingers are supported; cut the "
+            "URDF down to one hand, or make joints that are no fingers fixed"
         )
-    whole = _carrying(urdf, structure, locked)
-    base = _common_link(urdf, structure) if whole else None
-    return FingerStructure(structure.tree, base, tuple(locked), whole, structure.tips, structure.drives)
-
-
-def _tip_names(structure: FingerStructure) -> str:
-    return ", ".join(structure.links(b)[0] for b in structure.tips[:12])
+    base = _common_link(urdf, structure)
+    above = [j.name for j in _joints_above(urdf, base)]
+    carrying = tuple(n for n in locked if n in above)
+    return replace(structure, base_link=base if carrying else None, locked=tuple(locked), carrying=carrying)
 
 
 def _structure(urdf: Urdf, name: str, locked: dict[str, float]) -> FingerStructure:
     solid = [link for link, geometry in urdf.links.items() if geometry]
     tree = build_tree(urdf, probe_spec(name, solid[0], locked, None))
-    rough = FingerStructure(tree, None, (), (), (), ())
-    has = {int(tree.link_body[tree.link_names.index(link)]) for link in solid} - {0}
-    inner = {b for body in has for b in rough.path(body)[:-1]}
-    tips = tuple(sorted(has - inner))
-    return FingerStructure(tree, None, (), (), tips, tuple(rough.driven_by(tip) for tip in tips))
+    has = {tree.body_of(link) for link in solid} - {0}
+    tips = tuple(sorted(has - {b for body in has for b in tree.path(body)[:-1]}))
+    structure = FingerStructure(tree, None, (), (), tips, ())
+    return replace(structure, drives=tuple(structure.driven_by(tip) for tip in tips))
 
 
 def _shared_joint(structure: FingerStructure) -> str | None:
@@ -158,36 +132,24 @@ def _shared_joint(structure: FingerStructure) -> str | None:
     return best
 
 
-def _carrying(urdf: Urdf, structure: FingerStructure, locked: list[str]) -> tuple[str, ...]:
-    """Locked joints between the root and the link that all fingers stand on."""
+def _joints_above(urdf: Urdf, link: str) -> list[Joint]:
+    """Joints from a link up to the root."""
     into = {j.child: j for j in urdf.joints}
-    at, above = _common_link(urdf, structure), []
-    while at in into:
-        above.append(into[at].name)
-        at = into[at].parent
-    return tuple(n for n in locked if n in above)
+    found = []
+    while link in into:
+        found.append(into[link])
+        link = into[link].parent
+    return found
 
 
 def _common_link(urdf: Urdf, structure: FingerStructure) -> str:
     """The deepest link that carries all fingers."""
-    into = {j.child: j for j in urdf.joints}
-
-    def above(link: str) -> list[str]:
-        out = [link]
-        while link in into:
-            link = into[link].parent
-            out.append(link)
-        return out[::-1]
-
-    static = {n for n, b in zip(structure.tree.link_names, structure.tree.link_body, strict=True) if b == 0}
-    lines = []
+    tree = structure.tree
+    static, lines = set(tree.links_on(0)), []
     for tip in structure.tips:
-        first = structure.path(tip)[0]
-        lines.append([link for link in above(structure.links(first)[0]) if link in static])
-    depth = 0
-    while all(len(line) > depth for line in lines) and len({line[depth] for line in lines}) == 1:
-        depth += 1
-    return lines[0][depth - 1]
+        first = tree.links_on(tree.path(tip)[0])[0]
+        lines.append([j.parent for j in reversed(_joints_above(urdf, first)) if j.parent in static])
+    return [links[0] for links in zip(*lines, strict=False) if len(set(links)) == 1][-1]
 
 
 def finger_names(structure: FingerStructure) -> list[str]:
@@ -202,7 +164,7 @@ def finger_names(structure: FingerStructure) -> list[str]:
     names: list[str] = []
     for g in range(structure.tree.groups):
         bodies = np.flatnonzero(structure.tree.body_group == g)
-        texts = [link.lower() for b in bodies for link in structure.links(int(b))]
+        texts = [link.lower() for b in bodies for link in structure.tree.links_on(int(b))]
         texts += [
             n.lower() for tip, d in zip(structure.tips, structure.drives, strict=True) if tip in bodies for n in d
         ]

@@ -1,6 +1,7 @@
 """Any URDF -> a hand's folder: the URDF with its meshes beside it, and a drafted, commented hand.yaml."""
 
 import hashlib
+import itertools
 import os
 import re
 import shutil
@@ -17,7 +18,7 @@ from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, thin_mesh
-from lgrasp.hand.spec import HandSpec, hand_digest, load_spec
+from lgrasp.hand.spec import Box, ContactRule, HandSpec, hand_digest, load_spec
 from lgrasp.hand.urdf import find_mesh, parse_robot, read_urdf
 from lgrasp.paths import cache_dir, user_dir
 
@@ -110,10 +111,11 @@ def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> t
         )
     spec, decided = draft_spec(target, name, jaws=jaws)
     spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {urdf.name}"})
-    write_spec(spec, folder / "hand.yaml", [*changes, *decided])
+    changes += decided
+    write_spec(spec, folder / "hand.yaml", changes)
     written = load_spec(folder / "hand.yaml")
     build_hand(target, written)
-    return written, [*changes, *decided]
+    return written, changes
 
 
 def _write(robot: etree._Element, path: Path) -> None:
@@ -122,20 +124,15 @@ def _write(robot: etree._Element, path: Path) -> None:
 
 def _take_visuals(robot: etree._Element) -> list[str]:
     """Where no link has collision geometry, the visual geometry is it."""
-    if any(True for _ in robot.iter("collision")):
+    visuals = list(robot.iter("visual"))
+    if not visuals or robot.find(".//collision") is not None:
         return []
-    count = 0
-    for visual in list(robot.iter("visual")):
+    for visual in visuals:
         collision = etree.SubElement(visual.getparent(), "collision")
-        for part in visual:
-            if part.tag in ("origin", "geometry"):
-                collision.append(etree.fromstring(etree.tostring(part)))
-        count += 1
-    return (
-        [f"no link has collision geometry: the visual geometry of {count} elements is used as collision"]
-        if count
-        else []
-    )
+        # copies without what follows them
+        copies = (etree.fromstring(etree.tostring(part)) for part in visual if part.tag in ("origin", "geometry"))
+        collision.extend(copies)
+    return [f"no link has collision geometry: the visual geometry of {len(visuals)} elements is used as collision"]
 
 
 def _take_meshes(robot: etree._Element, urdf: Path, folder: Path, originals: dict[Path, Path]) -> list[str]:
@@ -167,20 +164,16 @@ def _take_meshes(robot: etree._Element, urdf: Path, folder: Path, originals: dic
 def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], changes: list[str]) -> str:
     """Path, relative to the folder, of the copy of a mesh."""
     base = f"meshes/{kind}/{_slug(file.stem)}"
-    suffix = file.suffix.lower()
-    thin = _thinned(file) if kind == "collision" else None
-    if thin is not None:
-        suffix = ".stl"
-    name, number = f"{base}{suffix}", 1
-    while name in taken:
-        number += 1
-        name = f"{base}_{number}{suffix}"
+    whole = _huge_mesh(file) if kind == "collision" else None
+    suffix = file.suffix.lower() if whole is None else ".stl"
+    numbered = (f"{base}_{number}{suffix}" for number in itertools.count(2))
+    name = next(name for name in itertools.chain([f"{base}{suffix}"], numbered) if name not in taken)
     target = folder / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    if thin is not None:
-        mesh, before = thin
+    if whole is not None:
+        mesh = thin_mesh(whole, MOST_FACES)
         mesh.export(target)
-        changes.append(f"collision mesh {file.name} has {before:,} faces: thinned to {len(mesh.faces):,}")
+        changes.append(f"collision mesh {file.name} has {len(whole.faces):,} faces: thinned to {len(mesh.faces):,}")
         return name
     shutil.copyfile(file, target)
     if suffix == ".obj":
@@ -191,17 +184,15 @@ def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], changes: li
     return name
 
 
-def _thinned(file: Path) -> tuple[trimesh.Trimesh, int] | None:
-    """A huge mesh, thinned, and its faces before; None for others, and for what cannot be read (reported later)."""
+def _huge_mesh(file: Path) -> trimesh.Trimesh | None:
+    """A mesh that must be thinned; None for others, and for what cannot be read (reported later)."""
     if file.stat().st_size < _LARGE_FILE:
         return None
     try:
         mesh = trimesh.load_mesh(file, process=True)
     except Exception:
         return None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) <= MOST_FACES:
-        return None
-    return thin_mesh(mesh, MOST_FACES), len(mesh.faces)
+    return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > MOST_FACES else None
 
 
 def drafted_folder(urdf: Path, name: str) -> Path:
@@ -210,8 +201,8 @@ def drafted_folder(urdf: Path, name: str) -> Path:
     Raises:
         HandError: see :func:`import_urdf`.
     """
-    probe = {"name": name, "contact": [{"links": ["-"]}], "canonical_box": {"min": (0, 0, 0), "max": (1, 1, 1)}}
-    content = hand_digest(urdf, HandSpec.model_validate(probe))
+    box = Box(min=(0, 0, 0), max=(1, 1, 1))
+    content = hand_digest(urdf, HandSpec(name=name, contact=(ContactRule(links=("-",)),), canonical_box=box))
     key = hashlib.sha256(f"{_DRAFT_VERSION} {content}".encode()).hexdigest()
     folder = cache_dir() / "drafts" / key[:32] / name
     try:

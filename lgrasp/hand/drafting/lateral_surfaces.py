@@ -1,6 +1,7 @@
 """Pads and lateral sides of fingers, and which fingers stand side by side."""
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations, groupby
 
 import numpy as np
@@ -9,7 +10,6 @@ from lgrasp.hand.drafting.contact_survey import ContactSurvey, pad_axis
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import Postures, sample_bodies
 from lgrasp.hand.spec import Surface
-from lgrasp.hand.spec_check import moving_joints
 from lgrasp.hand.surface import SurfaceSamples
 
 _PAD_ANGLE, _LATERAL_ANGLE = 60.0, 45.0  # degrees around the axis
@@ -27,9 +27,8 @@ class Finger:
     name: str
     joints: tuple[str, ...]  # that move its tip, shared ones left out
     pad: tuple[Surface, ...]
-    lateral_surfaces: dict[
-        int, tuple[Surface, ...]
-    ]  # both lateral sides, +1 and -1; empty for a thumb and what does not bend
+    # both lateral sides, +1 and -1; empty for a thumb and what does not bend
+    lateral_surfaces: dict[int, tuple[Surface, ...]]
     base: np.ndarray  # (3,) [m] where its last bodies begin
     along: np.ndarray  # (3,) unit, from there to the tip
     lateral: np.ndarray  # (3,) unit, outward of side +1
@@ -63,7 +62,7 @@ def find_fingers(survey: ContactSurvey, model: HandModel, names: list[str], q: n
 def _finger(survey: ContactSurvey, model: HandModel, standing: Postures, group: int, name: str) -> Finger | None:
     tree = survey.model.tree
     tips = [tip for tip in survey.sides if tree.body_group[tip] == group]
-    place = _Place(model, standing)
+    place = partial(_placed, model, standing)
     pads, hinges, moved = [], [], np.zeros(model.dofs, bool)
     for tip in tips:
         surfaces = [s for s in survey.surfaces if s.body == tip]
@@ -75,11 +74,11 @@ def _finger(survey: ContactSurvey, model: HandModel, standing: Postures, group: 
             axis = _flexed(survey, model, tip, R.T @ np.cross(hinge, along), axis)
             hinges.append(hinge)
         pads += [(s, axis) for s in surfaces if axis is not None]
-        moved |= moving_joints(model.tree, int(model.tree.link_body[model.tree.link_names.index(surfaces[0].link)]))
+        moved |= model.tree.moving_joints(model.tree.body_of(surfaces[0].link))
     joints = [n for n, m in zip(model.tree.joint_names, moved, strict=True) if m and n not in model.tree.shared_names]
     if not joints or not pads:
         return None
-    last = [b for b in survey.structure.path(tips[0]) if any(s.body == b for s in survey.surfaces)][-_LATERAL_BODIES:]
+    last = [b for b in tree.path(tips[0]) if any(s.body == b for s in survey.surfaces)][-_LATERAL_BODIES:]
     last_surfaces = [s for b in last for s in survey.surfaces if s.body == b]
     base = place(last_surfaces[0])[1]
     R, t = place(last_surfaces[-1])
@@ -100,23 +99,16 @@ def _middle(surfaces: list[SurfaceSamples]) -> np.ndarray:
     return np.vstack([s.points for s in surfaces]).mean(0)
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Called with a samples: rotation (3, 3) and position (3,) [m] of the frame of its points in a posture of the hand.
+def _placed(model: HandModel, standing: Postures, samples: SurfaceSamples) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and position (3,) [m] of the frame of samples' points in the one posture of ``standing``.
 
     Bodies of the hand need not be those of the survey, which has the shared joints locked; links are the same.
     """
-
-    model: HandModel
-    standing: Postures
-
-    def __call__(self, samples: SurfaceSamples) -> tuple[np.ndarray, np.ndarray]:
-        tree = self.model.tree
-        index = tree.link_names.index(samples.link)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = self.standing.R[0, tree.link_body[index]], self.standing.t[0, tree.link_body[index]]
-        T = T @ tree.T_body_link[index] @ np.linalg.inv(samples.T_body_link)
-        return T[:3, :3], T[:3, 3]
+    tree = model.tree
+    index, T = tree.link_names.index(samples.link), np.eye(4)
+    T[:3, :3], T[:3, 3] = standing.R[0, tree.link_body[index]], standing.t[0, tree.link_body[index]]
+    T = T @ tree.T_body_link[index] @ np.linalg.inv(samples.T_body_link)
+    return T[:3, :3], T[:3, 3]
 
 
 def _flexed(survey: ContactSurvey, model: HandModel, tip: int, way: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
@@ -125,8 +117,7 @@ def _flexed(survey: ContactSurvey, model: HandModel, tip: int, way: np.ndarray, 
     The open posture leaves a joint most of its room to close; where it does not tell, the side that is ``seen`` does.
     """
     tree, k = survey.model.tree, tip - 1
-    name = tree.joint_names[tree.dof_index[tree.dof_first[tree.body_group[tip]] + tree.joint_dof[k]]]
-    column = model.tree.joint_names.index(name)
+    column = model.tree.joint_names.index(tree.joint_names[tree.joint_column[k]])
     limits = np.array([model.tree.joint_lower[column], model.tree.joint_upper[column]])
     room = tree.joint_mult[k] * (limits - model.tree.joint_open[column])
     down, up = -min(room), max(room)

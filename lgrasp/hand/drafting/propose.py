@@ -5,13 +5,13 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from lgrasp.hand.contacts import in_cone
 from lgrasp.hand.drafting.contact_survey import ContactSurvey
 from lgrasp.hand.drafting.lateral_surfaces import Finger, find_fingers, finger_rows, neighbours
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.facing import Opening, space_opening, space_postures
 from lgrasp.hand.opposition.spaces import hand_spaces, side_surface
-from lgrasp.hand.spec import Box, Cone, HandSpec, OppositionSpace, Surface
-from lgrasp.hand.surface import SurfaceSamples
+from lgrasp.hand.spec import Box, HandSpec, OppositionSpace, Surface
 from lgrasp.hand.urdf import Urdf
 
 _MIN_ACROSS_COSINE = 0.9  # cosine of an axis of a palm link to the way across the palm, for the palm to be cut
@@ -29,15 +29,12 @@ def propose_spaces(
         survey: the same hand with its shared joints locked. names: fingers of the survey's groups.
     """
     postures = space_postures(model)
-
     made = cache(lambda side: side_surface(urdf, model.tree, side))
 
     def opening(name: str, space: OppositionSpace) -> Opening:
-        first, second = (made(side) for side in space.sides)
-        if first is None or second is None:
-            return Opening(0.0, 0.0, np.nan, np.nan)
         alone = spec.model_copy(update={"opposition_spaces": {name: space}})
-        return space_opening(model, postures, hand_spaces(alone, model.tree)[0], (first, second))
+        sides = made(space.sides[0]), made(space.sides[1])
+        return space_opening(model, postures, hand_spaces(alone, model.tree)[0], sides)
 
     spaces: dict[str, OppositionSpace] = {}
     kept, dropped = [], {}
@@ -115,7 +112,8 @@ def _cut_palm(spec: HandSpec, survey: ContactSurvey, row: list[Finger]) -> list[
     if first @ way < _MIN_ACROSS_COSINE or any(axis @ first < _MIN_ALIKE_COSINE for axis in across.values()):
         return []
     cone = spec.palm.allowed[0]
-    points = {side.samples.link: _in_cone(side.samples, cone) for side in survey.palm}
+    palm = [side.samples for side in survey.palm]
+    points = {s.link: s.points[in_cone(s.normals @ s.T_body_link[:3, :3], cone)] for s in palm}
     place = np.concatenate([p @ first for p in points.values()])
     edges = np.linspace(place.min(), place.max(), len(row) + 1)
     edges[[0, -1]] += [-_PALM_PART_MARGIN, _PALM_PART_MARGIN]
@@ -126,17 +124,10 @@ def _cut_palm(spec: HandSpec, survey: ContactSurvey, row: list[Finger]) -> list[
             T, k = frames[link], main[link]
             local = (p - T[:3, 3]) @ T[:3, :3]
             box = np.array([local.min(0) - _PALM_PART_MARGIN, local.max(0) + _PALM_PART_MARGIN])
-            ends = (np.array([low, high]) - T[:3, 3] @ first) * np.sign(T[:3, k] @ first)
-            box[:, k] = np.sort(ends)
+            box[:, k] = np.sort((np.array([low, high]) - T[:3, 3] @ first) * np.sign(T[:3, k] @ first))
             if ((p @ first >= low) & (p @ first <= high)).any():
-                lower, upper = (tuple(end.tolist()) for end in np.round(box, 3))
-                box_of = Box.model_validate({"min": lower, "max": upper})
-                part.append(Surface(links=(link,), axis=cone.axis, angle=cone.angle, box=box_of))
+                lower, upper = np.round(box, 3).tolist()
+                cut = Box(min=tuple(lower), max=tuple(upper))
+                part.append(Surface(links=(link,), axis=cone.axis, angle=cone.angle, box=cut))
         parts.append(tuple(part))
     return parts
-
-
-def _in_cone(samples: SurfaceSamples, cone: Cone) -> np.ndarray:
-    """Points (n, 3) of a samples whose normals are in a cone of the link frame."""
-    axis = samples.T_body_link[:3, :3] @ np.array(cone.axis)
-    return samples.points[samples.normals @ axis > np.cos(np.radians(cone.angle)) * np.linalg.norm(axis)]

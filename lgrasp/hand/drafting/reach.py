@@ -1,23 +1,27 @@
 """Where fingers can hold something: contact points and normals of random postures vote for the centre of a ball."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import convolve1d
 
+from lgrasp.hand.geometry import spread_directions
 from lgrasp.hand.postures import Postures
 
 _MIN_CELL = 0.010  # [m], more where fingers reach farther than hands do
 _MAX_CELLS = 400_000
 _BALL_RADII = (0.02, 0.025, 0.03)  # of the balls that are held [m]
+_MIN_STATIC_DISTANCE = 0.016  # [m] of a ball's centre: a ball of 4 cm would cut static links
 _PALM_WEIGHT = 0.02  # of a finger against the palm, where fingers could face each other
 _FULL_VOTES = 4.0  # votes at which a finger counts as able to touch from a direction
 _MIN_HALF_EDGE = 0.020  # half edges of the box [m]
 _MAX_HALF_EDGE = 0.035  # [m]
 
 
-@dataclass(frozen=True)
-class Touch:
+class Touch(NamedTuple):
     """Contact points (n, 3) [m] and outward normals (n, 3) that one holder (finger or palm) can make, base frame."""
 
     name: str
@@ -41,12 +45,9 @@ def finger_touches(
     name: str, postures: Postures, group: int, body: int, points: np.ndarray, normals: np.ndarray, each: int = 8
 ) -> Touch:
     """Contact points of a body's allowed surface (body frame) at the postures at which its finger is clear."""
-    rng = np.random.default_rng(body)
-    rows = np.flatnonzero(postures.clear[:, group])
-    rows = np.repeat(rows, each)
-    k = rng.integers(len(points), size=len(rows))
-    R, t = postures.R[rows, body], postures.t[rows, body]
-    return Touch(name, np.einsum("nij,nj->ni", R, points[k]) + t, np.einsum("nij,nj->ni", R, normals[k]))
+    rows = np.repeat(np.flatnonzero(postures.clear[:, group]), each)
+    k = np.random.default_rng(body).integers(len(points), size=len(rows))
+    return Touch(name, postures.place(rows, body, points[k]), postures.turn(rows, body, normals[k]))
 
 
 def still_touches(name: str, points: np.ndarray, normals: np.ndarray, count: int) -> Touch:
@@ -55,19 +56,10 @@ def still_touches(name: str, points: np.ndarray, normals: np.ndarray, count: int
     return Touch(name, points[rows], normals[rows])
 
 
-def _directions(n: int = 32) -> np.ndarray:
-    i = np.arange(n) + 0.5
-    phi, theta = np.arccos(1 - 2 * i / n), np.pi * (1 + 5**0.5) * i
-    return np.column_stack([np.cos(theta) * np.sin(phi), np.sin(theta) * np.sin(phi), np.cos(phi)])
-
-
 def _smooth(votes: np.ndarray) -> np.ndarray:
     """Sums over neighbouring cells (weights 1/2, 1, 1/2 on each axis), votes (nx, ny, nz, b)."""
     for axis in range(3):
-        n = votes.shape[axis]
-        padded = np.pad(votes, [(1, 1) if a == axis else (0, 0) for a in range(4)])
-        left, right = (np.take(padded, np.arange(k, k + n), axis) for k in (0, 2))
-        votes = 0.5 * left + votes + 0.5 * right
+        votes = convolve1d(votes, [0.5, 1.0, 0.5], axis, mode="constant")
     return votes
 
 
@@ -89,11 +81,11 @@ def _balanced_threes(able: list[np.ndarray], axes: np.ndarray, free: np.ndarray)
     return out
 
 
-def best_hold(touches: list[Touch], blocked) -> Hold | None:
+def best_hold(touches: Iterable[Touch], static_depth: Callable[[np.ndarray], np.ndarray]) -> Hold | None:
     """Where two or more holders face each other across a ball; None when no two ever do.
 
     Args:
-        blocked: function of ball centres (n, 3) [m] -> (n,) bool, those where a ball of 4 cm would cut static links.
+        static_depth: points (n, 3) [m] -> lower bound of their distance to the static links (n,) [m].
     """
     touches = [t for t in touches if len(t.points)]
     if len(touches) < 2:
@@ -102,32 +94,30 @@ def best_hold(touches: list[Touch], blocked) -> Hold | None:
     low, high = np.min([c.min(0) for c in centres], 0), np.max([c.max(0) for c in centres], 0)
     size = max(_MIN_CELL, float(np.prod(high - low) / _MAX_CELLS) ** (1 / 3))
     shape = np.floor((high - low) / size).astype(int) + 1
-    axes = _directions()
+    axes = spread_directions(32)
+    alike = (axes @ axes.T > 0.85).astype(np.float32)
     able = []
     for t, c in zip(touches, centres, strict=True):
         cell = np.ravel_multi_index(tuple(np.floor((c - low) / size).astype(int).T), tuple(shape))
         side = np.tile(np.argmax(t.normals @ axes.T, 1), len(_BALL_RADII))
         votes = np.bincount(cell * len(axes) + side, minlength=int(shape.prod()) * len(axes)).astype(np.float32)
         # neighbouring directions count as well
-        votes = _smooth(votes.reshape(*shape, len(axes))).reshape(-1, len(axes)) @ (axes @ axes.T > 0.85).astype(
-            np.float32
-        )
+        votes = _smooth(votes.reshape(*shape, len(axes))).reshape(-1, len(axes)) @ alike
         able.append(np.minimum(votes * (20_000 / len(c)) / _FULL_VOTES / 8, 1.0))
     places = low + (np.stack(np.unravel_index(np.arange(shape.prod()), tuple(shape)), -1) + 0.5) * size
-    free = ~blocked(places)
+    free = static_depth(places) >= _MIN_STATIC_DISTANCE
     opposite = axes @ axes.T < -0.82
     partner = [np.stack([a[:, opposite[b]].max(1) for b in range(len(axes))], 1) for a in able]
     fingers = [i for i, t in enumerate(touches) if t.name != "palm"]
     pairs = {}
     score = np.zeros(len(places), np.float32)
-    for i in range(len(touches)):
+    for i, last in enumerate(touches):
         score += 0.05 * able[i].max(1)
-        for j in range(i):
+        for j, first in enumerate(touches[:i]):
             facing = np.minimum(able[i], partner[j])
             # one way to oppose is needed, several make it robust
-            value = facing.max(1) + 0.1 * facing.sum(1)
-            pairs[touches[j].name, touches[i].name] = value
-            with_palm = "palm" in (touches[j].name, touches[i].name)
+            pairs[first.name, last.name] = value = facing.max(1) + 0.1 * facing.sum(1)
+            with_palm = "palm" in (first.name, last.name)
             score += value * (_PALM_WEIGHT if with_palm and len(fingers) > 1 else 1.0)
     faced = np.max(list(pairs.values()), axis=0)
     if len(fingers) > 2:

@@ -1,13 +1,15 @@
 """Whether two surfaces of a hand press towards each other, and how far apart they are then."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.opposition.spaces import Space, SpaceSide
+from lgrasp.hand.opposition.spaces import Space
 from lgrasp.hand.postures import Postures, sample_bodies
+from lgrasp.hand.surface import ContactLink
 
 _MIN_FACING_COSINE = np.cos(np.radians(35.0))  # of each hand normal to the line between the two, at least
 _MIN_PALM_COSINE = np.cos(np.radians(16.0))  # of the palm's, which no finger can turn
@@ -56,20 +58,24 @@ def opposed(
 def space_postures(model: HandModel, device: str = "cpu") -> Postures:
     """Random postures of a hand; row r has the shared joints at setting r modulo the number of settings."""
     tree = model.tree
-    q = np.random.default_rng(0).uniform(tree.joint_lower, tree.joint_upper, (_SAMPLED_POSTURES, model.dofs))
+    q = model.random_postures(_SAMPLED_POSTURES)
     shared = np.isin(tree.joint_names, tree.shared_names)
     q[:, shared] = np.resize(tree.settings[:, shared], (_SAMPLED_POSTURES, int(shared.sum())))
     return sample_bodies(model, q, device)
 
 
-def space_opening(model: HandModel, postures: Postures, space: Space, sides: tuple[SpaceSide, SpaceSide]) -> Opening:
+def space_opening(
+    model: HandModel, postures: Postures, space: Space, sides: tuple[Sequence[ContactLink], Sequence[ContactLink]]
+) -> Opening:
     """How far the two sides of a space open, by random pairs of postures of their fingers, shared joints alike.
 
     Args:
         postures: see :func:`space_postures`.
     """
-    first, second = sorted(sides, key=lambda side: side.links[0].group)  # the palm last
-    still = second.links[0].group == model.groups
+    if not all(sides):
+        return Opening(0.0, 0.0, np.nan, np.nan)
+    first, second = sorted(sides, key=lambda side: side[0].group)  # the palm last
+    still = second[0].group == model.groups
     rng = np.random.default_rng(1)
     settings = len(model.tree.settings)
     count = _PAIRS_DRAWN // settings
@@ -104,16 +110,15 @@ class _Contacts(NamedTuple):
 def _contacts(
     model: HandModel,
     postures: Postures,
-    side: SpaceSide,
+    side: Sequence[ContactLink],
     setting: int,
     settings: int,
     count: int,
     rng: np.random.Generator,
 ) -> _Contacts:
     """Random contacts of a side where its finger is clear of the palm; none where it never is."""
-    tree, group = model.tree, side.links[0].group
-    points, normals = (np.concatenate([getattr(link, key) for link in side.links]) for key in ("points", "normals"))
-    bodies = [int(tree.link_body[tree.link_names.index(link.link)]) for link in side.links]
+    group = side[0].group
+    points, normals = (np.concatenate([getattr(link, key) for link in side]) for key in ("points", "normals"))
     clear = np.arange(len(postures.q)) % settings == setting
     if group < model.groups:
         clear &= postures.clear[:, group]
@@ -121,10 +126,8 @@ def _contacts(
     count = count if len(rows) else 0
     k = rng.integers(len(points), size=count)
     row = rows[rng.integers(max(len(rows), 1), size=count)]
-    body = np.repeat(bodies, [len(link.points) for link in side.links])[k]
-    R = postures.R[row, body]
-    p = np.einsum("nij,nj->ni", R, points[k]) + postures.t[row, body]
-    return _Contacts(row, body, p, np.einsum("nij,nj->ni", R, normals[k]))
+    body = np.repeat([model.tree.body_of(link.link) for link in side], [len(link.points) for link in side])[k]
+    return _Contacts(row, body, postures.place(row, body, points[k]), postures.turn(row, body, normals[k]))
 
 
 def _moves_along(
@@ -136,14 +139,10 @@ def _moves_along(
     for body in np.unique(end.body[end.body > 0]):
         mine = end.body == body
         row, p = end.row[mine], end.p[mine]
-        group, j = int(tree.body_group[body]), int(body) - 1
-        while j >= 0:
-            axis = postures.R[row, 1 + j] @ tree.joint_axis[j].astype(float)
-            moved = axis if tree.joint_prismatic[j] else np.cross(axis, p - postures.t[row, 1 + j])
-            column = tree.dof_index[tree.dof_first[group] + tree.joint_dof[j]]
-            velocity[column, mine] += tree.joint_mult[j] * moved
-            up = int(tree.joint_parent[j])
-            j = -1 if up < 0 else int(tree.joint_first[group]) + up
+        for up in reversed(tree.path(int(body))):
+            axis = postures.R[row, up] @ tree.joint_axis[up - 1].astype(float)
+            moved = axis if tree.joint_prismatic[up - 1] else np.cross(axis, p - postures.t[row, up])
+            velocity[tree.joint_column[up - 1], mine] += tree.joint_mult[up - 1] * moved
     speed = np.linalg.norm(velocity[joints], axis=2)
     along = np.abs(np.einsum("jnd,nd->jn", velocity[joints], line))
     return ((along > 0.5 * speed) & (speed > _MIN_SPEED)).any(0)

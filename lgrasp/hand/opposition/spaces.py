@@ -12,7 +12,7 @@ import trimesh
 
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import LinkGrid, body_cones, side_points
-from lgrasp.hand.geometry import geometry_mesh
+from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.spec import Cone, HandSpec, Surface
 from lgrasp.hand.spec_check import side_links
@@ -32,10 +32,9 @@ class Space:
 
 def hand_spaces(spec: HandSpec, tree: Tree) -> tuple[Space, ...]:
     """The opposition spaces of a hand in the order of hand.yaml; none is legal."""
-    body = dict(zip(tree.link_names, tree.link_body, strict=True))
     out = []
     for name, space in spec.opposition_spaces.items():
-        first, second = (int(tree.body_group[body[links[0]]]) for links in side_links(space))
+        first, second = (tree.group_of(links[0]) for links in side_links(space))
         out.append(Space(name, np.isin(tree.joint_names, space.joints), (first, second)))
     return tuple(out)
 
@@ -82,33 +81,25 @@ def _longest(masks: tuple[int, ...], joints: int) -> int:
     return max((1 + _longest(masks, joints | mask) for mask in masks if mask & ~joints), default=0)
 
 
-@dataclass(frozen=True)
-class SpaceSide:
-    """One side of an opposition space, body frame."""
-
-    links: tuple[ContactLink, ...]
-    area: float  # [m^2]
-
-
-def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface], device: str = "cpu") -> SpaceSide | None:
-    """The surface of one side of a space, links without any left out; None when there is none at all."""
+def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface], device: str = "cpu") -> tuple[ContactLink, ...]:
+    """The surface of one side of a space, links without any left out."""
     rng = np.random.default_rng(0)
-    surfaces = [(tree.link_names.index(link), part) for part in side for link in part.links]
-    meshes = _body_meshes(urdf, tree, {int(tree.link_body[index]) for index, _ in surfaces})
-    found, total = [], 0.0
-    for index, surface in surfaces:
-        link, T, body = tree.link_names[index], tree.T_body_link[index], tree.link_body[index]
-        around = [m for n, b in zip(tree.link_names, tree.link_body, strict=True) if b == body for m in meshes[n]]
+    surfaces = [(link, part) for part in side for link in part.links]
+    meshes = _body_meshes(urdf, tree, {tree.body_of(link) for link, _ in surfaces})
+    found = []
+    for link, surface in surfaces:
+        T, group = tree.T_body_link[tree.link_names.index(link)], tree.group_of(link)
+        around = [m for other in tree.links_on(tree.body_of(link)) for m in meshes[other]]
         points, normals, area = side_points(meshes[link], around, T, surface, rng, device)
-        group = int(tree.body_group[body])
-        rules = body_cones(_outside(surface) if group >= 0 else (), T)
         if len(points):
-            found.append(ContactLink(link, group if group >= 0 else tree.groups, points, normals, rules))
-            total += area
-    return SpaceSide(tuple(found), total) if found else None
+            rules = body_cones(_outside(surface) if group >= 0 else (), T)
+            found.append(ContactLink(link, group if group >= 0 else tree.groups, points, normals, rules, area))
+    return tuple(found)
 
 
-def space_sides(urdf: Urdf, spec: HandSpec, tree: Tree, name: str, device: str = "cpu") -> tuple[SpaceSide, SpaceSide]:
+def space_sides(
+    urdf: Urdf, spec: HandSpec, tree: Tree, name: str, device: str = "cpu"
+) -> tuple[tuple[ContactLink, ...], tuple[ContactLink, ...]]:
     """The surface of both sides of a space.
 
     Raises:
@@ -121,7 +112,7 @@ def space_sides(urdf: Urdf, spec: HandSpec, tree: Tree, name: str, device: str =
     found = []
     for number, side in enumerate(space.sides, 1):
         surface = side_surface(urdf, tree, side, device)
-        if surface is None:
+        if not surface:
             raise HandError(
                 f"hand '{spec.name}': opposition space '{name}': side {number} ({', '.join(side[0].links)}) has no "
                 f"surface within {side[0].angle:g} degrees of {list(side[0].axis)}; change axis, angle or box"
@@ -144,8 +135,8 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
         HandError: see :func:`space_sides`.
     """
     urdf, tree = read_urdf(urdf_path), model.tree
-    links = [link for side in space_sides(urdf, spec, tree, name, device) for link in side.links]
-    meshes = _body_meshes(urdf, tree, {int(tree.link_body[tree.link_names.index(link.link)]) for link in links})
+    links = [link for side in space_sides(urdf, spec, tree, name, device) for link in side]
+    meshes = _body_meshes(urdf, tree, {tree.body_of(link.link) for link in links})
     arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=_grids(model))
     arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
     described = spec.opposition_spaces[name].model_dump(mode="json")
@@ -155,18 +146,10 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
 
 def _grids(model: HandModel) -> dict[str, LinkGrid]:
     """Distance grids of the hand's own contact links."""
-    return {
-        model.tree.link_names[link]: LinkGrid(model.grid_values[a:b].reshape(shape), origin, float(cell))
-        for link, a, b, shape, origin, cell in zip(
-            model.grid_link,
-            model.grid_first[:-1],
-            model.grid_first[1:],
-            model.grid_shape,
-            model.grid_origin,
-            model.grid_cell,
-            strict=True,
-        )
-    }
+    m = model
+    parts = np.split(m.grid_values, m.grid_first[1:-1])
+    rows = zip(m.grid_link, parts, m.grid_shape, m.grid_origin, m.grid_cell, strict=True)
+    return {m.tree.link_names[k]: LinkGrid(v.reshape(shape), origin, float(c)) for k, v, shape, origin, c in rows}
 
 
 def _outside(surface: Surface) -> tuple[Cone, ...]:
@@ -177,8 +160,4 @@ def _outside(surface: Surface) -> tuple[Cone, ...]:
 
 def _body_meshes(urdf: Urdf, tree: Tree, bodies: Collection[int]) -> dict[str, list[trimesh.Trimesh]]:
     """Solids of every link that rides on one of the bodies, body frame."""
-    return {
-        link: [geometry_mesh(urdf, g).apply_transform(T @ g.T_link_geometry) for g in urdf.links[link]]
-        for link, body, T in zip(tree.link_names, tree.link_body, tree.T_body_link, strict=True)
-        if body in bodies
-    }
+    return {link: link_meshes(urdf, tree, link) for body in bodies for link in tree.links_on(body)}

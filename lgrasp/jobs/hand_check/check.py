@@ -2,7 +2,7 @@
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,18 +36,18 @@ class ObjectCheck:
     reasons: list[str]  # why fewer than asked came out
 
 
-@dataclass
+@dataclass(frozen=True)
 class HandCheck:
     """Result of :func:`check_hand`."""
 
     hand: str
     note: str  # where the rules come from
     notes: list[str]  # of the collision model
-    hints: list[str] = field(default_factory=list)  # what the rules leave unused, though enough came out
-    objects: list[ObjectCheck] = field(default_factory=list)
-    spaces: list[SpaceCheck] = field(default_factory=list)
-    longest_sequence: int = 0  # objects
-    pictures: list[Path] = field(default_factory=list)
+    hints: list[str]  # what the rules leave unused, though enough came out
+    objects: list[ObjectCheck]
+    spaces: list[SpaceCheck]
+    longest_sequence: int  # objects
+    pictures: list[Path]
 
 
 def check_objects(folder: Path) -> dict[str, Path]:
@@ -86,7 +86,7 @@ def check_hand(
     say = report or (lambda line: None)
     cache = cache or Cache()
     bounded = pipeline.model_copy(update={"effort": _CANDIDATES_PER_ROW})
-    result: HandCheck | None = None
+    checks: list[ObjectCheck] = []
     shards: dict[str, Shard] = {}
     inputs: Inputs | None = None
     with tempfile.TemporaryDirectory(prefix="lgrasp-check-") as folder:
@@ -103,49 +103,44 @@ def check_hand(
                 shard_rows=rows,
                 cache=cache,
             )
-            outcome = generate(job)
-            inputs = job.inputs
-            if result is None:
-                model = inputs.hand.model
-                result = HandCheck(model.name, inputs.keys.source.note, list(model.notes))
+            outcome, inputs = generate(job), job.inputs
             done = outcome.results[0]
             reasons = diagnose(inputs, done.counts, outcome.rows, rows)
-            check = ObjectCheck(name, rows, outcome.rows, done.wall, survivors(done.counts), done.counts, reasons)
-            result.objects.append(check)
+            left = survivors(done.counts)
+            checks.append(ObjectCheck(name, rows, outcome.rows, done.wall, left, done.counts, reasons))
             if outcome.rows:
                 shards[name] = read_shard(outcome.paths[0])
-    assert result is not None
     assert inputs is not None
-    if not any(o.reasons for o in result.objects):
-        found = hand_findings(inputs.hand.model, inputs.field.model, dict(inputs.keys.source.spec.fingers))
-        result.hints = [line for stage in ("domain", "place", "ik", "search") for line in found[stage]]
+    model, source = inputs.hand.model, inputs.keys.source
+    hints = []
+    if not any(check.reasons for check in checks):
+        found = hand_findings(model, inputs.field.model, dict(source.spec.fingers))
+        hints = [line for stage in ("domain", "place", "ik", "search") for line in found[stage]]
     say("opposition spaces")
-    result.spaces = check_spaces(inputs)
-    result.longest_sequence = longest_sequence(inputs, result.spaces)
+    spaces = check_spaces(inputs)
+    sequence = longest_sequence(inputs, spaces)
     say("pictures")
+    pictures = _draw(inputs, shards, [space.name for space in spaces if all(space.areas)], out)
+    return HandCheck(model.name, source.note, list(model.notes), hints, checks, spaces, sequence, pictures)
+
+
+def _draw(inputs: Inputs, shards: dict[str, Shard], spaces: list[str], out: Path) -> list[Path]:
     try:
         out.mkdir(parents=True, exist_ok=True)
-        result.pictures = [
+        pictures = [
             draw_hand(inputs, out / "hand.png"),
             draw_palmar(inputs, out / "palmar.png"),
             draw_workspace(inputs, out / "workspace.png"),
         ]
-        able = [space.name for space in result.spaces if all(space.areas)]
-        if able:
-            result.pictures.append(draw_spaces(inputs, able, out / "spaces.png"))
-        if shards:
-            result.pictures.append(draw_grasps(inputs, _samples(shards), out / "grasps.png"))
+        pictures += [draw_spaces(inputs, spaces, out / "spaces.png")] if spaces else []
+        pictures += [draw_grasps(inputs, _samples(shards), out / "grasps.png")] if shards else []
     except OSError as error:
         raise OutputError(f"pictures cannot be written to {out}: {error.strerror}; choose another --out") from None
-    return result
+    return pictures
 
 
 def _samples(shards: dict[str, Shard]) -> list[tuple[str, Shard, int]]:
     """Three grasps, of different objects where there are some: those with the largest epsilon."""
-    out = []
-    for turn in range(3):
-        for name, shard in shards.items():
-            order = np.argsort(-shard.grasps.metrics["epsilon"], kind="stable")
-            if turn < len(order) and len(out) < 3:
-                out.append((name, shard, int(order[turn])))
-    return out
+    best = {name: np.argsort(-shard.grasps.metrics["epsilon"], kind="stable") for name, shard in shards.items()}
+    turns = [(name, turn) for turn in range(3) for name in shards if turn < len(best[name])]
+    return [(name, shards[name], int(best[name][turn])) for name, turn in turns[:3]]

@@ -1,5 +1,6 @@
 """Pictures of a hand without a display: contact patches, canonical box, palmar side, workspace, sample grasps."""
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.surface_visibility import last_bodies, link_surfaces, visible_surface
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hand_check.diagnose import field_vectors, finger_label
-from lgrasp.jobs.hand_check.plotting import add_box, add_triangles, frame_points, new_figure, save_figure, shade
+from lgrasp.jobs.hand_check.plotting import add_box, add_view, frame_points, new_figure, save_figure, shade
 from lgrasp.refine.surface import DISTAL, OTHER
 
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#e377c2", "#17becf")
@@ -31,39 +32,31 @@ _MAX_LINK_FACES = 2500  # of a link
 
 def draw_hand(inputs: Inputs, path: Path) -> Path:
     """The open hand from two sides: surface that may touch in colours, the palm's in gold, canonical box."""
-    model = inputs.hand.model
-    triangles, colours = _hand_triangles(inputs, model.tree.joint_open, patches=True)
-    figure = new_figure(13, 7.2)
-    towards = _palmar_direction(inputs)
-    for i, turn in enumerate((20.0, 115.0)):
-        axes = figure.add_subplot(1, 2, i + 1, projection="3d")
-        add_triangles(axes, triangles, colours)
-        add_box(axes, model.canonical_box)
-        frame_points(axes, np.vstack([_hand_points(inputs, model.tree.joint_open), model.canonical_box]), towards, turn)
-    _legend(figure, inputs, box=True)
-    figure.suptitle(f"{model.name}: open posture, surface that may touch, canonical box")
-    return save_figure(figure, path)
+    title = "open posture, surface that may touch, canonical box"
+    return _draw_sides(inputs, path, title, _patches(inputs.hand.model), [])
 
 
 def draw_workspace(inputs: Inputs, path: Path) -> Path:
     """Where each finger's contact surface can go (dots), the canonical box and the hand, from two sides."""
-    model = inputs.hand.model
-    triangles, colours = _hand_triangles(inputs, model.tree.joint_open, patches=False)
-    clouds = [field_vectors(inputs.field.model, g, model.groups)[0] for g in range(model.groups)]
+    groups = inputs.hand.model.groups
+    clouds = [field_vectors(inputs.field.model, g, groups)[0] for g in range(groups)]
     clouds = [c[:: max(1, len(c) // 1500)] for c in clouds]
-    figure = new_figure(13, 7.2)
-    towards = _palmar_direction(inputs)
+    return _draw_sides(inputs, path, "reach of every finger's contact surface", lambda *link: [], clouds)
+
+
+def _draw_sides(inputs: Inputs, path: Path, title: str, paint: "_Paint", clouds: list[np.ndarray]) -> Path:
+    """The open hand from two sides with its canonical box and a cloud of dots for each finger."""
+    model = inputs.hand.model
+    hand, figure, towards = _Hand(inputs, model.tree.joint_open), new_figure(13, 7.2), _palmar_direction(inputs)
+    solid = hand.painted(paint)
     for i, turn in enumerate((20.0, 115.0)):
-        axes = figure.add_subplot(1, 2, i + 1, projection="3d")
-        add_triangles(axes, triangles, colours)
+        axes = add_view(figure, 1, 2, i, *solid)
         for g, cloud in enumerate(clouds):
             axes.scatter(*cloud.T, s=5.0, color=_COLOURS[g % len(_COLOURS)], alpha=0.5, linewidths=0, zorder=5)
         add_box(axes, model.canonical_box)
-        frame_points(
-            axes, np.vstack([_hand_points(inputs, model.tree.joint_open), model.canonical_box, *clouds]), towards, turn
-        )
-    _legend(figure, inputs, box=True)
-    figure.suptitle(f"{model.name}: reach of every finger's contact surface")
+        frame_points(axes, np.vstack([hand.points, model.canonical_box, *clouds]), towards, turn)
+    _legend(figure, inputs)
+    figure.suptitle(f"{model.name}: {title}")
     return save_figure(figure, path)
 
 
@@ -71,22 +64,20 @@ def draw_palmar(inputs: Inputs, path: Path) -> Path:
     """The open hand from four sides, its palmar side in colours: what it pulls to an object, by weight."""
     from matplotlib.patches import Patch
 
-    source, model = inputs.keys.source, inputs.hand.model
-    q, last = model.tree.joint_open, last_bodies(model)
-    side = visible_surface(source, model, inputs.hand.device)
-    triangles, colours = [], []
-    for samples, mesh, placed in _hand_meshes(inputs, q):
-        own, tint = side.link == model.tree.link_names.index(samples.link), shade(placed, _LINK)
+    model = inputs.hand.model
+    side, last = visible_surface(inputs.keys.source, model, inputs.hand.device), last_bodies(model)
+
+    def paint(samples: SurfaceSamples, mesh: trimesh.Trimesh) -> _Painted:
+        own = side.link == model.tree.link_names.index(samples.link)
         if own.any():
-            pulled = _seen_faces(mesh, samples, side.points[own])
-            tint[pulled] = shade(placed[pulled], _WEIGHT_COLOURS[DISTAL if samples.body in last else OTHER])
-        triangles.append(placed)
-        colours.append(tint)
-    figure = new_figure(16, 5.6)
+            weight = DISTAL if samples.body in last else OTHER
+            yield _seen_faces(mesh, samples, side.points[own]), _WEIGHT_COLOURS[weight]
+
+    hand, figure = _Hand(inputs, model.tree.joint_open), new_figure(16, 5.6)
+    solid = hand.painted(paint)
     for i, turn in enumerate((0.0, 75.0, 180.0, -75.0)):
-        axes = figure.add_subplot(1, 4, i + 1, projection="3d")
-        add_triangles(axes, np.concatenate(triangles), np.concatenate(colours))
-        frame_points(axes, _hand_points(inputs, q), _palmar_direction(inputs), turn)
+        axes = add_view(figure, 1, 4, i, *solid)
+        frame_points(axes, hand.points, _palmar_direction(inputs), turn)
     words = {DISTAL: "last links", OTHER: "other links"}
     marks = [Patch(color=colour, label=f"{words[w]}, weight {w:g}") for w, colour in _WEIGHT_COLOURS.items()]
     figure.legend(handles=[*marks, Patch(color=_LINK, label="not palmar")], loc="lower center", ncols=3, frameon=False)
@@ -99,25 +90,19 @@ def draw_grasps(inputs: Inputs, samples: list[tuple[str, Shard, int]], path: Pat
     model = inputs.hand.model
     figure = new_figure(15, 6.0)
     for i, (name, shard, row) in enumerate(samples):
-        axes = figure.add_subplot(1, len(samples), i + 1, projection="3d")
-        triangles, colours = _hand_triangles(inputs, shard.grasps.q[row], patches=True)
-        obj = shard.objects[0]
+        hand, obj = _Hand(inputs, shard.grasps.q[row]), shard.objects[0]
+        triangles, colours = hand.painted(_patches(model))
         pose = pose_matrix(shard.grasps.object_pose[row, 0])
-        mesh = thin_mesh(
-            trimesh.Trimesh(np.asarray(obj.vertices), np.asarray(obj.faces), process=False), _MAX_LINK_FACES
-        )
+        mesh = trimesh.Trimesh(np.asarray(obj.vertices), np.asarray(obj.faces), process=False)
+        mesh = thin_mesh(mesh, _MAX_LINK_FACES)
         vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
         solid = vertices[mesh.faces]
-        add_triangles(axes, np.vstack([triangles, solid]), np.vstack([colours, shade(solid, _OBJECT)]))
+        triangles, colours = np.vstack([triangles, solid]), np.vstack([colours, shade(solid, _OBJECT)])
+        axes = add_view(figure, 1, len(samples), i, triangles, colours)
         points = shard.grasps.contact_points[row, 0]
         points = points[np.isfinite(points).all(1)] @ pose[:3, :3].T + pose[:3, 3]
         axes.scatter(*points.T, s=45, c="black", depthshade=False, zorder=10)
-        frame_points(
-            axes,
-            np.vstack([_hand_points(inputs, shard.grasps.q[row]), vertices]),
-            _away(points, vertices.mean(0), inputs),
-            0.0,
-        )
+        frame_points(axes, np.vstack([hand.points, vertices]), _away(points, vertices.mean(0), inputs), 0.0)
         axes.set_title(f"{name}: {len(points)} contacts, epsilon {shard.grasps.metrics['epsilon'][row]:.2f}")
     figure.suptitle(f"{model.name}: sample grasps (black: contacts)")
     return save_figure(figure, path)
@@ -126,79 +111,71 @@ def draw_grasps(inputs: Inputs, samples: list[tuple[str, Shard, int]], path: Pat
 def draw_spaces(inputs: Inputs, names: list[str], path: Path) -> Path:
     """The open hand once for each opposition space, its two sides in colours."""
     source, model = inputs.keys.source, inputs.hand.model
-    urdf, q = read_urdf(source.urdf), model.tree.joint_open
-    meshes = _hand_meshes(inputs, q)
+    urdf, hand = read_urdf(source.urdf), _Hand(inputs, model.tree.joint_open)
     columns = min(4, len(names))
     rows = -(-len(names) // columns)
     figure = new_figure(3.6 * columns, 4.0 * rows + 0.6)
     towards = _palmar_direction(inputs)
     for i, name in enumerate(names):
-        tints = [shade(placed, _LINK) for _, _, placed in meshes]
-        for side, colour in zip(
-            space_sides(urdf, source.spec, model.tree, name, inputs.hand.device), _COLOURS, strict=False
-        ):
-            for link in side.links:
-                for (samples, mesh, placed), tint in zip(meshes, tints, strict=True):
-                    if samples.link == link.link:
-                        near = _near_faces(mesh, link.points, link.normals)
-                        tint[near] = shade(placed[near], colour)
-        axes = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        add_triangles(axes, np.concatenate([placed for _, _, placed in meshes]), np.concatenate(tints))
-        frame_points(axes, _hand_points(inputs, q), towards, 35.0)
+        sides = space_sides(urdf, source.spec, model.tree, name, inputs.hand.device)
+        coloured = [(link, colour) for side, colour in zip(sides, _COLOURS, strict=False) for link in side]
+        solid = hand.painted(
+            lambda samples, mesh, coloured=coloured: [
+                (_near_faces(mesh, link.points, link.normals), colour)
+                for link, colour in coloured
+                if link.link == samples.link
+            ]
+        )
+        axes = add_view(figure, rows, columns, i, *solid)
+        frame_points(axes, hand.points, towards, 35.0)
         axes.set_title(name)
     figure.suptitle(f"{model.name}: opposition spaces, one side red, the other blue")
     return save_figure(figure, path)
 
 
-def _hand_triangles(inputs: Inputs, q: np.ndarray, *, patches: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (n, 3, 3) of a hand in the base frame and their colours (n, 4)."""
-    model = inputs.hand.model
-    triangles, colours = [], []
-    for samples, mesh, placed in _hand_meshes(inputs, q):
-        tint = shade(placed, _LINK)
-        if patches:
-            for group, chosen in _patch_faces(model, samples, mesh):
-                colour = _PALM if group == model.groups else _COLOURS[group % len(_COLOURS)]
-                tint[chosen] = shade(placed[chosen], colour)
-        triangles.append(placed)
-        colours.append(tint)
-    return np.concatenate(triangles), np.concatenate(colours)
+_Painted = Iterable[tuple[np.ndarray, str]]  # faces and their colour
+_Paint = Callable[[SurfaceSamples, trimesh.Trimesh], _Painted]  # of a link's mesh
 
 
-def _hand_meshes(inputs: Inputs, q: np.ndarray) -> list[tuple[SurfaceSamples, trimesh.Trimesh, np.ndarray]]:
-    """Every link with its mesh (body frame) in about even triangles, and these (n, 3, 3) in the base frame."""
-    model = inputs.hand.model
-    postures = sample_bodies(model, np.asarray(q, float)[None], inputs.hand.device)
-    R, t = postures.R[0], postures.t[0]
-    out = []
-    for samples in link_surfaces(read_urdf(inputs.keys.source.urdf), model):
-        mesh = thin_mesh(samples.mesh, _MAX_LINK_FACES)
-        if len(mesh.faces) < _MAX_LINK_FACES:
-            edge = max(0.008, float(np.sqrt(4 * mesh.area / _MAX_LINK_FACES)))
-            mesh = trimesh.Trimesh(
-                *trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge)[:2], process=False
-            )
-        out.append((samples, mesh, (mesh.vertices @ R[samples.body].T + t[samples.body])[mesh.faces]))
-    return out
+class _Hand:
+    """A hand in a posture: its links in about even triangles, and the points that a picture must show of it."""
+
+    def __init__(self, inputs: Inputs, q: np.ndarray) -> None:
+        model = inputs.hand.model
+        postures = sample_bodies(model, np.asarray(q, float)[None], inputs.hand.device)
+        # contact points and body origins: all but an arm
+        self.points = np.vstack([postures.place(0, model.contact_body, model.contact_points), postures.t[0][1:]])
+        self._meshes: list[tuple[SurfaceSamples, trimesh.Trimesh, np.ndarray]] = []
+        for samples in link_surfaces(read_urdf(inputs.keys.source.urdf), model):
+            mesh = thin_mesh(samples.mesh, _MAX_LINK_FACES)
+            if len(mesh.faces) < _MAX_LINK_FACES:
+                edge = max(0.008, float(np.sqrt(4 * mesh.area / _MAX_LINK_FACES)))
+                fine = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge)[:2]
+                mesh = trimesh.Trimesh(*fine, process=False)
+            placed = mesh.vertices @ postures.R[0, samples.body].T + postures.t[0, samples.body]
+            self._meshes.append((samples, mesh, placed[mesh.faces]))
+
+    def painted(self, paint: _Paint) -> tuple[np.ndarray, np.ndarray]:
+        """Triangles (n, 3, 3) [m] in the base frame and their colours (n, 4)."""
+        tints = []
+        for samples, mesh, placed in self._meshes:
+            tints.append(shade(placed, _LINK))
+            for faces, colour in paint(samples, mesh):
+                tints[-1][faces] = shade(placed[faces], colour)
+        return np.concatenate([placed for _, _, placed in self._meshes]), np.concatenate(tints)
 
 
-def _hand_points(inputs: Inputs, q: np.ndarray) -> np.ndarray:
-    """Contact points (n, 3) and body origins at a posture: what a picture must show of a hand, without its arm."""
-    model = inputs.hand.model
-    postures = sample_bodies(model, np.asarray(q, float)[None], inputs.hand.device)
-    body = model.contact_body
-    placed = np.einsum("nij,nj->ni", postures.R[0][body], model.contact_points) + postures.t[0][body]
-    return np.vstack([placed, postures.t[0][1:]])
+def _patches(model: HandModel) -> _Paint:
+    """Surface that may touch, in the colour of its finger."""
 
+    def paint(samples: SurfaceSamples, mesh: trimesh.Trimesh) -> _Painted:
+        rows = np.flatnonzero(model.contact_link == model.tree.link_names.index(samples.link))
+        if len(rows):
+            group = int(np.searchsorted(model.contact_first, rows[0], "right")) - 1
+            colour = _PALM if group == model.groups else _COLOURS[group % len(_COLOURS)]
+            yield _near_faces(mesh, model.contact_points[rows], model.contact_normals[rows]), colour
 
-def _patch_faces(model: HandModel, samples: SurfaceSamples, mesh: trimesh.Trimesh) -> list[tuple[int, np.ndarray]]:
-    """(group, faces that are contact surface) of a link."""
-    link = model.tree.link_names.index(samples.link)
-    rows = np.flatnonzero(model.contact_link == link)
-    if not len(rows):
-        return []
-    group = int(np.searchsorted(model.contact_first, rows[0], "right")) - 1
-    return [(group, _near_faces(mesh, model.contact_points[rows], model.contact_normals[rows]))]
+    return paint
 
 
 def _near_faces(mesh: trimesh.Trimesh, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -220,10 +197,8 @@ def _palmar_direction(inputs: Inputs) -> np.ndarray:
     """Direction from which the contact surface of the open hand is seen best."""
     model = inputs.hand.model
     postures = sample_bodies(model, model.tree.joint_open[None], inputs.hand.device)
-    last = int(model.contact_first[model.groups + 1])
-    body = model.contact_body[:last]
-    weight = np.where(body == 0, 2.0, 1.0)
-    n = np.einsum("nij,nj->ni", postures.R[0][body], model.contact_normals[:last])
+    weight = np.where(model.contact_body == 0, 2.0, 1.0)
+    n = postures.turn(0, model.contact_body, model.contact_normals)
     way = (weight[:, None] * n).sum(0)
     size = float(np.linalg.norm(way))
     if size < 0.15 * weight.sum():  # jaws that face each other: look across them
@@ -238,7 +213,7 @@ def _away(points: np.ndarray, centre: np.ndarray, inputs: Inputs) -> np.ndarray:
     return way / size if size > 1e-6 else _palmar_direction(inputs)
 
 
-def _legend(figure: Any, inputs: Inputs, *, box: bool) -> None:
+def _legend(figure: Any, inputs: Inputs) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -249,6 +224,5 @@ def _legend(figure: Any, inputs: Inputs, *, box: bool) -> None:
     ]
     if model.contact_first[-1] > model.contact_first[-2]:
         marks.append(Patch(color=_PALM, label="palm"))
-    if box:
-        marks.append(Line2D([], [], color="black", label="canonical box"))
+    marks.append(Line2D([], [], color="black", label="canonical box"))
     figure.legend(handles=marks, loc="lower center", ncols=len(marks), fontsize=9, frameon=False)

@@ -1,5 +1,6 @@
 """Drawing of solids without a display: figures, shaded triangles, a camera that frames points."""
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -38,21 +39,21 @@ def shade(triangles: np.ndarray, colour: str) -> np.ndarray:
     return np.column_stack([np.clip(light[:, None] * np.array(to_rgb(colour)), 0, 1), np.ones(len(light))])
 
 
-def add_triangles(axes: Any, triangles: np.ndarray, colours: np.ndarray) -> None:
-    """Triangles (n, 3, 3) [m] in their colours (n, 4)."""
+def add_view(figure: Any, rows: int, columns: int, number: int, triangles: np.ndarray, colours: np.ndarray) -> Any:
+    """Axes of place ``number``, from 0, of a figure, with triangles (n, 3, 3) [m] in their colours (n, 4)."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+    axes = figure.add_subplot(rows, columns, number + 1, projection="3d")
     axes.add_collection3d(Poly3DCollection(triangles, facecolors=colours, edgecolors=colours, linewidths=0.2, zorder=1))
+    return axes
 
 
 def add_box(axes: Any, box: np.ndarray) -> None:
     """Edges of a box (2, 3)."""
-    corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    points = box[0] + corner * (box[1] - box[0])
-    for a in range(8):
-        for b in range(a):
-            if np.abs(corner[a] - corner[b]).sum() == 1:
-                axes.plot(*points[[a, b]].T, color="black", linewidth=1.6, zorder=9)
+    for a, b in product(product((0, 1), repeat=3), repeat=2):
+        if a > b and np.abs(np.subtract(a, b)).sum() == 1:
+            ends = box[0] + np.array([a, b]) * (box[1] - box[0])
+            axes.plot(*ends.T, color="black", linewidth=1.6, zorder=9)
 
 
 def frame_points(axes: Any, points: np.ndarray, towards: np.ndarray, turn: float) -> None:

@@ -44,7 +44,7 @@ def check_spaces(inputs: Inputs) -> list[SpaceCheck]:
             continue
         opening = space_opening(model, postures, space, sides)
         low, high = (float(x) if np.isfinite(x) else None for x in (opening.low, opening.high))
-        areas = [side.area for side in sides]
+        areas = [sum(link.area for link in side) for side in sides]
         out.append(SpaceCheck(space.name, joints, labels, areas, low, high, opening.problem))
     return out
 
