@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.hand.distance import signed_distance
+from lgrasp.hand.model import csr
 from lgrasp.hand.spec import Cone, Surface
 
 _GRID_CELL = 8.0e-4  # [m], more on large links
@@ -28,6 +29,18 @@ class LinkGrid:
     values: np.ndarray  # (nx, ny, nz) f32 [m]
     origin: np.ndarray  # (3,) [m]
     cell: float
+
+
+def grid_arrays(grids: Sequence[LinkGrid], prefix: str = "") -> dict[str, np.ndarray]:
+    """Arrays ``grid_*`` of a HandModel, their names after a prefix."""
+    arrays = {
+        "first": csr([grid.values.size for grid in grids]),
+        "shape": np.array([grid.values.shape for grid in grids], np.int32).reshape(-1, 3),
+        "origin": np.array([grid.origin for grid in grids], np.float32).reshape(-1, 3),
+        "cell": np.array([grid.cell for grid in grids], np.float32),
+        "values": np.concatenate([np.zeros(0, np.float32), *(grid.values.ravel() for grid in grids)]),
+    }
+    return {f"{prefix}grid_{name}": array for name, array in arrays.items()}
 
 
 def link_grid(meshes: Sequence[trimesh.Trimesh], device: str = "cpu") -> LinkGrid:

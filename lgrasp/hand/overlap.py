@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.geometry.clusters import one_per_cell
-from lgrasp.hand.contacts import LinkGrid, box_grid
+from lgrasp.hand.contacts import LinkGrid, box_grid, grid_arrays
 from lgrasp.hand.model import csr, stack_rows
 from lgrasp.hand.self_collision import OVERLAP
 
@@ -134,14 +134,9 @@ def overlap_arrays(sides: Sequence[OverlapSide], key: Sequence[int], keys: int) 
     chosen = [sides[i] for i in np.argsort(np.asarray(key, int), kind="stable")]
     ends = np.cumsum([0, *(len(s.points) for s in chosen)])
     rows = [(s.body, s.grid_body, ends[i], ends[i + 1]) for i, s in enumerate(chosen)]
-    grids = [s.grid for s in chosen]
     return {
         "overlap_first": csr(np.bincount(np.asarray(key, int), minlength=keys)),
         "overlap_sides": np.array(rows, np.int32).reshape(-1, 4),
         "overlap_points": stack_rows([s.points for s in chosen], 3),
-        "overlap_grid_first": csr([grid.values.size for grid in grids]),
-        "overlap_grid_shape": np.array([grid.values.shape for grid in grids], np.int32).reshape(-1, 3),
-        "overlap_grid_origin": np.array([grid.origin for grid in grids], np.float32).reshape(-1, 3),
-        "overlap_grid_cell": np.array([grid.cell for grid in grids], np.float32),
-        "overlap_grid_values": np.concatenate([np.zeros(0, np.float32), *(grid.values.ravel() for grid in grids)]),
+        **grid_arrays([s.grid for s in chosen], "overlap_"),
     }

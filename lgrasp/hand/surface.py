@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.errors import HandError
-from lgrasp.hand.contacts import LinkGrid, cover_patches, link_grid
+from lgrasp.hand.contacts import LinkGrid, cover_patches, grid_arrays, link_grid
 from lgrasp.hand.model import HandModel, csr, stack_rows
 from lgrasp.hand.tree import Tree
 
@@ -71,13 +71,13 @@ def contact_arrays(
     # grids in the order given, points group by group
     order = sorted(range(len(links)), key=lambda i: links[i].group)
     flat = [links[i] for i in order]
-    patches, count = [], 0
+    patches, count = [np.zeros(0, np.int32)], 0
     for entry in flat:
         patches.append(cover_patches(entry.points, entry.normals, rng) + count)
         count = int(patches[-1].max(initial=count - 1)) + 1
     repeat = [len(entry.points) for entry in flat]
-    index = {entry.link: tree.link_names.index(entry.link) for entry in links}
-    of_point = np.repeat([index[entry.link] for entry in flat], repeat).astype(np.int32)
+    index = np.array([tree.link_names.index(entry.link) for entry in links], np.int32)
+    of_point = np.repeat(index[order], repeat)
     per_group = [sum(len(e.points) for e in flat if e.group == g) for g in range(tree.groups + 1)]
     return {
         "contact_first": csr(per_group),
@@ -85,14 +85,10 @@ def contact_arrays(
         "contact_normals": stack_rows([e.normals for e in flat], 3),
         "contact_body": tree.link_body[of_point].astype(np.int32),
         "contact_link": of_point,
-        "contact_patch": np.concatenate([np.zeros(0), *patches]).astype(np.int32),
+        "contact_patch": np.concatenate(patches),
         "contact_grid": np.repeat(order, repeat).astype(np.int32),
-        "grid_first": csr([g.values.size for g in grids]),
-        "grid_shape": np.array([g.values.shape for g in grids], np.int32),
-        "grid_origin": np.array([g.origin for g in grids], np.float32),
-        "grid_cell": np.array([g.cell for g in grids], np.float32),
-        "grid_values": np.concatenate([g.values.ravel() for g in grids]),
-        "grid_link": np.array([index[entry.link] for entry in links], np.int32),
+        **grid_arrays(grids),
+        "grid_link": index,
         "rule_first": csr([len(entry.rules) for entry in links]),
         "rules": stack_rows([entry.rules for entry in links], 4),
         "mesh_vertex_first": csr([len(m.vertices) for m in joined]),

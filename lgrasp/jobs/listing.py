@@ -25,17 +25,12 @@ def list_hands() -> list[dict[str, Any]]:
     Raises:
         HandError: a hand.yaml is wrong.
     """
-    specs = {name: (load_spec(folder / "hand.yaml"), folder) for name, folder in known_hands().items()}
-    return [
-        {
-            "name": name,
-            "description": spec.description,
-            "spaces": len(spec.opposition_spaces),
-            "licence": spec.licence,
-            "folder": str(folder),
-        }
-        for name, (spec, folder) in specs.items()
-    ]
+    found = []
+    for name, folder in known_hands().items():
+        spec = load_spec(folder / "hand.yaml")
+        entry = {"name": name, "description": spec.description, "spaces": len(spec.opposition_spaces)}
+        found.append({**entry, "licence": spec.licence, "folder": str(folder)})
+    return found
 
 
 def describe_hand(name: str) -> dict[str, Any]:
@@ -49,8 +44,8 @@ def describe_hand(name: str) -> dict[str, Any]:
     urdf = read_urdf(source.urdf)
     tree = build_tree(urdf, spec)
     check_spaces(spec, tree, dict(urdf.links))
-    group = np.repeat(np.arange(tree.groups), np.diff(tree.dof_first))
-    finger = {int(k): int(g) for k, g in zip(tree.dof_index, group, strict=True)}
+    finger = dict(zip(tree.joint_column.tolist(), tree.body_group[1:].tolist(), strict=True))
+    limits = zip(tree.joint_names, tree.joint_lower.tolist(), tree.joint_upper.tolist(), strict=True)
     return {
         "name": source.name,
         "description": spec.description,
@@ -67,13 +62,8 @@ def describe_hand(name: str) -> dict[str, Any]:
         "source": spec.source,
         "notes": [spec.notes] if isinstance(spec.notes, str) and spec.notes else list(spec.notes),
         "joints": [
-            {
-                "name": joint,
-                "finger": None if joint in tree.shared_names else finger[k],
-                "lower": float(tree.joint_lower[k]),
-                "upper": float(tree.joint_upper[k]),
-            }
-            for k, joint in enumerate(tree.joint_names)
+            {"name": joint, "finger": None if joint in tree.shared_names else finger[k], "lower": lower, "upper": upper}
+            for k, (joint, lower, upper) in enumerate(limits)
         ],
     }
 
@@ -85,11 +75,10 @@ def list_objects() -> list[dict[str, Any]]:
         if (folder / "objects.yaml").is_file():
             notes = read_yaml(folder / "objects.yaml") | notes
     empty = {"faces": None, "licence": "", "description": ""}
-    found = []
-    for name, path in named_objects().items():
-        note = notes.get(name, {})
-        found.append({"name": name, "file": str(path), **{k: note.get(k, v) for k, v in empty.items()}})
-    return found
+    return [
+        {"name": name, "file": str(path), **{key: notes.get(name, {}).get(key, value) for key, value in empty.items()}}
+        for name, path in named_objects().items()
+    ]
 
 
 def describe_object(mesh: str, scale: float = 1.0) -> dict[str, Any]:

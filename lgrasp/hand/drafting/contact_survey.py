@@ -106,11 +106,9 @@ def _finger_sides(structure: FingerStructure, model: HandModel, surfaces: list[S
     rest of the finger stays clear. One of fewer drives needs all its palmar surface, that of the body before included.
     """
     distal = [s for s in surfaces if s.body == tip]
-    axis = _palmar_axis(model, distal, tip)
+    axis, along, across = _palmar_axes(model, distal, tip)
     if axis is None:
         return []
-    along = _along(distal)
-    across = _across(model, axis, along, tip)
     if across is not None and len(structure.driven_by(tip)) >= 3:
         sides = _sides(distal, [(-along, 91.0), (-across, 60.0)], _MIN_TIP_AREA)
         if sides:
@@ -123,7 +121,7 @@ def _finger_sides(structure: FingerStructure, model: HandModel, surfaces: list[S
     if sides and structure.tree.groups > 1 and before > 0 and before not in structure.tips:
         inner = [s for s in surfaces if s.body == before]
         siblings = [t for t in structure.tips if t != tip and before in structure.tree.path(t)]
-        axis = _palmar_axis(model, inner, before) if inner and not siblings else None
+        axis = _palmar_axes(model, inner, before)[0] if inner and not siblings else None
         if axis is not None:
             more = _sides(inner, [(-axis, 120.0)], _MIN_LINK_AREA)
             shown = sum(s.samples.seen[s.chosen].mean() * s.area for s in more)
@@ -132,34 +130,29 @@ def _finger_sides(structure: FingerStructure, model: HandModel, surfaces: list[S
     return sides
 
 
-def _along(surfaces: list[SurfaceSamples]) -> np.ndarray:
-    """Unit vector from a body's joint to the far end of its surface."""
+def _palmar_axes(
+    model: HandModel, surfaces: list[SurfaceSamples], body: int
+) -> tuple[np.ndarray | None, np.ndarray, np.ndarray | None]:
+    """Palmar direction of a body's surface, the direction of its far end, and the part of the first square to that.
+
+    The first is the mean of the normals seen, across the flexion axis, None when none is; the last is None for a body
+    that slides or when the first lies along the second. Unit vectors (3,), body frame.
+    """
     way = tip_point(surfaces, 0.2)
-    return way / max(float(np.linalg.norm(way)), 1e-9)
-
-
-def _palmar_axis(model: HandModel, surfaces: list[SurfaceSamples], body: int) -> np.ndarray | None:
-    """Palmar direction in the body frame: mean of the normals seen, across the flexion axis."""
+    along = way / max(float(np.linalg.norm(way)), 1e-9)
     m = sum(((s.seen[:, None] * s.normals).mean(0) * s.area for s in surfaces), np.zeros(3))
     if np.linalg.norm(m) < 1e-9:
-        return None
+        return None, along, None
     m /= np.linalg.norm(m)
     if model.tree.joint_prismatic[body - 1]:
-        return m
-    along = _along(surfaces)
+        return m, along, None
     hinge = model.tree.joint_axis[body - 1].astype(float)
-    if abs(hinge @ along) < 0.6:
-        flat = m - (m @ hinge) * hinge
-        if np.linalg.norm(flat) > 0.35:
-            m = flat / np.linalg.norm(flat)
-    return m
-
-
-def _across(model: HandModel, axis: np.ndarray, along: np.ndarray, body: int) -> np.ndarray | None:
-    """The palmar direction of a body that turns, square to its length; None when it lies along it."""
-    across = axis - (axis @ along) * along
+    flat = m - (m @ hinge) * hinge
+    if abs(hinge @ along) < 0.6 and np.linalg.norm(flat) > 0.35:
+        m = flat / np.linalg.norm(flat)
+    across = m - (m @ along) * along
     size = float(np.linalg.norm(across))
-    return None if model.tree.joint_prismatic[body - 1] or size <= 0.3 else across / size
+    return m, along, across / size if size > 0.3 else None
 
 
 def pad_axis(model: HandModel, surfaces: list[SurfaceSamples], tip: int) -> np.ndarray | None:
@@ -168,10 +161,7 @@ def pad_axis(model: HandModel, surfaces: list[SurfaceSamples], tip: int) -> np.n
     Args:
         surfaces: of the links on the body ``tip``.
     """
-    axis = _palmar_axis(model, surfaces, tip)
-    if axis is None:
-        return None
-    across = _across(model, axis, _along(surfaces), tip)
+    axis, _, across = _palmar_axes(model, surfaces, tip)
     return axis if across is None else across
 
 
