@@ -130,11 +130,11 @@ def _without_misfits(urdf: Urdf, spec: HandSpec) -> tuple[HandSpec, str]:
         tree = build_tree(urdf, spec)
     except HandError:  # reported when the hand is built
         return spec, ""
-    problems = {n: space_problem(spec, tree, space, dict(urdf.links)) for n, space in spec.opposition_spaces.items()}
-    unfit = {name: problem for name, problem in problems.items() if problem}
+    spaces = spec.opposition_spaces
+    unfit = {n: problem for n, s in spaces.items() if (problem := space_problem(spec, tree, s, dict(urdf.links)))}
     if not unfit:
         return spec, ""
-    fit = {name: space for name, space in spec.opposition_spaces.items() if name not in unfit}
+    fit = {name: space for name, space in spaces.items() if name not in unfit}
     note = f", without the opposition spaces {', '.join(unfit)}, which do not fit: {next(iter(unfit.values()))}"
     return spec.model_copy(update={"opposition_spaces": fit}), note
 

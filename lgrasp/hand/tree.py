@@ -171,8 +171,7 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     body: dict[str, int] = {}
     for members in groups:
         sources = dict.fromkeys(drive[j.name][0] for j in members)
-        own = [n for n in sources if n not in shared]
-        place = {n: i for i, n in enumerate([*own, *(n for n in sources if n in shared)])}
+        place = {n: i for i, n in enumerate(sorted(sources, key=shared.__contains__))}  # shared ones last
         local = {j.name: i for i, j in enumerate(members)}
         for j in members:
             up = parent_of[j.name]
@@ -182,7 +181,7 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
             body.setdefault(j.name, len(joint_dof))
         dof_index += [column[n] for n in place]
         dof_first.append(len(dof_index))
-        dof_free.append(len(own))
+        dof_free.append(len(place.keys() - shared))
     order = [j for members in groups for j in members]
     lower, upper = _limits(actuated, moving, drive, spec)
     settings = _settings(spec, column, lower, upper)

@@ -13,8 +13,8 @@ from lgrasp.engine.run import run
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import sample_bodies
+from lgrasp.jobs.hand_check.check import check_spaces
 from lgrasp.jobs.hand_check.pictures import draw_palmar
-from lgrasp.jobs.hand_check.space_check import check_spaces
 from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.runtime.device import Device, start

@@ -79,8 +79,7 @@ def draft_spec(
     base = carrier if structure.base_link else f"the root link '{urdf.root}'"
     decided = [f"base frame: {base} (base_link)", *_say_locked(survey), *_say_contacts(survey, names)]
     decided.append(_say_box(survey.hold, names, low, high))
-    drives = [len(d) for tip, d in zip(structure.tips, structure.drives, strict=True) if tip in survey.sides]
-    if structure.tree.groups > 1 and np.mean(drives) <= _FEW_DRIVES:
+    if structure.tree.groups > 1 and np.mean([len(structure.drives[tip]) for tip in survey.sides]) <= _FEW_DRIVES:
         data["contacts"] = (2, 3)
         decided.append(
             "grasps touch with 2 or 3 fingers: fingers of one or two drives seldom meet an object more at "
@@ -233,13 +232,11 @@ def _check_hold(urdf: Urdf, survey: ContactSurvey) -> None:
 
 
 def _say_locked(survey: ContactSurvey) -> list[str]:
-    decided = []
-    for joint, value in survey.locked.items():
-        why = "it carries the whole hand" if joint in survey.structure.carrying else "it moves several fingers"
-        if survey.model.groups == 1:
-            why = "it does not move the jaw"
-        decided.append(f"joint '{joint}' is locked at {value:g}: {why} (locked)")
-    return decided
+    why = dict.fromkeys(survey.locked, "it moves several fingers")
+    why |= dict.fromkeys(survey.structure.carrying, "it carries the whole hand")
+    if survey.model.groups == 1:
+        why = dict.fromkeys(survey.locked, "it does not move the jaw")
+    return [f"joint '{joint}' is locked at {v:g}: {why[joint]} (locked)" for joint, v in survey.locked.items()]
 
 
 def _contact_rules(survey: ContactSurvey) -> list[dict[str, Any]]:
@@ -272,7 +269,7 @@ def _say_contacts(survey: ContactSurvey, names: list[str]) -> list[str]:
         area = 1e4 * sum(s.area for s in sides.values())
         touches = f"may touch with {', '.join(sides)} ({area:.1f} cm2; contact)"
         nothing = "shows the others no surface, so it touches nothing (contact)"
-        joints = len(frozenset().union(*(structure.driven_by(tip) for tip in tips)))
+        joints = len(frozenset().union(*(structure.drives[tip] for tip in tips)))
         decided.append(f"finger '{finger}': {joints} drives, {touches if sides else nothing}")
         if len(tips) > 1:
             decided.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
@@ -309,8 +306,8 @@ def _open_posture(survey: ContactSurvey) -> tuple[dict[str, float], bool]:
     away = np.full(len(q), np.inf)
     for side in itertools.chain(*survey.sides.values()):
         p = postures.place(slice(None), [side.samples.body], side.samples.points[::8])  # (N, k, 3)
-        outside = np.maximum(np.maximum(survey.hold.low - p, p - survey.hold.high), 0.0)
-        away = np.minimum(away, np.linalg.norm(outside, axis=2).min(1))
+        outside = np.linalg.norm(p - np.clip(p, survey.hold.low, survey.hold.high), axis=2)
+        away = np.minimum(away, outside.min(1))
     cost = np.abs((q - rest) / span).mean(1)
     value = np.minimum(away, 0.03) / 0.03 - 0.5 * cost - 10.0 * postures.touching
     best = int(np.argmax(value))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -26,7 +27,11 @@ class FingerStructure:
     locked: tuple[str, ...]  # joints that move several fingers
     carrying: tuple[str, ...]  # those of them that carry the whole hand (arm, wrist)
     tips: tuple[int, ...]
-    drives: tuple[frozenset[str], ...]  # actuated joints that move each tip
+
+    @cached_property
+    def drives(self) -> dict[int, frozenset[str]]:
+        """Actuated joints that move each tip."""
+        return {tip: self.driven_by(tip) for tip in self.tips}
 
     def driven_by(self, body: int) -> frozenset[str]:
         """Actuated joints that move a body."""
@@ -73,18 +78,14 @@ def finger_structure(urdf: Urdf, name: str, mover: str | None = None) -> FingerS
             f"URDF {urdf.path} has no collision geometry; 'lgrasp hands add {urdf.path}' takes the visual "
             "geometry for it"
         )
-    locked: list[str] = []
+    structure, locked = _structure(urdf, name, {}), []
     if mover is not None:
-        whole = _structure(urdf, name, {})
-        drive = whole.driven_by(whole.tree.body_of(mover))
-        locked = [n for n in whole.tree.joint_names if n not in drive]
-    while mover is None:
+        drive = structure.driven_by(structure.tree.body_of(mover))
+        locked = [n for n in structure.tree.joint_names if n not in drive]
         structure = _structure(urdf, name, {n: held_value(by_name[n]) for n in locked})
-        joint = _shared_joint(structure)
-        if joint is None:
-            break
+    while mover is None and (joint := _shared_joint(structure)) is not None:
         locked.append(joint)
-    structure = _structure(urdf, name, {n: held_value(by_name[n]) for n in locked})
+        structure = _structure(urdf, name, {n: held_value(by_name[n]) for n in locked})
     for j in urdf.joints:
         if j.name in structure.tree.joint_names and not j.prismatic and j.upper - j.lower > 13.0:
             raise HandError(
@@ -110,8 +111,7 @@ def _structure(urdf: Urdf, name: str, locked: dict[str, float]) -> FingerStructu
     tree = build_tree(urdf, probe_spec(name, solid[0], locked, None))
     has = {tree.body_of(link) for link in solid} - {0}
     tips = tuple(sorted(has - {b for body in has for b in tree.path(body)[:-1]}))
-    structure = FingerStructure(tree, None, (), (), tips, ())
-    return replace(structure, drives=tuple(structure.driven_by(tip) for tip in tips))
+    return FingerStructure(tree, None, (), (), tips)
 
 
 def _shared_joint(structure: FingerStructure) -> str | None:
@@ -123,7 +123,7 @@ def _shared_joint(structure: FingerStructure) -> str | None:
     best, most = None, 1
     group = structure.tree.body_group
     for g in range(structure.tree.groups):
-        members = [d for tip, d in zip(structure.tips, structure.drives, strict=True) if group[tip] == g]
+        members = [d for tip, d in structure.drives.items() if group[tip] == g]
         for name in structure.tree.joint_names:
             moved = [d for d in members if name in d]
             pair = len(moved) == len(members) == 2 and structure.tree.groups > 1 and min(map(len, moved)) == 2
@@ -152,25 +152,25 @@ def _common_link(urdf: Urdf, structure: FingerStructure) -> str:
     return [links[0] for links in zip(*lines, strict=False) if len(set(links)) == 1][-1]
 
 
+_FINGER_WORDS = {
+    "thumb": ("thumb", "th_", "_th", "thj", "thd"),
+    "index": ("index", "fore", "ff_", "_ff", "ffj", "ffd"),
+    "middle": ("middle", "mf_", "_mf", "mfj", "mfd"),
+    "ring": ("ring", "rf_", "_rf", "rfj", "rfd"),
+    "little": ("little", "pinky", "lf_", "_lf", "lfj", "lfd"),
+}
+
+
 def finger_names(structure: FingerStructure) -> list[str]:
     """A name for each dependency group, from its links and joints where they say which finger it is."""
-    words = (
-        ("thumb", ("thumb", "th_", "_th", "thj", "thd")),
-        ("index", ("index", "fore", "ff_", "_ff", "ffj", "ffd")),
-        ("middle", ("middle", "mf_", "_mf", "mfj", "mfd")),
-        ("ring", ("ring", "rf_", "_rf", "rfj", "rfd")),
-        ("little", ("little", "pinky", "lf_", "_lf", "lfj", "lfd")),
-    )
     names: list[str] = []
     for g in range(structure.tree.groups):
-        bodies = np.flatnonzero(structure.tree.body_group == g)
-        texts = [link.lower() for b in bodies for link in structure.tree.links_on(int(b))]
-        texts += [
-            n.lower() for tip, d in zip(structure.tips, structure.drives, strict=True) if tip in bodies for n in d
-        ]
-        count = dict.fromkeys((word for word, _ in words), 0)
+        bodies = np.flatnonzero(structure.tree.body_group == g).tolist()
+        texts = [link for body in bodies for link in structure.tree.links_on(body)]
+        texts += [joint for tip, drives in structure.drives.items() if tip in bodies for joint in drives]
+        count = dict.fromkeys(_FINGER_WORDS, 0)
         for text in texts:
-            found = [word for word, keys in words if any(k in text for k in keys)]
+            found = [word for word, keys in _FINGER_WORDS.items() if any(key in text.lower() for key in keys)]
             # a middle phalanx is no middle finger
             for word in [w for w in found if w != "middle"] or found:
                 count[word] += 1

@@ -8,7 +8,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import LinkGrid, body_cones, side_points
@@ -85,7 +84,8 @@ def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface], device: str = 
     """The surface of one side of a space, links without any left out."""
     rng = np.random.default_rng(0)
     surfaces = [(link, part) for part in side for link in part.links]
-    meshes = _body_meshes(urdf, tree, {tree.body_of(link) for link, _ in surfaces})
+    bodies = {tree.body_of(link) for link, _ in surfaces}
+    meshes = {link: link_meshes(urdf, tree, link) for body in bodies for link in tree.links_on(body)}
     found = []
     for link, surface in surfaces:
         T, group = tree.T_body_link[tree.link_names.index(link)], tree.group_of(link)
@@ -136,7 +136,7 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
     """
     urdf, tree = read_urdf(urdf_path), model.tree
     links = [link for side in space_sides(urdf, spec, tree, name, device) for link in side]
-    meshes = _body_meshes(urdf, tree, {tree.body_of(link.link) for link in links})
+    meshes = {link.link: link_meshes(urdf, tree, link.link) for link in links}
     arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=_grids(model))
     arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
     described = spec.opposition_spaces[name].model_dump(mode="json")
@@ -146,18 +146,12 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
 
 def _grids(model: HandModel) -> dict[str, LinkGrid]:
     """Distance grids of the hand's own contact links."""
-    m = model
-    parts = np.split(m.grid_values, m.grid_first[1:-1])
-    rows = zip(m.grid_link, parts, m.grid_shape, m.grid_origin, m.grid_cell, strict=True)
-    return {m.tree.link_names[k]: LinkGrid(v.reshape(shape), origin, float(c)) for k, v, shape, origin, c in rows}
+    names, parts = model.tree.link_names, np.split(model.grid_values, model.grid_first[1:-1])
+    rows = zip(model.grid_link, parts, model.grid_shape, model.grid_origin, model.grid_cell, strict=True)
+    return {names[k]: LinkGrid(part.reshape(shape), origin, float(cell)) for k, part, shape, origin, cell in rows}
 
 
 def _outside(surface: Surface) -> tuple[Cone, ...]:
     """Normals that a side's cone leaves out."""
     x, y, z = surface.axis
     return (Cone(axis=(-x, -y, -z), angle=180.0 - surface.angle),) if surface.angle < 180.0 else ()
-
-
-def _body_meshes(urdf: Urdf, tree: Tree, bodies: Collection[int]) -> dict[str, list[trimesh.Trimesh]]:
-    """Solids of every link that rides on one of the bodies, body frame."""
-    return {link: link_meshes(urdf, tree, link) for body in bodies for link in tree.links_on(body)}

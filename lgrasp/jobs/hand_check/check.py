@@ -13,12 +13,14 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.errors import OutputError
+from lgrasp.errors import HandError, OutputError
 from lgrasp.grasp.records import Shard
+from lgrasp.hand.opposition.facing import space_opening, space_postures
+from lgrasp.hand.opposition.spaces import hand_spaces, longest, space_sides
+from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.generate import GenerateJob, generate
-from lgrasp.jobs.hand_check.diagnose import diagnose, hand_findings
+from lgrasp.jobs.hand_check.diagnose import diagnose, finger_label, hand_findings
 from lgrasp.jobs.hand_check.pictures import draw_grasps, draw_hand, draw_palmar, draw_spaces, draw_workspace
-from lgrasp.jobs.hand_check.space_check import SpaceCheck, check_spaces, longest_sequence
 
 _CANDIDATES_PER_ROW = 300  # candidates per row before an object is given up
 
@@ -34,6 +36,19 @@ class ObjectCheck:
     survivors: dict[str, int]  # one number per stage
     counts: dict[str, dict[str, int]]
     reasons: list[str]  # why fewer than asked came out
+
+
+@dataclass(frozen=True)
+class SpaceCheck:
+    """Findings on one opposition space."""
+
+    name: str
+    joints: list[str]
+    sides: list[str]  # names of the fingers, or palm
+    areas: list[float]  # [m^2] of each side
+    low: float | None  # [m] between which the sides face each other; None when they hardly ever do
+    high: float | None
+    problem: str  # why it can never hold anything; empty when it can
 
 
 @dataclass(frozen=True)
@@ -122,6 +137,36 @@ def check_hand(
     say("pictures")
     pictures = _draw(inputs, shards, [space.name for space in spaces if all(space.areas)], out)
     return HandCheck(model.name, source.note, list(model.notes), hints, checks, spaces, sequence, pictures)
+
+
+def check_spaces(inputs: Inputs) -> list[SpaceCheck]:
+    """Measure every opposition space of a hand on random postures."""
+    spec, model, device = inputs.keys.source.spec, inputs.hand.model, inputs.hand.device
+    if not spec.opposition_spaces:
+        return []
+    urdf, postures = read_urdf(inputs.keys.source.urdf), space_postures(model, device)
+    out = []
+    for space in hand_spaces(spec, model.tree):
+        labels = [finger_label(model, dict(spec.fingers), g) if g >= 0 else "palm" for g in space.groups]
+        joints = list(spec.opposition_spaces[space.name].joints)
+        try:
+            sides = space_sides(urdf, spec, model.tree, space.name, device)
+        except HandError as error:
+            out.append(SpaceCheck(space.name, joints, labels, [0.0, 0.0], None, None, str(error).split(": ", 2)[-1]))
+            continue
+        opening = space_opening(model, postures, space, sides)
+        low, high = (float(x) if np.isfinite(x) else None for x in (opening.low, opening.high))
+        areas = [sum(link.area for link in side) for side in sides]
+        out.append(SpaceCheck(space.name, joints, labels, areas, low, high, opening.problem))
+    return out
+
+
+def longest_sequence(inputs: Inputs, checks: list[SpaceCheck]) -> int:
+    """Most objects, one after another, that the spaces which can hold something allow."""
+    tree = inputs.hand.model.tree
+    able = {check.name for check in checks if not check.problem}
+    spaces = [space for space in hand_spaces(inputs.keys.source.spec, tree) if space.name in able]
+    return longest(spaces, (), np.zeros(len(tree.joint_names), bool))
 
 
 def _draw(inputs: Inputs, shards: dict[str, Shard], spaces: list[str], out: Path) -> list[Path]:
