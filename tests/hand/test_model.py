@@ -11,9 +11,10 @@ from support.hands import HANDS, hand_model, hand_source, minimal_spec
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.contacts import link_points
-from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres
+from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres, link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
+from lgrasp.hand.surface import joined_mesh
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Geometry, Joint, read_urdf
 
@@ -256,12 +257,7 @@ def test_contact_points_obey_the_rules():
             allowed = [n @ np.array(c.axis) >= np.cos(np.radians(c.angle)) - 1e-6 for c in spec.palm.allowed]
             assert np.any(allowed, 0).all()
         # on the surface of the link's solid
-        solid = trimesh.util.concatenate(
-            [
-                geometry_mesh(read_urdf(path), g).apply_transform(tree.T_body_link[index] @ g.T_link_geometry)
-                for g in read_urdf(path).links[link]
-            ]
-        )
+        solid = joined_mesh(link_meshes(read_urdf(path), tree, link))
         assert surface_distance(solid, model.contact_points[own][:60]).max() < 1e-6
     # one patch: near in place and direction
     for patch in np.unique(model.contact_patch)[::7]:

@@ -53,7 +53,8 @@ def cold(tmp_path: Path) -> Cache:
 
 
 def test_plan(on_cpu, cold, tmp_path):
-    outcome = run(PlanJob(hand="barrett", object="sphere", starts=3, out=tmp_path / "out", cache=cold))
+    given = {"hand": "barrett", "object": "sphere", "starts": 3}
+    outcome = run(PlanJob(**given, out=tmp_path / "out", cache=cold))
     assert outcome.rows
     assert on_cpu == []
 
