@@ -103,7 +103,7 @@ def check_hand(
     bounded = pipeline.model_copy(update={"effort": _CANDIDATES_PER_ROW})
     checks: list[ObjectCheck] = []
     shards: dict[str, Shard] = {}
-    inputs: Inputs | None = None
+    inputs = None
     with tempfile.TemporaryDirectory(prefix="lgrasp-check-") as folder:
         for name, mesh in check_objects(Path(folder)).items():
             say(f"{name} of 5 cm")
@@ -118,7 +118,8 @@ def check_hand(
                 shard_rows=rows,
                 cache=cache,
             )
-            outcome, inputs = generate(job), job.inputs
+            outcome = generate(job)
+            inputs = job.inputs
             done = outcome.results[0]
             reasons = diagnose(inputs, done.counts, outcome.rows, rows)
             left = survivors(done.counts)
