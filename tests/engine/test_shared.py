@@ -22,7 +22,7 @@ def cache(tmp_path_factory) -> Cache:
 def test_rows_take_the_listed_values_and_are_valid(name, cache, tmp_path):
     pipeline = load_pipeline("swift")
     pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 40_000})})
-    outcome = generate(GenerateJob(name, "sphere", 60, pipeline, tmp_path, cache=cache))
+    outcome = generate(GenerateJob(hand=name, object="sphere", rows=60, pipeline=pipeline, out=tmp_path, cache=cache))
     assert outcome.rows == 60
     shard = read_shard(outcome.paths[0])
     names = list(shard.hand.joint_names)
@@ -58,7 +58,9 @@ def test_joints_that_only_the_rules_couple_are_in_the_shard(cache, tmp_path):
     bare.write_text(text)
     pipeline = load_pipeline("swift")
     pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 40_000})})
-    outcome = generate(GenerateJob(str(bare), "sphere", 40, pipeline, tmp_path / "out", cache=cache))
+    outcome = generate(
+        GenerateJob(hand=str(bare), object="sphere", rows=40, pipeline=pipeline, out=tmp_path / "out", cache=cache)
+    )
     assert outcome.rows == 40
     shard = read_shard(outcome.paths[0])
     names = list(shard.hand.joint_names)

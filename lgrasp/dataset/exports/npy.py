@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lgrasp.dataset.exports.unpickle import load_plain
 from lgrasp.dataset.files import new_file, parsing, write_file
 
 _PROTOCOL = 3  # names are plain text in it, and every Python 3 reads it
@@ -55,7 +56,7 @@ def load_objects(path: str | os.PathLike[str]) -> list[Any]:
         shape, _, dtype = read(file)
         if not dtype.hasobject:
             raise ValueError(f"it holds numbers of type {dtype}, not objects")
-        values = _Unpickler(file, encoding="latin1").load()
+        values = load_plain(file.read())
         if not isinstance(values, np.ndarray) or values.shape != shape:
             raise ValueError(f"what it holds is not of the promised shape {shape}")
         return values.ravel().tolist()
@@ -80,23 +81,3 @@ def _words(value: Any) -> bytes:
     """The pickle of a value, without its first and last words, which frame it."""
     words = pickle.dumps(value, protocol=_PROTOCOL)[2:-1]
     return words.replace(pickle.GLOBAL + b"numpy._core.", pickle.GLOBAL + b"numpy.core.")
-
-
-class _Unpickler(pickle.Unpickler):
-    """Reads arrays and plain values; refuses to call anything else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        known = module.replace("numpy._core", "numpy.core")
-        if (known, name) in _READABLE:
-            return _READABLE[known, name]
-        raise pickle.UnpicklingError(f"it would call {module}.{name}; only numbers, texts, lists and arrays are read")
-
-
-_READABLE: dict[tuple[str, str], Any] = {
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
-    ("numpy.core.multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],
-    ("numpy.core.multiarray", "scalar"): np.float64(0).__reduce__()[0],
-    ("numpy.core.numeric", "_frombuffer"): np.empty(0).__reduce_ex__(5)[0],
-    ("_codecs", "encode"): lambda text, _: text.encode("latin1"),
-}

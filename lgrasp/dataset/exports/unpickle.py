@@ -1,0 +1,250 @@
+"""Pickled numbers, texts, lists, dictionaries and NumPy arrays, read without calling anything that a file names.
+
+A pickle is a program for a small stack machine. This one knows the words that plain values and arrays need, and nothing
+else. NumPy's constructors are only noted while the program runs; afterwards each array is made from bytes whose
+number, type and shape were compared.
+"""
+
+import io
+import math
+import pickletools
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+DEPTH = 32
+"""Lists, dictionaries and arrays inside each other."""
+_NUMBERS = re.compile(r"[?]|[biufc?][0-9]{1,2}|[SU][0-9]{1,4}")  # types of elements that are read
+_VALUES = re.compile(
+    r"(LONG|BIN)?INT[12]?|LONG[14]?|(BIN)?FLOAT|(SHORT_)?(BIN)?(STRING|BYTES|UNICODE)8?|BYTEARRAY8"
+)  # words that push the value they carry
+_IGNORED = ("PROTO", "FRAME", "STOP")
+_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+
+
+class UnpickleError(ValueError):
+    """What a pickle holds is no plain value."""
+
+
+@dataclass
+class _Noted:
+    """A call of a name that NumPy's pickles hold, not made: its arguments and the state set later."""
+
+    name: str
+    args: tuple[Any, ...] | None = None  # None: the name itself
+    state: Any = None
+
+
+_NAMES = {
+    "numpy ndarray": "ndarray",
+    "numpy dtype": "dtype",
+    "numpy.core.multiarray _reconstruct": "array",
+    "numpy.core.multiarray scalar": "scalar",
+    "numpy.core.numeric _frombuffer": "buffer",
+    "_codecs encode": "bytes",
+}
+
+
+def load_plain(data: bytes) -> Any:
+    """The value that a pickle holds, of any protocol and of Python 2 too (its texts as latin1).
+
+    Raises:
+        UnpickleError: it is damaged, or holds more than None, numbers, texts, bytes, lists, tuples, dictionaries by
+            text or number, and arrays of bool, int, float, text, bytes or of such values.
+    """
+    try:
+        return _Reader(1000 + 8 * len(data)).read(_run(data), 0)
+    except Exception as error:  # a damaged program fails in many ways
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UnpickleError(reason if isinstance(error, UnpickleError) else f"damaged: {reason}") from error
+
+
+def _run(data: bytes) -> Any:
+    """The value left by the words of a pickle; arrays as :class:`_Noted`."""
+    stack: list[Any] = []
+    marks: list[int] = []
+    memo: dict[int, Any] = {}
+
+    def above_mark() -> list[Any]:
+        at = marks.pop()
+        values = stack[at:]
+        del stack[at:]
+        return values
+
+    def top(kind: type) -> Any:
+        if type(stack[-1]) is not kind or (marks and len(stack) <= marks[-1]):
+            raise UnpickleError("it builds on something else than a list, dictionary or array")
+        return stack[-1]
+
+    for code, arg, _ in pickletools.genops(io.BytesIO(data)):
+        word = code.name
+        if _VALUES.fullmatch(word):
+            stack.append(arg)
+        elif word in _CONSTANTS:
+            stack.append(_CONSTANTS[word])
+        elif word == "MARK":
+            marks.append(len(stack))
+        elif word in ("EMPTY_LIST", "EMPTY_DICT"):
+            stack.append([] if word == "EMPTY_LIST" else {})
+        elif word in ("LIST", "TUPLE", "DICT"):
+            values = above_mark()
+            stack.append(_dictionary(values) if word == "DICT" else list(values) if word == "LIST" else tuple(values))
+        elif word in ("TUPLE1", "TUPLE2", "TUPLE3"):
+            count = int(word[-1])
+            stack[-count:] = [tuple(stack[-count:])]
+        elif word in ("APPEND", "APPENDS"):
+            values = above_mark() if word == "APPENDS" else [stack.pop()]
+            top(list).extend(values)
+        elif word in ("SETITEM", "SETITEMS"):
+            values = above_mark() if word == "SETITEMS" else [stack.pop(-2), stack.pop()]
+            top(dict).update(_dictionary(values))
+        elif word == "MEMOIZE":
+            memo[len(memo)] = stack[-1]
+        elif word.endswith("PUT"):
+            memo[arg] = stack[-1]
+        elif word.endswith("GET"):
+            stack.append(memo[arg])
+        elif word in ("GLOBAL", "STACK_GLOBAL"):
+            module, name = arg.split(" ", 1) if word == "GLOBAL" else (stack.pop(-2), stack.pop())
+            stack.append(_named(module, name))
+        elif word == "REDUCE":
+            args, called = stack.pop(), stack.pop()
+            if type(called) is not _Noted or called.args is not None or type(args) is not tuple:
+                raise UnpickleError("it calls something else than a name")
+            stack.append(_Noted(called.name, args))
+        elif word == "BUILD":
+            state = stack.pop()
+            top(_Noted).state = state
+        elif word not in _IGNORED:
+            raise UnpickleError(f"it says {word}, which no plain value needs")
+    (value,) = stack
+    return value
+
+
+def _named(module: str, name: str) -> _Noted:
+    known = _NAMES.get(f"{module} {name}".replace("numpy._core", "numpy.core"))
+    if known is None:
+        raise UnpickleError(f"it would call {module}.{name}; only numbers, texts, lists and arrays are read")
+    return _Noted(known)
+
+
+def _dictionary(values: list[Any]) -> dict[str | int, Any]:
+    keys = values[::2]
+    if len(values) % 2 or not all(type(key) in (str, int) for key in keys):
+        raise UnpickleError("it has a dictionary by something else than texts and numbers")
+    return dict(zip(keys, values[1::2], strict=True))
+
+
+class _Reader:
+    """Turns what a program left into plain values; one that stands in several places is read once.
+
+    Args:
+        most: values there may be, each counted wherever it stands.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most, self._count = most, 0
+        self._known: dict[int, tuple[Any, int]] = {}
+        self._open: set[int] = set()
+        self._calls: dict[str, Callable[[_Noted, int], Any]] = {
+            "array": self._array,
+            "scalar": lambda noted, _: _elements(*_exactly(noted.args, 2)).item(),
+            "buffer": self._buffer,
+            "bytes": lambda noted, _: _latin(_exactly(noted.args, 2)[0]),
+        }
+
+    def read(self, value: Any, depth: int) -> Any:
+        """The plain value of what a program made."""
+        if not isinstance(value, (list, tuple, dict, _Noted)):
+            return value
+        key = id(value)
+        if key in self._open or depth > DEPTH:
+            raise UnpickleError(f"it is more than {DEPTH} values inside each other, or inside itself")
+        if key not in self._known:
+            self._open.add(key)
+            before = self._count
+            self._known[key] = self._read(value, depth + 1), self._count - before
+            self._open.remove(key)
+        else:
+            self._count += self._known[key][1]
+        if self._count > self._most:
+            raise UnpickleError("the same values stand in it too many times")
+        return self._known[key][0]
+
+    def _read(self, value: Any, depth: int) -> Any:
+        self._count += 1 if isinstance(value, _Noted) else len(value)
+        if isinstance(value, dict):
+            return {name: self.read(item, depth) for name, item in value.items()}
+        if isinstance(value, _Noted):
+            if value.args is None or value.name not in self._calls:
+                raise UnpickleError(f"it holds {value.name} itself")
+            return self._calls[value.name](value, depth)
+        return type(value)(self.read(item, depth) for item in value)
+
+    def _array(self, noted: _Noted, depth: int) -> np.ndarray:
+        """An array from ``_reconstruct(ndarray, (0,), b'b')`` and the state (version, shape, type, Fortran?, data)."""
+        _, shape, kind, fortran, data = _exactly(noted.state, 5)
+        if isinstance(data, list):
+            _object_type(kind)
+            flat = np.empty(len(data), object)
+            for k, item in enumerate(data):
+                flat[k] = self.read(item, depth)
+        else:
+            flat = _elements(kind, self.read(data, depth))
+        return _shaped(flat, shape, "F" if fortran else "C")
+
+    def _buffer(self, noted: _Noted, _: int) -> np.ndarray:
+        data, kind, shape, order = _exactly(noted.args, 4)
+        return _shaped(_elements(kind, data), shape, order)
+
+
+def _exactly(values: Any, count: int) -> tuple[Any, ...]:
+    if type(values) is not tuple or len(values) != count:
+        raise UnpickleError(f"an array of it has not {count} properties")
+    return values
+
+
+def _shaped(flat: np.ndarray, shape: Any, order: Any) -> np.ndarray:
+    if type(shape) is not tuple or not all(type(n) is int and n >= 0 for n in shape) or order not in ("C", "F"):
+        raise UnpickleError(f"an array of it has the shape {str(shape)[:40]}")
+    if math.prod(shape) != len(flat):
+        raise UnpickleError(f"an array of it has the shape {str(shape)[:40]} and {len(flat):,} elements")
+    return flat.reshape(shape, order=order)
+
+
+def _latin(data: Any) -> bytes:
+    if isinstance(data, str):
+        return data.encode("latin1")
+    if isinstance(data, bytes | bytearray):
+        return bytes(data)
+    raise UnpickleError("an array of it has no bytes")
+
+
+def _elements(kind: Any, data: Any) -> np.ndarray:
+    """Elements of a noted type from their bytes, shape (n,)."""
+    name, order = _type(kind)
+    if not _NUMBERS.fullmatch(name):
+        raise UnpickleError(f"it has an array of type {name[:20]!r}; only numbers and texts are read")
+    dtype, raw = np.dtype(name).newbyteorder(order), _latin(data)
+    if dtype.itemsize == 0 or len(raw) % dtype.itemsize:
+        raise UnpickleError(f"an array of type {name} has {len(raw):,} bytes")
+    return np.frombuffer(raw, dtype)
+
+
+def _object_type(kind: Any) -> None:
+    if _type(kind)[0] not in ("O8", "O4", "O"):
+        raise UnpickleError("an array of objects has another type")
+
+
+def _type(kind: Any) -> tuple[str, str]:
+    """Name and byte order of a noted ``dtype(name, align, copy)`` with state (3, order, None, None, None, ...)."""
+    if type(kind) is not _Noted or kind.name != "dtype" or not kind.args or type(kind.args[0]) is not str:
+        raise UnpickleError("an array of it has no type")
+    state = (3, "=", None) if kind.state is None else kind.state
+    plain = type(state) is tuple and len(state) >= 3 and state[1] in ("<", ">", "=", "|")
+    if not plain or any(part is not None for part in state[2:5]):
+        raise UnpickleError("it has an array of a type with fields")
+    return kind.args[0], state[1]
