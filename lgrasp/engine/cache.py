@@ -15,6 +15,7 @@ import numpy as np
 from lgrasp.dataset.files import new_file, remove_leftovers
 from lgrasp.errors import CacheError, OutputError
 from lgrasp.paths import cache_dir
+from lgrasp.runtime.kernel_cache import unfinished
 
 _FORMAT = 2
 _NAMES = "/names"  # member that lists the others
@@ -139,6 +140,8 @@ class Cache:
                 entry.path.unlink(missing_ok=True)
                 files, size = files + 1, size + entry.size
         remove_leftovers(self.root, "*/*.tmp")
+        for folder in unfinished(self.root / "kernels"):
+            shutil.rmtree(folder, ignore_errors=True)
         return files, size
 
     def kernel_bytes(self) -> int:

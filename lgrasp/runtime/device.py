@@ -1,16 +1,19 @@
 """Starts Warp quietly, keeps its kernels in our cache and resolves device names."""
 
+import atexit
 import contextlib
 import ctypes
 import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import warp as wp
 
 from lgrasp.errors import DeviceError
 from lgrasp.paths import cache_dir
+from lgrasp.runtime.kernel_cache import drop_damaged, note_checksums, usable_folder
 
 KERNEL_OPTIONS = {"enable_backward": False, "max_unroll": 1}
 """Module options of every non-differentiable kernel module (they decide compile time: minutes or seconds)."""
@@ -33,7 +36,8 @@ class Device:
 
 
 def start() -> None:
-    """Initialise Warp once, without output; compiled kernels go to ``<cache>/kernels``.
+    """Initialise Warp once, without output; compiled kernels go to ``<cache>/kernels``, or where that cannot be written
+    to a temporary folder. Damaged ones are dropped.
 
     A ``WARP_CACHE_PATH`` set by the user wins.
     """
@@ -42,9 +46,12 @@ def start() -> None:
         return
     wp.config.log_level = wp.LOG_ERROR
     if "WARP_CACHE_PATH" not in os.environ:
-        wp.config.kernel_cache_dir = str(cache_dir() / "kernels")
+        wp.config.kernel_cache_dir = str(usable_folder(cache_dir() / "kernels"))
     with _without_driver_warning():
         wp.init()
+    folder = Path(wp.config.kernel_cache_dir)  # Warp added its version
+    drop_damaged(folder)
+    atexit.register(note_checksums, folder)
     _started = True
 
 

@@ -6,11 +6,13 @@ import pkgutil
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
 from types import ModuleType
 
 import warp as wp
 
 import lgrasp
+from lgrasp.runtime.kernel_cache import note_checksums
 
 
 def import_all() -> None:
@@ -50,3 +52,4 @@ def load_kernels(device: str, modules: list[str], progress: Callable[[str, float
             future.result()
             if progress:
                 progress(f"kernels {waiting[future]}", done / len(waiting))
+    note_checksums(Path(wp.config.kernel_cache_dir))

@@ -53,9 +53,12 @@ def test_no_command_prints_help(cli):
     assert "error" not in result.err
 
 
+HEAVY = ("numpy", "warp", "torch", "h5py", "pydantic", "yaml")
+
+
 def test_help_is_light():
     code = "import sys; sys.argv = ['lgrasp', '--help']\nfrom lgrasp_cli.main import main\n"
-    code += "try:\n    main()\nfinally:\n    print([m for m in ('numpy', 'warp', 'torch', 'h5py', 'pydantic', 'yaml') if m in sys.modules])"
+    code += f"try:\n    main()\nfinally:\n    print([m for m in {HEAVY} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines()[-1] == "[]"
 
