@@ -151,7 +151,7 @@ class _Reader:
         self._open: set[int] = set()
         self._calls: dict[str, Callable[[_Noted, int], Any]] = {
             "array": self._array,
-            "scalar": lambda noted, _: _elements(*_exactly(noted.args, 2)).item(),
+            "scalar": self._scalar,
             "buffer": self._buffer,
             "bytes": lambda noted, _: _latin(_exactly(noted.args, 2)[0]),
         }
@@ -196,9 +196,13 @@ class _Reader:
             flat = _elements(kind, self.read(data, depth))
         return _shaped(flat, shape, "F" if fortran else "C")
 
-    def _buffer(self, noted: _Noted, _: int) -> np.ndarray:
+    def _buffer(self, noted: _Noted, depth: int) -> np.ndarray:
         data, kind, shape, order = _exactly(noted.args, 4)
-        return _shaped(_elements(kind, data), shape, order)
+        return _shaped(_elements(kind, self.read(data, depth)), shape, order)
+
+    def _scalar(self, noted: _Noted, depth: int) -> Any:
+        kind, data = _exactly(noted.args, 2)
+        return _elements(kind, self.read(data, depth)).item()
 
 
 def _exactly(values: Any, count: int) -> tuple[Any, ...]:
@@ -231,7 +235,12 @@ def _elements(kind: Any, data: Any) -> np.ndarray:
     dtype, raw = np.dtype(name).newbyteorder(order), _latin(data)
     if dtype.itemsize == 0 or len(raw) % dtype.itemsize:
         raise UnpickleError(f"an array of type {name} has {len(raw):,} bytes")
-    return np.frombuffer(raw, dtype)
+    elements = np.frombuffer(raw, dtype)
+    if dtype.kind == "U":
+        codes = elements.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+        if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes < 0xE000))).any():
+            raise UnpickleError("an array of texts holds what is no letter")
+    return elements
 
 
 def _object_type(kind: Any) -> None:
