@@ -15,7 +15,7 @@ from lgrasp.judge.duplicates import Repeats
 
 
 @dataclass(repr=False, eq=False)
-class Verdict:
+class JudgedRows:
     """Findings over judged rows; arrays have one number a row.
 
     Attributes:
@@ -52,7 +52,7 @@ class Verdict:
 
 
 @dataclass
-class ShardVerdict(Verdict):
+class ShardVerdict(JudgedRows):
     """Findings over the judged rows of one shard; ``rows`` (n,) are their places in the file.
 
     Attributes:
@@ -75,7 +75,7 @@ class ShardVerdict(Verdict):
         return {"path": str(self.path), "total_rows": self.total_rows, **self.counts(), **passing, **told}
 
 
-class Report(Verdict):
+class Report(JudgedRows):
     """Findings over all judged rows of all shards; arrays are those of :class:`ShardVerdict` one after another.
 
     Attributes:
