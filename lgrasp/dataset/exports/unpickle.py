@@ -11,7 +11,7 @@ import pickletools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -79,8 +79,8 @@ def _run(data: bytes) -> Any:
             raise UnpickleError("it builds on something else than a list, dictionary or array")
         return stack[-1]
 
-    for code, arg, _ in pickletools.genops(io.BytesIO(data)):
-        word = code.name
+    for code, carried, _ in pickletools.genops(io.BytesIO(data)):
+        word, arg = code.name, cast(Any, carried)
         if _VALUES.fullmatch(word):
             stack.append(arg)
         elif word in _CONSTANTS:
@@ -232,12 +232,12 @@ def _elements(kind: Any, data: Any) -> np.ndarray:
     name, order = _type(kind)
     if not _NUMBERS.fullmatch(name):
         raise UnpickleError(f"it has an array of type {name[:20]!r}; only numbers and texts are read")
-    dtype, raw = np.dtype(name).newbyteorder(order), _latin(data)
+    dtype, raw = np.dtype(f"{order}{name}"), _latin(data)
     if dtype.itemsize == 0 or len(raw) % dtype.itemsize:
         raise UnpickleError(f"an array of type {name} has {len(raw):,} bytes")
     elements = np.frombuffer(raw, dtype)
     if dtype.kind == "U":
-        codes = elements.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+        codes = elements.view(f"{order}u4")
         if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes < 0xE000))).any():
             raise UnpickleError("an array of texts holds what is no letter")
     return elements
@@ -252,8 +252,9 @@ def _type(kind: Any) -> tuple[str, str]:
     """Name and byte order of a noted ``dtype(name, align, copy)`` with state (3, order, None, None, None, ...)."""
     if type(kind) is not _Noted or kind.name != "dtype" or not kind.args or type(kind.args[0]) is not str:
         raise UnpickleError("an array of it has no type")
-    state = (3, "=", None) if kind.state is None else kind.state
-    plain = type(state) is tuple and len(state) >= 3 and state[1] in ("<", ">", "=", "|")
-    if not plain or any(part is not None for part in state[2:5]):
+    state: Any = (3, "=") if kind.state is None else kind.state
+    if not isinstance(state, tuple) or len(state) < 2 or state[1] not in ("<", ">", "=", "|"):
+        raise UnpickleError("a type of it has no byte order")
+    if any(part is not None for part in state[2:5]):
         raise UnpickleError("it has an array of a type with fields")
     return kind.args[0], state[1]
