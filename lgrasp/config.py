@@ -14,6 +14,9 @@ from lgrasp.paths import data_dirs
 
 Model = TypeVar("Model", bound=BaseModel)
 
+_YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_YAML_DEPTH, _YAML_BYTES = 64, 4 << 20
+
 # fields that several models have
 Seed = Annotated[int, Field(ge=0, lt=2**63, description="Decides every random draw.")]
 DeviceName = Annotated[str, Field(description="auto, cpu or cuda:N.")]
@@ -78,6 +81,22 @@ def find_yaml(name: str, files: Mapping[str, Path], what: str) -> Path:
     return path
 
 
+def load_yaml(text: str | bytes) -> Any:
+    """What a YAML text says: plain values, without aliases, at most 64 inside each other, which any parser survives.
+
+    Raises:
+        yaml.YAMLError: no such text.
+    """
+    depth = 0
+    for event in yaml.parse(text, Loader=_YAML):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent) or depth > _YAML_DEPTH:
+            what = "an alias (*name); write the value out" if depth <= _YAML_DEPTH else "more than 64 levels"
+            raise yaml.YAMLError(f"line {event.start_mark.line + 1}: {what}")
+    return yaml.load(text, Loader=_YAML)
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping that a YAML file holds.
 
@@ -85,7 +104,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ConfigError: unreadable, not YAML, or not a mapping.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > _YAML_BYTES:
+            raise ConfigError(f"file {path} has {path.stat().st_size:,} bytes; at most {_YAML_BYTES:,} are read")
+        data = load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError(f"file {path} cannot be read: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict):
@@ -114,7 +135,9 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
             raise ConfigError(f"{where}: key '{key}' is missing") from None
         if not first["loc"]:
             raise ConfigError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
-        raise ConfigError(f"{where}: key '{key}' = {first['input']!r}: {first['msg']}") from None
+        value = repr(first["input"])
+        shown = value if len(value) <= 100 else f"{value[:97]}..."
+        raise ConfigError(f"{where}: key '{key}' = {shown}: {first['msg']}") from None
 
 
 def apply_settings(parts: Mapping[str, BaseModel], settings: Sequence[str], where: str) -> dict[str, BaseModel]:
@@ -139,7 +162,7 @@ def apply_settings(parts: Mapping[str, BaseModel], settings: Sequence[str], wher
             hint = did_you_mean(name.strip(), sorted(known), cutoff=0.4)
             raise ConfigError(f"--set '{text}': {where} has no '{name.strip()}'; {hint}known: {', '.join(keys)}")
         try:
-            changes.setdefault(part, {})[key] = yaml.safe_load(value)
+            changes.setdefault(part, {})[key] = load_yaml(value)
         except yaml.YAMLError:
             raise ConfigError(f"--set '{text}': the value cannot be read") from None
     made = dict(parts)

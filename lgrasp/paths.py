@@ -46,3 +46,14 @@ def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:
         return Path(override).expanduser()
     env = os.environ.get("LGRASP_CACHE_DIR")
     return Path(env).expanduser() if env else Path(platformdirs.user_cache_dir("lgrasp"))
+
+
+def name_problem(name: str) -> str:
+    """Why a hand or an object cannot have a name, which becomes part of file names and tables; "" if it can."""
+    if not name.isprintable():
+        return "it has characters that cannot be printed"
+    if not 0 < len(name) <= 120:
+        return f"it has {len(name)} characters, 1 to 120 are accepted"
+    if name.startswith(".") or any(letter in r"/\[]" for letter in name):
+        return r"it begins with '.' or has one of / \ [ ]"
+    return ""

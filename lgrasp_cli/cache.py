@@ -49,13 +49,13 @@ def list_entries(
 @app.command()
 def prune(
     kind: Annotated[list[str] | None, Option(help="Only this kind, such as bank; repeatable.")] = None,
-    older_than: Annotated[float | None, Option(metavar="DAYS", help="Only entries older than this.")] = None,
+    older_than: Annotated[str | None, Option(metavar="AGE", help="Only entries older than this: 30d, 12h.")] = None,
     everything: Annotated[bool, Option("--all", help="All entries, and compiled kernels.")] = False,
     cache_dir: CacheDir = None,
 ) -> None:
     """Remove entries from the cache; they are rebuilt when needed.
 
-    Example: lgrasp cache prune --kind bank --older-than 7
+    Example: lgrasp cache prune --kind bank --older-than 7d
     """
     import time
 
@@ -63,14 +63,26 @@ def prune(
 
     if not (kind or older_than is not None or everything):
         raise ConfigError("cache prune: say what, with --kind, --older-than or --all")
+    before = None if older_than is None else time.time() - _seconds(older_than)
     cache = open_cache(cache_dir)
     if kind:
         known = sorted({e.kind for e in cache.entries()} | {"kernels"})
         for name in kind:
             if name not in known:
                 raise ConfigError(f"cache prune: no entries of kind '{name}'; there are: {', '.join(known)}")
-    before = None if older_than is None else time.time() - older_than * 86400
     files, size = cache.prune(set(kind) if kind else None, before)
     if everything or "kernels" in (kind or ()):
         size += cache.prune_kernels()
     typer.echo(f"{files} files and {size / 1e6:.1f} MB removed from {cache.root}")
+
+
+def _seconds(age: str) -> float:
+    """Seconds of an age such as ``30d`` or ``12h``; a number alone is of days."""
+    import re
+
+    from lgrasp.errors import ConfigError
+
+    match = re.fullmatch(r"([0-9]{1,6}(?:\.[0-9]+)?)([dh]?)", age.strip())
+    if not match:
+        raise ConfigError(f"--older-than '{age}': give days or hours, such as 30d or 12h")
+    return float(match[1]) * (3600 if match[2] == "h" else 86400)

@@ -15,9 +15,10 @@ from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.files import Paths, check_heaps, find_shards, new_shard_file, parsing, write_file
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import column_texts, create_rows, finish, write_context
-from lgrasp.errors import ShardError
+from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, Shard, ShardHeader
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
+from lgrasp.notices import notice
 
 _FIELDS = GRASP_FIELDS | SEQUENCE_FIELDS
 
@@ -39,7 +40,7 @@ def merge_shards(paths: Paths, out: str | os.PathLike[str], *, manifest: str | o
 
     Raises:
         ShardError: A shard is missing, damaged, changed, given twice, or does not belong to the others.
-        OutputError: ``out`` cannot be written.
+        OutputError: ``out`` cannot be written, or is there and no merged shard.
     """
     found, there = find_shards(paths), Path(out).exists()
     folder = Path(paths) if isinstance(paths, str | os.PathLike) else None
@@ -49,10 +50,13 @@ def merge_shards(paths: Paths, out: str | os.PathLike[str], *, manifest: str | o
             manifest = folder / _MANIFEST
     if not found or any(there and path.samefile(out) for path in found):
         raise ShardError(f"{out}: must not be one of the shards to merge")
+    if there and not _is_merged(Path(out)):
+        raise OutputError(f"{out} exists and is no merged shard; choose another --out")
     if manifest is not None:
         _check_manifest(manifest, found)
     sources = sorted((_survey(path) for path in found), key=lambda s: (s.header.shard_index, s.path.name))
     _require_one_run(sources)
+    _tell_gaps(sources)
     with new_shard_file(out) as file:
         hand = _write_head(file, sources)
         _copy_rows(file, sources, hand)
@@ -128,6 +132,24 @@ def _require_one_run(sources: Sequence[_Source]) -> None:
             if index in holder:
                 raise ShardError(f"{source.path}: shard {index} is already in {holder[index]}; leave one out")
             holder[index] = source.path
+
+
+def _tell_gaps(sources: Sequence[_Source]) -> None:
+    """Say which shards of a run are not among those merged, as far as their numbers tell."""
+    numbers = {part["shard_index"] for source in sources for part in source.parts()}
+    gaps = sorted(set(range(max(numbers))) - numbers)
+    if gaps:
+        named = ", ".join(map(str, gaps[:5])) + (", ..." if len(gaps) > 5 else "")
+        notice(f"{len(gaps)} of {max(numbers) + 1} shards of this run are not merged, by their numbers: {named}")
+
+
+def _is_merged(path: Path) -> bool:
+    """True for a file that merging made."""
+    try:
+        with ShardReader(path) as reader:
+            return bool(reader.header.merged_from)
+    except ShardError:
+        return False
 
 
 def _write_head(file: h5py.File, sources: Sequence[_Source]) -> HandRecord:

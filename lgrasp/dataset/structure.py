@@ -19,6 +19,10 @@ from lgrasp.grasp.schema import (
     AttributeSpec,
     DatasetSpec,
 )
+from lgrasp.paths import name_problem
+
+_MOST_GROUPS = 8  # inside each other
+_EXPANSION = 2000  # declared over stored bytes; the compression of HDF5 ends at about 1000
 
 
 def format_problems(file: h5py.File, name: str, form: str, version: str) -> list[str]:
@@ -36,7 +40,45 @@ def format_problems(file: h5py.File, name: str, form: str, version: str) -> list
 
 def shard_problems(file: h5py.File) -> list[str]:
     """Why a file is no whole shard, or all differences to the schema, one line each; empty when it conforms."""
-    return format_problems(file, "grasp shard", FORMAT, FORMAT_VERSION) or structure_problems(file)
+    return (
+        format_problems(file, "grasp shard", FORMAT, FORMAT_VERSION)
+        or foreign_problems(file)
+        or structure_problems(file)
+    )
+
+
+def foreign_problems(file: h5py.File) -> list[str]:
+    """What makes a file more than its own bytes, or larger than them: one line, empty when there is nothing.
+
+    Links and datasets that lead to other files, groups inside each other without end, sizes that are only declared, and
+    names that could not be those of files.
+    """
+    todo: list[tuple[str, h5py.Group, int]] = [("", file, 1)]
+    while todo:
+        path, group, depth = todo.pop()
+        for name in group:
+            here = f"{path}{name}"
+            if name_problem(name):
+                return [f"{here!r}: the name cannot be used: {name_problem(name)}"]
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                return [f"{here}: is a link; a shard holds its own data"]
+            node = group[name]
+            if isinstance(node, h5py.Group):
+                if depth == _MOST_GROUPS:
+                    return [f"{here}: more than {_MOST_GROUPS} groups inside each other"]
+                todo.append((f"{here}/", node, depth + 1))
+            elif isinstance(node, h5py.Dataset) and (problem := _foreign_data(node)):
+                return [f"{here}: {problem}"]
+    return []
+
+
+def _foreign_data(dataset: h5py.Dataset) -> str:
+    if dataset.external or dataset.is_virtual:
+        return "its data are in other files; a shard holds its own data"
+    declared, stored = dataset.nbytes if dataset.shape else 0, dataset.id.get_storage_size()
+    if declared > _EXPANSION * max(stored, 4096):
+        return f"declares {declared:,} bytes and stores {stored:,}"
+    return ""
 
 
 def structure_problems(file: h5py.File) -> list[str]:

@@ -15,6 +15,7 @@ from lgrasp.dataset.structure import structure_problems, text_sha256
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, object_set_sha256
 from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, DatasetSpec
+from lgrasp.paths import name_problem
 
 
 def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
@@ -56,12 +57,15 @@ def write_context(file: h5py.File, shard: Shard) -> None:
     spaces of sequences.
 
     Raises:
-        ShardError: The object ids are not sorted, not unique or not usable as a group name.
+        ShardError: The object ids are not sorted or not unique, or a name cannot be used.
     """
     header, hand, objects, steps = shard.header, shard.hand, shard.objects, shard.grasps.sequence
     ids = [o.id for o in objects]
-    if ids != sorted(set(ids)) or any(not i or "/" in i or i == "." for i in ids):
-        raise ShardError(f"object ids must be unique, sorted and without '/': {ids}")
+    if ids != sorted(set(ids)):
+        raise ShardError(f"object ids must be unique and sorted: {ids}")
+    for name in (hand.name, *ids):
+        if problem := name_problem(name):
+            raise ShardError(f"name {name!r} cannot be used: {problem}")
     file.attrs.update(
         format=FORMAT,
         format_version=FORMAT_VERSION,

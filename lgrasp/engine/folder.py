@@ -9,11 +9,13 @@ from typing import NamedTuple
 
 from lgrasp.dataset import ShardReader
 from lgrasp.dataset.files import check_heaps, remove_leftovers
-from lgrasp.errors import OutputError
+from lgrasp.errors import ConfigError, OutputError
 
 MADE_FROM = "made_from"
 """Statistic of a shard that a job made of another: content key of the job and of the rows that it was made of."""
 
+MOST_PARTS = 100_000
+"""Files of a job."""
 _MAX_NAME_LENGTH = 120  # characters of a name; file systems allow 255 bytes
 
 
@@ -30,6 +32,16 @@ def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
     """File of a shard."""
     safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{hand}-{name}")[:_MAX_NAME_LENGTH]
     return out / f"{safe}-{shard:05d}.h5"
+
+
+def check_number(parts: int, what: str) -> None:
+    """Check that a folder can hold so many files of a job: their names have five digits.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    if parts > MOST_PARTS:
+        raise ConfigError(f"{parts:,} {what}; a folder holds at most {MOST_PARTS:,}")
 
 
 def check_folder(out: Path) -> None:

@@ -15,6 +15,7 @@ from lgrasp.errors import ObjectError
 from lgrasp.field.arrays import FieldArrays, upload_field
 from lgrasp.field.model import FIELD_VERSION, ContactField
 from lgrasp.field.params import FieldParams
+from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
@@ -82,11 +83,15 @@ def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str
     """
     path = find_object(mesh)
     try:
-        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        content = mesh_digest(mesh_bytes(path))
     except OSError as error:
-        raise ObjectError(f"object {path} cannot be read: {error.strerror}") from None
+        raise ObjectError(f"object {path} cannot be read: {error.filename or path}: {error.strerror}") from None
+    return path, _object_key(path, content, scale, params)
+
+
+def _object_key(path: Path, content: str, scale: float, params: ObjectParams) -> str:
     described = {"name": path.name, "scale": float(scale), "params": params.model_dump(mode="json")}
-    return path, content_key("object", OBJECT_VERSION, content=content, **described)
+    return content_key("object", OBJECT_VERSION, content=content, **described)
 
 
 class Loader:
@@ -117,7 +122,10 @@ class Loader:
         def make() -> ObjectModel:
             from lgrasp.object.preprocess import preprocess_object
 
-            return preprocess_object(mesh, scale=scale, params=params, device=self.device)
+            model = preprocess_object(mesh, scale=scale, params=params, device=self.device)
+            if _object_key(mesh, model.sha256, scale, params) != key:
+                raise ObjectError(f"object {mesh} was changed while it was read; run the command again")
+            return model
 
         return self.get("object", ObjectModel, key, make)
 

@@ -10,7 +10,7 @@ from lgrasp.hand.spec import Coupling, HandSpec, load_spec
 from lgrasp.hand.spec_check import space_problem
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
-from lgrasp.paths import data_dirs, package_files
+from lgrasp.paths import data_dirs, name_problem, package_files
 
 PACKAGE_HANDS = {
     "allegro_right": ("example-robot-data", "allegro_right_hand"),
@@ -41,6 +41,10 @@ class HandSource:
     urdf: Path
     spec: HandSpec
     note: str = ""
+
+    def __post_init__(self) -> None:
+        if problem := name_problem(self.name):
+            raise HandError(f"hand {self.name!r} ({str(self.urdf)!r}) cannot have this name: {problem}")
 
 
 Drafter = Callable[[Path, str], Path]

@@ -9,7 +9,9 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from lgrasp.config import load_yaml
 from lgrasp.errors import HandError
+from lgrasp.geometry.mesh_files import mesh_bytes
 from lgrasp.hand.urdf import Urdf, read_urdf
 
 Vec3 = tuple[float, float, float]
@@ -149,8 +151,8 @@ def load_spec(path: Path) -> HandSpec:
         HandError: unreadable file, bad YAML, unknown key or bad value.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        data = load_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())[:300]
         raise HandError(f"hand file {path} cannot be read as YAML: {reason}") from None
     if not isinstance(data, dict):
@@ -171,7 +173,8 @@ def urdf_digest(urdf: Urdf, spec: HandSpec) -> str:
     h = hashlib.sha256(urdf.text.encode())
     for name in sorted(urdf.mesh_files):
         h.update(name.encode())
-        h.update(urdf.mesh_files[name].read_bytes())
+        for data in mesh_bytes(urdf.mesh_files[name]).values():
+            h.update(data)
     # neither changes a HandModel; views of opposition spaces have digests of their own
     h.update(spec.model_dump_json(exclude={"opposition_spaces", "stand_off"}).encode())
     return h.hexdigest()

@@ -13,7 +13,7 @@ from lgrasp.config import HandName, ShardFolder
 from lgrasp.dataset import GraspRows, ObjectRecord, Shard, ShardHeader
 from lgrasp.dataset.info import survivors
 from lgrasp.engine.events import Events, Part, PartProgress
-from lgrasp.engine.folder import shard_path
+from lgrasp.engine.folder import check_number, shard_path
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard import add_counts, add_seconds, flat_statistics
@@ -77,6 +77,7 @@ class SearchJob(Job):
             find_protocol(self.protocol)
             check_installed(resolve_device(self.device).alias)
         hand, name = self.keys.source.name, self.object_name
+        check_number(-(-rows // size), "shards; use larger --shard-rows or several --out")
         return [
             Part(s, shard_path(self.out, hand, name, s), min(size, rows - s * size)) for s in range(-(-rows // size))
         ]

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from lgrasp.errors import ObjectError
-from lgrasp.paths import data_dirs, package_files
+from lgrasp.paths import data_dirs, name_problem, package_files
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
 
@@ -27,10 +27,13 @@ def find_object(name_or_path: str | os.PathLike[str]) -> Path:
     """Mesh file of an object: an existing path, a name of :func:`list_objects`, or ``ycb:NAME`` of a package.
 
     Raises:
-        ObjectError: There is neither such a file nor such a name, or the package is not installed.
+        ObjectError: There is neither such a file nor such a name, the package is not installed, or the file's name
+            cannot be used.
     """
     path = Path(name_or_path).expanduser()
     if path.is_file():
+        if problem := name_problem(path.stem):
+            raise ObjectError(f"object {str(path)!r}: a mesh file cannot have this name: {problem}")
         return path
     text = os.fspath(name_or_path)
     named = list_objects()

@@ -6,7 +6,7 @@ import io
 import logging
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import trimesh
 from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import LgraspError, ObjectError
+from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.params import ObjectParams
 
@@ -68,8 +69,12 @@ def load_mesh(
         path = Path(source)
         label, name = str(path), path.stem
         data = read_bytes(path, MESH_SUFFIXES, "a mesh file", ObjectError)
-        sha = hashlib.sha256(data).hexdigest()
-        vertices, faces, parts = _parse(path, data)
+        try:
+            files = mesh_bytes(path, data)
+        except OSError as error:
+            raise ObjectError(f"{label}: {error.filename or label}: {error.strerror or error}") from error
+        sha = mesh_digest(files)
+        vertices, faces, parts = _parse(path, files)
     if not len(faces):
         raise ObjectError(f"{label}: 0 faces; a triangle mesh of a solid is accepted")
     used = np.zeros(len(vertices), bool)
@@ -141,15 +146,26 @@ def short_reason(error: Exception) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
-def _parse(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray, int]:
+class _Buffers(FilePathResolver):
+    """Gives a parser the buffers that were read, and textures, which change no shape, as they are on disk."""
+
+    def __init__(self, path: Path, files: Mapping[str, bytes]) -> None:
+        super().__init__(str(path))
+        self._files = files
+
+    def get(self, name: str) -> bytes:
+        return self._files[name] if name in self._files else super().get(name)
+
+
+def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarray, int]:
     """Vertices, faces and the number of geometries of a mesh file's bytes."""
     kind = path.suffix.lower()[1:]
     options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
     if kind == "gltf":
-        options["resolver"] = FilePathResolver(str(path))
+        options["resolver"] = _Buffers(path, files)
     try:
         with quiet_parsers():
-            scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, **options)
+            scene = trimesh.load_scene(io.BytesIO(files[""]), file_type=kind, process=False, **options)
             meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
     except Exception as error:  # the parsers raise anything on garbage
         why = f"not a readable .{kind} mesh ({short_reason(error)}); a triangle mesh file is accepted"

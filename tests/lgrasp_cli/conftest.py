@@ -13,7 +13,6 @@ from lgrasp_cli import progress
 from lgrasp_cli.main import main
 
 QUICK = str(Path(__file__).parent / "quick.yaml")
-SCRIPT = "from lgrasp_cli.main import main; main()"
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ def process(shared_cache, tmp_path):
     env = os.environ | {"LGRASP_CACHE_DIR": str(shared_cache), "WARP_CACHE_PATH": str(kernels)}
 
     def begin(*arguments):
-        command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
+        command = [sys.executable, "-m", "lgrasp_cli", *map(str, arguments)]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         return subprocess.Popen(command, cwd=tmp_path, env=env, text=True, **pipes)
 

@@ -3,7 +3,9 @@
 import json
 import os
 import signal
+import subprocess
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -190,9 +192,17 @@ def test_interruption_leaves_whole_shards(process, generate, tmp_path, number, q
             }
 
 
-@pytest.mark.parametrize("delay", [0.5, 1.0])
+def catches(process: subprocess.Popen[str], number: int) -> bool:
+    """True once a process handles a signal."""
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    return bool(int(status.partition("SigCgt:")[2].split()[0], 16) >> (number - 1) & 1)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.2, 1.0])
 def test_interruption_while_loading(process, tmp_path, delay):
     running = process("generate", "--object", "mug", "-n", 1_000_000, "--out", tmp_path / "out")
+    while not catches(running, signal.SIGTERM):
+        time.sleep(0.005)
     time.sleep(delay)
     running.send_signal(signal.SIGINT)
     _, errors = running.communicate(timeout=30)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from lgrasp.config import load_yaml
 from lgrasp.dataset.exports.folder import GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.reading import GraspSet, open_folder
@@ -16,7 +17,6 @@ from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import inverse
 
 _POSTURES = ("cspace_position", "pregrasp_cspace_position", "squeeze_cspace_position")
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 ISAAC_GRASP_NOTES = """\
 grasps/CODE.yaml   isaac_grasp format, version 1.0: all grasps of one object by name.
@@ -71,7 +71,7 @@ def read_isaac_grasp(path: Path | str, *, joint_names: Sequence[str] | None = No
     index, poses, q = [], [], []
     for file in folder.files:
         with parsing(file, "an isaac_grasp file", (yaml.YAMLError, KeyError, TypeError, ValueError)):
-            document = yaml.load(file.read_bytes(), Loader=_Loader)
+            document = load_yaml(file.read_bytes())
             version = document["format"], float(document["format_version"])
             grasps = document["grasps"]
         if version != ("isaac_grasp", 1.0) or not isinstance(grasps, dict):

@@ -14,7 +14,7 @@ from pydantic import PrivateAttr
 from lgrasp.dataset.files import shard_tree
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, Made, Part, PartProgress
-from lgrasp.engine.folder import Found, shard_path
+from lgrasp.engine.folder import Found, check_number, shard_path
 from lgrasp.engine.run import JobOutcome
 from lgrasp.errors import ShardError
 from lgrasp.jobs.hands import hand_source
@@ -58,6 +58,7 @@ class SceneJob(SceneConfig):
     def parts(self) -> list[Part]:
         import_mujoco()
         name = self.hand_name
+        check_number(self.scenes, "scenes; use several --out")
         return [Part(index, shard_path(self.out, name, "scene", index), 1) for index in range(self.scenes)]
 
     def found(self, part: Part) -> Found:

@@ -15,7 +15,6 @@ from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp_cli.main import main
 
 GENERATED = Path(__file__).parent / "allegro-tiny.h5"  # lgrasp generate --object tiny -n 10
-SCRIPT = "from lgrasp_cli.main import main; main()"
 
 
 @pytest.fixture
@@ -110,7 +109,7 @@ def test_a_flat_object_is_refused_by_name(cli, tmp_path, shards):
 def test_interrupted(tmp_path, shards):
     """Ctrl-C: exit code 130, every file whole, the export marked as not whole."""
     shards.make(tmp_path / "a.h5", n=50_000)
-    command = [sys.executable, "-c", SCRIPT, "export", "a.h5", "--to", "dexgraspbench", "--out", "made"]
+    command = [sys.executable, "-m", "lgrasp_cli", "export", "a.h5", "--to", "dexgraspbench", "--out", "made"]
     job = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=os.environ)
     folder = tmp_path / "made" / "grasps" / "cup"
     end = time.monotonic() + 60

@@ -1,0 +1,139 @@
+"""Shards that are more than their own bytes: every reader refuses them, in one line that names the file."""
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from support.shards import sample_shard
+
+from lgrasp.dataset import ShardReader, merge_shards, validate_shard, write_shard
+from lgrasp.dataset.exports import export_shards
+from lgrasp.dataset.torch_dataset import GraspDataset
+from lgrasp.errors import LgraspError, OutputError
+from lgrasp.notices import on_notice
+
+
+def replaced(file: h5py.File, path: str) -> tuple[h5py.Group, str, np.ndarray]:
+    """A dataset taken out of its group: the group, its name there, what it held."""
+    group, _, name = path.rpartition("/")
+    values = file[path][()]
+    del file[path]
+    return file[group], name, values
+
+
+def external_storage(file: h5py.File, folder: Path) -> None:
+    (folder / "secret.bin").write_bytes(b"\0" * 4096)
+    group, name, values = replaced(file, "grasps/q")
+    group.create_dataset(name, values.shape, values.dtype, external=[(str(folder / "secret.bin"), 0, values.nbytes)])
+
+
+def pipe(file: h5py.File, folder: Path) -> None:
+    os.mkfifo(folder / "pipe")
+    group, name, values = replaced(file, "grasps/q")
+    group.create_dataset(name, values.shape, values.dtype, external=[(str(folder / "pipe"), 0, values.nbytes)])
+
+
+def external_link(file: h5py.File, folder: Path) -> None:
+    group, name, _ = replaced(file, "objects/cup/vertices")
+    group[name] = h5py.ExternalLink(str(folder / "other.h5"), "/vertices")
+
+
+def soft_link(file: h5py.File, folder: Path) -> None:
+    group, name, _ = replaced(file, "grasps/q_squeeze")
+    group[name] = h5py.SoftLink("/grasps/q")
+
+
+def virtual(file: h5py.File, folder: Path) -> None:
+    group, name, values = replaced(file, "grasps/q")
+    layout = h5py.VirtualLayout(values.shape, values.dtype)
+    layout[:] = h5py.VirtualSource(str(folder / "other.h5"), "q", values.shape)
+    group.create_virtual_dataset(name, layout)
+
+
+def nested(file: h5py.File, folder: Path) -> None:
+    group = file
+    for _ in range(3000):
+        group = group.create_group("g")
+
+
+def ring(file: h5py.File, folder: Path) -> None:
+    file["hand/again"] = file["hand"]
+
+
+def declared(file: h5py.File, folder: Path) -> None:
+    group, name, values = replaced(file, "grasps/q")
+    group.create_dataset(name, (10**12, values.shape[1]), values.dtype, chunks=(1024, values.shape[1]))
+
+
+def control_letters(file: h5py.File, folder: Path) -> None:
+    file.move("objects/cup", "objects/cup\nv 0 0 0")
+
+
+def markup(file: h5py.File, folder: Path) -> None:
+    file.move("objects/cup", "objects/[red]")
+
+
+def upwards(file: h5py.File, folder: Path) -> None:
+    file.move("objects/cup", "objects/..")
+
+
+TAMPERED = (
+    external_storage,
+    pipe,
+    external_link,
+    soft_link,
+    virtual,
+    nested,
+    ring,
+    declared,
+    control_letters,
+    markup,
+    upwards,
+)
+
+
+@pytest.mark.parametrize("tamper", TAMPERED)
+def test_every_reader_refuses(tmp_path: Path, tamper: Callable[[h5py.File, Path], None]) -> None:
+    path = tmp_path / "a.h5"
+    write_shard(path, sample_shard(5, joints=4))
+    with h5py.File(path, "r+") as file:
+        tamper(file, tmp_path)
+    start = time.monotonic()
+    for read in (
+        ShardReader,
+        lambda path: merge_shards([path], tmp_path / "all.h5"),
+        lambda path: export_shards([path], tmp_path / "out", "isaac-grasp"),
+        lambda path: GraspDataset(path),
+    ):
+        with pytest.raises(LgraspError) as refused:
+            read(path)
+        line = str(refused.value)
+        assert line.startswith(str(path))
+        assert "\n" not in line
+        assert line.isprintable()
+    (problem,) = validate_shard(path)
+    assert problem.isprintable()
+    assert time.monotonic() - start < 60  # they end by themselves
+    assert not (tmp_path / "all.h5").exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_merge_says_what_is_missing_and_replaces_nothing(tmp_path):
+    lines: list[str] = []
+    on_notice(lines.append)
+    for index in (0, 2, 5):
+        write_shard(tmp_path / "run" / f"{index}.h5", sample_shard(2, shard_index=index))
+    merge_shards(tmp_path / "run", tmp_path / "all.h5")
+    assert lines == ["3 of 6 shards of this run are not merged, by their numbers: 1, 3, 4"]
+    merge_shards(tmp_path / "run", tmp_path / "all.h5")  # a merged shard may be made again
+    for precious in (tmp_path / "mug.obj", tmp_path / "run" / "0.h5"):
+        if not precious.exists():
+            precious.write_text("v 0 0 0\n")
+        before = precious.read_bytes()
+        with pytest.raises(OutputError, match="exists and is no merged shard"):
+            merge_shards([tmp_path / "run" / "2.h5"], precious)
+        assert precious.read_bytes() == before
