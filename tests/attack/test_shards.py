@@ -11,7 +11,7 @@ import pytest
 from support.shards import sample_shard
 
 from lgrasp.dataset import ShardReader, merge_shards, validate_shard, write_shard
-from lgrasp.dataset.exports import export_shards
+from lgrasp.dataset.exports.formats import export_shards
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.errors import LgraspError, OutputError
 from lgrasp.notices import on_notice
