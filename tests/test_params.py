@@ -21,7 +21,6 @@ ALLOWED = {
     "source": "of a hand's model and of published figures",
     "links": "of the three rules in hand.yaml, each with links of its own kind",
     "params": "each job holds the parameters of what it runs",
-    "pipeline": "each job holds the pipeline that it runs",
 }
 """Fields without a description that several models have, and why they are not one declaration."""
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
-from lgrasp.hand.geometry import Piece
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.piece import Piece
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.sdf import SdfGrid
 

@@ -10,10 +10,11 @@ from lgrasp.errors import HandError
 from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.contacts import body_cones, link_points
-from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh, inner_spheres, surface_samples
+from lgrasp.hand.geometry import convex_pieces, geometry_mesh, inner_spheres, surface_samples
 from lgrasp.hand.model import HandModel, csr, stack_rows
 from lgrasp.hand.overlap import overlap_arrays
 from lgrasp.hand.pairs import with_pairs
+from lgrasp.hand.piece import Piece
 from lgrasp.hand.spec import HandSpec, urdf_digest
 from lgrasp.hand.spec_check import check_contact_links, check_size, check_spaces
 from lgrasp.hand.surface import ContactLink, contact_arrays

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lgrasp.hand.geometry import Piece
+from lgrasp.hand.piece import Piece
 from lgrasp.hand.tree import Tree
 
 HAND_VERSION = 13

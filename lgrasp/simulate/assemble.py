@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
-from lgrasp.hand.geometry import Piece
+from lgrasp.hand.piece import Piece
 from lgrasp.hand.urdf import numbers, parse_robot
 from lgrasp.simulate.builder import add_drive, add_hull, add_solid, set_compiler, set_contact, set_joint, set_options
 from lgrasp.simulate.protocol import Protocol

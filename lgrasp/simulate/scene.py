@@ -14,7 +14,8 @@ from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.decompose import decompose as cut_mesh
 from lgrasp.grasp.hand_files import write_hand
 from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.hand.geometry import Piece, convex_pieces, geometry_mesh
+from lgrasp.hand.geometry import convex_pieces, geometry_mesh
+from lgrasp.hand.piece import Piece
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.simulate.solid import Solid, solid_of_mesh
 

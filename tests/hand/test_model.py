@@ -11,9 +11,10 @@ from support.hands import HANDS, hand_model, hand_source, minimal_spec
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.contacts import link_points
-from lgrasp.hand.geometry import Piece, convex_piece, geometry_mesh, inner_spheres, link_meshes
+from lgrasp.hand.geometry import convex_piece, geometry_mesh, inner_spheres, link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
+from lgrasp.hand.piece import Piece
 from lgrasp.hand.surface import joined_mesh
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Geometry, Joint, read_urdf

@@ -1,11 +1,14 @@
 """Help, version and start-up cost."""
 
 import ast
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import typer
+import warp as wp
 
 import lgrasp
 from lgrasp_cli.main import app
@@ -87,7 +90,8 @@ def test_generating_from_the_cache_imports_nothing_slow(run, cache_root, tmp_pat
     code = f"import sys; sys.argv = {['lgrasp', *arguments]}\nfrom lgrasp_cli.main import main\n"
     code += f"try:\n    main()\nfinally:\n    print([m for m in {SLOW} if m in sys.modules])\n"
     code += "    print([m for m in sys.modules if m.startswith(('lgrasp.refine.', 'lgrasp.hand.drafting'))])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    env = os.environ | {"WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent)}  # Warp adds its version
+    result = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
     slow, others = result.stdout.splitlines()[-2:]
     assert slow == "[]"
     assert set(ast.literal_eval(others)) <= {"lgrasp.refine.params"}

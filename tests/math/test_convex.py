@@ -7,7 +7,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from support.convex import hull_distance, segment_distance
 
-from lgrasp.hand.geometry import Piece
+from lgrasp.hand.piece import Piece
 from lgrasp.math.convex import Pieces, pieces_clear, point_depth
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
