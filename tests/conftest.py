@@ -1,5 +1,6 @@
 """What tests of engine, tables and stages share: a hand, a small contact field and an object, made once."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,8 +44,9 @@ def lightning() -> Pipeline:
 
 @pytest.fixture(scope="session")
 def cache_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a cache that all tests share; a test that damages entries makes its own."""
-    return tmp_path_factory.mktemp("cache")
+    """Folder of a cache that all tests share, those of other processes too; a test that damages entries makes its own."""
+    base = tmp_path_factory.getbasetemp()
+    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
 
 
 @pytest.fixture(scope="session")

@@ -13,9 +13,9 @@ from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.judge.run import judge
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Cache:
-    return Cache(tmp_path_factory.mktemp("cache"))
+@pytest.fixture
+def cache(cache_root) -> Cache:
+    return Cache(cache_root)
 
 
 @pytest.mark.parametrize("name", ["barrett", "schunk_svh"])
