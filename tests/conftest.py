@@ -44,7 +44,7 @@ def lightning() -> Pipeline:
 
 @pytest.fixture(scope="session")
 def cache_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a cache that all tests share, those of other processes too; a test that damages entries makes its own."""
+    """Folder of a cache that the tests of all processes share; a test that damages entries makes its own."""
     base = tmp_path_factory.getbasetemp()
     return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
 
