@@ -1,9 +1,11 @@
 """What tests of engine, tables and stages share: a hand, a small contact field and an object, made once."""
 
 import os
-from collections.abc import Callable
+import socket
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +28,20 @@ from lgrasp.stages.context import Context
 OBJECT = "mug"
 RECORDS = 20_000
 CANDIDATES = 2000
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_network() -> Iterator[None]:
+    """Nothing in lgrasp uses the network."""
+    connect = socket.socket.connect
+
+    def local(self: socket.socket, address: Any) -> None:
+        assert self.family == socket.AF_UNIX, f"a connection to {address}"
+        connect(self, address)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(socket.socket, "connect", local)
+        yield
 
 
 @pytest.fixture(scope="session")

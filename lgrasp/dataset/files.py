@@ -1,14 +1,20 @@
 """Whole-or-absent output files, which files are shards, and guards against damage that HDF5 does not notice."""
 
 import errno
+import hashlib
 import io
 import mmap
 import os
+import platform
+import re
+import time
 import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from struct import unpack_from
+from typing import IO
 
 import h5py
 
@@ -22,6 +28,8 @@ except ImportError:  # Windows: leftovers cannot be distinguished from files bei
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 """Shard files, or folders of them."""
 
+_TEMPORARY = re.compile(r"\.([0-9a-f]{6})[0-9a-f]{6}-[0-9a-f]{12}\b")  # the computer in a temporary file's name
+_FOREIGN_AGE = 86_400.0  # [s]
 _LIBVER = ("v110", "v110")  # readable since HDF5 1.10; its metadata blocks carry checksums, the older layout's do not
 
 
@@ -71,11 +79,10 @@ def new_file(path: str | os.PathLike[str], *, flush: bool = True) -> Iterator:
         OutputError: The folder cannot be written or is full.
     """
     path = Path(path)
-    temporary = path.with_name(f"{path.stem}.{uuid.uuid4().hex[:12]}{path.suffix}.tmp")
+    temporary = path.with_name(f"{path.stem}.{_machine()}-{uuid.uuid4().hex[:12]}{path.suffix}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "x+b") as file:
-            hold_file(file.fileno())
+        with _held_file(temporary) as file:
             yield file
             file.flush()
             if flush:
@@ -114,19 +121,42 @@ def new_shard_file(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
             raise sink.error
 
 
-def hold_file(descriptor: int) -> None:
-    """Mark an open temporary file as being written, until it is closed or its process ends in any way."""
-    if fcntl:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+@contextmanager
+def _held_file(path: Path) -> Iterator[IO[bytes]]:
+    """A new file, open and locked until it is closed or its process ends in any way."""
+    while True:
+        with open(path, "x+b") as file:
+            if fcntl:
+                with suppress(OSError):  # a file system without locks
+                    fcntl.flock(file.fileno(), fcntl.LOCK_EX)
+            if path.exists():  # else it was taken for a leftover between the two calls
+                yield file
+                return
+
+
+@cache
+def _machine() -> str:
+    """Digits of this computer and of its last start, which tell whose a temporary file is."""
+    try:
+        start = Path("/proc/sys/kernel/random/boot_id").read_text()
+    except OSError:
+        start = ""
+    return "".join(hashlib.sha256(text.encode()).hexdigest()[:6] for text in (platform.node(), start))
 
 
 def remove_leftovers(folder: Path, pattern: str) -> None:
-    """Remove the temporary files that match a glob pattern and that no living process holds."""
+    """Remove the temporary files that match a glob pattern and that no living process writes.
+
+    A lock tells of processes on this computer only (network file systems need not share locks); files of other
+    computers stay for a day.
+    """
     if not fcntl:
         return
     for path in folder.glob(pattern):
         with suppress(OSError), open(path, "rb") as file:  # gone already, held, or not ours to remove
+            written = _TEMPORARY.search(path.name)
+            if written and written[1] != _machine()[:6] and time.time() - path.stat().st_mtime < _FOREIGN_AGE:
+                continue
             fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
 
