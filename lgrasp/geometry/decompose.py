@@ -1,11 +1,14 @@
 """Triangle mesh -> convex pieces by CoACD, in a separate process, which may hang, crash or print anything."""
 
+import contextlib
+import ctypes
 import hashlib
+import io
 import json
 import os
+import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -89,48 +92,61 @@ def _run(
     vertices: np.ndarray, faces: np.ndarray, parameters: dict[str, float], timeout: float
 ) -> dict[str, np.ndarray]:
     """Pieces as ``vertices`` (W, 3) and ``first`` (pieces + 1,), made by this module in another process."""
-    with tempfile.TemporaryDirectory(prefix="lgrasp-convex-") as folder:
-        task, result = Path(folder) / "task.npz", Path(folder) / "result.npz"
-        np.savez(task, vertices=vertices, faces=faces, parameters=np.asarray(json.dumps(parameters)))
-        # -P: no module of the folder that the user is in gets in the way
-        where = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
-        try:
-            done = subprocess.run(
-                [sys.executable, "-P", "-m", "lgrasp.geometry.decompose", str(task), str(result)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                timeout=timeout,
-                env={**os.environ, "PYTHONPATH": where, "OMP_NUM_THREADS": "1"},
-            )
-        except subprocess.TimeoutExpired:
-            raise DecomposeError(f"convex decomposition took longer than {timeout:g} s") from None
-        except OSError as error:
-            raise DecomposeError(f"convex decomposition cannot be started: {error.strerror}") from None
-        try:
-            with np.load(result, allow_pickle=False) as arrays:
-                found = {name: arrays[name] for name in ("vertices", "first")}
-        except Exception:  # no file, or half a file: the same to the caller
-            said = done.stderr.decode(errors="replace").strip().splitlines()
-            raise DecomposeError(
-                f"convex decomposition failed (exit code {done.returncode}){': ' + said[-1][:200] if said else ''}"
-            ) from None
+    task = io.BytesIO()
+    np.savez(task, vertices=vertices, faces=faces, parameters=np.asarray(json.dumps(parameters)))
+    # -P: no module of the folder that the user is in gets in the way
+    where = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", "lgrasp.geometry.decompose", str(os.getpid())],
+            input=task.getvalue(),
+            capture_output=True,
+            timeout=timeout,
+            env={**os.environ, "PYTHONPATH": where, "OMP_NUM_THREADS": "1"},
+        )
+    except subprocess.TimeoutExpired:
+        raise DecomposeError(f"convex decomposition took longer than {timeout:g} s") from None
+    except OSError as error:
+        raise DecomposeError(f"convex decomposition cannot be started: {error.strerror}") from None
+    try:
+        with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+            found = {name: arrays[name] for name in ("vertices", "first")}
+    except Exception:  # nothing, or half of it: the same to the caller
+        said = done.stderr.decode(errors="replace").strip().splitlines()
+        raise DecomposeError(
+            f"convex decomposition failed (exit code {done.returncode}){': ' + said[-1][:200] if said else ''}"
+        ) from None
     if len(found["first"]) < 2 or not np.isfinite(found["vertices"]).all():
         raise DecomposeError("convex decomposition gave no pieces")
     return found
 
 
-def _main(task: str, result: str) -> None:
+def _main(parent: int) -> None:
+    """A task from standard input to standard output, which whatever is printed must not reach."""
+    _end_with(parent)
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
     import coacd
 
-    with np.load(task, allow_pickle=False) as arrays:
+    with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as arrays:
         mesh = coacd.Mesh(arrays["vertices"], arrays["faces"])
         parameters = json.loads(str(arrays["parameters"]))
     coacd.set_log_level("error")
     pieces = [np.asarray(v, np.float64) for v, _ in coacd.run_coacd(mesh, real_metric=True, **parameters)]
+    result = io.BytesIO()
     first = np.cumsum([0, *map(len, pieces)])
     np.savez(result, vertices=np.vstack(pieces) if pieces else np.zeros((0, 3)), first=first)
+    with out:
+        out.write(result.getvalue())
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent ends in any way, in the middle of native code too (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    if os.getppid() != parent:
+        sys.exit(1)
 
 
 if __name__ == "__main__":
-    _main(*sys.argv[1:])
+    _main(int(sys.argv[1]))

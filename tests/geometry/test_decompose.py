@@ -1,5 +1,11 @@
 """Convex decomposition in a process of its own: what comes back, what is kept, what happens when it fails."""
 
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
@@ -67,3 +73,32 @@ def test_results_are_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_run", run)
     for a, b in zip(first, decompose(mesh.vertices, mesh.faces), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+LONG = """
+import trimesh
+from lgrasp.geometry.decompose import decompose
+mesh = trimesh.creation.annulus(0.02, 0.05, 0.05).subdivide_to_size(0.002)
+decompose(mesh.vertices, mesh.faces, threshold=1e-4, timeout=600.0)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="reads /proc")
+def test_nothing_goes_on_when_the_process_is_killed(tmp_path):
+    process = subprocess.Popen([sys.executable, "-c", LONG], env=os.environ | {"TMPDIR": str(tmp_path)})
+    children: list[str] = []
+    while not children:
+        time.sleep(0.02)
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    (child,) = children
+    while b"decompose" not in Path(f"/proc/{child}/cmdline").read_bytes():  # between fork and exec
+        time.sleep(0.02)
+    time.sleep(1.0)
+    process.kill()
+    process.wait()
+    for _ in range(500):
+        if not Path(f"/proc/{child}").exists():
+            break
+        time.sleep(0.02)
+    assert not Path(f"/proc/{child}").exists()
+    assert not list(tmp_path.iterdir())
