@@ -97,6 +97,18 @@ def load_yaml(text: str | bytes) -> Any:
     return yaml.load(text, Loader=_YAML)
 
 
+def load_yaml_file(path: Path) -> Any:
+    """What a YAML file of at most 4 MB says.
+
+    Raises:
+        OSError, UnicodeDecodeError, yaml.YAMLError: it cannot be read.
+    """
+    size = path.stat().st_size
+    if size > _YAML_BYTES:
+        raise yaml.YAMLError(f"it has {size:,} bytes; at most {_YAML_BYTES:,} are read")
+    return load_yaml(path.read_text(encoding="utf-8"))
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping that a YAML file holds.
 
@@ -104,9 +116,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ConfigError: unreadable, not YAML, or not a mapping.
     """
     try:
-        if path.stat().st_size > _YAML_BYTES:
-            raise ConfigError(f"file {path} has {path.stat().st_size:,} bytes; at most {_YAML_BYTES:,} are read")
-        data = load_yaml(path.read_text(encoding="utf-8"))
+        data = load_yaml_file(path)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError(f"file {path} cannot be read: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict):

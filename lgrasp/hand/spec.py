@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from lgrasp.config import load_yaml
+from lgrasp.config import load_yaml_file
 from lgrasp.errors import HandError
 from lgrasp.geometry.mesh_files import mesh_bytes
 from lgrasp.hand.urdf import Urdf, read_urdf
@@ -151,7 +151,7 @@ def load_spec(path: Path) -> HandSpec:
         HandError: unreadable file, bad YAML, unknown key or bad value.
     """
     try:
-        data = load_yaml(path.read_text(encoding="utf-8"))
+        data = load_yaml_file(path)
     except (OSError, ValueError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())[:300]
         raise HandError(f"hand file {path} cannot be read as YAML: {reason}") from None

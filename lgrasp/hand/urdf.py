@@ -14,6 +14,8 @@ from lgrasp.errors import HandError
 
 _MOVABLE = {"revolute", "prismatic", "continuous"}
 
+_MOST_BYTES = 16 << 20
+
 
 @dataclass(frozen=True)
 class Geometry:
@@ -62,6 +64,8 @@ def read_urdf(path: Path) -> Urdf:
             a mesh that is missing or outside the URDF's folder tree.
     """
     try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise HandError(f"URDF {path} has {path.stat().st_size:,} bytes; at most {_MOST_BYTES:,} are read")
         raw = path.read_bytes()
     except OSError as error:
         raise HandError(f"URDF {path} cannot be read: {error.strerror}") from None

@@ -6,6 +6,7 @@ import io
 import logging
 import os
 import warnings
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.params import ObjectParams
 
 _FLAT = 1e-4  # thinner than this share of the largest side is a plane
+_MOST_UNPACKED = 256 << 20
 _UNITS = ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"))
 
 
@@ -157,6 +159,13 @@ class _Buffers(FilePathResolver):
         return self._files[name] if name in self._files else super().get(name)
 
 
+def _check_archive(data: bytes) -> None:
+    """Refuse an archive that unpacks to more than a mesh needs."""
+    size = sum(member.file_size for member in zipfile.ZipFile(io.BytesIO(data)).infolist())
+    if size > _MOST_UNPACKED:
+        raise ValueError(f"it unpacks to {size:,} bytes, at most {_MOST_UNPACKED:,} are read")
+
+
 def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarray, int]:
     """Vertices, faces and the number of geometries of a mesh file's bytes."""
     kind = path.suffix.lower()[1:]
@@ -164,6 +173,8 @@ def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarr
     if kind == "gltf":
         options["resolver"] = _Buffers(path, files)
     try:
+        if kind == "3mf":
+            _check_archive(files[""])
         with quiet_parsers():
             scene = trimesh.load_scene(io.BytesIO(files[""]), file_type=kind, process=False, **options)
             meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]

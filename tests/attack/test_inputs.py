@@ -2,6 +2,7 @@
 
 import os
 import re
+import zipfile
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ import trimesh
 from lgrasp.config import load_yaml, parse_model, read_yaml
 from lgrasp.engine.inputs import object_key
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
-from lgrasp.errors import ConfigError, ObjectError
+from lgrasp.errors import ConfigError, HandError, LgraspError, ObjectError
 from lgrasp.hand.spec import load_spec
+from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.object.load import load_mesh
 from lgrasp.object.params import ObjectParams
@@ -69,8 +71,26 @@ def test_yaml_bombs(tmp_path, text):
 def test_yaml_of_many_bytes(tmp_path):
     path = tmp_path / "long.yaml"
     path.write_text("a: " + "x" * (5 << 20))
-    with pytest.raises(ConfigError, match=r"has 5,242,883 bytes; at most"):
-        read_yaml(path)
+    for read in (read_yaml, load_spec):
+        with pytest.raises(LgraspError, match=r"has 5,242,883 bytes; at most"):
+            read(path)
+
+
+def test_urdf_of_many_bytes(tmp_path):
+    path = tmp_path / "long.urdf"
+    path.write_text("<robot>" + " " * (17 << 20) + "</robot>")
+    with pytest.raises(HandError, match=r"long\.urdf has 17,825,807 bytes; at most"):
+        read_urdf(path)
+
+
+def test_archives_that_unpack_without_end(tmp_path):
+    path = tmp_path / "bomb.3mf"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/3dmodel.model", "w") as member:
+        for _ in range(300):
+            member.write(bytes(1 << 20))
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(ObjectError, match=r"bomb\.3mf: .*unpacks to 314,572,800 bytes, at most"):
+        load_mesh(path)
 
 
 def test_plain_yaml_is_read():
