@@ -82,18 +82,35 @@ def find_yaml(name: str, files: Mapping[str, Path], what: str) -> Path:
 
 
 def load_yaml(text: str | bytes) -> Any:
-    """What a YAML text says: plain values, without aliases, at most 64 inside each other, which any parser survives.
+    """What a YAML text says: plain values, at most 64 inside each other, aliases that stand for no more values than the
+    text has letters; any parser and whoever walks through the values survives that.
 
     Raises:
         yaml.YAMLError: no such text.
     """
-    depth = 0
+    sizes: dict[str, int] = {}  # values behind each anchor
+    inside: list[tuple[str | None, int]] = []  # (anchor, values before) of the collections around
+    values = 0
     for event in yaml.parse(text, Loader=_YAML):
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if isinstance(event, yaml.AliasEvent) or depth > _YAML_DEPTH:
-            what = "an alias (*name); write the value out" if depth <= _YAML_DEPTH else "more than 64 levels"
-            raise yaml.YAMLError(f"line {event.start_mark.line + 1}: {what}")
+        where = f"line {event.start_mark.line + 1}"
+        if isinstance(event, yaml.CollectionStartEvent):
+            inside.append((event.anchor, values))
+            if len(inside) > _YAML_DEPTH:
+                raise yaml.YAMLError(f"{where}: more than {_YAML_DEPTH} levels")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = inside.pop()
+            if anchor:
+                sizes[anchor] = values - before + 1
+        elif isinstance(event, yaml.ScalarEvent):
+            values += 1
+            if event.anchor:
+                sizes[event.anchor] = 1
+        elif isinstance(event, yaml.AliasEvent):
+            if event.anchor not in sizes:
+                raise yaml.YAMLError(f"{where}: alias '{event.anchor}' stands for nothing before it")
+            values += sizes[event.anchor]
+        if values > len(text):
+            raise yaml.YAMLError(f"{where}: aliases stand for more values than are read")
     return yaml.load(text, Loader=_YAML)
 
 

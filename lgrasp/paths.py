@@ -52,8 +52,8 @@ def name_problem(name: str) -> str:
     """Why a hand or an object cannot have a name, which becomes part of file names and tables; "" if it can."""
     if not name.isprintable():
         return "it has characters that cannot be printed"
-    if not 0 < len(name) <= 120:
-        return f"it has {len(name)} characters, 1 to 120 are accepted"
-    if name.startswith(".") or any(letter in r"/\[]" for letter in name):
-        return r"it begins with '.' or has one of / \ [ ]"
+    if not 0 < len(name) <= 255:
+        return f"it has {len(name)} characters, 1 to 255 are accepted"
+    if name in (".", "..") or any(letter in r"/\[]" for letter in name):
+        return r"it is '.' or '..' or has one of / \ [ ]"
     return ""

@@ -11,6 +11,7 @@ from lgrasp.hand.model import csr
 from lgrasp.hand.spec import Cone, Surface
 
 _GRID_CELL = 8.0e-4  # [m], more on large links
+_ROUNDING = 1e-6  # [m] of distances in single precision
 _GRID_PAD = 6.0e-3  # [m] of a grid beyond its link
 _POINTS_PER_LINK = 600
 _DRAWN_AREA = 1.0e-6  # [m^2] of a link's surface to a point drawn for a side, if that is _POINTS_DRAWN points
@@ -57,7 +58,10 @@ def box_grid(
     shape = np.ceil((high - low) / cell).astype(int) + 1
     axes = [low[a] + cell * np.arange(shape[a]) for a in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    values = np.min([signed_distance(m, points, device, **sign) for m in meshes], 0)
+    values = signed_distance(meshes[0], points, device, **sign)
+    for mesh in meshes[1:]:
+        near = np.flatnonzero(_box_distance(mesh, points) <= values + _ROUNDING)  # no other can be nearer
+        values[near] = np.minimum(values[near], signed_distance(mesh, points[near], device, **sign))
     return LinkGrid(values.reshape(shape).astype(np.float32), low.astype(np.float32), cell)
 
 
@@ -148,8 +152,17 @@ def _free(
     """(n,) bool: is every place ``probe`` [m] above a point farther than ``least`` [m] from a link's solids?"""
     free = np.ones(len(points), bool)
     for probe, least in probes:
-        free &= np.min([signed_distance(m, points + probe * normals, device) for m in meshes], 0) > least
+        places = points + probe * normals
+        for mesh in meshes:
+            near = np.flatnonzero(free & (_box_distance(mesh, places) <= least + _ROUNDING))
+            free[near] = signed_distance(mesh, places[near], device) > least
     return free
+
+
+def _box_distance(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """(n,) [m]: no point (n, 3) is nearer than this to a mesh, by the box around it; negative inside the box."""
+    low, high = mesh.bounds
+    return np.maximum(low - points, points - high).max(1)
 
 
 def _thin(

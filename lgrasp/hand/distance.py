@@ -40,6 +40,8 @@ def signed_distance(
     Args:
         winding: decide inside and outside by winding numbers, which bear holes and cost more.
     """
+    if not len(points):
+        return np.zeros(0, np.float32)
     start()
     handle = wp.Mesh(
         wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device=device),

@@ -57,7 +57,7 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
 
 
 @pytest.mark.parametrize(
-    "text", [BOMB, "[" * 20_000, "{a: " * 20_000, "- " * 5_000 + "x", "!!python/name:os.system ''"]
+    "text", [BOMB, "[" * 20_000, "{a: " * 20_000, "- " * 5_000 + "x", "a: &a [*a]", "!!python/name:os.system ''"]
 )
 def test_yaml_bombs(tmp_path, text):
     path = tmp_path / "bomb.yaml"
@@ -95,6 +95,7 @@ def test_archives_that_unpack_without_end(tmp_path):
 
 def test_plain_yaml_is_read():
     assert load_yaml("a: {b: [1, 2.5, x, null]}\nc: 'd'") == {"a": {"b": [1, 2.5, "x", None]}, "c": "d"}
+    assert load_yaml("a: &a [1, 2]\nb: *a\nc: [*a, *a]") == {"a": [1, 2], "b": [1, 2], "c": [[1, 2], [1, 2]]}
 
 
 def test_long_values_are_cut_in_messages():

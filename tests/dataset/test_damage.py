@@ -114,7 +114,7 @@ def test_foreign_missing_and_newer_files(tmp_path, make_shard):
 _WRITE_FOREVER = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from conftest import sample_shard
+from support.shards import sample_shard
 from lgrasp.dataset import write_shard
 shard = sample_shard(30000)
 print("go", flush=True)
@@ -126,7 +126,7 @@ while True:
 
 
 def test_killed_writer_leaves_whole_files_only(tmp_path):
-    arguments = [sys.executable, "-c", _WRITE_FOREVER, str(Path(__file__).parent), str(tmp_path)]
+    arguments = [sys.executable, "-c", _WRITE_FOREVER, str(Path(__file__).parents[1]), str(tmp_path)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         process.stdout.readline()
@@ -141,7 +141,7 @@ def test_killed_writer_leaves_whole_files_only(tmp_path):
 _DISK_FULL = """
 import resource, sys
 sys.path.insert(0, sys.argv[1])
-from conftest import sample_shard
+from support.shards import sample_shard
 from lgrasp.dataset import write_shard
 from lgrasp.errors import OutputError
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), resource.RLIM_INFINITY))
@@ -155,7 +155,7 @@ except OutputError as error:
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs RLIMIT_FSIZE")
 @pytest.mark.parametrize("limit", [10, 20_000])
 def test_writes_that_fail_end_in_one_line(tmp_path, limit):
-    arguments = [sys.executable, "-c", _DISK_FULL, str(Path(__file__).parent), str(tmp_path), str(limit)]
+    arguments = [sys.executable, "-c", _DISK_FULL, str(Path(__file__).parents[1]), str(tmp_path), str(limit)]
     done = subprocess.run(arguments, capture_output=True, text=True, check=True)
     assert done.stdout == f"cannot write {tmp_path}/s.h5: File too large\n"
     assert done.stderr == ""

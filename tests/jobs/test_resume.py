@@ -1,5 +1,6 @@
 """A run that was cut in any way ends with the bytes of an uninterrupted one."""
 
+import fcntl
 import shutil
 import signal
 import subprocess
@@ -12,7 +13,6 @@ import h5py
 import numpy as np
 import pytest
 
-from lgrasp.dataset.files import hold_file
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
@@ -287,7 +287,7 @@ def test_killed_while_writing(whole, raw_grasps, job, cache_root, tmp_path):
     foreign = out / "notes.tmp"
     foreign.touch()
     with open(held, "wb") as file:
-        hold_file(file.fileno())
+        fcntl.flock(file, fcntl.LOCK_EX)
         generate(job(rows=80, out=out))
         assert sorted(leftovers(out)) == sorted([held.name, foreign.name])
     generate(job(rows=80, out=out))
