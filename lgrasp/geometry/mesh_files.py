@@ -3,6 +3,7 @@
 import hashlib
 import json
 from pathlib import Path
+from urllib.parse import unquote
 
 
 def mesh_bytes(path: Path, data: bytes | None = None) -> dict[str, bytes]:
@@ -43,8 +44,6 @@ def _buffers(data: bytes) -> list[str]:
 
 def _inside(folder: Path, uri: str) -> Path:
     """The regular file that a URI names below a folder."""
-    from urllib.parse import unquote
-
     for name in (uri, unquote(uri)):
         path = (folder / name).resolve()
         if path.is_relative_to(folder.resolve()) and path.is_file():

@@ -70,6 +70,7 @@ class SearchJob(Job):
             raise ConfigError(f"--shard-rows {size}: must be at least 1")
         if self.workers < 0:
             raise ConfigError(f"--workers {self.workers}: must be at least 0 (0: by device)")
+        check_number(-(-rows // size), "shards; use larger --shard-rows or several --out")
         if self.protocol:
             from lgrasp.simulate.protocol import find_protocol
             from lgrasp.simulate.run import check_installed
@@ -77,7 +78,6 @@ class SearchJob(Job):
             find_protocol(self.protocol)
             check_installed(resolve_device(self.device).alias)
         hand, name = self.keys.source.name, self.object_name
-        check_number(-(-rows // size), "shards; use larger --shard-rows or several --out")
         return [
             Part(s, shard_path(self.out, hand, name, s), min(size, rows - s * size)) for s in range(-(-rows // size))
         ]

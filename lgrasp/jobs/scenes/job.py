@@ -56,9 +56,9 @@ class SceneJob(SceneConfig):
         return hashlib.sha256(json.dumps(self._described(), sort_keys=True).encode()).hexdigest()
 
     def parts(self) -> list[Part]:
+        check_number(self.scenes, "scenes; use several --out")
         import_mujoco()
         name = self.hand_name
-        check_number(self.scenes, "scenes; use several --out")
         return [Part(index, shard_path(self.out, name, "scene", index), 1) for index in range(self.scenes)]
 
     def found(self, part: Part) -> Found:
