@@ -3,6 +3,8 @@
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
+# Python compiles what is imported; compiling every file of every package takes long.
+PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
 
 # The first of these that is Python 3.11 or 3.12; or say which: make setup PYTHON=/path/to/python
 ifndef PYTHON
@@ -25,8 +27,8 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "lgrasp needs Python 3.11 or 3.12; give its path: make setup PYTHON=..." >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0 hatchling editables
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-build-isolation -e ".[dev,sim]"
+	$(PIP) hatchling editables
+	$(PIP) --no-build-isolation -e ".[dev,sim]"
 	@touch $@
 
 demo: setup
@@ -36,7 +38,9 @@ demo: setup
 
 test: check
 
-check: lint type pytest
+# pyright has one thread: the tests start beside it.
+check: lint
+	@$(MAKE) --no-print-directory -j 2 type pytest
 
 lint: setup
 	$(BIN)/ruff check .

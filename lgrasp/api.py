@@ -1,6 +1,5 @@
 """The functions of ``import lgrasp as lg``: hand and object in, grasps in memory out; no file without ``out``."""
 
-import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.engine.run import Job, run
 from lgrasp.errors import ConfigError, StarvedError
+from lgrasp.files import temporary_folder
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.listing import list_hands, list_objects, list_pipelines
@@ -190,7 +190,8 @@ def refine(
     Raises:
         LgraspError: grasps that cannot be refined, or an option out of range.
     """
-    from lgrasp.jobs.refine.shards import RefineJob, refine_params
+    from lgrasp.jobs.refine.shards import RefineJob
+    from lgrasp.jobs.requests.shards import refine_params
 
     what = {"params": refine_params(coarse=coarse, **params), "device": device}
     what |= {} if bounds is None else {"bounds": bounds}
@@ -303,8 +304,8 @@ def _folder(out: Name | None) -> Iterator[Path]:
     if out is not None:
         yield Path(out)
         return
-    with tempfile.TemporaryDirectory(prefix="lgrasp-") as folder:
-        yield Path(folder) / "shards"
+    with temporary_folder() as folder:
+        yield folder / "shards"
 
 
 @contextmanager

@@ -1,12 +1,13 @@
 """YAML declarations -> checked pydantic models; unknown keys fail and name the nearest valid one."""
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
 from lgrasp.errors import ConfigError
 from lgrasp.notices import notice
@@ -17,9 +18,21 @@ Model = TypeVar("Model", bound=BaseModel)
 _YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _YAML_DEPTH, _YAML_BYTES = 64, 4 << 20
 
+
+def device_name(name: str) -> str:
+    """A name that a device can have; whether it is there shows when it is used.
+
+    Raises:
+        ValueError: no device has such a name.
+    """
+    if not re.fullmatch(r"auto|cpu|cuda(:[0-9]{1,3})?", name):
+        raise ValueError(f"device '{name}' cannot be; choose auto, cpu or cuda:N")
+    return name
+
+
 # fields that several models have
 Seed = Annotated[int, Field(ge=0, lt=2**63, description="Decides every random draw.")]
-DeviceName = Annotated[str, Field(description="auto, cpu or cuda:N.")]
+DeviceName = Annotated[str, AfterValidator(device_name), Field(description="auto, cpu or cuda:N.")]
 Workers = Annotated[int, Field(ge=0, description="Threads or processes; 0: by device.")]
 HandName = Annotated[str, Field(description="Name or path.")]
 MeshScale = Annotated[float, Field(gt=0, description="Factor from the meshes' unit to metres.")]
@@ -164,7 +177,7 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
             raise ConfigError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
         value = repr(first["input"])
         shown = value if len(value) <= 100 else f"{value[:97]}..."
-        raise ConfigError(f"{where}: key '{key}' = {shown}: {first['msg']}") from None
+        raise ConfigError(f"{where}: key '{key}' = {shown}: {first['msg'].removeprefix('Value error, ')}") from None
 
 
 def apply_settings(parts: Mapping[str, BaseModel], settings: Sequence[str], where: str) -> dict[str, BaseModel]:

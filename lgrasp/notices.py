@@ -12,8 +12,8 @@ def on_notice(listener: Callable[[str], None]) -> None:
 
 
 def notice(line: str) -> None:
-    """Report a line, unless it was reported before or there is no listener."""
-    if line in _said or not _listeners:
+    """Report a line, unless it is empty, was reported before, or there is no listener."""
+    if not line or line in _said or not _listeners:
         return
     _said.add(line)
     for listener in _listeners:

@@ -1,9 +1,13 @@
 """Where shipped data, user data and caches live."""
 
+import glob
 import os
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import platformdirs
+
+from lgrasp.errors import LgraspError
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -48,6 +52,20 @@ def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:
     return Path(env).expanduser() if env else Path(platformdirs.user_cache_dir("lgrasp"))
 
 
+def check_file(path: Path, suffixes: Sequence[str], what: str, error: type[LgraspError]) -> None:
+    """Check that an input file is there and has an accepted suffix.
+
+    Args:
+        what: what is accepted, such as ``a mesh file``.
+        error: raised, in one line, if not.
+    """
+    if not path.is_file():
+        problem = "is a folder" if path.is_dir() else "does not exist"
+        raise error(f"{path}: {problem}; {what} ({', '.join(suffixes)}) is accepted")
+    if path.suffix.lower() not in suffixes:
+        raise error(f"{path}: suffix '{path.suffix}' is unknown; accepted are {', '.join(suffixes)}")
+
+
 def name_problem(name: str) -> str:
     """Why a hand or an object cannot have a name, which becomes part of file names and tables; "" if it can."""
     if not name.isprintable():
@@ -57,3 +75,18 @@ def name_problem(name: str) -> str:
     if name in (".", "..") or any(letter in r"/\[]" for letter in name):
         return r"it is '.' or '..' or has one of / \ [ ]"
     return ""
+
+
+def expanded(name: str, members: Callable[[Path], Iterable[Path]], usable: Callable[[Path], bool]) -> list[str] | None:
+    """The paths that a folder or a glob pattern stands for, sorted; None if the name is neither.
+
+    Args:
+        members: the paths in a folder.
+        usable: of what a pattern matches, what is meant.
+    """
+    path = Path(name).expanduser()
+    if path.is_dir() and not usable(path):
+        return sorted(str(found) for found in members(path) if usable(found))
+    if glob.has_magic(name) and not path.exists():
+        return sorted(found for found in glob.glob(str(path), recursive=True) if usable(Path(found)))
+    return None

@@ -1,21 +1,35 @@
-"""The process ``lgrasp``: Ctrl-C and SIGTERM end it at once until the command line is loaded; leaving takes no time."""
+"""The process ``lgrasp``: it heeds signals before the command line is loaded, and leaves nothing and at once."""
 
 import atexit
 import os
-import signal
 import sys
+import tempfile
 from contextlib import suppress
 
+from lgrasp_cli.stopping import heed_signals
 
-def _stop(number: int, frame: object) -> None:
-    os.write(2, b"interrupted\n")
-    os._exit(130)
+
+def _fill_streams() -> None:
+    """Standard streams that are closed lead nowhere; else the next file that is opened takes their place, and words."""
+    while (nowhere := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(nowhere)
+    sys.stdout, sys.stderr = sys.stdout or os.fdopen(1, "w"), sys.stderr or os.fdopen(2, "w")
+
+
+def _gather_temporaries() -> None:
+    """Have every library put its temporary files into one folder, which goes with this process, however that ends."""
+    from lgrasp.files import scratch_folder
+
+    with suppress(OSError):
+        os.environ["TMPDIR"] = tempfile.tempdir = str(scratch_folder())
 
 
 def main() -> None:
     """Run the command line; see :func:`lgrasp_cli.main.main`."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _stop)
+    _fill_streams()
+    heed_signals()
+    _gather_temporaries()
     from lgrasp_cli.main import main as command
 
     try:

@@ -1,16 +1,20 @@
 """``lgrasp bench``: how fast, on this machine; its commands compare published figures with ours."""
 
 from pathlib import Path
+from tempfile import gettempdir
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
 
+from lgrasp.choices import Policy, ProtocolName
+from lgrasp_cli.names import OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import (
     CacheDir,
     Device,
     Hand,
     JsonPath,
+    Quiet,
     Settings,
     Workers,
     check_report,
@@ -20,7 +24,7 @@ from lgrasp_cli.options import (
     split,
     warn,
 )
-from lgrasp_cli.progress import before_end, say
+from lgrasp_cli.progress import say
 from lgrasp_cli.tables import Block, TextTable, print_report
 
 if TYPE_CHECKING:
@@ -29,7 +33,9 @@ if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
     from lgrasp.jobs.config import JobConfig
 
-app = typer.Typer(name="bench", invoke_without_command=True, subcommand_metavar="[table1|sequence|refine [OPTIONS]]")
+app = typer.Typer(
+    name="bench", invoke_without_command=True, subcommand_metavar="[table1|sequence|refine|soak [OPTIONS]]"
+)
 
 _List = Annotated[str | None, Option(help="Names or files, separated by commas.", show_default="the published")]
 _ObjectDir = Annotated[Path | None, Option(help="Folder where the names of objects are looked up first.")]
@@ -61,8 +67,6 @@ def bench(
     if context.invoked_subcommand:
         _refuse_options(context)
         return
-    cache = open_cache(None)
-    from lgrasp.bench.comparison import new_table
     from lgrasp.config import parse_model
     from lgrasp.jobs.config import JobConfig
 
@@ -70,6 +74,10 @@ def bench(
     how = given(settings=settings, seed=seed, device=device, workers=workers)
     config = parse_model(JobConfig, what | how, "bench")
     check_report(json_path)
+    _check(config)
+    cache = open_cache(None)
+    from lgrasp.bench.comparison import new_table
+
     _print_comparison(_measure(new_table(config, repeat=repeat, baseline_rows=rows), config, cache), json_path)
 
 
@@ -108,10 +116,6 @@ def table1(
 
     Example: lgrasp bench table1 --hand-dir hands --object-dir meshes --json table1.json --plot table1.png
     """
-    cache = open_cache(None)
-    from lgrasp.bench.charts import check_plot, draw_table
-    from lgrasp.bench.comparison import new_table, read_table, without_missing
-    from lgrasp.bench.page import load_published
     from lgrasp.config import parse_model
     from lgrasp.errors import ConfigError
     from lgrasp.jobs.config import JobConfig, load_config
@@ -125,6 +129,12 @@ def table1(
     if resume and not file:
         raise ConfigError("--resume needs the file to continue: --json PATH")
     check_report(json_path)
+    _check(config)
+    cache = open_cache(None)
+    from lgrasp.bench.charts import check_plot, draw_table
+    from lgrasp.bench.comparison import new_table, read_table, without_missing
+    from lgrasp.bench.page import load_published
+
     if plot:
         check_plot(plot)
     if not objects:
@@ -145,7 +155,9 @@ def table1(
 def bench_sequence(
     objects: Annotated[
         list[str] | None,
-        Argument(help="Pool of objects: mesh files or names.", show_default="mug sphere box capsule bottle bowl"),
+        Argument(
+            help="Pool of objects: mesh files or names.", show_default="mug sphere box capsule bottle bowl", **OBJECT
+        ),
     ] = None,
     hand: Hand = "allegro",
     length: Annotated[int, Option(min=2, help="Objects in a sequence.")] = 4,
@@ -156,11 +168,13 @@ def bench_sequence(
     iterations: Annotated[
         int | None, Option(min=1, help="Iterations of the optimiser; default: as published.", show_default="6000")
     ] = None,
-    policy: Annotated[str, Option(help="uniform, as published, or lookahead.")] = "uniform",
-    simulate: Annotated[str, Option(help="Protocol: seq6 (friction 2.0, as published) or seq6_mu06.")] = "seq6",
+    policy: Annotated[str, Option(**one_of(Policy, "POLICY", "uniform is as published."))] = "uniform",
+    simulate: Annotated[
+        str, Option(**one_of(ProtocolName, "PROTOCOL", "Protocol (seq6: friction 2.0, as published)."))
+    ] = "seq6",
     scale: Annotated[str, Option(help="Factor to metres, or range of the longest side [m].")] = "0.06:0.10",
     pipeline: Annotated[
-        str, Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.")
+        str, Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.", **PIPELINE)
     ] = "sequence",
     settings: Settings = None,
     seed: Annotated[int, Option(min=0, help="Seed of the sequences and the grasps.")] = 0,
@@ -176,10 +190,8 @@ def bench_sequence(
     Example: lgrasp bench sequence --sequences 2 --methods field
     """
     check_report(json_path)
-    cache = open_cache(cache_dir)
-    from lgrasp.bench.sequence import bench_methods, sequence_page
     from lgrasp.config import parse_model
-    from lgrasp.jobs.sequence.job import SequenceJob
+    from lgrasp.jobs.requests.search import SequenceRequest
     from lgrasp.jobs.sets import SequenceSets, object_sequences
 
     pool = objects or ["mug", "sphere", "box", "capsule", "bottle", "bowl"]
@@ -187,11 +199,20 @@ def bench_sequence(
     chosen = choose_pipeline(pipeline, seed, settings=settings)
     optimiser = chosen.params("sequence").optimiser.model_dump() | given(iterations=iterations)
     chosen = chosen.with_params("sequence", policy=policy, width=width, optimiser=optimiser)
-    how: dict[str, Any] = {"scale": scale, "simulate": simulate, "device": device, "workers": workers, "cache": cache}
-    jobs = [
-        SequenceJob(hand=hand, objects=names, rows=1, pipeline=chosen, out=Path("."), **how)
+    for method in split(methods):
+        chosen.with_params("sequence", method=method)
+    how = {"scale": scale, "simulate": simulate, "device": device, "workers": workers}
+    how |= {"hand": hand, "rows": 1, "pipeline": chosen, "out": gettempdir()}  # nothing is written there
+    asked = [
+        parse_model(SequenceRequest, how | {"objects": names}, "bench sequence")
         for names in object_sequences(pool, sets, seed)
     ]
+    for request in asked:
+        request.check()
+    cache = open_cache(cache_dir)
+    from lgrasp.bench.sequence import bench_methods, sequence_page
+
+    jobs = [request.job(cache) for request in asked]
     result = bench_methods(jobs, split(methods), baseline_width, say) | {"set": settings or []}
     _print(result, json_path, sequence_page(result))
 
@@ -201,7 +222,7 @@ def bench_refine(
     hands: Annotated[str, Option(help="Names, separated by commas.")] = "barrett,schunk_svh",
     objects: Annotated[str, Option(help="Names or mesh files, separated by commas.")] = "bowl,box,bottle,mug",
     starts: Annotated[int, Option("--starts", "-n", min=1, help="Starts on each object.")] = 80,
-    simulate: Annotated[str, Option(help="Protocol that decides which plans are valid.")] = "fc",
+    simulate: Annotated[str, Option(**one_of(ProtocolName, "PROTOCOL", "Decides which plans are valid."))] = "fc",
     noise: Annotated[bool, Option("--noise/--no-noise", help="Also measure table IV: clouds with noise.")] = True,
     settings: Annotated[
         list[str] | None,
@@ -223,14 +244,52 @@ def bench_refine(
     Example: lgrasp bench refine --objects bottle,mug --starts 40
     """
     check_report(json_path)
+    from lgrasp.jobs.requests.plan import plan_params
+    from lgrasp.jobs.requests.shards import check_hand, check_object
+
+    params = plan_params(settings or ())
+    for names, check in ((hands, check_hand), (objects, check_object)):
+        for name in split(names):
+            check(name)
     cache = open_cache(cache_dir)
     from lgrasp.bench.refine import NOISES, bench_hands, refine_page
-    from lgrasp.jobs.refine.plan import plan_params
 
-    how = {"params": plan_params(settings or ()), "noises": NOISES if noise else (), "device": device, "cache": cache}
+    how = {"params": params, "noises": NOISES if noise else (), "device": device, "cache": cache}
     result = bench_hands(split(hands), split(objects), starts, simulate, progress=say, **how)
     result["set"] = settings or []
     _print(result, json_path, refine_page(result))
+
+
+@app.command("soak")
+def bench_soak(
+    rounds: Annotated[int, Option(min=1, help="Times that every command is ended by every signal.")] = 1,
+    hours: Annotated[float, Option(min=0, help="Go on for so long, however many rounds that takes.")] = 0.0,
+    seed: Annotated[int, Option(min=0, help="Seed of the moments.")] = 0,
+    commands: Annotated[str | None, Option(help="Commands, separated by commas.", show_default="all")] = None,
+    signals: Annotated[str | None, Option(help="Ways to end them, separated by commas.", show_default="all")] = None,
+    json_path: JsonPath = None,
+    quiet: Quiet = False,
+) -> None:
+    """End every command that writes at random moments, run it again, and compare with an uninterrupted run.
+
+    Small runs, each a process in a temporary folder. Reported are files that differ or are left over, processes that
+    are still there after a minute, and wrong exit codes; exit code 1 if there is any of that. --json PATH is written
+    after each.
+
+    Example: lgrasp bench soak --hours 2 --json soak.json
+    """
+    check_report(json_path)
+    from lgrasp.bench.soak import run_soak, soak_page
+    from lgrasp.engine.report import write_json
+
+    chosen = [split(names) if names else () for names in (commands, signals)]
+    result: dict[str, Any] = {}
+    for result in run_soak(*chosen, rounds=rounds, hours=hours, seed=seed, **({} if quiet else {"say": say})):
+        if json_path not in (None, "-"):
+            write_json(json_path, result)
+    _print(result, json_path, soak_page(result))
+    if result["faults"]:
+        raise typer.Exit(1)
 
 
 def _print(result: Any, json_path: str | None, page: "Page") -> None:
@@ -239,6 +298,21 @@ def _print(result: Any, json_path: str | None, page: "Page") -> None:
         title = f"\n{table.title}" if table.title else ""
         blocks += [title, TextTable(table.columns, table.rows, table.columns[table.texts :])]
     print_report(result, json_path, [*blocks, "", *page.notes])
+
+
+def _check(config: "JobConfig") -> None:
+    """Raises the first problem where nothing that is to be measured can be."""
+    from lgrasp.errors import LgraspError
+    from lgrasp.jobs.config import plan_requests
+
+    problems = []
+    for request in plan_requests(config):
+        try:
+            request.model_copy(update={"out": Path(gettempdir())}).check()  # nothing is written to its own
+            return
+        except LgraspError as problem:
+            problems.append(problem)
+    raise problems[0]
 
 
 def _refuse_options(context: typer.Context) -> None:
@@ -255,7 +329,7 @@ def _measure(table: "Comparison", config: "JobConfig", cache: "Cache", file: str
     from lgrasp.bench.rate import Bench
     from lgrasp.engine.report import write_json
 
-    with Bench() as runs, before_end(runs.discard):
+    with Bench() as runs:
         measured = measure_table(runs, table, config, cache, progress=say)
         for table, cell in measured:
             if file:

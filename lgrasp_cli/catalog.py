@@ -5,7 +5,8 @@ from typing import Annotated
 import typer
 from typer import Argument
 
-from lgrasp_cli.options import Scale
+from lgrasp_cli.names import PIPELINE
+from lgrasp_cli.options import MeshArgument, Scale
 from lgrasp_cli.tables import Answer, TextTable, reporting
 
 objects = typer.Typer(name="objects", help="List and show objects.", no_args_is_help=True)
@@ -28,14 +29,12 @@ def list_objects() -> Answer:
 
 @objects.command("show")
 @reporting
-def show_object(
-    mesh: Annotated[str, Argument(metavar="NAME", help="Mesh file, or the name of an object.")], scale: Scale = 1.0
-) -> Answer:
+def show_object(mesh: MeshArgument, scale: Scale = 1.0) -> Answer:
     """Check a mesh; report its properties and needed repairs.
 
     Example: lgrasp objects show mug
     """
-    from lgrasp.jobs.listing import describe_object
+    from lgrasp.jobs.prepare import describe_object
 
     data = describe_object(mesh, scale)
     pairs = [
@@ -66,7 +65,7 @@ def list_pipelines() -> Answer:
 
 @pipelines.command("show")
 @reporting
-def show_pipeline(name: Annotated[str, Argument(help="Name of a pipeline, or a YAML file.")]) -> Answer:
+def show_pipeline(name: Annotated[str, Argument(help="Name of a pipeline, or a YAML file.", **PIPELINE)]) -> Answer:
     """Show every parameter of a pipeline with its value and meaning.
 
     Example: lgrasp pipelines show swift

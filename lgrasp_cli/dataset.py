@@ -1,13 +1,16 @@
 """``lgrasp dataset`` and ``export``: look at, check, merge and convert grasp files."""
 
+import os
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 from typer import Option
 
+from lgrasp.choices import FormatName, MetricName
+from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Quiet, Shards, old_name, split, warn
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, plural, reporting
 from lgrasp_cli.working import How, working
@@ -22,7 +25,10 @@ def info(paths: Shards) -> Answer:
 
     Example: lgrasp dataset info out/mug
     """
-    from lgrasp.dataset import describe
+    from lgrasp.dataset.files import shards_below
+
+    shards_below(paths)
+    from lgrasp.dataset.info import describe
 
     shards = describe(paths)
     blocks = [_shard_table(shards), "", _metric_table(shards)]
@@ -36,13 +42,19 @@ def info(paths: Shards) -> Answer:
 @app.command()
 @reporting
 def check(paths: Shards) -> Answer:
-    """Check every byte and value of each shard against the format; exit code 2 if one has a problem.
+    """Check every byte and value of each shard against the format, and each folder against its manifest.json.
+
+    Exit code 2 if a file has a problem, or one that is listed is missing.
 
     Example: lgrasp dataset check out/mug
     """
-    from lgrasp.dataset import find_shards, validate_shard
+    from lgrasp.dataset.files import shards_below
 
-    return checked({str(path): validate_shard(path) for path in find_shards(paths)}, "shard")
+    shards_below(paths)
+    from lgrasp.dataset.manifest import check_files
+    from lgrasp.dataset.validate import validate_shard
+
+    return checked(check_files(paths, validate_shard), "shard")
 
 
 app.command("validate", hidden=True)(old_name(check, "lgrasp dataset validate", "lgrasp dataset check"))
@@ -55,14 +67,18 @@ def merge(
     manifest: Annotated[
         Path | None, Option(help="List of shards to check against; by default manifest.json of a single folder.")
     ] = None,
+    partial: Annotated[bool, Option("--partial", help="Merge what is there, though the list has more.")] = False,
 ) -> None:
     """Put the rows of shards of one hand, object and run into one file.
 
     Example: lgrasp dataset merge out/mug -o mug.h5
     """
-    from lgrasp.dataset import merge_shards
+    from lgrasp.dataset.files import find_shards
 
-    rows = merge_shards(paths[0] if len(paths) == 1 else paths, out, manifest=manifest)
+    find_shards(paths)
+    from lgrasp.dataset.merge import merge_shards
+
+    rows = merge_shards(paths[0] if len(paths) == 1 else paths, out, manifest=manifest, partial=partial)
     typer.echo(f"{out}: {rows} rows")
 
 
@@ -71,7 +87,7 @@ def merge(
 def metrics(
     paths: Shards,
     how: How,
-    add: Annotated[str, Option(help="Metrics, separated by commas: volume, epsilon_exact.")],
+    add: Annotated[str, Option(help=f"Metrics, separated by commas: {', '.join(get_args(MetricName))}.")],
     out: Annotated[Path, Option("--out", "-o", help="Folder of the new shards.")],
     settings: Annotated[
         list[str] | None,
@@ -86,12 +102,12 @@ def metrics(
 
     Subfolders are searched and recreated in --out. docs/reference/metrics.md defines the metrics.
 
-    Example: lgrasp dataset metrics grasps/allegro-mug --add volume,epsilon_exact -o grasps/measured
+    Example: lgrasp dataset metrics grasps/allegro-mug/robust --add volume,epsilon_exact -o grasps/measured
     """
-    from lgrasp.jobs.metrics import MetricsJob
+    from lgrasp.jobs.requests.shards import MetricsRequest
 
     what = {"shards": paths, "out": out, "add": split(add), "settings": settings}
-    how.run(how.job(MetricsJob, "dataset metrics", **what), _show_metrics)
+    how.run(how.job(MetricsRequest, "dataset metrics", **what), _show_metrics)
 
 
 def _show_metrics(data: dict[str, Any]) -> list[Block]:
@@ -113,11 +129,14 @@ def report(
 
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """
-    from lgrasp.dataset.report.write import report_dataset
+    from lgrasp.dataset.files import shards_below
     from lgrasp.engine.report import check_json
+
+    shards_below(paths)
+    check_json(out)
+    from lgrasp.dataset.report.write import report_dataset
     from lgrasp_cli.progress import Bar
 
-    check_json(out)
     with Bar(quiet=quiet) as bar:
         numbers = report_dataset(paths, out, progress=lambda done, rows: bar.show("read", done, rows, "rows"))
     for line in numbers["remarks"]:
@@ -153,17 +172,24 @@ def _sums(parts: Iterable[dict[str, int]]) -> Counter[str]:
     return total
 
 
+def _places(shards: list[dict[str, Any]]) -> list[str]:
+    """The names of the files; below their common folder if they lie in several."""
+    files = [Path(s["file"]).absolute() for s in shards]
+    top = os.path.commonpath([file.parent for file in files])
+    return [str(file.relative_to(top)) for file in files]
+
+
 def _shard_table(shards: list[dict[str, Any]]) -> TextTable:
     columns = ("shard", "hand", "objects", "pipeline", "seed", "index", "rows", "joints", "MB")
     rows = [
         (
-            Path(s["file"]).name,
+            name,
             *map(str, (s["hand"], ", ".join(s["objects"]), s["pipeline"], s["seed"], s["shard_index"])),
             f"{s['rows']:,}",
             str(len(s["joints"])),
             f"{s['bytes'] / 1e6:.1f}",
         )
-        for s in shards
+        for name, s in zip(_places(shards), shards, strict=True)
     ]
     if len(shards) > 1:
         total, size = sum(s["rows"] for s in shards), sum(s["bytes"] for s in shards)
@@ -175,12 +201,12 @@ def _metric_table(shards: list[dict[str, Any]]) -> TextTable:
     ends = ("min", "mean", "max")
     rows = [
         (
-            Path(s["file"]).name,
+            name,
             metric,
             values["unit"],
             *("-" if values[k] is None else f"{values[k]:.4g}" for k in ends),
         )
-        for s in shards
+        for name, s in zip(_places(shards), shards, strict=True)
         for metric, values in s["metrics"].items()
     ]
     return TextTable(("shard", "metric", "unit", *ends), rows, right=ends)
@@ -196,7 +222,7 @@ def _count_table(shards: list[dict[str, Any]], what: str, key: str) -> TextTable
 def export(
     shards: Shards,
     how: How,
-    to: Annotated[str, Option(help="dexgraspnet, dexgraspbench, isaac-grasp or mjcf.")],
+    to: Annotated[str, Option(**one_of(FormatName, "FORMAT", "Format to write."))],
     out: Annotated[Path, Option("--out", "-o", help="Folder to write; it must be empty or not exist yet.")],
     limit: Annotated[int | None, Option(help="Largest number of grasps.")] = None,
     where: Annotated[
@@ -211,13 +237,14 @@ def export(
 ) -> None:
     """Write grasps in the format of another program, with the hand's URDF and all meshes.
 
-    Example: lgrasp export grasps/allegro-mug --to isaac-grasp --out mug-isaac --where "metrics/epsilon > 0.01"
+    Example: lgrasp export grasps/allegro-mug/robust --to isaac-grasp --out mug-isaac --where "metrics/epsilon > 0.01"
     """
-    from lgrasp.dataset.exports.selection import HOLDS
-    from lgrasp.jobs.export import ExportJob
+    from lgrasp.jobs.requests.shards import ExportRequest
+    from lgrasp.simulate.protocol import HOLDS
 
     conditions = [*(where or ()), *([HOLDS] if only_holding else ())]
-    how.run(how.job(ExportJob, "export", shards=shards, out=out, to=to, where=conditions, limit=limit), _show_export)
+    what = {"shards": shards, "out": out, "to": to, "where": conditions, "limit": limit}
+    how.run(how.job(ExportRequest, "export", **what), _show_export)
 
 
 def _show_export(data: dict[str, Any]) -> list[Block]:

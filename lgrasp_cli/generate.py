@@ -1,33 +1,54 @@
 """``lgrasp generate``: the main job."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from typer import Option
 
-from lgrasp_cli.options import Contacts, DryRun, Hand, Mesh, PipelineName, Scale, Seed, Settings, choose_pipeline
-from lgrasp_cli.tables import Block, TextTable, counted, place, print_report
+from lgrasp.choices import ProtocolName
+from lgrasp_cli.many import run_all, show_plans
+from lgrasp_cli.names import HANDS, OBJECTS, one_of
+from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, choose_pipeline
+from lgrasp_cli.tables import Block, counted, place
 from lgrasp_cli.working import How, working
-
-if TYPE_CHECKING:
-    from lgrasp.engine.run import Job
 
 
 @working
 def generate(
-    mesh: Mesh,
+    meshes: Annotated[
+        list[str],
+        Option(
+            "--object",
+            "-o",
+            help="Mesh file, name of an object, folder of meshes, or glob in quotes; repeatable.",
+            **OBJECTS,
+        ),
+    ],
     how: How,
-    hand: Hand = "allegro",
+    hands: Annotated[
+        list[str],
+        Option(
+            "--hand",
+            help="Name of a hand, URDF file, folder with hand.yaml or of such folders, or glob in quotes; repeatable.",
+            **HANDS,
+        ),
+    ] = ["allegro"],  # noqa: B006 as typer takes it
     rows: Annotated[int, Option("-n", "--rows", help="Grasps requested.")] = 1000,
     pipeline: PipelineName = "robust",
     settings: Settings = None,
-    out: Annotated[Path | None, Option(help="Folder of the shards; default: grasps/HAND-OBJECT")] = None,
+    out: Annotated[
+        Path | None,
+        Option(
+            help="Folder of the shards (of several: for HAND-OBJECT/PIPELINE); default: grasps/HAND-OBJECT/PIPELINE."
+        ),
+    ] = None,
     seed: Seed = None,
     contacts: Contacts = None,
     scale: Scale = 1.0,
     batch: Annotated[int, Option(min=0, help="Candidates per batch; 0: by device.")] = 0,
     simulate: Annotated[
-        str | None, Option(help="Keep only grasps that hold in simulation, with protocol fc, gravity6 or gravity6_mu1.")
+        str | None,
+        Option(**one_of(ProtocolName, "PROTOCOL", "Keep only grasps that hold in a simulation.")),
     ] = None,
     shard_rows: Annotated[
         int, Option(help="Grasps per shard. Changing it changes which grasps are generated.")
@@ -48,32 +69,30 @@ def generate(
 ) -> None:
     """Generate grasps of an object and write them as shards.
 
-    The exit code is 3 if fewer grasps are found than requested; those found are kept.
+    The exit code is 3 if fewer grasps are found than requested; those found are kept. With several objects or hands,
+    every pair is a job; one that fails does not stop the others.
 
-    Example: lgrasp generate --object mug.obj -n 10000
+    Example: lgrasp generate --object mug --object bowl --object "meshes/*.obj" -n 10000
     """
-    from lgrasp.engine.bank import with_passes
-    from lgrasp.jobs.config import default_out
-    from lgrasp.jobs.generate import GenerateJob
+    from lgrasp.hand.names import all_hands
+    from lgrasp.jobs.config import pair_requests
+    from lgrasp.object.find import all_objects
 
-    chosen = with_passes(choose_pipeline(pipeline, seed, contacts, settings), passes, reuse)
+    chosen = choose_pipeline(pipeline, seed, contacts, settings).with_passes(passes, reuse)
     chosen = chosen.with_simulation(simulate) if simulate else chosen
-    out = out or default_out(hand, mesh, simulate)
-    what = {"hand": hand, "object": mesh, "rows": rows, "pipeline": chosen, "out": out, "scale": scale}
-    job = how.job(GenerateJob, "generate", **what, batch=batch, shard_rows=shard_rows, reuse=reuse)
+    pairs = all_hands(hands), all_objects(meshes)
+    what = {"rows": rows, "scale": scale, "batch": batch, "shard_rows": shard_rows, "reuse": reuse}
+    requests = pair_requests(*pairs, chosen, out or Path("grasps"), simulate, **what, **how.shared)
+    if len(requests) > 1 or pairs != (tuple(hands), tuple(meshes)):
+        run_all(requests, how, dry_run=dry_run)
+        return
+    request = requests[0].model_copy(update={"out": out}) if out else requests[0]
+    request.check()
+    job = request.job(how.cache)
     if dry_run:
         show_plans([(job, how)], how)
     else:
         how.run(job, _show)
-
-
-def show_plans(jobs: "list[tuple[Job, How]]", how: How) -> None:
-    """Print the plans of jobs, each with its own array task."""
-    from lgrasp.jobs.preview import preview
-
-    lines = list({x: None for job, own in jobs for x in preview(job, array=own.array, resume=not own.overwrite)})
-    table = TextTable(("what", "which", "state", "to do", "file"), lines)
-    print_report([line._asdict() for line in lines], how.json_path, [table])
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
+from lgrasp_cli.look import view_hand
 from lgrasp_cli.options import CacheDir, Device, HandArgument, PipelineName, Quiet, Workers, choose_pipeline, open_cache
 from lgrasp_cli.tables import Answer, Block, TextTable, plural, reporting
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from lgrasp.jobs.hand_check.check import HandCheck
 
 app = typer.Typer(name="hands", help="List, show, add and check hands.", no_args_is_help=True)
+app.command("view")(view_hand)
 
 
 @app.command("list")
@@ -36,7 +38,7 @@ def show_hand(name: HandArgument) -> Answer:
 
     Example: lgrasp hands show allegro
     """
-    from lgrasp.jobs.listing import describe_hand
+    from lgrasp.jobs.hands import describe_hand
 
     hand = describe_hand(name)
     box = " to ".join(" ".join(f"{1000 * x:.0f}" for x in hand["canonical_box"][end]) for end in ("min", "max"))
@@ -65,7 +67,7 @@ def show_hand(name: HandArgument) -> Answer:
 
 @app.command("add")
 def add_hand(
-    urdf: Annotated[Path, Argument(metavar="URDF", help="URDF file of the hand.")],
+    urdf: Annotated[Path, Argument(metavar="URDF", exists=True, dir_okay=False, help="URDF file of the hand.")],
     name: Annotated[str | None, Option(help="Name of the hand; default: the file's.")] = None,
     out: Annotated[Path | None, Option(help="Folder of the hand; default: hands/NAME in your data folder.")] = None,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace the hand of that name.")] = False,
@@ -87,7 +89,7 @@ def add_hand(
 @app.command("check")
 @reporting
 def check_hand(
-    name: Annotated[str, Argument(help="Name of a hand, a URDF file, a folder, or a hand of a package.")],
+    name: HandArgument,
     out: Annotated[Path | None, Option(help="Folder of the pictures; default: check/NAME.")] = None,
     rows: Annotated[int, Option("-n", "--rows", min=1, help="Grasps requested per object.")] = 200,
     pipeline: PipelineName = "robust",
@@ -100,13 +102,13 @@ def check_hand(
 
     Example: lgrasp hands check my_hand
     """
+    chosen, cache = choose_pipeline(pipeline), open_cache(cache_dir)
     from dataclasses import asdict
 
     from lgrasp.jobs.hand_check.check import check_hand as check
     from lgrasp.jobs.hands import hand_source
     from lgrasp_cli.progress import say
 
-    chosen, cache = choose_pipeline(pipeline), open_cache(cache_dir)
     folder = out or Path("check") / hand_source(name).name
     tell = None if quiet else lambda line: say(f"trying {line}")
     found = check(name, chosen, out=folder, rows=rows, device=device, workers=workers, cache=cache, report=tell)

@@ -38,18 +38,18 @@ def fit(
     Example: lgrasp learn fit grasps --out coarse.pt
     """
     from lgrasp.config import parse_model
-    from lgrasp.jobs.learn.job import FitJob
+    from lgrasp.jobs.requests.shards import FitRequest
     from lgrasp.learn.params import LearnParams
 
     chosen = given(steps=steps, joint_steps=joint_steps, unrolled=unrolled, batch=batch, seed=seed)
     params = parse_model(LearnParams, chosen, "learn fit")
-    how.run(how.job(FitJob, "learn fit", shards=shards, out=out, params=params), _show_fit)
+    how.run(how.job(FitRequest, "learn fit", shards=shards, out=out, params=params), _show_fit)
 
 
 @app.command(name="eval")
 @reporting
 def evaluate(
-    predictor: Annotated[Path, Argument(help="File written by lgrasp learn fit.")],
+    predictor: Annotated[Path, Argument(exists=True, dir_okay=False, help="File written by lgrasp learn fit.")],
     shards: _Shards,
     clouds: Annotated[int, Option(min=1, help="New clouds per object.")] = 8,
     seed: Annotated[int, Option(min=0, help="Seed of the clouds.")] = 1,
@@ -61,6 +61,9 @@ def evaluate(
 
     Example: lgrasp learn eval coarse.pt grasps
     """
+    from lgrasp.dataset.files import shards_below
+
+    shards_below(shards)
     cache = open_cache(cache_dir)
     from lgrasp.jobs.learn.job import evaluate as run
 

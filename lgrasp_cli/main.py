@@ -1,37 +1,61 @@
 """The ``lgrasp`` command: mounts the commands and turns every failure into one line and an exit code."""
 
 import os
+import re
 import sys
 from typing import Annotated
 
 import typer
 from typer import Option
+from typer.core import TyperGroup
 
 from lgrasp.judge.__main__ import judge
 from lgrasp.notices import on_notice
 from lgrasp_cli import bench, cache, catalog, dataset, hands, learn, prepare, scenes
 from lgrasp_cli.generate import generate
+from lgrasp_cli.look import render, view
 from lgrasp_cli.options import old_name, warn
 from lgrasp_cli.plan import plan
-from lgrasp_cli.progress import Interrupted, on_interrupt, stop_asked, stop_now
 from lgrasp_cli.refine import refine
 from lgrasp_cli.renamed import renew
 from lgrasp_cli.run import run
 from lgrasp_cli.sequence import sequence
 from lgrasp_cli.simulate import simulate
+from lgrasp_cli.status import status
+
+_PANELS = {
+    "Generate": (generate, sequence, plan, refine, run),
+    "Check": (simulate, judge, status),
+    "Look": (render, view, hands.app, catalog.objects, catalog.pipelines),
+    "Data": (dataset.app, dataset.export, scenes.app),
+    "Learn": (learn.app,),
+    "Developer": (*prepare.COMMANDS, *prepare.STAGES, bench.app, cache.app),
+}
+
+
+class _Panels(TyperGroup):
+    """Lists commands panel by panel."""
+
+    def list_commands(self, context: typer.Context) -> list[str]:
+        place = {panel: number for number, panel in enumerate(_PANELS)}
+        panels = {name: str(getattr(command, "rich_help_panel", "")) for name, command in self.commands.items()}
+        return sorted(panels, key=lambda name: place.get(panels[name], len(place)))  # those of old names are hidden
+
 
 app = typer.Typer(
+    cls=_Panels,
     help="Generate grasps for dexterous hands.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_jobs = (generate, sequence, plan, refine, run, simulate)
-for command in (*prepare.COMMANDS, *_jobs, *prepare.STAGES, dataset.export, judge):
-    app.command()(command)
+for panel, members in _PANELS.items():
+    for member in members:
+        if isinstance(member, typer.Typer):
+            app.add_typer(member, rich_help_panel=panel)
+        else:
+            app.command(rich_help_panel=panel)(member)
 app.command("validate", hidden=True)(old_name(simulate, "lgrasp validate", "lgrasp simulate"))
-for group in (bench.app, hands.app, catalog.objects, catalog.pipelines, cache.app, dataset.app, scenes.app, learn.app):
-    app.add_typer(group)
 
 
 def _version(wanted: bool) -> None:
@@ -55,16 +79,16 @@ def _options(
 
 
 def main() -> None:
-    """Run the command line; exit codes: 0 done, 2 bad input or output, 3 too few grasps, 130 interrupted."""
+    """Run the command line; exit codes: 0 done, 2 bad input or output, 3 too few grasps, 130 interrupted, 141 nobody
+    reads what it prints."""
     on_notice(warn)
     sys.argv[1:] = renew(sys.argv[1:])
     if os.environ.get("LGRASP_DEBUG"):
         code = app(prog_name="lgrasp", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     try:
-        with on_interrupt(stop_now):
-            code = app(prog_name="lgrasp", standalone_mode=False)
-            sys.stdout.flush()
+        code = app(prog_name="lgrasp", standalone_mode=False)
+        sys.stdout.flush()
     except BaseException as error:
         _leave(*_explain(error))
     sys.exit(code if isinstance(code, int) else 0)
@@ -74,26 +98,42 @@ def _explain(error: BaseException) -> tuple[str, int]:
     """One line for the user and the exit code of a failure."""
     from lgrasp.errors import LgraspError
 
-    if stop_asked():
-        return "interrupted", 130
     if isinstance(error, LgraspError):
         return f"error: {error}", error.exit_code
     if type(error).__name__ == "NoArgsIsHelpError":  # no command: its message, the help, is printed already
         return "", 2
     if isinstance(error, typer.TyperException):
-        return f"error: {error.format_message()}", error.exit_code
-    if isinstance(error, Interrupted | KeyboardInterrupt | typer.Abort):
+        return f"error: {error.format_message()}{_extra_word(error)}", error.exit_code
+    if isinstance(error, KeyboardInterrupt | typer.Abort):
         return "interrupted", 130
+    if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):  # nobody reads
+        return "", 141
     if isinstance(error, SystemExit):
         return "", error.code if isinstance(error.code, int) else 1
-    if isinstance(error, BrokenPipeError):
-        return "", 141
     if isinstance(error, MemoryError) or "out of memory" in str(error).lower():
         return "error: out of memory; lower --workers or --batch, or choose fewer --shard-rows", 2
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
         return f"error: {where}{error.strerror}", 2
     return f"error: unexpected {type(error).__name__}: {error} (set LGRASP_DEBUG=1 for the traceback)", 1
+
+
+def _extra_word(error: typer.TyperException) -> str:
+    """How to give an option several values, for a word too many after one."""
+    found, context = (
+        re.search(r"unexpected extra argument\S* \((\S+)", error.format_message()),
+        getattr(error, "ctx", None),
+    )
+    words = sys.argv[1:]
+    if not found or not context or found[1].rstrip(")") not in words[2:]:
+        return ""
+    extra = found[1].rstrip(")")
+    option, value = words[words.index(extra) - 2 : words.index(extra)]
+    known = [each for each in context.command.params if option in each.opts]
+    if not known:
+        return ""
+    several = f": {option} {value} {option} {extra}" if getattr(known[0], "multiple", False) else ""
+    return f"; {option} takes one value{several and ', and may be repeated'}{several}"
 
 
 def _leave(line: str, code: int) -> None:

@@ -8,18 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 from typer import Argument, Option
 
+from lgrasp_cli.names import DEVICE, HAND, OBJECT, PIPELINE
+
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
     from lgrasp.engine.pipeline import Pipeline
 
-Hand = Annotated[str, Option(help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
-HandArgument = Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.")]
-Mesh = Annotated[str, Option("--object", "-o", help="Mesh file, or the name of an object.")]
-Shards = Annotated[list[Path], Argument(help="Shard files, or folders of *.h5 files.")]
-PipelineName = Annotated[str, Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.")]
+Hand = Annotated[str, Option(help="Name of a hand, a URDF file, or a folder with hand.yaml.", **HAND)]
+HandArgument = Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.", **HAND)]
+Mesh = Annotated[str, Option("--object", "-o", help="Mesh file, or the name of an object.", **OBJECT)]
+MeshArgument = Annotated[str, Argument(help="Mesh file, or the name of an object.", **OBJECT)]
+Shards = Annotated[list[Path], Argument(help="Shard files, or folders of any depth.")]
+PipelineName = Annotated[str, Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.", **PIPELINE)]
 Seed = Annotated[int | None, Option(help="Base seed; default: the pipeline's.")]
 Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
-Device = Annotated[str, Option(help="auto, cpu or cuda:N.")]
+Device = Annotated[str, Option(help="auto: the first GPU, else the CPU.", **DEVICE)]
 Workers = Annotated[int, Option(min=0, help="Threads; 0: all cores (1 on a GPU).")]
 CacheDir = Annotated[Path | None, Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.")]
 Contacts = Annotated[str | None, Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.")]

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 from typer import Option
 
+from lgrasp_cli.names import HAND_OR_SHARD, OBJECT_OR_SHARD
 from lgrasp_cli.options import Scale, Settings
 from lgrasp_cli.tables import Block
 from lgrasp_cli.working import How, working
@@ -14,7 +15,7 @@ from lgrasp_cli.working import How, working
 def plan(
     how: How,
     mesh: Annotated[
-        str | None, Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.")
+        str | None, Option("--object", "-o", help="Mesh file, name of an object, or a shard of one.", **OBJECT_OR_SHARD)
     ] = None,
     cloud: Annotated[Path | None, Option(help="Point cloud or scene (.ply .xyz .npy .npz .h5).")] = None,
     mask: Annotated[Path | None, Option(help="Labels of the cloud's points (.npy, .npz).")] = None,
@@ -24,8 +25,9 @@ def plan(
     ] = None,
     scale: Scale = 1.0,
     hand: Annotated[
-        str, Option(help="Name of a hand, a URDF file, a folder with hand.yaml, or a shard (its hand).")
-    ] = "barrett",
+        str,
+        Option(help="Name of a hand, a URDF file, a folder with hand.yaml, or a shard (its hand).", **HAND_OR_SHARD),
+    ] = "allegro",
     starts: Annotated[int, Option("--starts", "-n", help="Points of the surface to start from.")] = 80,
     stand_off: Annotated[
         float | None, Option(help="Distance of the hand's base from a start [m]; default: the hand's.")
@@ -45,12 +47,12 @@ def plan(
 
     Example: lgrasp plan --cloud scene.ply --mask labels.npy --label 3 --hand barrett --starts 80
     """
-    from lgrasp.jobs.refine.plan import PlanJob, plan_params
+    from lgrasp.jobs.requests.plan import PlanRequest, plan_params
 
     what = {"hand": hand, "object": mesh, "scale": scale, "cloud": cloud, "mask": mask, "label": label, "out": out}
     what |= {"viewpoint": _numbers(viewpoint), "starts": starts, "stand_off": stand_off, "keep_invalid": keep_invalid}
     params = plan_params(settings or (), distal=distal, other=other)
-    how.run(how.job(PlanJob, "plan", **what, params=params), _show)
+    how.run(how.job(PlanRequest, "plan", **what, params=params), _show)
 
 
 def _numbers(text: str | None) -> list[float] | None:

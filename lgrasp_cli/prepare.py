@@ -3,8 +3,10 @@
 from typing import Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
+from lgrasp.choices import FieldIndex
+from lgrasp_cli.names import one_of
 from lgrasp_cli.options import (
     CacheDir,
     Contacts,
@@ -12,6 +14,7 @@ from lgrasp_cli.options import (
     Hand,
     HandArgument,
     Mesh,
+    MeshArgument,
     PipelineName,
     Scale,
     Seed,
@@ -26,7 +29,7 @@ _Rebuild = Annotated[bool, Option("--rebuild", help="Rebuild it even if it is ca
 @reporting
 def build_field(
     hand: HandArgument,
-    index: Annotated[str | None, Option(help="voxel or bvh; default: the pipeline's.")] = None,
+    index: Annotated[str | None, Option(**one_of(FieldIndex, "INDEX", "Default: the pipeline's."))] = None,
     pipeline: PipelineName = "robust",
     device: Device = "auto",
     cache_dir: CacheDir = None,
@@ -37,10 +40,10 @@ def build_field(
     Example: lgrasp build-field allegro
     """
     cache = open_cache(cache_dir, fresh=rebuild)
+    params = choose_pipeline(pipeline).field
     from lgrasp.jobs.prepare import prepare_field
     from lgrasp_cli.progress import Bar
 
-    params = choose_pipeline(pipeline).field
     with Bar() as bar:
         data = prepare_field(cache, hand, params, index=index, device=device, report=bar.share)
     note = f"; {data['note']}" if data["note"] else ""
@@ -61,7 +64,7 @@ def build_field(
 
 @reporting
 def preprocess(
-    mesh: Annotated[str, Argument(metavar="OBJECT", help="Mesh file, or the name of an object.")],
+    mesh: MeshArgument,
     scale: Scale = 1.0,
     pipeline: PipelineName = "robust",
     cache_dir: CacheDir = None,
@@ -72,9 +75,10 @@ def preprocess(
     Example: lgrasp preprocess mug.obj --scale 0.001
     """
     cache = open_cache(cache_dir, fresh=rebuild)
+    params = choose_pipeline(pipeline).object
     from lgrasp.jobs.prepare import prepare_object
 
-    data = prepare_object(cache, mesh, choose_pipeline(pipeline).object, scale=scale)
+    data = prepare_object(cache, mesh, params, scale=scale)
     sides = " x ".join(f"{1000 * side:.1f}" for side in data["extents"])
     grid = " x ".join(map(str, data["sdf_shape"]))
     pairs = [
@@ -97,13 +101,15 @@ def warm_up(device: Device = "auto", cache_dir: CacheDir = None) -> None:
     """
     open_cache(cache_dir)
     from lgrasp.runtime.device import resolve_device
-    from lgrasp.runtime.kernels import import_all, kernel_modules, load_kernels
+    from lgrasp.runtime.kernels import first_time, import_all, kernel_modules, load_kernels
     from lgrasp_cli.progress import Bar
 
     chosen = resolve_device(device)
     import_all()
     modules = kernel_modules()
     with Bar() as bar:
+        if words := first_time(chosen.alias):
+            bar.say(words)
         load_kernels(chosen.alias, modules, bar.share)
     typer.echo(f"{len(modules)} modules ready on {chosen.alias} ({chosen.name})")
 
@@ -122,9 +128,9 @@ def _up_to(stage: str):
         mesh: Mesh,
         hand: Hand = "allegro",
         pipeline: PipelineName = "robust",
-        candidates: Annotated[int, Option(help="Candidates in the batch.")] = 1024,
-        first: Annotated[int, Option(help="First candidate of the batch.")] = 0,
-        shard_index: Annotated[int, Option(help="Shard whose candidate stream is used.")] = 0,
+        candidates: Annotated[int, Option(min=1, help="Candidates in the batch.")] = 1024,
+        first: Annotated[int, Option(min=0, help="First candidate of the batch.")] = 0,
+        shard_index: Annotated[int, Option(min=0, help="Shard whose candidate stream is used.")] = 0,
         seed: Seed = None,
         contacts: Contacts = None,
         scale: Scale = 1.0,
@@ -133,9 +139,9 @@ def _up_to(stage: str):
         cache_dir: CacheDir = None,
     ) -> Answer:
         cache = open_cache(cache_dir, fresh=rebuild)
+        chosen = choose_pipeline(pipeline, seed, contacts)
         from lgrasp.jobs.onestage import run_up_to
 
-        chosen = choose_pipeline(pipeline, seed, contacts)
         runs = run_up_to(stage, chosen, hand, mesh, first, candidates, shard_index, cache, scale=scale, device=device)
         rows = [
             (

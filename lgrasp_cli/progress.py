@@ -1,27 +1,21 @@
 """While a job runs: one stream of progress on standard error, Ctrl-C to stop after the current batch."""
 
-import os
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from types import FrameType
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from lgrasp.engine.events import Events
+from lgrasp.files import at_end
+from lgrasp_cli.stopping import on_interrupt, stop_now, tell
 
 if TYPE_CHECKING:
     from lgrasp.engine.events import Made, Part
 
-_PATIENCE = 5.0  # [s] that a job may take to leave what it is making
 _PLAIN_INTERVAL = 10.0  # [s] between lines when standard error is no terminal
-_GRACE = 1.0  # [s] that native code may take before the process is ended
-_last: list[Callable[[], None]] = []  # what is still done then
-_asked = threading.Event()
 
 
 def say(line: str) -> None:
@@ -50,6 +44,7 @@ class Bar:
             columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
             self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True))
             self._task = self._bar.add_task("", total=None, note="")
+            at_end(self._bar.stop)  # which shows the cursor
             self._bar.start()
         return self
 
@@ -66,6 +61,13 @@ class Bar:
             self._said = time.monotonic()
             count = "" if done is None else f" {done:,}/{total:,}"
             say(f"{what}{count} {note}".rstrip())
+
+    def say(self, line: str) -> None:
+        """Print a line that stays."""
+        if self._bar:
+            self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
+        elif not self._quiet:
+            say(line)
 
     def share(self, what: str, share: float) -> None:
         """Tell what is being loaded or made, and how much of it is done, from 0 to 1."""
@@ -84,6 +86,9 @@ class JobProgress(Events):
         self._bar, self._unit = bar, unit
         self._rows: dict[int, int] = {}  # done, by part
         self._asked = 0
+
+    def said(self, words: str) -> None:
+        self._bar.say(words)
 
     def loading(self, what: str, share: float = 0.0) -> None:
         self._bar.share(what, share)
@@ -105,81 +110,16 @@ class JobProgress(Events):
 
 @contextmanager
 def interruptible(progress: JobProgress) -> Iterator[JobProgress]:
-    """The first Ctrl-C (or SIGTERM) ends the job as soon as it can, the second, or five seconds, at once.
+    """The first Ctrl-C (or SIGTERM, SIGHUP) ends the job as soon as it can, the second, or five seconds, at once.
 
     Whole files stay, what is being made is dropped.
     """
-    waiting = threading.Timer(_PATIENCE, signal.raise_signal, (signal.SIGINT,))
-    waiting.daemon = True
 
-    def stop() -> None:
-        if progress.stop or not progress.running:
+    def stop(again: bool) -> None:
+        if again or not progress.running:
             stop_now()
         progress.stop = True
-        waiting.start()
-        say("stopping after the current batch; press Ctrl-C again to stop at once")
+        tell("stopping after the current batch; press Ctrl-C again to stop at once")
 
     with on_interrupt(stop):
-        try:
-            yield progress
-        finally:
-            waiting.cancel()
-
-
-class Interrupted(BaseException):
-    """The user stopped the command."""
-
-
-def stop_now() -> None:
-    """Unwind to the end of the command, and end the process where that takes longer than a second.
-
-    Raises:
-        Interrupted: always.
-    """
-    _asked.set()
-    last = threading.Timer(_GRACE, _end)
-    last.daemon = True
-    last.start()
-    raise Interrupted
-
-
-def stop_asked() -> bool:
-    """True if :func:`stop_now` was called; a module half-imported then may fail later in unrelated ways."""
-    return _asked.is_set()
-
-
-@contextmanager
-def before_end(action: Callable[[], None]) -> Iterator[None]:
-    """Call ``action`` if the process is ended inside the block before the main thread could unwind it."""
-    _last.append(action)
-    try:
-        yield
-    finally:
-        _last.remove(action)
-
-
-def _end() -> None:
-    for action in list(_last):
-        with suppress(Exception):
-            action()
-    sys.stderr.write("interrupted\n")
-    sys.stderr.flush()
-    os._exit(130)
-
-
-@contextmanager
-def on_interrupt(action: Callable[[], None]) -> Iterator[None]:
-    """Call ``action`` on SIGINT and SIGTERM inside the block."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def handler(number: int, frame: FrameType | None) -> None:
-        action()
-
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
+        yield progress

@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from lgrasp.choices import FormatName
+from lgrasp_cli.names import HAND_OR_SHARD, one_of
 from lgrasp_cli.options import Settings
 from lgrasp_cli.tables import Block, TextTable
 from lgrasp_cli.working import How, working
@@ -16,10 +18,10 @@ def refine(
     how: How,
     out: Annotated[Path, Option(help="Folder of the refined shards.")],
     form: Annotated[
-        str | None, Option("--from", help="Format of the grasps: dexgraspnet, dexgraspbench, isaac-grasp or mjcf.")
+        str | None, Option("--from", **one_of(FormatName, "FORMAT", "Format of the grasps, if not shards."))
     ] = None,
     hand: Annotated[
-        str | None, Option(help="Hand of the grasps, for formats without one; shards contain theirs.")
+        str | None, Option(help="Hand of the grasps, for formats without one; shards contain theirs.", **HAND_OR_SHARD)
     ] = None,
     matching_rounds: Annotated[int | None, Option(help="Number of times that nearest points are matched.")] = None,
     gradient_steps: Annotated[int | None, Option(help="Gradient steps after each matching.")] = None,
@@ -38,14 +40,14 @@ def refine(
     A refined grasp replaces the original if it passes every check and resists loads better. Rows that pass in neither
     posture are left out. The bounds are those that the shard's rows passed, or --set bounds.KEY=VALUE.
 
-    Example: lgrasp refine grasps/allegro-mug --out grasps/allegro-mug-refined
+    Example: lgrasp refine grasps/allegro-mug/robust --out refined/allegro-mug
     """
-    from lgrasp.jobs.refine.shards import RefineJob, refine_params
+    from lgrasp.jobs.requests.shards import RefineRequest, refine_params
 
     rounds = {"matching_rounds": matching_rounds, "gradient_steps": gradient_steps, "outer": outer, "inner": inner}
     params = refine_params(coarse=coarse, **rounds)
     what = {"shards": shards, "out": out, "form": form, "hand": hand, "params": params, "settings": settings}
-    how.run(how.job(RefineJob, "refine", **what, keep_invalid=keep_invalid), _show)
+    how.run(how.job(RefineRequest, "refine", **what, keep_invalid=keep_invalid), _show)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from lgrasp_cli.names import HAND, OBJECT_OR_SHARD, PIPELINE
 from lgrasp_cli.options import given
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, counted, reporting
 from lgrasp_cli.working import How, working
@@ -22,16 +23,17 @@ _Paths = Annotated[list[Path], Argument(help="Scene files, or folders of *.h5 fi
 def make(
     how: How,
     objects: Annotated[
-        list[str] | None, Argument(help="Names or mesh files of objects; or one config of scenes.")
+        list[str] | None,
+        Argument(help="Names or mesh files of objects; or one config of scenes.", **OBJECT_OR_SHARD),
     ] = None,
-    hand: Annotated[str | None, Option(help="Hand; default: that of --grasps, else allegro.")] = None,
+    hand: Annotated[str | None, Option(help="Hand; default: that of --grasps, else allegro.", **HAND)] = None,
     scenes: Annotated[int | None, Option("-n", "--scenes", help="Scenes requested; default: 100.")] = None,
     out: Annotated[Path | None, Option(help="Folder of the scenes; default: scenes.")] = None,
     grasps: Annotated[
         Path | None, Option(help="Folder of shards (lgrasp generate); default: grasps are generated.")
     ] = None,
     pipeline: Annotated[
-        str | None, Option("--pipeline", "-p", help="Pipeline that generates the grasps; default: swift.")
+        str | None, Option("--pipeline", "-p", help="Pipeline that generates the grasps; default: robust.", **PIPELINE)
     ] = None,
     stock: Annotated[int | None, Option(help="Grasps generated of each object; default: 1000.")] = None,
     on_table: Annotated[int | None, Option(help="Objects on a table; default: 5.")] = None,
@@ -46,25 +48,30 @@ def make(
 
     Example: lgrasp scenes make mug bowl bottle box sphere hammer --hand allegro -n 100 --out scenes
     """
-    from lgrasp.jobs.scenes.job import SceneJob
+    from lgrasp.jobs.requests.scenes import SceneRequest
 
     changes = given(
         hand=hand, scenes=scenes, out=out, grasps=grasps, pipeline=pipeline, stock=stock, scale=scale, seed=seed
     )
-    how.run(how.job(SceneJob, "scenes make", **_config(objects or [], changes, on_table, views)), _show)
+    how.run(how.job(SceneRequest, "scenes make", **_config(objects or [], changes, on_table, views)), _show)
 
 
 @app.command()
 @reporting
 def check(paths: _Paths) -> Answer:
-    """Check every byte and value of each scene against the format; exit code 2 if one has a problem.
+    """Check every byte and value of each scene against the format, and each folder against its manifest.json.
+
+    Exit code 2 if a file has a problem, or one that is listed is missing.
 
     Example: lgrasp scenes check scenes
     """
-    from lgrasp.dataset import find_shards
+    from lgrasp.dataset.files import find_shards
+
+    find_shards(paths)
+    from lgrasp.dataset.manifest import check_files
     from lgrasp.scenes.files import check_scene
 
-    return checked({str(path): check_scene(path) for path in find_shards(paths)}, "scene")
+    return checked(check_files(paths, check_scene, below=False), "scene")
 
 
 @app.command()
@@ -74,10 +81,12 @@ def info(paths: _Paths) -> Answer:
 
     Example: lgrasp scenes info scenes
     """
-    from lgrasp.dataset import find_shards
+    from lgrasp.dataset.files import find_shards
+
+    files = find_shards(paths)
     from lgrasp.jobs.scenes.job import describe_scenes
 
-    data = describe_scenes(find_shards(paths))
+    data = describe_scenes(files)
     return Answer(data, _blocks(data, [("scenes", f"{data['scenes']:,}")]))
 
 

@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from lgrasp.choices import Method, Policy, ProtocolName
+from lgrasp_cli.names import OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import Hand, Seed, Settings, choose_pipeline
 from lgrasp_cli.tables import Block, TextTable, counted, place, share
 from lgrasp_cli.working import How, working
@@ -12,23 +14,26 @@ from lgrasp_cli.working import How, working
 
 @working
 def sequence(
-    objects: Annotated[list[str], Argument(help="Mesh files or names of objects, in the order of grasping.")],
+    objects: Annotated[list[str], Argument(help="Mesh files or names of objects, in the order of grasping.", **OBJECT)],
     how: How,
     hand: Hand = "allegro",
     rows: Annotated[int, Option("-n", "--rows", help="Complete sequences requested.")] = 256,
-    method: Annotated[str | None, Option(help="field, anneal or mala; default: the pipeline's.")] = None,
-    policy: Annotated[str | None, Option(help="uniform or lookahead; default: the pipeline's.")] = None,
+    method: Annotated[str | None, Option(**one_of(Method, "METHOD", "Default: the pipeline's."))] = None,
+    policy: Annotated[str | None, Option(**one_of(Policy, "POLICY", "Default: the pipeline's."))] = None,
     scale: Annotated[
         str, Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")
     ] = "1",
     simulate: Annotated[
-        str | None, Option(help="Continue only rows that hold in simulation: seq6 or seq6_mu06.")
+        str | None,
+        Option(**one_of(ProtocolName, "PROTOCOL", "Continue only rows that hold in a simulation.")),
     ] = None,
     pipeline: Annotated[
-        str, Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.")
+        str, Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.", **PIPELINE)
     ] = "sequence",
     settings: Settings = None,
-    out: Annotated[Path | None, Option(help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT...")] = None,
+    out: Annotated[
+        Path | None, Option(help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT.../PIPELINE")
+    ] = None,
     seed: Seed = None,
     shard_rows: Annotated[
         int, Option(help="Sequences per shard. Changing it changes which sequences are generated.")
@@ -42,17 +47,22 @@ def sequence(
 
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10
     """
-    from lgrasp.jobs.hands import hand_source
-    from lgrasp.jobs.sequence.job import SequenceJob, sequence_name
-
     chosen = choose_pipeline(pipeline, seed, settings=settings)
     if chosen.sequence is not None and (method or policy):
         changes = {"method": method, "policy": policy}
         chosen = chosen.with_params("sequence", **{name: value for name, value in changes.items() if value})
-    out = out or Path("grasps") / sequence_name(hand_source(hand).name, tuple(objects))
+    if out is None:
+        from lgrasp.engine.folder import run_folder
+        from lgrasp.jobs.config import hand_name
+        from lgrasp.jobs.sets import sequence_name
+
+        name = sequence_name(tuple(objects))
+        out = run_folder(Path("grasps"), hand_name(hand), name, chosen.name, simulate)
+    from lgrasp.jobs.requests.search import SequenceRequest
+
     what = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen, "out": out}
     what |= {"scale": scale, "simulate": simulate, "shard_rows": shard_rows}
-    how.run(how.job(SequenceJob, "sequence", **what), _show)
+    how.run(how.job(SequenceRequest, "sequence", **what), _show)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 from typer import Option
 
+from lgrasp.choices import ProtocolName
+from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Shards
 from lgrasp_cli.tables import Block, TextTable, place, share
 from lgrasp_cli.working import How, working
@@ -15,28 +17,29 @@ def simulate(
     shards: Shards,
     how: How,
     protocol: Annotated[
-        str, Option("--protocol", "-p", help="Protocol: fc, gravity6, gravity6_mu1, seq6 or seq6_mu06.")
+        str, Option("--protocol", "-p", **one_of(ProtocolName, "PROTOCOL", "What a grasp must withstand."))
     ] = "fc",
     out: Annotated[
-        Path | None, Option(help="Folder of the results; default: that of the shards with -PROTOCOL added.")
+        Path | None, Option(help="Write copies into this folder; by default the shards get the verdicts.")
     ] = None,
     all_directions: Annotated[
         bool, Option("--all-directions", help="Continue after the first direction in which an object is lost.")
     ] = False,
 ) -> None:
-    """Simulate grasps with MuJoCo and write copies of the shards with the verdicts added.
+    """Simulate grasps with MuJoCo and add the verdicts to the shards, as columns physics/PROTOCOL_...
 
     The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
     directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects: the
     hand starts at q, and every object must still touch it. docs/guides/physics.md describes the simulation.
 
-    Example: lgrasp simulate grasps/allegro-mug --out grasps/allegro-mug-fc --protocol fc
-    """
-    from lgrasp.jobs.simulate import SimulateJob
-    from lgrasp.simulate.protocol import find_protocol
+    A shard that has the verdicts already is left as it is. A run that was interrupted loses less than a minute of work.
 
-    what = {"shards": shards, "protocol": find_protocol(protocol), "out": out, "all_directions": all_directions}
-    how.run(how.job(SimulateJob, "simulate", **what), _show)
+    Example: lgrasp simulate grasps/allegro-mug/robust --protocol fc
+    """
+    from lgrasp.jobs.requests.shards import SimulateRequest
+
+    what = {"shards": shards, "protocol": protocol, "out": out, "all_directions": all_directions}
+    how.run(how.job(SimulateRequest, "simulate", **what), _show)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

@@ -2,17 +2,21 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Option
 
+from lgrasp_cli.names import DEVICE
 from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, given, open_cache, with_options
 from lgrasp_cli.tables import Block, plural, print_report
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
+    from lgrasp.engine.request import Request
     from lgrasp.engine.run import Job, JobOutcome
+    from lgrasp.runtime.array import Array
 
 
 @dataclass(frozen=True)
@@ -22,26 +26,34 @@ class How:
     cache: "Cache"
     device: str | None
     workers: int | None
-    array: tuple[int, int]
+    array: "Array"
     overwrite: bool
     json_path: str | None
     quiet: bool
 
-    def rotated(self, number: int) -> "How":
-        """The same for one of several jobs: tasks of an array begin to share the parts of each with another task."""
-        index, tasks = self.array
-        return replace(self, array=((index - number) % max(tasks, 1) if 0 <= index < tasks else index, tasks))
+    def of_each(self, jobs: "Sequence[Request]") -> "list[How]":
+        """The same for each of several jobs, whose parts the tasks of an array share like those of one."""
+        if len(jobs) == 1 or not (self.array.slurm or self.array.tasks > 1):
+            return [self] * len(jobs)
+        *before, total = accumulate((_parts(job, self.cache) for job in jobs), initial=0)
+        return [replace(self, array=self.array._replace(before=number, total=total)) for number in before]
 
-    def job(self, kind: "type[Job]", where: str, /, **options: Any) -> "Job":
-        """A job of some kind; options that are None are left to its defaults.
+    def job(self, kind: "type[Request]", where: str, /, **options: Any) -> "Job":
+        """A job of some kind, checked before what makes it is imported; options that are None are left to its defaults.
 
         Raises:
-            ConfigError: a value out of range.
+            LgraspError: a value, a name or a path that cannot be.
         """
         from lgrasp.config import parse_model
 
-        shared = given(device=self.device, workers=self.workers, cache=self.cache)
-        return parse_model(kind, given(**options) | shared, where)
+        request = parse_model(kind, given(**options) | self.shared, where)
+        request.check()
+        return request.job(self.cache)
+
+    @property
+    def shared(self) -> dict[str, Any]:
+        """Fields of all requests, those that are given."""
+        return given(device=self.device, workers=self.workers)
 
     def run(self, job: "Job", show: Callable[[dict[str, Any]], Sequence[Block]]) -> None:
         """Run a job with progress, report it, and leave with its exit code if it fell short.
@@ -49,9 +61,9 @@ class How:
         Args:
             show: its report to be read.
         """
-        check_report(self.json_path)
         data, outcome = run_job(job, self)
-        print_report(data, self.json_path, () if self.quiet or self.json_path == "-" else show(data))
+        nothing = outcome.cancelled and not outcome.paths
+        print_report(data, self.json_path, () if self.quiet or self.json_path == "-" or nothing else show(data))
         conclude(data, outcome)
 
 
@@ -60,15 +72,20 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
 
     def run(
         *,
-        device: Annotated[str | None, Option(help="auto, cpu or cuda:N.")] = None,
+        device: Annotated[
+            str | None, Option(help="auto: the first GPU, else the CPU. Default: auto; of simulate cpu.", **DEVICE)
+        ] = None,
         workers: Annotated[int | None, Option(min=0, help="Threads or processes; 0: by device.")] = None,
-        shard_index: Annotated[
-            int | None,
-            Option(help="Number of this array task, which makes every NUMth file; default: SLURM_ARRAY_TASK_ID."),
-        ] = None,
-        num_shards: Annotated[
-            int | None, Option(help="Number of array tasks; default: SLURM_ARRAY_TASK_COUNT.")
-        ] = None,
+        array: Annotated[
+            str,
+            Option(
+                metavar="auto|off|I/N",
+                help="Share the files with other tasks: I/N is task I of N, counted from 0; auto: this task of a SLURM "
+                "job array, if it is one.",
+            ),
+        ] = "auto",
+        shard_index: Annotated[int | None, Option(hidden=True)] = None,
+        num_shards: Annotated[int | None, Option(hidden=True)] = None,
         overwrite: Annotated[
             bool, Option("--overwrite", help="Replace existing files; by default complete ones are kept.")
         ] = False,
@@ -78,22 +95,40 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
         quiet: Quiet = False,
         **options: Any,
     ) -> None:
-        cache = open_cache(cache_dir, fresh=rebuild)
-        from lgrasp.engine.run import array_task
+        check_report(json_path)
+        from lgrasp.runtime.array import parse_array
 
-        array = array_task(shard_index, num_shards)
-        command(**options, how=How(cache, device, workers, array, overwrite, json_path, quiet))
+        if shard_index is not None or num_shards is not None:
+            from lgrasp.notices import notice
+
+            array = f"{shard_index or 0}/{1 if num_shards is None else num_shards}"
+            notice(f"--shard-index and --num-shards are now --array {array}; the old names work in this release only")
+        shares = parse_array(array)
+        cache = open_cache(cache_dir, fresh=rebuild)
+        command(**options, how=How(cache, device, workers, shares, overwrite, json_path, quiet))
 
     return with_options(run, command)
+
+
+def _parts(request: "Request", cache: "Cache") -> int:
+    """Parts of a job; 1 of one that will fail."""
+    from lgrasp.errors import LgraspError
+
+    try:
+        request.check()
+        return len(request.job(cache).parts())
+    except LgraspError:
+        return 1
 
 
 def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "JobOutcome"]:
     """Run a job with progress; its report and outcome."""
     from lgrasp.engine.report import job_report
     from lgrasp.engine.run import run
+    from lgrasp.files import before_end
     from lgrasp_cli.progress import Bar, JobProgress, interruptible
 
-    with Bar(quiet=how.quiet) as bar, interruptible(JobProgress(bar, job.unit)) as progress:
+    with Bar(quiet=how.quiet) as bar, interruptible(JobProgress(bar, job.unit)) as progress, before_end(job.abandon):
         outcome = run(job, progress, array=how.array, resume=not how.overwrite)
     return job_report(outcome), outcome
 

@@ -1,6 +1,7 @@
 """What tests of engine, tables and stages share: a hand, a small contact field and an object, made once."""
 
 import os
+import signal
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +14,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from lgrasp.config import parse_model
-from lgrasp.dataset import read_shard
+from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
@@ -42,6 +43,13 @@ def no_network() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(socket.socket, "connect", local)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c() -> None:
+    """Commands that the tests start heed Ctrl-C, even if the tests run in the background of a script."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
@@ -146,7 +154,7 @@ def raw_grasps() -> Callable[[Path], dict[str, dict[str, bytes]]]:
             with h5py.File(path) as file:
                 found: dict[str, bytes] = {}
 
-                def visit(name: str, node: object, found: dict[str, bytes] = found) -> None:
+                def visit(name: str, node: Any, found: dict[str, bytes] = found) -> None:
                     if isinstance(node, h5py.Dataset):
                         found[name] = repr((node.shape, node.dtype)).encode() + b"".join(
                             node.id.read_direct_chunk(node.id.get_chunk_info(i).chunk_offset)[1]

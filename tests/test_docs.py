@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from lgrasp.grasp.outcomes import METRICS
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("hands/*/*.md")])
@@ -44,3 +46,8 @@ def test_all_pages_are_reached():
         seen.add(page)
         new += {target for target, _ in links(page) if target.suffix == ".md" and target.exists()} - seen
     assert set(DOCS.rglob("*.md")) <= seen
+
+
+def test_every_metric_is_explained():
+    page = (DOCS / "reference" / "metrics.md").read_text(encoding="utf-8")
+    assert [name for name in (*METRICS, "contacts") if f"| `{name}` |" not in page] == []

@@ -15,18 +15,19 @@ HEAVY = ("torch", "warp", "trimesh", "yourdfpy", "h5py", "scipy", "numpy", "coac
 DATA = ("hands", "objects", "pipelines", "configs")
 
 ORDER = (
-    ("errors", "paths", "notices", "config", "seeding"),
+    ("errors", "files", "paths", "notices", "choices", "config", "seeding", "signals"),
     ("geometry", "math", "runtime"),
     ("hand", "object"),
     ("cloud", "differentiable", "field"),
     ("grasp",),
+    ("picture",),
     ("simulate", "dataset", "refine"),
     ("planning", "scenes"),
     ("stages",),
     ("sequence", "learn"),
     ("engine",),
     ("jobs",),
-    ("bench", "api"),
+    ("bench", "api", "view"),
 )
 """Rooms of lgrasp from the lowest floor up; a room imports rooms of its own floor or below, without a cycle."""
 

@@ -20,6 +20,7 @@ ALLOWED = {
     "name": "of a hand and of a pipeline",
     "source": "of a hand's model and of published figures",
     "links": "of the three rules in hand.yaml, each with links of its own kind",
+    "pipeline": "what a job runs, and the name of it in a list of files",
     "params": "each job holds the parameters of what it runs",
 }
 """Fields without a description that several models have, and why they are not one declaration."""

@@ -4,9 +4,9 @@ import io
 from pathlib import Path
 from typing import Any
 
-from lgrasp.dataset.files import new_file
 from lgrasp.engine.report import check_json
 from lgrasp.errors import OutputError
+from lgrasp.files import write_file
 
 _COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#9467bd")
 _PUBLISHED = "#b0b0b0"
@@ -52,8 +52,7 @@ def draw_table(table: dict[str, Any], path: Path) -> None:
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
     data = io.BytesIO()
     figure.savefig(data, format="png")
-    with new_file(path) as file:
-        file.write(data.getvalue())
+    write_file(path, data.getvalue())
 
 
 def _draw_hand(axes: Any, table: dict[str, Any], cells: list[dict[str, Any]]) -> None:

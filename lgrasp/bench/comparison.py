@@ -12,7 +12,7 @@ from lgrasp.bench.page import Table as Texts
 from lgrasp.bench.rate import Bench
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, LgraspError, ObjectError
-from lgrasp.jobs.config import JobConfig, in_folder, plan_jobs
+from lgrasp.jobs.config import JobConfig, in_folder, plan_requests
 from lgrasp.object.find import find_object
 from lgrasp.runtime.device import resolve_device
 
@@ -102,10 +102,10 @@ def measure_table(
     rows. A cell that cannot be measured says why in ``error`` and does not stop the others.
 
     Raises:
-        ConfigError: see :func:`plan_jobs`.
+        ConfigError: see :func:`plan_requests`.
     """
-    settings, jobs = table["settings"], plan_jobs(config, cache)
-    # plan_jobs: pipeline, hand, object; here all pipelines of a hand and object go together
+    settings, jobs = table["settings"], [request.job(cache) for request in plan_requests(config)]
+    # plan_requests: pipeline, hand, object; here all pipelines of a hand and object go together
     pairs = [(hand, mesh) for hand in table["hands"] for mesh in table["objects"]]
     done = {(cell["hand"], cell["object"]) for cell in table["cells"]}
     for first, (hand, mesh) in enumerate(pairs):

@@ -1,7 +1,5 @@
 """Pipelines side by side on several objects, in one run on one device."""
 
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
@@ -10,6 +8,7 @@ from typing import Any
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import JobOutcome
+from lgrasp.files import temporary_folder
 from lgrasp.jobs.generate import GenerateJob, generate
 
 _MEASURED = ("strict_valid_per_s", "published_count_per_s")
@@ -28,17 +27,13 @@ class Bench:
         self._built: dict[str, dict[str, float]] = {kind: {} for kind in _INPUTS}
 
     def __enter__(self) -> "Bench":
-        self._folder = tempfile.TemporaryDirectory(prefix="lgrasp-bench-")
-        self._cache = Cache(Path(self._folder.name) / "cache")
+        self._held = temporary_folder()
+        self._folder = self._held.__enter__()
+        self._cache = Cache(self._folder / "cache")
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.discard()
-
-    def discard(self) -> None:
-        """Remove the temporary folder, whatever still runs in it."""
-        shutil.rmtree(self._folder.name, ignore_errors=True)
-        self._folder.cleanup()
+    def __exit__(self, *error: Any) -> None:
+        self._held.__exit__(*error)
 
     def measure(self, jobs: list[GenerateJob], repeat: int, progress: Progress | None = None) -> list[dict[str, Any]]:
         """Run each job ``repeat`` times, in turns, and report the middle and the spread.
@@ -78,8 +73,8 @@ class Bench:
         return job.changed(rate=outcome.job.measured_rate)
 
     def _run(self, job: GenerateJob) -> tuple[dict[str, Any], JobOutcome]:
-        with tempfile.TemporaryDirectory(dir=self._folder.name) as out:
-            outcome = generate(job.changed(out=Path(out), cache=self._cache), resume=False)
+        with temporary_folder() as out:
+            outcome = generate(job.changed(out=out, cache=self._cache), resume=False)
             data = job_report(outcome)
         data["keys"] = {kind: getattr(outcome.job.inputs.keys, kind) for kind in _INPUTS}
         for kind, key in data["keys"].items():

@@ -24,12 +24,13 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.surface import ContactSurface
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
-from lgrasp.jobs.refine.shards import COARSE
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
-from lgrasp.planning.planner import Planner, PlanParams, cloud_params
+from lgrasp.planning.params import PlanParams, cloud_params
+from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import STAND_OFF
+from lgrasp.refine.params import COARSE
 from lgrasp.refine.refiner import Pose, Refiner, table_pose
 from lgrasp.refine.surface import hand_surface
 from lgrasp.runtime.device import Device, resolve_device

@@ -7,15 +7,13 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES
 from lgrasp.errors import CloudError, ShardError
 from lgrasp.object.load import quiet_parsers, read_bytes, short_reason
-
-CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz", ".h5")
 
 SceneCloud = Callable[[Path], dict[str, np.ndarray]]
 """Reads the merged cloud of a scene (.h5): points (n, 3) [m], normals (n, 3), labels (n,)."""
 
-_MASK_SUFFIXES = (".npy", ".npz")
 _LABELS = ("label", "labels")  # names that a file may give to the label of a point
 
 
@@ -68,7 +66,7 @@ def read_mask(path: Path, count: int) -> np.ndarray:
     Raises:
         CloudError: no such file, not integers or flags, or of another length.
     """
-    data = read_bytes(path, _MASK_SUFFIXES, "a mask", CloudError)
+    data = read_bytes(path, MASK_SUFFIXES, "a mask", CloudError)
     try:
         values = _load_numpy(data, (*_LABELS, "mask"), "labels")
         values = next(values[name] for name in (*_LABELS, "mask", "") if name in values)

@@ -60,7 +60,7 @@ def read_cloud(
     """Read a whole cloud; with a label, its ``target`` are the points of that label.
 
     Args:
-        path: File (see ``cloud.files.CLOUD_SUFFIXES``) with points and perhaps normals and labels.
+        path: File (see ``cloud.suffixes.CLOUD_SUFFIXES``) with points and perhaps normals and labels.
         mask: File with a label for each point (.npy, .npz); default: the labels in the cloud's own file.
         label: Which points are the target; 1 where a mask of flags is given and no label.
         scale: Factor from the file's unit to metres.

@@ -1,17 +1,17 @@
 """The contents of shards, in one dictionary each, and survivors of stages, in one number each."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.files import Paths, find_shards
+from lgrasp.dataset.files import Paths
+from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
 
 
 def describe(paths: Paths) -> list[dict[str, Any]]:
-    """Summaries of shard files, or folders of them, JSON-serialisable, one per file.
+    """Summaries of shard files, or folders of them at any depth, JSON-serialisable, one per file.
 
     Returns:
         For each shard: ``file``, ``bytes``, ``rows``, ``rows_by_objects`` (rows by the number of objects held),
@@ -23,35 +23,34 @@ def describe(paths: Paths) -> list[dict[str, Any]]:
     Raises:
         ShardError: No shard is found, or one cannot be read.
     """
-    return [_describe(path) for path in find_shards(paths)]
+    return [shard.value for shard in gather(paths, _describe)]
 
 
-def _describe(path: Path) -> dict[str, Any]:
-    with ShardReader(path) as reader:
-        header = reader.header
-        units = reader.rows(0, 0).metric_units
-        held, by_space = (reader.column("object_index") >= 0).sum(1), None
-        if reader.space_names is not None:
-            last = np.take_along_axis(reader.column("sequence/space"), held[:, None] - 1, 1)
-            by_space = {name: int((last == number).sum()) for number, name in enumerate(reader.space_names)}
-        return {
-            "file": str(path),
-            "bytes": path.stat().st_size,
-            "rows": len(reader),
-            "rows_by_objects": {str(n): int(rows) for n, rows in enumerate(np.bincount(held)) if rows},
-            "rows_by_space": by_space,
-            "hand": str(reader.attributes["hand"]),
-            "objects": reader.object_ids,
-            "pipeline": header.pipeline,
-            "seed": header.seed,
-            "shard_index": header.shard_index,
-            "created": header.created,
-            "lgrasp_version": header.lgrasp_version,
-            "joints": list(reader.hand().joint_names),
-            "columns": {name: list(shape) for name, (shape, _) in reader.columns.items()},
-            "metrics": {n: {"unit": unit, **_range(reader.column(f"metrics/{n}"))} for n, unit in units.items()},
-            "statistics": reader.statistics,
-        }
+def _describe(reader: ShardReader) -> dict[str, Any]:
+    header = reader.header
+    units = reader.rows(0, 0).metric_units
+    held, by_space = (reader.column("object_index") >= 0).sum(1), None
+    if reader.space_names is not None:
+        last = np.take_along_axis(reader.column("sequence/space"), held[:, None] - 1, 1)
+        by_space = {name: int((last == number).sum()) for number, name in enumerate(reader.space_names)}
+    return {
+        "file": str(reader.path),
+        "bytes": reader.path.stat().st_size,
+        "rows": len(reader),
+        "rows_by_objects": {str(n): int(rows) for n, rows in enumerate(np.bincount(held)) if rows},
+        "rows_by_space": by_space,
+        "hand": str(reader.attributes["hand"]),
+        "objects": reader.object_ids,
+        "pipeline": header.pipeline,
+        "seed": header.seed,
+        "shard_index": header.shard_index,
+        "created": header.created,
+        "lgrasp_version": header.lgrasp_version,
+        "joints": list(reader.hand().joint_names),
+        "columns": {name: list(shape) for name, (shape, _) in reader.columns.items()},
+        "metrics": {n: {"unit": unit, **_range(reader.column(f"metrics/{n}"))} for n, unit in units.items()},
+        "statistics": reader.statistics,
+    }
 
 
 def _range(values: np.ndarray) -> dict[str, float | None]:

@@ -1,7 +1,5 @@
-"""Puts the rows of many shards of one hand and one object set into one file, and lists the shards of a folder."""
+"""Puts the rows of many shards of one hand and one object set into one file."""
 
-import hashlib
-import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +10,9 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.checks import row_problems
-from lgrasp.dataset.files import Paths, check_heaps, find_shards, new_shard_file, parsing, write_file
+from lgrasp.dataset.files import Paths, check_heaps, find_shards
+from lgrasp.dataset.manifest import MANIFEST, compare, read_manifest
+from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import column_texts, create_rows, finish, write_context
 from lgrasp.errors import OutputError, ShardError
@@ -23,7 +23,13 @@ from lgrasp.notices import notice
 _FIELDS = GRASP_FIELDS | SEQUENCE_FIELDS
 
 
-def merge_shards(paths: Paths, out: str | os.PathLike[str], *, manifest: str | os.PathLike[str] | None = None) -> int:
+def merge_shards(
+    paths: Paths,
+    out: str | os.PathLike[str],
+    *,
+    manifest: str | os.PathLike[str] | None = None,
+    partial: bool = False,
+) -> int:
     """Copy the rows of shards, ordered by shard index, into one shard file; streams, so memory stays bounded.
 
     The shards must agree in hand, objects, pipeline, config and seed, and in the names of metrics and verdicts. Rows
@@ -34,29 +40,29 @@ def merge_shards(paths: Paths, out: str | os.PathLike[str], *, manifest: str | o
         paths: Shard files, or a folder of them.
         out: The file to write; if it lies in the folder, it is not merged into itself.
         manifest: List to check the shards against; by default ``manifest.json`` of the folder, if there is one.
+        partial: Merge what is there, though the list has more.
 
     Returns:
         The number of rows written.
 
     Raises:
-        ShardError: A shard is missing, damaged, changed, given twice, or does not belong to the others.
+        ShardError: A shard is missing (unless ``partial``), damaged, changed, given twice, not in the ``manifest`` that
+            is named, or does not belong to the others.
         OutputError: ``out`` cannot be written, or is there and no merged shard.
     """
     found, there = find_shards(paths), Path(out).exists()
     folder = Path(paths) if isinstance(paths, str | os.PathLike) else None
     if folder and folder.is_dir():
         found = [path for path in found if not (there and path.samefile(out))]
-        if manifest is None and (folder / _MANIFEST).exists():
-            manifest = folder / _MANIFEST
     if not found or any(there and path.samefile(out) for path in found):
         raise ShardError(f"{out}: must not be one of the shards to merge")
     if there and not _is_merged(Path(out)):
         raise OutputError(f"{out} exists and is no merged shard; choose another --out")
-    if manifest is not None:
-        _check_manifest(manifest, found)
+    listed = _check_manifest(found, manifest, folder, partial)
     sources = sorted((_survey(path) for path in found), key=lambda s: (s.header.shard_index, s.path.name))
     _require_one_run(sources)
-    _tell_gaps(sources)
+    if not listed:
+        _tell_gaps(sources)
     with new_shard_file(out) as file:
         hand = _write_head(file, sources)
         _copy_rows(file, sources, hand)
@@ -132,6 +138,33 @@ def _require_one_run(sources: Sequence[_Source]) -> None:
             if index in holder:
                 raise ShardError(f"{source.path}: shard {index} is already in {holder[index]}; leave one out")
             holder[index] = source.path
+
+
+def _check_manifest(
+    shards: Sequence[Path], named: str | os.PathLike[str] | None, folder: Path | None, partial: bool
+) -> bool:
+    """Compare shards with the manifest that is named, else with that of their folder; False if there is none.
+
+    Raises:
+        ShardError: The manifest is damaged, or a shard is missing, changed, or not in a manifest that is named.
+    """
+    path = Path(named) if named is not None else folder and folder / MANIFEST
+    manifest = path and read_manifest(path)
+    if path is None or manifest is None:
+        if named is not None:
+            raise ShardError(f"{named}: no manifest there")
+        return False
+    found = compare(shards, manifest)
+    if line := found.missing_line(path):
+        if not partial:
+            raise ShardError(f"{line}; run the job again to make them, or merge what is there with --partial")
+        notice(f"{line}; what is there is merged")
+    for name, how in found.changed.items():
+        raise ShardError(f"{path.parent / name}: {how}")
+    if named is not None and found.foreign:
+        raise ShardError(found.foreign_line(path))
+    notice(found.foreign_line(path))
+    return True
 
 
 def _tell_gaps(sources: Sequence[_Source]) -> None:
@@ -219,48 +252,3 @@ def pad_column(name: str, values: np.ndarray, tail: tuple[int, ...]) -> np.ndarr
 def widest(tails: Iterable[tuple[int, ...]]) -> tuple[int, ...]:
     """The smallest tail that holds all given ones; they have the same number of axes."""
     return tuple(max(sizes) for sizes in zip(*tails, strict=True))
-
-
-_MANIFEST, _FORMAT, _VERSION = "manifest.json", "lgrasp-manifest", "1.0"
-
-
-def write_manifest(folder: str | os.PathLike[str]) -> Path:
-    """Write ``manifest.json`` for the shards of a folder: file, rows, shard index and SHA-256 of each.
-
-    Raises:
-        ShardError: The folder holds no shard, or a shard cannot be read.
-        OutputError: The manifest cannot be written.
-    """
-    shards = []
-    for path in find_shards(folder):
-        with ShardReader(path) as reader:
-            shards.append({"file": path.name, "rows": len(reader), "shard_index": reader.header.shard_index})
-        shards[-1]["sha256"] = _sha256(path)
-    document = {"format": _FORMAT, "format_version": _VERSION, "rows": sum(s["rows"] for s in shards), "shards": shards}
-    target = Path(folder) / _MANIFEST
-    write_file(target, json.dumps(document, indent=2) + "\n")
-    return target
-
-
-def _check_manifest(manifest: str | os.PathLike[str], shards: Sequence[Path]) -> None:
-    """Compare shard files with a manifest, by their names; a ShardError says what differs."""
-    with parsing(manifest, "a manifest of shards", (ValueError, KeyError, TypeError)):
-        document = json.loads(Path(manifest).read_bytes())
-        listed = {entry["file"]: entry["sha256"] for entry in document["shards"]}
-        if document["format"] != _FORMAT:
-            raise ValueError(f"format is {document['format']!r}, expected {_FORMAT!r}")
-    given = {path.name: path for path in shards}
-    missing, unlisted = sorted(listed.keys() - given.keys()), sorted(given.keys() - listed.keys())
-    if missing:
-        raise ShardError(f"{manifest}: {len(missing)} of {len(listed)} shards missing, first {missing[0]}")
-    if unlisted:
-        raise ShardError(f"{given[unlisted[0]]}: not listed in {manifest}; write the manifest again")
-    for name, path in given.items():
-        actual = _sha256(path)
-        if actual != listed[name]:
-            raise ShardError(f"{path}: SHA-256 is {actual[:12]}…, {manifest} says {str(listed[name])[:12]}…")
-
-
-def _sha256(path: Path) -> str:
-    with parsing(path), open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -12,10 +12,10 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.files import check_heaps
-from lgrasp.dataset.structure import expand, shard_problems
+from lgrasp.dataset.structure import expand, format_problems, shard_problems
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
-from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
+from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS
 
 _RENAMED = {"metrics/disturbance": "metrics/unresisted_load"}
 """Flat names of columns in shards of earlier releases -> their names; readers give the columns by these."""
@@ -216,6 +216,20 @@ class ShardReader(FileReader):
             path = GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"
             old = next((f"grasps/{was}" for was, now in _RENAMED.items() if now == name), path)
             return self._file[old if old in self._file and path not in self._file else path]
+
+
+def count_rows(path: str | os.PathLike[str]) -> int:
+    """How many rows a shard says it has; the rest of the file is not looked at.
+
+    Raises:
+        ShardError: The file is truncated, foreign, or of another format version.
+    """
+    with open_hdf5(path) as file, reading(path):
+        problems = format_problems(file, "grasp shard", FORMAT, FORMAT_VERSION)
+        rows = file.get("grasps/q")
+        if problems or not isinstance(rows, h5py.Dataset):
+            raise ShardError(f"{path}: {next(iter(problems), 'grasps/q: missing dataset')}")
+        return rows.shape[0] if rows.shape else 0
 
 
 def read_shard(path: str | os.PathLike[str]) -> Shard:

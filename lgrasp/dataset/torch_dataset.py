@@ -1,21 +1,24 @@
 """Grasps of many shards as a map-style PyTorch Dataset."""
 
+import hashlib
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 
-from lgrasp.dataset.files import Paths, find_shards
+from lgrasp.dataset.files import Paths
+from lgrasp.dataset.gather import gather
+from lgrasp.dataset.manifest import tell_differences
 from lgrasp.dataset.merge import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.grasp.schema import CHUNK_ROWS, SEQUENCE_FIELDS
+from lgrasp.grasp.schema import CHUNK_ROWS, POSE_BITS, SEQUENCE_FIELDS
 
 
 class _Source(NamedTuple):
@@ -38,10 +41,11 @@ class GraspDataset(torch.utils.data.Dataset):
 
     Blocks of 4096 rows are decoded at a time and the last used ones kept, so sequential reading is fast at any size and
     random reading as long as the data fits ``cache_bytes``. No file stays open: safe with worker processes, forked or
-    spawned, and with any number of shards.
+    spawned, and with any number of shards. Shards that are missing from a folder, or not listed, by its
+    ``manifest.json`` are reported.
 
     Args:
-        paths: Shard files or folders of them.
+        paths: Shard files, or folders of any depth; what cannot be used in these is left out, with a notice.
         columns: Names to return; by default all that every shard has.
         cache_bytes: Memory for decoded blocks, per worker process.
 
@@ -50,7 +54,8 @@ class GraspDataset(torch.utils.data.Dataset):
     """
 
     def __init__(self, paths: Paths, *, columns: Sequence[str] | None = None, cache_bytes: int = 1 << 29) -> None:
-        self._sources = [_survey(path) for path in find_shards(paths)]
+        self._sources = [shard.value for shard in gather(paths, _survey)]
+        tell_differences(paths)
         first = self._sources[0]
         for source in self._sources:
             if source.hand_sha256 != first.hand_sha256:
@@ -101,6 +106,72 @@ class GraspDataset(torch.utils.data.Dataset):
         with ShardReader(source.path) as reader:
             return reader.object(key[0])
 
+    def split(
+        self, *, by: Literal["object", "pose"], shares: Sequence[float] = (0.8, 0.1, 0.1), seed: int = 0
+    ) -> list[torch.utils.data.Subset]:
+        """Parts of about some shares of the rows, such that no object (or pose) is in two of them.
+
+        Grasps of one object pose are much alike: a split row by row has siblings on both sides. Which groups a part
+        gets depends on the seed and the groups alone.
+
+        Args:
+            by: ``object``: source meshes, whatever their scale; objects held at once stay together. ``pose``: rows
+                made from one object pose, so all objects are in every part.
+            shares: of the rows, positive; they are divided by their sum.
+
+        Raises:
+            ShardError: There are fewer groups than parts.
+            ValueError: ``by`` or ``shares`` is out of range.
+        """
+        if by not in ("object", "pose") or not shares or min(shares) <= 0:
+            raise ValueError(f"by={by!r}, shares={tuple(shares)}: by is 'object' or 'pose', shares are positive")
+        names = self._object_groups() if by == "object" else self._pose_groups()
+        groups, group_of, sizes = np.unique(names, return_inverse=True, return_counts=True)
+        if len(groups) < len(shares):
+            raise ShardError(f"rows of {len(groups)} {by}(s) cannot be split into {len(shares)} parts by {by}")
+        order = np.argsort([hashlib.sha256(f"{seed}/{group}".encode()).digest() for group in groups])
+        middle = np.cumsum(sizes[order]) - sizes[order] / 2  # the row that says where its group goes
+        number = np.arange(1, len(shares))
+        cuts = np.searchsorted(middle, np.cumsum(shares)[:-1] / sum(shares) * len(self))
+        cuts = np.maximum.accumulate(np.maximum(cuts - number, 0)) + number  # every part gets a group
+        cuts = np.minimum(cuts, len(groups) - len(shares) + number)
+        rows_of = (np.flatnonzero(np.isin(group_of, part)).tolist() for part in np.split(order, cuts))
+        return [torch.utils.data.Subset(self, rows) for rows in rows_of]
+
+    def _object_groups(self) -> np.ndarray:
+        """Of each row, the hash of a source mesh; the same for all that are held at once in some row."""
+        joined = {sha256: sha256 for _, sha256, _ in self.objects}
+
+        def root(name: str) -> str:
+            while joined[name] != name:
+                name = joined[name]
+            return name
+
+        sets: list[list[str]] = []
+        rows = []
+        for source in self._sources:
+            with ShardReader(source.path) as reader:
+                kinds, which = np.unique(reader.column("object_index"), axis=0, return_inverse=True)
+            rows.append(which.ravel() + len(sets))
+            for kind in kinds:
+                held = [source.objects[i][1] for i in kind if i >= 0]
+                sets.append(held)
+                for name in held[1:]:
+                    joined[root(name)] = root(held[0])
+        names = np.array([root(held[0]) if held else "" for held in sets])
+        return names[np.concatenate(rows)]
+
+    def _pose_groups(self) -> np.ndarray:
+        """Of each row, the object that was placed first and the number of its pose."""
+        parts = []
+        for source in self._sources:
+            with ShardReader(source.path) as reader:
+                pose = reader.column("candidate") & POSE_BITS
+                first = reader.column("object_index")[:, 0]
+            names = np.array([sha256[:16] for _, sha256, _ in source.objects] + [""])[first]
+            parts.append(np.char.add(np.char.add(names, "/"), pose.astype(str)))
+        return np.concatenate(parts)
+
     def _choose(self, columns: Sequence[str] | None) -> list[str]:
         kinds = [  # what must agree for a column to be stacked
             {n: (t, len(shape), n in SEQUENCE_FIELDS and s.space_names) for n, (shape, t) in s.columns.items()}
@@ -149,7 +220,6 @@ class GraspDataset(torch.utils.data.Dataset):
         return block
 
 
-def _survey(path: Path) -> _Source:
-    with ShardReader(path) as reader:
-        hand = str(reader.attributes["hand_sha256"])
-        return _Source(path, len(reader), hand, reader.object_keys, reader.space_names, reader.columns)
+def _survey(reader: ShardReader) -> _Source:
+    hand = str(reader.attributes["hand_sha256"])
+    return _Source(reader.path, len(reader), hand, reader.object_keys, reader.space_names, reader.columns)

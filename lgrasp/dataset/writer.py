@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
-from lgrasp.dataset.files import new_shard_file
+from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.structure import structure_problems, text_sha256
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, object_set_sha256

@@ -10,10 +10,8 @@ from lgrasp.engine.inputs import InputKeys
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
 
-BANK_VERSION = 3
+BANK_VERSION = 4
 """Raised whenever the arrays of an entry change meaning; the versions of the stages are in the key too."""
-REUSE_PASSES = 8
-"""Passes of a run that keeps a bank, unless it or its pipeline says otherwise."""
 _NUMBERS_MEMBER = "about"  # member with the numbers
 
 
@@ -71,14 +69,3 @@ class Bank:
         self.cache.store(
             "bank", self.key, grasp_arrays(account.grasps) | {_NUMBERS_MEMBER: np.asarray(json.dumps(about))}
         )
-
-
-def with_passes(pipeline: Pipeline, passes: int | None, reuse: bool = False) -> Pipeline:
-    """The pipeline with some passes over its candidates: those given, else REUSE_PASSES where a bank is kept.
-
-    Raises:
-        ConfigError: passes out of range.
-    """
-    if passes is None and (not reuse or pipeline.params("search").passes > 1):
-        return pipeline
-    return pipeline.with_params("search", passes=passes or REUSE_PASSES)

@@ -9,6 +9,7 @@ import warp as wp
 
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
+from lgrasp.grasp.schema import PASS_SHIFT
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_rows, select_poses, take_rows
 from lgrasp.hand.model import HandModel
 from lgrasp.runtime.tally import Meter
@@ -20,10 +21,7 @@ Search = Callable[[Context, int, int], tuple[ContactSets, Meter]]
 
 PASS_BLOCK = 64
 """Candidates that later passes search again before the next ones start: it decides the order of the rows."""
-PASS_SHIFT = 32
-"""Bits of the number of a candidate below that of its pass."""
-PASS_BITS = np.uint64(0xFF << PASS_SHIFT)
-"""Bits of the pass in the column ``candidate`` of a shard; the rest is the pose."""
+_BLOCK = 256  # candidates of a block where there is one pass
 
 
 @dataclass
@@ -33,6 +31,15 @@ class BatchResult:
     grasps: GraspTable
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+
+
+def block_size(pipeline: Pipeline) -> int:
+    """Candidates of a block: batches are whole blocks, and a shard that ends inside one takes a random part of it.
+
+    Smaller where a candidate takes long.
+    """
+    slow = pipeline.params("search").passes > 1 or "simulate" in pipeline.order
+    return PASS_BLOCK if slow else _BLOCK
 
 
 def run_stages(

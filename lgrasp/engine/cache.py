@@ -6,16 +6,18 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from lgrasp.dataset.files import new_file, remove_leftovers
 from lgrasp.errors import CacheError, OutputError
+from lgrasp.files import new_file, remove_leftovers
 from lgrasp.paths import cache_dir
-from lgrasp.runtime.kernel_cache import unfinished
+from lgrasp.runtime.kernel_cache import remove_unfinished
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _FORMAT = 2
 _NAMES = "/names"  # member that lists the others
@@ -71,7 +73,7 @@ class Cache:
         path = self.path(kind, key)
         return os.path.isfile(path) and (not self._fresh or path in self._stored)
 
-    def load(self, kind: str, key: str) -> dict[str, np.ndarray] | None:
+    def load(self, kind: str, key: str) -> "dict[str, np.ndarray] | None":
         """Arrays of an artifact, or None if it is absent or damaged (which is reported)."""
         path = self.path(kind, key)
         if not self.has(kind, key):
@@ -83,6 +85,8 @@ class Cache:
         except OSError as error:
             self.warn(f"cache entry {path} cannot be read ({error.strerror}); rebuilding it")
             return None
+        import numpy as np  # slow to load, and not needed to list
+
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
@@ -93,13 +97,15 @@ class Cache:
             self.warn(f"cache entry {path} is damaged; rebuilding it")
             return None
 
-    def store(self, kind: str, key: str, arrays: dict[str, np.ndarray]) -> None:
+    def store(self, kind: str, key: str, arrays: "dict[str, np.ndarray]") -> None:
         """Write an artifact: unique temporary name, fsync, rename.
 
         A folder that cannot be written is reported once and is not an error; nothing more is stored then.
         """
         if not self._writable:
             return
+        import numpy as np
+
         path = self.path(kind, key)
         try:
             with new_file(path) as file:
@@ -112,7 +118,14 @@ class Cache:
             reason = getattr(error.__cause__, "strerror", error)
             self.warn(f"cache folder {self.root} cannot be written ({reason}); going on without it")
 
-    def get(self, kind: str, key: str, make: Callable[[], dict[str, np.ndarray]]) -> tuple[dict[str, np.ndarray], bool]:
+    def discard(self, kind: str, key: str) -> None:
+        """Remove an artifact that is needed no more, if it is there."""
+        with suppress(OSError):
+            self.path(kind, key).unlink()
+
+    def get(
+        self, kind: str, key: str, make: "Callable[[], dict[str, np.ndarray]]"
+    ) -> "tuple[dict[str, np.ndarray], bool]":
         """The artifact and whether it was a hit; a miss is made and stored."""
         arrays = self.load(kind, key)
         if arrays is not None:
@@ -140,8 +153,8 @@ class Cache:
                 entry.path.unlink(missing_ok=True)
                 files, size = files + 1, size + entry.size
         remove_leftovers(self.root, "*/*.tmp")
-        for folder in unfinished(self.root / "kernels"):
-            shutil.rmtree(folder, ignore_errors=True)
+        for folder in (self.root / "kernels").glob("*/"):
+            remove_unfinished(folder)
         return files, size
 
     def kernel_bytes(self) -> int:

@@ -20,6 +20,13 @@ class Part:
     """Rows (or scenes, or steps) that are asked, or that the source holds; 0: not known before."""
     source: Path | None = None
     """What it is made of, where that is a file."""
+    index: int | None = None
+    """Index of the shard in the run that its rows are of, where it is not the number."""
+
+    @property
+    def shard_index(self) -> int:
+        """Index of the shard that the file holds."""
+        return self.number if self.index is None else self.index
 
 
 @dataclass
@@ -35,6 +42,9 @@ class Made:
 
 class Events:
     """Notifications and queries of a running job; every method may be overridden."""
+
+    def said(self, words: str) -> None:
+        """Something that the user had better know before the job begins."""
 
     def loading(self, what: str, share: float = 0.0) -> None:
         """An input is being loaded or made."""

@@ -5,14 +5,12 @@ import re
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
-from lgrasp.dataset import ShardReader
-from lgrasp.dataset.files import check_heaps, remove_leftovers
+from lgrasp.choices import ProtocolName
+from lgrasp.dataset.files import check_heaps
 from lgrasp.errors import ConfigError, OutputError
-
-MADE_FROM = "made_from"
-"""Statistic of a shard that a job made of another: content key of the job and of the rows that it was made of."""
+from lgrasp.files import remove_leftovers
 
 MOST_PARTS = 100_000
 """Files of a job."""
@@ -26,12 +24,23 @@ class Found(NamedTuple):
     rows: int
     tried: int = 0
     """Candidates (or rounds), when they were all that the file may try; else 0."""
+    protocols: tuple[str, ...] = ()
+    """Those of ``lgrasp simulate`` that the rows have verdicts of."""
 
 
 def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
     """File of a shard."""
-    safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{hand}-{name}")[:_MAX_NAME_LENGTH]
-    return out / f"{safe}-{shard:05d}.h5"
+    return out / f"{_safe(f'{hand}-{name}')}-{shard:05d}.h5"
+
+
+def run_folder(top: Path, hand: str, name: str, pipeline: str, protocol: str | None = None) -> Path:
+    """``TOP/HAND-NAME/PIPELINE[-PROTOCOL]``: the folder of a run's shards, whose rows hold under the protocol."""
+    return top / _safe(f"{hand}-{name}") / _safe(f"{pipeline}-{protocol}" if protocol else pipeline)
+
+
+def _safe(name: str) -> str:
+    """A name without characters that a file's name had better not have."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name)[:_MAX_NAME_LENGTH]
 
 
 def check_number(parts: int, what: str) -> None:
@@ -78,6 +87,9 @@ def found_shard(path: Path) -> Found:
     Raises:
         ShardError: it is no whole shard.
     """
+    from lgrasp.dataset.reader import ShardReader  # slow to load
+    from lgrasp.grasp.schema import MADE_FROM
+
     check_heaps(path)
     with ShardReader(path) as reader:
         config, statistics = reader.header.config, reader.statistics
@@ -86,7 +98,8 @@ def found_shard(path: Path) -> Found:
         # of a file with sequences only the whole ones count, and rounds are tried
         rows = int(statistics.get("sequences", len(reader)))
         tried = statistics.get("rounds" if "sequences" in statistics else "candidates", 0)
-        return Found(config.get("run_key"), rows, int(tried) if statistics.get("exhausted") else 0)
+        simulated = tuple(name for name in get_args(ProtocolName) if f"{name}_tried" in statistics)
+        return Found(config.get("run_key"), rows, int(tried) if statistics.get("exhausted") else 0, simulated)
 
 
 def _stem(path: Path) -> str:

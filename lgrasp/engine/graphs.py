@@ -24,7 +24,7 @@ _SAME_SIZE = (0.99, 1.03)
 class _CapturedGraph:
     graph: wp.Graph
     first: wp.array  # (1,) i32
-    seeds: dict[tuple[str, int], wp.array]
+    context: Context  # the graph reads its arrays: they must stay
     meter: Meter
     sets: ContactSets
 
@@ -60,7 +60,7 @@ class GraphCache:
             self._graphs[count] = self._capture(context, count)
         captured = self._graphs[count]
         captured.first.fill_(first)
-        for (stage, salt), seed in captured.seeds.items():
+        for (stage, salt), seed in captured.context.seeds.items():
             seed.fill_(stage_seed(context.base_seed, context.shard, stage, salt))
         wp.capture_launch(captured.graph)
         return captured.sets, captured.meter.again()
@@ -75,4 +75,4 @@ class GraphCache:
         with self.capturing, wp.ScopedCapture(device=device) as capture:
             sets = run_stages(self._pipeline, own, first, count, "search", meter)
         assert capture.graph is not None
-        return _CapturedGraph(capture.graph, first, own.seeds, meter, sets)
+        return _CapturedGraph(capture.graph, first, own, meter, sets)

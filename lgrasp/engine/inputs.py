@@ -17,9 +17,10 @@ from lgrasp.field.model import FIELD_VERSION, ContactField
 from lgrasp.field.params import FieldParams
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
-from lgrasp.hand.spec import hand_digest
+from lgrasp.notices import notice
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel
@@ -127,7 +128,10 @@ class Loader:
                 raise ObjectError(f"object {mesh} was changed while it was read; run the command again")
             return model
 
-        return self.get("object", ObjectModel, key, make)
+        model = self.get("object", ObjectModel, key, make)
+        for line in model.warnings:
+            notice(f"object '{model.name}': {line}")
+        return model
 
     def field(self, hand: HandArrays, key: str, params: FieldParams) -> ContactField:
         def make() -> ContactField:

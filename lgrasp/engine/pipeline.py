@@ -7,13 +7,18 @@ from typing import Any
 from pydantic import BaseModel, Field, SerializeAsAny
 
 from lgrasp.config import Params, Seed, apply_settings, did_you_mean, find_yaml, parse_model, read_yaml, yaml_files
-from lgrasp.engine.migration import ALIASES, move_to_bounds, stage_name
 from lgrasp.engine.registry import SEQUENCE, STAGES, Stage, check_order
 from lgrasp.errors import ConfigError
 from lgrasp.field.params import FieldParams
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.notices import notice
 from lgrasp.object.params import ObjectParams
+from lgrasp.stages.migration import ALIASES, move_to_bounds, stage_name
+
+_ORDER_VERSION = 2
+"""Raised whenever the same candidates give the rows of a shard in another order."""
+REUSE_PASSES = 8
+"""Passes of a run that keeps a bank, unless it or its pipeline says otherwise."""
 
 
 class _Head(Params):
@@ -93,6 +98,16 @@ class Pipeline(_Head):
         shared = {name: made[name] for name in ("bounds", "object", "field")} | {"sequence": made.get("sequence")}
         return self.model_copy(update=shared | {"stages": tuple((name, made[name]) for name in self.order)})
 
+    def with_passes(self, passes: int | None, reuse: bool = False) -> "Pipeline":
+        """A copy with some passes over its candidates: those given, else REUSE_PASSES where a bank is kept.
+
+        Raises:
+            ConfigError: passes out of range.
+        """
+        if passes is None and (not reuse or self.params("search").passes > 1):
+            return self
+        return self.with_params("search", passes=passes or REUSE_PASSES)
+
     def with_simulation(self, protocol: str) -> "Pipeline":
         """A copy that keeps only grasps which hold under a protocol of :mod:`lgrasp.simulate.protocol`.
 
@@ -107,6 +122,7 @@ class Pipeline(_Head):
         """JSON-serialisable description, the same for equal pipelines; execution settings are not in it."""
         return {
             **self.model_dump(mode="json", include={"name", "seed", "effort", "object", "field"}),
+            "order": _ORDER_VERSION,
             "bounds": self.bounds.describe(),
             "stages": [{s.name: {"version": s.version, **p.model_dump(mode="json")}} for s, p in self.sections],
         }

@@ -5,17 +5,17 @@ import os
 import resource
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import warp as wp
-
-from lgrasp.dataset.files import new_file
 from lgrasp.engine.folder import check_folder
-from lgrasp.engine.run import JobOutcome
 from lgrasp.errors import OutputError
+from lgrasp.files import write_file
+
+if TYPE_CHECKING:
+    from lgrasp.engine.run import JobOutcome
 
 
-def job_report(outcome: JobOutcome) -> dict[str, Any]:
+def job_report(outcome: "JobOutcome") -> dict[str, Any]:
     """The report of a job, JSON-serialisable: its own numbers and those of all jobs.
 
     Returns:
@@ -53,7 +53,11 @@ def peak_rss_mb() -> float:
 
 def peak_device_mb(device: str) -> float:
     """Largest memory that arrays held on a GPU so far [MB]; 0 on the CPU."""
-    if not device.startswith("cuda") or not wp.is_mempool_enabled(device):
+    if not device.startswith("cuda"):
+        return 0.0
+    import warp as wp  # slow to load
+
+    if not wp.is_mempool_enabled(device):
         return 0.0
     return wp.get_mempool_used_mem_high(device) / 1e6
 
@@ -87,8 +91,7 @@ def write_json(path: str | os.PathLike[str], data: Any) -> None:
         except OSError as error:
             raise OutputError(f"report {path} cannot be written: {error.strerror}") from None
         return
-    with new_file(path) as file:
-        file.write(text.encode())
+    write_file(path, text)
 
 
 def _is_special(path: Path) -> bool:

@@ -6,51 +6,55 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
-from pydantic import ConfigDict, Field, PrivateAttr
+from pydantic import Field, PrivateAttr
 
-from lgrasp.config import DeviceName, Params, Workers
-from lgrasp.dataset import validate_shard, write_shard
+from lgrasp import __version__
+from lgrasp.dataset.manifest import ListedRun
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError, Events, Made, Part, PartProgress
 from lgrasp.engine.folder import Found, check_folder, clean_folder, found_shard, neighbours
-from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
+from lgrasp.engine.listing import Listing, Renewing, begun_array, listing, renewing
+from lgrasp.engine.request import Request
+from lgrasp.errors import LgraspError, OutputError, ShardError
+from lgrasp.notices import notice
+from lgrasp.runtime.array import Array
 from lgrasp.runtime.device import Device, resolve_device
-from lgrasp.runtime.kernels import kernel_modules, load_kernels
+from lgrasp.runtime.kernels import first_time, kernel_modules, load_kernels
 
 
-class Job(Params, ABC):
-    """A job that makes files part by part: its settings, and how one part is made.
+class Job(Request, ABC):
+    """A job that makes files part by part: what is asked, and how one part is made.
 
-    The fields are the keys of a config (``lgrasp run``). What is loaded for the parts is private to the job.
+    What is loaded for the parts is private to the job.
     """
 
-    model_config = ConfigDict(frozen=False, arbitrary_types_allowed=True)
-
-    unit: ClassVar[str] = "grasps"
-    """What is counted."""
+    command: ClassVar[str]
+    """Words of the command line that run the job."""
+    part: ClassVar[str] = "shard"
+    """What a part is."""
     asks: ClassVar[bool] = False
     """True if fewer rows than requested may be found. A part without any then ends the job."""
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.stages.", "lgrasp.grasp.")
     """Prefixes of the modules whose kernels the parts launch; empty: none."""
     one_key: ClassVar[bool] = True
     """True if all parts have the key of the job, and so have all files of their name in the folder."""
-    differs: ClassVar[str] = "other hand, object, pipeline, seed or --shard-rows"
+    differs: ClassVar[str] = "other parameters"
     """What may be other in a file with another key."""
 
-    device: DeviceName = "auto"
-    workers: Workers = 0
     cache: Cache = Field(default_factory=Cache, exclude=True, repr=False)
     _device: Device = PrivateAttr()
     _events: Events = PrivateAttr(default_factory=Events)
+    _manifests: Listing | Renewing | None = PrivateAttr(None)
 
     @property
     def title(self) -> str:
-        """Title of the job, in a few words."""
         return str(self.folder)
 
     @property
@@ -69,6 +73,11 @@ class Job(Params, ABC):
         Raises:
             LgraspError: an option is out of range, or an input is not found.
         """
+
+    def about(self) -> dict[str, Any]:
+        """What manifests say of the run, as far as it is the same for all parts: ``hand``, ``objects``, ``pipeline``,
+        ``seed``; called when the inputs are loaded."""
+        return {}
 
     def part_key(self, part: Part) -> str:
         """Content key that the file of a part holds."""
@@ -96,13 +105,18 @@ class Job(Params, ABC):
             except (ShardError, ValueError) as error:
                 self.cache.warn(f"{part.file} is damaged ({error}); rebuilding it")
                 continue
+            if found is None:
+                continue
             self._check_run(part.file, found, self.part_key(part))
             if found.rows >= part.rows or found.tried >= self.effort(part.rows):
                 present[part.number] = found.rows
+            else:
+                lost = f", and its verdicts ({', '.join(found.protocols)}) are lost" if found.protocols else ""
+                notice(f"{part.file} has {found.rows:,} of {part.rows:,} {self.unit}: it is made again{lost}")
         return present
 
-    def found(self, part: Part) -> Found:
-        """What the file of a part says of itself.
+    def found(self, part: Part) -> Found | None:
+        """What the file of a part says of itself; None: it is there, and the part is still to be made in it.
 
         Raises:
             ShardError: it is damaged.
@@ -113,9 +127,16 @@ class Job(Params, ABC):
 
     def _check_run(self, path: Path, found: Found, key: str) -> None:
         if found.key != key:
-            raise OutputError(
-                f"{path} belongs to another run ({self.differs}); choose another --out, or --overwrite to replace it"
-            )
+            raise OutputError(self.refusal(path))
+
+    def refusal(self, path: Path) -> str:
+        """Why a file of another run stays."""
+        how = self.difference(path)
+        return f"{path} belongs to another run ({how}); choose another --out, or --overwrite to replace it"
+
+    def difference(self, path: Path) -> str:
+        """How a file of another run differs from those of this job, in a few words."""
+        return self.differs
 
     def clean(self, parts: Sequence[Part]) -> None:
         """Remove leftovers of killed processes that wrote parts; files being written stay."""
@@ -154,10 +175,15 @@ class Job(Params, ABC):
 
     def changed(self, **changes: Any) -> Self:
         """A copy with other fields; nothing is loaded in it."""
-        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | changes)
+        return type(self)(**self.values() | changes)
 
     def close(self) -> None:
         """Release what was opened for the parts; called however the job ends."""
+
+    def abandon(self) -> None:
+        """Tidy the folder; for a process that ends before :func:`run` does."""
+        if self._manifests:
+            self._manifests.close()
 
     @property
     def events(self) -> Events:
@@ -226,11 +252,13 @@ class JobOutcome:
         return self.seconds["total"]
 
 
-def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 1), resume: bool = True) -> JobOutcome:
+def run(
+    job: Job, events: Events | None = None, *, array: Array | tuple[int, int] = (0, 1), resume: bool = True
+) -> JobOutcome:
     """Make the missing parts of a job.
 
     Args:
-        array: (task, number of tasks) of a job array; a task makes every so manieth part.
+        array: how tasks share the parts: (task, number of tasks), or more.
         resume: keep whole parts of the same run.
 
     Raises:
@@ -238,9 +266,11 @@ def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 
     """
     job._events = events = events or Events()
     start = time.perf_counter()
-    device, parts, present = look(job, array=array, resume=resume)
+    array, device, every, parts, present = look(job, array=array, resume=resume)
     job.clean(parts)
     missing = [part for part in parts if part.number not in present]
+    if missing and job.kernels and (words := first_time(device.alias)):
+        events.said(words)
     job.load(events, bool(missing))
     outcome = JobOutcome(job, device, parts, present)
     begin = time.perf_counter()
@@ -250,7 +280,8 @@ def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 
     events.started(parts, present)
     begin = time.perf_counter()
     try:
-        _make_parts(job, events, outcome)
+        with _manifests(job, array, every, parts, present) as job._manifests:
+            _make_parts(job, events, outcome, job._manifests)
     except CancelledError:
         outcome.cancelled = True
     finally:
@@ -260,52 +291,58 @@ def run(job: Job, events: Events | None = None, *, array: tuple[int, int] = (0, 
     return outcome
 
 
-def look(job: Job, *, array: tuple[int, int], resume: bool) -> tuple[Device, list[Part], dict[int, int]]:
-    """The device, the parts of this task, and the rows of those that are there; nothing is written.
+def _manifests(
+    job: Job, array: Array, every: Sequence[Part], parts: Sequence[Part], present: Mapping[int, int]
+) -> AbstractContextManager[Listing | Renewing]:
+    if job.in_place:
+        return renewing(parts, present)
+    return listing(lambda: _described(job, array), job.folder, every, parts, present, asks=job.asks)
+
+
+def _described(job: Job, array: Array) -> ListedRun:
+    told = {"job": job.command, "unit": job.unit, "lgrasp_version": __version__, "array": array.text or None}
+    return ListedRun(run_key=job.key(), **told, **job.about())
+
+
+class Todo(NamedTuple):
+    """What a job has before it."""
+
+    array: Array
+    device: Device
+    every: list[Part]
+    parts: list[Part]
+    """Those of this task."""
+    present: dict[int, int]
+    """Rows of those that are there, by number."""
+
+
+def look(job: Job, *, array: Array | tuple[int, int], resume: bool) -> Todo:
+    """What a job has before it; nothing is written.
 
     Raises:
         LgraspError: as :func:`run`, before anything is loaded.
     """
+    job.check()
     job._device = resolve_device(job.device)
-    parts = own_parts(job.parts(), array)
+    array, every, parts = own_parts(job, array if isinstance(array, Array) else Array(*array))
+    if array.tasks > 1:
+        job.events.said(array.words([part.number for part in parts], job.part))
     check_folder(job.folder)
-    return job.device_used, parts, job.present(parts) if resume else {}
+    return Todo(array, job.device_used, every, parts, job.present(parts) if resume else {})
 
 
-def own_parts(parts: Sequence[Part], array: tuple[int, int]) -> list[Part]:
-    """The parts of a task of an array.
-
-    Raises:
-        ConfigError: array numbers out of range.
-    """
-    index, number = array
-    if number <= 0 or not 0 <= index < number:
-        raise ConfigError(f"--shard-index {index} --num-shards {number}: need 0 <= index < number")
-    return list(parts[index::number])
-
-
-def array_task(
-    index: int | None = None, number: int | None = None, environment: Mapping[str, str] | None = None
-) -> tuple[int, int]:
-    """(task, number of tasks) of an array: as given, else those of a SLURM job array, else (0, 1).
+def own_parts(job: Job, array: Array) -> tuple[Array, list[Part], list[Part]]:
+    """The array with its numbers, all parts of a job, and those of the task.
 
     Raises:
-        ConfigError: a SLURM variable is no integer.
+        LgraspError: an option is out of range, or an input is not found; SLURM started more tasks than there are parts.
     """
-    if index is not None or number is not None:
-        return index or 0, 1 if number is None else number
-    env = os.environ if environment is None else environment
-    if "SLURM_ARRAY_TASK_ID" not in env or "SLURM_ARRAY_TASK_COUNT" not in env:
-        return 0, 1
-    try:
-        task, count = int(env["SLURM_ARRAY_TASK_ID"]), int(env["SLURM_ARRAY_TASK_COUNT"])
-        first, step = int(env.get("SLURM_ARRAY_TASK_MIN", 0)), int(env.get("SLURM_ARRAY_TASK_STEP", 1))
-    except ValueError as error:
-        raise ConfigError(f"SLURM_ARRAY_TASK_*: {error}; give --shard-index and --num-shards") from None
-    return (task - first) // max(step, 1), count
+    every = job.parts()
+    array = array.resolved(begun_array(every) if array.slurm and not job.in_place else "")
+    return array, every, array.share(every, job.part)
 
 
-def _make_parts(job: Job, events: Events, outcome: JobOutcome) -> None:
+def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listing | Renewing) -> None:
     """Make what is missing, in order; one part is written, on another thread, while the next is made."""
     writing: list[tuple[Part, Made, Future[None]]] = []
 
@@ -316,6 +353,10 @@ def _make_parts(job: Job, events: Events, outcome: JobOutcome) -> None:
             outcome.made_parts.append((part, made))
             events.wrote(part, made)
             made.contents = None  # memory must not grow with the parts
+
+    def write(part: Part, made: Made) -> None:
+        job.write(part, made.contents)
+        manifests.record(part, made.rows, written=True)
 
     def make(part: Part) -> Made:
         progress = PartProgress(events, part)
@@ -332,8 +373,13 @@ def _make_parts(job: Job, events: Events, outcome: JobOutcome) -> None:
                     outcome.results.append(made.result)
                     if made.contents is not None:
                         settle()
-                        writing.append((part, made, writer.submit(job.write, part, made.contents)))
+                        writing.append((part, made, writer.submit(write, part, made)))
+                    else:
+                        manifests.record(part, 0, written=False)
                 if job.asks and rows == 0:  # nor will the next parts give any
+                    for rest in outcome.parts[outcome.parts.index(part) + 1 :]:
+                        if rest.number not in present:
+                            manifests.record(rest, 0, written=False)
                     break
         except CancelledError:
             settle()

@@ -12,20 +12,21 @@ import numpy as np
 import warp as wp
 
 from lgrasp.engine.bank import Account, Bank
-from lgrasp.engine.batch import PASS_BLOCK, BatchResult, run_batch
+from lgrasp.engine.batch import PASS_BLOCK, BatchResult, block_size, run_batch
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
-from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_grasps
+from lgrasp.grasp.row_order import RowOrder
+from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_grasps, take_rows
 from lgrasp.stages.context import Context
 
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
 _EFFORT_STEP = 1024  # candidates: what a shard may try is a multiple of it
 _CPU_BATCH, _CPU_LARGEST = 256, 512  # candidates of a batch; the second with several passes
-_PHYSICS_BATCH = 32  # candidates, when their grasps are simulated on the CPU, which takes long
+_PHYSICS_BATCH = 64  # candidates, when their grasps are simulated on the CPU, which takes long
 _GPU_SMALLEST, _GPU_LARGEST = 2_048, 65_536  # candidates of a batch
 _GPU_WHOLE = 16_384  # candidates: a batch of more is cut in two
 _GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
@@ -184,7 +185,9 @@ def make_shard(
     bank_cache: Cache | None = None,
     progress: Callable[[int, ShardResult], None] | None = None,
 ) -> ShardResult:
-    """The first ``rows`` grasps of a shard's candidate stream, near-duplicates left out.
+    """The first ``rows`` grasps of a shard's candidate stream, near-duplicates left out, shuffled.
+
+    The rows of the last block of candidates that is needed (:func:`block_size`) are drawn from all that it gives.
 
     Args:
         bank_cache: continue from the shard's bank there, and update it; counts and seconds are then those of
@@ -195,7 +198,8 @@ def make_shard(
     context = shard_context(pipeline, inputs, shard)
     bank = Bank(bank_cache, pipeline, inputs.keys, shard, device) if bank_cache else None
     graphs = execution.graphs
-    found = _Rows(inputs, rows, graphs.capturing if graphs else nullcontext())
+    block = block_size(pipeline)
+    found = _Rows(inputs, RowOrder(pipeline.seed, shard, block), rows, graphs.capturing if graphs else nullcontext())
     result = found.result
     if bank and (account := bank.load(rows)):
         found.restore(account)
@@ -210,7 +214,7 @@ def make_shard(
         wanted = fixed or _batch_size(device, missing, rate, running, most, passes=passes, share=share)
         if graphs and not fixed and wanted:
             wanted = graphs.size(wanted)
-        return wanted if passes == 1 else -(-wanted // PASS_BLOCK) * PASS_BLOCK
+        return -(-wanted // block) * block
 
     def run(first: int, count: int) -> BatchResult:
         return run_batch(pipeline, context, first, count, graphs.run if graphs else None)
@@ -226,7 +230,8 @@ def make_shard(
                 progress(found.count, result)
             if found.count >= rows:
                 break
-    result.grasps = join_rows(found.parts)
+    rows_found = join_rows(found.parts)
+    result.grasps = take_rows(rows_found, found.order.shuffled(rows_found))
     result.wall = earlier + time.perf_counter() - start
     result.exhausted = found.count < rows
     if bank:
@@ -244,11 +249,12 @@ def _fixed_batch(context: Context, execution: Execution) -> int:
 class _Rows:
     """Rows of a shard as they come in: near-duplicates are left out, rows beyond those asked are set aside."""
 
-    def __init__(self, inputs: Inputs, rows: int, lock: AbstractContextManager[Any]) -> None:
+    def __init__(self, inputs: Inputs, order: RowOrder, rows: int, lock: AbstractContextManager[Any]) -> None:
         self.parts: list[GraspTable] = []
         self.result = ShardResult(no_grasps())
         self._kept = KeptRows(inputs.hand.model.dofs, inputs.device.alias)
         self._center = inputs.object.model.center
+        self.order = order
         self._rows = rows
         self._lock = lock  # held while the device is used
         self._aside: GraspTable | None = None
@@ -262,13 +268,14 @@ class _Rows:
         if self.count >= self._rows:
             self._aside = grasps
             return
+        order = self.order.by_blocks(grasps)
         # near-duplicates are defined on poses as they are written
-        pose = user_poses(grasps.pose, self._center)
+        pose = user_poses(grasps.pose.take(order, axis=0), self._center)
         with self._lock:
-            new, duplicates = self._kept.add(pose, grasps.q, self._rows - self.count)
+            new, duplicates = self._kept.add(pose, grasps.q.take(order, axis=0), self._rows - self.count)
         self.result.duplicates += duplicates
-        self.parts.append(take_grasps(grasps, new))
-        self._aside = take_grasps(grasps, np.arange(len(new) + duplicates, len(grasps)))
+        self.parts.append(take_grasps(grasps, np.sort(order[new])))
+        self._aside = take_rows(grasps, order[len(new) + duplicates :])
 
     def restore(self, account: Account) -> None:
         """Start from the state of an earlier run."""

@@ -3,57 +3,59 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import PrivateAttr
 
-from lgrasp.config import ShardPaths
-from lgrasp.dataset.files import remove_leftovers, shard_tree
+from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Part
-from lgrasp.engine.folder import MADE_FROM
+from lgrasp.engine.request import ShardRequest
 from lgrasp.engine.run import Job
-from lgrasp.errors import OutputError
+from lgrasp.errors import OutputError, ShardError
+from lgrasp.files import remove_leftovers
 from lgrasp.grasp.records import Shard
+from lgrasp.grasp.schema import MADE_FROM
 
 _ROW = ("q", "q_pregrasp", "q_squeeze", "object_pose", "object_index", "candidate")
 _BATCH_ROWS = 65_536  # at a time
 
 
-class ShardJob(Job):
+class ShardJob(ShardRequest, Job):
     """A part is a shard, written under its place in the output folder."""
 
     kernels: ClassVar[tuple[str, ...]] = ()
     one_key: ClassVar[bool] = False
     differs: ClassVar[str] = "other grasps or parameters, or another protocol"
 
-    shards: ShardPaths
-    out: Path = Field(description="Folder of the files, under the places of the shards.")
-
-    @property
-    def title(self) -> str:
-        return f"{' '.join(path.name for path in self.shards)} -> {self.folder}"
-
-    @property
-    def folder(self) -> Path:
-        return self.out
+    _hands: set[str] = PrivateAttr(default_factory=set)
+    _objects: set[str] = PrivateAttr(default_factory=set)
 
     def parts(self) -> list[Part]:
-        out = self.folder
-        inside = out.is_dir() and any(path.resolve() in out.resolve().parents for path in self.shards)
-        found = shard_tree(self.shards, leave_out=out if inside else None)
-        parts = [
-            Part(number, self.folder / place, shard_rows(source), source)
-            for number, (place, source) in enumerate(found.items())
-        ]
+        def look(reader: ShardReader) -> tuple[int, int]:
+            self.check_source(reader)
+            self._hands.add(str(reader.attributes["hand"]))
+            self._objects.update(reader.object_ids)
+            return len(reader), reader.header.shard_index
+
+        out, parts, places = self.folder, [], {}
+        for number, (source, place, (rows, index)) in enumerate(gather(self.shards, look, leave_out=self.inside)):
+            parts.append(Part(number, source if self.in_place else out / place, rows, source, index))
+            if not self.in_place and (other := places.setdefault(place, source)) != source:
+                raise ShardError(f"{source}: it has the same place {place} as {other}; name one folder above both")
         for part in parts:
             assert part.source is not None
-            if part.file.exists() and part.file.samefile(part.source):
+            if not self.in_place and part.file.exists() and part.file.samefile(part.source):
                 raise OutputError(f"{part.source} would be overwritten; choose another folder with --out")
         return parts
+
+    def check_source(self, reader: ShardReader) -> None:
+        """Raise ShardError if a shard is none for this job; among others in a folder it is left out."""
+
+    def about(self) -> dict[str, Any]:
+        return {"hand": ", ".join(sorted(self._hands)), "objects": sorted(self._objects)}
 
     def clean(self, parts: Sequence[Part]) -> None:
         for folder in {part.file.parent for part in parts}:
@@ -62,29 +64,19 @@ class ShardJob(Job):
     def part_key(self, part: Part) -> str:
         """Content key of the job and of the rows of a part's source."""
         assert part.source is not None
-        return content_key("part", 1, job=self.key(), rows=rows_digest(part.source))
+        with ShardReader(part.source) as reader:
+            return content_key("part", 1, job=self.key(), rows=rows_digest(reader))
 
     def marked(self, part: Part, shard: Shard, statistics: Mapping[str, int | float | str]) -> Shard:
         """The shard with more statistics, and what tells that it is this part of this job."""
         return replace(shard, statistics={**shard.statistics, **statistics, MADE_FROM: self.part_key(part)})
 
 
-def shard_rows(path: Path) -> int:
-    """Rows of a shard.
-
-    Raises:
-        ShardError: it cannot be read.
-    """
-    with ShardReader(path) as reader:
-        return len(reader)
-
-
-def rows_digest(path: Path) -> str:
-    """SHA-256 of the identity of the rows of a shard: joints, poses, objects, candidates."""
+def rows_digest(reader: ShardReader, more: Sequence[str] = ()) -> str:
+    """SHA-256 of the identity of the rows of a shard: joints, poses, objects, candidates; and of more columns."""
     h = hashlib.sha256()
-    with ShardReader(path) as reader:
-        for name in _ROW:
-            for first in range(0, len(reader), _BATCH_ROWS):
-                values: Any = reader.column(name, first, min(first + _BATCH_ROWS, len(reader)))
-                h.update(np.ascontiguousarray(values).tobytes())
+    for name in (*_ROW, *more):
+        for first in range(0, len(reader), _BATCH_ROWS):
+            values: Any = reader.column(name, first, min(first + _BATCH_ROWS, len(reader)))
+            h.update(np.ascontiguousarray(values).tobytes())
     return h.hexdigest()

@@ -4,7 +4,8 @@ import warp as wp
 
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
-from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_forward, vec_dof
+from lgrasp.math.kinematics import Kinematics, group_forward, vec_dof
+from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.transforms import encode_normal, normal_bin
 from lgrasp.runtime.device import KERNEL_OPTIONS
 

@@ -6,6 +6,7 @@ from lgrasp.hand.opposition.facing import opposed
 
 _PAIRS_DRAWN = 4_000_000  # pairs looked at, all settings together
 _PAIRS_KEPT = 65_536
+_PAIRS_AT_ONCE = 65_536  # arrays that stay in the processor's cache
 
 
 def opposed_pairs(
@@ -28,35 +29,37 @@ def opposed_pairs(
     fingers = {slot % groups for slot, part in enumerate(parts) if len(part["position"])}
     if len(fingers) == 1 and len(palm["position"]):  # a lone jaw closes against nothing else
         both += [(a, -1) for a in range(len(parts)) if len(parts[a]["position"])]
-    ends, normals, slots = [], [], []
-    for a, b in both:
+    found, widths = [np.zeros((0, 3), np.int32)], [np.zeros(0, np.float32)]
+    for number, (a, b) in enumerate(both):
         p, q = parts[a], palm if b < 0 else parts[b]
-        i, j = (rng.integers(len(x["position"]), size=_PAIRS_DRAWN // len(both)) for x in (p, q))
-        first, second = (p["position"][i], p["direction"][i]), (q["position"][j], q["direction"][j])
-        good, _ = opposed(*first, *second, still=b < 0)
-        ends.append(np.stack([p["position"][i[good]], q["position"][j[good]]], 1))
-        normals.append(np.stack([p["direction"][i[good]], q["direction"][j[good]]], 1))
-        second = -1 - q["index"][j[good]] if b < 0 else np.full(int(good.sum()), b)
-        slots.append(np.stack([np.full(len(second), a), second], 1))
-    end = np.concatenate([np.zeros((0, 2, 3)), *ends]).astype(np.float32)
-    normal = np.concatenate([np.zeros((0, 2, 3)), *normals]).astype(np.float32)
-    slot = np.concatenate([np.zeros((0, 2)), *slots]).astype(np.int32)
-    width = np.linalg.norm(end[:, 1] - end[:, 0], axis=1)
+        drawn = np.stack([rng.integers(len(x["position"]), size=_PAIRS_DRAWN // len(both)) for x in (p, q)], 1)
+        for rows in np.split(drawn.astype(np.int32), range(_PAIRS_AT_ONCE, len(drawn), _PAIRS_AT_ONCE)):
+            i, j = rows.T
+            first, second = (p["position"][i], p["direction"][i]), (q["position"][j], q["direction"][j])
+            good, width = opposed(*first, *second, still=b < 0)
+            found.append(np.insert(rows[good], 0, number, axis=1))
+            widths.append(width[good].astype(np.float32))
+    width = np.concatenate(widths)
     kept = _even(width, rng)
-    return {
-        "pair_point": end[kept],
-        "pair_normal": normal[kept],
-        "pair_slot": slot[kept],
-        "pair_width": width[kept].astype(np.float32),
-    }
+    pair = np.concatenate(found)[kept]
+    point, normal = np.zeros((2, len(pair), 2, 3), np.float32)
+    slot = np.zeros((len(pair), 2), np.int32)
+    for number, both_slots in enumerate(both):
+        mine = pair[:, 0] == number
+        for end, at in enumerate(both_slots):
+            part, row = palm if at < 0 else parts[at], pair[mine, 1 + end]
+            point[mine, end], normal[mine, end] = part["position"][row], part["direction"][row]
+            slot[mine, end] = at if at >= 0 else -1 - part["index"][row]
+    return {"pair_point": point, "pair_normal": normal, "pair_slot": slot, "pair_width": width[kept]}
 
 
 def _even(width: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Rows in order of width, about as many of every millimetre; small hands' rare distances are all kept."""
     order = rng.permutation(len(width))
-    order = order[np.argsort(np.floor(width[order] / 0.001), kind="stable")]
-    _, first, number = np.unique(np.floor(width[order] / 0.001), return_index=True, return_counts=True)
-    rank = np.arange(len(order)) - np.repeat(first, number)
-    most = _PAIRS_KEPT // max(len(first), 1)
-    kept = order[rank < most]
+    bin = np.floor(width / 0.001).astype(np.uint16)  # sixteen bits are sorted fast
+    order = order[np.argsort(bin[order], kind="stable")]
+    number = np.bincount(bin)
+    number = number[number > 0]
+    rank = np.arange(len(order)) - np.repeat(np.cumsum(number) - number, number)
+    kept = order[rank < _PAIRS_KEPT // max(len(number), 1)]
     return kept[np.argsort(width[kept], kind="stable")]

@@ -1,18 +1,15 @@
 """Parameters of the contact field; all of them enter its cache key."""
 
-from typing import Literal
-
 from pydantic import Field
 
+from lgrasp.choices import FieldIndex
 from lgrasp.config import Params, Seed
 
 
 class FieldParams(Params):
     """How the contact field of a hand is sampled and indexed; lengths in metres."""
 
-    index: Literal["voxel", "bvh"] = Field(
-        default="voxel", description="voxel: table with joint seeds; bvh: one tree per patch."
-    )
+    index: FieldIndex = Field(default="voxel", description="voxel: table with joint seeds; bvh: one tree per patch.")
     records: int = Field(
         default=400_000, ge=1000, le=20_000_000, description="Contact vectors sampled per dependency group."
     )

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from lgrasp.errors import DecomposeError
+from lgrasp.signals import spared
 
 DECOMPOSE_VERSION = 1
 """Raised whenever the same mesh and parameters give other pieces."""
@@ -97,24 +98,30 @@ def _run(
     # -P: no module of the folder that the user is in gets in the way
     where = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
     try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-m", "lgrasp.geometry.decompose", str(os.getpid())],
-            input=task.getvalue(),
-            capture_output=True,
-            timeout=timeout,
-            env={**os.environ, "PYTHONPATH": where, "OMP_NUM_THREADS": "1"},
-        )
+        with spared():
+            helper = subprocess.Popen(
+                [sys.executable, "-P", "-m", "lgrasp.geometry.decompose", str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env={**os.environ, "PYTHONPATH": where, "OMP_NUM_THREADS": "1"},
+            )
+        with helper:
+            try:
+                out, words = helper.communicate(task.getvalue(), timeout)
+            finally:
+                helper.kill()
     except subprocess.TimeoutExpired:
         raise DecomposeError(f"convex decomposition took longer than {timeout:g} s") from None
     except OSError as error:
         raise DecomposeError(f"convex decomposition cannot be started: {error.strerror}") from None
     try:
-        with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(out), allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in ("vertices", "first")}
     except Exception:  # nothing, or half of it: the same to the caller
-        said = done.stderr.decode(errors="replace").strip().splitlines()
+        said = words.decode(errors="replace").strip().splitlines()
         raise DecomposeError(
-            f"convex decomposition failed (exit code {done.returncode}){': ' + said[-1][:200] if said else ''}"
+            f"convex decomposition failed (exit code {helper.returncode}){': ' + said[-1][:200] if said else ''}"
         ) from None
     if len(found["first"]) < 2 or not np.isfinite(found["vertices"]).all():
         raise DecomposeError("convex decomposition gave no pieces")

@@ -1,13 +1,16 @@
 """The one declaration of a valid grasp: every bound that a row must meet, and the parameters of its measures."""
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from pydantic import Field, ValidationInfo, model_validator
 
 from lgrasp.config import Params
 from lgrasp.math.constants import DRIVE_STIFFNESS
+
+if TYPE_CHECKING:
+    import numpy as np
 
 PROFILES: dict[str, dict[str, float]] = {
     "strict": {},
@@ -92,18 +95,20 @@ class GraspBounds(Params):
         """Largest value of each stored metric that is bounded."""
         limits = {
             "gap": self.max_gap,
-            "normal_error": float(np.radians(self.max_normal_angle)),
+            "normal_error": math.radians(self.max_normal_angle),
             "penetration": self.max_penetration,
             "gswo": self.max_gswo,
         }
         return limits | ({"unresisted_load": self.max_unresisted_load} if self.max_unresisted_load < 1 else {})
 
-    def met_by(self, metrics: Mapping[str, np.ndarray]) -> np.ndarray:
+    def met_by(self, metrics: "Mapping[str, np.ndarray]") -> "np.ndarray":
         """Rows whose stored metrics are within the bounds, (N,) bool; the metrics must have this friction or less.
 
         Raises:
             KeyError: a metric is missing.
         """
+        import numpy as np  # not above: bounds are told wrong before anything is loaded
+
         return np.logical_and.reduce([metrics[name] <= np.float32(limit) for name, limit in self.limits.items()])
 
     def describe(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from lgrasp.grasp.check_kernels import (
     pack_rows,
 )
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
-from lgrasp.grasp.control_kernels import control_poses, open_poses
+from lgrasp.grasp.control_kernels import FINGER_TRIES, control_poses, open_fingers, open_poses, try_fingers
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS
 from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, grasp_epsilon, resist_loads
@@ -109,7 +109,13 @@ class Check:
         wp.launch(center_forces, m, [limits, places, at, row], [found], device=d)
         inputs = [hand, limits, places, at, found, row]
         wp.launch(control_poses, (m, model.groups), inputs, [packed, opened], device=d)
-        wp.launch(open_poses, m, [hand, obj, self.held.struct, limits, at, opened, row], [packed], device=d)
+        stuck = wp.zeros(1 + m, dtype=wp.int32, device=d)
+        inputs = [hand, obj, self.held.struct, limits, at, opened, row]
+        wp.launch(open_poses, m, inputs, [packed, stuck], device=d)
+        clear = wp.zeros((m, model.groups), dtype=wp.int32, device=d)
+        wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)
+        inputs = [hand, self.held.struct, limits, at, opened, row, stuck, clear]
+        wp.launch(open_fingers, m, inputs, [packed], device=d)
         wp.launch(grasp_epsilon, m, [obj, seed, limits, places, at, row], [packed], device=d)
         wp.launch(pack_rows, m, [hand, places, at, found, row], [packed], device=d)
         return {name: getattr(packed, name) for name in Packed.vars}
@@ -119,7 +125,8 @@ def _table(columns: dict[str, np.ndarray], count: int) -> GraspTable:
     """The first ``count`` rows of what :meth:`Check._columns` gave."""
     x: dict[str, Any] = {name: values[:count] for name, values in columns.items() if name != "numbers"}
     numbers = dict(zip(MEASURED, columns["numbers"][:, :count], strict=True))
-    numbers |= {name: x.pop(name) for name in ("epsilon", "self_penetration")}
+    numbers |= {name: x.pop(name) for name in ("epsilon", "self_penetration", "pregrasp_opening")}
+    numbers["force_closure"] = (numbers["epsilon"] > 0).astype(np.float32)
     numbers["normal_error"] = np.arccos(np.clip(numbers["facing"], -1, 1))
     x["index"] = x["index"].astype(np.int64)
     return GraspTable(**x, metrics={name: numbers[name] for name in METRICS})

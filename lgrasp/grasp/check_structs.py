@@ -91,6 +91,7 @@ class Packed:
     numbers: wp.array2d(dtype=wp.float32)  # (6, m) MEASURED
     epsilon: wp.array(dtype=wp.float32)  # (m,)
     self_penetration: wp.array(dtype=wp.float32)  # (m,) [m]
+    pregrasp_opening: wp.array(dtype=wp.float32)  # (m,) [rad or m]
 
 
 def device_limits(bounds: GraspBounds, *, deepest: float | None = None) -> Limits:

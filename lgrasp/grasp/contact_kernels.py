@@ -5,7 +5,8 @@ import warp as wp
 from lgrasp.grasp.check_kernels import contact_fit
 from lgrasp.grasp.check_structs import Limits
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.kinematics import MAX_JOINTS, group_dofs, group_forward
+from lgrasp.math.kinematics import group_dofs, group_forward
+from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import sdf_gradient, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS

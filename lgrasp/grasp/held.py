@@ -7,7 +7,8 @@ import warp as wp
 
 from lgrasp.grasp.collision import body_apart, body_depth
 from lgrasp.hand.arrays import Hand, HandArrays
-from lgrasp.math.kinematics import MAX_DOFS, vec_dof
+from lgrasp.math.kinematics import vec_dof
+from lgrasp.math.limits import MAX_DOFS
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct

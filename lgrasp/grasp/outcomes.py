@@ -31,5 +31,8 @@ REASONS = ("kept", "unused finger", "self-collision", "object collision", "conta
 MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
 """Rows of the numbers that the checks leave on the device; ``facing`` is the least cosine of opposed normals."""
 
-METRICS = ("fswo", "gswo", "unresisted_load", "epsilon", "penetration", "self_penetration", "gap", "normal_error")
+METRICS = (
+    *("fswo", "gswo", "unresisted_load", "epsilon", "force_closure"),
+    *("penetration", "self_penetration", "gap", "normal_error", "pregrasp_opening"),
+)
 """Columns of the metrics table."""

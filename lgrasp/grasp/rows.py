@@ -11,7 +11,11 @@ from lgrasp.grasp.records import GraspRows
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.tree import Tree
 
-METRIC_UNITS = {"penetration": "m", "self_penetration": "m", "gap": "m", "normal_error": "rad"}
+METRIC_UNITS = {
+    **dict.fromkeys(("penetration", "self_penetration", "gap"), "m"),
+    "normal_error": "rad",
+    "pregrasp_opening": "rad or m",
+}
 """Unit of each metric that has one."""
 
 POSTURES = ("q", "q_pregrasp", "q_squeeze")

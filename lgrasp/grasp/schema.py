@@ -6,13 +6,20 @@ of further axes.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 FORMAT = "lgrasp-shard"
 FORMAT_VERSION = "1.1"
 CHUNK_ROWS = 4096
+MADE_FROM = "made_from"
+"""Statistic of a shard that a job made of another: content key of the job and of the rows that it was made of."""
+PASS_SHIFT = 32
+"""Bits of the number of a candidate below that of its pass."""
+POSE_BITS = (1 << 64) - 1 - (0xFF << PASS_SHIFT)
+"""Bits of the column ``candidate`` that tell the pose that the row was made from; the others are its pass."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +36,10 @@ class DatasetSpec:
     required: bool = True
 
     @property
-    def numpy(self) -> np.dtype:
+    def numpy(self) -> "np.dtype":
         """The NumPy dtype of a numeric dataset."""
+        import numpy as np  # slow to load, and names are told wrong before
+
         return np.dtype(self.dtype)
 
 

@@ -190,7 +190,10 @@ def no_grasps() -> GraspTable:
 
 def take_rows(table: Rows, rows: np.ndarray | slice) -> Rows:
     """Some rows of a table in memory, by index or mask (n,)."""
-    return _of_arrays(type(table), {name: values[rows] for name, values in grasp_arrays(table).items()})
+    if isinstance(rows, slice) or rows.dtype == bool:
+        return _of_arrays(type(table), {name: values[rows] for name, values in grasp_arrays(table).items()})
+    # many times as fast as indexing
+    return _of_arrays(type(table), {name: values.take(rows, axis=0) for name, values in grasp_arrays(table).items()})
 
 
 def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:

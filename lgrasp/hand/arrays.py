@@ -9,7 +9,8 @@ import warp as wp
 from lgrasp.geometry.poses import device_from_matrix
 from lgrasp.hand.model import HandModel
 from lgrasp.math.convex import Pieces
-from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_dofs, group_forward
+from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
+from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import sdf_part
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.structs import upload_struct

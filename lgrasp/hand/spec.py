@@ -1,7 +1,6 @@
 """hand.yaml: the few things about a hand that its URDF does not say."""
 
 import difflib
-import hashlib
 import reprlib
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,8 +10,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from lgrasp.config import load_yaml_file
 from lgrasp.errors import HandError
-from lgrasp.geometry.mesh_files import mesh_bytes
-from lgrasp.hand.urdf import Urdf, read_urdf
 
 Vec3 = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
@@ -161,20 +158,3 @@ def load_spec(path: Path) -> HandSpec:
         return HandSpec.model_validate(data)
     except ValidationError as error:
         raise HandError(f"hand file {path}: {spec_problem(error)}") from None
-
-
-def hand_digest(urdf_path: Path, spec: HandSpec) -> str:
-    """SHA-256 over the URDF, the collision meshes it names and the rules: the content key of a hand."""
-    return urdf_digest(read_urdf(urdf_path), spec)
-
-
-def urdf_digest(urdf: Urdf, spec: HandSpec) -> str:
-    """:func:`hand_digest` of a URDF that has been read."""
-    h = hashlib.sha256(urdf.text.encode())
-    for name in sorted(urdf.mesh_files):
-        h.update(name.encode())
-        for data in mesh_bytes(urdf.mesh_files[name]).values():
-            h.update(data)
-    # neither changes a HandModel; views of opposition spaces have digests of their own
-    h.update(spec.model_dump_json(exclude={"opposition_spaces", "stand_off"}).encode())
-    return h.hexdigest()

@@ -7,7 +7,7 @@ import numpy as np
 from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec, OppositionSpace
 from lgrasp.hand.tree import Tree
-from lgrasp.math.kinematics import MAX_BODIES, MAX_DOFS, MAX_JOINTS
+from lgrasp.math.limits import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 
 
 def check_size(spec: HandSpec, tree: Tree) -> None:

@@ -75,7 +75,7 @@ def contact_arrays(
     for entry in flat:
         patches.append(cover_patches(entry.points, entry.normals, rng) + count)
         count = int(patches[-1].max(initial=count - 1)) + 1
-    repeat = [len(entry.points) for entry in flat]
+    repeat = np.array([len(entry.points) for entry in flat], int)
     index = np.array([tree.link_names.index(entry.link) for entry in links], np.int32)
     of_point = np.repeat(index[order], repeat)
     per_group = [sum(len(e.points) for e in flat if e.group == g) for g in range(tree.groups + 1)]

@@ -112,17 +112,6 @@ class Tree:
         return [name for name, b in zip(self.link_names, self.link_body, strict=True) if b == body]
 
 
-def _motion(j: Joint, x: float) -> np.ndarray:
-    T = np.eye(4)
-    if j.prismatic:
-        T[:3, 3] = j.axis * x
-        return T
-    a = j.axis
-    K = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-    T[:3, :3] = np.eye(3) + np.sin(x) * K + (1 - np.cos(x)) * K @ K
-    return T
-
-
 def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     """Split the hand into static base and dependency groups.
 
@@ -151,7 +140,7 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
             moving.append(j)
             rides[j.child] = (j.name, np.eye(4))
         else:
-            rides[j.child] = (carrier, T @ _motion(j, fixed[j.name]) if j.movable else T)
+            rides[j.child] = (carrier, T @ j.motion(np.array(fixed[j.name])) if j.movable else T)
     if not moving:
         raise HandError(f"hand '{spec.name}': every joint of {urdf.path} is locked; leave some to move")
     # the base frame: the base link must be static

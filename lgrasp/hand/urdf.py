@@ -42,6 +42,18 @@ class Joint:
     upper: float
     mimic: tuple[str, float, float] | None  # source joint, multiplier, offset
 
+    def motion(self, x: np.ndarray) -> np.ndarray:
+        """Transforms [..., 4, 4] of the moving frame at positions x [rad or m], shape [...]."""
+        x = np.asarray(x, float)[..., None, None]
+        T = np.broadcast_to(np.eye(4), (*x.shape[:-2], 4, 4)).copy()
+        if self.prismatic:
+            T[..., :3, 3:] = self.axis[:, None] * x
+            return T
+        a = self.axis
+        K = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+        T[..., :3, :3] += np.sin(x) * K + (1 - np.cos(x)) * (K @ K)
+        return T
+
 
 @dataclass(frozen=True)
 class Urdf:

@@ -1,8 +1,8 @@
 """On what and where: default folders and configs/*.yaml."""
 
 import itertools
-from collections.abc import Iterator
-from importlib import import_module
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,33 +19,32 @@ from lgrasp.config import (
     read_yaml,
     yaml_files,
 )
-from lgrasp.engine.bank import with_passes
-from lgrasp.engine.cache import Cache
+from lgrasp.engine.folder import run_folder
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
-from lgrasp.engine.run import Job
-from lgrasp.errors import ConfigError
-from lgrasp.jobs.generate import GenerateJob
-from lgrasp.jobs.hands import hand_source
+from lgrasp.engine.request import Request, named
+from lgrasp.errors import ConfigError, LgraspError
+from lgrasp.hand.names import all_hands, hand_path
+from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest
 from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
-from lgrasp.object.find import MESH_SUFFIXES, find_object
+from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object
 
 
 class JobConfig(Params):
     """Many hands and objects in one run: configs/NAME.yaml. Paths are relative to the current folder."""
 
     description: str = ""
-    hands: tuple[str, ...] = Field(("allegro",), min_length=1, description="Names or paths.")
+    hands: tuple[str, ...] = Field(("allegro",), min_length=1, description="Names, paths, folders of hands, or globs.")
     hand_dir: Path | None = Field(None, description="Folder where NAME/NAME.urdf is looked up first.")
-    objects: tuple[str, ...] = Field((), description="Names or paths; none: all meshes of object_dir.")
+    objects: tuple[str, ...] = Field(
+        (), description="Names, paths, folders of meshes, or globs; none: all meshes of object_dir."
+    )
     object_dir: Path | None = Field(None, description="Folder where the names of objects are looked up first.")
     pipelines: tuple[str, ...] = Field(("robust",), min_length=1, description="Names or paths.")
     rows: int = Field(1000, ge=1, description="Grasps per hand, object and pipeline.")
     settings: tuple[str, ...] = Field((), description="PART.KEY=VALUE of every pipeline, such as bounds.friction=0.8.")
     seed: int | None = Field(None, ge=0, lt=2**63, description="Replaces the pipelines' own.")
     scale: MeshScale = 1.0
-    out: Path = Field(
-        Path("grasps"), description="Folder for the folders HAND-OBJECT (PIPELINE/HAND-OBJECT if several)."
-    )
+    out: Path = Field(Path("grasps"), description="Folder for the folders HAND-OBJECT/PIPELINE.")
     device: DeviceName = "auto"
     workers: Workers = 0
     batch: int = Field(0, ge=0)
@@ -92,20 +91,20 @@ def load_config(name: str) -> JobConfig:
 
 
 KINDS = {
-    "sequence": ("lgrasp.jobs.sequence.job", "SequenceJob"),
-    "refine": ("lgrasp.jobs.refine.shards", "RefineJob"),
-    "plan": ("lgrasp.jobs.refine.plan", "PlanJob"),
-    "simulate": ("lgrasp.jobs.simulate", "SimulateJob"),
-    "scenes": ("lgrasp.jobs.scenes.job", "SceneJob"),
-    "learn": ("lgrasp.jobs.learn.job", "FitJob"),
-    "metrics": ("lgrasp.jobs.metrics", "MetricsJob"),
-    "export": ("lgrasp.jobs.export", "ExportJob"),
+    "sequence": "lgrasp.jobs.requests.search:SequenceRequest",
+    "refine": "lgrasp.jobs.requests.shards:RefineRequest",
+    "plan": "lgrasp.jobs.requests.plan:PlanRequest",
+    "simulate": "lgrasp.jobs.requests.shards:SimulateRequest",
+    "scenes": "lgrasp.jobs.requests.scenes:SceneRequest",
+    "learn": "lgrasp.jobs.requests.shards:FitRequest",
+    "metrics": "lgrasp.jobs.requests.shards:MetricsRequest",
+    "export": "lgrasp.jobs.requests.shards:ExportRequest",
 }
-"""Kind of a job, as key ``job`` of a config names it, and where it is; ``generate`` is :class:`JobConfig`."""
+"""Kind of a job, as key ``job`` of a config names it, and its keys; those of ``generate`` are :class:`JobConfig`."""
 
 
-def load_jobs(name: str, changes: dict[str, Any], cache: Cache) -> list[Job]:
-    """The jobs of a config by name or by path, some keys replaced.
+def load_requests(name: str, changes: dict[str, Any]) -> list[Request]:
+    """The jobs that a config by name or by path asks for, some keys replaced.
 
     Raises:
         ConfigError: no such config or kind of job, or a wrong key or value.
@@ -117,18 +116,12 @@ def load_jobs(name: str, changes: dict[str, Any], cache: Cache) -> list[Job]:
         hint = did_you_mean(str(kind), ("generate", *KINDS))
         raise ConfigError(f"config {path}: unknown job '{kind}'; {hint}known: generate, {', '.join(KINDS)}")
     if kind == "generate" or "sequences" in data:
-        return list(plan_jobs(parse_model(JobConfig, data | changes, f"config {path}"), cache))
+        return plan_requests(parse_model(JobConfig, data | changes, f"config {path}"))
     data.pop("description", None)
-    return [parse_model(_kind(kind), data | changes | {"cache": cache}, f"config {path}")]
+    return [parse_model(named(KINDS[kind]), data | changes, f"config {path}")]
 
 
-def _kind(name: str) -> Any:
-    """The model of a kind of job, imported when it is asked for."""
-    module, model = KINDS[name]
-    return getattr(import_module(module), model)
-
-
-def plan_jobs(config: JobConfig, cache: Cache) -> list[Any]:
+def plan_requests(config: JobConfig) -> list[Request]:
     """One job for each pipeline, hand, and object or sequence of objects, in this order.
 
     Raises:
@@ -137,32 +130,86 @@ def plan_jobs(config: JobConfig, cache: Cache) -> list[Any]:
     """
     objects, sets = _objects(config), config.sequences
     drawn = object_sequences(objects, sets, config.seed or 0) if sets else [(mesh,) for mesh in objects]
-    jobs = []
-    for pipeline, out in _pipelines(config):
-        for hand, names in itertools.product(config.hands, drawn):
+    hands = [_urdf_in_folder(config.hand_dir, hand) for hand in all_hands(config.hands)]
+    shared = config.model_dump(include={"rows", "device", "workers", "shard_rows"})
+    found: list[Request] = []
+    for pipeline in _pipelines(config):
+        if not sets:
+            meshes = [in_folder(config.object_dir, mesh) for mesh in objects]
+            own = pipeline.with_passes(config.passes, config.reuse)
+            more = config.model_dump(include={"scale", "batch", "reuse"})
+            found += pair_requests(hands, meshes, own, config.out, **shared, **more)
+            continue
+        changes = {name: value for name in ("method", "policy") if (value := getattr(sets, name))}
+        own = pipeline.with_params("sequence", **changes) if changes else pipeline
+        what = {"shard_rows": min(config.shard_rows, 1000), "scale": sets.scale, "simulate": sets.simulate}
+        for hand, names in itertools.product(hands, drawn):
             meshes = tuple(in_folder(config.object_dir, mesh) for mesh in names)
-            shared = config.model_dump(include={"rows", "device", "workers", "shard_rows"})
-            shared |= {"hand": _urdf_in_folder(config.hand_dir, hand), "cache": cache}
-            shared["out"] = out / sequence_name(Path(hand).stem, names)
-            if sets:
-                changes = {name: value for name in ("method", "policy") if (value := getattr(sets, name))}
-                shared |= {"shard_rows": min(config.shard_rows, 1000), "scale": sets.scale, "simulate": sets.simulate}
-                own = pipeline.with_params("sequence", **changes) if changes else pipeline
-                jobs.append(_kind("sequence")(**shared, objects=meshes, pipeline=own))
-            else:
-                shared |= config.model_dump(include={"scale", "batch", "reuse"})
-                own = with_passes(pipeline, config.passes, config.reuse)
-                jobs.append(GenerateJob(**shared, object=meshes[0], pipeline=own))
-    return jobs
+            out = run_folder(config.out, Path(hand).stem, sequence_name(names), pipeline.name, sets.simulate)
+            found.append(SequenceRequest(**shared | what, hand=hand, objects=meshes, pipeline=own, out=out))
+    return found
 
 
-def _pipelines(config: JobConfig) -> Iterator[tuple[Pipeline, Path]]:
-    """Each pipeline with the config's seed, and the folder of its output."""
+def pair_requests(
+    hands: Sequence[str],
+    objects: Sequence[str],
+    pipeline: Pipeline,
+    top: Path,
+    protocol: str | None = None,
+    **shared: Any,
+) -> list[GenerateRequest]:
+    """A request for each hand and object, with a folder of its own below ``top``.
+
+    Args:
+        protocol: that of ``--simulate``, which the pipeline has already.
+        shared: other fields of the requests.
+
+    Raises:
+        ConfigError: a value out of range, or two pairs with the same folder.
+    """
+    found: dict[Path, GenerateRequest] = {}
+    for hand, mesh in itertools.product(hands, objects):
+        out = run_folder(top, *_names(hand, mesh), pipeline.name, protocol)
+        what = {"hand": hand, "object": mesh, "pipeline": pipeline, "out": out}
+        request = parse_model(GenerateRequest, what | shared, "generate")
+        if other := found.get(out):
+            raise ConfigError(
+                f"{other.hand} with {other.object} and {hand} with {mesh} have one folder, {out}; rename a file, or "
+                "generate one of them alone with --out"
+            )
+        found[out] = request
+    return list(found.values())
+
+
+def _names(hand: str, mesh: str) -> tuple[str, str]:
+    """What a hand and an object are called in the names of folders; a job tells if there is no such thing."""
+    names = Path(hand).stem, Path(mesh).stem
+    with suppress(LgraspError):
+        names = names[0], find_object(mesh).stem
+        names = hand_name(hand), names[1]
+    return names
+
+
+def hand_name(hand: str) -> str:
+    """What a hand is called in the names of folders.
+
+    Raises:
+        HandError: there is no such hand.
+    """
+    if hand_path(hand).name == hand:  # one of the catalogue is called by its folder
+        return hand
+    from lgrasp.jobs.hands import hand_source  # slow to load
+
+    return hand_source(hand).name
+
+
+def _pipelines(config: JobConfig) -> Iterator[Pipeline]:
+    """Each pipeline with the config's seed."""
     for name in config.pipelines:
         pipeline = load_pipeline(name).with_settings(config.settings)
         if config.seed is not None:
             pipeline = pipeline.model_copy(update={"seed": config.seed})
-        yield pipeline, config.out / pipeline.name if len(config.pipelines) > 1 else config.out
+        yield pipeline
 
 
 def _objects(config: JobConfig) -> tuple[str, ...]:
@@ -171,14 +218,10 @@ def _objects(config: JobConfig) -> tuple[str, ...]:
         if folder is not None and not folder.expanduser().is_dir():
             raise ConfigError(f"{key} {folder} is not a folder")
     if config.objects:
-        return config.objects
+        return all_objects(config.objects)
     if config.object_dir is None:
         raise ConfigError("the config names no objects; give object_dir, a folder of meshes (--object-dir)")
-    folder = config.object_dir.expanduser()
-    found = tuple(sorted(p.name for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES))
-    if not found:
-        raise ConfigError(f"object_dir {config.object_dir} holds no mesh; accepted: {', '.join(MESH_SUFFIXES)}")
-    return found
+    return tuple(Path(mesh).name for mesh in all_objects([str(config.object_dir)]))
 
 
 def _urdf_in_folder(folder: Path | None, hand: str) -> str:
@@ -194,12 +237,3 @@ def in_folder(folder: Path | None, mesh: str) -> str:
     here = folder.expanduser()
     found = next((p for p in (here / mesh, *(here / f"{mesh}{s}" for s in MESH_SUFFIXES)) if p.is_file()), None)
     return mesh if found is None else str(found)
-
-
-def default_out(hand: str, mesh: str, protocol: str | None = None) -> Path:
-    """``grasps/HAND-OBJECT``, or with ``-PROTOCOL`` after it, for a hand and an object given by name or path.
-
-    Raises:
-        HandError, ObjectError: there is no such hand or object.
-    """
-    return Path("grasps") / f"{hand_source(hand).name}-{find_object(mesh).stem}{f'-{protocol}' if protocol else ''}"

@@ -7,40 +7,43 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 
-from lgrasp.dataset import ObjectRecord, find_shards
+from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.exports.formats import export_shards
 from lgrasp.dataset.exports.mjcf import Cut
+from lgrasp.dataset.gather import gather
+from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import OutputError
+from lgrasp.grasp.records import ObjectRecord
+from lgrasp.jobs.requests.shards import ExportRequest
+from lgrasp.simulate.protocol import HOLDS
 
 _INDEX = "export.json"  # the last file of an export: one without it is not whole
 
 
-class ExportJob(Job):
+class ExportJob(ExportRequest, Job):
     """Grasps of shards, all of one hand, with the hand's URDF and all meshes."""
 
+    command: ClassVar[str] = "export"
+    part: ClassVar[str] = "export"
     kernels: ClassVar[tuple[str, ...]] = ()
-
-    shards: tuple[Path, ...] = Field(description="Shard files, or folders of *.h5 files.")
-    to: str = Field(description="Name of the format.")
-    out: Path = Field(description="Folder to write; it must be empty or not exist yet.")
-    limit: int | None = Field(None, description="Most grasps.")
-    where: tuple[str, ...] = Field(
-        (), description="Only rows of which these are true, such as 'metrics/epsilon > 0.01'."
-    )
 
     @property
     def folder(self) -> Path:
         return self.out
 
     def key(self) -> str:
-        rows = [rows_digest(path) for path in find_shards(self.shards)]
-        return content_key("export", 1, to=self.to, rows=rows, limit=self.limit, where=list(self.where))
+        columns = {parse_condition(text).column for text in self.where} | {HOLDS}
+
+        def digest(reader: ShardReader) -> str:
+            return rows_digest(reader, sorted(columns & reader.columns.keys()))
+
+        rows = [shard.value for shard in gather(self.shards, digest)]
+        return content_key("export", 2, to=self.to, rows=rows, limit=self.limit, where=list(self.where))
 
     def parts(self) -> list[Part]:
         return [Part(0, self.out / _INDEX)]

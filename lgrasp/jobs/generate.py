@@ -1,56 +1,52 @@
 """The main job: hand + object -> grasp shards in a folder."""
 
-import math
 from collections import Counter
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import PrivateAttr
 
-from lgrasp.dataset import ObjectRecord
 from lgrasp.dataset.info import stage_counts, survivors
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.engine.batch import PASS_BITS
 from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.run import JobOutcome, run
 from lgrasp.engine.shard import Execution, add_counts, make_shard, shard_effort
-from lgrasp.errors import ConfigError, LgraspError, StarvedError
+from lgrasp.errors import LgraspError, StarvedError
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.duplicates import near_pairs
+from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.rows import grasp_rows
+from lgrasp.grasp.schema import POSE_BITS
 from lgrasp.grasp.tables import take_grasps
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.records import object_record
+from lgrasp.jobs.requests.search import GenerateRequest
 from lgrasp.jobs.search import SearchJob, telling
+from lgrasp.runtime.array import Array
 
 PUBLISHED_FSWO = 0.15
 """Squared frictionless residual below which the published system counts a grasp."""
 
 _TALLY_THREADS = 4
+_MOST_COMPARED = 4_000_000
+"""Rows of a folder among which near-duplicates are looked for: some 400 MB."""
 
 
-class GenerateJob(SearchJob):
+class GenerateJob(GenerateRequest, SearchJob):
     """Grasps of one object by one hand."""
 
-    object: str = Field(description="Name or mesh file.")
-    scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
-    batch: int = Field(default=0, description="Candidates per batch; 0: by device.")
-    rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
-    reuse: bool = Field(default=False, description="Cache the state of shards; later runs continue from there.")
+    command: ClassVar[str] = "generate"
+
     _graphs: GraphCache | None = PrivateAttr(None)
     _rate: float = PrivateAttr(1.0)
-
-    @property
-    def title(self) -> str:
-        return f"{Path(self.hand).stem} {Path(self.object).stem} {self.pipeline.name}"
 
     @property
     def object_name(self) -> str:
@@ -74,19 +70,11 @@ class GenerateJob(SearchJob):
         """Rows per candidate of the last shard made; ``rate`` if none was."""
         return self._rate if self._inputs else self.rate
 
+    def own_config(self) -> dict[str, Any]:
+        return {"object": self.object, "scale": self.scale, "reuse": self.reuse}
+
     def key(self) -> str:
         return run_key(self.pipeline.describe(), self.keys, self.shard_rows)
-
-    def parts(self) -> list[Part]:
-        if self.batch < 0:
-            raise ConfigError(f"--batch {self.batch}: must be at least 0 (0: by device)")
-        if not 0 < self.rate < math.inf:
-            raise ConfigError(f"rate {self.rate}: the rows expected per candidate must be positive and finite")
-        if self.pipeline.sequence is not None:
-            raise ConfigError(
-                f"pipeline '{self.pipeline.name}' is for several objects: lgrasp sequence OBJECT OBJECT ..."
-            )
-        return super().parts()
 
     def effort(self, rows: int) -> int:
         return shard_effort(self.pipeline, rows)
@@ -114,8 +102,7 @@ class GenerateJob(SearchJob):
         # poses and contacts go from the internal to the user's frame of the object
         tree, center = self.inputs.hand.model.tree, self.inputs.object.model.center
         rows = grasp_rows(result.grasps, tree, center, shard=part.number, protocol=self.protocol_text())
-        config = {"object": self.object, "scale": self.scale, "reuse": self.reuse}
-        contents = self.shard(part, result, rows, config, {"candidates": result.candidates})
+        contents = self.shard(part, result, rows, {"candidates": result.candidates})
         # a copy: memory must not grow with the shards
         return Made(len(rows), contents, replace(result, grasps=take_grasps(result.grasps, np.zeros(0, int))))
 
@@ -126,21 +113,23 @@ class GenerateJob(SearchJob):
             ``grasps``, ``strict`` (those within the strict bounds) and ``profile`` (of the bounds that all are within);
             ``grasps_per_s``, ``strict_valid_per_s``, ``published_count_per_s`` (over the wall time of placement through
             filter), ``seconds`` (thread-seconds per stage; ``wall`` of placement through filter; hand, object, field),
-            ``survivors`` and ``counts`` per stage, ``near_duplicates``, ``distinct_poses`` and what was asked.
+            ``survivors`` and ``counts`` per stage, ``near_duplicates`` (across shards), ``distinct_poses`` and what was
+            asked.
         """
         inputs, tree = self.inputs, self.inputs.hand.model.tree
         moving = tree.body_group[tree.link_body] >= 0
-        made, _ = _tally(outcome.written, moving, inputs.device.alias)
-        present, counted = _tally(set(outcome.paths) - set(outcome.written), moving, inputs.device.alias)
+        made, _ = _tally(outcome.written, moving)
+        present, counted = _tally(set(outcome.paths) - set(outcome.written), moving)
         sums = self.sums(outcome, self.pipeline.order)
         if not outcome.results:
             sums["counts"] |= counted
         wall, both = sums["seconds"]["wall"], made + present
         rates = {"grasps": "rows", "strict_valid": "strict", "published_count": "published_count"}
-        counts = ("strict", "near_duplicates", "distinct_poses", "published_count")
+        counts = ("strict", "distinct_poses", "published_count")
         return {
             "grasps": outcome.rows,
             **{name: both[name] for name in counts},
+            "near_duplicates": _near_duplicates(outcome.paths, inputs.device.alias),
             "profile": self.pipeline.bounds.profile,
             **{f"{name}_per_s": made[of] / wall if wall else 0.0 for name, of in rates.items()},
             "survivors": survivors(sums["counts"]),
@@ -156,12 +145,11 @@ class GenerateJob(SearchJob):
         return StarvedError(f"{outcome.rows:,} of {self.rows:,} grasps found; stage {stage} is the bottleneck: {words}")
 
 
-def _tally(paths: Collection[Path], moving: np.ndarray, device: str) -> tuple[Counter[str], dict[str, dict[str, int]]]:
+def _tally(paths: Collection[Path], moving: np.ndarray) -> tuple[Counter[str], dict[str, dict[str, int]]]:
     """Counts over shards on disk, a few of them in memory at a time, and survivors as the stages report them.
 
     Args:
         moving: which links of the hand are moved by a finger, (L,).
-        device: where near-duplicates are looked for.
 
     Raises:
         ShardError: a file is damaged.
@@ -175,8 +163,7 @@ def _tally(paths: Collection[Path], moving: np.ndarray, device: str) -> tuple[Co
                 rows=len(reader),
                 strict=_strict_rows(reader),
                 published_count=int(((fingers >= 3) & (fswo**2 < PUBLISHED_FSWO)).sum()),
-                near_duplicates=len(near_pairs(reader.column("object_pose")[:, 0], reader.column("q"), device)),
-                distinct_poses=len(np.unique(reader.column("candidate") & ~PASS_BITS)),
+                distinct_poses=len(np.unique(reader.column("candidate") & POSE_BITS)),
             )
             return found, stage_counts(reader.statistics)
 
@@ -189,6 +176,21 @@ def _tally(paths: Collection[Path], moving: np.ndarray, device: str) -> tuple[Co
     return whole, counts
 
 
+def _near_duplicates(paths: Collection[Path], device: str) -> int:
+    """Rows of all shards together that are near-duplicates of a row before them; of the first _MOST_COMPARED rows."""
+    poses, postures, rows = [], [], 0
+    for path in paths:
+        with ShardReader(path) as reader:
+            poses.append(reader.column("object_pose")[:, 0])
+            postures.append(reader.column("q"))
+            rows += len(reader)
+        if rows >= _MOST_COMPARED:
+            break
+    if not poses:
+        return 0
+    return len(np.unique(near_pairs(np.concatenate(poses), np.concatenate(postures), device)[:, 1]))
+
+
 def _strict_rows(reader: ShardReader) -> int:
     """Rows within the strict bounds; none where friction was taken to be higher, since forces were balanced with it."""
     strict = GraspBounds()
@@ -198,7 +200,7 @@ def _strict_rows(reader: ShardReader) -> int:
 
 
 def generate(
-    job: GenerateJob, events: Events | None = None, *, array: tuple[int, int] = (0, 1), resume: bool = True
+    job: GenerateJob, events: Events | None = None, *, array: Array | tuple[int, int] = (0, 1), resume: bool = True
 ) -> JobOutcome:
     """Make the missing shards of a job; see :func:`lgrasp.engine.run.run`."""
     return run(job, events, array=array, resume=resume)

@@ -1,8 +1,12 @@
-"""A hand by name, with rules drafted for those of installed packages."""
+"""A hand by name, with rules drafted for those of installed packages, and its description."""
 
 from pathlib import Path
+from typing import Any
 
 from lgrasp.hand.find import HandSource, find_hand
+from lgrasp.hand.spec_check import check_spaces
+from lgrasp.hand.tree import build_tree
+from lgrasp.hand.urdf import read_urdf
 
 
 def hand_source(name: str) -> HandSource:
@@ -12,6 +16,41 @@ def hand_source(name: str) -> HandSource:
         HandError: nothing of that name, or a URDF that no rules can be drafted for.
     """
     return find_hand(name, _draft)
+
+
+def describe_hand(name: str) -> dict[str, Any]:
+    """A hand's source, rules, and joints by finger (0 is the first dependency group, None for shared joints).
+
+    Raises:
+        HandError: no such hand, or one that cannot be used.
+    """
+    source = hand_source(name)
+    spec = source.spec
+    urdf = read_urdf(source.urdf)
+    tree = build_tree(urdf, spec)
+    check_spaces(spec, tree, dict(urdf.links))
+    finger = dict(zip(tree.joint_column.tolist(), tree.body_group[1:].tolist(), strict=True))
+    limits = zip(tree.joint_names, tree.joint_lower.tolist(), tree.joint_upper.tolist(), strict=True)
+    return {
+        "name": source.name,
+        "description": spec.description,
+        "urdf": str(source.urdf),
+        "note": source.note,
+        "base_link": tree.base_link,
+        "locked": dict(spec.locked),
+        "shared": {name: list(values) for name, values in spec.shared.items()},
+        "contact_links": [link for rule in spec.contact for link in rule.links],
+        "palm_links": list(spec.palm.links),
+        "canonical_box": spec.canonical_box.model_dump(),
+        "opposition_spaces": {name: list(space.joints) for name, space in spec.opposition_spaces.items()},
+        "licence": spec.licence,
+        "source": spec.source,
+        "notes": [spec.notes] if isinstance(spec.notes, str) and spec.notes else list(spec.notes),
+        "joints": [
+            {"name": joint, "finger": None if joint in tree.shared_names else finger[k], "lower": lower, "upper": upper}
+            for k, (joint, lower, upper) in enumerate(limits)
+        ],
+    }
 
 
 def _draft(urdf: Path, name: str) -> Path:

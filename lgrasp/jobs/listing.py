@@ -1,21 +1,13 @@
-"""Descriptions of hands, objects and pipelines, JSON-serialisable."""
+"""What can be used by name: hands, objects, pipelines; JSON-serialisable. Light to import: a list comes at once."""
 
 from typing import Any
-
-import numpy as np
 
 from lgrasp.config import read_yaml
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.errors import ConfigError
-from lgrasp.hand.find import known_hands
+from lgrasp.hand.names import known_hands
 from lgrasp.hand.spec import load_spec
-from lgrasp.hand.spec_check import check_spaces
-from lgrasp.hand.tree import build_tree
-from lgrasp.hand.urdf import read_urdf
-from lgrasp.jobs.hands import hand_source
-from lgrasp.object.find import find_object
 from lgrasp.object.find import list_objects as named_objects
-from lgrasp.object.load import load_mesh
 from lgrasp.paths import data_dirs
 
 
@@ -33,41 +25,6 @@ def list_hands() -> list[dict[str, Any]]:
     return found
 
 
-def describe_hand(name: str) -> dict[str, Any]:
-    """A hand's source, rules, and joints by finger (0 is the first dependency group, None for shared joints).
-
-    Raises:
-        HandError: no such hand, or one that cannot be used.
-    """
-    source = hand_source(name)
-    spec = source.spec
-    urdf = read_urdf(source.urdf)
-    tree = build_tree(urdf, spec)
-    check_spaces(spec, tree, dict(urdf.links))
-    finger = dict(zip(tree.joint_column.tolist(), tree.body_group[1:].tolist(), strict=True))
-    limits = zip(tree.joint_names, tree.joint_lower.tolist(), tree.joint_upper.tolist(), strict=True)
-    return {
-        "name": source.name,
-        "description": spec.description,
-        "urdf": str(source.urdf),
-        "note": source.note,
-        "base_link": tree.base_link,
-        "locked": dict(spec.locked),
-        "shared": {name: list(values) for name, values in spec.shared.items()},
-        "contact_links": [link for rule in spec.contact for link in rule.links],
-        "palm_links": list(spec.palm.links),
-        "canonical_box": spec.canonical_box.model_dump(),
-        "opposition_spaces": {name: list(space.joints) for name, space in spec.opposition_spaces.items()},
-        "licence": spec.licence,
-        "source": spec.source,
-        "notes": [spec.notes] if isinstance(spec.notes, str) and spec.notes else list(spec.notes),
-        "joints": [
-            {"name": joint, "finger": None if joint in tree.shared_names else finger[k], "lower": lower, "upper": upper}
-            for k, (joint, lower, upper) in enumerate(limits)
-        ],
-    }
-
-
 def list_objects() -> list[dict[str, Any]]:
     """Name, file, faces, licence and description of every named object; keys absent from objects.yaml are empty."""
     notes: dict[str, Any] = {}
@@ -79,25 +36,6 @@ def list_objects() -> list[dict[str, Any]]:
         {"name": name, "file": str(path), **{key: notes.get(name, {}).get(key, value) for key, value in empty.items()}}
         for name, path in named_objects().items()
     ]
-
-
-def describe_object(mesh: str, scale: float = 1.0) -> dict[str, Any]:
-    """A mesh as it would be used: size, repairs.
-
-    Raises:
-        ObjectError: the mesh cannot be used.
-    """
-    path = find_object(mesh)
-    loaded = load_mesh(path, scale=scale)
-    return {
-        "name": loaded.name,
-        "file": str(path),
-        "faces": len(loaded.faces),
-        "extents": [float(side) for side in np.ptp(loaded.vertices, axis=0)],
-        "watertight": loaded.closed,
-        "sha256": loaded.sha256,
-        "notes": list(loaded.notes),
-    }
 
 
 def list_pipelines() -> list[dict[str, Any]]:

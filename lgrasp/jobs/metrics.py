@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any, ClassVar
 
-from pydantic import Field, PrivateAttr
+from pydantic import PrivateAttr
 
 from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.metrics import METRICS, TASK_ROWS, is_extended, measure_shard, process_map
@@ -13,30 +13,19 @@ from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
-from lgrasp.errors import ConfigError, OutputError
+from lgrasp.jobs.requests.shards import MetricsRequest
 
 
-class MetricsJob(ShardJob):
+class MetricsJob(MetricsRequest, ShardJob):
     """Metrics that are computed from the shards alone, added to copies of them."""
 
-    unit: ClassVar[str] = "rows"
+    command: ClassVar[str] = "dataset metrics"
 
-    add: tuple[str, ...] = Field(description=f"Metrics: {', '.join(METRICS)}.")
-    settings: tuple[str, ...] = Field((), description="bounds.KEY=VALUE each, in place of what the rows passed.")
     _open: ExitStack = PrivateAttr(default_factory=ExitStack)
     _each: Any = PrivateAttr(None)
 
     def key(self) -> str:
         return content_key("metrics", 1, names=list(self.add), settings=list(self.settings))
-
-    def parts(self) -> list[Part]:
-        unknown = [name for name in self.add if name not in METRICS]
-        if unknown or not self.add:
-            raise ConfigError(f"unknown metric '{''.join(unknown[:1])}'; known: {', '.join(METRICS)}")
-        for folder in (path if path.is_dir() else path.parent for path in self.shards):
-            if folder.resolve() == self.out.resolve():
-                raise OutputError(f"--out {self.out} is the folder of the shards themselves; choose another")
-        return super().parts()
 
     def present(self, parts: Sequence[Part]) -> dict[int, int]:
         """A copy tells by its rows and metrics whether it may stay; other bounds are not seen in it."""

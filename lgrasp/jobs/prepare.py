@@ -1,4 +1,4 @@
-"""Make and describe the inputs of a job one by one: a contact field, a preprocessed object."""
+"""Make and describe the inputs of a job one by one: a contact field, a mesh, a preprocessed object."""
 
 import time
 from collections.abc import Callable
@@ -12,6 +12,8 @@ from lgrasp.engine.inputs import Loader, input_keys, object_key
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.jobs.hands import hand_source
+from lgrasp.object.find import find_object
+from lgrasp.object.load import load_mesh
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.device import start as start_warp
@@ -90,4 +92,23 @@ def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: floa
         "seconds": time.perf_counter() - start,
         "cached": load.hits["object"],
         "file": str(cache.path("object", key)),
+    }
+
+
+def describe_object(mesh: str, scale: float = 1.0) -> dict[str, Any]:
+    """A mesh as it would be used: size, repairs.
+
+    Raises:
+        ObjectError: the mesh cannot be used.
+    """
+    path = find_object(mesh)
+    loaded = load_mesh(path, scale=scale)
+    return {
+        "name": loaded.name,
+        "file": str(path),
+        "faces": len(loaded.faces),
+        "extents": [float(side) for side in np.ptp(loaded.vertices, axis=0)],
+        "watertight": loaded.closed,
+        "sha256": loaded.sha256,
+        "notes": list(loaded.notes),
     }

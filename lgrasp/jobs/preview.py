@@ -1,14 +1,15 @@
 """The plan of a job, without computing or writing anything."""
 
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
 from lgrasp.engine.bank import Bank
 from lgrasp.engine.run import Job, look
+from lgrasp.files import temporary_folder
 from lgrasp.jobs.generate import GenerateJob
+from lgrasp.runtime.array import Array
 
 
 class PlanLine(NamedTuple):
@@ -21,14 +22,14 @@ class PlanLine(NamedTuple):
     file: str
 
 
-def preview(job: Job, *, array: tuple[int, int] = (0, 1), resume: bool = True) -> list[PlanLine]:
+def preview(job: Job, *, array: Array | tuple[int, int] = (0, 1), resume: bool = True) -> list[PlanLine]:
     """The artifacts of a job in the order in which it would make them.
 
     Raises:
         LgraspError: bad input, as :func:`lgrasp.engine.run.run` would raise it before computing.
     """
     with _no_kernel_folder():
-        device, parts, present = look(job, array=array, resume=resume)
+        _, device, _, parts, present = look(job, array=array, resume=resume)
     lines = _inputs(job) if isinstance(job, GenerateJob) else []
     for part in parts:
         number, file = str(part.number), str(part.file)
@@ -66,8 +67,8 @@ def _no_kernel_folder() -> Iterator[None]:
     if "WARP_CACHE_PATH" in os.environ:
         yield
         return
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["WARP_CACHE_PATH"] = folder
+    with temporary_folder() as folder:
+        os.environ["WARP_CACHE_PATH"] = str(folder)
         try:
             yield
         finally:

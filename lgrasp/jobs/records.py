@@ -5,9 +5,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lgrasp.dataset import HandRecord, ObjectRecord
 from lgrasp.engine.cache import Cache
 from lgrasp.geometry.decompose import decompose
+from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.urdf import read_urdf

@@ -7,32 +7,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pydantic import Field, PrivateAttr
+from pydantic import PrivateAttr
 
-from lgrasp.config import HandName, ShardFolder
-from lgrasp.dataset import GraspRows, ObjectRecord, Shard, ShardHeader
 from lgrasp.dataset.info import survivors
+from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, Part, PartProgress
-from lgrasp.engine.folder import check_number, shard_path
-from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard import add_counts, add_seconds, flat_statistics
-from lgrasp.errors import ConfigError
+from lgrasp.grasp.records import GraspRows, ObjectRecord, Shard, ShardHeader
 from lgrasp.hand.model import HandModel
+from lgrasp.jobs.difference import config_difference
 from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs
+from lgrasp.jobs.requests.search import SearchRequest
 from lgrasp.runtime.device import resolve_device
 
 
-class SearchJob(Job):
+class SearchJob(SearchRequest, Job):
     """Shards of grasps by one hand, perhaps of fewer rows than requested."""
 
     asks: ClassVar[bool] = True
+    differs: ClassVar[str] = "other contents of the hand's or an object's files"
 
-    hand: HandName = "allegro"
-    rows: int = Field(default=1000, description="Rows requested.")
-    pipeline: Pipeline
-    out: ShardFolder
-    shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
     _keys: Any = PrivateAttr(None)
     _inputs: Any = PrivateAttr(None)
     _meshes: dict[str, bytes] = PrivateAttr(default_factory=dict)
@@ -64,18 +60,9 @@ class SearchJob(Job):
 
     def parts(self) -> list[Part]:
         rows, size = self.rows, self.shard_rows
-        if rows <= 0:
-            raise ConfigError(f"-n {rows}: request at least 1")
-        if size <= 0:
-            raise ConfigError(f"--shard-rows {size}: must be at least 1")
-        if self.workers < 0:
-            raise ConfigError(f"--workers {self.workers}: must be at least 0 (0: by device)")
-        check_number(-(-rows // size), "shards; use larger --shard-rows or several --out")
         if self.protocol:
-            from lgrasp.simulate.protocol import find_protocol
             from lgrasp.simulate.run import check_installed
 
-            find_protocol(self.protocol)
             check_installed(resolve_device(self.device).alias)
         hand, name = self.keys.source.name, self.object_name
         return [
@@ -83,6 +70,9 @@ class SearchJob(Job):
         ]
 
     def load(self, events: Events, missing: bool) -> None:
+        if missing:
+            for stage, _ in self.pipeline.sections:
+                assert stage.run  # imported now, so that its kernels are compiled before the clock starts
         inputs = self.load_inputs(events)
         self._meshes = mesh_blobs(self.keys.source.urdf)
         if missing and self.protocol:
@@ -90,6 +80,11 @@ class SearchJob(Job):
             scene = make_scene(self.cache, *self.records(inputs), self._meshes, self.device_used.alias)
             inputs = replace(inputs, scene=scene)
         self._inputs = inputs
+
+    def about(self) -> dict[str, Any]:
+        hand, objects = self.records(self.inputs)
+        named = {"hand": hand.name, "objects": [record.name for record in objects]}
+        return named | {"pipeline": self.pipeline.name, "seed": self.pipeline.seed}
 
     @abstractmethod
     def load_inputs(self, events: Events) -> Any:
@@ -99,19 +94,28 @@ class SearchJob(Job):
     def records(self, inputs: Any) -> tuple[HandModel, list[ObjectRecord]]:
         """The hand, and the objects as they are written."""
 
-    def shard(
-        self, part: Part, result: Any, grasps: GraspRows, config: dict[str, Any], statistics: dict[str, Any]
-    ) -> Shard:
-        """A result as records, with what the job says of it in ``config`` and ``statistics``."""
-        hand, objects = self.records(self.inputs)
-        described = {
+    @abstractmethod
+    def own_config(self) -> dict[str, Any]:
+        """What the kind of job adds to the config in its shards."""
+
+    def config(self) -> dict[str, Any]:
+        """The config in the shards."""
+        return {
             "run_key": self.key(),
             "pipeline": self.pipeline.describe(),
             "bounds": self.pipeline.bounds.describe(),
             "shard_rows": self.shard_rows,
-            **config,
+            **self.own_config(),
             **hand_config(self.keys.source),
         }
+
+    def difference(self, path: Path) -> str:
+        with ShardReader(path) as reader:
+            return config_difference(reader.header.config, self.config()) or self.differs
+
+    def shard(self, part: Part, result: Any, grasps: GraspRows, statistics: dict[str, Any]) -> Shard:
+        """A result as records, with what the job says of it in ``statistics``."""
+        hand, objects = self.records(self.inputs)
         told = {
             "device": self.device_used.name,
             "duplicates_dropped": result.duplicates,
@@ -120,7 +124,7 @@ class SearchJob(Job):
         }
         return Shard(
             header=ShardHeader(
-                pipeline=self.pipeline.name, seed=self.pipeline.seed, shard_index=part.number, config=described
+                pipeline=self.pipeline.name, seed=self.pipeline.seed, shard_index=part.number, config=self.config()
             ),
             hand=hand_record(hand, self._meshes),
             objects=objects,

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 from pydantic import Field, field_validator
 
+from lgrasp.choices import Method, Policy, ProtocolName
 from lgrasp.config import Params
 from lgrasp.errors import ConfigError
 from lgrasp.seeding import stage_seed
@@ -23,9 +23,9 @@ class SequenceSets(Params):
     length: int = Field(4, ge=2, le=16, description="Objects in a set.")
     permutations: int = Field(4, ge=1, description="Different orders of each set.")
     scale: str = Field("0.06:0.10", description="Factor to metres, or range of the longest side [m].")
-    method: str | None = Field(None, description="Replaces that of stage sequence.")
-    policy: str | None = Field(None, description="Replaces that of stage sequence.")
-    simulate: str | None = Field(None, description="Protocol that rows must pass to be continued.")
+    method: Method | None = Field(None, description="Replaces that of stage sequence.")
+    policy: Policy | None = Field(None, description="Replaces that of stage sequence.")
+    simulate: ProtocolName | None = Field(None, description="Protocol that rows must pass to be continued.")
 
     @field_validator("scale", mode="before")
     @classmethod
@@ -48,6 +48,8 @@ def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list
         raise ConfigError(f"{sets.sets} sets of {sets.length} objects are requested; {len(pool)} objects make {most}")
     if sets.permutations > orders:
         raise ConfigError(f"{sets.permutations} orders are requested; {sets.length} objects have {orders}")
+    import numpy as np  # slow to load, and needed by few configs
+
     rng = np.random.default_rng(stage_seed(seed, 0, "sets"))
     chosen: dict[tuple[int, ...], None] = {}
     if most <= 4 * sets.sets:
@@ -64,6 +66,6 @@ def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list
     return out
 
 
-def sequence_name(hand: str, objects: tuple[str, ...]) -> str:
-    """HAND-OBJECT-OBJECT..., for files and folders."""
-    return "-".join([hand, *(Path(name).stem for name in objects)])
+def sequence_name(objects: tuple[str, ...]) -> str:
+    """OBJECT-OBJECT..., for files and folders."""
+    return "-".join(Path(name).stem for name in objects)

@@ -1,9 +1,6 @@
 """Hand and object of a shard as the models that jobs work with; whatever is installed under their names."""
 
-import atexit
 import hashlib
-import shutil
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -13,14 +10,17 @@ import numpy as np
 from pydantic import ValidationError
 
 from lgrasp.cloud.model import cloud_object
-from lgrasp.dataset import HandRecord, ObjectRecord, ShardReader
+from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import OBJECT_VERSION, Loader, object_key
 from lgrasp.errors import HandError, ShardError
+from lgrasp.files import scratch_folder
 from lgrasp.grasp.hand_files import write_hand
+from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource, rules_of_known
 from lgrasp.hand.model import HAND_VERSION, HandModel
-from lgrasp.hand.spec import HandSpec, hand_digest
+from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hands import hand_source
@@ -122,9 +122,7 @@ def _built(cache: Cache, source: HandSource, device: Device) -> tuple[HandSource
 
 def _files(record: HandRecord) -> Path:
     """The URDF of a shard's hand beside its meshes, in a folder that goes when the program ends."""
-    folder = Path(tempfile.mkdtemp(prefix="lgrasp-hand-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return write_hand(record, folder)
+    return write_hand(record, scratch_folder())
 
 
 def _with_rules(urdf: Path, record: HandRecord, config: Mapping[str, Any]) -> HandSource:

@@ -1,29 +1,32 @@
-"""Simulates the rows of shards and adds the verdicts to copies of them."""
+"""Simulates the rows of shards and adds the verdicts to them, or to copies."""
 
+import json
 import os
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr, field_validator
+from pydantic import PrivateAttr
 
-from lgrasp.config import DeviceName
-from lgrasp.dataset import HandRecord, ObjectRecord, ShardReader, read_shard
 from lgrasp.dataset.extend import extend_shard
+from lgrasp.dataset.files import check_heaps
+from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
-from lgrasp.engine.folder import MADE_FROM
+from lgrasp.engine.folder import Found
 from lgrasp.engine.run import JobOutcome
-from lgrasp.engine.shard_job import ShardJob
-from lgrasp.errors import ConfigError
+from lgrasp.engine.shard_job import ShardJob, rows_digest
 from lgrasp.geometry.decompose import decompose
+from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.jobs.difference import config_difference
+from lgrasp.jobs.kept_verdicts import GPU_BLOCK, KeptVerdicts
+from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.jobs.shard_inputs import mesh_hash
 from lgrasp.runtime.device import resolve_device
-from lgrasp.simulate.protocol import Protocol, find_protocol
+from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.run import check_installed, protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
@@ -33,35 +36,52 @@ from lgrasp.stages.context import Keeper
 _MIN_HOLDING_LINKS = 2  # links that it takes to hold anything
 
 
-class SimulateJob(ShardJob):
-    """Adds verdicts of a physics simulation to copies of shards."""
+class SimulateJob(SimulateRequest, ShardJob):
+    """Adds verdicts of a physics simulation to shards, in place or to copies."""
 
-    protocol: Protocol = Field(description="Named protocol.")
-    out: Path | None = Field(None, description="Folder; default: that of the shards with -PROTOCOL added.")
-    device: DeviceName = "cpu"
-    all_directions: bool = Field(False, description="Go on after the first direction in which an object is lost.")
+    command: ClassVar[str] = "simulate"
+
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)
     _scene: tuple[tuple[str, ...], Scene] | None = PrivateAttr(None)  # the latest
 
-    @field_validator("protocol", mode="before")
-    @classmethod
-    def _named(cls, value: object) -> object:
-        return find_protocol(value) if isinstance(value, str) else value
-
-    @property
-    def folder(self) -> Path:
-        if self.out is not None:
-            return self.out
-        folders = {(path if path.is_dir() else path.parent).absolute() for path in self.shards}
-        if len(folders) > 1:
-            raise ConfigError(f"the shards lie in {len(folders)} folders; name one for the results with --out")
-        parent = folders.pop()
-        return parent.with_name(f"{parent.name}-{self.protocol.name}")
-
     def key(self) -> str:
+        return content_key("simulate", 2, settings=self._settings())
+
+    def _settings(self) -> dict[str, Any]:
+        """What decides a verdict besides its row, as far as it is the same for all shards."""
         described = self.protocol.model_dump(mode="json")
-        return content_key("simulate", 1, protocol=described, all_directions=self.all_directions, device=self._kind())
+        return described | {"all_directions": self.all_directions, "device": self._kind()}
+
+    def check_source(self, reader: ShardReader) -> None:
+        check_heaps(reader.path)
+        for _ in reader.blocks():  # whose checksums are compared
+            pass
+
+    def found(self, part: Part) -> Found | None:
+        if not self.in_place:  # else the source was checked
+            super().found(part)
+        with ShardReader(part.file) as reader:
+            text = reader.rows(0, 0).physics_protocols.get(f"{self.protocol.name}_holds")
+            if text is None and self.in_place:
+                return None
+            rows, digest = len(reader), rows_digest(reader)
+        job = content_key("simulate", 2, settings=_told(text or "{}", self._settings()))
+        return Found(content_key("part", 1, job=job, rows=digest), rows)
+
+    def refusal(self, path: Path) -> str:
+        if not self.in_place:
+            return super().refusal(path)
+        name = self.protocol.name
+        return f"{path} has other verdicts of {name} ({self.difference(path)}); --overwrite replaces them"
+
+    def difference(self, path: Path) -> str:
+        with ShardReader(path) as reader:
+            text = reader.rows(0, 0).physics_protocols.get(f"{self.protocol.name}_holds")
+        if text is None:
+            return "it has no verdicts of this protocol"
+        settings = self._settings()
+        return config_difference(_told(text, settings), settings) or "other grasps"
 
     def parts(self) -> list[Part]:
         check_installed(resolve_device(self.device).alias)
@@ -69,46 +89,46 @@ class SimulateJob(ShardJob):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
-        shard, protocol = read_shard(part.source), self.protocol
-        scene, device = self._scene_of(shard.hand, shard.objects), self.device_used.alias
-        began, compiling = time.perf_counter(), 0.0
+        protocol, device, name = self.protocol, self.device_used.alias, self.protocol.name
+        threads = self.workers or os.cpu_count() or 1
+        with ShardReader(part.source) as reader:
+            scene, rows = self._scene_of(reader.hand(), reader.objects()), len(reader)
+            kept = KeptVerdicts(self.cache, self.part_key(part), name, largest=None if device == "cpu" else GPU_BLOCK)
 
-        def prepared(seconds: float) -> None:
-            nonlocal compiling
-            compiling += seconds
+            def told(done: int, held: int) -> None:
+                rate = (kept.rows + done) / max(kept.seconds_now, 1e-9)
+                progress(kept.rows + done, f"{kept.held + held:,} hold  {rate:.1f}/s")
 
-        def told(done: int, held: int) -> None:
-            seconds = time.perf_counter() - began - compiling
-            progress(done, f"{held:,} hold  {done / max(seconds, 1e-9):.1f}/s")
-
-        found = verdicts(
-            scene,
-            shard.grasps,
-            protocol,
-            threads=self.workers or os.cpu_count() or 1,
-            progress=told,
-            all_directions=self.all_directions,
-            device=device,
-            keep=self._kept.get,
-            prepared=prepared,
-        )
-        seconds = time.perf_counter() - began - compiling
+            while (block := kept.next_block(rows, threads)) or not kept.columns:
+                found = verdicts(
+                    scene,
+                    reader.rows(kept.rows, kept.rows + block),
+                    protocol,
+                    threads=threads,
+                    progress=told,
+                    all_directions=self.all_directions,
+                    device=device,
+                    keep=self._kept.get,
+                    prepared=kept.prepared,
+                )
+                kept.add(found, last=kept.rows + block == rows)
         added = {
-            "physics": found,
+            "physics": kept.columns,
             "protocol": protocol_text(scene, protocol, all_directions=self.all_directions, device=device),
             "statistics": {
-                f"{protocol.name}_tried": len(shard.grasps),
-                f"{protocol.name}_held": int(found[f"{protocol.name}_holds"].sum()),
-                f"seconds_{protocol.name}": seconds,
-                f"seconds_{protocol.name}_compile": compiling,
-                MADE_FROM: self.part_key(part),
+                f"{name}_tried": rows,
+                f"{name}_held": kept.held,
+                f"seconds_{name}": kept.seconds,
+                f"seconds_{name}_compile": kept.compiling,
             },
         }
-        return Made(len(shard.grasps), added, (seconds, compiling))
+        return Made(rows, (kept, added), (kept.seconds, kept.compiling))
 
     def write(self, part: Part, contents: Any) -> None:
         assert part.source is not None
-        extend_shard(part.source, part.file, **contents)
+        kept, added = contents
+        extend_shard(part.source, part.file, **added)
+        kept.discard()
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``protocol``; ``results``: see :func:`summary`; ``seconds_compile``: of models and, on a GPU, kernels, in no
@@ -150,6 +170,17 @@ class SimulateJob(ShardJob):
                     self.cache.warn(line)
             self._scene = key, scene
         return self._scene[1]
+
+
+def _told(text: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that verdicts were made with, from their ``protocol`` attribute."""
+    try:
+        told = json.loads(text)
+        simulator = str(told.get("simulator"))
+    except (ValueError, AttributeError, RecursionError):
+        return {}
+    device = "gpu" if simulator.startswith("mujoco_warp") else "cpu"
+    return {name: told.get(name) for name in settings} | {"device": device}
 
 
 @dataclass(frozen=True)

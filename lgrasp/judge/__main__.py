@@ -43,9 +43,14 @@ def judge(
         name, sign, file = given.partition("=")
         meshes |= {name: file} if sign else {"": given}
     try:
+        from lgrasp.judge.files import existing, find_shards
+
+        files = find_shards(shards)
+        for path in (*meshes.values(), *([urdf] if urdf else ())):
+            existing(path)
         from lgrasp.judge import run
 
-        report = run.judge(shards, urdf=urdf, mesh=meshes or None, rows=rows, progress=None if quiet else _Progress())
+        report = run.judge(files, urdf=urdf, mesh=meshes or None, rows=rows, progress=None if quiet else _Progress())
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         if json_path and json_path != "-":
             Path(json_path).write_text(text + "\n", encoding="utf-8")

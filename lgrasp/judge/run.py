@@ -5,7 +5,7 @@ import re
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.checks import CHECKS, VALUES, RowChecks
 from lgrasp.judge.duplicates import count_repeats
+from lgrasp.judge.files import existing, find_shards
 from lgrasp.judge.report import Report, ShardVerdict
 from lgrasp.judge.shard import JudgedShard, read_shard
 
@@ -51,8 +52,8 @@ def judge(
         raise JudgeError(f"rows {rows}: at least 1")
     meshes = {} if mesh is None else mesh if isinstance(mesh, Mapping) else {"": mesh}
     start = time.perf_counter()
-    sources = {k: _existing(p) for k, p in meshes.items()}
-    read = [read_shard(p, None if urdf is None else _existing(urdf), sources) for p in paths]
+    sources = {k: existing(p) for k, p in meshes.items()}
+    read = [read_shard(p, None if urdf is None else existing(urdf), sources) for p in paths]
     counts = [len(s.kept_invalid) for s in read]
     total = sum(counts)
     if not total:
@@ -90,27 +91,6 @@ def _judge_shard(shard: JudgedShard, rows: np.ndarray, step: Callable[[int], obj
         rows=rows,
         claims=shard.claims,
     )
-
-
-def find_shards(given: Sequence[str | Path]) -> list[Path]:
-    """Files, and every ``*.h5`` in folders at any depth, each once.
-
-    Raises:
-        JudgeError: no such file or folder, or a folder without shards.
-    """
-    found: list[Path] = []
-    for path in map(_existing, given):
-        files = sorted(path.rglob("*.h5")) if path.is_dir() else [path]
-        if not files:
-            raise JudgeError(f"{path}: no shard (*.h5) in this folder")
-        found += files
-    return list(dict.fromkeys(found))
-
-
-def _existing(path: str | Path) -> Path:
-    if not Path(path).exists():
-        raise JudgeError(f"{path}: no such file or folder")
-    return Path(path)
 
 
 METRICS = {

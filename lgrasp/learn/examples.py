@@ -10,9 +10,11 @@ from lgrasp.geometry.poses import pose_matrix
 from lgrasp.hand.model import HandModel
 from lgrasp.learn.params import LearnParams
 from lgrasp.object.model import ObjectModel
-from lgrasp.scenes.camera import intrinsics_of, look_at
+from lgrasp.picture.camera import look_at
+from lgrasp.picture.depth import LabelledMesh, render
+from lgrasp.scenes.camera import intrinsics_of
 from lgrasp.scenes.params import CameraParams
-from lgrasp.scenes.render import LabelledMesh, add_noise, draw_offsets, merge_views, render
+from lgrasp.scenes.render import add_noise, draw_offsets, merge_views
 
 _CAMERA = CameraParams.model_validate(
     {"views": 2, "width": 96, "height": 96, "angle": 40.0, "calibration": 0.003, "voxel": 0.0, "window": 2}

@@ -2,16 +2,9 @@
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+from lgrasp.math.limits import MAX_DOFS
 
-MAX_JOINTS = 16
-"""Most movable joints (mimic joints included) in one dependency group."""
-MAX_BODIES = 40
-"""Most movable joints in a hand."""
-MAX_DOFS = 8
-"""Most actuated joints in one dependency group."""
-MAX_GROUPS = 6
-"""Most dependency groups of a hand."""
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 vec_dof = wp.types.vector(MAX_DOFS, wp.float32)
 

@@ -2,10 +2,11 @@
 
 import difflib
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from lgrasp.errors import ObjectError
-from lgrasp.paths import data_dirs, name_problem, package_files
+from lgrasp.paths import data_dirs, expanded, name_problem, package_files
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
 
@@ -18,9 +19,28 @@ def list_objects() -> dict[str, Path]:
     found: dict[str, Path] = {}
     for folder in data_dirs("objects"):
         for path in sorted(folder.iterdir()):
-            if path.suffix.lower() in MESH_SUFFIXES and path.is_file():
+            if _is_mesh(path):
                 found.setdefault(path.stem, path)
     return dict(sorted(found.items()))
+
+
+def all_objects(names: Iterable[str]) -> tuple[str, ...]:
+    """Objects by names and paths; a folder stands for the meshes in it, a glob pattern for those that it matches.
+
+    Raises:
+        ObjectError: A folder or a pattern without a mesh.
+    """
+    found: dict[str, None] = {}
+    for name in names:
+        meshes = None if name in list_objects() else expanded(name, Path.iterdir, _is_mesh)
+        if meshes == []:
+            raise ObjectError(f"object '{name}' holds no mesh; accepted: {', '.join(MESH_SUFFIXES)}")
+        found |= dict.fromkeys([name] if meshes is None else meshes)
+    return tuple(found)
+
+
+def _is_mesh(path: Path) -> bool:
+    return path.suffix.lower() in MESH_SUFFIXES and path.is_file()
 
 
 def find_object(name_or_path: str | os.PathLike[str]) -> Path:

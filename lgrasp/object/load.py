@@ -20,6 +20,7 @@ from lgrasp.errors import LgraspError, ObjectError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.params import ObjectParams
+from lgrasp.paths import check_file
 
 _FLAT = 1e-4  # thinner than this share of the largest side is a plane
 _MOST_UNPACKED = 256 << 20
@@ -115,18 +116,14 @@ def read_bytes(path: Path, suffixes: Sequence[str], what: str, error: type[Lgras
         what: what is accepted, such as ``a mesh file``.
         error: raised, in one line, for no file, an unknown suffix, a file that cannot be read or is empty.
     """
-    accepted = f"{what} ({', '.join(suffixes)}) is accepted"
-    if not path.is_file():
-        raise error(f"{path}: {'is a folder' if path.is_dir() else 'does not exist'}; {accepted}")
-    if path.suffix.lower() not in suffixes:
-        raise error(f"{path}: suffix '{path.suffix}' is unknown; accepted are {', '.join(suffixes)}")
+    check_file(path, suffixes, what, error)
     try:
         data = path.read_bytes()
     except OSError as problem:
         why = f"cannot be read ({problem.strerror}); a readable {what.partition(' ')[2]} is accepted"
         raise error(f"{path}: {why}") from problem
     if not data:
-        raise error(f"{path}: 0 bytes; {accepted}")
+        raise error(f"{path}: 0 bytes; {what} ({', '.join(suffixes)}) is accepted")
     return data
 
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+_TIDIED = ("merged", "dropped", "turned", "filled")  # how notes on harmless repairs begin
+
 
 @dataclass(frozen=True)
 class ObjectModel:
@@ -55,6 +57,11 @@ class ObjectModel:
     sdf: np.ndarray
     sdf_origin: np.ndarray
     sdf_cell: float
+
+    @property
+    def warnings(self) -> list[str]:
+        """The notes that tell of more than a tidied mesh: parts that were joined, an open surface, ..."""
+        return [note for note in self.notes if not note.startswith(_TIDIED)]
 
     @cached_property
     def area(self) -> float:

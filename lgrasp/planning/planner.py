@@ -8,9 +8,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from lgrasp.config import Params
 from lgrasp.geometry.poses import device_inverse
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps
@@ -21,69 +19,16 @@ from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.surface import ContactSurface, palm_axis
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
+from lgrasp.planning.params import PlanParams
 from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
-from lgrasp.refine.params import LocalSearch
-from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface
+from lgrasp.refine.surface import farthest_points, hand_surface
 from lgrasp.refine.volume import upload_target
 
 _CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
-_COLLIDES, _CLOUD_GAP = 1.0e-3, 6.0e-3  # [m]
+_COLLIDES = 1.0e-3  # [m]
 _COARSE_BOUNDS = {"max_penetration": 0.01, "max_gap": 0.012, "max_normal_angle": 60.0, "max_normal_spread": 90.0}
-_PLAN_BOUNDS = GraspBounds(profile="plan")
-
-
-class PlanParams(Params):
-    """How many hands are tried, how far they are moved, and the conditions on a plan."""
-
-    rolls: int = Field(
-        default=30, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
-    )
-    tilts: tuple[float, ...] = Field(
-        default=(0.0, 45.0, 90.0),
-        min_length=1,
-        description="Angles between the surface's normal and the way back from it [deg], in turn.",
-    )
-    finalists: int = Field(
-        default=10, ge=1, le=64, description="Number of hands that continue after the first matchings."
-    )
-    opening: int = Field(default=5, ge=1, le=100, description="Matchings of all of them.")
-    clearance: float = Field(
-        default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
-    )
-    distal: float = Field(
-        default=DISTAL, ge=0, le=100, description="Weight of palmar points on the last links of fingers."
-    )
-    other: float = Field(default=OTHER, ge=0, le=100, description="Weight of the other palmar points.")
-    search: LocalSearch = Field(
-        default=LocalSearch(
-            max_exit_distance=0.0,
-            max_translation_step=0.002,
-            max_rotation_step=0.02,
-            max_joint_step=0.04,
-            reach=0.15,
-            reach_end=0.1,
-            soft=0.01,
-            force=0.3,
-            margin=0.005,
-        ),
-        description="The local search.",
-    )
-    rank_friction: float = Field(
-        default=0.3, gt=0, le=2, description="Friction coefficient at which the hands of a start are compared."
-    )
-    bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
-
-    def weights(self) -> dict[str, float]:
-        """Arguments of :func:`hand_surface`."""
-        return {"distal": self.distal, "other": self.other}
-
-
-def cloud_params(params: PlanParams) -> PlanParams:
-    """The parameters for an object that is a point cloud, whose points lie off its surface by their noise."""
-    bounds = params.bounds.changed(max_gap=max(params.bounds.max_gap, _CLOUD_GAP))
-    return params.model_copy(update={"bounds": bounds})
 
 
 def _loosened(bounds: GraspBounds) -> GraspBounds:

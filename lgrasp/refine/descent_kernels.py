@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from lgrasp.math.kinematics import MAX_BODIES, Kinematics, group_dofs, group_forward
+from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
+from lgrasp.math.limits import MAX_BODIES
 from lgrasp.refine.energy_gradient import Search, beyond, joint_pulls, point_pulls, solid_pulls, wrench_pulls
 from lgrasp.refine.match_kernels import Correspondences, Points, Solids
 from lgrasp.refine.volume import Volume, volume_at

@@ -5,7 +5,8 @@ Rows are hands; everything is frozen until it is matched again (:mod:`lgrasp.ref
 
 import warp as wp
 
-from lgrasp.math.kinematics import MAX_JOINTS, Kinematics, group_dofs, group_forward
+from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
+from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_part, sdf_value
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS

@@ -13,6 +13,9 @@ STEEPEST = 0.1
 LIMIT_SHARE = 0.15
 """Joint limits repel within this share of the range."""
 
+DISTAL, OTHER = 1.0, 0.2
+"""Weight of palmar points on the last link of a finger, and of the others."""
+
 # fields with other defaults in stage refine
 MatchingRounds = Annotated[int, Field(ge=0, le=1000, description="Number of times that nearest points are matched.")]
 TranslationStep = Annotated[float, Field(gt=0, le=0.1, description="Largest translation of the hand in one step.")]
@@ -71,3 +74,7 @@ class LocalSearch(Params):
     nearest: float = Field(
         default=0.2, gt=0, le=1, description="Share of the palmar points, nearest first, they come from."
     )
+
+
+COARSE = LocalSearch(matching_rounds=13, reach=0.05, reach_end=0.03)
+"""For poses as a network predicts them: off by centimetres."""

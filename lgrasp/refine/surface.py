@@ -8,11 +8,10 @@ from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.surface import ContactSurface, contact_surface
 from lgrasp.hand.surface_visibility import last_bodies
+from lgrasp.refine.params import DISTAL, OTHER
 
 BLOCK = 24
 """Points are in blocks of this many, each on one body."""
-DISTAL, OTHER = 1.0, 0.2
-"""Weight of palmar points on the last link of a finger, and of the others."""
 
 LINK_POINTS = 1024
 """Points of the surfaces of all links together, where links are solids (:func:`hand_solids`)."""

@@ -13,7 +13,7 @@ import warp as wp
 
 from lgrasp.errors import DeviceError
 from lgrasp.paths import cache_dir
-from lgrasp.runtime.kernel_cache import drop_damaged, note_checksums, usable_folder
+from lgrasp.runtime.kernel_cache import drop_damaged, enter, note_checksums, usable_folder
 
 KERNEL_OPTIONS = {"enable_backward": False, "max_unroll": 1}
 """Module options of every non-differentiable kernel module (they decide compile time: minutes or seconds)."""
@@ -50,6 +50,7 @@ def start() -> None:
     with _without_driver_warning():
         wp.init()
     folder = Path(wp.config.kernel_cache_dir)  # Warp added its version
+    enter(folder)
     drop_damaged(folder)
     atexit.register(note_checksums, folder)
     _started = True

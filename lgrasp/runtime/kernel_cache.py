@@ -4,7 +4,6 @@ Warp keeps each compiled module in a folder of its own and trusts what it finds 
 the process, so every folder gets the SHA-256 of its files, which are compared when a process starts.
 """
 
-import atexit
 import hashlib
 import json
 import os
@@ -14,15 +13,17 @@ import tempfile
 import time
 import uuid
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
+from lgrasp.errors import OutputError
+from lgrasp.files import FOREIGN_AGE, at_end, hold_file, leave_behind, remove_leftovers, scratch_folder, write_file
 from lgrasp.notices import notice
 
 LEAST_FREE = 32 << 20
 """Free bytes without which nothing is compiled into a folder: a full disk ends the compiler, and the process."""
-_START = time.time()
 _CHECKSUMS = "sha256.json"
-_UNFINISHED = re.compile(r"_p([0-9]+)_t[0-9]+$")  # of folders that Warp compiles in: process and thread
+_UNFINISHED = re.compile(r"_(p[0-9]+)_t[0-9]+$")  # of folders that Warp compiles in: process and thread
 _LOADED = (".o", ".cubin", ".ptx", ".meta")  # what Warp reads; sources are for people
 
 
@@ -31,8 +32,7 @@ def usable_folder(wanted: Path) -> Path:
     reason = _unusable(wanted)
     if reason is None:
         return wanted
-    instead = Path(tempfile.mkdtemp(prefix="lgrasp-kernels-"))
-    atexit.register(shutil.rmtree, instead, ignore_errors=True)
+    instead = scratch_folder()
     notice(f"kernels cannot be kept in {wanted} ({reason}); they go to a temporary folder (see --cache-dir)")
     with suppress(OSError, shutil.Error):
         shutil.copytree(wanted, instead, dirs_exist_ok=True)
@@ -43,9 +43,7 @@ def _unusable(folder: Path) -> str | None:
     """Why nothing can be written into a folder, None if it can."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".probe-{uuid.uuid4().hex[:12]}"
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=folder).close()
         return "disk full" if shutil.disk_usage(folder).free < LEAST_FREE else None
     except OSError as error:
         return error.strerror or str(error)
@@ -60,23 +58,49 @@ def drop_damaged(folder: Path) -> None:
             _drop(module)
 
 
+def has_compiled(folder: Path, *, cuda: bool) -> bool:
+    """True if the folder holds a module for the processor, or for a GPU."""
+    return any(path.suffix == ".o" if not cuda else path.suffix in (".cubin", ".ptx") for path in folder.glob("*/*"))
+
+
 def note_checksums(folder: Path) -> None:
-    """Store the SHA-256 of the modules that were compiled since this process started."""
+    """Store the SHA-256 of the modules that have none: compiled by this process, or by one that was killed."""
     for module in _modules(folder):
-        with suppress(OSError):
+        with suppress(OSError, OutputError):
             files = [path for path in module.iterdir() if path.suffix in _LOADED]
-            if module.stat().st_mtime < _START or {path.name for path in files} == set(_noted(module)):
+            if {path.name for path in files} == set(_noted(module)):
                 continue
             digests = {path.name: _sha256(path) for path in files}
-            temporary = module / f"{uuid.uuid4().hex[:12]}.tmp"
-            temporary.write_text(json.dumps(digests), encoding="utf-8")
-            os.replace(temporary, module / _CHECKSUMS)
+            write_file(module / _CHECKSUMS, json.dumps(digests))
 
 
-def unfinished(folder: Path) -> list[Path]:
-    """Folders in which processes that are gone were compiling, and what is left of removed ones."""
-    found = [(path, _UNFINISHED.search(path.name)) for path in folder.glob("*/*") if path.is_dir()]
-    return [path for path, match in found if path.suffix == ".tmp" or (match and not _runs(int(match[1])))]
+def enter(folder: Path) -> None:
+    """Let other processes know, until this one ends, that it may compile; remove what killed ones left."""
+    with suppress(OSError):  # a folder that cannot be written: nothing is compiled into it
+        remove_unfinished(folder)
+        at_end(partial(_leave, folder, hold_file(folder / f"p{os.getpid()}")))
+
+
+def _leave(folder: Path, note: Path) -> None:
+    """Remove what this process was compiling; another thread may go on with it, which is for the next process."""
+    for path in (own := list(folder.glob(f"*_p{os.getpid()}_t*"))):
+        shutil.rmtree(path, ignore_errors=True)
+    if any(path.exists() for path in own):
+        leave_behind(note)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove folders in which killed processes were compiling, and what is left of removed ones.
+
+    A process is known by its number and by a file that it holds; its number alone may be that of one elsewhere.
+    """
+    gone = {path.name.partition(".")[0] for path in remove_leftovers(folder, "*.tmp")}
+    there = {path.name.partition(".")[0] for path in folder.glob("p*.tmp")}
+    for path in folder.glob("*_p*_t*"):
+        match = _UNFINISHED.search(path.name)
+        with suppress(OSError):
+            if match and match[1] not in there and (match[1] in gone or _age(path) > FOREIGN_AGE):
+                shutil.rmtree(path)
 
 
 def _modules(folder: Path) -> list[Path]:
@@ -110,12 +134,6 @@ def _drop(module: Path) -> None:
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _runs(process: int) -> bool:
-    """True if a process of this number is there."""
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True
+def _age(path: Path) -> float:
+    """Seconds since something was last made in a folder."""
+    return time.time() - path.stat().st_mtime

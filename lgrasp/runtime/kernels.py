@@ -12,7 +12,7 @@ from types import ModuleType
 import warp as wp
 
 import lgrasp
-from lgrasp.runtime.kernel_cache import note_checksums
+from lgrasp.runtime.kernel_cache import has_compiled, note_checksums
 
 
 def import_all() -> None:
@@ -37,6 +37,13 @@ def _kernels(module: ModuleType) -> Iterator[wp.Kernel]:
         for x in value.values() if isinstance(value, dict) else (value,):
             if isinstance(x, wp.Kernel):
                 yield x
+
+
+def first_time(device: str) -> str:
+    """What a user is told before this machine compiles its first kernels for a kind of device; "" if it has some."""
+    if has_compiled(Path(wp.config.kernel_cache_dir), cuda=device != "cpu"):
+        return ""
+    return "compiling kernels once for this machine (about 20 s)"
 
 
 def load_kernels(device: str, modules: list[str], progress: Callable[[str, float], None] | None = None) -> None:

@@ -1,53 +1,14 @@
-"""Pinhole depth cameras: intrinsics, poses, where they stand around a table.
-
-Camera frame: x to the right, y down, z forward. The centre of the pixel in row i and column j is at (j, i) of the
-image. A depth is the z of what is seen [m], not the length of the ray.
-"""
-
-from dataclasses import dataclass
+"""Where the depth cameras stand around a table."""
 
 import numpy as np
 
-from lgrasp.geometry.poses import pose_from_matrix
+from lgrasp.picture.camera import Intrinsics, central_camera, look_at
 from lgrasp.scenes.params import CameraParams
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera: pixel (j, i) = (fx x / z + cx, fy y / z + cy) of a point x y z in the camera frame."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def points(self, depth: np.ndarray) -> np.ndarray:
-        """Points [m], shape (..., h, w, 3), in the camera frame, of depths [m], shape (..., h, w)."""
-        x = (np.arange(self.width) - self.cx) / self.fx
-        y = (np.arange(self.height)[:, None] - self.cy) / self.fy
-        return np.stack([x * depth, y * depth, depth], axis=-1)
 
 
 def intrinsics_of(params: CameraParams) -> Intrinsics:
     """Square pixels, the optical axis through the middle of the image."""
-    width, height = params.width, params.height
-    f = float(0.5 * width / np.tan(np.radians(0.5 * params.angle)))
-    return Intrinsics(width, height, f, f, 0.5 * (width - 1), 0.5 * (height - 1))
-
-
-def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Poses T_scene_camera, x y z [m] qw qx qy qz, shape (v, 7), of cameras at ``eye`` [m], shape (v, 3), that look at
-    a point [m], shape (3,), neither straight above nor below, with the image's upper edge up, z of the scene."""
-    forward = target - eye
-    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    T = np.zeros((len(eye), 4, 4))
-    T[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
-    T[:, :3, 3] = eye
-    return pose_from_matrix(T)
+    return central_camera(params.width, params.height, params.angle)
 
 
 def place_cameras(params: CameraParams, rng: np.random.Generator) -> np.ndarray:

@@ -8,14 +8,15 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from lgrasp.dataset.files import check_heaps, new_shard_file
+from lgrasp.dataset.files import check_heaps
+from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.reader import FileReader, reading
 from lgrasp.dataset.structure import format_problems, schema_problems
 from lgrasp.dataset.validate import file_problems
 from lgrasp.dataset.writer import create_array, finish, write_models
 from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import DatasetSpec
-from lgrasp.scenes.camera import Intrinsics
+from lgrasp.picture.camera import Intrinsics
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord, scene_problems
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
 

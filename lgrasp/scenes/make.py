@@ -6,24 +6,17 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from lgrasp.dataset import HandRecord, ObjectRecord
 from lgrasp.geometry.poses import compose, device_from_stored, inverse, pose_matrix
+from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.object.arrays import Object, ObjectArrays
+from lgrasp.picture.depth import LabelledMesh, join_surfaces, render
 from lgrasp.scenes import collision_kernels as kernels
 from lgrasp.scenes.camera import intrinsics_of, place_cameras
 from lgrasp.scenes.drop import drop
 from lgrasp.scenes.params import CameraParams, SceneParams
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord
-from lgrasp.scenes.render import (
-    LabelledMesh,
-    add_noise,
-    draw_offsets,
-    join_surfaces,
-    merge_views,
-    render,
-    table_surface,
-)
+from lgrasp.scenes.render import add_noise, draw_offsets, merge_views, table_surface
 from lgrasp.scenes.schema import DEPTH_UNIT
 from lgrasp.seeding import stage_seed
 from lgrasp.simulate.solid import Solid

@@ -9,7 +9,7 @@ import numpy as np
 import lgrasp
 from lgrasp.dataset.checks import accepted_limits, are_unit, hand_problems, object_problems, requirer
 from lgrasp.grasp.records import HandRecord, ObjectRecord, now
-from lgrasp.scenes.camera import Intrinsics
+from lgrasp.picture.camera import Intrinsics
 
 
 @dataclass(frozen=True, kw_only=True)

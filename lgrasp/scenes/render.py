@@ -1,49 +1,22 @@
-"""Depth cameras that see meshes: exact depths and labels, noise, normals, one merged cloud."""
+"""What depth cameras make of exact images: noise, normals, one merged cloud."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
 
-from lgrasp.geometry.poses import device_from_stored, pose_matrix
+from lgrasp.geometry.poses import pose_matrix
+from lgrasp.picture.depth import Images, LabelledMesh
 from lgrasp.runtime.device import start
 from lgrasp.scenes import render_kernels as kernels
-from lgrasp.scenes.camera import Intrinsics
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.records import CloudRecord
 from lgrasp.scenes.schema import DEPTH_UNIT
 
-NOTHING, TABLE = -1, 0
-"""Labels of pixels that see nothing, and of the table; object k is k + 1."""
+TABLE = 0
+"""Label of the table; object k is k + 1."""
 
-_FAR = 10.0  # [m]
 _SLOPE = 6.0  # tangent of the steepest angle to the image plane at which neighbouring pixels still lie on one surface
-
-
-class LabelledMesh(NamedTuple):
-    """A triangle mesh in the scene frame, every face with a label."""
-
-    vertices: np.ndarray
-    """[m], shape (v, 3)."""
-    faces: np.ndarray
-    """Shape (f, 3)."""
-    labels: np.ndarray
-    """Shape (f,)."""
-
-
-@dataclass(frozen=True)
-class Images:
-    """Images of v cameras."""
-
-    intrinsics: Intrinsics
-    pose: np.ndarray
-    """T_scene_camera, x y z [m] qw qx qy qz, shape (v, 7)."""
-    depth: np.ndarray
-    """Along the optical axis [m], shape (v, h, w), f32; 0 where nothing is seen."""
-    labels: np.ndarray
-    """Shape (v, h, w), int32; ``NOTHING`` where nothing is seen."""
 
 
 def table_surface(side: float) -> LabelledMesh:
@@ -51,35 +24,6 @@ def table_surface(side: float) -> LabelledMesh:
     x = 0.5 * side
     corners = np.array([[-x, -x, 0.0], [x, -x, 0.0], [x, x, 0.0], [-x, x, 0.0]])
     return LabelledMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.full(2, TABLE))
-
-
-def join_surfaces(surfaces: Sequence[LabelledMesh]) -> LabelledMesh:
-    """Several surfaces as one."""
-    first = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
-    moved = (s._replace(faces=s.faces + at) for s, at in zip(surfaces, first, strict=False))
-    return LabelledMesh(*map(np.concatenate, zip(*moved, strict=True)))
-
-
-def render(surface: LabelledMesh, intrinsics: Intrinsics, pose: np.ndarray, device: str = "cpu") -> Images:
-    """Exact depths and labels from v cameras at T_scene_camera, x y z [m] qw qx qy qz, shape (v, 7)."""
-    start()
-    with wp.ScopedDevice(device):
-        mesh = wp.Mesh(
-            wp.array(np.asarray(surface.vertices, np.float32), dtype=wp.vec3),
-            wp.array(np.asarray(surface.faces, np.int32).ravel(), dtype=wp.int32),
-        )
-        shape = (len(pose), intrinsics.height, intrinsics.width)
-        depth, label = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.int32)
-        inputs = [
-            mesh.id,
-            wp.array(np.asarray(surface.labels, np.int32), dtype=wp.int32),
-            wp.vec2(intrinsics.fx, intrinsics.fy),
-            wp.vec2(intrinsics.cx, intrinsics.cy),
-            _FAR,
-            wp.array(device_from_stored(pose), dtype=wp.transform),
-        ]
-        wp.launch(kernels.cast_rays, shape, inputs, [depth, label])
-        return Images(intrinsics, np.asarray(pose, float), depth.numpy(), label.numpy())
 
 
 def image_normals(images: Images, window: int, device: str = "cpu") -> np.ndarray:

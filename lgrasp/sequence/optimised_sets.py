@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lgrasp.grasp.tables import ContactSets
-from lgrasp.math.kinematics import MAX_DOFS
+from lgrasp.math.limits import MAX_DOFS
 from lgrasp.stages.context import Context
 
 if TYPE_CHECKING:  # torch takes a second to import

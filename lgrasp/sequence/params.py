@@ -1,9 +1,8 @@
 """Parameters of the sequence stage."""
 
-from typing import Literal
-
 from pydantic import Field, model_validator
 
+from lgrasp.choices import Method, Policy
 from lgrasp.config import Params
 from lgrasp.sequence.optimiser.params import OptimiserParams
 
@@ -11,10 +10,10 @@ from lgrasp.sequence.optimiser.params import OptimiserParams
 class SequenceParams(Params):
     """How sequences of grasps grow, object by object."""
 
-    method: Literal["field", "anneal", "mala"] = Field(
+    method: Method = Field(
         "field", description="field: the contact field proposes; anneal, mala: the published optimiser, true Langevin."
     )
-    policy: Literal["uniform", "lookahead"] = Field(
+    policy: Policy = Field(
         "uniform",
         description="Opposition space of a step: any that is left; or those, and grasps, that leave most for later.",
     )

@@ -7,7 +7,8 @@ from lgrasp.grasp.collision import body_clear
 from lgrasp.grasp.held import Held
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.kinematics import MAX_JOINTS, group_forward
+from lgrasp.math.kinematics import group_forward
+from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.context import Context

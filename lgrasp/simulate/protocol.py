@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     from lgrasp.grasp.records import GraspRows
 
+HOLDS = "physics/fc_holds"
+"""Column that says whether the default protocol saw a grasp hold."""
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Directions of the load in the hand's base frame, in the order of the columns."""
 

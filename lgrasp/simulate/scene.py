@@ -3,13 +3,12 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import trimesh
 
 from lgrasp.errors import PhysicsError
+from lgrasp.files import temporary_folder
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.decompose import decompose as cut_mesh
 from lgrasp.grasp.hand_files import write_hand
@@ -70,8 +69,8 @@ def hand_of_record(record: HandRecord, decompose: Decompose = cut_mesh, device: 
         HandError: the URDF or a mesh cannot be used.
     """
     pieces, notes = {}, []
-    with TemporaryDirectory(prefix="lgrasp-hand-") as folder:
-        urdf = read_urdf(write_hand(record, Path(folder)))
+    with temporary_folder() as folder:
+        urdf = read_urdf(write_hand(record, folder))
         for link, geometries in urdf.links.items():
             found = []
             for geometry in geometries:

@@ -1,7 +1,7 @@
 """Damaged, unwritable and left-over kernels: every command does what it did, and says what it met."""
 
 import os
-import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from lgrasp.engine.cache import Cache
+from lgrasp.files import discard_temporaries
+from lgrasp.runtime.kernel_cache import enter, remove_unfinished
 
 CODE = """
 import importlib
@@ -56,18 +58,18 @@ DAMAGE = {
 
 @pytest.fixture
 def double(tmp_path: Path):
-    """double(cache): double a number by the kernel of each module, in another process; gives its standard error."""
+    """double(cache, *modules): double a number by the kernel of each, in another process; gives its standard error."""
     (tmp_path / "code").mkdir()
     for name in DAMAGE:
         (tmp_path / "code" / f"{name}.py").write_text(KERNEL)
 
-    def run(cache: Path) -> str:
+    def run(cache: Path, *modules: str) -> str:
         env = {name: value for name, value in os.environ.items() if name != "WARP_CACHE_PATH"}
-        command = [sys.executable, "-c", CODE, str(tmp_path / "code"), *DAMAGE]
+        command = [sys.executable, "-c", CODE, str(tmp_path / "code"), *modules]
         env["LGRASP_CACHE_DIR"] = str(cache)
         done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=False)
         assert done.returncode == 0, done.stderr
-        assert int(done.stdout) == 2 ** len(DAMAGE)
+        assert int(done.stdout) == 2 ** len(modules)
         return done.stderr
 
     return run
@@ -75,34 +77,62 @@ def double(tmp_path: Path):
 
 def test_damaged_kernels_are_compiled_again(double, tmp_path):
     cache = tmp_path / "cache"
-    assert double(cache) == ""
+    assert double(cache, *DAMAGE) == ""
     for name, (suffix, damage) in DAMAGE.items():
         (path,) = cache.rglob(f"wp_{name}_*/*{suffix}")
         damage(path)
-    said = double(cache).splitlines()
+    said = double(cache, *DAMAGE).splitlines()
     assert len(said) == len(DAMAGE)
     assert all(line.endswith("is damaged; compiling it again") for line in said)
-    assert double(cache) == ""
+    assert double(cache, *DAMAGE) == ""
     assert not list(cache.rglob("*.tmp"))
 
 
 def test_a_folder_that_cannot_be_made(double, tmp_path):
     (tmp_path / "cache").mkdir()
     (tmp_path / "cache" / "kernels").write_text("a file where the folder should be")
-    said = double(tmp_path / "cache")
+    said = double(tmp_path / "cache", "gone")
     assert said.count("kernels cannot be kept in") == 1
     assert "--cache-dir" in said
 
 
-def test_left_overs_are_pruned(tmp_path):
-    cache = tmp_path / "cache"
-    whole = cache / "kernels" / "1.0" / "wp_some_module_1234567"
-    whole.mkdir(parents=True)
-    gone = whole.with_name(whole.name + "_p999999999_t1")
-    alive = whole.with_name(f"{whole.name}_p{os.getpid()}_t1")
-    shutil.copytree(whole, gone)
-    shutil.copytree(whole, alive)
-    Cache(cache).prune({"bank"})
-    assert whole.exists()
-    assert alive.exists()
-    assert not gone.exists()
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from lgrasp.runtime.kernel_cache import enter
+folder = Path(sys.argv[1])
+enter(folder)
+(folder / f"wp_module_1234567_p{os.getpid()}_t1").mkdir()
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_compiler_left_goes_when_the_next_process_starts(tmp_path):
+    """Numbers of processes say nothing: the folder may be shared with other computers."""
+    whole = tmp_path / "wp_module_1234567"
+    foreign = tmp_path / "wp_module_1234567_p999999999_t1"
+    old = tmp_path / "wp_module_1234567_p999999998_t1"
+    alive = tmp_path / f"wp_module_1234567_p{os.getpid()}_t1"
+    dropped = tmp_path / "0123456789ab.tmp"
+    for folder in (whole, foreign, old, alive, dropped):
+        folder.mkdir()
+    os.utime(old, times=(0.0, 0.0))
+    enter(tmp_path)
+    try:
+        done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], timeout=60, check=False)
+        assert done.returncode == -signal.SIGKILL
+        assert len(list(tmp_path.glob("p*.tmp"))) == 2
+        remove_unfinished(tmp_path)
+        (note,) = tmp_path.glob("p*.tmp")
+        assert note.name.startswith(f"p{os.getpid()}.")
+        assert set(tmp_path.iterdir()) == {whole, foreign, alive, note}
+    finally:
+        discard_temporaries()  # this process was compiling when it was ended
+    assert set(tmp_path.iterdir()) == {whole, foreign}
+
+
+def test_pruning_the_cache_removes_them_too(tmp_path):
+    left = tmp_path / "kernels" / "1.0" / "0123456789ab.tmp"
+    left.mkdir(parents=True)
+    Cache(tmp_path).prune({"bank"})
+    assert not left.exists()

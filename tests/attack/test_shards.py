@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from support.shards import sample_shard
 
-from lgrasp.dataset import ShardReader, merge_shards, validate_shard, write_shard
 from lgrasp.dataset.exports.formats import export_shards
+from lgrasp.dataset.merge import merge_shards
+from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.torch_dataset import GraspDataset
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import LgraspError, OutputError
 from lgrasp.notices import on_notice
 

@@ -3,16 +3,16 @@
 import os
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lgrasp.dataset import files
-from lgrasp.dataset.files import new_file, remove_leftovers
+from lgrasp import files
+from lgrasp.dataset.manifest import ListedRun, ListedShard, read_manifest, update_manifest
 from lgrasp.engine.cache import Cache
+from lgrasp.files import new_file, remove_leftovers
 
 
 def leftover(folder: Path, monkeypatch: pytest.MonkeyPatch, machine: str) -> Path:
@@ -34,7 +34,7 @@ def test_files_of_other_computers_stay_for_a_day(tmp_path, monkeypatch):
     own = leftover(tmp_path, monkeypatch, here)
     before_start = leftover(tmp_path, monkeypatch, here[:6] + "0" * 6)
     other, old = leftover(tmp_path, monkeypatch, "f" * 12), leftover(tmp_path, monkeypatch, "e" * 12)
-    os.utime(old, (time.time() - 100_000,) * 2)
+    os.utime(old, times=(0.0, 0.0))
     remove_leftovers(tmp_path, "*.tmp")
     assert [path.exists() for path in (own, before_start, other, old)] == [False, False, True, False]
 
@@ -92,3 +92,21 @@ def test_two_users_share_a_cache(common, tmp_path):
     by_user(4001, lambda: store(1.0))
     by_user(4002, lambda: found(1.0) and store(2.0))
     by_user(4001, lambda: found(2.0))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be two users")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
+def test_two_users_share_a_manifest(common):
+    """What one lists stays when the other, who may not write the file but the folder, lists more."""
+
+    def listing(name: str) -> bool:
+        run = ListedRun(run_key=name, shards=[ListedShard(file=f"{name}.h5", shard_index=0, rows=0)])
+        update_manifest(common, lambda manifest: manifest.ask(run, ()))
+        os.chmod(common / "manifest.json", 0o644)
+        return True
+
+    for user, name in ((4001, "a"), (4002, "b"), (4001, "c")):
+        by_user(user, lambda name=name: listing(name))
+    found = read_manifest(common / "manifest.json")
+    assert found is not None
+    assert [shard.file for shard in found.shards] == ["a.h5", "b.h5", "c.h5"]

@@ -20,7 +20,7 @@ from lgrasp.bench.comparison import (
 from lgrasp.bench.page import Published, load_published
 from lgrasp.bench.rate import Bench
 from lgrasp.errors import ConfigError, OutputError
-from lgrasp.jobs.config import JobConfig, in_folder, load_config, plan_jobs
+from lgrasp.jobs.config import JobConfig, in_folder, load_config, plan_requests
 from lgrasp.jobs.generate import generate
 
 QUICK = str(Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml")
@@ -156,7 +156,7 @@ def test_ratios(table):
 def test_only_the_last_pipeline_is_the_baseline(job):
     asked = []
 
-    class Watched:
+    class Watched(Bench):
         def measure(self, jobs, repeat, progress):
             asked.extend(job.rows for job in jobs)
             raise ConfigError("enough")
@@ -252,11 +252,11 @@ def test_folders_come_first(tmp_path, job):
     (tmp_path / "allegro" / "allegro.urdf").touch()
     (tmp_path / "mug.stl").touch()
     chosen = config(hands=("allegro", "leap"), hand_dir=tmp_path, object_dir=tmp_path, pipelines=("swift",))
-    jobs = plan_jobs(chosen, job().cache)
-    assert {j.hand for j in jobs} == {str(tmp_path / "allegro" / "allegro.urdf"), "leap"}
-    assert {j.object for j in jobs} == {"capsule", str(tmp_path / "mug.stl"), "box"}
+    jobs = plan_requests(chosen)
+    assert {j.values()["hand"] for j in jobs} == {str(tmp_path / "allegro" / "allegro.urdf"), "leap"}
+    assert {j.values()["object"] for j in jobs} == {"capsule", str(tmp_path / "mug.stl"), "box"}
     assert in_folder(None, "mug") == "mug"
     kept, missing = without_missing(config(objects=("mug", "plier")))
     assert (kept.objects, missing) == (("mug",), ["plier"])
     with pytest.raises(ConfigError, match="hand_dir"):
-        plan_jobs(config(hand_dir=tmp_path / "none"), job().cache)
+        plan_requests(config(hand_dir=tmp_path / "none"))

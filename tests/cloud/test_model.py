@@ -7,7 +7,8 @@ import trimesh
 from lgrasp.cloud.model import TRUST, cloud_object, sdf_object
 from lgrasp.errors import ObjectError
 from lgrasp.object.sdf import SdfGrid, sample_sdf
-from lgrasp.planning.planner import Planner, PlanParams
+from lgrasp.planning.params import PlanParams
+from lgrasp.planning.planner import Planner
 
 RADIUS = 0.05
 

@@ -4,7 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lgrasp import notices
-from lgrasp.dataset import write_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ShardError
 from lgrasp_cli.dataset import app
 

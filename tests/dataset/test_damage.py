@@ -9,7 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
-from lgrasp.dataset import files, read_shard, validate_shard, write_shard
+from lgrasp.dataset import files
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import OutputError, ShardError
 
 
@@ -115,7 +118,7 @@ _WRITE_FOREVER = """
 import sys
 sys.path.insert(0, sys.argv[1])
 from support.shards import sample_shard
-from lgrasp.dataset import write_shard
+from lgrasp.dataset.writer import write_shard
 shard = sample_shard(30000)
 print("go", flush=True)
 i = 0
@@ -142,7 +145,7 @@ _DISK_FULL = """
 import resource, sys
 sys.path.insert(0, sys.argv[1])
 from support.shards import sample_shard
-from lgrasp.dataset import write_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import OutputError
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), resource.RLIM_INFINITY))
 try:

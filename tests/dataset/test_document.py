@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lgrasp.dataset import write_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.grasp.schema import ATTRIBUTES, DATASETS, FORMAT_VERSION, SEQUENCE_DATASETS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "reference" / "file-format.md").read_text(encoding="utf-8")

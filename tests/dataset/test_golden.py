@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lgrasp.dataset import read_shard, validate_shard
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
 
 GOLDEN = Path(__file__).parent / "golden"
 

@@ -6,7 +6,13 @@ import h5py
 import numpy as np
 import pytest
 
-from lgrasp.dataset import describe, find_shards, merge_shards, read_shard, validate_shard, write_manifest, write_shard
+from lgrasp.dataset.files import find_shards
+from lgrasp.dataset.info import describe
+from lgrasp.dataset.manifest import write_manifest
+from lgrasp.dataset.merge import merge_shards
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ShardError
 
 
@@ -61,23 +67,26 @@ def test_out_must_not_be_an_input(folder):
 
 def test_manifest(folder, tmp_path, make_shard):
     manifest = write_manifest(folder)
-    document = json.loads(manifest.read_text())
-    assert document["rows"] == 4103
-    assert [entry["rows"] for entry in document["shards"]] == [4100, 0, 3]
+    (run,) = json.loads(manifest.read_text())["runs"]
+    assert [entry["rows"] for entry in run["shards"]] == [4100, 0, 3]
     assert merge_shards(folder, tmp_path / "all.h5") == 4103
     shutil.copy(folder / "9.h5", folder / "new.h5")
-    with pytest.raises(ShardError, match=r"new\.h5: not listed in"):
-        merge_shards(folder, tmp_path / "x.h5")
+    with pytest.raises(ShardError, match=r"1 of the shards there are not listed, first new\.h5"):
+        merge_shards(folder, tmp_path / "x.h5", manifest=manifest)
     (folder / "new.h5").unlink()
-    write_shard(folder / "9.h5", make_shard(4, objects=2, columns=2))
+    data = bytearray((folder / "9.h5").read_bytes())
+    data[-1] ^= 1
+    (folder / "9.h5").write_bytes(data)
     with pytest.raises(ShardError, match=r"9\.h5: SHA-256 is"):
         merge_shards(folder, tmp_path / "x.h5")
     (folder / "9.h5").unlink()
-    with pytest.raises(ShardError, match=r"1 of 3 shards missing, first 9\.h5"):
-        merge_shards(folder, tmp_path / "x.h5", manifest=manifest)
+    with pytest.raises(ShardError, match=r"1 of 3 shards are missing, first 9\.h5"):
+        merge_shards([folder / "8.h5", folder / "7.h5"], tmp_path / "x.h5", manifest=manifest)
     manifest.write_text("[]")
     with pytest.raises(ShardError, match="not a manifest of shards"):
         merge_shards(folder, tmp_path / "x.h5")
+    with pytest.raises(ShardError, match="no manifest there"):
+        merge_shards(folder, tmp_path / "x.h5", manifest=tmp_path / "none.json")
     assert not (tmp_path / "x.h5").exists()
 
 

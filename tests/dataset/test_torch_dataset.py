@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from lgrasp.dataset import read_shard, write_shard
+from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.torch_dataset import GraspDataset
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ShardError
 
 
@@ -72,3 +73,48 @@ def test_errors(folder, make_shard):
     write_shard(folder / "d.h5", replace(shard, hand=replace(shard.hand, sha256="d" * 64)))
     with pytest.raises(ShardError, match=r"d\.h5: another hand"):
         GraspDataset(folder)
+
+
+def sides(data, parts, key):
+    """What ``key`` tells of the rows of each part, as sets."""
+    assert sorted(i for part in parts for i in part.indices) == list(range(len(data)))
+    return [{key(data[i]) for i in part.indices} for part in parts]
+
+
+def test_split_by_object(tmp_path, make_shard):
+    for number in range(6):
+        shard = make_shard(20 + number, objects=1, shard_index=number)
+        objects = [replace(o, sha256=f"{number // 2:064x}", scale=1.0 + number) for o in shard.objects]
+        write_shard(tmp_path / f"{number}.h5", replace(shard, objects=objects))
+    data = GraspDataset(tmp_path)
+    assert len(data.objects) == 6  # three meshes, two scales of each
+    parts = data.split(by="object")
+    found = sides(data, parts, lambda row: data.objects[int(row["object_index"][0])][1])
+    assert [len(s) for s in found] == [1, 1, 1]
+    assert len(set().union(*found)) == 3
+    assert [p.indices for p in data.split(by="object")] == [p.indices for p in parts]
+    assert any(data.split(by="object", seed=s)[0].indices != parts[0].indices for s in range(1, 9))
+    with pytest.raises(ShardError, match="3 object"):
+        data.split(by="object", shares=[1, 1, 1, 1])
+    with pytest.raises(ValueError, match="by='row'"):
+        data.split(by="row")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="shares are positive"):
+        data.split(by="object", shares=(0.5, 0.0))
+
+
+def test_split_keeps_objects_held_at_once_together(folder):
+    data = GraspDataset(folder)
+    with pytest.raises(ShardError, match="cannot be split"):
+        data.split(by="object", shares=(0.7, 0.2, 0.1))
+
+
+def test_split_by_pose(tmp_path, make_shard):
+    shard = make_shard(1000, objects=1)
+    pose = np.repeat(np.arange(250, dtype=np.uint64), 4)
+    candidate = pose + (np.arange(1000, dtype=np.uint64) % np.uint64(4) << np.uint64(32))  # four passes over a pose
+    write_shard(tmp_path / "a.h5", replace(shard, grasps=replace(shard.grasps, candidate=candidate)))
+    data = GraspDataset(tmp_path)
+    parts = data.split(by="pose")
+    found = sides(data, parts, lambda row: int(row["candidate"]) & 0xFFFFFFFF)
+    assert sum(map(len, found)) == 250
+    assert [len(p) for p in parts] == pytest.approx([800, 100, 100], abs=4)

@@ -2,8 +2,10 @@ import h5py
 import numpy as np
 import pytest
 
-from lgrasp.dataset import read_shard, validate_shard, write_shard
+from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.structure import expand
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import ATTRIBUTES, DATASETS
 

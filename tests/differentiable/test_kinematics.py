@@ -49,13 +49,15 @@ def matrices(kinematics: BodyKinematics, q: np.ndarray) -> np.ndarray:
 def fork(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, HandModel]:
     path = tmp_path_factory.mktemp("fork") / "fork.urdf"
     path.write_text(FORK)
-    return path, build_hand(path, minimal_spec("fork", ["left", "nail"], shared={"turn": [-0.5, 0.4]}))
+    return path, build_hand(
+        path, minimal_spec("fork", ["left", "nail"], shared={"turn": [-0.5, 0.4]}), pieces_only=True
+    )
 
 
 @pytest.mark.parametrize("name", HANDS)
 def test_poses_equal_those_of_the_kernels_and_of_pytorch_kinematics(name):
     pk = pytest.importorskip("pytorch_kinematics")
-    model = hand_model(name)
+    model = hand_model(name, pieces_only=True)
     q = postures(model, 5)
     ours = matrices(BodyKinematics(model.tree, dtype=torch.float64), q)
     warp = device_matrix(body_poses(upload_hand(model, "cpu"), q).astype(float).reshape(-1, 7))
@@ -100,7 +102,7 @@ def test_shared_prismatic_and_coupled_joints(fork):
 
 @pytest.mark.parametrize("name", ["fork", "shipped"])
 def test_derivatives_of_first_and_second_order(name, fork):
-    model = fork[1] if name == "fork" else hand_model(name)
+    model = fork[1] if name == "fork" else hand_model(name, pieces_only=True)
     kinematics = BodyKinematics(model.tree, dtype=torch.float64)
     q = torch.from_numpy(postures(model, 1)).requires_grad_()
     assert torch.autograd.gradcheck(kinematics, q, fast_mode=True)
@@ -108,7 +110,7 @@ def test_derivatives_of_first_and_second_order(name, fork):
 
 
 def test_single_precision_is_within_a_micrometre():
-    model = hand_model("shipped")
+    model = hand_model("shipped", pieces_only=True)
     q = postures(model, 64)
     R, t = BodyKinematics(model.tree)(torch.from_numpy(q.astype(np.float32)))
     assert t.dtype == torch.float32

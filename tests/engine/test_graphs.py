@@ -1,9 +1,12 @@
 """Replayed batches give the rows of batches launched step by step."""
 
+import gc
+import weakref
+
 import numpy as np
 
 from lgrasp.engine.graphs import GraphCache
-from lgrasp.engine.shard import Execution, make_shard
+from lgrasp.engine.shard import Execution, make_shard, shard_context
 from lgrasp.grasp.tables import grasp_arrays
 
 
@@ -35,3 +38,14 @@ def test_close_sizes_are_used_again(swift, context):
     graphs = GraphCache(swift)
     graphs.run(context, 0, 200)
     assert [graphs.size(n) for n in (190, 195, 200, 202, 205)] == [190, 200, 200, 200, 205]
+
+
+def test_arrays_of_a_past_shard_stay_while_its_graph_is_replayed(swift, inputs):
+    graphs = GraphCache(swift)
+    context = shard_context(swift, inputs, 0)
+    for first in range(0, 320, 64):
+        graphs.run(context, first, 64)
+    read = weakref.ref(context.held)
+    del context
+    gc.collect()
+    assert read() is not None

@@ -57,13 +57,13 @@ def test_enough_rows(swift, inputs, watched):
 
 
 def test_error_in_a_batch(swift, inputs, watched):
-    watched.fail_at = 128
+    watched.fail_at = 512
     watched.pause = 0.02
     with pytest.raises(RuntimeError, match="out of memory") as caught:
         make_shard(swift, inputs, 0, 10_000, Execution(2, 64))
     assert watched.running == 0
     assert threads() == 0
-    assert max(watched.begun) <= 128 + 3 * 64
+    assert max(watched.begun) <= 512 + 3 * 256
     assert caught.value
 
 
@@ -82,11 +82,11 @@ def test_error_while_reporting(swift, inputs, watched, error):
 def test_progress(swift, inputs):
     seen = []
     result = make_shard(
-        swift, inputs, 0, 30, Execution(2, 100), progress=lambda rows, running: seen.append((rows, running.candidates))
+        swift, inputs, 0, 600, Execution(2, 100), progress=lambda rows, running: seen.append((rows, running.candidates))
     )
-    assert [candidates for _, candidates in seen] == [100 * (i + 1) for i in range(len(seen))]
+    assert [candidates for _, candidates in seen] == [256 * (i + 1) for i in range(len(seen))]
     assert [rows for rows, _ in seen] == sorted(rows for rows, _ in seen)
-    assert seen[-1] == (30, result.candidates)
+    assert seen[-1] == (600, result.candidates)
     assert result.counts["place"]["tried"] == result.candidates
     assert set(result.seconds) == set(swift.order)
     assert result.wall > 0

@@ -19,7 +19,7 @@ SHIPPED = ["barrett", "schunk_svh"]
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_link_is_where_the_urdf_puts_it(name):
     source = find_hand(name)
-    model = build_hand(source.urdf, source.spec)
+    model = build_hand(source.urdf, source.spec, pieces_only=True)
     tree = model.tree
     rng = np.random.default_rng(0)
     q = rng.uniform(tree.joint_lower, tree.joint_upper, (10, model.dofs)).astype(np.float32)
@@ -70,11 +70,11 @@ def test_fingers_behind_a_free_joint_stay_together():
 def test_solids_are_not_doubled():
     """A link on a joint that several groups share has its solid once."""
     source = find_hand("schunk_svh")
-    free = build_hand(source.urdf, source.spec)
+    free = build_hand(source.urdf, source.spec, pieces_only=True)
     held = source.spec.model_copy(
         update={"shared": {}, "locked": {n: v[0] for n, v in source.spec.shared.items()}, "palm": source.spec.palm}
     )
-    assert len(build_hand(source.urdf, held).piece_link) == len(free.piece_link)
+    assert len(build_hand(source.urdf, held, pieces_only=True).piece_link) == len(free.piece_link)
 
 
 def spread_hand(**changes):

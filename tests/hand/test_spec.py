@@ -12,8 +12,10 @@ from support.hands import REAL, ROOT, minimal_spec
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
-from lgrasp.hand.find import find_hand, known_hands
-from lgrasp.hand.spec import HandSpec, hand_digest, load_spec
+from lgrasp.hand.digest import hand_digest
+from lgrasp.hand.find import find_hand
+from lgrasp.hand.names import known_hands
+from lgrasp.hand.spec import HandSpec, load_spec
 from lgrasp.hand.spec_check import check_contact_links
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lgrasp.dataset import read_shard
+from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.jobs.generate import GenerateJob, generate

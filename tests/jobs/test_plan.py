@@ -10,16 +10,19 @@ import trimesh
 from support.jaws import mesh_record
 
 from lgrasp.cloud.read import Cloud
-from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import JobOutcome, run
 from lgrasp.errors import ConfigError, ObjectError, OutputError
+from lgrasp.grasp.records import Shard
 from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.judge.report import Report
 from lgrasp.judge.run import judge
 from lgrasp.object.find import find_object
-from lgrasp.planning.planner import PlanParams
+from lgrasp.planning.params import PlanParams
 
 PENETRATION, GAP, CLOUD_GAP, ANGLE = 2.0, 4.0, 6.0, 45.0  # [mm, deg] that docs/guides/refine.md promises
 ROUNDING = 0.1  # [mm] of distance grids; the judge measures meshes

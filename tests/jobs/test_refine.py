@@ -11,14 +11,18 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support.wrench import unresisted
 
-from lgrasp.dataset import GraspRows, Shard, merge_shards, read_shard, validate_shard, write_shard
+from lgrasp.dataset.merge import merge_shards
+from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.torch_dataset import GraspDataset
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run
 from lgrasp.errors import ShardError
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.records import GraspRows, Shard
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.refine.shards import RefineJob

@@ -5,7 +5,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset import read_shard, validate_shard
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.shard import Execution, make_shard
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.judge.run import judge

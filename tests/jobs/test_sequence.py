@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lgrasp.dataset import read_shard, validate_shard
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
 from lgrasp.engine.pipeline import load_pipeline
@@ -13,11 +14,12 @@ from lgrasp.engine.run import run
 from lgrasp.errors import OutputError
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.jobs.sequence import round as round_module
-from lgrasp.jobs.sequence.inputs import Size, load_sequence_inputs, sequence_keys
+from lgrasp.jobs.sequence.inputs import load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.sequence.round import run_round
 from lgrasp.jobs.sequence.shard import make_sequences
 from lgrasp.runtime.device import resolve_device
+from lgrasp.sequence.size import Size
 
 OBJECTS = ("sphere", "mug")
 SIZE = Size(0.06, 0.08)

@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lgrasp.dataset import Shard, read_shard, validate_shard, write_shard
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.run import run
 from lgrasp.errors import HandError, ShardError
+from lgrasp.grasp.records import Shard
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.refine.plan import PlanJob
@@ -55,13 +58,13 @@ def test_rows_are_refined_with_the_hand_in_their_shard(made: Path, cache_root: P
     shard = read_shard(made)
     assert shard.hand.name == "allegro"
     cache = Cache(cache_root, pytest.fail)
-    (done,) = run(RefineJob(shards=[made], out=tmp_path / "out", device="cpu", cache=cache)).paths
+    (done,) = run(RefineJob(shards=(made,), out=tmp_path / "out", device="cpu", cache=cache)).paths
     assert validate_shard(done) == []
     assert read_shard(done).hand.sha256 == shard.hand.sha256
 
 
 def test_a_named_hand_must_be_that_of_the_shard(made: Path, cache_root: Path, tmp_path: Path):
-    job = RefineJob(shards=[made], out=tmp_path / "out", hand="allegro", device="cpu", cache=Cache(cache_root))
+    job = RefineJob(shards=(made,), out=tmp_path / "out", hand="allegro", device="cpu", cache=Cache(cache_root))
     with pytest.raises(HandError, match="leave --hand out, the hand is in the shard"):
         run(job)
 

@@ -9,6 +9,7 @@ import warp as wp
 
 from lgrasp import notices
 from lgrasp.runtime.device import start
+from lgrasp.runtime.kernels import load_kernels
 from lgrasp_cli import progress
 from lgrasp_cli.main import main
 
@@ -37,10 +38,11 @@ def quick():
 
 
 @pytest.fixture(scope="session")
-def shared_cache(tmp_path_factory):
-    """A cache that all tests of the command line share; compiled kernels stay in the user's."""
+def shared_cache(cache_root):
+    """The cache of all tests; compiled kernels stay in the user's."""
     start()
-    return tmp_path_factory.mktemp("cli-cache")
+    load_kernels("cpu", ["lgrasp.grasp.near_kernels"])  # commands tell when a machine has none
+    return cache_root
 
 
 @pytest.fixture
@@ -83,7 +85,8 @@ def process(shared_cache, tmp_path):
 
     def begin(*arguments):
         command = [sys.executable, "-m", "lgrasp_cli", *map(str, arguments)]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        return subprocess.Popen(command, cwd=tmp_path, env=env, text=True, **pipes)
+        return subprocess.Popen(
+            command, cwd=tmp_path, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
 
     return begin

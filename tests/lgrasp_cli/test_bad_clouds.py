@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lgrasp.dataset import read_shard
+from lgrasp.dataset.reader import read_shard
 
 BALL = trimesh.creation.icosphere(subdivisions=4)
 NORMALS = np.asarray(BALL.vertices)

@@ -52,7 +52,7 @@ def test_stages_use_the_cache(cli, tmp_path, shared_cache, order, quick):
     assert again[-1]["counts"]["kept"] > 0
     other = json.loads(cli("place", *base, "--first", 128 * len(order), "--json", "-").out)
     assert not other[0]["hit"]
-    assert "--candidates 0" in cli("place", "--object", "tiny", "--candidates", 0).error()
+    assert "'--candidates'" in cli("place", "--object", "tiny", "--candidates", 0).error()
 
 
 def test_a_damaged_table_is_made_anew(cli, quick):
@@ -124,6 +124,21 @@ def test_run(cli, tmp_path, quick):
     assert [line.split()[-1] for line in result.out.splitlines()[1:]] == ["done", "failed", "done"]
     made = sorted(p.relative_to(tmp_path / "made").parts[0] for p in (tmp_path / "made").rglob("*.h5"))
     assert made == ["allegro-sphere", "allegro-tiny"]
+
+
+def test_run_by_an_array(cli, tmp_path, quick, monkeypatch):
+    """Tasks share the shards of all jobs; only more tasks than these are refused."""
+    config = tmp_path / "c.yaml"
+    config.write_text(f"objects: [tiny, sphere]\npipelines: [{quick}]\nrows: 5\nout: made\ndevice: cpu\n")
+    for task, states in enumerate((["done", "of other tasks"], ["of other tasks", "done"])):
+        data = json.loads(cli("run", config, "--array", f"{task}/2", "--json", "-").out)
+        assert [job["status"] for job in data["jobs"]] == states
+    assert len(list((tmp_path / "made").rglob("*.h5"))) == 2
+    for name, value in {"ID": 0, "MIN": 0, "MAX": 2, "STEP": 1, "COUNT": 3}.items():
+        monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", str(value))
+    result = cli("run", config)
+    assert result.code == 2
+    assert "array task 0 of 3: there are 2 shards to share" in result.err
 
 
 @pytest.mark.parametrize(
@@ -256,7 +271,7 @@ def test_bench_table1_refuses(cli):
     assert "hand_dir" in cli("bench", "table1", "--hand-dir", "absent", "--objects", "mug").error()
     result = cli("bench", "table1", "--objects", "plier", "--device", "cpu", "-n", 1)
     assert result.code == 2
-    assert "no cell could be measured" in result.err
+    assert "object 'plier' is neither" in result.err
 
 
 def test_warm_up(cli):

@@ -22,8 +22,8 @@ from lgrasp.object.find import find_object
         (["-n", "many"], "valid integer"),
         (["--shard-rows", "0"], "--shard-rows 0"),
         (["--workers", "-1"], "--workers"),
-        (["--num-shards", "0"], "--num-shards 0"),
-        (["--shard-index", "3"], "--shard-index 3"),
+        (["--array", "0/0"], "--array 0/0"),
+        (["--array", "4"], "accepted are auto, off, and I/N"),
         (["--seed", "-1"], "--seed -1"),
         (["--contacts", "3,7"], "from 2 to 5"),
         (["--contacts", "three"], "from 2 to 5"),
@@ -69,7 +69,7 @@ def test_cache_is_a_file(generate, tmp_path):
 
 def write_meshes(folder):
     """Name -> words of the error."""
-    mesh = trimesh.load(find_object("tiny"))
+    mesh = trimesh.load_mesh(find_object("tiny"))
     text = find_object("tiny").read_text()
     vertices = [line for line in text.splitlines() if line.startswith("v ")]
     (folder / "nan.obj").write_text(text.replace(vertices[3], "v nan 0 0"))
@@ -78,11 +78,8 @@ def write_meshes(folder):
     (folder / "garbage.stl").write_bytes(np.random.default_rng(0).bytes(4000))
     (folder / "garbage.glb").write_bytes(np.random.default_rng(0).bytes(4000))
     (folder / "text.xyz").write_text("0 0 0")
-    big = mesh.copy().apply_scale(1000)
-    big.export(folder / "millimetres.obj")
-    mesh.copy().apply_scale(1200).export(folder / "hundred.obj")
-    flat = mesh.copy().apply_transform(np.diag([1, 1, 0, 1]))
-    flat.export(folder / "flat.obj")
+    for name, scale in (("millimetres", [1000] * 3), ("hundred", [1200] * 3), ("flat", [1, 1, 0])):
+        trimesh.Trimesh(mesh.vertices * scale, mesh.faces, process=False).export(folder / f"{name}.obj")
     return {
         "nan.obj": "NaN or infinite",
         "empty.obj": "0 bytes",

@@ -9,6 +9,7 @@ import torch
 
 from lgrasp.learn.network import CoarseNet
 from lgrasp.learn.params import LearnParams
+from lgrasp_cli.progress import JobProgress
 
 
 def test_fit_and_eval(generate, cli):
@@ -27,7 +28,16 @@ def test_fit_and_eval(generate, cli):
     assert found["refined"][-1] < found["coarse"]
     Path("bad.pt").write_bytes(b"nonsense")
     assert "not a predictor" in cli("learn", "eval", "bad.pt", "out").error()
-    assert "no such file" in cli("learn", "eval", "absent.pt", "out").error()
+    assert "'absent.pt' does not exist" in cli("learn", "eval", "absent.pt", "out").error()
+
+
+def test_interrupted_before_there_is_anything_to_report(generate, cli, monkeypatch):
+    assert generate(rows=20).code == 0
+    monkeypatch.setattr(JobProgress, "cancelled", lambda self: True)
+    done = cli("learn", "fit", "out", "--out", "net.pt", "--device", "cpu")
+    assert (done.code, done.out) == (130, "")
+    assert done.err.startswith("interrupted: 0 finished files")
+    assert not Path("net.pt").exists()
 
 
 def test_bad_options(cli):
@@ -59,6 +69,7 @@ def test_shards_that_cannot_be_learned_from(generate, cli, tmp_path):
 def test_files_that_are_no_predictors(cli):
     params = LearnParams.model_validate({"width": 8})
     net = CoarseNet(torch.zeros(2), torch.ones(2), params)
+    Path("none.h5").touch()  # the predictor is read first
     good = {"format": "lgrasp-coarse", "version": 1, "hand": "h", "hand_sha256": "0" * 64}
     good |= {"params": params.model_dump_json(), "state": net.state_dict()}
     weights = {name: values * float("nan") for name, values in net.state_dict().items()}
@@ -70,11 +81,11 @@ def test_files_that_are_no_predictors(cli):
         ({"state": weights}, "weights that are not finite"),
     ):
         torch.save(good | change, "net.pt")
-        line = cli("learn", "eval", "net.pt", "absent").error()
+        line = cli("learn", "eval", "net.pt", "none.h5").error()
         assert "net.pt: not a predictor of lgrasp" in line
         assert words in line
     torch.save(good, "net.pt")
     data = Path("net.pt").read_bytes()
     assert "absent: no such file" in cli("learn", "eval", "net.pt", "absent").error()
     Path("net.pt").write_bytes(data[: len(data) // 2])
-    assert "not a predictor" in cli("learn", "eval", "net.pt", "absent").error()
+    assert "not a predictor" in cli("learn", "eval", "net.pt", "none.h5").error()

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from lgrasp.dataset import read_shard, validate_shard
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
 
 QUICK = ("--starts", 4, "--device", "cpu")
 
@@ -36,8 +37,8 @@ def test_object(cli, tmp_path):
     assert validate_shard(path) == []
     shard = read_shard(path)
     assert shard.header.pipeline == "plan"
-    assert shard.hand.name == "barrett"
-    assert shard.header.config["stand_off"] == 0.15
+    assert shard.hand.name == "allegro"
+    assert shard.header.config["stand_off"] == 0.12
     again = cli("plan", "--object", "sphere", *QUICK, "--out", tmp_path / "out", "--json", "-")
     assert json.loads(again.out)["present"] == data["grasps"]
     line = cli("plan", "--object", "sphere", *QUICK, "--stand-off", 0.1, "--out", tmp_path / "out").error()

@@ -4,13 +4,16 @@ import json
 import shutil
 import signal
 import time
+from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 import trimesh
 
-from lgrasp.dataset import read_shard, validate_shard
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 
 
 @pytest.fixture
@@ -190,8 +193,15 @@ def test_exports_of_another_hand_or_without_a_mesh(cli, export, tmp_path):
     assert "entry 0: lacks joint 'finger_1_med_joint'" in cli("refine", *base, "barrett").error()
     (tmp_path / "export/objects/tiny.obj").unlink()
     assert "objects/tiny.obj: does not exist" in cli("refine", *base, "allegro").error()
-    assert "choose one of dexgraspnet" in cli("refine", "export", "--from", "x", *base[3:], "allegro").error()
+    assert "choose dexgraspnet" in cli("refine", "export", "--from", "x", *base[3:], "allegro").error()
     assert not (tmp_path / "x").exists()
+
+
+def of_another_run(path, copy):
+    """The same rows, as if they came from elsewhere: of one run they would count once."""
+    shard = read_shard(path)
+    config = {**shard.header.config, "run_key": str(copy)}
+    write_shard(copy, replace(shard, header=replace(shard.header, config=config)))
 
 
 def test_bad_input(cli, shards, tmp_path):
@@ -207,7 +217,7 @@ def test_bad_input(cli, shards, tmp_path):
     other.parent.mkdir()
     other.write_bytes(path.read_bytes()[:9000])
     assert f"{other}: " in cli("refine", other, *out).error()
-    shutil.copy(path, other)
+    of_another_run(path, other)
     assert "name one folder above both" in cli("refine", shards, other.parent, *out).error()
     assert "is a file" in cli("refine", shards, "--out", path).error()
     assert not (tmp_path / "x").exists()
@@ -216,8 +226,7 @@ def test_bad_input(cli, shards, tmp_path):
 def test_a_tree_of_shards_stays_a_tree(cli, shards, tmp_path):
     (path,) = shards.glob("*.h5")
     for name in ("a", "b"):
-        (tmp_path / "tree" / name).mkdir(parents=True)
-        shutil.copy(path, tmp_path / "tree" / name)
+        of_another_run(path, tmp_path / "tree" / name / path.name)
     quick = ("--device", "cpu", "--matching-rounds", 1, "--gradient-steps", 1, "-q")
     assert cli("refine", tmp_path / "tree", "--out", tmp_path / "x", *quick).code == 0
     assert sorted(p.parent.name for p in (tmp_path / "x").rglob("*.h5")) == ["a", "b"]

@@ -71,7 +71,7 @@ def test_bad_configs(cli, config, changes, words):
 def test_bad_options(cli, config):
     assert "no objects" in cli("scenes", "make").error()
     assert "unknown config of scenes" in cli("scenes", "make", "absent.yaml").error()
-    assert "need 0 <= index < number" in cli("scenes", "make", config(), "--shard-index", 3, "--num-shards", 2).error()
+    assert "need 0 <= task < number" in cli("scenes", "make", config(), "--array", "3/2").error()
     assert "no such file" in cli("scenes", "check", "absent").error()
     Path("file").write_text("")
     assert "is a file" in cli("scenes", "make", config(), "--out", "file/out").error()
@@ -116,5 +116,6 @@ def test_ctrl_c_leaves_whole_scenes(process, config, cli, tmp_path):
     _, err = running.communicate(timeout=60)
     assert running.returncode == 130, err
     assert "Run the same command again to resume" in err
-    assert cli("scenes", "check", "out").code == 0
+    assert cli("scenes", "check", *(tmp_path / "out").glob("*.h5")).code == 0
+    assert " of 500 shards are missing" in cli("scenes", "check", "out").err
     assert not list((tmp_path / "out").glob("*.tmp"))

@@ -51,7 +51,7 @@ def sequence(cli, small, tmp_path):
         (["mug", "sphere", "-n", "0"], "at least 1"),
         (["mug", "sphere", "--simulate", "fcc"], "seq6"),
         (["mug", "sphere", "box", "capsule", "bowl", "--scale", "0.05:0.06"], "take at most 4"),
-        (["mug", "sphere", "--num-shards", "0"], "--num-shards 0"),
+        (["mug", "sphere", "--array", "0/0"], "--array 0/0"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -109,10 +109,10 @@ def test_sets(cli, small, tmp_path):
     config.write_text(yaml.safe_dump(given | {"device": "cpu", "out": str(tmp_path / "sets")}))
     plan = cli("run", config, "--dry-run")
     assert len(plan.out.splitlines()) == 3
-    parts = [cli("run", config, "--dry-run", "--num-shards", 2, "--shard-index", i).out for i in (0, 1)]
+    parts = [cli("run", config, "--dry-run", "--array", f"{i}/2").out for i in (0, 1)]
     assert sorted(line for part in parts for line in part.splitlines()[1:]) == sorted(plan.out.splitlines()[1:])
     assert cli("run", config).code == 0
-    assert len(list(Path(tmp_path / "sets").glob("*/*.h5"))) == 2
+    assert len(list(Path(tmp_path / "sets").glob("*/*/*.h5"))) == 2
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_sequences_are_drawn_with_a_seed():
     from lgrasp.jobs.sets import SequenceSets, object_sequences
 
     pool = [f"o{i}" for i in range(12)]
-    sets = SequenceSets(sets=20, length=4, permutations=3)
+    sets = SequenceSets.model_validate({"sets": 20, "length": 4, "permutations": 3})
     drawn = object_sequences(pool, sets, 5)
     assert drawn == object_sequences(pool[::-1], sets, 5) != object_sequences(pool, sets, 6)
     assert len(set(drawn)) == 60

@@ -1,4 +1,4 @@
-"""lgrasp simulate: the shards again, with verdicts."""
+"""lgrasp simulate: verdicts beside the rows of shards, in place or in copies."""
 
 import json
 import signal
@@ -12,7 +12,12 @@ import pytest
 from support.jaws import Jaws
 from support.twins import twin_rows, twin_shard
 
-from lgrasp.dataset import read_shard, validate_shard, write_shard
+from lgrasp.dataset.manifest import write_manifest
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.listing import Renewing
+from lgrasp.jobs import kept_verdicts, simulate
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -26,15 +31,20 @@ def grasps(tmp_path):
     return tmp_path / "grasps"
 
 
-def test_adds_columns_and_keeps_the_rest(cli, grasps, tmp_path):
-    result = cli("simulate", grasps)
+@pytest.mark.parametrize("place", ["in place", "copies"])
+def test_adds_columns_and_keeps_the_rest(cli, grasps, tmp_path, raw_grasps, place):
+    folder = grasps if place == "in place" else tmp_path / "copies"
+    old = {path.name: read_shard(path) for path in grasps.glob("*.h5")}
+    stored = raw_grasps(grasps)
+    result = cli("simulate", grasps, *(["--out", folder] if place == "copies" else []))
     assert result.code == 0, result
     head, row = (line.split() for line in result.out.splitlines()[:2])
     assert row[: head.index("+x")] == ["jaws", "cube", "3", "33.3%"]
     for number, holds in ((0, [True]), (1, [False, False])):
         name = f"jaws-cube-0000{number}.h5"
-        before, after = read_shard(grasps / name), read_shard(tmp_path / "grasps-fc" / name)
-        assert not validate_shard(tmp_path / "grasps-fc" / name)
+        before, after = old[name], read_shard(folder / name)
+        assert not validate_shard(folder / name)
+        assert stored[name].items() <= raw_grasps(folder)[name].items()
         for column, values in before.grasps.columns().items():
             np.testing.assert_array_equal(values, after.grasps.columns()[column], err_msg=column)
         assert after.grasps.physics["fc_holds"].tolist() == holds
@@ -68,9 +78,8 @@ def test_several_objects(cli, tmp_path):
     one, both = json.loads((tmp_path / "report.json").read_text())["results"]
     assert (one["objects"], both["objects"], both["stay"]) == (["one"], ["one", "two"], 1)
     assert both["mass"] == pytest.approx(2 * one["mass"])
-    out = tmp_path / "twins-seq6" / "a.h5"
-    assert not validate_shard(out)
-    found = read_shard(out).grasps
+    assert not validate_shard(path)
+    found = read_shard(path).grasps
     assert found.physics["seq6_object_touches"].tolist() == [[1, 1], [1, 0], [1, -1]]
     objects = json.loads(found.physics_protocols["seq6_holds"])["objects"]
     assert [entry["name"] for entry in objects] == ["one", "two"]
@@ -80,7 +89,7 @@ def test_goes_on_where_it_was(cli, grasps, tmp_path):
     """What is there stays byte for byte; damage is made anew; a second protocol adds its own columns."""
     out = tmp_path / "verdicts"
     assert cli("simulate", grasps, "--out", out, "--json", "-").code == 0
-    kept, lost = sorted(out.iterdir())
+    kept, lost = sorted(out.glob("*.h5"))
     bytes_before = kept.read_bytes()
     lost.write_bytes(lost.read_bytes()[:-50])
     again = cli("simulate", grasps, "--out", out, "--json", "-")
@@ -89,16 +98,88 @@ def test_goes_on_where_it_was(cli, grasps, tmp_path):
     assert kept.read_bytes() == bytes_before
     assert not validate_shard(lost)
     line = cli("simulate", grasps, "--out", out, "--protocol", "gravity6").error()
-    assert "another protocol" in line
-    assert cli("simulate", out, "--out", tmp_path / "both", "--protocol", "gravity6").code == 0
-    physics = read_shard(tmp_path / "both" / kept.name).grasps.physics
+    assert "belongs to another run (it has no verdicts of this protocol)" in line
+
+
+def test_in_place(cli, grasps, tmp_path):
+    """What has its verdicts stays as it is; a second protocol adds its own; other settings replace only when asked."""
+    write_manifest(grasps)
+    first, second = sorted(grasps.glob("*.h5"))
+    assert cli("simulate", first).code == 0
+    bytes_before = first.read_bytes()
+    data = json.loads(cli("simulate", grasps, "--json", "-").out)
+    assert (data["made"], data["present"], data["shards"]) == (2, 1, [first.name, second.name])
+    assert first.read_bytes() == bytes_before
+    assert cli("dataset", "check", grasps).code == 0  # the manifest has the new sizes
+    assert cli("simulate", grasps, "--protocol", "gravity6").code == 0
+    physics = read_shard(first).grasps.physics
     assert {"fc_holds", "gravity6_holds"} <= set(physics)
+    line = cli("simulate", grasps, "--all-directions").error()
+    assert "has other verdicts of fc (all_directions: False there, True requested); --overwrite replaces them" in line
+    assert cli("simulate", grasps, "--all-directions", "--overwrite").code == 0
+    assert (read_shard(second).grasps.physics["fc_directions"] >= 0).all()
+    assert cli("dataset", "check", grasps).code == 0
+    assert sorted(path.name for path in grasps.iterdir()) == [first.name, second.name, "manifest.json"]
+
+
+def test_killed_while_it_replaces_a_shard(cli, grasps, tmp_path, monkeypatch):
+    """The list says nothing of the size of a file that is being replaced, so that nobody calls it damaged."""
+    write_manifest(grasps)
+    seen = []
+
+    def die(source, out, **added):
+        seen.append(cli("status", grasps).out)
+        extend_shard(source, out, **added)
+        seen.append(cli("status", grasps).out)
+        raise MemoryError
+
+    extend_shard = simulate.extend_shard
+    monkeypatch.setattr(simulate, "extend_shard", die)
+    monkeypatch.setattr(Renewing, "close", lambda self: None)
+    assert cli("simulate", grasps).code == 2
+    assert len(seen) == 2
+    assert not any("damaged" in text for text in seen)
+    monkeypatch.undo()
+    assert cli("simulate", grasps).code == 0
+    assert cli("dataset", "check", grasps).code == 0
+
+
+def test_verdicts_so_far_are_kept(cli, grasps, tmp_path, monkeypatch, shared_cache):
+    """A run that was cut goes on with the rows after the last block, and the verdicts are those of a whole run."""
+    path = grasps / "jaws-cube-00001.h5"
+    shard = Jaws(tmp_path).shard(0.004, count=5)
+    squeeze = shard.grasps.q_squeeze.copy()
+    squeeze[::2] = shard.grasps.q[::2] - 0.0001
+    write_shard(path, replace(shard, grasps=replace(shard.grasps, q_squeeze=squeeze)))
+    assert cli("simulate", path, "--out", tmp_path / "whole").code == 0
+    monkeypatch.setattr(kept_verdicts, "_FIRST", 2)
+    monkeypatch.setattr(kept_verdicts, "_BLOCK_SECONDS", 0.0)
+    run, blocks = simulate.verdicts, []
+
+    def cut(scene, rows, *more, **options):
+        blocks.append(rows.candidate.tolist())
+        if len(blocks) == 3:
+            raise MemoryError
+        return run(scene, rows, *more, **options)
+
+    monkeypatch.setattr(simulate, "verdicts", cut)
+    assert cli("simulate", path, "--workers", 1).code == 2
+    result = cli("simulate", path, "--workers", 1, "--json", "-")
+    assert result.code == 0, result
+    assert blocks == [[0, 1], [2, 3], [4], [4]]
+    (entry,) = json.loads(result.out)["results"]
+    assert (entry["rows"], entry["held"]) == (5, 2)
+    found, whole = (read_shard(file).grasps.columns() for file in (path, tmp_path / "whole" / path.name))
+    for name in whole:
+        np.testing.assert_array_equal(found[name], whole[name], err_msg=name)
+    assert not list((shared_cache / "verdicts").glob("*"))
 
 
 def test_bad_input(cli, grasps, tmp_path, monkeypatch):
-    assert "unknown protocol 'fall'; choose fc" in cli("simulate", grasps, "--protocol", "fall").error()
+    assert "--protocol 'fall': choose fc" in cli("simulate", grasps, "--protocol", "fall").error()
     assert "no such file or folder" in cli("simulate", tmp_path / "nothing").error()
     assert "would be overwritten" in cli("simulate", grasps, "--out", grasps).error()
+    before = {path: path.read_bytes() for path in grasps.iterdir()}
     (tmp_path / "text.h5").write_text("no shard")
     assert "not a whole HDF5 file" in cli("simulate", tmp_path / "text.h5", "--out", tmp_path / "a").error()
     heavy = Jaws(tmp_path).shard(0.004)
@@ -108,7 +189,7 @@ def test_bad_input(cli, grasps, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     assert 'pip install "lgrasp[sim]"' in cli("simulate", grasps).error()
     assert not (tmp_path / "a").exists()
-    assert not (tmp_path / "grasps-fc").exists()
+    assert {path: path.read_bytes() for path in grasps.iterdir()} == before
 
 
 def test_interruption_leaves_whole_shards(process, grasps, tmp_path):
@@ -122,8 +203,9 @@ def test_interruption_leaves_whole_shards(process, grasps, tmp_path):
     _, errors = running.communicate(timeout=30)
     assert running.returncode == 130
     assert errors.splitlines()[-1].startswith("interrupted")
-    assert sorted(path.name for path in out.iterdir()) == ["jaws-cube-00000.h5", "jaws-cube-00001.h5"]
-    assert not any(map(validate_shard, out.iterdir()))
+    names = ["jaws-cube-00000.h5", "jaws-cube-00001.h5"]
+    assert sorted(path.name for path in out.iterdir()) == [*names, "manifest.json"]
+    assert not any(validate_shard(out / name) for name in names)
 
 
 def test_validate_is_the_old_name(cli, grasps, tmp_path):
@@ -134,7 +216,7 @@ def test_validate_is_the_old_name(cli, grasps, tmp_path):
     (entry,) = data["results"]
     assert entry["held"] == 1
     seconds = read_shard(tmp_path / "old" / "jaws-cube-00000.h5").statistics
-    assert 0 < seconds["seconds_fc_compile"] <= data["seconds_compile"]
+    assert 0 < float(seconds["seconds_fc_compile"]) <= data["seconds_compile"]
     assert entry["per_s"] == pytest.approx(entry["rows"] / entry["seconds"])
     assert entry["seconds"] + data["seconds_compile"] <= data["seconds"]["total"]
 

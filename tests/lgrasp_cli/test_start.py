@@ -17,9 +17,9 @@ GROUPS = ("hands", "objects", "pipelines", "cache", "dataset", "scenes", "learn"
 
 
 def names():
-    group = typer.main.get_command(app)
+    commands = vars(typer.main.get_command(app))["commands"]
     found = []
-    for name, command in group.commands.items():
+    for name, command in commands.items():
         if command.hidden:  # the name of the release before
             continue
         if name not in GROUPS:  # bench is a command by itself as well
@@ -43,6 +43,14 @@ def test_help_has_an_example(cli, command):
     result = cli(*command, "--help")
     assert result.code == 0
     assert f"Example: lgrasp {' '.join(command)}" in result.out
+
+
+def test_every_command_is_in_a_panel():
+    commands = vars(typer.main.get_command(app))["commands"]
+    panels = {name: command.rich_help_panel for name, command in commands.items() if not command.hidden}
+    assert None not in panels.values(), panels
+    assert (panels["generate"], panels["judge"], panels["cache"]) == ("Generate", "Check", "Developer")
+    assert {"Generate", "Check", "Look", "Data", "Learn", "Developer"} == set(panels.values())
 
 
 def test_version(cli):
@@ -88,11 +96,15 @@ def test_generating_from_the_cache_imports_nothing_slow(run, cache_root, tmp_pat
     ]
     arguments += ["--out", str(tmp_path / "other"), "--cache-dir", str(cache_root)]
     code = f"import sys; sys.argv = {['lgrasp', *arguments]}\nfrom lgrasp_cli.main import main\n"
+    code += "from lgrasp.runtime import kernels\nload = kernels.load_kernels\n"
+    code += "kernels.load_kernels = lambda device, modules, told: print(modules) or load(device, modules, told)\n"
     code += f"try:\n    main()\nfinally:\n    print([m for m in {SLOW} if m in sys.modules])\n"
     code += "    print([m for m in sys.modules if m.startswith(('lgrasp.refine.', 'lgrasp.hand.drafting'))])"
     env = os.environ | {"WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent)}  # Warp adds its version
     result = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
-    slow, others = result.stdout.splitlines()[-2:]
+    compiled, slow, others = result.stdout.splitlines()[-3:]
+    stages = {name.split(".")[2] for name in ast.literal_eval(compiled) if name.startswith("lgrasp.stages.")}
+    assert stages == {"place", "domain", "ik", "search", "filter"}  # before the clock of the rates starts
     assert slow == "[]"
     assert set(ast.literal_eval(others)) <= {"lgrasp.refine.params"}
     assert list((tmp_path / "other").glob("*.h5"))

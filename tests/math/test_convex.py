@@ -87,10 +87,10 @@ def coal_solid(piece: Piece):
     return coal.Convex.convexHull(points, True, "Qt"), np.zeros(3), np.eye(3)
 
 
-def coal_distance(a: Piece, b: Piece, R: np.ndarray, t: np.ndarray) -> float:
-    """Signed distance [m] of a to b, b placed by (R, t); negative when deep."""
+def coal_distance(a: Piece, b: Piece, R: np.ndarray, t: np.ndarray, solids: tuple | None = None) -> float:
+    """Signed distance [m] of a to b, b placed by (R, t); negative when deep. ``solids``: both as coal's, if known."""
     coal = pytest.importorskip("coal")
-    (sa, pa, Ra), (sb, pb, Rb) = coal_solid(a), coal_solid(b)
+    (sa, pa, Ra), (sb, pb, Rb) = solids or (coal_solid(a), coal_solid(b))
     request = coal.DistanceRequest()
     request.gjk_tolerance = 1e-9
     request.epa_tolerance = 1e-9
@@ -113,10 +113,11 @@ def cases():
         margin = float(rng.choice([0.0, 5e-4, 2e-3, 1e-2]))
         away = float(rng.choice([-1, 1]) * 10 ** rng.uniform(-6, -2.3))
         # slide b along u until its distance is margin + away
-        low, high = 0.0, 0.2
+        low, high, solids = 0.0, 0.2, (coal_solid(a), coal_solid(b))
         for _ in range(40):
             t = 0.5 * (low + high)
-            low, high = (t, high) if coal_distance(a, b, R, t * u) < margin + max(away, 1e-6 - margin) else (low, t)
+            near = coal_distance(a, b, R, t * u, solids) < margin + max(away, 1e-6 - margin)
+            low, high = (t, high) if near else (low, t)
         place = 0.5 * (low + high) * u
         pieces += [a, b]
         pairs.append((2 * k, 2 * k + 1))
@@ -195,7 +196,7 @@ def test_long_thin_pieces(device):
         R, t = Rotation.random(random_state=k), rng.uniform(-0.05, 0.05, 3)
         pieces += [Piece(a, planes(a), 0.0), Piece(b, planes(b), 0.0)]
         poses.append(np.concatenate([t, R.as_quat()]))
-        exact.append(coal_distance(*pieces[-2:], R.as_matrix(), t))
+        exact.append(coal_distance(pieces[-2], pieces[-1], R.as_matrix(), t))
     exact = np.array(exact)
     pairs = np.arange(600).reshape(-1, 2)
     for margin in (0.0, 1e-3):

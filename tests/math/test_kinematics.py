@@ -33,7 +33,7 @@ JAWS = """<robot name="jaws">
 def jaws(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, HandModel]:
     path = tmp_path_factory.mktemp("jaws") / "jaws.urdf"
     path.write_text(JAWS)
-    return path, build_hand(path, minimal_spec("jaws", ["left", "nail"]))
+    return path, build_hand(path, minimal_spec("jaws", ["left", "nail"]), pieces_only=True)
 
 
 def postures(model: HandModel, count: int, seed: int = 0) -> np.ndarray:
@@ -74,7 +74,7 @@ def test_poses_equal_yourdfpy_and_pytorch_kinematics(name, device):
     torch = pytest.importorskip("torch")
     pk = pytest.importorskip("pytorch_kinematics")
     path, _ = hand_source(name)
-    model = hand_model(name)
+    model = hand_model(name, pieces_only=True)
     locked = LOCKED.get(name, {})
     q = postures(model, 8)
     ours = link_transforms(model, body_poses(upload_hand(model, device), q))
@@ -96,7 +96,7 @@ def test_poses_equal_yourdfpy_and_pytorch_kinematics(name, device):
 
 @pytest.mark.parametrize("name", HANDS)
 def test_jacobian_equals_finite_differences(name, device):
-    check_jacobian(hand_model(name), device)
+    check_jacobian(hand_model(name, pieces_only=True), device)
 
 
 def check_jacobian(model: HandModel, device: str) -> None:

@@ -5,7 +5,8 @@ import pytest
 
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.outcomes import REASONS, Outcome
-from lgrasp.planning.planner import Planner, PlanParams
+from lgrasp.planning.params import PlanParams
+from lgrasp.planning.planner import Planner
 from lgrasp.refine.params import LocalSearch
 
 QUICK = PlanParams(
@@ -56,4 +57,4 @@ def test_a_start_does_not_depend_on_the_others(planner, planned):
 
 def test_parameters_are_bounded():
     with pytest.raises(ValueError, match="greater than"):
-        LocalSearch(shift=0)
+        LocalSearch(max_translation_step=0)

@@ -13,9 +13,11 @@ from lgrasp.hand.surface import contact_surface, palm_axis
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.object.find import find_object
 from lgrasp.object.preprocess import preprocess_object
-from lgrasp.planning.planner import Planner, PlanParams
+from lgrasp.planning.params import PlanParams
+from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import start_poses, tilted
-from lgrasp.refine.surface import DISTAL, OTHER, farthest_points, hand_surface
+from lgrasp.refine.params import DISTAL, OTHER
+from lgrasp.refine.surface import farthest_points, hand_surface
 from lgrasp.runtime.device import resolve_device
 
 

@@ -4,9 +4,11 @@ import subprocess
 import sys
 
 import pytest
+import warp as wp
 
 from lgrasp.errors import DeviceError
 from lgrasp.runtime.device import resolve_device
+from lgrasp.runtime.kernels import first_time
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:
@@ -61,6 +63,15 @@ def test_closed_stderr_does_not_stop_the_start():
 def test_unknown_device_lists_what_exists(name):
     with pytest.raises(DeviceError, match=r"choose auto, cpu"):
         resolve_device(name)
+
+
+def test_the_first_kernels_of_a_machine_are_announced(tmp_path, monkeypatch):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    assert "compiling kernels once for this machine" in first_time("cpu")
+    (tmp_path / "wp_module_1234567").mkdir()
+    (tmp_path / "wp_module_1234567" / "module.cpu.o").touch()
+    assert first_time("cpu") == ""
+    assert first_time("cuda:0") != ""
 
 
 def test_auto_is_one_of_the_devices():

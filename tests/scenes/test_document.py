@@ -5,7 +5,7 @@ from pathlib import Path
 
 import yaml
 
-from lgrasp.cloud.files import CLOUD_SUFFIXES
+from lgrasp.cloud.suffixes import CLOUD_SUFFIXES
 from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
 

@@ -6,19 +6,17 @@ import trimesh
 import warp as wp
 
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.picture.camera import Intrinsics, look_at
+from lgrasp.picture.depth import NOTHING, LabelledMesh, join_surfaces, render
 from lgrasp.runtime.device import start
-from lgrasp.scenes.camera import Intrinsics, intrinsics_of, look_at, place_cameras
+from lgrasp.scenes.camera import intrinsics_of, place_cameras
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.render import (
-    NOTHING,
     TABLE,
-    LabelledMesh,
     add_noise,
     draw_offsets,
     image_normals,
-    join_surfaces,
     merge_views,
-    render,
     table_surface,
 )
 
@@ -89,7 +87,7 @@ def test_camera_looks_at_its_target_with_the_image_upright(camera):
     eye, target = np.array([[0.5, -0.4, 0.7]]), np.array([0.1, 0.1, 0.0])
     T = np.linalg.inv(pose_matrix(look_at(eye, target))[0])
     seen, above = (T @ [*p, 1.0] for p in (target, target + np.array([0, 0, 0.1])))
-    np.testing.assert_allclose(seen[:3], [0, 0, np.linalg.norm(eye - target)], atol=1e-9)
+    np.testing.assert_allclose(seen[:3], np.array([0, 0, np.linalg.norm(eye - target)]), atol=1e-9)
     assert above[1] < -0.01  # y points down
     np.testing.assert_allclose(above[0], 0, atol=1e-9)
 

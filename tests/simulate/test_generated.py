@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lgrasp.dataset import GraspRows, ShardReader, read_shard
+from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.grasp.records import GraspRows
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts

@@ -7,7 +7,7 @@ import pytest
 from support.jaws import EDGE
 from support.twins import SIDE, in_one_gripper, twin_rows, twin_shard
 
-from lgrasp.dataset import GraspRows, Shard
+from lgrasp.grasp.records import GraspRows, Shard
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
 from lgrasp.simulate.scene import scene_of

@@ -51,6 +51,6 @@ def hand_source(name: str) -> tuple[Path, HandSpec]:
 
 
 @cache
-def hand_model(name: str) -> HandModel:
-    """One of HANDS, built once per test run."""
-    return build_hand(*hand_source(name))
+def hand_model(name: str, *, pieces_only: bool = False) -> HandModel:
+    """One of HANDS, built once per test run; without contact surface where kinematics is all that matters."""
+    return build_hand(*hand_source(name), pieces_only=pieces_only)

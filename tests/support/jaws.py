@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from support.urdfs import gripper
 
-from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import read_urdf

@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 
 
 def sample_hand(joints=4, links=3) -> HandRecord:

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from support.jaws import EDGE, HEIGHT, mesh_record
 
-from lgrasp.dataset import GraspRows, HandRecord, Shard, ShardHeader
+from lgrasp.grasp.records import GraspRows, HandRecord, Shard, ShardHeader
 
 __all__ = ["SIDE", "in_one_gripper", "twin_rows", "twin_shard"]
 

@@ -1,6 +1,7 @@
 """The parts of an export other than its grasps: the hand, the meshes, a README, and an index that is written last."""
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,18 +12,22 @@ from trimesh.exchange.obj import export_obj
 import lgrasp
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.selection import ExportObject, Selection
-from lgrasp.dataset.files import write_file
 from lgrasp.errors import OutputError
+from lgrasp.files import remove_leftovers, write_file
 
 
-def check_empty(out: Path) -> None:
-    """Check that an export can be written into a folder, which need not exist.
+def check_empty(out: Path, run_key: str = "") -> None:
+    """Check that an export can be written into a folder, which need not exist, or holds a part of the same export: all
+    files have the same names again, and are replaced.
 
     Raises:
-        OutputError: It holds something, is a file, or cannot be read.
+        OutputError: It holds something else, is a file, or cannot be read.
     """
     rule = "--out needs an empty folder, or one that does not exist"
     try:
+        remove_leftovers(out, f"{Path(_UNFINISHED).stem}.*.tmp")
+        if run_key and _interrupted(out) == run_key:
+            return
         for first in sorted(path.name for path in out.iterdir()):
             raise OutputError(f"{out} is not empty (it holds {first}); {rule}")
     except FileNotFoundError:
@@ -36,6 +41,7 @@ def check_empty(out: Path) -> None:
 HAND, OBJECTS, GRASPS = "hand", "objects", "grasps"
 """Folders of an export."""
 INDEX, INDEX_FORMAT = "export.json", "lgrasp-export"
+_UNFINISHED = "unfinished.json"  # what becomes the index
 
 
 def write_assets(out: Path, selection: Selection) -> None:
@@ -61,6 +67,30 @@ def object_text(item: ExportObject) -> str:
 def mesh_text(mesh: Trimesh, **options: Any) -> str:
     """A mesh as OBJ: vertices and faces only."""
     return export_obj(mesh, include_normals=False, include_texture=False, digits=9, **options)
+
+
+def begin(out: Path, run_key: str) -> None:
+    """Mark a folder as that of an unfinished export.
+
+    Raises:
+        OutputError: The folder cannot be written.
+    """
+    write_file(out / _UNFINISHED, json.dumps({"run_key": run_key}))
+
+
+def abandon(out: Path) -> None:
+    """Remove the folder of an export that failed before its first file."""
+    if [path.name for path in out.iterdir()] == [_UNFINISHED]:
+        (out / _UNFINISHED).unlink()
+        out.rmdir()
+
+
+def _interrupted(out: Path) -> str | None:
+    """Key of the unfinished export that a folder holds, if it holds one."""
+    try:
+        return str(json.loads((out / _UNFINISHED).read_bytes())["run_key"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def write_index(
@@ -103,7 +133,9 @@ def write_index(
             for item, count in zip(selection.objects, selection.counts, strict=True)
         },
     }
-    write_file(out / INDEX, json.dumps(document, indent=2) + "\n")
+    remove_leftovers(out, "**/*.tmp")
+    write_file(out / _UNFINISHED, json.dumps(document, indent=2) + "\n")
+    os.replace(out / _UNFINISHED, out / INDEX)
 
 
 _TEXT = """\

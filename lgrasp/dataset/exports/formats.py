@@ -6,16 +6,18 @@ from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
+from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgraspbench, write_dexgraspbench
 from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
-from lgrasp.dataset.exports.folder import check_empty, readme, write_assets, write_index
+from lgrasp.dataset.exports.folder import abandon, begin, check_empty, readme, write_assets, write_index
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
 from lgrasp.dataset.exports.reading import GraspSet
-from lgrasp.dataset.exports.selection import Selection, parse_condition, select_rows
-from lgrasp.dataset.files import Paths, find_shards, write_file
-from lgrasp.errors import ConfigError
+from lgrasp.dataset.exports.selection import Selection, select_rows
+from lgrasp.dataset.files import Paths
+from lgrasp.errors import ConfigError, LgraspError
+from lgrasp.files import write_file
 
 
 class Format(NamedTuple):
@@ -80,7 +82,8 @@ def export_shards(
         limit: Most rows.
         cut: Convex pieces of an object, for formats that simulate; without it the hull of its mesh collides.
         advance: Called with rows done and rows in all.
-        run_key: Kept in ``export.json``, to tell a later run that the export is its own.
+        run_key: Of the shards and options, to tell a later run that the export, whole or not, is its own; without it an
+            export that was interrupted cannot be gone on with.
 
     Raises:
         ConfigError: An unknown format, a condition that cannot be read, or a limit below 1.
@@ -93,8 +96,8 @@ def export_shards(
     if limit is not None and limit < 1:
         raise ConfigError(f"--limit {limit}: must be at least 1")
     form, conditions, out = FORMATS[to], [parse_condition(text) for text in where], Path(out)
-    check_empty(out)
-    selection = select_rows(find_shards(paths), where=conditions, limit=limit, single=form.single)
+    check_empty(out, run_key)
+    selection = select_rows(paths, where=conditions, limit=limit, single=form.single)
     frames = HandFrames(selection.hand.urdf, selection.hand.base_link, selection.hand.joint_names, selection.shards[0])
     write = form.writer(selection, frames, cut)
     chosen = list(map(str, conditions))
@@ -106,7 +109,12 @@ def export_shards(
         if advance:
             advance(done, selection.rows)
 
-    write_assets(out, selection)
+    begin(out, run_key)
+    try:
+        write_assets(out, selection)
+    except LgraspError:
+        abandon(out)
+        raise
     write_file(out / "README.txt", readme(selection, frames, form.notes, chosen))
     write(out, count)
     write_index(out, selection, frames, to, chosen, run_key)

@@ -12,8 +12,9 @@ from lgrasp.dataset.exports.folder import GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.reading import GraspSet, open_folder
 from lgrasp.dataset.exports.selection import Batch, Selection
-from lgrasp.dataset.files import new_file, parsing
+from lgrasp.dataset.files import parsing
 from lgrasp.errors import ShardError
+from lgrasp.files import new_file
 from lgrasp.geometry.poses import inverse
 
 _POSTURES = ("cspace_position", "pregrasp_cspace_position", "squeeze_cspace_position")

@@ -13,8 +13,9 @@ from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.mjcf_scene import Keyframe, MjcfScene, SceneObject
 from lgrasp.dataset.exports.reading import GraspSet, open_folder, order_of
 from lgrasp.dataset.exports.selection import Selection
-from lgrasp.dataset.files import parsing, write_file
+from lgrasp.dataset.files import parsing
 from lgrasp.errors import ShardError
+from lgrasp.files import write_file
 from lgrasp.geometry.poses import inverse
 from lgrasp.grasp.records import ObjectRecord
 

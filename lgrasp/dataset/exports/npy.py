@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from lgrasp.dataset.exports.unpickle import load_plain
-from lgrasp.dataset.files import new_file, parsing, write_file
+from lgrasp.dataset.files import parsing
+from lgrasp.files import new_file, write_file
 
 _PROTOCOL = 3  # names are plain text in it, and every Python 3 reads it
 

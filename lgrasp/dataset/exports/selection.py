@@ -8,62 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lgrasp.dataset.conditions import OBJECTS_HELD, Condition
 from lgrasp.dataset.exports.hand import free_name
+from lgrasp.dataset.files import Paths
+from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.errors import ConfigError, ShardError
+from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.schema import CHUNK_ROWS
-
-OBJECTS_HELD = "objects"
-"""The number of objects in the hand, as if it were a column."""
-
-_OPERATORS = {">=": np.greater_equal, "<=": np.less_equal, "==": np.equal, "!=": np.not_equal}
-_OPERATORS |= {">": np.greater, "<": np.less}
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_PATTERN = re.compile(rf"\s*([\w/.-]+?)\s*(?:({'|'.join(_OPERATORS)})\s*({_NUMBER})\s*)?", re.ASCII)
-
-
-class Condition(NamedTuple):
-    """A column of one number per row, compared with a number; without an operator it must be true (not 0)."""
-
-    column: str
-    operator: str = "!="
-    value: float = 0.0
-
-    def __str__(self) -> str:
-        return self.column if self[1:] == ("!=", 0.0) else f"{self.column} {self.operator} {self.value:g}"
-
-    def holds(self, reader: ShardReader) -> np.ndarray:
-        """Which rows satisfy it, bool, shape [N]; a NaN satisfies nothing.
-
-        Raises:
-            ShardError: The shard has no such column, or not one number per row.
-        """
-        single = [OBJECTS_HELD, *(name for name, (shape, _) in reader.columns.items() if len(shape) == 1)]
-        if self.column not in single:
-            hint = " (lgrasp simulate adds physics columns)" if self.column.startswith("physics/") else ""
-            known = ", ".join(single)
-            raise ShardError(f"{reader.path}: no column {self.column!r}{hint}; with one number per row it has {known}")
-        held = self.column == OBJECTS_HELD
-        values = (reader.column("object_index") >= 0).sum(1) if held else reader.column(self.column)
-        return _OPERATORS[self.operator](values, self.value) & ~np.isnan(values.astype(np.float64))
-
-
-def parse_condition(text: str) -> Condition:
-    """Read ``COLUMN`` or ``COLUMN OP NUMBER`` with OP one of ``> >= < <= == !=``.
-
-    Raises:
-        ConfigError: It is neither.
-    """
-    match = _PATTERN.fullmatch(text)
-    if match is None:
-        raise ConfigError(f"--where '{text}': expected COLUMN or COLUMN OP NUMBER, such as 'metrics/epsilon > 0.01'")
-    column, sign, number = match.groups()
-    return Condition(column, sign, float(number)) if sign else Condition(column)
-
-
-HOLDS = "physics/fc_holds"
-"""Column that says whether a simulator saw the grasp hold."""
+from lgrasp.simulate.protocol import HOLDS
 
 
 class ExportObject(NamedTuple):
@@ -166,12 +119,12 @@ class Selection:
 
 
 def select_rows(
-    paths: Sequence[Path], *, where: Sequence[Condition] = (), limit: int | None = None, single: bool = False
+    paths: Paths, *, where: Sequence[Condition] = (), limit: int | None = None, single: bool = False
 ) -> Selection:
     """Choose rows; reads only the columns of the conditions.
 
     Args:
-        paths: Shard files.
+        paths: Shard files, or folders of any depth; in these, shards that cannot be taken are left out with a notice.
         where: Conditions that a row must satisfy, all of them.
         limit: Most rows, counted over all shards in the order given.
         single: Insist on one object in every row.
@@ -180,30 +133,38 @@ def select_rows(
         ShardError: A shard cannot be read, hands differ, no row is left, or a row holds several objects and ``single``.
     """
     hand: HandRecord | None = None
+    source: Path | None = None
     known: dict[tuple[str, str, float], ExportObject] = {}
     sources: list[_Source] = []
     chosen = seen = 0
-    for path in paths:
-        with ShardReader(path) as reader:
-            this = reader.hand()
-            hand = hand or this
-            if this.sha256 != hand.sha256 or sorted(this.joint_names) != sorted(hand.joint_names):
-                raise ShardError(
-                    f"{path}: another hand ({this.name}) than {paths[0]} ({hand.name}); export one at a time"
-                )
-            columns = [list(this.joint_names).index(name) for name in hand.joint_names]
-            places = np.array([*(_place(record, path, known) for record in reader.objects()), -1])  # -1: absent
-            good = np.ones(len(reader), bool)
-            for condition in where:
-                good &= condition.holds(reader)
-            rows = np.flatnonzero(good)[: None if limit is None else limit - chosen]
-            seen += len(reader)
-            index = reader.column("object_index")[rows]
+
+    def look(reader: ShardReader) -> tuple[np.ndarray, np.ndarray, int]:
+        """The rows that conditions leave, their ``object_index``, and the number of all rows."""
+        good = np.ones(len(reader), bool)
+        for condition in where:
+            good &= condition.holds(reader)
+        rows = np.flatnonzero(good)
+        index = reader.column("object_index")[rows]
         several = np.flatnonzero((index >= 0).sum(1) != 1)
         if single and len(several):
             count = int((index[several[0]] >= 0).sum())
             hint = f"choose rows with --where '{OBJECTS_HELD} == 1', or --to mjcf"
-            raise ShardError(f"{path}: row {rows[several[0]]} holds {count} objects, this format one; {hint}")
+            raise ShardError(f"{reader.path}: row {rows[several[0]]} holds {count} objects, this format one; {hint}")
+        return rows, index, len(reader)
+
+    for path, _, (rows, index, number) in gather(paths, look):
+        with ShardReader(path) as reader:
+            this = reader.hand()
+            hand, source = hand or this, source or path
+            if this.sha256 != hand.sha256 or sorted(this.joint_names) != sorted(hand.joint_names):
+                raise ShardError(
+                    f"{path}: another hand ({this.name}) than {source} ({hand.name}); export one at a time"
+                )
+            columns = [list(this.joint_names).index(name) for name in hand.joint_names]
+            places = np.array([*(_place(record, path, known) for record in reader.objects()), -1])  # -1: absent
+        rows = rows[: None if limit is None else limit - chosen]
+        index = index[: len(rows)]
+        seen += number
         sources.append(_Source(path, rows, places[index], columns, chosen))
         chosen += len(rows)
         if chosen == limit:
@@ -212,7 +173,7 @@ def select_rows(
     if not chosen:
         why = f"none satisfies {' and '.join(map(str, where))}" if where and seen else "there are none"
         of = f"{len(sources)} shard{'s' * (len(sources) > 1)}, {seen:,} rows"
-        raise ShardError(f"{paths[0]}: no rows to export; {why} ({of})")
+        raise ShardError(f"{source}: no rows to export; {why} ({of})")
     objects = list(known.values())
     counts = np.bincount(np.concatenate([s.index[s.index >= 0] for s in sources]), minlength=len(objects))
     order = sorted(np.flatnonzero(counts), key=lambda i: objects[i].code)

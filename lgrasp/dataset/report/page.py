@@ -30,8 +30,12 @@ from lgrasp.dataset.report.tables import (
 )
 
 
-def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows]) -> str:
-    """The page of the numbers of a report, and of the hands that they were made of, for the samples."""
+def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows], pictures: str = "") -> str:
+    """The page of the numbers of a report, and of the hands that they were made of, for the samples.
+
+    Args:
+        pictures: some of the rows as HTML.
+    """
     objects = [" + ".join(group["objects"]) for hand in numbers["hands"] for group in hand["objects"]]
     names = [hand["hand"] for hand in numbers["hands"]]
     what = names[0] if len(names) == 1 else f"{len(names)} hands"
@@ -43,7 +47,7 @@ def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows]) -> 
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n"
-        + "\n".join([_head(title, numbers), *hand_sections])
+        + "\n".join([_head(title, numbers), pictures, *hand_sections])
         + "\n</body>\n</html>\n"
     )
 

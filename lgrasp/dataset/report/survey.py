@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from lgrasp.dataset.files import Paths, check_heaps, shard_tree
+from lgrasp.dataset.files import Paths, check_heaps
+from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.grasp.records import ShardHeader
 
@@ -37,7 +38,7 @@ def survey(paths: Paths) -> tuple[list[Head], list[str]]:
     Raises:
         ShardError: No shard is found, or one cannot be read.
     """
-    heads = [_head(path) for path in shard_tree(paths).values()]
+    heads = [shard.value for shard in gather(paths, _head)]
     meanings: dict[str, set[tuple[str, str, float]]] = defaultdict(set)
     for head in heads:
         for key in head.objects:
@@ -46,29 +47,28 @@ def survey(paths: Paths) -> tuple[list[Head], list[str]]:
     return sorted(heads, key=lambda h: (h.hand, h.labels)), _remarks(heads)
 
 
-def _head(path: Path) -> Head:
-    check_heaps(path)
-    with ShardReader(path) as reader:
-        header, attributes, keys = reader.header, reader.attributes, reader.object_keys
-        run = header.config.get("run_key") or json.dumps(dict(header.config), sort_keys=True)
-        indices = [part["shard_index"] for part in header.merged_from] or [header.shard_index]
-        hand = (str(attributes["hand"]), str(attributes["hand_sha256"]))
-        try:
-            stages = [next(iter(stage)) for stage in header.config["pipeline"]["stages"]]
-        except (KeyError, TypeError, StopIteration):  # of another writer
-            stages = []
-        return Head(
-            path=path,
-            bytes=path.stat().st_size,
-            rows=len(reader),
-            hand=hand,
-            objects=keys,
-            labels=[],
-            header=header,
-            parts=[(f"{hand} {keys} {header.pipeline} {header.seed} {run}", index) for index in indices],
-            stages=stages,
-            statistics=reader.statistics,
-        )
+def _head(reader: ShardReader) -> Head:
+    check_heaps(reader.path)
+    header, attributes, keys = reader.header, reader.attributes, reader.object_keys
+    run = header.config.get("run_key") or json.dumps(dict(header.config), sort_keys=True)
+    indices = [part["shard_index"] for part in header.merged_from] or [header.shard_index]
+    hand = (str(attributes["hand"]), str(attributes["hand_sha256"]))
+    try:
+        stages = [next(iter(stage)) for stage in header.config["pipeline"]["stages"]]
+    except (KeyError, TypeError, StopIteration):  # of another writer
+        stages = []
+    return Head(
+        path=reader.path,
+        bytes=reader.path.stat().st_size,
+        rows=len(reader),
+        hand=hand,
+        objects=keys,
+        labels=[],
+        header=header,
+        parts=[(f"{hand} {keys} {header.pipeline} {header.seed} {run}", index) for index in indices],
+        stages=stages,
+        statistics=reader.statistics,
+    )
 
 
 def _label(key: tuple[str, str, float], others: set[tuple[str, str, float]]) -> str:
@@ -85,7 +85,7 @@ def _remarks(heads: list[Head]) -> list[str]:
     holder: dict[tuple[str, int], Path] = {}
     twice: set[str] = set()
     for head in heads:
-        twice |= {f"{head.path.name} and {holder[part].name}" for part in head.parts if part in holder}
+        twice |= {f"{head.path} and {holder[part]}" for part in head.parts if part in holder}
         for part in head.parts:
             holder.setdefault(part, head.path)
     empty = [head.path.name for head in heads if not head.rows]

@@ -1,10 +1,11 @@
 """Makes the report: shards in, one HTML file and the numbers out."""
 
+import base64
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lgrasp.dataset.files import Paths, write_file
+from lgrasp.dataset.files import Paths
 from lgrasp.dataset.info import SURVIVORS, stage_counts, survivors
 from lgrasp.dataset.merge import sum_statistics
 from lgrasp.dataset.reader import ShardReader
@@ -13,9 +14,15 @@ from lgrasp.dataset.report.gather import HandRows, ObjectRows
 from lgrasp.dataset.report.page import page
 from lgrasp.dataset.report.quantity import Distribution
 from lgrasp.dataset.report.survey import Head, survey
+from lgrasp.dataset.report.tables import escape, figure
 from lgrasp.dataset.report.verdicts import held_numbers
-from lgrasp.errors import OutputError
+from lgrasp.dataset.scenes import SceneRows, draw_rows
+from lgrasp.errors import LgraspError, OutputError
+from lgrasp.files import write_file
+from lgrasp.picture.sheet import image_bytes
 from lgrasp.runtime.device import resolve_device
+
+_PICTURES, _SIZE = 8, 160  # of a report, and pixels of a side
 
 
 def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
@@ -36,8 +43,21 @@ def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], No
     if out.exists() and not out.is_file():
         raise OutputError(f"report {out} cannot be written: it is no regular file; name another")
     numbers, hands = read_dataset(paths, progress=progress)
-    write_file(out, page(numbers, hands))
+    write_file(out, page(numbers, hands, _pictures(paths) if numbers["rows"] else ""))
     return numbers
+
+
+def _pictures(paths: Paths) -> str:
+    """Some rows, drawn."""
+    try:
+        rows = SceneRows(paths)
+        chosen = rows.spread(_PICTURES)
+        image = draw_rows(rows, chosen, size=_SIZE, columns=_PICTURES // 2)
+    except LgraspError as error:  # what is reported need not be of a hand that can be drawn
+        return f'<p class="note">No pictures: {escape(str(error))}</p>'
+    data = base64.b64encode(image_bytes(image, ".jpg")).decode()
+    caption = f"{len(chosen)} of {len(rows):,} rows, evenly spread. Dots are contacts. More: lgrasp render, lgrasp view"
+    return figure(f'<img alt="grasps" src="data:image/jpeg;base64,{data}" style="max-width:100%">', caption)
 
 
 def read_dataset(

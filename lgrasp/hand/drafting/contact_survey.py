@@ -55,7 +55,8 @@ def survey_contacts(
     Args:
         jaws: (static link, moving link) of a gripper whose one drive closes them; nothing else touches then.
     """
-    model = build_hand(urdf.path, probe_spec(name, tip_link(urdf, structure), locked, structure.base_link))
+    probe = probe_spec(name, tip_link(urdf, structure), locked, structure.base_link)
+    model = build_hand(urdf.path, probe, pieces_only=True)
     tree = model.tree
     postures = sample_bodies(model, model.random_postures(_SAMPLED_POSTURES))
     surfaces = link_surfaces(urdf, model)

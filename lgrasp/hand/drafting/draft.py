@@ -26,7 +26,7 @@ from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
-from lgrasp.math.kinematics import MAX_JOINTS
+from lgrasp.math.limits import MAX_JOINTS
 
 _LEAST_EXTENT, _MOST_EXTENT = 0.02, 3.0  # [m] of a hand, an arm included
 _OPEN_DRAWS = 800
@@ -92,7 +92,10 @@ def draft_spec(
     if jaws is None:
         spec, decided = _with_shared(urdf, survey, spec, decided)
     # without shared joints the hand is that of the survey in another open posture
-    model = build_hand(urdf.path, spec) if spec.shared else replace(survey.model, tree=build_tree(urdf, spec))
+    if spec.shared:
+        model = build_hand(urdf.path, spec, pieces_only=True)
+    else:
+        model = replace(survey.model, tree=build_tree(urdf, spec))
     spaces, of_spaces = propose_spaces(urdf, spec, survey, names, model)
     return spec.model_copy(update={"opposition_spaces": spaces}), [*decided, *of_spaces]
 
@@ -183,7 +186,7 @@ def _unlocked(urdf: Urdf, name: str, structure: FingerStructure, locked: dict[st
     shared = {n: (value,) for n, value in locked.items() if n not in held}
     spec = probe_spec(name, tip_link(urdf, structure), held, structure.base_link)
     try:
-        return build_hand(urdf.path, spec.model_copy(update={"shared": shared}))
+        return build_hand(urdf.path, spec.model_copy(update={"shared": shared}), pieces_only=True)
     except HandError:
         return None
 

@@ -5,20 +5,21 @@ import itertools
 import os
 import re
 import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import trimesh
 from lxml import etree
 
-from lgrasp.errors import HandError, LgraspError
+from lgrasp.errors import HandError, LgraspError, OutputError
+from lgrasp.files import new_folder
 from lgrasp.hand.build import build_hand
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, thin_mesh
-from lgrasp.hand.spec import Box, ContactRule, HandSpec, hand_digest, load_spec
+from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
 from lgrasp.hand.urdf import find_mesh, parse_robot, read_urdf
 from lgrasp.paths import cache_dir, user_dir
 
@@ -56,39 +57,24 @@ def import_urdf(urdf: Path, *, name: str | None = None, out: Path | None = None,
         raise HandError(f"hand folder {folder} exists; choose another --name or --out, or replace it with --overwrite")
     if folder.exists() and not (folder / "hand.yaml").is_file() and any(folder.iterdir() if folder.is_dir() else [1]):
         raise HandError(f"{folder} holds something that is no hand (it has no hand.yaml); choose another --out")
+    originals: dict[Path, Path] = {}
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
-    except OSError as error:
-        raise HandError(f"hand folder {folder} cannot be made: {error.strerror}; choose another with --out") from None
-    originals = {temporary / "hand.urdf": urdf}
-    try:
-        spec, changes = _fill(urdf, name, temporary, originals)
-        temporary.chmod(0o755)
-        _swap(temporary, folder)
+        with new_folder(folder) as made:
+            originals[made / "hand.urdf"] = urdf
+            spec, changes = _fill(urdf, name, made, originals)
+    except OutputError as error:
+        raise HandError(f"hand folder {error}; choose another with --out") from None
     except LgraspError as error:
         # messages name the user's files, not copies that are gone
         text = str(error)
         for copy, original in originals.items():
             text = text.replace(str(copy.resolve()), str(original)).replace(str(copy), str(original))
         raise type(error)(text) from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return ImportedHand(folder, spec, changes)
 
 
 def _slug(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("._-") or "hand"
-
-
-def _swap(new: Path, folder: Path) -> None:
-    if not os.path.lexists(folder):
-        os.replace(new, folder)
-        return
-    old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
-    os.replace(folder, old / "old")
-    os.replace(new, folder)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> tuple[HandSpec, list[str]]:

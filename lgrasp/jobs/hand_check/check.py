@@ -1,6 +1,5 @@
 """Try a hand on a ball, a box and a cylinder: survivors per stage, reasons for losses, pictures."""
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,8 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.errors import HandError, OutputError
+from lgrasp.errors import HandError
+from lgrasp.files import temporary_folder
 from lgrasp.grasp.records import Shard
 from lgrasp.hand.opposition.facing import space_opening, space_postures
 from lgrasp.hand.opposition.spaces import hand_spaces, longest, space_sides
@@ -104,15 +104,15 @@ def check_hand(
     checks: list[ObjectCheck] = []
     shards: dict[str, Shard] = {}
     inputs = None
-    with tempfile.TemporaryDirectory(prefix="lgrasp-check-") as folder:
-        for name, mesh in check_objects(Path(folder)).items():
+    with temporary_folder() as folder:
+        for name, mesh in check_objects(folder).items():
             say(f"{name} of 5 cm")
             job = GenerateJob(
                 hand=hand,
                 object=str(mesh),
                 rows=rows,
                 pipeline=bounded,
-                out=Path(folder) / "grasps",
+                out=folder / "grasps",
                 device=device,
                 workers=workers,
                 shard_rows=rows,
@@ -171,17 +171,13 @@ def longest_sequence(inputs: Inputs, checks: list[SpaceCheck]) -> int:
 
 
 def _draw(inputs: Inputs, shards: dict[str, Shard], spaces: list[str], out: Path) -> list[Path]:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        pictures = [
-            draw_hand(inputs, out / "hand.png"),
-            draw_palmar(inputs, out / "palmar.png"),
-            draw_workspace(inputs, out / "workspace.png"),
-        ]
-        pictures += [draw_spaces(inputs, spaces, out / "spaces.png")] if spaces else []
-        pictures += [draw_grasps(inputs, _samples(shards), out / "grasps.png")] if shards else []
-    except OSError as error:
-        raise OutputError(f"pictures cannot be written to {out}: {error.strerror}; choose another --out") from None
+    pictures = [
+        draw_hand(inputs, out / "hand.png"),
+        draw_palmar(inputs, out / "palmar.png"),
+        draw_workspace(inputs, out / "workspace.png"),
+    ]
+    pictures += [draw_spaces(inputs, spaces, out / "spaces.png")] if spaces else []
+    pictures += [draw_grasps(inputs, _samples(shards), out / "grasps.png")] if shards else []
     return pictures
 
 

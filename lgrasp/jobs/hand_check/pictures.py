@@ -20,7 +20,7 @@ from lgrasp.hand.surface_visibility import last_bodies, link_surfaces, visible_s
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hand_check.diagnose import field_vectors, finger_label
 from lgrasp.jobs.hand_check.plotting import add_box, add_view, frame_points, new_figure, save_figure, shade
-from lgrasp.refine.surface import DISTAL, OTHER
+from lgrasp.refine.params import DISTAL, OTHER
 
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#e377c2", "#17becf")
 _PALM = "#e8a400"

@@ -1,10 +1,13 @@
 """Drawing of solids without a display: figures, shaded triangles, a camera that frames points."""
 
+import io
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from lgrasp.files import write_file
 
 _LIGHT = np.array([0.35, 0.25, 0.9]) / np.linalg.norm([0.35, 0.25, 0.9])
 
@@ -25,7 +28,9 @@ def new_figure(width: float, height: float) -> Any:
 
 def save_figure(figure: Any, path: Path) -> Path:
     """Write the picture; gives its path back."""
-    figure.savefig(path)
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    write_file(path, data.getvalue())
     return path
 
 

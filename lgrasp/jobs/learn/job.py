@@ -10,17 +10,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import Field, PrivateAttr
+from pydantic import PrivateAttr
 
-from lgrasp.config import ShardPaths
-from lgrasp.dataset.files import new_file, shard_tree
+from lgrasp.dataset.gather import gather
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.folder import Found
 from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard_job import rows_digest
-from lgrasp.errors import ConfigError, OutputError
+from lgrasp.errors import ConfigError
+from lgrasp.files import write_file
 from lgrasp.hand.model import HandModel
+from lgrasp.jobs.requests.shards import FitRequest
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import object_of_shard
 from lgrasp.learn.examples import Examples, make_examples
@@ -36,7 +37,7 @@ _FORMAT, _VERSION = "lgrasp-coarse", 1
 _MIN_GRASPS = 16  # grasps to learn from
 
 
-class FitJob(Job):
+class FitJob(FitRequest, Job):
     """A predictor of coarse grasps, trained on the grasps of shards: one file.
 
     The report compares mean energies on clouds that were not trained on: of the predictor trained on poses alone
@@ -44,15 +45,12 @@ class FitJob(Job):
     (``joint``).
     """
 
-    unit: ClassVar[str] = "steps"
+    command: ClassVar[str] = "learn fit"
+    part: ClassVar[str] = "file"
     kernels: ClassVar[tuple[str, ...]] = ()
     one_key: ClassVar[bool] = False
     differs: ClassVar[str] = "other shards or parameters"
 
-    shards: ShardPaths
-    out: Path = Field(Path("coarse.pt"), description="File of the predictor.")
-    params: LearnParams = Field(default_factory=lambda: LearnParams.model_validate({}))
-    hand: str | None = Field(None, description="Default: that of the shards.")
     _key: str | None = PrivateAttr(None)
 
     @property
@@ -61,14 +59,12 @@ class FitJob(Job):
 
     def key(self) -> str:
         if self._key is None:
-            rows = [rows_digest(path) for path in shard_tree(self.shards).values()]
+            rows = [shard.value for shard in gather(self.shards, rows_digest)]
             described = self.params.model_dump(mode="json")
             self._key = content_key("predictor", _VERSION, rows=rows, params=described, hand=self.hand)
         return self._key
 
     def parts(self) -> list[Part]:
-        if self.out.is_dir():
-            raise OutputError(f"{self.out} is a folder; name a file with --out, such as coarse.pt")
         return [Part(0, self.out, self.params.steps + self.params.joint_steps)]
 
     def found(self, part: Part) -> Found:
@@ -104,8 +100,7 @@ class FitJob(Job):
         return Made(part.rows, _bytes(trainer, hand, self.key(), report))
 
     def write(self, part: Part, contents: Any) -> None:
-        with new_file(part.file) as file:
-            file.write(contents)
+        write_file(part.file, contents)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         if not outcome.paths:
@@ -170,7 +165,7 @@ def _examples(
     shards: Sequence[Path], name: str | None, params: LearnParams, cache: Cache, device: str
 ) -> tuple[HandModel, list[Examples], list[Examples]]:
     """The hand; clouds to train on and others, with the grasps, object by object."""
-    parts = read_parts(list(shard_tree(shards).values()))
+    parts = read_parts(shards)
     found = resolve_device(device)
     hand, _ = load_hand(parts.values(), name, cache, found)
     sets: tuple[list[Examples], list[Examples]] = ([], [])

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset import GraspRows
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import Outcome
+from lgrasp.grasp.records import GraspRows
 from lgrasp.grasp.rows import CONTACTS, POSTURES, grasp_rows, press
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.grasp.tables import GraspTable, choose_grasps, join_rows, widen_grasps

@@ -1,33 +1,33 @@
 """The job of ``lgrasp plan``: a hand before an object or a cloud -> one shard of grasps."""
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, InstanceOf, PrivateAttr
+from pydantic import InstanceOf, PrivateAttr
 
 from lgrasp.cloud.model import cloud_object
 from lgrasp.cloud.read import Cloud, read_cloud
-from lgrasp.config import apply_settings, parse_model
-from lgrasp.dataset import ObjectRecord, Shard, ShardHeader
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import Job, JobOutcome
-from lgrasp.errors import ConfigError, LgraspError, StarvedError
+from lgrasp.errors import LgraspError, StarvedError
+from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader
 from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
+from lgrasp.jobs.requests.plan import PlanRequest
 from lgrasp.jobs.shard_inputs import mesh_hash, named_hand, named_object
 from lgrasp.object.model import ObjectModel
-from lgrasp.planning.planner import Planner, PlanParams, cloud_params
+from lgrasp.planning.params import PlanParams, cloud_params
+from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import STAND_OFF
 from lgrasp.scenes.files import scene_cloud
 
@@ -36,46 +36,24 @@ VERSION = 2
 
 _OBSTACLE_REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way
 _LEAST_AROUND = 50
-_MAX_BASE_DISTANCE = 1.0  # [m] of a base from a start
 
 
-class PlanJob(Job):
+class PlanJob(PlanRequest, Job):
     """Plans of grasps of an object or of a cloud: one shard of those that passed every check, a row a start.
 
     Of a cloud the shard has the target's points as they were given, with their normals, as an object without faces.
     """
 
-    unit: ClassVar[str] = "starts"
-    kernels: ClassVar[tuple[str, ...]] = ()
+    command: ClassVar[str] = "plan"
+    kernels: ClassVar[tuple[str, ...]] = ("lgrasp.refine.", "lgrasp.grasp.")
 
-    hand: str = Field("barrett", description="Name, path, or a shard (its hand).")
-    out: Path | None = Field(None, description="Folder of the plans; default: plans/HAND-OBJECT.")
-    starts: int = Field(80, description="Points of the surface to start from.")
-    object: str | None = Field(None, description="Name, mesh file, or a shard of one object.")
-    scale: float = Field(1.0, gt=0, description="Factor from the unit of the mesh or cloud to metres.")
-    cloud: Path | InstanceOf[Cloud] | None = Field(
-        None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene."
-    )
-    mask: Path | None = Field(None, description="Labels of the cloud's points (.npy, .npz).")
-    label: int | None = Field(None, description="Label of the points to grasp.")
-    viewpoint: tuple[float, float, float] | None = Field(None, description="Where the cloud was seen from [m].")
-    stand_off: float | None = Field(None, description="Of the hand's base from a start [m]; default: the hand's.")
-    keep_invalid: bool = Field(False, description="The best of a start is kept where it fails too, metric valid 0.")
-    params: PlanParams = Field(default_factory=PlanParams)
+    cloud: Path | InstanceOf[Cloud] | None = None
     _cloud: Cloud | None = PrivateAttr(None)
     _found: tuple[HandSource, HandModel, ObjectModel, ObjectModel | None] | None = PrivateAttr(None)
 
     @property
-    def title(self) -> str:
-        return f"{Path(self.hand).stem} {self.name}"
-
-    @property
     def name(self) -> str:
-        """Of what is grasped."""
-        if self.object is not None:
-            return Path(self.object).stem
-        name = "cloud" if isinstance(self.cloud, Cloud) else Path(str(self.cloud)).stem
-        return name if self.label is None else f"{name}-{self.label}"
+        return "cloud" if isinstance(self.cloud, Cloud) else super().name
 
     @property
     def folder(self) -> Path:
@@ -99,20 +77,12 @@ class PlanJob(Job):
         )
 
     def parts(self) -> list[Part]:
-        if (self.object is None) == (self.cloud is None):
-            raise ConfigError("give --object (a mesh or a name) or --cloud (a file of points), one of the two")
-        if self.cloud is None and not (self.mask is self.label is self.viewpoint is None):
-            raise ConfigError("--mask, --label and --viewpoint belong to --cloud")
-        if self.starts < 1:
-            raise ConfigError(f"--starts {self.starts}: at least 1")
-        if self.stand_off is not None and not 0 < self.stand_off <= _MAX_BASE_DISTANCE:
-            raise ConfigError(
-                f"--stand-off {self.stand_off:g}: more than 0 and at most {_MAX_BASE_DISTANCE:g} m is accepted"
-            )
-        if not self.params.distal + self.params.other > 0:
-            raise ConfigError("--distal 0 --other 0: nothing pulls the hand to the object; give one of them a weight")
         source, _, model, _ = self._models()
         return [Part(0, shard_path(self.folder, source.name, model.name, 0), self.starts)]
+
+    def about(self) -> dict[str, Any]:
+        source, _, model, _ = self._models()
+        return {"hand": source.name, "objects": [model.name]}
 
     def effort(self, rows: int) -> int:
         return rows
@@ -208,22 +178,6 @@ class PlanJob(Job):
 
     def _record(self) -> ObjectRecord:
         return _record(self._models()[2], self._cloud)
-
-
-def plan_params(settings: Sequence[str] = (), **options: float) -> PlanParams:
-    """Parameters of plans.
-
-    Args:
-        settings: ``PART.KEY=VALUE`` each; a part is ``bounds``, ``search`` or ``plan``.
-        options: fields of :class:`PlanParams`.
-
-    Raises:
-        ConfigError: an unknown key, or a value out of range.
-    """
-    params = parse_model(PlanParams, options, "plan")
-    parts: dict[str, Any] = {"bounds": params.bounds, "search": params.search, "plan": params}
-    made = apply_settings(parts, settings, "lgrasp plan")
-    return cast(PlanParams, made["plan"]).model_copy(update={"bounds": made["bounds"], "search": made["search"]})
 
 
 def lost_starts(counts: dict[str, int]) -> str:

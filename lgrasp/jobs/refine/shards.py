@@ -4,53 +4,43 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import PrivateAttr
 
 from lgrasp import __version__
-from lgrasp.config import apply_settings, parse_model
-from lgrasp.dataset import ObjectRecord, ShardHeader, read_shard
 from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.exports.formats import read_grasps
-from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
-from lgrasp.errors import ConfigError, HandError, ShardError
-from lgrasp.grasp.bounds import GraspBounds, stored_bounds
-from lgrasp.grasp.records import Shard, now
+from lgrasp.errors import HandError, ShardError
+from lgrasp.grasp.bounds import stored_bounds
+from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader, now
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs
 from lgrasp.jobs.refine.moved import move_rows
+from lgrasp.jobs.requests.shards import RefineRequest
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
 from lgrasp.object.load import load_mesh
-from lgrasp.refine.params import LocalSearch
-from lgrasp.stages.refine.params import RefineParams
 
 VERSION = 2
 """Raised whenever refined shards change for the same parameters."""
 
-COARSE = LocalSearch(matching_rounds=13, reach=0.05, reach_end=0.03)
-"""For poses as a network predicts them: off by centimetres."""
 
-
-class RefineJob(ShardJob):
+class RefineJob(RefineRequest, ShardJob):
     """Grasps of shards, or of an export of another program, moved by a local search and checked again."""
 
-    shards: tuple[Path, ...] = Field(description="Shards, folders of them at any depth; or one export, see 'form'.")
-    form: str | None = Field(None, description="Format of another program; none: shards.")
-    hand: str | None = Field(None, description="Of grasps in another format; shards hold their own.")
-    keep_invalid: bool = Field(False, description="Rows that pass in no posture are kept too, with metric valid 0.")
-    params: RefineParams = Field(default_factory=RefineParams)
-    bounds: GraspBounds | None = Field(None, description="None: those that the rows of a shard passed before.")
-    settings: tuple[str, ...] = Field((), description="PART.KEY=VALUE of bounds or refine, in place of theirs.")
-    _hands: dict[str, HandArrays] = PrivateAttr(default_factory=dict)
+    command: ClassVar[str] = "refine"
+    kernels: ClassVar[tuple[str, ...]] = ("lgrasp.refine.", "lgrasp.grasp.")
+
+    _models: dict[str, HandArrays] = PrivateAttr(default_factory=dict)  # by hash
     _given: dict[int, Shard] = PrivateAttr(default_factory=dict)  # of an export, by number of the part
 
     def key(self) -> str:
@@ -63,28 +53,28 @@ class RefineJob(ShardJob):
         return content_key("refine", VERSION, **described)
 
     def parts(self) -> list[Part]:
-        self._numbers(GraspBounds())  # settings that cannot be are told before anything is read
         parts = super().parts() if self.form is None else self._parts_of_export(self.form)
         if not any(part.rows for part in parts):
             raise ShardError(f"{', '.join(map(str, self.shards))}: no grasps to refine")
         return parts
 
-    def _numbers(self, told: GraspBounds) -> tuple[GraspBounds, RefineParams]:
-        """What rows of a shard that passed ``told`` must pass, and how they are searched."""
-        parts = {"bounds": self.bounds or told, "refine": self.params}
-        made = apply_settings(parts, self.settings, "lgrasp refine")
-        return cast(GraspBounds, made["bounds"]), cast(RefineParams, made["refine"])
+    def check_source(self, reader: ShardReader) -> None:
+        if reader.space_names is not None or len(reader.object_ids) != 1 or reader.columns["object_index"][0][1] != 1:
+            raise ShardError(
+                f"{reader.path}: rows of several objects cannot be refined; one object to a shard is accepted"
+            )
 
     def _parts_of_export(self, form: str) -> list[Part]:
         """Grasps in the format of another program: a part of each object."""
-        if len(self.shards) != 1 or self.hand is None:
-            raise ConfigError(f"grasps in format {form}: give one folder or file, and their hand with --hand")
+        assert self.hand is not None
         source, model = named_hand(self.cache, self.hand, self.device_used)
-        self._hands[model.sha256] = upload_hand(model, self.device_used.alias)
+        self._models[model.sha256] = upload_hand(model, self.device_used.alias)
         self._given = dict(enumerate(_grasp_shards(self.shards[0], form, source, model)))
+        self._hands, self._objects = {model.name}, {shard.objects[0].id for shard in self._given.values()}
+        files = [shard_path(self.folder, model.name, shard.objects[0].id, 0) for shard in self._given.values()]
         return [
-            Part(number, shard_path(self.out, model.name, shard.objects[0].id, 0), len(shard.grasps), self.shards[0])
-            for number, shard in self._given.items()
+            Part(number, file, len(shard.grasps), self.shards[0], 0)
+            for (number, shard), file in zip(self._given.items(), files, strict=True)
         ]
 
     def part_key(self, part: Part) -> str:
@@ -104,7 +94,7 @@ class RefineJob(ShardJob):
         hand = self._hand(part.source, shard)
         model = object_of_shard(self.cache, shard.objects[0], self.device_used)
         told = stored_bounds(shard.header.config)
-        bounds, params = self._numbers(told)
+        bounds, params = self.numbers(told)
         begin = time.perf_counter()
         moved = move_rows(
             hand,
@@ -148,15 +138,15 @@ class RefineJob(ShardJob):
     def _hand(self, path: Path, shard: Shard) -> HandArrays:
         """The hand of a shard, whatever is installed under its name; ``hand`` is only compared with it."""
         digest, device = shard.hand.sha256, self.device_used
-        if digest not in self._hands:
+        if digest not in self._models:
             if self.hand is not None and (named := named_hand(self.cache, self.hand, device)[1]).sha256 != digest:
                 raise HandError(
                     f"{path}: its grasps are of hand '{shard.hand.name}' (hash {digest[:12]}), not of '{named.name}' "
                     f"(hash {named.sha256[:12]}); leave --hand out, the hand is in the shard"
                 )
             _, model = hand_of_shard(self.cache, shard.hand, shard.header.config, device)
-            self._hands[digest] = upload_hand(model, device.alias)
-        return self._hands[digest]
+            self._models[digest] = upload_hand(model, device.alias)
+        return self._models[digest]
 
 
 def _entry(path: Path) -> dict[str, Any]:
@@ -186,8 +176,6 @@ def _entry(path: Path) -> dict[str, Any]:
 def _check_rows(path: Path, shard: Shard) -> None:
     """Refuse what cannot be repaired; joints outside their limits can."""
     rows, hand = shard.grasps, shard.hand
-    if rows.sequence is not None or len(shard.objects) != 1 or np.shape(rows.object_index)[1] != 1:
-        raise ShardError(f"{path}: rows of several objects cannot be refined; one object to a shard is accepted")
     q = np.where(np.isfinite(rows.q), np.clip(rows.q, hand.joint_lower, hand.joint_upper), rows.q)
     columns = rows.columns()
     problems = row_problems(
@@ -195,17 +183,6 @@ def _check_rows(path: Path, shard: Shard) -> None:
     )
     if problems:
         raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset check' accepts them can be refined")
-
-
-def refine_params(*, coarse: bool = False, **options: int | None) -> RefineParams:
-    """The stage's parameters, or those for coarse poses, with the options that are given (not None) in their place.
-
-    Raises:
-        ConfigError: a value out of range.
-    """
-    given = parse_model(LocalSearch, {name: value for name, value in options.items() if value is not None}, "refine")
-    search = COARSE.model_dump() if coarse else {}
-    return parse_model(RefineParams, search | given.model_dump(exclude_unset=True), "refine")
 
 
 def _grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) -> Iterator[Shard]:

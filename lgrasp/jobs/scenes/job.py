@@ -11,23 +11,24 @@ from typing import Any, ClassVar
 
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.files import shard_tree
-from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.gather import gather
 from lgrasp.engine.events import Events, Made, Part, PartProgress
-from lgrasp.engine.folder import Found, check_number, shard_path
-from lgrasp.engine.run import JobOutcome
+from lgrasp.engine.folder import Found, shard_path
+from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.errors import ShardError
 from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.scenes.stock import SceneConfig, Stock, load_stock
+from lgrasp.jobs.requests.scenes import SceneRequest
+from lgrasp.jobs.scenes.stock import Stock, load_stock
 from lgrasp.scenes.files import SceneReader, check_scene, write_scene
 from lgrasp.scenes.make import make_scene
 from lgrasp.simulate.builder import import_mujoco
 
 
-class SceneJob(SceneConfig):
+class SceneJob(SceneRequest, Job):
     """Scenes of one hand, one a file."""
 
-    unit: ClassVar[str] = "scenes"
+    command: ClassVar[str] = "scenes make"
+    part: ClassVar[str] = "scene"
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.scenes.",)
     one_key: ClassVar[bool] = False
     differs: ClassVar[str] = "other hand, objects, grasps, parameters or seed"
@@ -42,8 +43,7 @@ class SceneJob(SceneConfig):
         """The hand's name: that of the grasps, else of the hand that is asked for."""
         if self.grasps is None:
             return hand_source(self.hand or "allegro").name
-        with ShardReader(next(iter(shard_tree([self.grasps]).values()))) as reader:
-            return str(reader.attributes["hand"])
+        return gather(self.grasps, lambda reader: str(reader.attributes["hand"]))[0].value
 
     @property
     def loaded(self) -> Stock:
@@ -55,8 +55,10 @@ class SceneJob(SceneConfig):
     def key(self) -> str:
         return hashlib.sha256(json.dumps(self._described(), sort_keys=True).encode()).hexdigest()
 
+    def about(self) -> dict[str, Any]:
+        return {"hand": self.hand_name, "objects": [i.record.id for i in self.loaded.items], "seed": self.seed}
+
     def parts(self) -> list[Part]:
-        check_number(self.scenes, "scenes; use several --out")
         import_mujoco()
         name = self.hand_name
         return [Part(index, shard_path(self.out, name, "scene", index), 1) for index in range(self.scenes)]

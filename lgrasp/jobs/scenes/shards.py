@@ -1,17 +1,20 @@
 """Grasps of shards by object, and their hand."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset import HandRecord, ObjectRecord, ShardReader
+from lgrasp.dataset.files import Paths
+from lgrasp.dataset.gather import gather
+from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, ShardError
+from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.spec import hand_digest
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.shard_inputs import hand_of_shard, mesh_hash
 from lgrasp.runtime.device import Device
@@ -34,27 +37,19 @@ class Grasped:
         return {name: np.concatenate([columns[name] for columns in self.columns]) for name in self.columns[0]}
 
 
-def read_parts(paths: Sequence[Path]) -> dict[tuple[str, str], Grasped]:
+def read_parts(paths: Paths) -> dict[tuple[str, str], Grasped]:
     """Objects by id and hash of their mesh as grasped, all with grasps of one hand.
 
     Raises:
-        ShardError: a file is no shard of single objects, of point clouds, has a row that is not finite, or is of
-            another hand than the others; two objects have one id.
+        ShardError: a file that is named is no shard of single objects, of point clouds, or has a row that is not
+            finite (in a folder it is left out, with a notice); shards are of different hands; two objects have one id.
     """
     found: dict[tuple[str, str], Grasped] = {}
     first: tuple[Grasped, Path] | None = None
-    for path in paths:
+    for path, _, (record, columns) in gather(paths, _single):
         with ShardReader(path) as reader:
-            if reader.space_names is not None or len(reader.object_ids) != 1:
-                raise ShardError(f"{path}: holds several objects; grasps of single objects are brought into scenes")
-            (record,), attributes = reader.objects(), reader.attributes
+            attributes, config = reader.attributes, reader.header.config
             hand = first[0].hand if first else reader.hand()
-            config = reader.header.config
-            columns = {name: reader.column(name) for name in _COLUMNS}
-            columns["T_hand_object"] = reader.column("object_pose")[:, 0]
-        if not len(record.faces):
-            raise ShardError(f"{path}: object '{record.id}' is a point cloud; objects with a mesh are accepted")
-        _check_finite(path, columns)
         if hand.sha256 != attributes["hand_sha256"]:
             assert first
             raise ShardError(
@@ -71,6 +66,19 @@ def read_parts(paths: Sequence[Path]) -> dict[tuple[str, str], Grasped]:
             f"the shards hold several objects of the name '{twice}' (other mesh or scale); use one of them"
         )
     return found
+
+
+def _single(reader: ShardReader) -> tuple[ObjectRecord, dict[str, np.ndarray]]:
+    """The object of a shard, and its columns."""
+    if reader.space_names is not None or len(reader.object_ids) != 1:
+        raise ShardError(f"{reader.path}: holds several objects; grasps of single objects are brought into scenes")
+    (record,) = reader.objects()
+    if not len(record.faces):
+        raise ShardError(f"{reader.path}: object '{record.id}' is a point cloud; objects with a mesh are accepted")
+    columns = {name: reader.column(name) for name in _COLUMNS}
+    columns["T_hand_object"] = reader.column("object_pose")[:, 0]
+    _check_finite(reader.path, columns)
+    return record, columns
 
 
 def _check_finite(path: Path, columns: dict[str, np.ndarray]) -> None:

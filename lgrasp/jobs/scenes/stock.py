@@ -7,19 +7,16 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
 
-from lgrasp.config import MeshScale, Seed
-from lgrasp.dataset import HandRecord
-from lgrasp.dataset.files import shard_tree
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
-from lgrasp.engine.run import Job
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.decompose import decompose
+from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.requests.scenes import SceneRequest
 from lgrasp.jobs.scenes.shards import Grasped, load_hand, read_parts
 from lgrasp.jobs.shard_inputs import mesh_hash, object_of_shard
 from lgrasp.object.arrays import upload_object
@@ -27,24 +24,7 @@ from lgrasp.object.find import find_object
 from lgrasp.object.load import load_mesh
 from lgrasp.runtime.device import Device
 from lgrasp.scenes.make import Item
-from lgrasp.scenes.params import SceneParams
 from lgrasp.simulate.scene import object_of_record
-
-
-class SceneConfig(Job):
-    """The scenes requested of one hand. Paths are relative to the current folder."""
-
-    hand: str | None = Field(None, description="Name or path; default: that of the grasps, else allegro.")
-    objects: tuple[str, ...] = Field((), description="Names or paths; default: all objects of the grasps.")
-    scale: MeshScale = 1.0
-    grasps: Path | None = Field(None, description="Folder of shards; default: grasps are generated.")
-    pipeline: str = Field("robust", description="Generates grasps where no folder of them is given.")
-    stock: int = Field(1000, ge=1, description="Grasps that are generated of each object.")
-    scenes: int = Field(100, ge=1)
-    seed: Seed = 0
-    out: Path = Field(Path("scenes"), description="Folder of the scenes.")
-    workers: int = Field(0, ge=0, description="Scenes made at once; 0: one a core.")
-    scene: SceneParams = Field(default_factory=lambda: SceneParams.model_validate({}))
 
 
 @dataclass(frozen=True)
@@ -58,7 +38,7 @@ class Stock:
     key: str
 
 
-def load_stock(config: SceneConfig, cache: Cache, device: Device, report: Callable[[str], None]) -> Stock:
+def load_stock(config: SceneRequest, cache: Cache, device: Device, report: Callable[[str], None]) -> Stock:
     """Find the grasps, or generate them into the folder ``grasps`` of the scenes, and load everything.
 
     Args:
@@ -69,10 +49,10 @@ def load_stock(config: SceneConfig, cache: Cache, device: Device, report: Callab
         LgraspError: hand, objects or shards cannot be used.
     """
     if config.grasps is None:
-        shards = _generated(config, cache, device, report)
+        shards = _generated(config, cache, report)
         wanted = None
     else:
-        shards = list(shard_tree([config.grasps]).values())
+        shards = config.grasps
         wanted = [_source_hash(name) for name in config.objects] or None
     found = read_parts(shards)
     chosen = {key: part for key, part in found.items() if wanted is None or part.record.sha256 in wanted}
@@ -96,12 +76,11 @@ def load_stock(config: SceneConfig, cache: Cache, device: Device, report: Callab
     return Stock(upload_hand(hand, device.alias), record, tuple(items), digest.hexdigest())
 
 
-def _generated(config: SceneConfig, cache: Cache, device: Device, report: Callable[[str], None]) -> list[Path]:
+def _generated(config: SceneRequest, cache: Cache, report: Callable[[str], None]) -> list[Path]:
     """Shards of every object, made where they are missing."""
-    if not config.objects:
-        raise ConfigError("no objects: name some (lgrasp objects list), or give a folder of shards with --grasps")
     hand, shards = config.hand or "allegro", []
-    _check_meshes(config)
+    for name in config.objects:  # before any grasps are generated
+        load_mesh(find_object(name), scale=config.scale)
     for name in config.objects:
         report(f"grasps of {Path(name).stem}")
         job = GenerateJob(
@@ -111,7 +90,7 @@ def _generated(config: SceneConfig, cache: Cache, device: Device, report: Callab
             pipeline=load_pipeline(config.pipeline).model_copy(update={"seed": config.seed}),
             out=config.out / "grasps" / f"{hand_source(hand).name}-{find_object(name).stem}",
             scale=config.scale,
-            device=device.alias,
+            device=config.device,
             workers=config.workers,
             cache=cache,
         )
@@ -119,23 +98,11 @@ def _generated(config: SceneConfig, cache: Cache, device: Device, report: Callab
     return shards
 
 
-def _check_meshes(config: SceneConfig) -> None:
-    """Check, before any grasps are generated, that all meshes can be used and have different names."""
-    found: dict[str, Path] = {}
-    for name in config.objects:
-        path = find_object(name)
-        load_mesh(path, scale=config.scale)
-        if not path.samefile(found.setdefault(path.stem, path)):
-            raise ConfigError(
-                f"objects {found[path.stem]} and {path} have one name, '{path.stem}'; rename one of the files"
-            )
-
-
 def _source_hash(name: str) -> str:
     return hashlib.sha256(find_object(name).read_bytes()).hexdigest()
 
 
-def _check_objects(config: SceneConfig, found: Iterable[Grasped], wanted: list[str]) -> None:
+def _check_objects(config: SceneRequest, found: Iterable[Grasped], wanted: list[str]) -> None:
     """Raises ConfigError where the shards lack an object that is asked for, by the hash of its file."""
     there = {part.record.sha256: part.record.id for part in found}
     for name, source in zip(config.objects, wanted, strict=True):

@@ -3,13 +3,12 @@
 import hashlib
 import json
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from dataclasses import field as with_default
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,24 +19,18 @@ from lgrasp.field.arrays import FieldArrays, upload_field
 from lgrasp.field.model import FIELD_VERSION
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
 from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, space_view
-from lgrasp.hand.spec import hand_digest
 from lgrasp.jobs.hands import hand_source
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device
 from lgrasp.seeding import stage_seed
+from lgrasp.sequence.size import Size
 from lgrasp.simulate.scene import Scene
-
-
-class Size(NamedTuple):
-    """A factor on all meshes (``high`` 0), or the bounds of the longest side of each object [m]."""
-
-    low: float = 1.0
-    high: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -101,13 +94,8 @@ def sequence_keys(
 
     Raises:
         HandError, ObjectError: see :func:`hand_source`, :func:`find_object`.
-        ConfigError: fewer than two objects, or a hand without opposition spaces.
+        ConfigError: a hand without opposition spaces.
     """
-    if len(meshes) < 2:
-        named = meshes[0] if meshes else "no object"
-        raise ConfigError(
-            f"a sequence needs at least two objects, got {named}; for one object: lgrasp generate --object MESH"
-        )
     source = hand_source(hand)
     if not source.spec.opposition_spaces:
         raise ConfigError(
@@ -160,25 +148,6 @@ def load_sequence_inputs(
             made[key] = upload_object(load.object(path, key, scale, objects), alias)
     steps = tuple(made[key] for key in keys.objects)
     return SequenceInputs(model, spaces, tuple(views), steps, keys, device, load.seconds, load.hits)
-
-
-def parse_size(text: str) -> Size:
-    """``0.001`` (a factor) or ``0.06:0.10`` (longest side of the bounding box, drawn evenly [m]).
-
-    Raises:
-        ConfigError: neither.
-    """
-    parts = re.split(r"\s*:\s*", text.strip())
-    try:
-        low, high = float(parts[0]), float(parts[1]) if len(parts) > 1 else 0.0
-    except ValueError:
-        low = high = math.nan
-    fine = len(parts) <= 2 and math.isfinite(low) and low > 0 and (len(parts) == 1 or low <= high < math.inf)
-    if not fine:
-        raise ConfigError(
-            f"--scale '{text}': give a factor such as 0.001, or a range of the longest side in metres such as 0.06:0.10"
-        )
-    return Size(low, high)
 
 
 def _object_scales(meshes: Sequence[Path], size: Size, seed: int, params: ObjectParams) -> tuple[float, ...]:

@@ -3,53 +3,39 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 
-from lgrasp.dataset import ObjectRecord
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.run import JobOutcome
-from lgrasp.errors import ConfigError, LgraspError, ObjectError, StarvedError
+from lgrasp.errors import LgraspError, ObjectError, StarvedError
+from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
+from lgrasp.jobs.requests.search import SequenceRequest
 from lgrasp.jobs.search import SearchJob, telling
-from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, parse_size, sequence_keys
+from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.records import object_records, sequence_rows
 from lgrasp.jobs.sequence.round import Verdicts, add_spaces
 from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_rounds
 from lgrasp.jobs.sets import sequence_name
+from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts
 from lgrasp.stages.context import Keeper
 
 
-class SequenceJob(SearchJob):
+class SequenceJob(SequenceRequest, SearchJob):
     """Sequences of grasps of several objects by one hand."""
 
-    RENAMED: ClassVar[dict[str, str]] = {"physics": "simulate"}
-
-    unit: ClassVar[str] = "sequences"
-
-    objects: tuple[str, ...] = Field(description="Names or mesh files, in the order in which they are grasped.")
-    rows: int = Field(default=256, description="Complete sequences requested.")
-    scale: str = Field(default="1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")
-    simulate: str | None = Field(
-        default=None, description="Protocol that the rows of every step must pass to be continued."
-    )
-    shard_rows: int = Field(default=1000, description="Sequences of a shard; part of what decides the rows.")
-
-    @property
-    def title(self) -> str:
-        return " ".join(Path(name).stem for name in (self.hand, *self.objects))
+    command: ClassVar[str] = "sequence"
 
     @property
     def object_name(self) -> str:
-        return sequence_name("", self.objects)[1:]
+        return sequence_name(self.objects)
 
     @property
     def protocol(self) -> str | None:
@@ -63,15 +49,11 @@ class SequenceJob(SearchJob):
             self._keys = sequence_keys(self.hand, self.objects, size, pipeline.seed, pipeline.object, pipeline.field)
         return self._keys
 
+    def own_config(self) -> dict[str, Any]:
+        return {"objects": list(self.objects), "scales": list(self.keys.scales), "physics": self.simulate}
+
     def key(self) -> str:
         return self.keys.run_key(self.pipeline.describe(), self.shard_rows, self.simulate)
-
-    def parts(self) -> list[Part]:
-        if self.pipeline.sequence is None:
-            raise ConfigError(
-                f"pipeline '{self.pipeline.name}' has no sequence; use pipeline sequence, or add 'sequence: {{}}' to it"
-            )
-        return super().parts()
 
     def effort(self, rows: int) -> int:
         return most_rounds(self.pipeline, rows)
@@ -99,14 +81,13 @@ class SequenceJob(SearchJob):
         forgotten = replace(result, levels=[])
         if not len(result):
             return Made(0, None, forgotten)
-        config = {"objects": list(self.objects), "scales": list(self.keys.scales), "physics": self.simulate}
         statistics = {
             "sequences": len(result),
             "rounds": result.rounds,
             **{f"found_{step}": found for step, found in enumerate(result.reached, 1)},
         }
         rows = sequence_rows(result.levels, self.inputs, part.number, self.protocol_text())
-        return Made(len(result), self.shard(part, result, rows, config, statistics), forgotten)
+        return Made(len(result), self.shard(part, result, rows, statistics), forgotten)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """The results in numbers.

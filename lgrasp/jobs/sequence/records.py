@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from lgrasp.dataset import GraspRows
-from lgrasp.grasp.records import ObjectRecord, SequenceRows
+from lgrasp.grasp.records import GraspRows, ObjectRecord, SequenceRows
 from lgrasp.grasp.rows import CONTACTS, METRIC_UNITS, POSTURES, row_numbers, step_columns, used_width
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.jobs.records import object_record

@@ -12,7 +12,7 @@ from lgrasp.stages.context import Context
 from lgrasp.stages.filter.params import FilterParams
 from lgrasp.stages.filter.posture_kernels import SetCandidates, fill_unused, place_touching
 
-VERSION = 7
+VERSION = 8
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, Tally]:

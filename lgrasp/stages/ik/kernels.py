@@ -10,7 +10,8 @@ from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.grasp.structs import Candidates, Sets, State
 from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.hand.self_collision import group_pairs_clear
-from lgrasp.math.kinematics import MAX_DOFS, MAX_JOINTS, clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.math.limits import MAX_DOFS, MAX_JOINTS
 from lgrasp.math.qp import mat8, solve_spd
 from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object

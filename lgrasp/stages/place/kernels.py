@@ -9,7 +9,8 @@ from lgrasp.field.arrays import Field, field_has, field_pair, field_seed
 from lgrasp.grasp.collision import body_clear, body_depth
 from lgrasp.grasp.structs import Poses
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.kinematics import MAX_GROUPS, MAX_JOINTS, group_forward
+from lgrasp.math.kinematics import group_forward
+from lgrasp.math.limits import MAX_GROUPS, MAX_JOINTS
 from lgrasp.math.transforms import random_rotation, rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS

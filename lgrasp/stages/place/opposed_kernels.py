@@ -6,7 +6,8 @@ from lgrasp.field.arrays import Field, field_has, field_seed
 from lgrasp.grasp.collision import body_clear, objects_apart
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.kinematics import MAX_JOINTS, group_forward
+from lgrasp.math.kinematics import group_forward
+from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.transforms import rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS

@@ -8,7 +8,8 @@ from lgrasp.grasp.structs import Candidates, Sets
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.constants import INSCRIBED
-from lgrasp.math.kinematics import MAX_JOINTS, group_forward
+from lgrasp.math.kinematics import group_forward
+from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted_load
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS

@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.grasp.structs import Candidates
 from lgrasp.math.constants import INSCRIBED
-from lgrasp.math.kinematics import MAX_GROUPS
+from lgrasp.math.limits import MAX_GROUPS
 from lgrasp.math.qp import MAX_CONTACTS, balance, frictionless
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object

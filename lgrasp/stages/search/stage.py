@@ -8,7 +8,7 @@ import warp as wp
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable, ContactSets
-from lgrasp.math.kinematics import MAX_GROUPS
+from lgrasp.math.limits import MAX_GROUPS
 from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally

@@ -12,7 +12,8 @@ import yaml
 import yourdfpy
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader, write_shard
+from lgrasp.dataset.writer import write_shard
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 
 ROOT = Path(__file__).resolve().parents[3]
 ASSETS = ROOT.parent / "shared" / "assets"

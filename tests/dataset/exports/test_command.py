@@ -13,6 +13,7 @@ import pytest
 
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp_cli.main import main
+from lgrasp_cli.progress import JobProgress
 
 GENERATED = Path(__file__).parent / "allegro-tiny.h5"  # lgrasp generate --object tiny -n 10
 
@@ -58,7 +59,7 @@ def test_help(cli):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["a.h5", "--to", "dexgraspnt", "--out", "made"], "choose one of dexgraspnet, dexgraspbench"),
+        (["a.h5", "--to", "dexgraspnt", "--out", "made"], "choose dexgraspnet, dexgraspbench"),
         (["a.h5", "--to", "mjcf"], "--out"),
         (["a.h5", "--out", "made"], "--to"),
         (["--to", "mjcf", "--out", "made"], "shards"),
@@ -67,7 +68,7 @@ def test_help(cli):
         (["a.h5", "--to", "mjcf", "--out", "note.txt"], "note.txt is a file"),
         (["a.h5", "--to", "mjcf", "--out", "."], ". is not empty (it holds a.h5)"),
         (["a.h5", "--to", "mjcf", "--out", "/proc/none"], "/proc/none"),
-        (["a.h5", "--to", "mjcf", "--out", "made", "--limit", "0"], "--limit 0"),
+        (["a.h5", "--to", "mjcf", "--out", "made", "--limit", "0"], "'limit' = 0"),
         (["a.h5", "--to", "mjcf", "--out", "made", "--limit", "x"], "--limit"),
         (["a.h5", "--to", "mjcf", "--out", "made", "--where", "a ="], "--where 'a ='"),
         (["a.h5", "--to", "mjcf", "--out", "made", "--only-holding"], "no column 'physics/fc_holds'"),
@@ -124,6 +125,27 @@ def test_interrupted(tmp_path, shards):
     assert [path.name for path in files] == [f"{n:08d}.npy" for n in range(len(files))]
     assert all(np.load(path, allow_pickle=True).item()["obj_scale"] == 1 for path in files[-5:])
     assert not (tmp_path / "made" / "export.json").exists()
+
+
+def test_an_interrupted_export_is_gone_on_with(cli, tmp_path, shards, monkeypatch):
+    """By the same command only; in the end it is as if nothing had happened."""
+    shards.make(tmp_path / "a.h5", n=6)
+    command = ("a.h5", "--to", "dexgraspbench", "--out", "made")
+    with monkeypatch.context() as patch:
+        patch.setattr(JobProgress, "cancelled", lambda self: (tmp_path / "made").exists())
+        assert cli(*command)[0] == 130
+    left = tmp_path / "made" / "hand" / "hand.0123456789ab.urdf.tmp"
+    left.touch()
+    code, _, err = cli(*command, "--limit", 3)
+    assert code == 2
+    assert "made is not empty" in err
+    assert cli(*command)[0] == 0
+    assert cli(*command[:-1], "whole")[0] == 0
+    whole, made = (
+        {path.relative_to(folder): path.is_file() and path.read_bytes() for path in folder.rglob("*")}
+        for folder in (tmp_path / "whole", tmp_path / "made")
+    )
+    assert made == whole
 
 
 def test_scenes_hold_their_grasps(tmp_path):

@@ -1,4 +1,4 @@
-"""The examples of docs/guides/exports.md and docs/guides/training.md run, and the network of the latter learns."""
+"""The examples of docs/guides/exports.md and training.md run, and the network of the latter beats its baselines."""
 
 import re
 from dataclasses import replace
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lgrasp.dataset import write_shard
+from lgrasp.dataset.writer import write_shard
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "guides"
 
@@ -19,8 +19,8 @@ def examples(name: str) -> str:
 
 @pytest.fixture
 def folder(tmp_path, shards, monkeypatch):
-    """Where the documents' grasps/allegro-mug has rows whose joints follow from the object's place."""
-    path = tmp_path / "grasps" / "allegro-mug" / "allegro-mug-00000.h5"
+    """Where the documents' grasps/allegro-mug/robust has rows whose joints follow from the object's place."""
+    path = tmp_path / "grasps" / "allegro-mug" / "robust" / "allegro-mug-00000.h5"
     shard = shards.make(path, n=400, objects=[shards.object("mug")])
     hand, place = shard.hand, shard.grasps.object_pose[:, 0, :3] / 0.3
     share = 0.5 + 0.4 * place[:, np.arange(len(hand.joint_names)) % 3]
@@ -44,8 +44,8 @@ def test_training(folder, make_sequence, capsys):
     torch.set_num_threads(1)  # small matrices: more threads only wait for each other
     exec(examples("training.md"), {})
     torch.set_num_threads(threads)
-    *epochs, chosen, moved = capsys.readouterr().out.splitlines()
-    errors = [float(re.fullmatch(r"epoch \d+: (\S+) rad", line).group(1)) for line in epochs]
-    assert errors[-1] < 0.8 * errors[0]
+    *lines, chosen, moved = capsys.readouterr().out.splitlines()
+    drawn, *baselines = [float(line.split()[-2]) for line in lines]
+    assert drawn < min(baselines)
     assert chosen == "200 of 400 grasps"
     assert moved == "tensor(0.)"

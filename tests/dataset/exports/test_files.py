@@ -10,14 +10,17 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset import GraspRows, Shard, ShardHeader, read_shard, validate_shard, write_shard
 from lgrasp.dataset.exports.dexgraspbench import read_dexgraspbench
 from lgrasp.dataset.exports.dexgraspnet import read_dexgraspnet
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.dataset.exports.isaac_grasp import read_isaac_grasp
 from lgrasp.dataset.exports.mjcf import read_mjcf
 from lgrasp.dataset.exports.npy import load_objects, save_object, save_objects
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ConfigError, ShardError
+from lgrasp.grasp.records import GraspRows, Shard, ShardHeader
 
 
 def names(path) -> set[str]:

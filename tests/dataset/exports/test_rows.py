@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from lxml import etree
 
+from lgrasp.dataset.conditions import Condition, parse_condition
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
-from lgrasp.dataset.exports.selection import Condition, parse_condition
 from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 

@@ -14,11 +14,13 @@ from scipy.spatial.transform import Rotation
 from support.near import new_rows
 from typer.testing import CliRunner
 
-from lgrasp.dataset import merge_shards, read_shard, write_shard
+from lgrasp.dataset.merge import merge_shards
+from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.report.coverage import Coverage, principal_postures
 from lgrasp.dataset.report.gather import EvenSample
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.write import read_dataset, report_dataset
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp_cli.dataset import app
@@ -82,6 +84,8 @@ def test_generated_grasps(run, make, tmp_path, grasps):
     seen = []
     numbers, text = make(tmp_path / "out", progress=lambda *now: seen.append(now))
     assert seen == [(30, 60), (60, 60)]
+    assert "8 of 60 rows, evenly spread" in text
+    assert text.count("data:image/jpeg;base64,") == 1
     titles = " ".join(" ".join(chart.itertext()) for chart in check_page(text))
     for words in ("penetration [mm]", "self_penetration [mm]", "normal_error [deg]", "epsilon", "x [mm]", "share [%]"):
         assert words in titles
@@ -339,7 +343,7 @@ def test_what_cannot_be_done(make, make_shard, tmp_path):
     data = (tmp_path / "in" / "0.h5").read_bytes()
     (tmp_path / "in" / "1.h5").write_bytes(data[:-100])
     with pytest.raises(ShardError, match=r"1\.h5"):
-        make(tmp_path / "in")
+        make(tmp_path / "in" / "1.h5")
     assert not (tmp_path / "report.html").exists()
 
 

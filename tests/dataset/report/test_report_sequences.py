@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from lgrasp.dataset import merge_shards, read_shard, write_shard
+from lgrasp.dataset.merge import merge_shards
+from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.report.write import report_dataset
+from lgrasp.dataset.writer import write_shard
 from lgrasp_cli.dataset import app
 
 COUNTS = (30, 25, 12)

@@ -55,7 +55,7 @@ def test_known_hand_is_drafted_like_its_author_did(allegro):
 
 def test_open_posture_is_free_and_inside_the_limits(allegro):
     spec, _ = allegro
-    model = build_hand(ALLEGRO, spec)
+    model = build_hand(ALLEGRO, spec, pieces_only=True)
     q = np.array([spec.open_posture[name] for name in model.tree.joint_names])
     assert (q >= model.tree.joint_lower - 1e-6).all()
     assert (q <= model.tree.joint_upper + 1e-6).all()
@@ -94,7 +94,7 @@ def test_jaws_with_one_drive_get_a_jaw_as_base(tmp_path):
     assert made.spec.palm.links == (made.spec.base_link,)
     assert any("made the base" in line for line in made.decisions)
     # the distance of the jaws is that of the original at every joint value
-    model = build_hand(made.folder / "hand.urdf", made.spec)
+    model = build_hand(made.folder / "hand.urdf", made.spec, pieces_only=True)
     other = model.tree.link_names.index("jaw_r" if made.spec.base_link == "jaw_l" else "jaw_l")
     postures = sample_bodies(model, np.array([[0.0], [0.02], [0.05]]))
     gaps = np.linalg.norm(postures.t[:, model.tree.link_body[other]], axis=1)
@@ -195,7 +195,7 @@ def test_a_spread_joint_is_shared_and_no_link_is_stuck_where_joints_are_held():
     assert len(spec.shared["right_hand_Finger_Spread"]) == 4
     assert any("'right_hand_Finger_Spread' moves several fingers" in line for line in said)
     build_tree(read_urdf(urdf), spec)
-    model = build_hand(urdf, spec)
+    model = build_hand(urdf, spec, pieces_only=True)
     names = model.tree.link_names
     kept = {frozenset((names[a], names[b])) for a, b in model.piece_link[model.pairs]}
     assert frozenset(("right_hand_a", "right_hand_e1")) in kept

@@ -9,7 +9,7 @@ from support.urdfs import gripper
 
 from lgrasp.errors import HandError, ObjectError
 from lgrasp.hand.build import build_hand
-from lgrasp.hand.find import PACKAGE_HANDS
+from lgrasp.hand.names import PACKAGE_HANDS
 from lgrasp.jobs.hands import hand_source
 from lgrasp.object.find import find_object
 

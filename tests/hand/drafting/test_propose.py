@@ -21,6 +21,12 @@ ALLEGRO = ROOT / "hands" / "allegro" / "hand.urdf"
 NAMES = {"finger_1": "index", "finger_2": "middle", "finger_3": "ring", "finger_4": "thumb"}
 
 
+@pytest.fixture(scope="module")
+def allegro() -> tuple[HandSpec, list[str]]:
+    """Drafted from the primitive URDF."""
+    return draft_spec(ALLEGRO, "drafted")
+
+
 def surfaces(space: OppositionSpace) -> set[frozenset]:
     """Both sides as (link, axis), whatever their order."""
     return {
@@ -29,11 +35,11 @@ def surfaces(space: OppositionSpace) -> set[frozenset]:
 
 
 @pytest.mark.parametrize("real", [False, True], ids=["primitive", "real"])
-def test_allegro_is_proposed_the_spaces_of_its_author(real):
-    path = REAL / "allegro" / "allegro.urdf" if real else ALLEGRO
-    if not path.is_file():
+def test_allegro_is_proposed_the_spaces_of_its_author(allegro, real):
+    path = REAL / "allegro" / "allegro.urdf"
+    if real and not path.is_file():
         pytest.skip("the real Allegro is not at ../shared/assets/hands")
-    spec, said = draft_spec(path, "drafted")
+    spec, said = draft_spec(path, "drafted") if real else allegro
     author = load_spec(ALLEGRO.parent / "hand.yaml").opposition_spaces
     found = {}
     for name, space in spec.opposition_spaces.items():
@@ -52,9 +58,9 @@ def test_allegro_is_proposed_the_spaces_of_its_author(real):
     assert any("opposition spaces" in line and "mm" in line for line in said)
 
 
-def test_a_left_hand_gets_the_mirror_image(tmp_path):
-    path = turned(ALLEGRO, tmp_path, "0 0 0", mirror=True)
-    left, right = (draft_spec(p, "x")[0].opposition_spaces for p in (path, ALLEGRO))
+def test_a_left_hand_gets_the_mirror_image(allegro, tmp_path):
+    right = allegro[0].opposition_spaces
+    left = draft_spec(turned(ALLEGRO, tmp_path, "0 0 0", mirror=True), "drafted")[0].opposition_spaces
     assert list(left) == list(right)
     for name, space in right.items():
         for side, other in zip(space.sides, left[name].sides, strict=True):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.hands import FILES, REAL, ROOT, hand_model, hand_source, minimal_spec
+from support.hands import FILES, REAL, ROOT, hand_source, minimal_spec
 from support.urdfs import fingers, gripper, turned
 
 from lgrasp.hand.build import build_hand
@@ -19,7 +19,7 @@ SHIPPED = sorted(p.name for p in (ROOT / "hands").iterdir())
 
 
 def measured(path: Path, spec: HandSpec) -> dict[str, Opening]:
-    urdf, model = read_urdf(path), build_hand(path, spec)
+    urdf, model = read_urdf(path), build_hand(path, spec, pieces_only=True)
     postures = space_postures(model)
     return {
         s.name: space_opening(model, postures, s, space_sides(urdf, spec, model.tree, s.name))
@@ -69,7 +69,8 @@ def test_every_space_of_a_shipped_hand_can_hold_something(name):
 
 @pytest.mark.parametrize("name", ["allegro", "leap", "shadow"])
 def test_every_space_can_hold_something_on_the_real_model(name):
-    path, model, spec = hand_source(name)[0], hand_model(name), find_hand(name).spec
+    path, least = hand_source(name)
+    model, spec = build_hand(path, least, pieces_only=True), find_hand(name).spec
     postures, urdf = space_postures(model), read_urdf(path)
     sides = {s: space_sides(urdf, spec, model.tree, s.name) for s in hand_spaces(spec, model.tree)}
     holds({s.name: space_opening(model, postures, s, both) for s, both in sides.items()})

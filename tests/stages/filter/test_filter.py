@@ -117,13 +117,13 @@ def test_control_poses(finished, inputs, link_poses):
 
 
 def test_pregrasp_is_clear(finished, inputs, link_poses, link_distance):
-    """Touching links are off the object by the margin, unless the pregrasp is the grasp itself."""
+    """Touching links are off the object by the margin, unless a finger cannot open."""
     grasps, _, bounds = finished
     X = link_poses(grasps.q_pregrasp)
     vertices = inputs.object.model.obstacle_points[::7]
     checked = 0
     for i in range(0, len(grasps), 5):
-        if np.abs(grasps.q_pregrasp[i] - grasps.q[i]).max() < 1e-6:
+        if grasps.metrics["pregrasp_opening"][i] == 0:
             continue
         points = Rotation.from_quat(grasps.pose[i, 3:]).apply(vertices) + grasps.pose[i, :3]
         for link in np.unique(grasps.contact_links[i]):
@@ -133,6 +133,20 @@ def test_pregrasp_is_clear(finished, inputs, link_poses, link_distance):
                 assert link_distance(int(link), local[near]).min() > 0.5 * bounds.min_pregrasp_distance
                 checked += 1
     assert checked > 10
+
+
+def test_pregrasp_opening(finished, inputs):
+    """The least over the touching fingers of the largest motion of their joints; 0 hardly ever."""
+    grasps, tree = finished[0], inputs.hand.model.tree
+    moved = np.abs(grasps.q_pregrasp - grasps.q)
+    widest = np.stack([moved[:, c].max(1) for c in np.split(tree.dof_index, tree.dof_first[1:-1])], 1)
+    opening = np.full(len(grasps), np.inf)
+    for i, links in enumerate(grasps.contact_links):
+        for group in {tree.body_group[tree.link_body[link]] for link in links[links >= 0]} - {-1}:
+            opening[i] = min(opening[i], widest[i, group])
+    np.testing.assert_allclose(grasps.metrics["pregrasp_opening"], opening, atol=1e-6)
+    assert (opening == 0).mean() < 0.01
+    np.testing.assert_array_equal(grasps.metrics["force_closure"], grasps.metrics["epsilon"] > 0)
 
 
 def test_unresisted_load_is_bounded_where_asked(tables, context, swift):

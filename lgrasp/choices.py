@@ -1,0 +1,16 @@
+"""Names of which one is chosen, as types: parameters, configs and options of the command line take the same ones."""
+
+from typing import Literal
+
+Method = Literal["field", "anneal", "mala"]
+"""How a sequence continues with the next object."""
+Policy = Literal["uniform", "lookahead"]
+"""How a sequence chooses the opposition space of a step."""
+FieldIndex = Literal["voxel", "bvh"]
+"""How a contact field is looked up."""
+ProtocolName = Literal["fc", "gravity6", "gravity6_mu1", "seq6", "seq6_mu06"]
+"""Protocols of the simulation (:mod:`lgrasp.simulate.protocol`)."""
+FormatName = Literal["dexgraspnet", "dexgraspbench", "isaac-grasp", "mjcf"]
+"""Formats of other programs (:mod:`lgrasp.dataset.exports.formats`)."""
+MetricName = Literal["volume", "epsilon_exact"]
+"""Metrics that can be added to shards (:mod:`lgrasp.dataset.metrics`)."""

@@ -1,0 +1,56 @@
+"""Conditions on the columns of shards, as users write them."""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.errors import ConfigError, ShardError
+
+OBJECTS_HELD = "objects"
+"""The number of objects in the hand, as if it were a column."""
+
+_OPERATORS = {">=": np.greater_equal, "<=": np.less_equal, "==": np.equal, "!=": np.not_equal}
+_OPERATORS |= {">": np.greater, "<": np.less}
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_PATTERN = re.compile(rf"\s*([\w/.-]+?)\s*(?:({'|'.join(_OPERATORS)})\s*({_NUMBER})\s*)?", re.ASCII)
+
+
+class Condition(NamedTuple):
+    """A column of one number per row, compared with a number; without an operator it must be true (not 0)."""
+
+    column: str
+    operator: str = "!="
+    value: float = 0.0
+
+    def __str__(self) -> str:
+        return self.column if self[1:] == ("!=", 0.0) else f"{self.column} {self.operator} {self.value:g}"
+
+    def holds(self, reader: ShardReader) -> np.ndarray:
+        """Which rows satisfy it, bool, shape [N]; a NaN satisfies nothing.
+
+        Raises:
+            ShardError: The shard has no such column, or not one number per row.
+        """
+        single = [OBJECTS_HELD, *(name for name, (shape, _) in reader.columns.items() if len(shape) == 1)]
+        if self.column not in single:
+            hint = " (lgrasp simulate adds physics columns)" if self.column.startswith("physics/") else ""
+            known = ", ".join(single)
+            raise ShardError(f"{reader.path}: no column {self.column!r}{hint}; with one number per row it has {known}")
+        held = self.column == OBJECTS_HELD
+        values = (reader.column("object_index") >= 0).sum(1) if held else reader.column(self.column)
+        return _OPERATORS[self.operator](values, self.value) & ~np.isnan(values.astype(np.float64))
+
+
+def parse_condition(text: str) -> Condition:
+    """Read ``COLUMN`` or ``COLUMN OP NUMBER`` with OP one of ``> >= < <= == !=``.
+
+    Raises:
+        ConfigError: It is neither.
+    """
+    match = _PATTERN.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"--where '{text}': expected COLUMN or COLUMN OP NUMBER, such as 'metrics/epsilon > 0.01'")
+    column, sign, number = match.groups()
+    return Condition(column, sign, float(number)) if sign else Condition(column)

@@ -1,0 +1,88 @@
+"""The shards that a command works on: files that were named, and those in folders that it can use."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from lgrasp.dataset.files import Paths, named_files, shards_below
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.errors import ShardError
+from lgrasp.grasp.schema import MADE_FROM
+from lgrasp.notices import notice
+
+T = TypeVar("T")
+
+
+class Gathered(NamedTuple, Generic[T]):
+    """A shard that can be used."""
+
+    path: Path
+    place: Path
+    """Below the folder that was named; the name of a file that was named itself."""
+    value: T
+    """What the look at it gave."""
+
+
+def gather(
+    paths: Paths, look: Callable[[ShardReader], T] = lambda _: None, *, leave_out: Path | None = None
+) -> list[Gathered[T]]:
+    """The shards among files and folders of any depth, in the order of their names.
+
+    In a folder, a file that cannot be used is left out, and so is one whose rows were made from those of another (by
+    ``refine``, ``simulate --out``, ...), or are copies of them; each kind is reported in one line.
+
+    Args:
+        look: What is needed of a shard; it raises ShardError where the shard cannot be used.
+        leave_out: Folder that is not looked into.
+
+    Raises:
+        ShardError: A path does not exist, a file that was named cannot be used, or no shard is left.
+    """
+    found: list[Gathered[T]] = []
+    unusable: list[str] = []
+    first: dict[Any, int] = {}  # rows -> number of their best file so far
+    twice: dict[int, int] = {}  # number of a file -> of the one that it repeats
+    by_name = set(named_files(paths))
+    for path, folder in shards_below(paths, leave_out):
+        named = path in by_name
+        try:
+            with ShardReader(path) as reader:
+                value, rows = look(reader), _rows_of(reader)
+        except ShardError as error:
+            if named:
+                raise
+            unusable.append(str(error))
+            continue
+        number = len(found)
+        found.append(Gathered(path, path.relative_to(folder), value))
+        if rows is None or named:
+            continue
+        best = first.setdefault(rows, number)
+        if best == number or found[best].path.parent == path.parent:
+            continue
+        if _rank(path) > _rank(found[best].path):
+            first[rows], twice[best] = number, number
+        else:
+            twice[number] = best
+    if not found:
+        raise ShardError(unusable[0])
+    if unusable:
+        notice(f"{len(unusable)} of {len(unusable) + len(found)} files are left out, first {unusable[0]}")
+    if twice:
+        other, best = min(twice.items())
+        told = f"{found[other].path} (rows of {found[best].path})"
+        notice(f"{len(twice)} of {len(found)} shards repeat rows of others and are left out, first {told}")
+    return [one for number, one in enumerate(found) if number not in twice]
+
+
+def _rows_of(reader: ShardReader) -> Any:
+    """The same for shards of the same candidates of a run; None where a shard does not tell."""
+    header = reader.header
+    key = header.config.get("run_key")
+    return (key, header.shard_index, *reader.object_ids) if isinstance(key, str) and header.shard_index >= 0 else None
+
+
+def _rank(path: Path) -> tuple[bool, int]:
+    """Larger for the rows as they were generated, and for more verdicts."""
+    with ShardReader(path) as reader:
+        return MADE_FROM not in reader.statistics, sum(name.startswith("physics/") for name in reader.columns)

@@ -1,0 +1,188 @@
+"""Rows of shards as scenes to look at, read as they are asked for; pictures of them."""
+
+import os
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from itertools import accumulate
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from lgrasp.dataset.conditions import Condition
+from lgrasp.dataset.files import Paths, check_heaps, shards_below
+from lgrasp.dataset.reader import ShardReader, count_rows
+from lgrasp.errors import ConfigError, ShardError
+from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.picture.draw import draw_scene
+from lgrasp.picture.scene import GraspScene, HandShape, scene_of_row
+from lgrasp.picture.sheet import sheet
+from lgrasp.runtime.device import start
+from lgrasp.runtime.kernels import kernel_modules, load_kernels
+
+_FRICTION = 0.5  # where a shard does not say
+_KEPT = 16  # hands, and lists of objects, that stay in memory
+
+
+class _Contents(NamedTuple):
+    hand: HandRecord
+    objects: tuple[ObjectRecord, ...]
+    friction: float
+
+
+class SceneRows:
+    """The rows of shards, counted through all of them, of whatever hands and objects.
+
+    Args:
+        paths: Shard files, or folders that hold some at any depth.
+
+    Raises:
+        ShardError: No shard is found, one cannot be read, or none has a row.
+    """
+
+    def __init__(self, paths: Paths) -> None:
+        self.files = [file for file, _ in shards_below(paths)]
+        self._ends = list(accumulate(map(count_rows, self.files)))
+        if not len(self):
+            raise ShardError(f"{self.files[0]}: no row to look at (shards: {len(self.files)})")
+        self._contents = lru_cache(_KEPT)(_contents)
+        self._shapes: dict[tuple[str, tuple[str, ...]], HandShape] = {}
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def place(self, row: int) -> tuple[Path, int]:
+        """The file of a row, and its number there.
+
+        Raises:
+            ConfigError: There is no such row.
+        """
+        if not 0 <= row < len(self):
+            raise ConfigError(f"row {row} does not exist; there are 0 to {len(self) - 1}")
+        file = bisect_right(self._ends, row)
+        return self.files[file], row - ([0, *self._ends][file])
+
+    def spread(self, count: int) -> list[int]:
+        """So many rows evenly over all of them, or all if there are fewer."""
+        count = min(count, len(self))
+        return [(2 * k + 1) * len(self) // (2 * count) for k in range(count)]
+
+    def scene(self, row: int) -> GraspScene:
+        """The scene of a row.
+
+        Raises:
+            ShardError: The shard is damaged, or its hand cannot be used.
+            ConfigError: There is no such row.
+        """
+        path, number = self.place(row)
+        hand, objects, _ = self._contents(path)
+        with ShardReader(path) as reader:
+            rows = reader.rows(number, number + 1)
+        key = hand.sha256, tuple(hand.joint_names)
+        if key not in self._shapes:
+            self._shapes[key] = HandShape.of_record(hand)
+        try:
+            return scene_of_row(self._shapes[key], objects, rows, 0)
+        except ShardError as error:
+            raise ShardError(f"{path}: row {number}: {error}") from None
+
+    def columns(self) -> list[str]:
+        """Columns with one number per row, of the first shard."""
+        with ShardReader(self.files[0]) as reader:
+            return [name for name, (shape, _) in reader.columns.items() if len(shape) == 1]
+
+    def column(self, name: str) -> np.ndarray:
+        """One number per row, shape [N], float64.
+
+        Raises:
+            ShardError: A shard lacks the column.
+        """
+        parts = []
+        for path in self.files:
+            with ShardReader(path) as reader:
+                parts.append(reader.column(name).astype(np.float64))
+        return np.concatenate(parts)
+
+    def chosen(self, where: Sequence[Condition]) -> np.ndarray:
+        """Rows that satisfy all conditions, rising.
+
+        Raises:
+            ShardError: A shard lacks a column.
+        """
+        good = []
+        for path in self.files:
+            with ShardReader(path) as reader:
+                good.append(np.all([condition.holds(reader) for condition in where], axis=0))
+        return np.flatnonzero(np.concatenate(good))
+
+    def numbers(self, row: int) -> dict[str, float | list[float]]:
+        """Metrics and verdicts of a row by column."""
+        path, number = self.place(row)
+        with ShardReader(path) as reader:
+            names = [name for name in reader.columns if name.startswith(("metrics/", "physics/"))]
+            return {name: reader.column(name, number, number + 1)[0].tolist() for name in names}
+
+    def friction(self, row: int) -> float:
+        """The friction at which the row was checked."""
+        return self._contents(self.place(row)[0]).friction
+
+    def caption(self, row: int, among: Sequence[int]) -> str:
+        """What tells a row from others: its number, and hand and objects where these differ."""
+        names = {r: self._names(r) for r in (row, *among)}
+        differing = [k for k in (0, 1) if len({n[k] for n in names.values()}) > 1]
+        return " · ".join([*(names[row][k] for k in differing), f"row {row:,}"])
+
+    def _names(self, row: int) -> tuple[str, str]:
+        path, _ = self.place(row)
+        hand, objects, _ = self._contents(path)
+        return hand.name, " + ".join(o.id for o in objects)
+
+
+def draw_rows(
+    rows: SceneRows,
+    chosen: Sequence[int],
+    *,
+    stage: str = "grasp",
+    size: int = 256,
+    columns: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    loading: Callable[[str, float], None] | None = None,
+) -> Image.Image:
+    """Rows side by side, each with its number.
+
+    Args:
+        chosen: At least one.
+        stage: pregrasp, grasp or squeeze.
+        size: Pixels of a side of each picture.
+        columns: 0: about as many as lines.
+        progress: Called with (pictures done, pictures in all).
+        loading: Called with (kernels that are ready, share done).
+
+    Raises:
+        ShardError: A shard is damaged, or its hand cannot be used.
+        ConfigError: There is no such row.
+    """
+    start()
+    load_kernels("cpu", kernel_modules("lgrasp.picture."), loading)
+    pictures: list[np.ndarray] = []
+    scenes = [rows.scene(row) for row in chosen]
+    known = sorted({scene.objects[0].record.id for scene in scenes})
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for picture in pool.map(lambda s: draw_scene(s, size, stage, known.index(s.objects[0].record.id)), scenes):
+            pictures.append(picture)
+            if progress:
+                progress(len(pictures), len(scenes))
+    return sheet(pictures, [rows.caption(row, chosen) for row in chosen], columns)
+
+
+def _contents(path: Path) -> _Contents:
+    check_heaps(path)
+    with ShardReader(path) as reader:
+        try:
+            friction = float(reader.header.config["bounds"]["numbers"]["friction"])
+        except (KeyError, TypeError, ValueError):  # of another writer
+            friction = _FRICTION
+        return _Contents(reader.hand(), reader.objects(), friction)

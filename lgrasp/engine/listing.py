@@ -1,0 +1,238 @@
+"""What ``manifest.json`` says while a job runs: of its own files what is asked and made, of files of others that it
+replaces what they are."""
+
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cached_property, partial
+from pathlib import Path
+
+from lgrasp.dataset.manifest import (
+    MANIFEST,
+    SUFFIX,
+    TEMPORARY,
+    ListedRun,
+    ListedShard,
+    Manifest,
+    listed,
+    read_manifest,
+    update_manifest,
+    workers,
+    working_on,
+)
+from lgrasp.engine.events import Part
+from lgrasp.errors import OutputError, ShardError
+from lgrasp.files import remove_leftovers
+
+_MOST_LISTING = 0.05  # share of a job's time that manifests may take while it runs
+
+
+@contextmanager
+def listing(
+    describe: Callable[[], ListedRun],
+    root: Path,
+    every: Sequence[Part],
+    own: Sequence[Part],
+    present: Mapping[int, int],
+    *,
+    asks: bool,
+) -> Iterator["Listing"]:
+    """Keep the manifests of a job's folders while its parts are made.
+
+    Where nothing is made, nothing is left behind, neither a manifest nor a folder.
+
+    Args:
+        describe: gives the job, without shards; called if there is something to list.
+        root: folder of the job.
+        every: all parts of the job.
+        own: those of this process.
+        present: rows of those that are there, by number.
+        asks: the parts ask for a number of rows.
+
+    Raises:
+        OutputError: a folder cannot be written.
+    """
+    found = Listing(describe, root, every, own, asks=asks)
+    try:
+        found.ask(present)
+        yield found
+        found.flush()
+    except BaseException:
+        with suppress(OutputError):  # the first error says more
+            found.flush()
+        raise
+    finally:
+        found.close()
+
+
+class Listing:
+    """The entries of a job in the manifests of its folders; see :func:`listing`."""
+
+    def __init__(
+        self, describe: Callable[[], ListedRun], root: Path, every: Sequence[Part], own: Sequence[Part], *, asks: bool
+    ) -> None:
+        self.folders = _by_folder(own)
+        self._describe, self._root, self._every, self._asks = describe, root, _by_folder(every), asks
+        self._new = sorted({p for f in (root, *self.folders) for p in (f, *f.parents) if not p.exists()}, reverse=True)
+        self._made: dict[Path, dict[str, ListedShard]] = defaultdict(dict)
+        self._dirty: set[Path] = set()
+        self._lock = threading.Lock()
+        self._mark = ExitStack()
+        self._flushed = 0.0  # when, and how long it took [s]
+        self._took = 0.0
+
+    @cached_property
+    def run(self) -> ListedRun:
+        """The job, without shards."""
+        return self._describe()
+
+    def ask(self, present: Mapping[int, int]) -> None:
+        """List what is asked, with the rows of the parts that are there, by number; say that this process works."""
+        if self.folders:
+            remove_leftovers(self._root, TEMPORARY)
+            self._mark.enter_context(working_on(self._root, self.run.run_key))
+        for folder, own in self.folders.items():
+            remove_leftovers(folder, TEMPORARY)
+            known = _entries(folder, self.run)
+            there = {part.number for part in own if part.number in present}
+            shards = []
+            for part in self._every[folder]:
+                shard = self._entry(part)
+                if part.number in there:
+                    old = known.get(shard.file)
+                    same = old is not None and old.sha256 and old.bytes == part.file.stat().st_size
+                    facts = old if same and old else listed(shard, part.file, 0)
+                    update = {"rows": present[part.number], "bytes": facts.bytes, "sha256": facts.sha256}
+                    shard = self._made[folder][shard.file] = shard.model_copy(update=update)
+                shards.append(shard)
+            run = self.run.model_copy(update={"shards": shards})
+            making = {part.file.name for part in own if part.number not in there}
+            update_manifest(folder, partial(Manifest.ask, run=run, making=making))
+
+    def record(self, part: Part, rows: int, *, written: bool) -> None:
+        """List a part that was made; ``written``: its file is on disk, else there was nothing to write."""
+        if part.file.suffix != SUFFIX:
+            return
+        shard = self._entry(part)
+        shard = listed(shard, part.file, rows) if written else shard.model_copy(update={"rows": 0})
+        with self._lock:
+            self._made[part.file.parent][shard.file] = shard
+            self._dirty.add(part.file.parent)
+        if time.monotonic() - self._flushed > self._took / _MOST_LISTING:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is not yet in the manifests."""
+        with self._lock:
+            begin = time.monotonic()
+            while self._dirty:
+                folder = self._dirty.pop()
+                shards = list(self._made[folder].values())
+                update_manifest(folder, partial(Manifest.record, run=self.run, shards=shards))
+            self._flushed = time.monotonic()
+            self._took = self._flushed - begin
+
+    def close(self) -> None:
+        """Say that this process is done; remove manifests without any file, and folders that were made for nothing."""
+        self._mark.close()
+
+        def forget(manifest: Manifest) -> None:
+            if not any(shard.written for shard in manifest.shards) and not workers(self._root):
+                manifest.runs = []
+
+        for folder in self.folders:
+            if not any(shard.sha256 for shard in self._made[folder].values()) and (folder / MANIFEST).exists():
+                update_manifest(folder, forget)
+        for folder in self._new if self.folders else ():
+            with suppress(OSError):
+                folder.rmdir()
+
+    def _entry(self, part: Part) -> ListedShard:
+        asked = part.rows if self._asks else None
+        return ListedShard(file=part.file.name, shard_index=part.shard_index, asked=asked)
+
+
+def begun_array(parts: Sequence[Part]) -> str:
+    """The array of SLURM that began the run of some parts, as the manifest tells; "" if none did."""
+    with suppress(ShardError):
+        for part in parts[:1]:
+            manifest = read_manifest(part.file.parent / MANIFEST)
+            runs = manifest.runs if manifest else []
+            return next((r.array for r in runs if any(s.file == part.file.name for s in r.shards)), None) or ""
+    return ""
+
+
+def _entries(folder: Path, run: ListedRun) -> dict[str, ListedShard]:
+    """What the manifest of a folder says of the files of a run."""
+    with suppress(ShardError):
+        manifest = read_manifest(folder / MANIFEST)
+        return manifest.entries(run) if manifest else {}
+    return {}
+
+
+def _by_folder(parts: Sequence[Part]) -> dict[Path, list[Part]]:
+    """Parts that manifests list, by their folders."""
+    found: dict[Path, list[Part]] = defaultdict(list)
+    for part in parts:
+        if part.file.suffix == SUFFIX:
+            found[part.file.parent].append(part)
+    return found
+
+
+@contextmanager
+def renewing(parts: Sequence[Part], present: Mapping[int, int]) -> Iterator["Renewing"]:
+    """Keep the manifests of the folders of parts, whose files are replaced.
+
+    A file that is going to be replaced is listed without size and SHA-256 until it is, so that a process may be killed
+    at any moment. Folders without a manifest get none.
+
+    Args:
+        present: rows of the parts that are made already, by number.
+
+    Raises:
+        OutputError: a folder cannot be written.
+    """
+    found = Renewing({part.file for part in parts if part.number not in present})
+    try:
+        found.begin([part.file for part in parts])
+        yield found
+    finally:
+        found.close()
+
+
+class Renewing:
+    """Entries of files that are replaced; see :func:`renewing`."""
+
+    def __init__(self, changing: set[Path]) -> None:
+        self._changing, self._lock = changing, threading.Lock()
+
+    def begin(self, files: Collection[Path]) -> None:
+        """List files as they are, but for those that are going to change."""
+        for folder in {file.parent for file in files}:
+            remove_leftovers(folder, TEMPORARY)
+        _renew([file for file in files if file not in self._changing])
+        _renew(self._changing, changing=True)
+
+    def record(self, part: Part, rows: int, *, written: bool) -> None:
+        """List a file as it is now."""
+        with self._lock:
+            self._changing.discard(part.file)
+        _renew([part.file])
+
+    def close(self) -> None:
+        """List files that were not replaced after all."""
+        with self._lock:
+            left, self._changing = self._changing, set()
+        with suppress(OutputError):
+            _renew(left)
+
+
+def _renew(files: Collection[Path], *, changing: bool = False) -> None:
+    folders: dict[Path, list[Path]] = defaultdict(list)
+    for file in files:
+        folders[file.parent].append(file)
+    for folder, these in folders.items():
+        if (folder / MANIFEST).exists():
+            update_manifest(folder, partial(Manifest.renew, files=these, changing=changing))

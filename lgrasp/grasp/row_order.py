@@ -1,0 +1,44 @@
+"""The order of a shard's rows: shuffled by the seed, and the same however the stream of candidates was cut."""
+
+import numpy as np
+
+from lgrasp.grasp.schema import POSE_BITS
+from lgrasp.grasp.tables import GraspTable
+from lgrasp.seeding import stage_seed
+
+_BLOCK_BITS, _KEY_BITS = np.uint64(26), np.uint64(38)  # the number of a block fits in 26 bits
+_GAMMA, _A, _B = np.array([[0x9E3779B97F4A7C15], [0xBF58476D1CE4E5B9], [0x94D049BB133111EB]], np.uint64)
+
+
+class RowOrder:
+    """The order of the rows of one shard.
+
+    Args:
+        seed: base seed.
+        block: candidates of a block.
+    """
+
+    def __init__(self, seed: int, shard: int, block: int) -> None:
+        self._seed = stage_seed(seed, shard, "rows") * _GAMMA
+        self._block = np.uint64(block)
+
+    def shuffled(self, grasps: GraspTable) -> np.ndarray:
+        """Indices (N,) that put the rows of a shard in the order in which they are written."""
+        return np.argsort(self._keys(grasps))
+
+    def by_blocks(self, grasps: GraspTable) -> np.ndarray:
+        """Indices (N,) that put blocks one after another, and the rows of each in random order."""
+        block = (grasps.index.astype(np.uint64) & POSE_BITS) // self._block
+        return np.argsort(block << _KEY_BITS | self._keys(grasps) >> _BLOCK_BITS)
+
+    def _keys(self, grasps: GraspTable) -> np.ndarray:
+        """Random numbers (N,) that belong to the rows: of the seed, the candidate and the search that found it."""
+        candidate = _mixed(grasps.index.astype(np.uint64) + self._seed)
+        return _mixed(candidate + grasps.slot.astype(np.uint64) * _GAMMA)
+
+
+def _mixed(values: np.ndarray) -> np.ndarray:
+    """The finaliser of splitmix64."""
+    values = (values ^ (values >> np.uint64(30))) * _A
+    values = (values ^ (values >> np.uint64(27))) * _B
+    return values ^ (values >> np.uint64(31))

@@ -1,0 +1,25 @@
+"""The content key of a hand: URDF, collision meshes and rules."""
+
+import hashlib
+from pathlib import Path
+
+from lgrasp.geometry.mesh_files import mesh_bytes
+from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.urdf import Urdf, read_urdf
+
+
+def hand_digest(urdf_path: Path, spec: HandSpec) -> str:
+    """SHA-256 over the URDF, the collision meshes it names and the rules: the content key of a hand."""
+    return urdf_digest(read_urdf(urdf_path), spec)
+
+
+def urdf_digest(urdf: Urdf, spec: HandSpec) -> str:
+    """:func:`hand_digest` of a URDF that has been read."""
+    h = hashlib.sha256(urdf.text.encode())
+    for name in sorted(urdf.mesh_files):
+        h.update(name.encode())
+        for data in mesh_bytes(urdf.mesh_files[name]).values():
+            h.update(data)
+    # neither changes a HandModel; views of opposition spaces have digests of their own
+    h.update(spec.model_dump_json(exclude={"opposition_spaces", "stand_off"}).encode())
+    return h.hexdigest()

@@ -1,0 +1,93 @@
+"""What is asked of the job of plans."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, cast
+
+from pydantic import Field
+
+from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES
+from lgrasp.config import apply_settings, parse_model
+from lgrasp.engine.folder import check_folder
+from lgrasp.engine.request import Request
+from lgrasp.errors import CloudError, ConfigError
+from lgrasp.jobs.requests.shards import check_hand, check_object
+from lgrasp.paths import check_file
+from lgrasp.planning.params import PlanParams
+
+_MAX_BASE_DISTANCE = 1.0  # [m] of a base from a start
+
+
+class PlanRequest(Request):
+    """Plans of grasps of an object or of a cloud: one shard of those that passed every check, a row a start."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.refine.plan:PlanJob"
+    unit: ClassVar[str] = "starts"
+
+    hand: str = Field(default="allegro", description="Name, path, or a shard (its hand).")
+    out: Path | None = Field(default=None, description="Folder of the plans; default: plans/HAND-OBJECT.")
+    starts: int = Field(default=80, description="Points of the surface to start from.")
+    object: str | None = Field(default=None, description="Name, mesh file, or a shard of one object.")
+    scale: float = Field(default=1.0, gt=0, description="Factor from the unit of the mesh or cloud to metres.")
+    cloud: Path | None = Field(default=None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene.")
+    mask: Path | None = Field(default=None, description="Labels of the cloud's points (.npy, .npz).")
+    label: int | None = Field(default=None, description="Label of the points to grasp.")
+    viewpoint: tuple[float, float, float] | None = Field(default=None, description="Where the cloud was seen from [m].")
+    stand_off: float | None = Field(
+        default=None, description="Of the hand's base from a start [m]; default: the hand's."
+    )
+    keep_invalid: bool = Field(
+        default=False, description="The best of a start is kept where it fails too, metric valid 0."
+    )
+    params: PlanParams = Field(default_factory=PlanParams)
+
+    @property
+    def title(self) -> str:
+        return f"{Path(self.hand).stem} {self.name}"
+
+    @property
+    def name(self) -> str:
+        """Of what is grasped."""
+        if self.object is not None:
+            return Path(self.object).stem
+        name = Path(str(self.cloud)).stem
+        return name if self.label is None else f"{name}-{self.label}"
+
+    def check(self) -> None:
+        if (self.object is None) == (self.cloud is None):
+            raise ConfigError("give --object (a mesh or a name) or --cloud (a file of points), one of the two")
+        if self.cloud is None and not (self.mask is self.label is self.viewpoint is None):
+            raise ConfigError("--mask, --label and --viewpoint belong to --cloud")
+        if self.starts < 1:
+            raise ConfigError(f"--starts {self.starts}: at least 1")
+        if self.stand_off is not None and not 0 < self.stand_off <= _MAX_BASE_DISTANCE:
+            raise ConfigError(
+                f"--stand-off {self.stand_off:g}: more than 0 and at most {_MAX_BASE_DISTANCE:g} m is accepted"
+            )
+        if not self.params.distal + self.params.other > 0:
+            raise ConfigError("--distal 0 --other 0: nothing pulls the hand to the object; give one of them a weight")
+        check_hand(self.hand)
+        if self.object is not None:
+            check_object(self.object)
+        if isinstance(self.cloud, Path):
+            check_file(self.cloud, CLOUD_SUFFIXES, "a point cloud", CloudError)
+        if self.mask is not None:
+            check_file(self.mask, MASK_SUFFIXES, "a mask", CloudError)
+        if self.out is not None:
+            check_folder(self.out)
+
+
+def plan_params(settings: Sequence[str] = (), **options: float) -> PlanParams:
+    """Parameters of plans.
+
+    Args:
+        settings: ``PART.KEY=VALUE`` each; a part is ``bounds``, ``search`` or ``plan``.
+        options: fields of :class:`PlanParams`.
+
+    Raises:
+        ConfigError: an unknown key, or a value out of range.
+    """
+    params = parse_model(PlanParams, options, "plan")
+    parts: dict[str, Any] = {"bounds": params.bounds, "search": params.search, "plan": params}
+    made = apply_settings(parts, settings, "lgrasp plan")
+    return cast(PlanParams, made["plan"]).model_copy(update={"bounds": made["bounds"], "search": made["search"]})

@@ -1,0 +1,100 @@
+"""What is asked of the jobs that search grasps by a pipeline."""
+
+import math
+from pathlib import Path
+from typing import ClassVar
+
+from pydantic import Field
+
+from lgrasp.choices import ProtocolName
+from lgrasp.config import HandName, ShardFolder
+from lgrasp.engine.folder import check_folder, check_number
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.request import Request
+from lgrasp.errors import ConfigError
+from lgrasp.hand.names import hand_path
+from lgrasp.object.find import find_object
+from lgrasp.sequence.size import parse_size
+
+
+class SearchRequest(Request):
+    """Shards of grasps by one hand, perhaps of fewer rows than requested."""
+
+    hand: HandName = "allegro"
+    rows: int = Field(default=1000, description="Rows requested.")
+    pipeline: Pipeline
+    out: ShardFolder
+    shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
+
+    def check(self) -> None:
+        if self.rows <= 0:
+            raise ConfigError(f"-n {self.rows}: request at least 1")
+        if self.shard_rows <= 0:
+            raise ConfigError(f"--shard-rows {self.shard_rows}: must be at least 1")
+        check_number(-(-self.rows // self.shard_rows), "shards; use larger --shard-rows or several --out")
+        hand_path(self.hand)
+        check_folder(self.out)
+
+
+class GenerateRequest(SearchRequest):
+    """Grasps of one object by one hand."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.generate:GenerateJob"
+
+    object: str = Field(description="Name or mesh file.")
+    scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
+    batch: int = Field(default=0, description="Candidates per batch; 0: by device.")
+    rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
+    reuse: bool = Field(default=False, description="Cache the state of shards; later runs continue from there.")
+
+    @property
+    def title(self) -> str:
+        return f"{Path(self.hand).stem} {Path(self.object).stem} {self.pipeline.name}"
+
+    def check(self) -> None:
+        if self.batch < 0:
+            raise ConfigError(f"--batch {self.batch}: must be at least 0 (0: by device)")
+        if not 0 < self.rate < math.inf:
+            raise ConfigError(f"rate {self.rate}: the rows expected per candidate must be positive and finite")
+        if self.pipeline.sequence is not None:
+            raise ConfigError(
+                f"pipeline '{self.pipeline.name}' is for several objects: lgrasp sequence OBJECT OBJECT ..."
+            )
+        find_object(self.object)
+        super().check()
+
+
+class SequenceRequest(SearchRequest):
+    """Sequences of grasps of several objects by one hand."""
+
+    RENAMED: ClassVar[dict[str, str]] = {"physics": "simulate"}
+
+    maker: ClassVar[str] = "lgrasp.jobs.sequence.job:SequenceJob"
+    unit: ClassVar[str] = "sequences"
+
+    objects: tuple[str, ...] = Field(description="Names or mesh files, in the order in which they are grasped.")
+    rows: int = Field(default=256, description="Complete sequences requested.")
+    scale: str = Field(default="1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")
+    simulate: ProtocolName | None = Field(
+        default=None, description="Protocol that the rows of every step must pass to be continued."
+    )
+    shard_rows: int = Field(default=1000, description="Sequences of a shard; part of what decides the rows.")
+
+    @property
+    def title(self) -> str:
+        return " ".join(Path(name).stem for name in (self.hand, *self.objects))
+
+    def check(self) -> None:
+        if self.pipeline.sequence is None:
+            raise ConfigError(
+                f"pipeline '{self.pipeline.name}' has no sequence; use pipeline sequence, or add 'sequence: {{}}' to it"
+            )
+        if len(self.objects) < 2:
+            named = self.objects[0] if self.objects else "no object"
+            raise ConfigError(
+                f"a sequence needs at least two objects, got {named}; for one object: lgrasp generate --object MESH"
+            )
+        parse_size(self.scale)
+        for name in self.objects:
+            find_object(name)
+        super().check()

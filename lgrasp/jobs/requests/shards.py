@@ -1,0 +1,184 @@
+"""What is asked of the jobs that read shards."""
+
+import os
+from pathlib import Path
+from typing import Annotated, ClassVar, cast
+
+from pydantic import BeforeValidator, Field, field_validator
+
+from lgrasp.choices import FormatName, MetricName
+from lgrasp.config import DeviceName, ShardPaths, apply_settings, parse_model
+from lgrasp.dataset.files import find_shards, shards_below
+from lgrasp.engine.folder import check_folder
+from lgrasp.engine.request import Request, ShardRequest
+from lgrasp.errors import ConfigError, OutputError, ShardError
+from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.hand.names import hand_path
+from lgrasp.learn.params import LearnParams
+from lgrasp.object.find import find_object
+from lgrasp.refine.params import COARSE, LocalSearch
+from lgrasp.simulate.protocol import Protocol, find_protocol
+from lgrasp.stages.refine.params import RefineParams
+
+Format = Annotated[FormatName, BeforeValidator(lambda name: name.replace("_", "-") if isinstance(name, str) else name)]
+"""A format of another program; isaac_grasp is read too."""
+
+
+class SimulateRequest(ShardRequest):
+    """Verdicts of a physics simulation, added to shards, in place or to copies."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.simulate:SimulateJob"
+
+    protocol: Protocol = Field(description="Named protocol.")
+    out: Path | None = Field(default=None, description="Folder of copies; default: the shards get the verdicts.")
+    device: DeviceName = "cpu"
+    all_directions: bool = Field(
+        default=False, description="Go on after the first direction in which an object is lost."
+    )
+
+    @field_validator("protocol", mode="before")
+    @classmethod
+    def _named(cls, value: object) -> object:
+        return find_protocol(value) if isinstance(value, str) else value
+
+    @property
+    def folder(self) -> Path:
+        if self.out is not None:
+            return self.out
+        folders = [path if path.is_dir() else path.parent for path in self.shards]
+        return folders[0] if len(set(folders)) == 1 else Path(os.path.commonpath([f.absolute() for f in folders]))
+
+    @property
+    def in_place(self) -> bool:
+        return self.out is None
+
+
+class MetricsRequest(ShardRequest):
+    """Metrics that are computed from the shards alone, added to copies of them."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.metrics:MetricsJob"
+    unit: ClassVar[str] = "rows"
+
+    add: tuple[MetricName, ...] = Field(min_length=1, description="Metrics: volume, epsilon_exact.")
+    settings: tuple[str, ...] = Field(
+        default=(), description="bounds.KEY=VALUE each, in place of what the rows passed."
+    )
+
+    def check(self) -> None:
+        apply_settings({"bounds": GraspBounds()}, self.settings, "dataset metrics")
+        for folder in (path if path.is_dir() else path.parent for path in self.shards):
+            if folder.resolve() == self.folder.resolve():
+                raise OutputError(f"--out {self.out} is the folder of the shards themselves; choose another")
+        super().check()
+
+
+class RefineRequest(ShardRequest):
+    """Grasps of shards, or of an export of another program, moved by a local search and checked again."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.refine.shards:RefineJob"
+
+    shards: tuple[Path, ...] = Field(description="Shards, folders of them at any depth; or one export, see 'form'.")
+    form: Format | None = Field(default=None, description="Format of another program; none: shards.")
+    hand: str | None = Field(default=None, description="Of grasps in another format; shards hold their own.")
+    keep_invalid: bool = Field(
+        default=False, description="Rows that pass in no posture are kept too, with metric valid 0."
+    )
+    params: RefineParams = Field(default_factory=RefineParams)
+    bounds: GraspBounds | None = Field(default=None, description="None: those that the rows of a shard passed before.")
+    settings: tuple[str, ...] = Field(default=(), description="PART.KEY=VALUE of bounds or refine, in place of theirs.")
+
+    def check(self) -> None:
+        self.numbers(GraspBounds())
+        if self.hand is not None:
+            check_hand(self.hand)
+        if self.form is None:
+            super().check()
+            return
+        if len(self.shards) != 1 or self.hand is None:
+            raise ConfigError(f"grasps in format {self.form}: give one folder or file, and their hand with --hand")
+        if not self.shards[0].exists():
+            raise ShardError(f"{self.shards[0]}: no such file or folder")
+        check_folder(self.folder)
+
+    def numbers(self, told: GraspBounds) -> tuple[GraspBounds, RefineParams]:
+        """What rows of a shard that passed ``told`` must pass, and how they are searched.
+
+        Raises:
+            ConfigError: a setting that cannot be.
+        """
+        parts = {"bounds": self.bounds or told, "refine": self.params}
+        made = apply_settings(parts, self.settings, "lgrasp refine")
+        return cast(GraspBounds, made["bounds"]), cast(RefineParams, made["refine"])
+
+
+class FitRequest(Request):
+    """A predictor of coarse grasps, trained on the grasps of shards: one file."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.learn.job:FitJob"
+    unit: ClassVar[str] = "steps"
+
+    shards: ShardPaths
+    out: Path = Field(default=Path("coarse.pt"), description="File of the predictor.")
+    params: LearnParams = Field(default_factory=lambda: LearnParams.model_validate({}))
+    hand: str | None = Field(default=None, description="Default: that of the shards.")
+
+    def check(self) -> None:
+        if self.out.is_dir():
+            raise OutputError(f"{self.out} is a folder; name a file with --out, such as coarse.pt")
+        shards_below(self.shards)
+        if self.hand is not None:
+            hand_path(self.hand)
+        check_folder(self.out.parent)
+
+
+class ExportRequest(Request):
+    """Grasps of shards, all of one hand, with the hand's URDF and all meshes."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.export:ExportJob"
+
+    shards: ShardPaths
+    to: Format = Field(description="Name of the format.")
+    out: Path = Field(description="Folder to write; it must be empty or not exist yet.")
+    limit: int | None = Field(default=None, ge=1, description="Most grasps.")
+    where: tuple[str, ...] = Field(
+        default=(), description="Only rows of which these are true, such as 'metrics/epsilon > 0.01'."
+    )
+
+    def check(self) -> None:
+        shards_below(self.shards)
+        check_folder(self.out)
+
+
+def check_hand(name: str) -> None:
+    """Look up a hand: a name, a path, or a shard that is to hold it.
+
+    Raises:
+        HandError, ShardError: there is none.
+    """
+    if name.endswith(".h5"):
+        find_shards(Path(name).expanduser())
+    else:
+        hand_path(name)
+
+
+def check_object(name: str) -> None:
+    """Look up an object: a name, a mesh file, or a shard that is to hold it.
+
+    Raises:
+        ObjectError, ShardError: there is none.
+    """
+    if name.endswith(".h5"):
+        find_shards(Path(name).expanduser())
+    else:
+        find_object(name)
+
+
+def refine_params(*, coarse: bool = False, **options: int | None) -> RefineParams:
+    """The stage's parameters, or those for coarse poses, with the options that are given (not None) in their place.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+    given = parse_model(LocalSearch, {name: value for name, value in options.items() if value is not None}, "refine")
+    search = COARSE.model_dump() if coarse else {}
+    return parse_model(RefineParams, search | given.model_dump(exclude_unset=True), "refine")

@@ -1,0 +1,10 @@
+"""Sizes that the kernels are compiled for; plain Python, for kernels and NumPy alike."""
+
+MAX_JOINTS = 16
+"""Most movable joints (mimic joints included) in one dependency group."""
+MAX_BODIES = 40
+"""Most movable joints in a hand."""
+MAX_DOFS = 8
+"""Most actuated joints in one dependency group."""
+MAX_GROUPS = 6
+"""Most dependency groups of a hand."""

@@ -1,0 +1,71 @@
+"""Depth and label images of meshes, by rays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from lgrasp.geometry.poses import device_from_stored
+from lgrasp.picture import depth_kernels as kernels
+from lgrasp.picture.camera import Intrinsics
+from lgrasp.runtime.device import start
+
+NOTHING = -1
+"""Label of pixels that see nothing."""
+
+_FAR = 10.0  # [m]
+
+
+class LabelledMesh(NamedTuple):
+    """A triangle mesh in the scene frame, every face with a label."""
+
+    vertices: np.ndarray
+    """[m], shape (v, 3)."""
+    faces: np.ndarray
+    """Shape (f, 3)."""
+    labels: np.ndarray
+    """Shape (f,)."""
+
+
+@dataclass(frozen=True)
+class Images:
+    """Images of v cameras."""
+
+    intrinsics: Intrinsics
+    pose: np.ndarray
+    """T_scene_camera, x y z [m] qw qx qy qz, shape (v, 7)."""
+    depth: np.ndarray
+    """Along the optical axis [m], shape (v, h, w), f32; 0 where nothing is seen."""
+    labels: np.ndarray
+    """Shape (v, h, w), int32; ``NOTHING`` where nothing is seen."""
+
+
+def join_surfaces(surfaces: Sequence[LabelledMesh]) -> LabelledMesh:
+    """Several surfaces as one."""
+    first = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
+    moved = (s._replace(faces=s.faces + at) for s, at in zip(surfaces, first, strict=False))
+    return LabelledMesh(*map(np.concatenate, zip(*moved, strict=True)))
+
+
+def render(surface: LabelledMesh, intrinsics: Intrinsics, pose: np.ndarray, device: str = "cpu") -> Images:
+    """Exact depths and labels from v cameras at T_scene_camera, x y z [m] qw qx qy qz, shape (v, 7)."""
+    start()
+    with wp.ScopedDevice(device):
+        mesh = wp.Mesh(
+            wp.array(np.asarray(surface.vertices, np.float32), dtype=wp.vec3),
+            wp.array(np.asarray(surface.faces, np.int32).ravel(), dtype=wp.int32),
+        )
+        shape = (len(pose), intrinsics.height, intrinsics.width)
+        depth, label = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.int32)
+        inputs = [
+            mesh.id,
+            wp.array(np.asarray(surface.labels, np.int32), dtype=wp.int32),
+            wp.vec2(intrinsics.fx, intrinsics.fy),
+            wp.vec2(intrinsics.cx, intrinsics.cy),
+            _FAR,
+            wp.array(device_from_stored(pose), dtype=wp.transform),
+        ]
+        wp.launch(kernels.cast_rays, shape, inputs, [depth, label])
+        return Images(intrinsics, np.asarray(pose, float), depth.numpy(), label.numpy())

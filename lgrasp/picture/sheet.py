@@ -1,0 +1,52 @@
+"""Pictures side by side, with captions, as one image file."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from lgrasp.errors import OutputError
+
+FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP"}
+"""Of image files, by suffix."""
+
+_INK = "#3c4650"
+
+
+def sheet(pictures: Sequence[np.ndarray], captions: Sequence[str] = (), columns: int = 0) -> Image.Image:
+    """Pictures of one size, shape (h, w, 3), uint8, in rows, each with its caption below.
+
+    Args:
+        columns: 0: about as many as rows.
+    """
+    columns = columns or int(np.ceil(np.sqrt(len(pictures))))
+    h, w = pictures[0].shape[:2]
+    size = max(11, w // 20)
+    tall = h + (2 * size if any(captions) else 0)
+    out = Image.new("RGB", (min(columns, len(pictures)) * w, -(-len(pictures) // columns) * tall), "#ffffff")
+    draw, font = ImageDraw.Draw(out), ImageFont.load_default(size)
+    for i, picture in enumerate(pictures):
+        x, y = i % columns * w, i // columns * tall
+        out.paste(Image.fromarray(picture), (x, y))
+        if i < len(captions):
+            draw.text((x + w / 2, y + h + size / 4), captions[i], _INK, font, anchor="ma")
+    return out
+
+
+def check_image(path: Path) -> None:
+    """Refuse a file that no image can be written to.
+
+    Raises:
+        OutputError: another suffix than those of :data:`FORMATS`, or a folder.
+    """
+    if path.suffix.lower() not in FORMATS or path.is_dir():
+        raise OutputError(f"picture {path} cannot be written: name a file that ends in {', '.join(FORMATS)}")
+
+
+def image_bytes(image: Image.Image, suffix: str = ".png") -> bytes:
+    """The contents of an image file."""
+    out = io.BytesIO()
+    image.save(out, FORMATS[suffix.lower()], optimize=True, quality=90)
+    return out.getvalue()

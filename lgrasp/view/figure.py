@@ -1,0 +1,165 @@
+"""A hand, objects and contacts in the scene of a viewer."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import trimesh
+
+from lgrasp.geometry.poses import pose_from_matrix
+from lgrasp.hand.surface import joined_mesh
+from lgrasp.picture.draw import CONTACT, HAND, OBJECTS
+from lgrasp.picture.scene import STAGES, GraspScene, HandShape, balls, split_edges
+
+if TYPE_CHECKING:
+    import viser
+
+FORCE = "#1f4fd1"
+NORMAL = "#1a1a1a"
+_DOT = 0.003  # [m]
+_NORMAL = 0.02  # [m]
+_FORCE = 0.08  # [m] of the sum of the normal forces
+_CONE = 0.018  # [m]
+
+
+class Marks(NamedTuple):
+    """What is shown of contacts, and whether the hand hides it."""
+
+    contacts: bool = True
+    normals: bool = False
+    forces: bool = True
+    cones: bool = False
+    see_through: bool = False
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue, 0 to 255, of a colour such as #ff8800."""
+    r, g, b = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return r, g, b
+
+
+STAGE_MARKS = tuple((float(i), name) for i, name in enumerate(STAGES))
+"""Names of the first times of :meth:`GraspScene.at`, for a slider."""
+
+
+def show_all(nodes: "Iterable[viser.SceneNodeHandle]", visible: bool) -> None:
+    """Show or hide nodes."""
+    for node in nodes:
+        node.visible = visible
+
+
+def place(node: "viser.SceneNodeHandle", T: np.ndarray) -> None:
+    """Move a node to a pose (4, 4) in the frame of its parent."""
+    pose = pose_from_matrix(T[None])[0]
+    node.position, node.wxyz = pose[:3], pose[3:]
+
+
+def add_mesh(
+    scene: "viser.SceneApi", name: str, mesh: trimesh.Trimesh, colour: str, opacity: float | None = None
+) -> "viser.MeshHandle":
+    """A mesh with smooth curved parts and sharp edges."""
+    split = split_edges(mesh)
+    return scene.add_mesh_simple(
+        name, split.vertices, split.faces, color=rgb(colour), opacity=opacity, side="double", cast_shadow=False
+    )
+
+
+class HandFigure:
+    """The links of a hand, each a frame with its mesh, below a node."""
+
+    def __init__(self, scene: "viser.SceneApi", name: str, shape: HandShape) -> None:
+        self.shape = shape
+        self.frames = {link: scene.add_frame(f"{name}/{link}", show_axes=False) for link in shape.links}
+        self.meshes = {
+            link: add_mesh(scene, f"{name}/{link}/surface", mesh, HAND[i % len(HAND)])
+            for i, (link, mesh) in enumerate(shape.links.items())
+        }
+
+    def move(self, q: np.ndarray) -> None:
+        """Take a posture, shape (K,)."""
+        for link, T in self.shape.poses(q[None]).items():
+            place(self.frames[link], T[0])
+
+
+class GraspFigure:
+    """A row below a node: what stays from row to row is sent to browsers once."""
+
+    def __init__(self, scene: "viser.SceneApi", name: str) -> None:
+        self._scene, self.name = scene, name
+        self.frame = scene.add_frame(name, show_axes=False)
+        self._hand: HandFigure | None = None
+        self._objects: list[tuple[trimesh.Trimesh, viser.MeshHandle]] = []
+        self._marks: list[viser.SceneNodeHandle] = []
+        self.shown: GraspScene | None = None
+        self._time = 0.0
+
+    def show(self, grasp: GraspScene, colour: int = 0) -> None:
+        """Show another row; the posture comes with :meth:`move`."""
+        if self._hand is None or self._hand.shape is not grasp.hand:
+            if self._hand is not None:
+                self._scene.remove_by_name(f"{self.name}/hand")
+            self._scene.add_frame(f"{self.name}/hand", show_axes=False)
+            self._hand = HandFigure(self._scene, f"{self.name}/hand", grasp.hand)
+        before = self._objects
+        self._objects = []
+        for i, placed in enumerate(grasp.objects):
+            same = i < len(before) and before[i][0] is placed.mesh
+            colour_of = OBJECTS[(colour + i) % len(OBJECTS)]
+            node = before[i][1] if same else add_mesh(self._scene, f"{self.name}/object{i}", placed.mesh, colour_of)
+            place(node, placed.pose)
+            self._objects.append((placed.mesh, node))
+        for _, node in before[len(grasp.objects) :]:
+            node.remove()
+        self.shown = grasp
+
+    def move(self, time: float) -> None:
+        """Show the grasp at a time, see :meth:`GraspScene.at`."""
+        assert self.shown is not None
+        assert self._hand is not None
+        self._time = time
+        q, held = self.shown.at(time)
+        self._hand.move(q)
+        for i, (_, node) in enumerate(self._objects):
+            node.visible = i < held
+
+    def mark(self, marks: Marks, friction: float) -> None:
+        """Show contacts and what acts there."""
+        for node in self._marks:
+            node.remove()
+        self._marks = []
+        assert self.shown is not None
+        assert self._hand is not None
+        for mesh in self._hand.meshes.values():
+            mesh.opacity = 0.35 if marks.see_through else None
+        points, normals, forces = self.shown.contacts
+        if not len(points):
+            return
+        scene, name = self._scene, self.name
+        if marks.contacts:
+            self._marks.append(add_mesh(scene, f"{name}/contacts", balls(points, _DOT), CONTACT))
+        if marks.normals:
+            lines = np.stack([points, points + _NORMAL * normals], 1)
+            self._marks.append(scene.add_line_segments(f"{name}/normals", lines, colors=rgb(NORMAL)))
+        if marks.forces and np.isfinite(forces).all():
+            arrows = np.stack([points - _FORCE * forces, points], 1)
+            self._marks.append(
+                scene.add_arrows(
+                    f"{name}/forces", arrows, rgb(FORCE), shaft_radius=0.001, head_radius=0.0025, head_length=0.007
+                )
+            )
+        if marks.cones:
+            cone = trimesh.creation.cone(_CONE * friction, _CONE).apply_translation([0, 0, -_CONE])
+            turns = [trimesh.geometry.align_vectors([0, 0, -1], normal) for normal in normals]
+            cones = [cone.copy().apply_transform(T).apply_translation(p) for T, p in zip(turns, points, strict=True)]
+            self._marks.append(add_mesh(scene, f"{name}/cones", joined_mesh(cones), FORCE, opacity=0.35))
+
+    def meshes(self) -> dict[str, trimesh.Trimesh]:
+        """What is shown, without marks, in the frame of the node."""
+        assert self.shown is not None
+        q, held = self.shown.at(self._time)
+        objects = {f"object{i}": placed.placed for i, placed in enumerate(self.shown.objects[:held])}
+        found = {**self.shown.hand.placed(q), **objects}
+        for name, mesh in found.items():
+            colour = OBJECTS[0] if name in objects else HAND[0]
+            mesh.visual.face_colors = [*rgb(colour), 255]  # type: ignore[union-attr]
+        return found

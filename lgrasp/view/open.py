@@ -1,0 +1,85 @@
+"""What ``lgrasp view`` is given: shards, a scene, a hand or an object."""
+
+import shlex
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import trimesh
+
+from lgrasp.dataset.reader import open_hdf5
+from lgrasp.dataset.scenes import SceneRows
+from lgrasp.engine.cache import Cache
+from lgrasp.jobs.shard_inputs import named_hand, named_object
+from lgrasp.runtime.device import resolve_device
+from lgrasp.scenes.files import read_scene
+from lgrasp.scenes.schema import FORMAT
+from lgrasp.view.hand import HandView
+from lgrasp.view.names import kind_of
+from lgrasp.view.rows import RowsView
+from lgrasp.view.server import View, close_server, open_server
+from lgrasp.view.table import ObjectView, TableView
+
+if TYPE_CHECKING:
+    import viser
+
+_Make = Callable[["viser.ViserServer"], View]
+
+
+def open_view(
+    what: Sequence[str], cache: Cache, *, host: str, port: int, row: int = 0, where: Sequence[str] = ()
+) -> tuple["viser.ViserServer", View]:
+    """A server that shows what is named.
+
+    Args:
+        what: shards or folders of them; or one scene file, hand or object, by name or path.
+        row: the first that is shown, counted through all shards.
+        where: conditions on rows.
+
+    Raises:
+        LgraspError: nothing of that name, or it cannot be used; viser is not installed.
+    """
+    return _opened(_maker(what, cache, row, where), host, port)
+
+
+def open_hand(name: str, cache: Cache, *, host: str, port: int) -> tuple["viser.ViserServer", View]:
+    """A server that shows a hand, by the user's name for it.
+
+    Raises:
+        LgraspError: there is no such hand, or it cannot be used; viser is not installed.
+    """
+    return _opened(_hand(name, cache), host, port)
+
+
+def _opened(make: "_Make", host: str, port: int) -> tuple["viser.ViserServer", View]:
+    server = open_server(host, port, "lgrasp")
+    try:
+        return server, make(server)
+    except BaseException:
+        close_server(server)
+        raise
+
+
+def _hand(name: str, cache: Cache) -> "_Make":
+    source, model = named_hand(cache, name, resolve_device("cpu"))
+    return partial(HandView, source=source, model=model)
+
+
+def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) -> "_Make":
+    """What makes the view, all input read."""
+    name, path, kind = what[0], Path(what[0]).expanduser(), kind_of(what)
+    if len(what) == 1 and path.is_file() and path.suffix == ".h5":
+        with open_hdf5(path) as file:
+            is_scene = file.attrs.get("format") == FORMAT
+        if is_scene:
+            return partial(TableView, scene=read_scene(path))
+    if kind == "hand":
+        return _hand(name, cache)
+    if kind == "object":
+        found = named_object(cache, name, 1.0, resolve_device("cpu"))
+        mesh = trimesh.Trimesh(np.asarray(found.vertices, float), np.asarray(found.faces), process=False)
+        return partial(ObjectView, name=found.name, mesh=mesh, notes=tuple(found.notes))
+    rows = SceneRows([Path(one).expanduser() for one in what])
+    return lambda server: RowsView(server, rows, shlex.join(what), where, row)

@@ -1,0 +1,203 @@
+"""Rows of shards in a viewer: one after another or side by side, from pregrasp to squeeze, with their contacts."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import trimesh
+
+from lgrasp.dataset.conditions import parse_condition
+from lgrasp.dataset.scenes import SceneRows
+from lgrasp.errors import ConfigError, LgraspError
+from lgrasp.view.figure import STAGE_MARKS, GraspFigure, Marks
+from lgrasp.view.server import Aim, add_saving
+
+if TYPE_CHECKING:
+    import viser
+
+_MOST = 9  # side by side
+_APART = 0.3  # [m]
+_SPEED = 0.8  # stages a second
+_PAUSE = 1.0  # stages, at the end
+_AS_STORED = "as stored"
+
+
+class RowsView:
+    """The rows of shards.
+
+    Args:
+        told: the shards as they were named on the command line.
+        where: conditions, such as ``metrics/epsilon > 0.05``.
+        row: the first that is shown, counted through all shards.
+
+    Raises:
+        LgraspError: no such row, a condition that cannot be read or that no row meets, a damaged shard.
+    """
+
+    def __init__(
+        self, server: "viser.ViserServer", rows: SceneRows, told: str, where: Sequence[str] = (), row: int = 0
+    ) -> None:
+        self._server, self._rows, self._told = server, rows, told
+        self._lock = threading.RLock()
+        self.order: Sequence[int] | np.ndarray = range(len(rows))
+        """Rows that can be gone through."""
+        self._figures: list[GraspFigure] = []
+        self.shown: Sequence[int] = ()
+        """Rows on the screen."""
+        self.told = ""
+        """What is said of the first of them, Markdown."""
+        self._clock: float | None = None
+        rows.place(row)
+        first = rows.scene(row)
+        links = list(first.hand.placed(first.at(1.0)[0]).values())
+        self._aim = Aim(links, [placed.placed for placed in first.objects], first.contacts.points)
+        gui = server.gui
+        self._at = gui.add_slider("grasp", 0, max(len(rows) - 1, 1), 1, row)
+        self._step = gui.add_button_group("", ("previous", "next"))
+        self._time = gui.add_slider("stage", 0.0, first.duration, 0.01, 1.0, marks=STAGE_MARKS)
+        self._play = gui.add_checkbox("play", False)
+        self._text = gui.add_markdown("")
+        with gui.add_folder("choose"):
+            self._where = gui.add_text(
+                "where", ", ".join(where), hint="such as metrics/epsilon > 0.05, physics/fc_holds"
+            )
+            metrics = [name for name in rows.columns() if name != "candidate"]
+            self._sort = gui.add_dropdown("sort by", (_AS_STORED, *metrics), initial_value=_AS_STORED)
+            self._falling = gui.add_checkbox("largest first", True)
+            self._side = gui.add_slider("side by side", 1, _MOST, 1, 1)
+        with gui.add_folder("show"):
+            self._marks = [gui.add_checkbox(name.replace("_", " "), on) for name, on in Marks()._asdict().items()]
+        add_saving(server, self, "grasps")
+        self._at.on_update(self._guarded(self._show))
+        self._side.on_update(self._guarded(self._show))
+        self._time.on_update(self._guarded(lambda: self.move(self._time.value)))
+        for box in self._marks:
+            box.on_update(self._guarded(self._mark))
+        for control in (self._where, self._sort, self._falling):
+            control.on_update(self._guarded(self._choose))
+        self._step.on_click(self._guarded(lambda: self._go(1 if self._step.value == "next" else -1)))
+        if where:
+            self._choose()
+            self._at.value = int(np.argmin(np.abs(np.asarray(self.order) - row)))
+        self._show()
+
+    def tick(self, seconds: float) -> None:
+        """Go on with the animation, if it runs."""
+        if self._play.value:
+            end = self._time.max + _PAUSE
+            self._clock = (self._clock + _SPEED * seconds) % end if self._clock is not None else 0.0
+            self._time.value = min(self._clock, self._time.max)
+        else:
+            self._clock = None
+
+    def meshes(self) -> trimesh.Scene:
+        """Hands and objects as they are shown."""
+        scene = trimesh.Scene()
+        with self._lock:
+            for figure in self._figures:
+                T = np.eye(4)
+                T[:3, 3] = figure.frame.position
+                for name, mesh in figure.meshes().items():
+                    scene.add_geometry(mesh, f"{figure.name}/{name}", f"{figure.name}/{name}", transform=T)
+        return scene
+
+    def _guarded(self, action: Callable[[], None]) -> Callable[["viser.GuiEvent"], None]:
+        """A callback of a control: one at a time; what goes wrong is told in the browser."""
+
+        def call(event: "viser.GuiEvent") -> None:
+            with self._lock:
+                try:
+                    action()
+                except LgraspError as error:
+                    for client in self._server.get_clients().values():
+                        client.add_notification("this does not work", str(error), color="red")
+
+        return call
+
+    def _go(self, step: int) -> None:
+        self._at.value = int(np.clip(self._at.value + step, 0, len(self.order) - 1))
+
+    def choose(self, where: str = "", sort: str = _AS_STORED, *, falling: bool = True, side: int = 1) -> None:
+        """Show the first of the rows that satisfy conditions.
+
+        Args:
+            where: conditions, separated by commas.
+            sort: a column, or ``as stored``.
+            falling: the largest first.
+            side: rows side by side.
+
+        Raises:
+            LgraspError: a condition that cannot be read, no such column, no such row; all stays as it is.
+        """
+        texts = [text for text in where.split(",") if text.strip()]
+        order: Sequence[int] | np.ndarray = range(len(self._rows))
+        if texts:
+            order = self._rows.chosen([parse_condition(text) for text in texts])
+            if not len(order):
+                raise ConfigError(f"no row of {len(self._rows):,} meets {where}")
+        if sort != _AS_STORED:
+            values = self._rows.column(sort)[np.asarray(order)]
+            order = np.asarray(order)[np.argsort(-values if falling else values, kind="stable")]
+        with self._lock:
+            self.order = order
+            self._at.max = max(len(order) - 1, 1)
+            self._at.value = 0
+            self.show(0, side)
+
+    def show(self, position: int, side: int = 1) -> None:
+        """Read and show rows side by side, from a position in :attr:`order` on.
+
+        Raises:
+            ShardError: a shard is damaged.
+        """
+        with self._lock, self._server.atomic():
+            first = min(position, len(self.order) - 1)
+            chosen = [int(row) for row in self.order[first : first + side]]
+            scenes = [self._rows.scene(row) for row in chosen]
+            while len(self._figures) > len(chosen):
+                self._server.scene.remove_by_name(self._figures.pop().name)
+            while len(self._figures) < len(chosen):
+                self._figures.append(GraspFigure(self._server.scene, f"/grasp{len(self._figures)}"))
+            columns = int(np.ceil(np.sqrt(len(chosen))))
+            right, down = _APART * self._aim.right, _APART * self._aim.down
+            places = [i % columns * right + i // columns * down for i in range(len(chosen))]
+            for figure, scene, place in zip(self._figures, scenes, places, strict=True):
+                figure.show(scene)
+                figure.frame.position = place
+            if len(chosen) != len(self.shown):
+                self._aim.apply(self._server, (places[0] + places[-1]) / 2, columns * (1 if columns == 1 else 1.2))
+            self._time.max = max(scene.duration for scene in scenes)
+            self.shown, self.told = chosen, self._described(chosen)
+            self._text.content = self.told
+            self.move(self._time.value)
+            self._mark()
+
+    def move(self, time: float) -> None:
+        """Show the grasps at a time, see :meth:`GraspScene.at`."""
+        with self._lock, self._server.atomic():
+            for figure in self._figures:
+                figure.move(time)
+
+    def _choose(self) -> None:
+        falling, side = self._falling.value, int(self._side.value)
+        self.choose(self._where.value, self._sort.value, falling=falling, side=side)
+
+    def _show(self) -> None:
+        self.show(int(self._at.value), int(self._side.value))
+
+    def _mark(self) -> None:
+        marks = Marks(*(box.value for box in self._marks))
+        for figure, row in zip(self._figures, self.shown, strict=True):
+            figure.mark(marks, self._rows.friction(row))
+
+    def _described(self, chosen: Sequence[int]) -> str:
+        path, number = self._rows.place(chosen[0])
+        lines = [f"**{self._rows.caption(chosen[0], [0, len(self._rows) - 1])}**, {number:,} of `{path.name}`", ""]
+        if len(chosen) > 1:
+            lines += [f"shown: rows {', '.join(f'{row:,}' for row in chosen)}", ""]
+        lines += ["| | |", "|---|---|"]
+        for name, value in self._rows.numbers(chosen[0]).items():
+            told = f"{value:.4g}" if isinstance(value, float) else str(value)
+            lines.append(f"| {name.partition('/')[2]} | {told} |")
+        return "\n".join([*lines, "", f"`lgrasp view {self._told} --row {chosen[0]}`"])

@@ -1,0 +1,125 @@
+"""``lgrasp render`` and ``view``: grasps as pictures without a screen, and in the browser."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from typer import Argument, Option, echo
+
+from lgrasp_cli.names import HAND_OR_OBJECT
+from lgrasp_cli.options import CacheDir, HandArgument, Quiet, Shards, open_cache
+from lgrasp_cli.tables import Answer, plural, reporting
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+    from lgrasp.view.server import View
+
+
+class StageName(StrEnum):
+    """Stages of a grasp."""
+
+    pregrasp = "pregrasp"
+    grasp = "grasp"
+    squeeze = "squeeze"
+
+
+@reporting
+def render(
+    paths: Shards,
+    out: Annotated[Path, Option("--out", "-o", help="File to write: .png, .jpg or .webp.")] = Path("grasps.png"),
+    count: Annotated[int, Option("-n", min=1, max=400, help="Rows, evenly over all.")] = 16,
+    rows: Annotated[str | None, Option(help="Numbers of rows, counted through all shards, such as 0,5,9.")] = None,
+    stage: Annotated[StageName, Option(help="Posture of the hand.")] = StageName.grasp,
+    size: Annotated[int, Option(min=32, max=2048, help="Pixels of a side of each picture.")] = 256,
+    columns: Annotated[int, Option(min=0, help="Pictures in a line; 0: as many as lines.")] = 0,
+    quiet: Quiet = False,
+) -> Answer:
+    """Draw grasps side by side: hand, objects, contacts as dots. Needs no screen and no GPU.
+
+    Shards may be of several hands and objects; subfolders are searched. A dot that is hidden shows through.
+
+    Example: lgrasp render grasps/allegro-mug/robust -n 16 --out grid.png
+    """
+    from lgrasp.dataset.files import shards_below
+
+    shards_below(paths)
+    from lgrasp.dataset.scenes import SceneRows, draw_rows
+    from lgrasp.files import write_file
+    from lgrasp.picture.sheet import check_image, image_bytes
+    from lgrasp_cli.progress import Bar
+
+    check_image(out)
+    found = SceneRows(paths)
+    chosen = found.spread(count) if rows is None else _numbers(rows)
+    with Bar(quiet=quiet) as bar:
+        image = draw_rows(
+            found,
+            chosen,
+            stage=stage,
+            size=size,
+            columns=columns,
+            progress=lambda done, total: bar.show("drawn", done, total, "rows"),
+            loading=bar.share,
+        )
+    write_file(out, image_bytes(image, out.suffix))
+    told = f"{out}: {plural(len(chosen), 'grasp')} of {len(found):,}, {image.width} x {image.height} pixels"
+    return Answer({"out": str(out), "rows": chosen, "of": len(found)}, [] if quiet else [told])
+
+
+Host = Annotated[str, Option(help="Address that the viewer listens on; 0.0.0.0: other computers reach it too.")]
+Port = Annotated[int, Option(min=0, max=65535, help="Port; the next free one is taken.")]
+
+
+def view(
+    what: Annotated[
+        list[str], Argument(help="Shards or folders of them; or one scene, hand or object.", **HAND_OR_OBJECT)
+    ],
+    row: Annotated[int, Option(min=0, help="First row to show, counted through all shards.")] = 0,
+    where: Annotated[
+        list[str] | None,
+        Option(help="Only rows that meet a condition: a column, or COLUMN OP NUMBER; repeatable."),
+    ] = None,
+    host: Host = "localhost",
+    port: Port = 8080,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Look at grasps, scenes, hands and objects in the browser; Ctrl-C ends it.
+
+    Rows are read as they are shown, so that data sets of any size open at once. Needs the extra view (viser).
+
+    Example: lgrasp view grasps/allegro-mug --where "metrics/epsilon > 0.05"
+    """
+    from lgrasp.view.names import kind_of
+
+    kind_of(what)
+    from lgrasp.view.open import open_view
+
+    cache = open_cache(cache_dir)
+    _serve(*open_view(what, cache, host=host, port=port, row=row, where=where or ()))
+
+
+def view_hand(name: HandArgument, host: Host = "localhost", port: Port = 8080, cache_dir: CacheDir = None) -> None:
+    """Look at a hand in the browser: move its joints, see what may touch, its opposition spaces and collision pieces.
+
+    Example: lgrasp hands view allegro
+    """
+    from lgrasp.view.open import open_hand
+
+    _serve(*open_hand(name, open_cache(cache_dir), host=host, port=port))
+
+
+def _serve(server: "ViserServer", view: "View") -> None:
+    from lgrasp.view.server import serve
+
+    echo(f"open http://{server.get_host()}:{server.get_port()} in a browser; Ctrl-C ends this")
+    serve(server, view)
+
+
+def _numbers(text: str) -> list[int]:
+    from lgrasp.errors import ConfigError
+    from lgrasp_cli.options import split
+
+    if not all(part.isdecimal() and len(part) < 19 for part in split(text)):
+        raise ConfigError(f"--rows '{text}': give numbers of rows from 0 on, separated by commas, such as 0,5,9")
+    return [int(part) for part in split(text)]

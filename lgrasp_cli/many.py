@@ -1,0 +1,88 @@
+"""Several jobs one after another: their progress, their plans, and one report of all."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from lgrasp_cli.tables import TextTable, print_report
+from lgrasp_cli.working import How, conclude, run_job
+
+if TYPE_CHECKING:
+    from lgrasp.engine.request import Request
+    from lgrasp.engine.run import Job
+
+
+def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool = False) -> None:
+    """Run jobs, report them, and leave with the worst exit code; one that fails does not stop the others.
+
+    Args:
+        dry_run: show what would be done instead.
+    """
+    tasks = list(zip(requests, how.of_each(requests), strict=True))
+    if dry_run:
+        show_plans([(request.job(how.cache), own) for request, own in tasks], how)
+        return
+    results = []
+    for number, (request, own) in enumerate(tasks, 1):
+        if not how.quiet:
+            typer.echo(f"[{number}/{len(tasks)}] {request.title}", err=True)
+        results.append(_run_one(request, own))
+        if results[-1]["exit_code"] == 130:
+            break
+    code = max(result["exit_code"] for result in results)
+    columns = ("job", "what", "requested", "present", "wall s", "strict/s", "status")
+    table = TextTable(columns, map(_row, results), right=columns[2:6])
+    print_report({"jobs": results, "exit_code": code}, how.json_path, () if how.quiet else [table])
+    if code:
+        raise typer.Exit(code)
+
+
+def show_plans(jobs: "list[tuple[Job, How]]", how: How) -> None:
+    """Print the plans of jobs, each with its own array task."""
+    from lgrasp.jobs.preview import preview
+
+    lines = list({x: None for job, own in jobs for x in preview(job, array=own.array, resume=not own.overwrite)})
+    table = TextTable(("what", "which", "state", "to do", "file"), lines)
+    print_report([line._asdict() for line in lines], how.json_path, [table])
+
+
+def _run_one(request: "Request", how: How) -> dict[str, Any]:
+    """The report of a job with its status, one line of why, and exit code."""
+    from lgrasp.errors import LgraspError
+
+    data: dict[str, Any] = {"title": request.title, "unit": request.unit}
+    status, text, code = "done", "", 0
+    try:
+        request.check()
+        job = request.job(how.cache)
+        from lgrasp.engine.run import own_parts  # not before the check
+
+        if how.array.total and not own_parts(job, how.array)[-1]:
+            return data | {"status": "of other tasks", "error": text, "exit_code": code}
+        found, outcome = run_job(job, how)
+        data |= found
+        conclude(data, outcome)
+    except LgraspError as error:
+        status, text, code = "starved" if error.exit_code == 3 else "failed", str(error), error.exit_code
+        typer.echo(f"error: {error}", err=True)
+    except (MemoryError, OSError) as error:
+        status, text, code = "failed", str(error), 2
+        typer.echo(f"error: {error or 'out of memory'}", err=True)
+    except typer.Exit:
+        status, code = "interrupted", 130
+    return data | {"status": status, "error": text, "exit_code": code}
+
+
+def _row(result: dict[str, Any]) -> tuple[str, ...]:
+    if "asked" not in result:
+        return (result["title"], result["unit"], "-", "-", "-", "-", result["status"])
+    return (
+        result["title"],
+        result["unit"],
+        f"{result['asked']:,}",
+        f"{result['made'] + result['present']:,}",
+        f"{result['seconds']['total']:.1f}",
+        f"{result['strict_valid_per_s']:,.0f}" if "strict_valid_per_s" in result else "-",
+        result["status"],
+    )

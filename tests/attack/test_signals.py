@@ -1,0 +1,36 @@
+"""Commands that are ended at random moments: the same files after another run, and nothing else.
+
+``lgrasp bench soak`` does the same for hours, with all commands.
+"""
+
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+from support.forked import start_forked
+
+from lgrasp.bench.soak import WAYS, Soak
+
+TIMES = {
+    "generate": 3,
+    "dataset merge": 6,
+    "export --to dexgraspnet": 4,
+    "export --to mjcf": 2,
+    "hands add": 1,
+    "simulate": 1,
+    "plan": 1,
+    "scenes make": 1,
+    "dataset metrics": 1,
+}
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks for processes in /proc")
+def test_twenty_moments(tmp_path):
+    random, ways = np.random.default_rng(15), cycle(WAYS)
+    place = Soak(tmp_path, Path(wp.config.kernel_cache_dir).parent, launch=start_forked)
+    found = [place.end(name, next(ways), random.uniform()) for name, times in TIMES.items() for _ in range(times)]
+    assert len(found) == 20
+    assert sum(attack.died for attack in found) > 10
+    assert not [f"{a.command}, {a.way} at {a.moment:.3f}: {fault}" for a in found for fault in a.faults]

@@ -1,0 +1,64 @@
+"""Which shards a command works on: a folder may hold folders, files that cannot be used, and the same rows twice."""
+
+from dataclasses import replace
+
+import pytest
+from support.shards import sample_shard
+
+from lgrasp.dataset.gather import gather
+from lgrasp.dataset.info import describe
+from lgrasp.dataset.torch_dataset import GraspDataset
+from lgrasp.dataset.writer import write_shard
+from lgrasp.errors import ShardError
+from lgrasp.grasp.schema import MADE_FROM
+from lgrasp.notices import on_notice
+
+
+@pytest.fixture
+def said(monkeypatch):
+    lines: list[str] = []
+    monkeypatch.setattr("lgrasp.notices._said", set())
+    monkeypatch.setattr("lgrasp.notices._listeners", [])
+    on_notice(lines.append)
+    return lines
+
+
+def write(path, index, run="a", **statistics):
+    shard = sample_shard(3, shard_index=index)
+    shard = replace(shard, header=replace(shard.header, config={"run_key": run}), statistics=statistics)
+    write_shard(path, shard)
+    return path
+
+
+def test_folders_of_folders(tmp_path, said):
+    one = write(tmp_path / "top" / "mug" / "robust" / "0.h5", 0)
+    two = write(tmp_path / "top" / "bowl" / "robust" / "0.h5", 0, "b")
+    assert [str(shard.place) for shard in gather(tmp_path / "top")] == ["bowl/robust/0.h5", "mug/robust/0.h5"]
+    assert [shard.path for shard in gather([one, one, tmp_path / "top"])] == [one, two]
+    assert len(GraspDataset(tmp_path / "top")) == 6
+    assert said == []
+
+
+def test_what_cannot_be_used_is_left_out(tmp_path, said):
+    good = write(tmp_path / "top" / "a" / "0.h5", 0)
+    cut = write(tmp_path / "top" / "a" / "1.h5", 1)
+    cut.write_bytes(cut.read_bytes()[:-50])
+    (tmp_path / "top" / "notes.h5").write_text("no shard")
+    assert [shard["file"] for shard in describe(tmp_path / "top")] == [str(good)]
+    (line,) = said
+    assert line.startswith(f"2 of 3 files are left out, first {cut}: ")
+    for named in (cut, [good, cut]):
+        with pytest.raises(ShardError, match=r"a/1\.h5"):
+            describe(named)
+    good.unlink()
+    with pytest.raises(ShardError, match=r"a/1\.h5"):
+        describe(tmp_path / "top")
+
+
+def test_the_same_rows_count_once(tmp_path, said):
+    source = write(tmp_path / "top" / "x" / "0.h5", 0)
+    refined = write(tmp_path / "top" / "a-refined" / "0.h5", 0, **{MADE_FROM: "some job"})
+    other = write(tmp_path / "top" / "x" / "1.h5", 1)
+    assert [shard.path for shard in gather(tmp_path / "top")] == [source, other]
+    assert said == [f"1 of 3 shards repeat rows of others and are left out, first {refined} (rows of {source})"]
+    assert [shard.path for shard in gather([refined, tmp_path / "top" / "x"])] == [refined, source, other]

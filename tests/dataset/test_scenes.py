@@ -1,0 +1,57 @@
+"""Rows of many shards as one list of scenes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.jaws import jaw_rows, jaw_shard
+
+from lgrasp.dataset.scenes import SceneRows
+from lgrasp.dataset.writer import write_shard
+from lgrasp.errors import ConfigError, ShardError
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """3 + 2 rows of two objects, in subfolders; the second shard's rows are opened further."""
+    (tmp_path / "urdf").mkdir()
+    first = jaw_shard(tmp_path / "urdf", jaw_rows(0.002, count=3))
+    box = first.objects[0]
+    other = replace(
+        jaw_shard(tmp_path / "urdf", jaw_rows(0.002, opening=0.02, count=2)), objects=[replace(box, id="other")]
+    )
+    for name, shard in (("a", first), ("b", other)):
+        (tmp_path / name).mkdir()
+        write_shard(tmp_path / name / f"{name}.h5", shard)
+    return tmp_path
+
+
+def test_rows_are_counted_through_all_shards(folder):
+    rows = SceneRows(folder)
+    assert len(rows) == 5
+    assert rows.place(2) == (folder / "a" / "a.h5", 2)
+    assert rows.place(3) == (folder / "b" / "b.h5", 0)
+    opening = [float(rows.scene(row).steps[0].stages["pregrasp"][0]) for row in range(5)]
+    np.testing.assert_allclose(opening, [0.03] * 3 + [0.04] * 2, atol=1e-6)
+
+
+def test_spread_is_even_and_complete(folder):
+    rows = SceneRows(folder)
+    assert rows.spread(9) == [0, 1, 2, 3, 4]
+    assert rows.spread(1) == [2]
+    assert rows.spread(2) == [1, 3]
+
+
+def test_captions_tell_what_differs(folder):
+    rows = SceneRows(folder)
+    assert rows.caption(1, [0, 1]) == "row 1"
+    assert rows.caption(4, [0, 4]) == "other · row 4"
+
+
+def test_rows_that_are_not_there(folder, tmp_path):
+    with pytest.raises(ConfigError, match="row 5 does not exist; there are 0 to 4"):
+        SceneRows(folder).scene(5)
+    empty = jaw_shard(folder / "urdf", jaw_rows(0.002, count=0))
+    write_shard(folder / "empty.h5", empty)
+    with pytest.raises(ShardError, match="no row to look at"):
+        SceneRows(folder / "empty.h5")

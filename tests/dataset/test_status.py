@@ -1,0 +1,140 @@
+"""``lgrasp status``, ``dataset check`` and the Dataset on folders with a manifest."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.jobs import SampleJob, StopAfter
+from support.shards import sample_shard
+from typer.testing import CliRunner
+
+from lgrasp import notices
+from lgrasp.dataset.status import folder_states
+from lgrasp.dataset.torch_dataset import GraspDataset
+from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.events import Events
+from lgrasp.engine.run import run
+from lgrasp.errors import ShardError
+from lgrasp_cli.main import app
+
+
+@pytest.fixture
+def said(monkeypatch) -> list[str]:
+    lines: list[str] = []
+    monkeypatch.setattr(notices, "_listeners", [lines.append])
+    monkeypatch.setattr(notices, "_said", set())
+    return lines
+
+
+def call(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def table(folder: Path, *more: str) -> list[list[str]]:
+    """Cells of the lines of lgrasp status, folders relative to one."""
+    lines = call("status", folder, *more).stdout.splitlines()[1:]
+    return [[" ".join(cell.split()) for cell in line.replace(f"{folder}/", "").split("  ") if cell] for line in lines]
+
+
+def test_states(tmp_path):
+    run(SampleJob(out=tmp_path / "a" / "whole"))
+    run(SampleJob(out=tmp_path / "a" / "cut"), StopAfter(1))
+    run(SampleJob(out=tmp_path / "few", most=3))
+    run(SampleJob(out=tmp_path / "two"))
+    run(SampleJob(out=tmp_path / "two", rows=1, name="bowl"))
+    shutil.copy(tmp_path / "two" / "toy-cup-00000.h5", tmp_path / "two" / "merged.h5")
+    write_shard(tmp_path / "old" / "x.h5", sample_shard(2))
+    run(SampleJob(out=tmp_path / "bad"))
+    (tmp_path / "bad" / "manifest.json").write_text("{")
+    run(SampleJob(out=tmp_path / "changed"))
+    path = tmp_path / "changed" / "toy-cup-00001.h5"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert table(tmp_path) == [
+        ["a/cut", "sample toy cup seed 0", "2 of 6", "1 of 3", "incomplete", "run 'lgrasp sample' again"],
+        ["a/whole", "sample toy cup seed 0", "6 of 6", "3 of 3", "complete"],
+        ["bad", "-", "-", "3", "bad list", "the next run in the folder writes it again"],
+        [
+            "changed",
+            "sample toy cup seed 0",
+            "6 of 6",
+            "3 of 3",
+            "damaged",
+            "remove the files, run 'lgrasp sample' again",
+        ],
+        ["few", "sample toy cup seed 0", "3 of 6", "3 of 3", "starved", "another pipeline or seed"],
+        ["old", "-", "-", "1", "unlisted", "the next run in the folder lists them"],
+        ["two", "sample toy bowl seed 0", "1 of 1", "1 of 1", "complete"],
+        ["two", "sample toy cup seed 0", "6 of 6", "3 of 3", "complete"],
+        ["two", "-", "-", "1", "foreign", "'lgrasp dataset info' says what they are"],
+    ]
+    (cut,) = json.loads(call("status", tmp_path / "a" / "cut", "--json", "-").stdout)
+    assert cut["missing"] == ["toy-cup-00001.h5", "toy-cup-00002.h5"]
+    assert (cut["rows"], cut["asked"], cut["shards"], cut["listed"], cut["state"]) == (2, 6, 1, 3, "incomplete")
+
+
+def test_verify_reads_the_files(tmp_path):
+    run(SampleJob(out=tmp_path))
+    path = tmp_path / "toy-cup-00001.h5"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    assert folder_states([tmp_path])[0]["state"] == "complete"
+    (found,) = folder_states([tmp_path], verify=True)
+    assert found["state"] == "damaged"
+    assert list(found["changed"]) == [path.name]
+
+
+def test_running(tmp_path):
+    class Look(Events):
+        def advanced(self, part, done, note=""):
+            found.extend(folder_states([tmp_path]))
+
+    found: list = []
+    run(SampleJob(out=tmp_path, rows=2), Look())
+    assert [(state["state"], len(state["workers"])) for state in found] == [("running", 1)]
+    assert folder_states([tmp_path])[0]["state"] == "complete"
+
+
+def test_nothing_there(tmp_path):
+    for folder, why in ((tmp_path / "none", "no such folder"), (tmp_path, "no manifest.json and no shard")):
+        with pytest.raises(ShardError, match=why):
+            folder_states([folder])
+
+
+def test_check(tmp_path, said):
+    run(SampleJob(out=tmp_path))
+    assert call("dataset", "check", tmp_path).stdout == "3 shards valid\n"
+    shutil.move(tmp_path / "toy-cup-00000.h5", tmp_path / "other.h5")
+    write_shard(tmp_path / "toy-cup-00001.h5", sample_shard(2, shard_index=1))
+    result = call("dataset", "check", tmp_path)
+    assert result.exit_code == 2
+    missing, changed = sorted(result.stderr.splitlines())
+    assert missing == f"{tmp_path / 'manifest.json'}: 1 of 3 shards are missing, first toy-cup-00000.h5"
+    assert changed.startswith(f"{tmp_path / 'toy-cup-00001.h5'}: ")
+    assert "manifest.json says" in changed
+    assert said == [f"{tmp_path / 'manifest.json'}: 1 of the shards there are not listed, first other.h5"]
+    (tmp_path / "manifest.json").write_text("[]")
+    result = call("dataset", "check", tmp_path)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"{tmp_path / 'manifest.json'}: not a manifest of shards")
+
+
+def test_dataset_says_what_is_missing(tmp_path, said):
+    run(SampleJob(out=tmp_path))
+    assert len(GraspDataset(tmp_path)) == 6
+    assert said == []
+    shutil.move(tmp_path / "toy-cup-00002.h5", tmp_path / "other.h5")
+    for _ in range(2):
+        assert len(GraspDataset(tmp_path)) == 6
+    missing, foreign = said
+    assert "1 of 3 shards are missing, first toy-cup-00002.h5" in missing
+    assert "1 of the shards there are not listed, first other.h5" in foreign
+
+
+def test_status_loads_nothing_slow():
+    code = "import sys, lgrasp_cli.status, lgrasp.dataset.status\n"
+    code += "print([m for m in ('torch', 'warp', 'scipy', 'trimesh', 'mujoco') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -1,0 +1,183 @@
+"""``manifest.json`` of a run: what was asked and what is there, whatever happened on the way."""
+
+import hashlib
+import json
+import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.jobs import SampleJob, StopAfter
+from support.shards import sample_shard
+
+from lgrasp import notices
+from lgrasp.dataset.manifest import compare, read_manifest, workers
+from lgrasp.dataset.merge import merge_shards
+from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.events import Events
+from lgrasp.engine.run import run
+from lgrasp.errors import OutputError, ShardError
+
+
+def document(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "manifest.json").read_text())
+
+
+def entries(folder: Path) -> list[tuple[int | None, int | None]]:
+    """(asked, rows) of every file, in order."""
+    return [(s.get("asked"), s.get("rows")) for r in document(folder)["runs"] for s in r["shards"]]
+
+
+def differences(folder: Path):
+    manifest = read_manifest(folder / "manifest.json")
+    assert manifest is not None
+    return compare(sorted(folder.glob("*.h5")), manifest)
+
+
+def test_what_a_manifest_says(tmp_path):
+    run(SampleJob(out=tmp_path, rows=5))
+    (found,) = document(tmp_path)["runs"]
+    shards = found.pop("shards")
+    assert found.pop("run_key") == SampleJob(out=tmp_path).key()
+    assert found.pop("lgrasp_version")
+    assert found == {"job": "sample", "unit": "grasps", "hand": "toy", "objects": ["cup"], "seed": 0}
+    assert [(s["file"], s["shard_index"], s["asked"], s["rows"]) for s in shards] == [
+        ("toy-cup-00000.h5", 0, 2, 2),
+        ("toy-cup-00001.h5", 1, 2, 2),
+        ("toy-cup-00002.h5", 2, 1, 1),
+    ]
+    for shard in shards:
+        data = (tmp_path / shard["file"]).read_bytes()
+        assert (shard["bytes"], shard["sha256"]) == (len(data), hashlib.sha256(data).hexdigest())
+
+
+def test_a_cut_run_lists_what_is_missing_and_ends_like_a_whole_one(tmp_path):
+    run(SampleJob(out=tmp_path / "whole"))
+    run(SampleJob(out=tmp_path / "cut"), StopAfter(1))
+    assert entries(tmp_path / "cut") == [(2, 2), (2, None), (2, None)]
+    assert differences(tmp_path / "cut").missing == ["toy-cup-00001.h5", "toy-cup-00002.h5"]
+    run(SampleJob(out=tmp_path / "cut"))
+    whole, cut = (tmp_path / name / "manifest.json" for name in ("whole", "cut"))
+    assert cut.read_bytes() == whole.read_bytes()
+    before = cut.stat().st_mtime_ns
+    run(SampleJob(out=tmp_path / "cut"))
+    assert cut.stat().st_mtime_ns == before
+
+
+def test_nothing_made_leaves_nothing(tmp_path):
+    assert run(SampleJob(out=tmp_path / "a" / "b"), StopAfter(0)).cancelled
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_more_and_fewer_rows_later(tmp_path):
+    run(SampleJob(out=tmp_path, rows=3))
+    assert entries(tmp_path) == [(2, 2), (1, 1)]
+    run(SampleJob(out=tmp_path, rows=8), StopAfter(0))
+    assert entries(tmp_path) == [(2, 2), (2, None), (2, None), (2, None)]
+    run(SampleJob(out=tmp_path, rows=8))
+    assert entries(tmp_path) == [(2, 2)] * 4
+    run(SampleJob(out=tmp_path, rows=3))  # what is there stays
+    assert entries(tmp_path) == [(2, 2), (1, 2), (None, 2), (None, 2)]
+    assert differences(tmp_path) == ([], {}, [], 4)
+
+
+def test_runs_of_one_folder(tmp_path):
+    """Each has its files; a run that replaces another's takes them over as it goes."""
+    run(SampleJob(out=tmp_path, rows=4))
+    run(SampleJob(out=tmp_path, rows=2, name="bowl"))
+    assert [(r["objects"], len(r["shards"])) for r in document(tmp_path)["runs"]] == [(["bowl"], 1), (["cup"], 2)]
+    run(SampleJob(out=tmp_path, rows=2, seed=1), resume=False)
+    assert [(r["objects"], r["seed"], len(r["shards"])) for r in document(tmp_path)["runs"]] == [
+        (["bowl"], 0, 1),
+        (["cup"], 1, 1),
+        (["cup"], 0, 1),
+    ]
+    assert differences(tmp_path) == ([], {}, [], 3)
+
+
+def test_a_run_that_finds_no_more_is_not_incomplete(tmp_path):
+    run(SampleJob(out=tmp_path, rows=9, most=3))
+    assert entries(tmp_path) == [(2, 2), (2, 1), (2, 0), (2, 0), (1, 0)]
+    assert differences(tmp_path) == ([], {}, [], 5)
+    assert len(list(tmp_path.glob("*.h5"))) == 3
+    before = (tmp_path / "manifest.json").read_bytes()
+    run(SampleJob(out=tmp_path, rows=9, most=3))
+    assert (tmp_path / "manifest.json").read_bytes() == before
+
+
+def test_files_that_came_before_the_manifest_belong(tmp_path):
+    run(SampleJob(out=tmp_path, rows=4))
+    run(SampleJob(out=tmp_path, rows=2, name="bowl"))
+    (tmp_path / "manifest.json").unlink()
+    run(SampleJob(out=tmp_path, rows=6))
+    assert [(r["job"], len(r["shards"])) for r in document(tmp_path)["runs"]] == [("", 1), ("sample", 3)]
+    assert differences(tmp_path) == ([], {}, [], 4)
+    run(SampleJob(out=tmp_path, rows=2, name="bowl"))
+    assert [r["job"] for r in document(tmp_path)["runs"]] == ["sample", "sample"]
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"\x00\xff", b"[]", b'{"format": "lgrasp-manifest", "runs": 3}'])
+def test_a_damaged_manifest_is_said_and_written_again(tmp_path, damage, monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(notices, "_listeners", [said.append])
+    monkeypatch.setattr(notices, "_said", set())
+    run(SampleJob(out=tmp_path))
+    whole = (tmp_path / "manifest.json").read_bytes()
+    (tmp_path / "manifest.json").write_bytes(damage)
+    run(SampleJob(out=tmp_path))
+    assert (tmp_path / "manifest.json").read_bytes() == whole
+    assert [line.endswith("writing it again") for line in said] == [True] * bool(damage)
+
+
+def test_manifest_that_is_no_file(tmp_path):
+    (tmp_path / "manifest.json").mkdir()
+    with pytest.raises(OutputError, match=r"manifest\.json: it is no file; remove it"):
+        run(SampleJob(out=tmp_path))
+
+
+def test_missing_changed_and_foreign_shards_in_a_merge(tmp_path, monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(notices, "_listeners", [said.append])
+    monkeypatch.setattr(notices, "_said", set())
+    folder, out = tmp_path / "run", tmp_path / "all.h5"
+    run(SampleJob(out=folder), StopAfter(2))
+    with pytest.raises(ShardError, match=r"1 of 3 shards are missing, first toy-cup-00002\.h5; .*--partial"):
+        merge_shards(folder, out)
+    assert not out.exists()
+    assert merge_shards(folder, out, partial=True) == 4
+    assert "what is there is merged" in said[-1]
+    run(SampleJob(out=folder))
+    shutil.copy(folder / "toy-cup-00002.h5", tmp_path / "kept.h5")
+    write_shard(folder / "toy-cup-00002.h5", sample_shard(2, shard_index=2))
+    for partial in (False, True):
+        with pytest.raises(ShardError, match=r"toy-cup-00002\.h5: .*manifest\.json says"):
+            merge_shards(folder, out, partial=partial)
+    shutil.copy(tmp_path / "kept.h5", folder / "toy-cup-00002.h5")
+    run(SampleJob(out=tmp_path / "more", rows=8))
+    shutil.copy(tmp_path / "more" / "toy-cup-00003.h5", folder / "found.h5")
+    assert merge_shards(folder, out) == 8
+    assert "1 of the shards there are not listed, first found.h5" in said[-1]
+
+
+def test_tasks_that_write_at_once(tmp_path):
+    """Nothing that one of four tasks lists is lost."""
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    run(SampleJob(out=whole, rows=48))
+    with ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(run, SampleJob(out=out, rows=48), array=(task, 4)) for task in range(4)]
+        assert [len(job.result().written) for job in jobs] == [6] * 4
+    assert (out / "manifest.json").read_bytes() == (whole / "manifest.json").read_bytes()
+    assert {path.suffix for path in out.iterdir()} == {".h5", ".json"}
+
+
+def test_a_working_process_is_seen(tmp_path):
+    class Look(Events):
+        def advanced(self, part, done, note=""):
+            found.extend(workers(tmp_path))
+
+    found: list = []
+    run(SampleJob(out=tmp_path, rows=2), Look())
+    assert [(worker.run_key, worker.pid) for worker in found] == [(SampleJob(out=tmp_path).key(), os.getpid())]
+    assert workers(tmp_path) == []

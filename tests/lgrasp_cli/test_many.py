@@ -1,0 +1,51 @@
+"""Several objects and hands in one command; words too many."""
+
+import json
+import shutil
+
+import pytest
+
+from lgrasp.object.find import find_object
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for name in ("tiny", "sphere"):
+        shutil.copy(find_object(name), folder)
+    (folder / "notes.txt").write_text("no mesh")
+    return folder
+
+
+def test_a_job_for_every_object(cli, meshes, quick, tmp_path):
+    base = ("generate", "-p", quick, "-n", 4, "--device", "cpu")
+    plan = cli(*base, "--object", "meshes", "--object", "tiny", "--dry-run")
+    assert "have one folder" in plan.error()
+    (meshes / "tiny.obj").rename(meshes / "small.obj")
+    result = cli(*base, "--object", "meshes/*.obj", "--object", "tiny", "--json", tmp_path / "r.json")
+    assert result.code == 0, result
+    assert [line.split()[-1] for line in result.out.splitlines()[1:]] == ["done"] * 3
+    data = json.loads((tmp_path / "r.json").read_text())
+    assert [job["title"].split()[1] for job in data["jobs"]] == ["small", "sphere", "tiny"]
+    made = sorted(path.parent.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.h5"))
+    assert made == [f"grasps/allegro-{name}/quick" for name in ("small", "sphere", "tiny")]
+    alone = cli(*base, "--object", "tiny", "--json", "-")  # the same folder as among others
+    assert json.loads(alone.out)["present"] == 4
+    info = cli("dataset", "info", "grasps", "--json", "-")
+    assert sum(shard["rows"] for shard in json.loads(info.out)) == 12
+
+
+def test_what_holds_nothing(cli, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for name in ("empty", "*.obj"):
+        assert f"object '{name}' holds no mesh; accepted: .obj" in cli("generate", "--object", name).error()
+    line = cli("generate", "--object", "tiny", "--hand", "empty").error()
+    assert "hand 'empty' holds no hand; folders with hand.yaml and URDF files are accepted" in line
+
+
+def test_a_word_too_many(cli):
+    line = cli("generate", "--object", "mug", "bowl").error()
+    assert line.endswith("(bowl); --object takes one value, and may be repeated: --object mug --object bowl")
+    line = cli("generate", "--object", "mug", "-n", 10, 20).error()
+    assert line.endswith("(20); -n takes one value")

@@ -1,0 +1,154 @@
+"""What the viewer shows, by what it holds; no browser."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.jaws import jaw_rows, jaw_shard
+
+from lgrasp.dataset.reader import read_shard
+from lgrasp.errors import ConfigError
+from lgrasp.picture.camera import Intrinsics
+from lgrasp.scenes.files import write_scene
+from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord
+
+SHARD = Path(__file__).parents[1] / "dataset" / "exports" / "allegro-tiny.h5"
+
+
+@pytest.fixture(scope="module")
+def epsilon():
+    return read_shard(SHARD).grasps.metrics["epsilon"]
+
+
+@pytest.fixture(scope="module")
+def rows(opened):
+    return opened(SHARD, row=3)[1]
+
+
+@pytest.fixture(scope="module")
+def hand(opened):
+    return opened("allegro")[1]
+
+
+def height(scene) -> float:
+    return float(np.ptp(scene.bounds, axis=0)[2])
+
+
+def test_it_begins_at_the_row_that_was_asked(rows):
+    assert list(rows.shown) == [3]
+    assert "lgrasp view" in rows.told
+    assert "--row 3" in rows.told
+
+
+def test_conditions_and_order_choose_rows(rows, epsilon):
+    rows.choose(where="metrics/epsilon > 0.05", sort="metrics/epsilon")
+    good = np.flatnonzero(epsilon > 0.05)
+    assert list(rows.order) == good[np.argsort(-epsilon[good], kind="stable")].tolist()
+    assert list(rows.shown) == [int(rows.order[0])]
+    with pytest.raises(ConfigError, match="no row of 10 meets"):
+        rows.choose(where="metrics/epsilon > 9")
+    rows.choose(where="")
+    assert list(rows.order) == list(range(10))
+
+
+def test_rows_side_by_side_do_not_touch(rows):
+    rows.choose(where="", side=4)
+    assert list(rows.shown) == [0, 1, 2, 3]
+    names = {name.split("/")[1] for name in rows.meshes().geometry}
+    assert names == {"grasp0", "grasp1", "grasp2", "grasp3"}
+    rows.choose(where="", side=1)
+    assert {name.split("/")[1] for name in rows.meshes().geometry} == {"grasp0"}
+
+
+def test_time_moves_the_hand(rows):
+    tips = []
+    for time in (0.0, 1.0):
+        rows.move(time)
+        tips.append(np.concatenate([m.vertices for n, m in rows.meshes().geometry.items() if "tip" in n]))
+    assert np.abs(tips[1] - tips[0]).max() > 0.001
+
+
+def test_a_hand_takes_postures(hand):
+    first = hand.meshes().bounds
+    hand.take(np.full(16, 9.9))  # beyond the limits, so at them
+    assert np.abs(hand.meshes().bounds - first).max() > 0.01
+
+
+@pytest.mark.parametrize("layer", ["contact patches", "palmar side", "collision pieces", "canonical box"])
+def test_layers_come_and_go(hand, layer):
+    assert hand.show(layer, True) > 0
+    assert hand.show(layer, False) == 0
+
+
+def test_an_object(opened):
+    view = opened("tiny")[1]
+    (mesh,) = view.meshes().geometry.values()
+    assert len(mesh.faces) > 10
+
+
+def test_a_scene(opened, tmp_path):
+    """Two grasps of a cube on a table, of which the second is free of collision and comes first."""
+    (tmp_path / "urdf").mkdir()
+    shard = jaw_shard(tmp_path / "urdf", jaw_rows(0.002, count=2))
+    at = np.array([[0, 0, 0.02, 1, 0, 0, 0]], "f4")
+    hand_pose = np.array([[0, 0, 0.3, 1, 0, 0, 0], [0, 0, 0.4, 1, 0, 0, 0]], "f4")
+    depth = np.array([[0.0, 0.01], [0.0, 0.0]], "f4")
+    scene = SceneRecord(
+        seed=0,
+        index=3,
+        hand=shard.hand,
+        objects=shard.objects,
+        table=0.5,
+        object_index=np.zeros(1, "i4"),
+        object_pose=at,
+        views=ViewsRecord(
+            intrinsics=Intrinsics(2, 2, 1.0, 1.0, 0.5, 0.5),
+            pose=at,
+            offset=np.zeros((1, 3), "f4"),
+            depth=np.zeros((1, 2, 2), "u2"),
+            labels=np.full((1, 2, 2), -1, "i2"),
+        ),
+        cloud=CloudRecord(
+            points=np.zeros((1, 3), "f4"),
+            normals=np.array([[0, 0, 1]], "f4"),
+            labels=np.ones(1, "i2"),
+            view=np.zeros(1, "i2"),
+        ),
+        grasps=SceneGrasps(
+            target=np.zeros(2, "i4"),
+            hand_pose=hand_pose,
+            q=shard.grasps.q,
+            q_pregrasp=shard.grasps.q_pregrasp,
+            q_squeeze=shard.grasps.q_squeeze,
+            table_depth=depth,
+            object_depth=np.zeros((2, 2), "f4"),
+            collision_free=np.array([False, True]),
+            candidate=np.arange(2, dtype="u8"),
+            tolerance=0.001,
+        ),
+    )
+    write_scene(tmp_path / "scene.h5", scene)
+    shown = opened(tmp_path / "scene.h5")[1].meshes()
+    cube, palm = shown.geometry["object0"], shown.graph.get("base")[0]
+    np.testing.assert_allclose(cube.bounds.mean(0), [0, 0, 0.02], atol=1e-6)
+    assert palm[2, 3] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("what", "options", "message"),
+    [
+        ("allegrp", {}, "'allegrp' is no file, folder, hand or object; did you mean 'allegro'"),
+        (SHARD, {"row": 10}, "row 10 does not exist; there are 0 to 9"),
+        (SHARD, {"where": ["epsilon >"]}, "expected COLUMN or COLUMN OP NUMBER"),
+    ],
+)
+def test_what_cannot_be_shown_is_said(opened, what, options, message):
+    with pytest.raises(ConfigError, match=message):
+        opened(what, **options)
+
+
+def test_without_viser_the_extra_is_named(opened, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ConfigError, match=r'pip install "lgrasp\[view\]"'):
+        opened(SHARD)
