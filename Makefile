@@ -53,9 +53,9 @@ format: setup
 type: setup
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# WORKERS test files run side by side, each on one thread.
+# WORKERS test files run side by side, each on one thread; a crash ends the run.
 pytest: setup
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0
 
 # Pages that are made from the code: docs/reference/cli.md.
 docs: setup

@@ -118,4 +118,4 @@ def test_names_that_no_file_can_have(tmp_path):
 def test_rows_beyond_a_folder(tmp_path, rows):
     job = GenerateJob(hand="allegro", object="mug", rows=rows, pipeline=load_pipeline("swift"), out=tmp_path)
     with pytest.raises(ConfigError, match=r"shards; use larger --shard-rows"):
-        job.parts()
+        job.check()
