@@ -20,7 +20,7 @@ from lgrasp.engine.pipeline import Pipeline
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.row_order import RowOrder
-from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_grasps, take_rows
+from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_rows
 from lgrasp.stages.context import Context
 
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
@@ -230,8 +230,7 @@ def make_shard(
                 progress(found.count, result)
             if found.count >= rows:
                 break
-    rows_found = join_rows(found.parts)
-    result.grasps = take_rows(rows_found, found.order.shuffled(rows_found))
+    result.grasps = found.shuffled()
     result.wall = earlier + time.perf_counter() - start
     result.exhausted = found.count < rows
     if bank:
@@ -250,14 +249,14 @@ class _Rows:
     """Rows of a shard as they come in: near-duplicates are left out, rows beyond those asked are set aside."""
 
     def __init__(self, inputs: Inputs, order: RowOrder, rows: int, lock: AbstractContextManager[Any]) -> None:
-        self.parts: list[GraspTable] = []
         self.result = ShardResult(no_grasps())
         self._kept = KeptRows(inputs.hand.model.dofs, inputs.device.alias)
         self._center = inputs.object.model.center
-        self.order = order
+        self._order = order
         self._rows = rows
         self._lock = lock  # held while the device is used
-        self._aside: GraspTable | None = None
+        self._parts: list[tuple[GraspTable, np.ndarray]] = []  # rows of tables, copied at the end
+        self._aside: tuple[GraspTable, np.ndarray | slice] | None = None
 
     @property
     def count(self) -> int:
@@ -266,30 +265,41 @@ class _Rows:
     def add(self, grasps: GraspTable) -> None:
         """Add the new ones of further rows, up to the number requested."""
         if self.count >= self._rows:
-            self._aside = grasps
+            self._aside = grasps, slice(None)
             return
-        order = self.order.by_blocks(grasps)
+        order = self._order.by_blocks(grasps)
         # near-duplicates are defined on poses as they are written
         pose = user_poses(grasps.pose.take(order, axis=0), self._center)
         with self._lock:
             new, duplicates = self._kept.add(pose, grasps.q.take(order, axis=0), self._rows - self.count)
         self.result.duplicates += duplicates
-        self.parts.append(take_grasps(grasps, np.sort(order[new])))
-        self._aside = take_rows(grasps, order[len(new) + duplicates :])
+        self._parts.append((grasps, order[new]))
+        self._aside = grasps, order[len(new) + duplicates :]
+
+    def shuffled(self) -> GraspTable:
+        """The rows that are kept, in the order in which they are written."""
+        index, slot = (
+            np.concatenate([getattr(t, name)[rows] for t, rows in self._parts]) for name in ("index", "slot")
+        )
+        order = self._order.shuffled(index, slot)
+        if len(self._parts) == 1:
+            table, rows = self._parts[0]
+            return take_rows(table, rows[order])
+        return take_rows(join_rows([take_rows(table, rows) for table, rows in self._parts]), order)
 
     def restore(self, account: Account) -> None:
         """Start from the state of an earlier run."""
         table = account.grasps
-        own = take_grasps(table, np.arange(account.kept))
-        self._kept.restore(user_poses(own.pose, self._center), own.q)
-        self.parts.append(own)
+        own = np.arange(account.kept)
+        self._kept.restore(user_poses(table.pose[own], self._center), table.q[own])
+        self._parts.append((table, own))
         result = self.result
         result.counts, result.seconds, result.wall = account.counts, account.seconds, account.wall
         result.candidates, result.duplicates = account.candidates, account.duplicates
-        self.add(take_grasps(table, np.arange(account.kept, len(table))))
+        self.add(take_rows(table, slice(account.kept, None)))
 
     def account(self) -> Account:
         """How far the shard has come."""
         r = self.result
-        table = join_rows([r.grasps, self._aside] if self._aside else [r.grasps])
+        table = join_rows([r.grasps, take_rows(*self._aside)] if self._aside else [r.grasps])
         return Account(table, self.count, r.candidates, r.duplicates, r.counts, r.seconds, r.wall)

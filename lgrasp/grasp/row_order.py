@@ -22,19 +22,18 @@ class RowOrder:
         self._seed = stage_seed(seed, shard, "rows") * _GAMMA
         self._block = np.uint64(block)
 
-    def shuffled(self, grasps: GraspTable) -> np.ndarray:
-        """Indices (N,) that put the rows of a shard in the order in which they are written."""
-        return np.argsort(self._keys(grasps))
+    def shuffled(self, index: np.ndarray, slot: np.ndarray) -> np.ndarray:
+        """Indices (N,) that put rows with these candidates and slots (N,) in the order in which they are written."""
+        return np.argsort(self._keys(index, slot))
 
     def by_blocks(self, grasps: GraspTable) -> np.ndarray:
         """Indices (N,) that put blocks one after another, and the rows of each in random order."""
         block = (grasps.index.astype(np.uint64) & POSE_BITS) // self._block
-        return np.argsort(block << _KEY_BITS | self._keys(grasps) >> _BLOCK_BITS)
+        return np.argsort(block << _KEY_BITS | self._keys(grasps.index, grasps.slot) >> _BLOCK_BITS)
 
-    def _keys(self, grasps: GraspTable) -> np.ndarray:
+    def _keys(self, index: np.ndarray, slot: np.ndarray) -> np.ndarray:
         """Random numbers (N,) that belong to the rows: of the seed, the candidate and the search that found it."""
-        candidate = _mixed(grasps.index.astype(np.uint64) + self._seed)
-        return _mixed(candidate + grasps.slot.astype(np.uint64) * _GAMMA)
+        return _mixed(_mixed(index.astype(np.uint64) + self._seed) + slot.astype(np.uint64) * _GAMMA)
 
 
 def _mixed(values: np.ndarray) -> np.ndarray:
