@@ -15,6 +15,7 @@ from lgrasp_cli.options import (
     Hand,
     JsonPath,
     Quiet,
+    Seed,
     Settings,
     Workers,
     check_report,
@@ -40,7 +41,6 @@ app = typer.Typer(
 _List = Annotated[str | None, Option(help="Names or files, separated by commas.", show_default="the published")]
 _ObjectDir = Annotated[Path | None, Option(help="Folder where the names of objects are looked up first.")]
 _Repeat = Annotated[int, Option(min=1, help="Runs of each pipeline and object.")]
-_Seed = Annotated[int | None, Option(help="Base seed; default: the pipelines'.")]
 
 
 @app.callback()
@@ -53,7 +53,7 @@ def bench(
     repeat: _Repeat = 3,
     object_dir: _ObjectDir = None,
     settings: Settings = None,
-    seed: _Seed = None,
+    seed: Seed = None,
     device: Device = "auto",
     workers: Workers = 0,
     json_path: JsonPath = None,
@@ -102,7 +102,7 @@ def table1(
         int | None, Option(min=1, help="Rows of a shard; large ones fill a GPU.", show_default="10000")
     ] = None,
     settings: Settings = None,
-    seed: _Seed = None,
+    seed: Seed = None,
     device: Device = "auto",
     workers: Workers = 0,
     json_path: JsonPath = None,

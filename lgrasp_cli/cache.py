@@ -48,14 +48,14 @@ def list_entries(
 
 @app.command()
 def prune(
-    kind: Annotated[list[str] | None, Option(help="Only this kind, such as bank; repeatable.")] = None,
+    kind: Annotated[list[str] | None, Option(help="Only this kind, such as field; repeatable.")] = None,
     older_than: Annotated[str | None, Option(metavar="AGE", help="Only entries older than this: 30d, 12h.")] = None,
     everything: Annotated[bool, Option("--all", help="All entries, and compiled kernels.")] = False,
     cache_dir: CacheDir = None,
 ) -> None:
     """Remove entries from the cache; they are rebuilt when needed.
 
-    Example: lgrasp cache prune --kind bank --older-than 7d
+    Example: lgrasp cache prune --kind field --older-than 7d
     """
     import time
 

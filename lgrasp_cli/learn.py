@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from lgrasp_cli.options import CacheDir, Device, Quiet, given, open_cache
+from lgrasp_cli.options import CacheDir, Device, Quiet, Shards, given, open_cache
 from lgrasp_cli.tables import Answer, Block, reporting
 from lgrasp_cli.working import How, working
 
@@ -14,13 +14,11 @@ app = typer.Typer(
     name="learn", help="Predict coarse grasps from partial point clouds with a small network.", no_args_is_help=True
 )
 
-_Shards = Annotated[list[Path], Argument(help="Shard files, or folders of them.")]
-
 
 @app.command()
 @working
 def fit(
-    shards: _Shards,
+    shards: Shards,
     how: How,
     out: Annotated[Path, Option("--out", "-o", help="File of the predictor.")] = Path("coarse.pt"),
     steps: Annotated[int | None, Option(help="Training steps on poses alone; default: 1500.")] = None,
@@ -50,7 +48,7 @@ def fit(
 @reporting
 def evaluate(
     predictor: Annotated[Path, Argument(exists=True, dir_okay=False, help="File written by lgrasp learn fit.")],
-    shards: _Shards,
+    shards: Shards,
     clouds: Annotated[int, Option(min=1, help="New clouds per object.")] = 8,
     seed: Annotated[int, Option(min=0, help="Seed of the clouds.")] = 1,
     device: Device = "auto",

@@ -23,7 +23,7 @@ PipelineName = Annotated[str, Option("--pipeline", "-p", help="Name of a pipelin
 Seed = Annotated[int | None, Option(help="Base seed; default: the pipeline's.")]
 Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
 Device = Annotated[str, Option(help="auto: the first GPU, else the CPU.", **DEVICE)]
-Workers = Annotated[int, Option(min=0, help="Threads; 0: all cores (1 on a GPU).")]
+Workers = Annotated[int, Option(min=0, help="Threads or processes; 0: by device.")]
 CacheDir = Annotated[Path | None, Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.")]
 Contacts = Annotated[str | None, Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.")]
 JsonPath = Annotated[

@@ -9,8 +9,10 @@ from typing import Any
 import typer
 
 _PAGE = Path(__file__).parents[1] / "docs" / "reference" / "cli.md"
-_MANY = 10  # commands from which on an option is listed once for all
+_MANY = 3  # commands from which on an option is explained once for all
 _MARK = "## Common options\n"
+_JOB = ("--device", "--workers", "--array", "--overwrite", "--rebuild", "--json", "--cache-dir", "--quiet")
+_Row = tuple[str, str, str]  # names, meaning, default and range of an option
 
 
 def cli_page() -> str:
@@ -18,16 +20,21 @@ def cli_page() -> str:
     from lgrasp_cli.main import app
 
     commands = list(_commands(typer.main.get_command(app), None, "lgrasp"))
-    counts = Counter(row for command in commands for row in _options(*command))
-    common: dict[str, str] = {}
+    counts = Counter(row[:2] for command in commands for row in _options(*command))
+    defaults = Counter(row for command in commands for row in _options(*command))
+    common: dict[str, _Row] = {}
     for (names, what), count in counts.most_common():
-        if count >= _MANY and _flag(names) not in map(_flag, common):
-            common[names] = what
-    lines = [_MARK, "The commands below name these options without repeating their meaning.", ""]
-    lines += [*_table(common.items()), ""]
+        if count >= _MANY and _flag(names) not in common:
+            rows = [row for row, _ in defaults.most_common() if row[:2] == (names, what)]
+            common[_flag(names)] = rows[0]
+    lines = [_MARK, "Commands name these options without repeating their meaning, and their default where it differs."]
+    lines += [f"*Job options* are {_code(_JOB)}.", ""]
+    lines += [*(f"- `{names}`: {what}{default}" for _, (names, what, default) in sorted(common.items())), ""]
+    rows: list[_Row] = []
     for command, context in commands:
+        before, rows = rows, _options(command, context)
         if context.parent is not None:
-            lines += _section(command, context, common)
+            lines += _section(command, context, rows, common, same=bool(rows) and rows == before)
         if context.command_path == "lgrasp run":
             lines += _config_keys()
     return _PAGE.read_text(encoding="utf-8").partition(_MARK)[0] + "\n".join(lines).rstrip() + "\n"
@@ -42,10 +49,20 @@ def _commands(command: Any, parent: typer.Context | None, name: str) -> Iterator
             yield from _commands(sub, context, below)
 
 
-def _options(command: Any, context: typer.Context) -> list[tuple[str, str]]:
-    """Names and help of the options of a command."""
+def _options(command: Any, context: typer.Context) -> list[_Row]:
+    """The options of a command."""
     records = [p.get_help_record(context) for p in command.get_params(context) if "--help" not in p.opts]
-    return [(_cell(names), _cell(what)) for names, what in filter(None, records)]
+    return [_row(names, what) for names, what in filter(None, records)]
+
+
+def _row(names: str, what: str) -> _Row:
+    names = re.sub(r" (<\w+) range>$", r" \1>", _line(names))  # the range follows the default
+    what, _, default = re.sub(r"\[default: \((.*?)\)", r"[default: \1", _line(what)).partition(" [")
+    return names, what, f" [{default}" if default else ""
+
+
+def _code(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
 
 
 def _flag(names: str) -> str:
@@ -53,39 +70,41 @@ def _flag(names: str) -> str:
     return names.split(", ")[-1].split()[0]
 
 
-def _table(rows: Iterable[tuple[str, str]]) -> list[str]:
-    return ["| option | meaning |", "|---|---|", *(f"| `{names}` | {what} |" for names, what in rows)]
-
-
-def _section(command: Any, context: typer.Context, common: dict[str, str]) -> list[str]:
+def _section(command: Any, context: typer.Context, rows: list[_Row], common: dict[str, _Row], same: bool) -> list[str]:
+    """The part of one command; ``same``: its options are those of the command before."""
     text, _, example = (command.help or "").replace("\b", "").partition("Example: ")
+    paragraphs = [" ".join(paragraph.split()) for paragraph in text.split("\n\n") if paragraph.strip()]
     lines = [f"## {context.command_path}", ""]
-    for paragraph in filter(str.strip, text.split("\n\n")):
-        lines += [" ".join(paragraph.split()), ""]
-    if example:
-        lines += ["```", example.strip(), "```", ""]
-    rows = _options(command, context)
-    if own := [row for row in rows if common.get(row[0]) != row[1]]:
-        lines += [*_table(own), ""]
-    if named := [f"`{_flag(names)}`" for names, what in rows if common.get(names) == what]:
-        lines += [f"[Common options](#common-options): {', '.join(named)}.", ""]
-    return lines
+    if same and len(rows) > 5:
+        return [*lines, f"{paragraphs[0]} Options are those of the command above.", ""]
+    for paragraph in paragraphs:
+        lines += [paragraph, ""]
+    if example.strip() != context.command_path and example:
+        lines += ["```", *(line.strip() for line in example.strip().splitlines()), "```", ""]
+    shared = [row for row in rows if row[:2] == common.get(_flag(row[0]), row[1:])[:2]]
+    lines += [f"- `{names}`: {what}{default}" for names, what, default in rows if (names, what, default) not in shared]
+    named = {_flag(row[0]): row[2] if row != common[_flag(row[0])] else "" for row in shared}
+    words = [f"`{name}`{default}" for name, default in named.items() if not (name in _JOB and named.keys() >= {*_JOB})]
+    words += ["job options"] if named.keys() >= {*_JOB} else []
+    return [*lines, *([f"- [Common](#common-options): {', '.join(words)}."] if words else []), *([""] if rows else [])]
 
 
 def _config_keys() -> list[str]:
     """The keys of a config, from its model."""
     from lgrasp.jobs.config import JobConfig
 
-    lines = ["Keys of a config:", "", "| key | default | meaning |", "|---|---|---|"]
+    lines = ["Keys of a config:", ""]
     for name, field in JobConfig.model_fields.items():
         default = field.get_default(call_default_factory=True)
         shown = ", ".join(default) if isinstance(default, tuple) else "" if default is None else str(default)
-        lines.append(f"| `{name}` | {_cell(shown)} | {_cell(field.description or '')} |")
+        what = _line(field.description or "") or "As the option."
+        lines.append(f"- `{name}`: {what}" + (f" [default: {shown}]" if shown else ""))
     return [*lines, ""]
 
 
-def _cell(text: str) -> str:
-    return re.sub(r"\s+", " ", text).replace("|", r"\|")
+def _line(text: str) -> str:
+    """Text on one line."""
+    return " ".join(text.split())
 
 
 if __name__ == "__main__":

@@ -73,7 +73,8 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
     def run(
         *,
         device: Annotated[
-            str | None, Option(help="auto: the first GPU, else the CPU. Default: auto; of simulate cpu.", **DEVICE)
+            str | None,
+            Option(help="auto: the first GPU, else the CPU.", show_default="auto", **DEVICE),
         ] = None,
         workers: Annotated[int | None, Option(min=0, help="Threads or processes; 0: by device.")] = None,
         array: Annotated[
