@@ -61,10 +61,56 @@ def new_file(path: str | os.PathLike[str], *, flush: bool = True) -> Iterator[IO
             _remove_left(path)
 
 
+def check_folder(out: Path) -> None:
+    """Check that files can be written into a folder, without creating it (the first shard does).
+
+    Raises:
+        OutputError: a file is in the way, or the nearest existing folder is read-only.
+    """
+    nearest = next(p for p in (out, *out.absolute().parents) if os.path.lexists(p))
+    if not nearest.is_dir():
+        raise OutputError(f"output folder {out} cannot be made: {nearest} is a file; choose another with --out")
+    try:
+        tempfile.TemporaryFile(dir=nearest).close()
+    except OSError as error:
+        why = error.strerror
+        raise OutputError(f"output folder {out} cannot be written: {why}; choose another with --out") from None
+
+
+def check_file(path: str | os.PathLike[str]) -> None:
+    """Check, before a long job, that a file can be written there.
+
+    Raises:
+        OutputError: it is a folder, or its folder cannot be written.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise OutputError(f"file {path} cannot be written: it is a folder; name a file")
+    if _is_special(path):
+        return
+    try:
+        check_folder(path.parent)
+    except OutputError as error:
+        raise OutputError(f"file {path}: {str(error).replace('choose another with --out', 'name another')}") from None
+
+
 def write_file(path: str | os.PathLike[str], data: bytes | str, *, flush: bool = True) -> None:
-    """Write a whole file; text is UTF-8. Arguments and errors as of :func:`new_file`."""
+    """Write a whole file; text is UTF-8. Arguments and errors as of :func:`new_file`.
+
+    A pipe or device such as /dev/stdout is written to, not replaced by a file.
+    """
+    data = data.encode() if isinstance(data, str) else data
+    if _is_special(Path(path)):
+        with writing(Path(path)), open(path, "wb") as file:
+            file.write(data)
+        return
     with new_file(path, flush=flush) as file:
-        file.write(data.encode() if isinstance(data, str) else data)
+        file.write(data)
+
+
+def _is_special(path: Path) -> bool:
+    """Something that exists and is no regular file: it must not be replaced by one."""
+    return path.exists() and not path.is_file()
 
 
 @contextmanager

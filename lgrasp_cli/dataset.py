@@ -130,10 +130,10 @@ def report(
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """
     from lgrasp.dataset.files import shards_below
-    from lgrasp.engine.report import check_json
+    from lgrasp.files import check_file
 
     shards_below(paths)
-    check_json(out)
+    check_file(out)
     from lgrasp.dataset.report.write import report_dataset
     from lgrasp_cli.progress import Bar
 

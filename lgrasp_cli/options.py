@@ -49,9 +49,9 @@ def check_report(path: str | None) -> None:
         OutputError: a folder, or one that cannot be written.
     """
     if path and path != "-":
-        from lgrasp.engine.report import check_json
+        from lgrasp.files import check_file
 
-        check_json(path)
+        check_file(path)
 
 
 def warn(line: str) -> None:

@@ -1,5 +1,6 @@
 """Whole files and folders, and what processes that were killed leave of them."""
 
+import ast
 import os
 import signal
 import subprocess
@@ -83,3 +84,46 @@ def test_a_process_that_is_ended_removes_what_it_was_writing(tmp_path):
 def test_a_pipe_does_not_hold_up(tmp_path):
     os.mkfifo(tmp_path / "lgrasp.tmp")
     assert remove_leftovers(tmp_path, "*.tmp") == [tmp_path / "lgrasp.tmp"]
+
+
+WRITERS = {"write_text", "write_bytes", "copyfile", "copytree", "save", "savez", "savefig", "dump", "imwrite", "imsave"}
+WRITTEN_BY_HAND = {
+    "lgrasp/api.py": "grasps that are saved as a shard",
+    "lgrasp/bench/charts.py": "a picture in memory",
+    "lgrasp/bench/soak.py": "a temporary folder",
+    "lgrasp/dataset/report/plots.py": "a picture in memory",
+    "lgrasp/dataset/new_shard.py": "a file of lgrasp.files",
+    "lgrasp/engine/cache.py": "arrays in memory",
+    "lgrasp/files.py": "the home",
+    "lgrasp/geometry/decompose.py": "a pipe",
+    "lgrasp/grasp/hand_files.py": "a temporary folder, or that of an export",
+    "lgrasp/hand/drafting/import_urdf.py": "a folder that is whole or absent",
+    "lgrasp/hand/drafting/write.py": "a folder that is whole or absent",
+    "lgrasp/jobs/hand_check/plotting.py": "a picture in memory",
+    "lgrasp/jobs/learn/job.py": "a predictor in memory",
+    "lgrasp/judge/run.py": "a temporary folder",
+    "lgrasp/object/load.py": "reads a scene",
+    "lgrasp/picture/sheet.py": "a picture in memory",
+    "lgrasp/runtime/kernel_cache.py": "a temporary folder",
+    "lgrasp_cli/__main__.py": "standard streams",
+    "lgrasp_cli/reference.py": "a page of the documentation",
+}
+
+
+def test_files_are_written_in_one_place():
+    """Every file of a user is made by lgrasp.files; a new module that writes says here where to."""
+    root = Path(__file__).parents[1]
+    found = set()
+    for path in (*root.glob("lgrasp/**/*.py"), *root.glob("lgrasp_cli/**/*.py")):
+        for call in ast.walk(ast.parse(path.read_text())):
+            if isinstance(call, ast.Call) and _writes(call):
+                found.add(path.relative_to(root).as_posix())
+    assert found == set(WRITTEN_BY_HAND)
+
+
+def _writes(call: ast.Call) -> bool:
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    if name not in ("open", "File", "fdopen"):
+        return name in WRITERS
+    modes = {a.value for a in (*call.args, *(k.value for k in call.keywords)) if isinstance(a, ast.Constant)}
+    return bool(modes & {"w", "wb", "x", "xb", "a", "ab", "r+", "r+b", "w+b", "wt"})

@@ -4,9 +4,8 @@ import io
 from pathlib import Path
 from typing import Any
 
-from lgrasp.engine.report import check_json
 from lgrasp.errors import OutputError
-from lgrasp.files import write_file
+from lgrasp.files import check_file, write_file
 
 _COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#9467bd")
 _PUBLISHED = "#b0b0b0"
@@ -21,7 +20,7 @@ def check_plot(path: Path) -> None:
     """
     if path.suffix.lower() != ".png":
         raise OutputError(f"--plot {path}: the plot is a PNG; name a file that ends in .png")
-    check_json(path)
+    check_file(path)
 
 
 def draw_table(table: dict[str, Any], path: Path) -> None:

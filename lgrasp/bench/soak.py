@@ -75,6 +75,8 @@ COMMANDS = {
         for form in ("dexgraspnet", "dexgraspbench", "isaac-grasp", "mjcf")
     },
     "render": Command(f"render {_SHARDS} -n 2 --size 64 --out {{out}}/rows.png"),
+    "judge": Command(f"judge {_SHARDS} --json {{out}}/verdict.json"),
+    "hands check": Command(f"hands check barrett -n 4 -p swift --out {{out}}/check {_SMALL}"),
     "build-field": Command("build-field barrett --device cpu", cold=True),
     "preprocess": Command("preprocess tiny", cold=True, compiles=True),
     "hands add": Command("hands add {inputs}/hand.urdf --name added --out {out}/added", once=True),

@@ -1,15 +1,13 @@
 """The output folder of a job: paths of its shards, and what those that are there say of themselves."""
 
-import os
 import re
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, get_args
 
 from lgrasp.choices import ProtocolName
 from lgrasp.dataset.files import check_heaps
-from lgrasp.errors import ConfigError, OutputError
+from lgrasp.errors import ConfigError
 from lgrasp.files import remove_leftovers
 
 MOST_PARTS = 100_000
@@ -51,22 +49,6 @@ def check_number(parts: int, what: str) -> None:
     """
     if parts > MOST_PARTS:
         raise ConfigError(f"{parts:,} {what}; a folder holds at most {MOST_PARTS:,}")
-
-
-def check_folder(out: Path) -> None:
-    """Check that files can be written into a folder, without creating it (the first shard does).
-
-    Raises:
-        OutputError: a file is in the way, or the nearest existing folder is read-only.
-    """
-    nearest = next(p for p in (out, *out.absolute().parents) if os.path.lexists(p))
-    if not nearest.is_dir():
-        raise OutputError(f"output folder {out} cannot be made: {nearest} is a file; choose another with --out")
-    try:
-        tempfile.TemporaryFile(dir=nearest).close()
-    except OSError as error:
-        why = error.strerror
-        raise OutputError(f"output folder {out} cannot be written: {why}; choose another with --out") from None
 
 
 def clean_folder(files: Sequence[Path]) -> None:

@@ -4,11 +4,8 @@ import json
 import os
 import resource
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lgrasp.engine.folder import check_folder
-from lgrasp.errors import OutputError
 from lgrasp.files import write_file
 
 if TYPE_CHECKING:
@@ -62,38 +59,10 @@ def peak_device_mb(device: str) -> float:
     return wp.get_mempool_used_mem_high(device) / 1e6
 
 
-def check_json(path: str | os.PathLike[str]) -> None:
-    """Check, before a long job, that a report can be written there.
-
-    Raises:
-        OutputError: it is a folder, or its folder cannot be written.
-    """
-    if Path(path).is_dir():
-        raise OutputError(f"report {path} cannot be written: it is a folder; name a file")
-    if _is_special(Path(path)):
-        return
-    try:
-        check_folder(Path(path).parent)
-    except OutputError as error:
-        raise OutputError(f"report {path}: {str(error).replace('choose another with --out', 'name another')}") from None
-
-
 def write_json(path: str | os.PathLike[str], data: Any) -> None:
-    """Write JSON so that the file is whole or absent; a pipe or device such as /dev/stdout is written to.
+    """Write JSON as :func:`lgrasp.files.write_file` writes.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    text = json.dumps(data, indent=2) + "\n"
-    if _is_special(Path(path)):
-        try:
-            Path(path).write_text(text)
-        except OSError as error:
-            raise OutputError(f"report {path} cannot be written: {error.strerror}") from None
-        return
-    write_file(path, text)
-
-
-def _is_special(path: Path) -> bool:
-    """Something that exists and is no regular file: it must not be replaced by one."""
-    return path.exists() and not path.is_file()
+    write_file(path, json.dumps(data, indent=2) + "\n")

@@ -19,10 +19,11 @@ from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError, Events, Made, Part, PartProgress
-from lgrasp.engine.folder import Found, check_folder, clean_folder, found_shard, neighbours
+from lgrasp.engine.folder import Found, clean_folder, found_shard, neighbours
 from lgrasp.engine.listing import Listing, Renewing, begun_array, listing, renewing
 from lgrasp.engine.request import Request
 from lgrasp.errors import LgraspError, OutputError, ShardError
+from lgrasp.files import check_folder
 from lgrasp.notices import notice
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.device import Device, resolve_device

@@ -43,8 +43,10 @@ def judge(
         name, sign, file = given.partition("=")
         meshes |= {name: file} if sign else {"": given}
     try:
-        from lgrasp.judge.files import existing, find_shards
+        from lgrasp.judge.files import check_report, existing, find_shards, write_report
 
+        if json_path and json_path != "-":
+            check_report(json_path)
         files = find_shards(shards)
         for path in (*meshes.values(), *([urdf] if urdf else ())):
             existing(path)
@@ -53,7 +55,7 @@ def judge(
         report = run.judge(files, urdf=urdf, mesh=meshes or None, rows=rows, progress=None if quiet else _Progress())
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         if json_path and json_path != "-":
-            Path(json_path).write_text(text + "\n", encoding="utf-8")
+            write_report(json_path, text + "\n")
     except JudgeError as error:
         typer.echo(f"error: {' '.join(str(error).split())}", err=True)
         raise typer.Exit(2) from error

@@ -1,6 +1,7 @@
 """Which files are judged; light to import, so that a missing one is told at once."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from lgrasp.judge.bounds import JudgeError
@@ -30,3 +31,38 @@ def existing(path: str | Path) -> Path:
     if not Path(path).exists():
         raise JudgeError(f"{path}: no such file or folder")
     return Path(path)
+
+
+def check_report(path: str) -> None:
+    """Check, before rows are judged, that findings can be written there.
+
+    Raises:
+        JudgeError: they cannot.
+    """
+    from lgrasp.files import check_file
+
+    with _telling():
+        check_file(path)
+
+
+def write_report(path: str, text: str) -> None:
+    """Write findings as a file that is whole or absent.
+
+    Raises:
+        JudgeError: it cannot be written.
+    """
+    from lgrasp.files import write_file
+
+    with _telling():
+        write_file(path, text)
+
+
+@contextmanager
+def _telling() -> Iterator[None]:
+    """Files are all that the judge shares with the rest, and those only where it is asked to write one."""
+    from lgrasp.errors import OutputError
+
+    try:
+        yield
+    except OutputError as error:
+        raise JudgeError(str(error)) from error

@@ -51,6 +51,9 @@ def test_table_json_and_exit_code(tmp_path):
     assert found["shards"][1]["failures"] == {"penetration": {"rows": 1, "worst": pytest.approx(5.0), "bound": 2.0}}
     assert found["shards"][0]["claims"] == {"pipeline": "by hand", "profile": "plan"}
     assert run(tmp_path / "good.h5", "--quiet").stdout == ""
+    refused = run(tmp_path / "good.h5", "--json", tmp_path)
+    assert (refused.exit_code, refused.stdout) == (2, "")
+    assert refused.stderr == f"error: file {tmp_path} cannot be written: it is a folder; name a file\n"
 
 
 def test_rows_that_the_file_calls_invalid_count_apart(tmp_path):
@@ -146,7 +149,7 @@ def test_no_shard_at_all(tmp_path):
         assert result.stderr.count("\n") == 1
         assert not result.stdout
     assert run(tmp_path / "s.h5", "--rows", 0).exit_code == 2
-    assert run(tmp_path / "s.h5", "--json", tmp_path / "no" / "out.json").exit_code == 2
+    assert run(tmp_path / "s.h5", "--json", "/proc/no/out.json").exit_code == 2
 
 
 def test_damaged_string_heaps_are_found_before_they_are_read(tmp_path):

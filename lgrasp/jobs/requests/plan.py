@@ -8,9 +8,9 @@ from pydantic import Field
 
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES
 from lgrasp.config import apply_settings, parse_model
-from lgrasp.engine.folder import check_folder
 from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
+from lgrasp.files import check_folder
 from lgrasp.jobs.requests.shards import check_hand, check_object
 from lgrasp.paths import check_file
 from lgrasp.planning.params import PlanParams

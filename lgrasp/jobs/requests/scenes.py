@@ -7,10 +7,11 @@ from pydantic import Field
 
 from lgrasp.config import MeshScale, Seed
 from lgrasp.dataset.files import shards_below
-from lgrasp.engine.folder import check_folder, check_number
+from lgrasp.engine.folder import check_number
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError
+from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.object.find import find_object
 from lgrasp.scenes.params import SceneParams

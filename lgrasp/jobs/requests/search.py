@@ -8,10 +8,11 @@ from pydantic import Field
 
 from lgrasp.choices import ProtocolName
 from lgrasp.config import HandName, ShardFolder
-from lgrasp.engine.folder import check_folder, check_number
+from lgrasp.engine.folder import check_number
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError
+from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.object.find import find_object
 from lgrasp.sequence.size import parse_size

@@ -9,9 +9,9 @@ from pydantic import BeforeValidator, Field, field_validator
 from lgrasp.choices import FormatName, MetricName
 from lgrasp.config import DeviceName, ShardPaths, apply_settings, parse_model
 from lgrasp.dataset.files import find_shards, shards_below
-from lgrasp.engine.folder import check_folder
 from lgrasp.engine.request import Request, ShardRequest
 from lgrasp.errors import ConfigError, OutputError, ShardError
+from lgrasp.files import check_folder
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.names import hand_path
 from lgrasp.learn.params import LearnParams
