@@ -24,6 +24,6 @@ def test_every_member_is_documented():
 
 @pytest.mark.parametrize("code", EXAMPLES)
 def test_examples_run(tmp_path, make_shard, make_sequence, code):
-    write_shard(tmp_path / "mug-00000.h5", make_shard(6))
+    write_shard(tmp_path / "allegro-mug-00000.h5", make_shard(6))
     write_shard(tmp_path / "four-00000.h5", make_sequence())
     subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=tmp_path, check=True, capture_output=True)
