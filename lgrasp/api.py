@@ -271,8 +271,8 @@ def load_object(name: Name, scale: float = 1.0, device: str = "cpu") -> Object:
 
 
 def hands() -> dict[str, str]:
-    """Known hands with their descriptions."""
-    return {entry["name"]: entry["description"] for entry in list_hands()}
+    """Known hands, and those of installed packages, with their descriptions."""
+    return {entry["name"]: entry["description"] for entry in list_hands() if entry["installed"]}
 
 
 def objects() -> dict[str, str]:

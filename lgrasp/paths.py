@@ -44,6 +44,13 @@ def package_files(distribution: str) -> list[Path] | None:
     return [Path(str(file.locate())) for file in listed or []]
 
 
+def is_installed(distribution: str) -> bool:
+    """Whether a distribution is installed; its files are not looked at."""
+    from importlib import metadata
+
+    return next(iter(metadata.distributions(name=distribution)), None) is not None
+
+
 def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:
     """The cache folder: ``override``, else ``LGRASP_CACHE_DIR``, else the platform's user cache folder."""
     if override:

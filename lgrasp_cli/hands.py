@@ -16,19 +16,29 @@ if TYPE_CHECKING:
 app = typer.Typer(name="hands", help="List, show, add and check hands.", no_args_is_help=True)
 app.command("view")(view_hand)
 
+_PRIMITIVE = "primitive approximation"
+
 
 @app.command("list")
 @reporting
 def list_hands() -> Answer:
-    """List the hands that can be used by name.
+    """List the hands that can be used by name, and those of packages of PyPI, installed or not.
 
     Example: lgrasp hands list
     """
     from lgrasp.jobs.listing import list_hands as listed
 
     hands = listed()
-    columns = ("name", "description", "spaces", "licence", "folder")
-    return Answer(hands, [TextTable(columns, [[str(hand[c]) for c in columns] for hand in hands], right=("spaces",))])
+    known, others = [], []
+    for hand in hands:
+        told = f"{hand['description']} ({_PRIMITIVE})" if hand["approximation"] else hand["description"]
+        if hand["package"] is None:
+            known.append((hand["name"], told, str(hand["spaces"]), hand["licence"], hand["folder"]))
+        else:
+            where = "yes" if hand["installed"] else hand["install"]
+            others.append((hand["name"], told, hand["package"], where))
+    table = TextTable(("name", "description", "spaces", "licence", "folder"), known, right=("spaces",))
+    return Answer(hands, [table, "", TextTable(("name", "description", "package", "installed"), others)])
 
 
 @app.command("show")
@@ -46,6 +56,7 @@ def show_hand(name: HandArgument) -> Answer:
     pairs = [
         ("hand", f"{hand['name']}: {hand['description']}" if hand["description"] else hand["name"]),
         ("file", hand["urdf"]),
+        *([("geometry", f"{_PRIMITIVE}; {hand['approximation']}")] if hand["approximation"] else []),
         ("rules", hand["note"] or "hand.yaml"),
         ("base link", hand["base_link"]),
         ("contact links", ", ".join(hand["contact_links"])),
@@ -68,17 +79,26 @@ def show_hand(name: HandArgument) -> Answer:
 @app.command("add")
 def add_hand(
     urdf: Annotated[Path, Argument(metavar="URDF", exists=True, dir_okay=False, help="URDF file of the hand.")],
-    name: Annotated[str | None, Option(help="Name of the hand; default: the file's.")] = None,
+    name: Annotated[str | None, Option(help="Name of the hand; default: the file's, or LINK.")] = None,
     out: Annotated[Path | None, Option(help="Folder of the hand; default: hands/NAME in your data folder.")] = None,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace the hand of that name.")] = False,
+    root: Annotated[
+        str | None, Option(metavar="LINK", help="Of a whole robot, take the hand that this link carries.")
+    ] = None,
+    mesh_dir: Annotated[
+        list[Path] | None,
+        Option(exists=True, file_okay=False, help="Folder of meshes that are not below the URDF's; repeatable."),
+    ] = None,
 ) -> None:
     """Draft a hand from its URDF: fingers, palmar surface, canonical box, open posture.
 
     Example: lgrasp hands add my_hand.urdf
+
+    Of a robot: lgrasp hands add robot.urdf --root left_palm --mesh-dir meshes
     """
     from lgrasp.hand.drafting.import_urdf import import_urdf
 
-    made = import_urdf(urdf, name=name, out=out, force=overwrite)
+    made = import_urdf(urdf, name=name, out=out, force=overwrite, root=root, mesh_dirs=mesh_dir or ())
     for line in made.decisions:
         typer.echo(f"- {' '.join(line.split())}")
     typer.echo(f"\nwrote {made.folder}")

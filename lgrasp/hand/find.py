@@ -81,7 +81,9 @@ def rules_of_known(path: Path) -> HandSource | None:
             if missing:
                 note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
             added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
-            spec, left_out = _without_misfits(urdf, source.spec.model_copy(update={"mimic": added | missing}))
+            spec, left_out = _without_misfits(
+                urdf, source.spec.model_copy(update={"mimic": added | missing, "approximation": ""})
+            )
             return HandSource(source.name, path, spec, note + left_out)
     return None
 

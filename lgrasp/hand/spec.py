@@ -105,6 +105,8 @@ class HandSpec(_Strict):
 
     name: Name
     description: str = ""
+    approximation: str = Field(default="", exclude=True)
+    """How to use the real hand, where the geometry is a primitive approximation of it."""
     urdf: str = "hand.urdf"
     base_link: str | None = None
     locked: dict[str, float] = Field(default_factory=dict)

@@ -12,9 +12,11 @@ from lxml import etree
 
 from lgrasp.errors import HandError
 
-_MOVABLE = {"revolute", "prismatic", "continuous"}
+MOVABLE = {"revolute", "prismatic", "continuous"}
+"""Types of joints that move."""
 
 _MOST_BYTES = 16 << 20
+_MOST_PARTS = 8  # of a mesh's name that are looked for below other folders
 
 
 @dataclass(frozen=True)
@@ -75,13 +77,33 @@ def read_urdf(path: Path) -> Urdf:
         HandError: not XML, entity declarations, a broken or looped tree, missing limits, no movable joint,
             a mesh that is missing or outside the URDF's folder tree.
     """
+    return check_robot(path, *read_robot(path))
+
+
+def read_robot(path: Path) -> tuple[etree._Element, bytes]:
+    """The <robot> element of a URDF file and its text, not checked yet; see :func:`parse_robot`.
+
+    Raises:
+        HandError: a file that cannot be read or is too large, and as of :func:`parse_robot`.
+    """
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise HandError(f"URDF {path} has {path.stat().st_size:,} bytes; at most {_MOST_BYTES:,} are read")
         raw = path.read_bytes()
     except OSError as error:
         raise HandError(f"URDF {path} cannot be read: {error.strerror}") from None
-    tree, raw = parse_robot(path, raw)
+    return parse_robot(path, raw)
+
+
+def check_robot(path: Path, tree: etree._Element, raw: bytes, mesh_dirs: Sequence[Path] = ()) -> Urdf:
+    """A <robot> element and its text as a checked tree.
+
+    Args:
+        mesh_dirs: folders in which meshes are looked for as well, see :func:`find_mesh`.
+
+    Raises:
+        HandError: see :func:`read_urdf`.
+    """
     for name in (part.get("name") for part in (*tree.findall("link"), *tree.findall("joint"))):
         if not name or not name.isprintable():
             raise HandError(f"URDF {path} has a link or joint named {name!r}; every one needs a printable name")
@@ -91,7 +113,7 @@ def read_urdf(path: Path) -> Urdf:
         name = link.get("name", "")
         if name in links:
             raise HandError(f"URDF {path}: link '{name}' is declared twice; names must be unique")
-        links[name] = tuple(_geometry(path, name, c, meshes) for c in link.findall("collision"))
+        links[name] = tuple(_geometry(path, name, c, meshes, mesh_dirs) for c in link.findall("collision"))
     joints, root = _order(path, links, [_joint(path, j, links) for j in tree.findall("joint")])
     if not any(j.movable for j in joints):
         raise HandError(f"URDF {path} has no movable joint; a hand needs revolute, continuous or prismatic joints")
@@ -115,6 +137,11 @@ def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
         raw = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
     if tree.getroottree().docinfo.doctype:
         raise HandError(f"URDF {path} declares a DOCTYPE; entity declarations are not accepted, remove them")
+    if tree.tag == "mujoco":
+        raise HandError(
+            f"URDF {path} is MJCF, and hands are read from URDF only: take the maker's URDF, or convert it with "
+            "mjcf_urdf_simple_converter.convert('hand.xml', 'hand.urdf') (pip install mjcf-urdf-simple-converter)"
+        )
     if tree.tag != "robot":
         raise HandError(f"URDF {path}: root element is <{tree.tag}>, expected <robot>")
     return tree, raw
@@ -186,7 +213,9 @@ def _origin(path: Path, where: str, element: etree._Element) -> np.ndarray:
     return T + 0.0  # no negative zeros
 
 
-def _geometry(path: Path, link: str, collision: etree._Element, meshes: dict[str, Path]) -> Geometry:
+def _geometry(
+    path: Path, link: str, collision: etree._Element, meshes: dict[str, Path], mesh_dirs: Sequence[Path]
+) -> Geometry:
     where = f"link '{link}'"
     geometry, origin = collision.find("geometry"), _origin(path, where, collision)
     if geometry is None:
@@ -202,7 +231,7 @@ def _geometry(path: Path, link: str, collision: etree._Element, meshes: dict[str
             raise HandError(
                 f"URDF {path}: mesh '{name}' has scale {scale.tolist()}; three numbers other than 0 are needed"
             )
-        meshes[name] = find_mesh(path, link, name)
+        meshes[name] = find_mesh(path, link, name, mesh_dirs)
         return Geometry(kind, tuple(np.broadcast_to(scale, 3).tolist()), origin, name)
     keys = {"sphere": ("radius",), "cylinder": ("radius", "length")}.get(kind, ())
     size = tuple(_number(path, where, shape, key) for key in keys)
@@ -213,11 +242,15 @@ def _geometry(path: Path, link: str, collision: etree._Element, meshes: dict[str
     return Geometry(kind, size, origin)
 
 
-def find_mesh(path: Path, link: str, name: str) -> Path:
+def find_mesh(path: Path, link: str, name: str, mesh_dirs: Sequence[Path] = ()) -> Path:
     """File of a mesh that a link of the URDF at ``path`` names; ``package://`` is a folder beside or above the URDF.
 
+    Args:
+        mesh_dirs: folders in which a mesh is looked for that is not there, by as many of the last parts of its name as
+            lead to a file.
+
     Raises:
-        HandError: no such file, or one outside the hand's folder tree.
+        HandError: no such file, or one outside the hand's folder tree and the given folders, symbolic links followed.
     """
     folder = path.resolve().parent
     if name.startswith("package://"):
@@ -235,9 +268,18 @@ def find_mesh(path: Path, link: str, name: str) -> Path:
         file = trial.resolve()
         if file.is_relative_to(allowed) and os.path.isfile(file):  # False, not an error, for impossible names
             return file
+    parts = [part for part in name.removeprefix("package://").removeprefix("file://").split("/") if part.strip(".")]
+    for first in range(max(0, len(parts) - _MOST_PARTS), len(parts)):
+        for other in (folder.resolve() for folder in mesh_dirs):
+            file = other.joinpath(*parts[first:]).resolve()
+            if file.is_relative_to(other) and os.path.isfile(file):
+                return file
+    problem = f"which does not exist ({trials[0]})"
     if not trials[0].resolve().is_relative_to(allowed):
-        raise HandError(f"URDF {path}: link '{link}' names mesh '{name}', outside the hand's folder {allowed}")
-    raise HandError(f"URDF {path}: link '{link}' names mesh '{name}', which does not exist ({trials[0]})")
+        problem = f"outside the hand's folder {allowed}"
+    problem += f", nor is it in {', '.join(map(str, mesh_dirs))}" if mesh_dirs else ""
+    remedy = f"where meshes are elsewhere: lgrasp hands add {path} --mesh-dir FOLDER"
+    raise HandError(f"URDF {path}: link '{link}' names mesh '{name}', {problem}; {remedy}")
 
 
 def _joint(path: Path, element: etree._Element, links: dict[str, tuple[Geometry, ...]]) -> Joint:
@@ -247,7 +289,7 @@ def _joint(path: Path, element: etree._Element, links: dict[str, tuple[Geometry,
     for end in (parent, child):
         if end not in links:
             raise HandError(f"URDF {path}: {where} connects link '{end}', which is not declared")
-    movable = kind in _MOVABLE
+    movable = kind in MOVABLE
     if not movable and kind != "fixed":
         raise HandError(f"URDF {path}: {where} is {kind}; accepted: fixed, revolute, continuous, prismatic")
     axis, (lower, upper), mimic = np.array([1.0, 0.0, 0.0]), (0.0, 0.0), None

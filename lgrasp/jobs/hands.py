@@ -36,6 +36,7 @@ def describe_hand(name: str) -> dict[str, Any]:
         "description": spec.description,
         "urdf": str(source.urdf),
         "note": source.note,
+        "approximation": spec.approximation,
         "base_link": tree.base_link,
         "locked": dict(spec.locked),
         "shared": {name: list(values) for name, values in spec.shared.items()},

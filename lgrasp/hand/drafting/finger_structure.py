@@ -11,7 +11,8 @@ from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Joint, Urdf
 
-_MAX_FINGERS = 6
+MAX_FINGERS = 6
+"""Most parts of a hand that move by themselves."""
 
 
 @dataclass(frozen=True)
@@ -94,11 +95,11 @@ def finger_structure(urdf: Urdf, name: str, mover: str | None = None) -> FingerS
             )
     if len(structure.tips) == 0:
         raise HandError(f"URDF {urdf.path}: no moving link has collision geometry; add <collision> to the finger links")
-    if structure.tree.groups > _MAX_FINGERS:
+    if structure.tree.groups > MAX_FINGERS:
         raise HandError(
             f"URDF {urdf.path} has {structure.tree.groups} parts that move by themselves "
-            f"({structure.first_links(structure.tips[:12])}), at most {_MAX_FINGERS} fingers are supported; cut the "
-            "URDF down to one hand, or make joints that are no fingers fixed"
+            f"({structure.first_links(structure.tips[:12])}), at most {MAX_FINGERS} fingers are supported; make "
+            "joints that are no fingers fixed"
         )
     base = _common_link(urdf, structure)
     above = [j.name for j in _joints_above(urdf, base)]

@@ -5,7 +5,9 @@ import itertools
 import os
 import re
 import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import trimesh
@@ -15,16 +17,18 @@ from lgrasp.errors import HandError, LgraspError, OutputError
 from lgrasp.files import new_folder
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.digest import hand_digest
+from lgrasp.hand.drafting.cut_hand import cut_hand, hand_roots
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, thin_mesh
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
-from lgrasp.hand.urdf import find_mesh, parse_robot, read_urdf
+from lgrasp.hand.urdf import check_robot, find_mesh, read_robot
 from lgrasp.paths import cache_dir, user_dir
 
 _UNINFORMATIVE_NAMES = {"hand", "robot", "model", "urdf", "gripper"}
 _DRAFT_VERSION = 3
+FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
 
 
@@ -37,19 +41,33 @@ class ImportedHand:
     decisions: list[str]
 
 
-def import_urdf(urdf: Path, *, name: str | None = None, out: Path | None = None, force: bool = False) -> ImportedHand:
+def import_urdf(
+    urdf: Path,
+    *,
+    name: str | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    root: str | None = None,
+    mesh_dirs: Sequence[Path] = (),
+) -> ImportedHand:
     """Make a hand's folder from a URDF; the folder appears whole or not at all.
 
     Args:
-        name: default: the file's name, or the robot's when the file is called hand.urdf or the like.
+        name: default: ``root``, else the file's name, or the robot's when the file is called hand.urdf or the like.
         out: default: the user's data folder, ``hands/NAME``.
         force: replace what is there.
+        root: the hand is what is below this link of a robot.
+        mesh_dirs: folders in which meshes are looked for as well, see :func:`lgrasp.hand.urdf.find_mesh`.
 
     Raises:
         HandError: the URDF cannot be used, or the folder exists.
     """
-    source = read_urdf(urdf)
-    name = name or _slug(urdf.stem if urdf.stem.lower() not in _UNINFORMATIVE_NAMES else source.name)
+    robot, raw = read_robot(urdf)
+    hands = hand_roots(robot) if root is None else []
+    if root is not None:
+        cut_hand(urdf, robot, root)
+    source = check_robot(urdf, robot, raw, mesh_dirs)
+    name = name or _slug(root or (urdf.stem if urdf.stem.lower() not in _UNINFORMATIVE_NAMES else source.name))
     if name != _slug(name):
         raise HandError(f"hand name '{name}' may hold letters, digits, '.', '_' and '-' only, such as '{_slug(name)}'")
     folder = Path(out).expanduser() if out is not None else user_dir("hands") / name
@@ -61,7 +79,8 @@ def import_urdf(urdf: Path, *, name: str | None = None, out: Path | None = None,
     try:
         with new_folder(folder) as made:
             originals[made / "hand.urdf"] = urdf
-            spec, changes = _fill(urdf, name, made, originals)
+            meshes = partial(find_mesh, urdf, mesh_dirs=mesh_dirs)
+            spec, changes = _fill(robot, urdf.name, name, made, meshes, originals)
     except OutputError as error:
         raise HandError(f"hand folder {error}; choose another with --out") from None
     except LgraspError as error:
@@ -69,6 +88,9 @@ def import_urdf(urdf: Path, *, name: str | None = None, out: Path | None = None,
         text = str(error)
         for copy, original in originals.items():
             text = text.replace(str(copy.resolve()), str(original)).replace(str(copy), str(original))
+        if hands:
+            text += f"; of a whole robot, take one hand: lgrasp hands add {urdf} --root {hands[0]}"
+            text += f" (links that carry hands: {', '.join(hands)})" if len(hands) > 1 else ""
         raise type(error)(text) from None
     return ImportedHand(folder, spec, changes)
 
@@ -77,14 +99,15 @@ def _slug(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("._-") or "hand"
 
 
-def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> tuple[HandSpec, list[str]]:
+def _fill(
+    robot: etree._Element, file: str, name: str, folder: Path, find: FindMesh, originals: dict[Path, Path]
+) -> tuple[HandSpec, list[str]]:
     """Write URDF, meshes and hand.yaml into a folder and build the hand once."""
-    robot, _ = parse_robot(urdf, urdf.read_bytes())
     for note in [e for e in robot.iter() if not isinstance(e.tag, str)]:
         if note.getparent() is not None:
             note.getparent().remove(note)
     changes = _take_visuals(robot)
-    changes += _take_meshes(robot, urdf, folder, originals)
+    changes += _take_meshes(robot, folder, find, originals)
     target = folder / "hand.urdf"
     _write(robot, target)
     jaws = find_jaws(target)
@@ -96,7 +119,7 @@ def _fill(urdf: Path, name: str, folder: Path, originals: dict[Path, Path]) -> t
             f"values mean the same), so that '{jaws[1]}' closes against it as against a palm"
         )
     spec, decided = draft_spec(target, name, jaws=jaws)
-    spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {urdf.name}"})
+    spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {file}"})
     changes += decided
     write_spec(spec, folder / "hand.yaml", changes)
     written = load_spec(folder / "hand.yaml")
@@ -121,7 +144,7 @@ def _take_visuals(robot: etree._Element) -> list[str]:
     return [f"no link has collision geometry: the visual geometry of {len(visuals)} elements is used as collision"]
 
 
-def _take_meshes(robot: etree._Element, urdf: Path, folder: Path, originals: dict[Path, Path]) -> list[str]:
+def _take_meshes(robot: etree._Element, folder: Path, find: FindMesh, originals: dict[Path, Path]) -> list[str]:
     """Copy every mesh to meshes/collision or meshes/visual and name it there; huge collision meshes are thinned.
 
     ``originals`` gets the file that each copy was made from.
@@ -133,12 +156,14 @@ def _take_meshes(robot: etree._Element, urdf: Path, folder: Path, originals: dic
             for mesh in list(element.iter("mesh")):
                 link = element.getparent().get("name")
                 try:
-                    file = find_mesh(urdf, link, mesh.get("filename", ""))
+                    file = find(link, mesh.get("filename", ""))
                 except HandError as error:
                     if kind == "collision":
                         raise
                     element.getparent().remove(element)
-                    changes.append(f"link '{link}': visual mesh left out ({str(error).split(': ', 1)[-1]})")
+                    changes.append(
+                        f"link '{link}': visual mesh left out ({str(error).split(': ', 1)[-1].split('; ')[0]})"
+                    )
                     break
                 if file not in copied:
                     copied[file] = _copy_mesh(file, folder, kind, set(copied.values()), changes)

