@@ -9,7 +9,8 @@ from lgrasp.errors import HandError
 from lgrasp.hand.drafting.finger_structure import MAX_FINGERS
 from lgrasp.hand.urdf import MOVABLE
 
-_WRIST = 2  # joints between two places where a hand divides; an arm has more
+_WRIST = 2  # most joints between two places where a hand divides
+_FINGER = 5  # most joints of one; an arm has more
 _NAMED = 20  # links that an error names
 
 
@@ -52,11 +53,15 @@ def hand_roots(robot: etree._Element) -> list[str]:
     links = _Links(robot)
     ends: dict[str, int] = {}  # chains of joints that end below a link
     branches: dict[str, int] = {}
+    longest: dict[str, int] = {}  # joints of the longest chain
     for root in [name for name in links.names if name not in links.into]:
         for link in reversed(links.subtree(root)):
-            counts = [ends[child] or int(links.into[child][1]) for child in links.below.get(link, [])]
+            children = [(child, int(links.into[child][1])) for child in links.below.get(link, [])]
+            counts = [ends[child] or movable for child, movable in children]
             ends[link], branches[link] = sum(counts), sum(map(bool, counts))
-    dividing = [link for link in links.names if branches.get(link, 0) > 1 and ends[link] <= MAX_FINGERS]
+            longest[link] = max((longest[child] + movable for child, movable in children), default=0)
+    dividing = [link for link in branches if branches[link] > 1 and ends[link] <= MAX_FINGERS]
+    dividing = [link for link in dividing if longest[link] <= _FINGER]
     found = dict.fromkeys(_whole_hand(links, link, set(dividing)) for link in dividing)
     inner = [link for link in found if not any(other in found for other in links.subtree(link)[1:])]
     carried = {link for root in inner for link in links.subtree(root)[1:]}

@@ -15,8 +15,10 @@ from lxml import etree
 
 from lgrasp.errors import HandError, LgraspError, OutputError
 from lgrasp.files import new_folder
+from lgrasp.geometry.mesh_files import mesh_bytes
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.digest import hand_digest
+from lgrasp.hand.drafting.couplings import left_out_couplings
 from lgrasp.hand.drafting.cut_hand import cut_hand, hand_roots
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
@@ -80,7 +82,7 @@ def import_urdf(
         with new_folder(folder) as made:
             originals[made / "hand.urdf"] = urdf
             meshes = partial(find_mesh, urdf, mesh_dirs=mesh_dirs)
-            spec, changes = _fill(robot, urdf.name, name, made, meshes, originals)
+            spec, changes = _fill(robot, urdf, name, made, meshes, originals)
     except OutputError as error:
         raise HandError(f"hand folder {error}; choose another with --out") from None
     except LgraspError as error:
@@ -100,7 +102,7 @@ def _slug(text: str) -> str:
 
 
 def _fill(
-    robot: etree._Element, file: str, name: str, folder: Path, find: FindMesh, originals: dict[Path, Path]
+    robot: etree._Element, urdf: Path, name: str, folder: Path, find: FindMesh, originals: dict[Path, Path]
 ) -> tuple[HandSpec, list[str]]:
     """Write URDF, meshes and hand.yaml into a folder and build the hand once."""
     for note in [e for e in robot.iter() if not isinstance(e.tag, str)]:
@@ -118,8 +120,9 @@ def _fill(
             f"one drive moves both jaws: '{jaws[0]}' is made the base (the copy of the URDF is turned round; joint "
             f"values mean the same), so that '{jaws[1]}' closes against it as against a palm"
         )
+    changes += left_out_couplings(urdf, robot)
     spec, decided = draft_spec(target, name, jaws=jaws)
-    spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {file}"})
+    spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {urdf.name}"})
     changes += decided
     write_spec(spec, folder / "hand.yaml", changes)
     written = load_spec(folder / "hand.yaml")
@@ -175,7 +178,7 @@ def _take_meshes(robot: etree._Element, folder: Path, find: FindMesh, originals:
 def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], changes: list[str]) -> str:
     """Path, relative to the folder, of the copy of a mesh."""
     base = f"meshes/{kind}/{_slug(file.stem)}"
-    whole = _huge_mesh(file) if kind == "collision" else None
+    whole = _rewritten(file, huge=kind == "collision")
     suffix = file.suffix.lower() if whole is None else ".stl"
     numbered = (f"{base}_{number}{suffix}" for number in itertools.count(2))
     name = next(name for name in itertools.chain([f"{base}{suffix}"], numbered) if name not in taken)
@@ -184,7 +187,8 @@ def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], changes: li
     if whole is not None:
         mesh = thin_mesh(whole, MOST_FACES)
         mesh.export(target)
-        changes.append(f"collision mesh {file.name} has {len(whole.faces):,} faces: thinned to {len(mesh.faces):,}")
+        if mesh is not whole:
+            changes.append(f"collision mesh {file.name} has {len(whole.faces):,} faces: thinned to {len(mesh.faces):,}")
         return name
     shutil.copyfile(file, target)
     if suffix == ".obj":
@@ -195,15 +199,18 @@ def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], changes: li
     return name
 
 
-def _huge_mesh(file: Path) -> trimesh.Trimesh | None:
-    """A mesh that must be thinned; None for others, and for what cannot be read (reported later)."""
-    if file.stat().st_size < _LARGE_FILE:
+def _rewritten(file: Path, *, huge: bool) -> trimesh.Trimesh | None:
+    """A mesh of several files, or a ``huge`` one to be thinned; None for others, and for what cannot be read (reported
+    later)."""
+    several = file.suffix.lower() == ".gltf"
+    if not several and not (huge and file.stat().st_size >= _LARGE_FILE):
         return None
     try:
+        mesh_bytes(file)  # refuses files outside the mesh's folder
         mesh = trimesh.load_mesh(file, process=True)
     except Exception:
         return None
-    return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > MOST_FACES else None
+    return mesh if isinstance(mesh, trimesh.Trimesh) and (several or len(mesh.faces) > MOST_FACES) else None
 
 
 def drafted_folder(urdf: Path, name: str) -> Path:
