@@ -12,7 +12,7 @@ from typer import Option
 from lgrasp.choices import FormatName, MetricName
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Quiet, Shards, old_name, split, warn
-from lgrasp_cli.tables import Answer, Block, TextTable, checked, plural, reporting
+from lgrasp_cli.tables import Answer, Block, TextTable, checked, following, place, plural, reporting, took
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(name="dataset", help="Inspect, check and merge grasp files (shards).", no_args_is_help=True)
@@ -111,9 +111,14 @@ def metrics(
 
 
 def _show_metrics(data: dict[str, Any]) -> list[Block]:
-    there = f"; {data['present']:,} rows there already" if data["present"] else ""
-    made = f"{plural(len(data['shards']), 'shard')}, {data['rows']:,} rows, {data['rows_per_s']:,.0f} rows/s"
-    return [f"{data['out']}: {made}{there}"]
+    pairs = [
+        ("rows", f"{data['rows']:,}; {data['present']:,} were there already"),
+        ("metrics", ", ".join(data["metrics"])),
+        *took(data, "rows"),
+        place(data),
+        following("dataset report", data["out"]),
+    ]
+    return [pairs]
 
 
 @app.command()
@@ -149,18 +154,20 @@ def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
     over = _sums({name: metric["over_bound"] or 0 for name, metric in group["metrics"].items()} for group in groups)
     held = _sums({n: group["rows"] for n, group in hand["held"].items()} for hand in numbers["hands"])
     near = sum(group["near_duplicates"]["duplicates"] for group in groups)
+    physics = []
+    for name in sorted({name for group in groups for name in group["physics"]}):
+        found = [group["physics"][name] for group in groups if name in group["physics"]]
+        physics.append((f"hold in {name}", f"{sum(f['held'] for f in found):,} of {sum(f['run'] for f in found):,}"))
     pairs = [
         ("grasps", f"{numbers['rows']:,} in {plural(numbers['shards'], 'shard')}, {numbers['bytes'] / 1e6:,.1f} MB"),
         ("hands", ", ".join(f"{h['hand']} ({plural(len(h['objects']), 'object')})" for h in numbers["hands"])),
+        *physics,
         ("above a strict bound", ", ".join(f"{name} {count:,}" for name, count in over.items() if count) or "none"),
         ("near-duplicates", f"{near:,}"),
         ("distinct poses", f"{sum(group['distinct_poses'] for group in groups):,}"),
     ]
     if set(held) - {"1"}:
         pairs.append(("objects in the hand", ", ".join(f"{n}: {rows:,}" for n, rows in sorted(held.items()))))
-    for name in sorted({name for group in groups for name in group["physics"]}):
-        found = [group["physics"][name] for group in groups if name in group["physics"]]
-        pairs.append((f"hold in {name}", f"{sum(f['held'] for f in found):,} of {sum(f['run'] for f in found):,}"))
     return [*pairs, ("where", str(out))]
 
 
@@ -201,13 +208,13 @@ def _metric_table(shards: list[dict[str, Any]]) -> TextTable:
     ends = ("min", "mean", "max")
     rows = [
         (
-            name,
+            "" if number else name,
             metric,
             values["unit"],
             *("-" if values[k] is None else f"{values[k]:.4g}" for k in ends),
         )
         for name, s in zip(_places(shards), shards, strict=True)
-        for metric, values in s["metrics"].items()
+        for number, (metric, values) in enumerate(s["metrics"].items())
     ]
     return TextTable(("shard", "metric", "unit", *ends), rows, right=ends)
 
@@ -248,4 +255,6 @@ def export(
 
 
 def _show_export(data: dict[str, Any]) -> list[Block]:
-    return [f"{data['out']}: {data['grasps']:,} grasps of {plural(len(data['objects']), 'object')}, {data['format']}"]
+    of = plural(len(data["objects"]), "object")
+    pairs = [("grasps", f"{data['grasps']:,} of {of}, {data['format']}"), *took(data, "grasps"), ("where", data["out"])]
+    return [pairs]

@@ -9,7 +9,7 @@ from lgrasp.choices import ProtocolName
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import HANDS, OBJECTS, one_of
 from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, choose_pipeline
-from lgrasp_cli.tables import Block, counted, place
+from lgrasp_cli.tables import Block, closed, counted, following, held, place, plural, took
 from lgrasp_cli.working import How, working
 
 
@@ -92,30 +92,32 @@ def generate(
     if dry_run:
         show_plans([(job, how)], how)
     else:
-        how.run(job, _show)
+        how.run(job, _show, _profile)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:
-    seconds, stages = data["seconds"], list(data["counts"])
-    rates = []
-    if data["made"]:
-        rates.append(("strict-valid", f"{data['strict_valid_per_s']:,.0f} /s ({data['strict']:,})"))
-        if data["strict"] < data["grasps"]:
-            rates.append(("by own bounds", f"{data['grasps_per_s']:,.0f} /s ({data['grasps']:,})"))
-        rates.append(("published count", f"{data['published_count_per_s']:,.0f} /s ({data['published_count']:,})"))
-    device_memory = f", device {data['peak_device_mb']:,.0f} MB" if data["peak_device_mb"] else ""
+    near, looser = data["near_duplicates"], data["grasps"] - data["strict"]
     pairs = [
         ("grasps", counted(data, "grasps")),
+        *held(data),
+        ("diversity", f"{plural(data['distinct_poses'], 'object pose')}, {plural(near, 'near-duplicate')}"),
+        closed(data),
+        *([("strict bounds", f"{looser:,} grasps meet only those of the pipeline")] if looser else ()),
+        *took(data, "grasps"),
         place(data),
+        following("render" if data["protocol"] else "simulate", data["out"]),
+    ]
+    return [pairs]
+
+
+def _profile(data: dict[str, Any]) -> list[Block]:
+    stages, seconds = list(data["counts"]), data["seconds"]
+    pairs = [
         ("hand, object", f"{data['hand']}, {data['object']}; pipeline {data['pipeline']}, seed {data['seed']}"),
-        ("wall", f"{seconds['total']:.2f} s, {seconds['wall']:.2f} s of it from placement through filter"),
-        *rates,
         ("survivors", "  ".join(f"{name} {data['survivors'][name]:,}" for name in stages)),
-        ("thread-seconds", "  ".join(f"{name} {seconds[name]:.2f}" for name in stages)),
-        ("loading", "  ".join(f"{n} {seconds[n]:.2f} s" for n in ("hand", "object", "field", "kernels"))),
-        ("near-duplicates", f"{data['near_duplicates']:,}"),
-        ("distinct poses", f"{data['distinct_poses']:,}"),
-        ("peak memory", f"{data['peak_rss_mb']:,.0f} MB{device_memory}"),
-        ("device", data["device"]),
+        ("search", f"{seconds['wall']:.2f} s from placement through filter"),
+        ("strict-valid", f"{data['strict_valid_per_s']:,.0f} /s ({data['strict']:,})"),
+        ("by own bounds", f"{data['grasps_per_s']:,.0f} /s ({data['grasps']:,})"),
+        ("published count", f"{data['published_count_per_s']:,.0f} /s ({data['published_count']:,})"),
     ]
     return [pairs]

@@ -97,8 +97,11 @@ def add_hand(
     Of a robot: lgrasp hands add robot.urdf --root left_palm --mesh-dir meshes
     """
     from lgrasp.hand.drafting.import_urdf import import_urdf
+    from lgrasp_cli.progress import Bar
 
-    made = import_urdf(urdf, name=name, out=out, force=overwrite, root=root, mesh_dirs=mesh_dir or ())
+    with Bar() as bar:
+        bar.show("drafting")
+        made = import_urdf(urdf, name=name, out=out, force=overwrite, root=root, mesh_dirs=mesh_dir or ())
     for line in made.decisions:
         typer.echo(f"- {' '.join(line.split())}")
     typer.echo(f"\nwrote {made.folder}")
@@ -127,11 +130,12 @@ def check_hand(
 
     from lgrasp.jobs.hand_check.check import check_hand as check
     from lgrasp.jobs.hands import hand_source
-    from lgrasp_cli.progress import say
+    from lgrasp_cli.progress import Bar, JobProgress
 
     folder = out or Path("check") / hand_source(name).name
-    tell = None if quiet else lambda line: say(f"trying {line}")
-    found = check(name, chosen, out=folder, rows=rows, device=device, workers=workers, cache=cache, report=tell)
+    how = {"rows": rows, "device": device, "workers": workers, "cache": cache}
+    with Bar(quiet=quiet) as bar:
+        found = check(name, chosen, out=folder, **how, events=JobProgress(bar, "grasps"))
     stages = list(found.objects[0].survivors)
     rated = [
         [o.name, *(f"{o.survivors[s]:,}" for s in stages), f"{o.rows:,} of {o.asked:,}", f"{o.seconds:.1f}"]

@@ -7,7 +7,7 @@ import typer
 from typer import Argument, Option
 
 from lgrasp_cli.options import CacheDir, Device, Quiet, Shards, given, open_cache
-from lgrasp_cli.tables import Answer, Block, reporting
+from lgrasp_cli.tables import Answer, Block, following, reporting, took
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(
@@ -81,8 +81,6 @@ def evaluate(
 def _show_fit(data: dict[str, Any]) -> list[Block]:
     pairs = [
         ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
-        ("where", data["out"]),
-        ("seconds", "  ".join(f"{name} {value:.1f}" for name, value in data["seconds"].items())),
     ]
     words = (
         ("frozen", "trained on poses"),
@@ -94,4 +92,5 @@ def _show_fit(data: dict[str, Any]) -> list[Block]:
             pairs.append((what, f"energy {found['coarse']:.4f}, after the unrolled steps {found['unrolled']:.4f}"))
     if lowered := data.get("lowered"):
         pairs.append(("lowered by", f"{lowered['coarse']:.1%}, after the unrolled steps {lowered['unrolled']:.1%}"))
-    return [pairs]
+    end = [*took(data, "steps"), ("where", data["out"]), following("learn eval", data["out"], " SHARDS")]
+    return [[*pairs, *end]]

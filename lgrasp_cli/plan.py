@@ -7,7 +7,7 @@ from typer import Option
 
 from lgrasp_cli.names import HAND_OR_SHARD, OBJECT_OR_SHARD
 from lgrasp_cli.options import Scale, Settings
-from lgrasp_cli.tables import Block
+from lgrasp_cli.tables import Block, closed, following, place, took
 from lgrasp_cli.working import How, working
 
 
@@ -72,12 +72,12 @@ def _show(data: dict[str, Any]) -> list[Block]:
 
     if not data["grasps"]:
         return []
-    seconds, lost = data["seconds_planning"], lost_starts(data["counts"]) or "none lost"
     pairs = [
-        ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({lost})"),
-        ("where", data["out"]),
-        ("hand, object", f"{data['hand']}, {data['object']}"),
+        ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({lost_starts(data['counts']) or 'none lost'})"),
+        closed(data),
         ("quality", f"median epsilon {data['epsilon']:.3f}, unresisted load {data['unresisted_load']:.2f}"),
-        ("wall", f"{seconds:.1f} s, {seconds / data['grasps']:.3f} s a plan"),
+        *took(data, "plans"),
+        place(data),
+        following("simulate", data["out"]),
     ]
     return [pairs]

@@ -2,8 +2,10 @@
 
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from lgrasp.engine.events import Made, Part
 
 _PLAIN_INTERVAL = 10.0  # [s] between lines when standard error is no terminal
+_LOOK_BACK = 60.0  # [s] over which speed is measured
+_FIXED = 16  # characters of a bar's line: the shortest bar, the time, spaces
 
 
 def say(line: str) -> None:
@@ -24,7 +28,7 @@ def say(line: str) -> None:
 
 
 class Bar:
-    """How far something is: a bar on a terminal, else a plain line every ten seconds, or nothing.
+    """How far something is, and when it will be done: a bar on a terminal, else a line every ten seconds, or nothing.
 
     Args:
         quiet: show nothing.
@@ -33,17 +37,25 @@ class Bar:
     def __init__(self, *, quiet: bool = False) -> None:
         self._quiet = quiet
         self._said = time.monotonic()
+        self._went: deque[tuple[float, float]] = deque()  # when, how far: of the last minute
+        self._what: Any = None
         self._bar: Any = None
         self._task: Any = None
 
     def __enter__(self) -> "Bar":
         if not self._quiet and sys.stderr.isatty():
             from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+            from rich.table import Column
 
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-            self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True))
-            self._task = self._bar.add_task("", total=None, note="")
+            def text(field: str) -> TextColumn:
+                return TextColumn(f"{{task.{field}}}", markup=False)
+
+            # the bar gives way, nothing else is cut
+            elapsed = TimeElapsedColumn(Column(no_wrap=True))
+            columns = text("description"), BarColumn(None), text("fields[count]"), elapsed, text("fields[tail]")
+            self._bar = Progress(*columns, console=Console(stderr=True))
+            self._task = self._bar.add_task("", total=None, count="", tail="")
             at_end(self._bar.stop)  # which shows the cursor
             self._bar.start()
         return self
@@ -52,15 +64,27 @@ class Bar:
         if self._bar:
             self._bar.stop()
 
-    def show(self, what: str, done: int | None = None, total: int = 0, note: str = "") -> None:
-        """Show the current activity, and how much is done if that is known."""
-        if self._bar:
-            whole = total if done is not None and total else None
-            self._bar.update(self._task, description=what, completed=done or 0, total=whole, note=note)
-        elif not self._quiet and time.monotonic() - self._said >= _PLAIN_INTERVAL:
-            self._said = time.monotonic()
-            count = "" if done is None else f" {done:,}/{total:,}"
-            say(f"{what}{count} {note}".rstrip())
+    def show(self, what: str, done: int | None = None, total: int = 0, note: str = "", ahead: float = 0.0) -> None:
+        """Show the current activity, and how much is done if that is known.
+
+        Args:
+            ahead: how many more what is being made now is worth.
+        """
+        if done is None:
+            self._tell(what, "", None, note)
+        elif not total:
+            self._tell(what, f"{done:,}", None, note)
+        else:
+            speed = self._speed(what, total, done + ahead)
+            rate = f"{speed:,.0f}/s" if speed > 9.95 else f"{speed:.1f}/s" if speed > 0.2 else f"{60 * speed:.1f}/min"
+            left = f"{_time((total - done - ahead) / speed)} left  {rate}" if speed and done < total else ""
+            self._tell(what, f"{done:,}/{total:,}", (done + ahead) / total, "  ".join(filter(None, (left, note))))
+
+    def share(self, what: str, share: float) -> None:
+        """Tell what is being loaded or made, and how much of it is done, from 0 to 1."""
+        speed = self._speed(what.split()[0], 1, share)
+        left = f"{_time((1 - share) / speed)} left" if speed else ""
+        self._tell("loading", f"{share:.0%}" if share else "", share or None, "  ".join(filter(None, (left, what))))
 
     def say(self, line: str) -> None:
         """Print a line that stays."""
@@ -69,9 +93,37 @@ class Bar:
         elif not self._quiet:
             say(line)
 
-    def share(self, what: str, share: float) -> None:
-        """Tell what is being loaded or made, and how much of it is done, from 0 to 1."""
-        self.show("loading", note=f"{what} {share:.0%}" if share else what)
+    def _speed(self, *at: Any) -> float:
+        """How much is done in a second; 0 if that is not known yet.
+
+        Args:
+            at: what it is that goes on, and how far it is.
+        """
+        *what, done = at
+        if what != self._what or (self._went and done < self._went[-1][1]):
+            self._what = what
+            self._went.clear()
+        self._went.append((time.monotonic(), done))
+        while len(self._went) > 2 and self._went[-1][0] - self._went[1][0] > _LOOK_BACK:
+            self._went.popleft()
+        (begin, first), (end, last) = self._went[0], self._went[-1]
+        return max(last - first, 0.0) / (end - begin) if end > begin else 0.0
+
+    def _tell(self, what: str, count: str, share: float | None, tail: str) -> None:
+        if self._bar:
+            room = self._bar.console.width - len(what) - len(count) - _FIXED
+            tail = tail if len(tail) <= room else tail[: max(room - 1, 0)] + "…"
+            task = self._bar.tasks[0]
+            task.total = None if share is None else 1.0
+            self._bar.update(self._task, description=what, completed=share or 0.0, count=count, tail=tail)
+        elif not self._quiet and time.monotonic() - self._said >= _PLAIN_INTERVAL:
+            self._said = time.monotonic()
+            say("  ".join(filter(None, (what, count, tail))))
+
+
+def _time(seconds: float) -> str:
+    """1:02:03"""
+    return str(timedelta(seconds=round(seconds)))
 
 
 class JobProgress(Events):
@@ -85,7 +137,7 @@ class JobProgress(Events):
         self.stop = self.running = False
         self._bar, self._unit = bar, unit
         self._rows: dict[int, int] = {}  # done, by part
-        self._asked = 0
+        self._asked: dict[int, int] = {}
 
     def said(self, words: str) -> None:
         self._bar.say(words)
@@ -95,14 +147,19 @@ class JobProgress(Events):
 
     def started(self, parts: "Sequence[Part]", present: Mapping[int, int]) -> None:
         self.running = True
-        self._asked, self._rows = sum(part.rows for part in parts), dict(present)
+        self._asked, self._rows = {part.number: part.rows for part in parts}, dict(present)
+        self._show()
 
-    def advanced(self, part: "Part", done: int, note: str = "") -> None:
-        self._rows[part.number] = done
-        self._bar.show(f"{self._unit} ({part.file.name})", sum(self._rows.values()), self._asked, note)
+    def advanced(self, part: "Part", done: int, note: str = "", ahead: float = 0.0) -> None:
+        self._rows[part.number], self._asked[part.number] = done, part.rows
+        self._show(note, ahead)
 
     def wrote(self, part: "Part", made: "Made") -> None:
         self._rows[part.number] = max(made.rows, self._rows.get(part.number, 0))
+        self._show()
+
+    def _show(self, note: str = "", ahead: float = 0.0) -> None:
+        self._bar.show(self._unit, sum(self._rows.values()), sum(self._asked.values()), note, ahead)
 
     def cancelled(self) -> bool:
         return self.stop

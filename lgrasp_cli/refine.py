@@ -8,7 +8,7 @@ from typer import Argument, Option
 from lgrasp.choices import FormatName
 from lgrasp_cli.names import HAND_OR_SHARD, one_of
 from lgrasp_cli.options import Settings
-from lgrasp_cli.tables import Block, TextTable
+from lgrasp_cli.tables import Block, TextTable, closed, following, place, took
 from lgrasp_cli.working import How, working
 
 
@@ -47,19 +47,26 @@ def refine(
     rounds = {"matching_rounds": matching_rounds, "gradient_steps": gradient_steps, "outer": outer, "inner": inner}
     params = refine_params(coarse=coarse, **rounds)
     what = {"shards": shards, "out": out, "form": form, "hand": hand, "params": params, "settings": settings}
-    how.run(how.job(RefineRequest, "refine", **what, keep_invalid=keep_invalid), _show)
+    how.run(how.job(RefineRequest, "refine", **what, keep_invalid=keep_invalid), _show, _profile)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:
-    names = ("hand", "object", "rows", "refined", "valid before", "valid", "energy before", "energy", "s")
+    names = ("hand", "object", "rows", "refined", "valid before", "valid")
+    rows = [
+        (one["hand"], one["object"], *(f"{one[n.replace(' ', '_')]:,}" for n in names[2:])) for one in data["results"]
+    ]
+    pairs = [closed(data), *took(data, "rows"), place(data), following("simulate", data["out"])]
+    return [TextTable(names, rows, right=names[2:]), pairs]
+
+
+def _profile(data: dict[str, Any]) -> list[Block]:
+    names = ("hand", "object", "energy before", "energy", "s")
     rows = [
         (
-            one["hand"],
-            one["object"],
-            *(f"{one[name]:,}" for name in ("rows", "refined", "valid_before", "valid")),
+            *(one["hand"], one["object"]),
             *("" if one[name] is None else f"{one[name]:.4f}" for name in ("energy_before", "energy")),
             f"{one['seconds']:.1f}",
         )
         for one in data["results"]
     ]
-    return [TextTable(names, rows, right=names[2:]), data["out"]]
+    return [TextTable(names, rows, right=names[2:])]

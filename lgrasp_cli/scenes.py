@@ -8,7 +8,7 @@ from typer import Argument, Option
 
 from lgrasp_cli.names import HAND, OBJECT_OR_SHARD, PIPELINE
 from lgrasp_cli.options import given
-from lgrasp_cli.tables import Answer, Block, TextTable, checked, counted, reporting
+from lgrasp_cli.tables import Answer, Block, TextTable, checked, counted, following, reporting, took
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(
@@ -110,10 +110,8 @@ def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, v
 
 
 def _show(data: dict[str, Any]) -> list[Block]:
-    speed = f", {data['scenes_per_minute']:.1f} scenes/min" if data["made"] else ""
-    wall = f"{data['seconds']['scenes']:.2f} s{speed}"
-    head = [("scenes", counted(data, "scenes")), ("where", data["out"]), ("hand", data["hand"]), ("wall", wall)]
-    return _blocks(data, head)
+    head = [("scenes", counted(data, "scenes")), *took(data, "scenes"), ("where", data["out"])]
+    return [*_blocks(data, head), [following("view", data["out"])]]
 
 
 def _blocks(data: dict[str, Any], head: list[tuple[str, str]]) -> list[Block]:

@@ -8,7 +8,7 @@ from typer import Argument, Option
 from lgrasp.choices import Method, Policy, ProtocolName
 from lgrasp_cli.names import OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import Hand, Seed, Settings, choose_pipeline
-from lgrasp_cli.tables import Block, TextTable, counted, place, share
+from lgrasp_cli.tables import Block, TextTable, counted, following, held, place, share, took
 from lgrasp_cli.working import How, working
 
 
@@ -62,7 +62,7 @@ def sequence(
 
     what = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen, "out": out}
     what |= {"scale": scale, "simulate": simulate, "shard_rows": shard_rows}
-    how.run(how.job(SequenceRequest, "sequence", **what), _show)
+    how.run(how.job(SequenceRequest, "sequence", **what), _show, _profile)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:
@@ -70,12 +70,19 @@ def _show(data: dict[str, Any]) -> list[Block]:
         return []
     pairs = [
         ("sequences", counted(data, "sequences")),
+        *held(data),
+        *took(data, "sequences"),
         place(data),
+        following("render" if data["protocol"] else "simulate --protocol seq6", data["out"]),
+    ]
+    return [pairs]
+
+
+def _profile(data: dict[str, Any]) -> list[Block]:
+    pairs = [
         ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
         ("how", f"pipeline {data['pipeline']}, method {data['method']}, policy {data['policy']}"),
-        ("wall", f"{data['seconds']['total']:.2f} s, {data['seconds']['wall']:.2f} s of it the sequences"),
         ("penetration", f"median {data['penetration'][0]:.2f} mm, largest {data['penetration'][1]:.2f} mm"),
-        ("device", data["device"]),
     ]
     columns = ("object", "space", "sequences", "continued", "share")
     rows = []

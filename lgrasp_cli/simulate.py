@@ -8,7 +8,7 @@ from typer import Option
 from lgrasp.choices import ProtocolName
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Shards
-from lgrasp_cli.tables import Block, TextTable, place, share
+from lgrasp_cli.tables import Block, TextTable, following, place, share, took
 from lgrasp_cli.working import How, working
 
 
@@ -39,37 +39,54 @@ def simulate(
     from lgrasp.jobs.requests.shards import SimulateRequest
 
     what = {"shards": shards, "protocol": protocol, "out": out, "all_directions": all_directions}
-    how.run(how.job(SimulateRequest, "simulate", **what), _show)
+    how.run(how.job(SimulateRequest, "simulate", **what), _show, _profile)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:
-    from lgrasp.simulate.protocol import DIRECTIONS
-
-    entries, protocol = data["results"], data["protocol"]
+    entries = data["results"]
     stay = ("stay",) if any(entry["stay"] is not None for entry in entries) else ()
-    names = ("hand", "object", "grasps", "hold", *stay, *DIRECTIONS, "at q", "at grasp", "mass", "stiffness", "/s")
+    names = ("hand", "object", "grasps", "hold", *stay, "/s")
     rows = [
         (
             entry["hand"],
             entry["object"],
             f"{entry['rows']:,}",
             *(share(entry[name], entry["rows"]) for name in ("held", *stay)),
-            *map(share, entry["directions_held"], entry["directions_run"]),
-            *(share(entry[name], entry["rows"]) for name in ("contact_at_q", "contact_at_grasp")),
-            f"{1e3 * entry['mass']:.0f} g",
-            f"{entry['stiffness']:.3g}",
             "-" if entry["per_s"] is None else f"{entry['per_s']:.1f}",
         )
         for entry in entries
     ]
-    start = "q" if protocol["start"] == "grasp" else "q_pregrasp"
+    name, start = data["protocol"]["name"], "q" if data["protocol"]["start"] == "grasp" else "q_pregrasp"
     lost = {name: sum(entry[name] for entry in entries) for name in ("pregrasp_too_deep", "diverged")}
-    told = f"{protocol['name']}, friction {protocol['friction']:g}; shares of the grasps run in a direction"
+    told = {"pregrasp_too_deep": f"penetrate too deeply at {start} and are not simulated", "diverged": "count as lost"}
     pairs = [
-        ("protocol", told),
-        ("too deep", f"{lost['pregrasp_too_deep']:,} penetrate too deeply at {start} and are not simulated"),
-        ("diverged", f"{lost['diverged']:,} count as lost"),
-        ("compiling", f"{data['seconds_compile']:.1f} s for models and kernels, not part of the rates"),
+        ("protocol", f"{name}, friction {data['protocol']['friction']:g}"),
+        *((cause.split("_", 1)[-1].replace("_", " "), f"{n:,} {told[cause]}") for cause, n in lost.items() if n),
+        *took(data, "grasps"),
         place(data),
+        following("dataset report", data["out"]),
     ]
     return [TextTable(names, rows, right=names[2:]), pairs]
+
+
+def _profile(data: dict[str, Any]) -> list[Block]:
+    from lgrasp.simulate.protocol import DIRECTIONS
+
+    names = ("hand", "object", *DIRECTIONS, "at q", "at grasp", "mass", "stiffness")
+    rows = [
+        (
+            entry["hand"],
+            entry["object"],
+            *map(share, entry["directions_held"], entry["directions_run"]),
+            *(share(entry[name], entry["rows"]) for name in ("contact_at_q", "contact_at_grasp")),
+            f"{1e3 * entry['mass']:.0f} g",
+            f"{entry['stiffness']:.3g}",
+        )
+        for entry in data["results"]
+    ]
+    compiling = f"{data['seconds_compile']:.1f} s for models and kernels, not part of /s"
+    return [
+        "shares of the grasps run in a direction",
+        TextTable(names, rows, right=names[2:]),
+        [("compiling", compiling)],
+    ]

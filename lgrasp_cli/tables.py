@@ -1,13 +1,20 @@
-"""Reports on standard output: lines, pairs and tables in aligned columns, the same on a terminal and in a file."""
+"""Reports on standard output: lines, pairs and tables in aligned columns, which a terminal may make narrower."""
 
 import json
+import shlex
+import shutil
+import sys
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import typer
 
 from lgrasp_cli.options import JsonPath, check_report, with_options
+
+_LEAST = 6  # characters that every column keeps
 
 
 @dataclass(frozen=True)
@@ -57,16 +64,38 @@ def print_report(data: Any, json_path: str | None, blocks: Iterable[Block]) -> N
         if isinstance(block, str):
             typer.echo(block)
             continue
-        rows: list[Any] = [block.columns, *block.rows] if isinstance(block, TextTable) else block
-        right = {i for i, n in enumerate(block.columns) if n in block.right} if isinstance(block, TextTable) else set()
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        if not isinstance(block, TextTable):  # commands and paths, which are copied, stay in one piece
+            width = max(len(what) for what, _ in block)
+            typer.echo("\n".join(f"{what:{width}}  {value}".rstrip() for what, value in block))
+            continue
+        rows = [block.columns, *block.rows]
+        widths = _fitting([max(map(len, column)) for column in zip(*rows, strict=True)])
+        sides = [">" if name in block.right else "<" for name in block.columns]
         for row in rows:
-            cells = [c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
-            typer.echo("  ".join(cells).rstrip())
+            for line in zip_longest(*map(_wrapped, row, widths), fillvalue=""):
+                cells = [f"{cell:{side}{width}}" for cell, side, width in zip(line, sides, widths, strict=True)]
+                typer.echo("  ".join(cells).rstrip())
     if json_path:
         from lgrasp.engine.report import write_json
 
         write_json(json_path, data)
+
+
+def _fitting(widths: list[int]) -> list[int]:
+    """Widths of columns with which a table fits the terminal: the widest ones give way."""
+    width = shutil.get_terminal_size((sys.maxsize, 0)).columns
+    room = max(width - 2 * (len(widths) - 1), _LEAST * len(widths))
+    while sum(widths) > room:
+        most, *others = sorted({*widths, _LEAST}, reverse=True)
+        wide = [i for i, w in enumerate(widths) if w == most]
+        down = min(most - others[0], -(-(sum(widths) - room) // len(wide)))
+        widths = [w - down if i in wide else w for i, w in enumerate(widths)]
+    return widths
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """The lines of a cell, which breaks at spaces, or else anywhere."""
+    return textwrap.wrap(text, width) if len(text) > width else [text]
 
 
 def plural(n: int, what: str) -> str:
@@ -83,6 +112,34 @@ def counted(data: dict[str, Any], unit: str) -> str:
     """How much of the requested amount exists."""
     extra = f" ({data['present']:,} already present)" if data["present"] else ""
     return f"{data[unit]:,} of {data['asked']:,} requested{extra}"
+
+
+def closed(data: dict[str, Any]) -> tuple[str, str]:
+    """How many grasps have force closure."""
+    share = data["force_closure"]
+    return "force closure", "-" if share is None else f"{share:.1%}"
+
+
+def held(data: dict[str, Any]) -> list[tuple[str, str]]:
+    """How many of the grasps that were simulated on the way hold; only those are in the files."""
+    counts = data["counts"].get("simulate")
+    return (
+        [("hold", f"all, in {data['protocol']}; {share(counts['held'], counts['tried'])} of those tried")]
+        if counts
+        else []
+    )
+
+
+def took(data: dict[str, Any], unit: str) -> list[tuple[str, str]]:
+    """The time of a job, and how fast it was without loading and compiling."""
+    seconds, made = data["seconds"], data["made"]
+    rate = f"; {made:,} {unit} in {seconds['parts']:.1f} s, {made / seconds['parts']:,.1f}/s" if made else ""
+    return [("time", f"{seconds['total']:.1f} s{rate}")]
+
+
+def following(command: str, path: Any, more: str = "") -> tuple[str, str]:
+    """The command that one would run next on the files of a job."""
+    return "next", f"lgrasp {command} {shlex.quote(str(path))}{more}"
 
 
 def place(data: dict[str, Any]) -> tuple[str, str]:

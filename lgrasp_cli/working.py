@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from lgrasp.runtime.array import Array
 
 
+Show = Callable[[dict[str, Any]], Sequence[Block]]
+"""What is shown of the report of a job."""
+
+
 @dataclass(frozen=True)
 class How:
     """How a job is run, as the options say."""
@@ -30,6 +34,7 @@ class How:
     overwrite: bool
     json_path: str | None
     quiet: bool
+    verbose: bool
 
     def of_each(self, jobs: "Sequence[Request]") -> "list[How]":
         """The same for each of several jobs, whose parts the tasks of an array share like those of one."""
@@ -55,15 +60,17 @@ class How:
         """Fields of all requests, those that are given."""
         return given(device=self.device, workers=self.workers)
 
-    def run(self, job: "Job", show: Callable[[dict[str, Any]], Sequence[Block]]) -> None:
+    def run(self, job: "Job", show: Show, profile: Show = lambda data: ()) -> None:
         """Run a job with progress, report it, and leave with its exit code if it fell short.
 
         Args:
-            show: its report to be read.
+            show: what a user decides by, of its report.
+            profile: what --verbose adds.
         """
         data, outcome = run_job(job, self)
-        nothing = outcome.cancelled and not outcome.paths
-        print_report(data, self.json_path, () if self.quiet or self.json_path == "-" or nothing else show(data))
+        nothing = self.quiet or self.json_path == "-" or (outcome.cancelled and not outcome.paths)
+        blocks = () if nothing else [*show(data), *((*profile(data), _used(data)) if self.verbose else ())]
+        print_report(data, self.json_path, blocks)
         conclude(data, outcome)
 
 
@@ -94,6 +101,9 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
         json_path: JsonPath = None,
         cache_dir: CacheDir = None,
         quiet: Quiet = False,
+        verbose: Annotated[
+            bool, Option("--verbose", "-v", help="Also print what time and memory went into, and what was lost where.")
+        ] = False,
         **options: Any,
     ) -> None:
         check_report(json_path)
@@ -106,9 +116,20 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
             notice(f"--shard-index and --num-shards are now --array {array}; the old names work in this release only")
         shares = parse_array(array)
         cache = open_cache(cache_dir, fresh=rebuild)
-        command(**options, how=How(cache, device, workers, shares, overwrite, json_path, quiet))
+        command(**options, how=How(cache, device, workers, shares, overwrite, json_path, quiet, verbose))
 
     return with_options(run, command)
+
+
+def _used(data: dict[str, Any]) -> Block:
+    """Time and memory of a job."""
+    on_device = f", device {data['peak_device_mb']:,.0f} MB" if data["peak_device_mb"] else ""
+    seconds = "  ".join(f"{name} {value:.2f}" for name, value in data["seconds"].items())
+    return [
+        ("seconds", seconds),
+        ("peak memory", f"{data['peak_rss_mb']:,.0f} MB{on_device}"),
+        ("device", data["device"]),
+    ]
 
 
 def _parts(request: "Request", cache: "Cache") -> int:

@@ -1,6 +1,7 @@
 """The contents of shards, in one dictionary each, and survivors of stages, in one number each."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,19 @@ def describe(paths: Paths) -> list[dict[str, Any]]:
         ShardError: No shard is found, or one cannot be read.
     """
     return [shard.value for shard in gather(paths, _describe)]
+
+
+def closure_share(paths: Iterable[Path]) -> float | None:
+    """Share of the rows of shards that have force closure (epsilon above 0); None if there are no rows.
+
+    Raises:
+        ShardError: One cannot be read.
+    """
+    closed = rows = 0
+    for path in paths:
+        with ShardReader(path) as reader:
+            closed, rows = closed + int((reader.column("metrics/epsilon") > 0).sum()), rows + len(reader)
+    return closed / rows if rows else None
 
 
 def _describe(reader: ShardReader) -> dict[str, Any]:

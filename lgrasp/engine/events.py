@@ -52,8 +52,8 @@ class Events:
     def started(self, parts: Sequence[Part], present: Mapping[int, int]) -> None:
         """Inputs are ready; ``present`` are the rows of the parts, by number, that are on disk already."""
 
-    def advanced(self, part: Part, done: int, note: str = "") -> None:
-        """``done`` rows of a part are made so far."""
+    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0) -> None:
+        """``done`` rows of a part are made so far; work on ``ahead`` more is done, as far as can be told."""
 
     def wrote(self, part: Part, made: Made) -> None:
         """A part is on disk."""
@@ -70,13 +70,13 @@ class PartProgress:
     events: Events
     part: Part
 
-    def __call__(self, done: int, note: str = "") -> None:
-        """Tell the rows done so far.
+    def __call__(self, done: int, note: str = "", ahead: float = 0.0) -> None:
+        """Tell the rows done so far; see :meth:`Events.advanced`.
 
         Raises:
             CancelledError: the job is to stop, and rows are missing.
         """
-        self.events.advanced(self.part, done, note)
+        self.events.advanced(self.part, done, note, ahead)
         if not 0 < self.part.rows <= done:
             self.check()
 

@@ -17,8 +17,8 @@ def job_report(outcome: "JobOutcome") -> dict[str, Any]:
 
     Returns:
         Of all jobs ``asked``, ``made``, ``present`` (rows), ``out``, ``shards`` (names of the files), ``device``,
-        ``seconds`` (``kernels``: compiling and loading; ``total``: the whole call), ``peak_rss_mb``,
-        ``peak_device_mb``, ``starved``, ``cancelled``.
+        ``seconds`` (``kernels``: compiling and loading; ``parts``: making the files; ``total``: the whole call),
+        ``peak_rss_mb``, ``peak_device_mb``, ``starved``, ``cancelled``.
     """
     own = outcome.job.report(outcome)
     shared = {
@@ -33,8 +33,7 @@ def job_report(outcome: "JobOutcome") -> dict[str, Any]:
         "starved": outcome.starved,
         "cancelled": outcome.cancelled,
     }
-    seconds = {"kernels": outcome.seconds["kernels"], "total": outcome.wall}
-    return shared | own | {"seconds": own.get("seconds", {}) | seconds}
+    return shared | own | {"seconds": own.get("seconds", {}) | outcome.seconds}
 
 
 def peak_rss_mb() -> float:

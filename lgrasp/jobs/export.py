@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -68,7 +69,7 @@ class ExportJob(ExportRequest, Job):
             where=self.where,
             limit=self.limit,
             cut=self._cut() if self.to == "mjcf" else None,
-            advance=lambda done, total: progress(done, f"of {total:,}"),
+            advance=lambda done, total: replace(progress, part=replace(part, rows=total))(done),
             run_key=self.key(),
         )
         return Made(done.rows, (), list(done.objects))

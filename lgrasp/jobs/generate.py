@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.info import stage_counts, survivors
+from lgrasp.dataset.info import closure_share, stage_counts, survivors
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.graphs import GraphCache
@@ -29,7 +29,7 @@ from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.records import object_record
 from lgrasp.jobs.requests.search import GenerateRequest
-from lgrasp.jobs.search import SearchJob, telling
+from lgrasp.jobs.search import SearchJob
 from lgrasp.runtime.array import Array
 
 PUBLISHED_FSWO = 0.15
@@ -95,7 +95,7 @@ class GenerateJob(GenerateRequest, SearchJob):
             part.rows,
             Execution(self.threads(), self.batch, self._rate, self._graphs),
             bank_cache=self.cache if self.reuse else None,
-            progress=telling(progress),
+            progress=lambda rows, _: progress(rows),
         )
         kept = result.counts.get("simulate", {}).get("held", result.counts.get("filter", {}).get("kept", 0))
         self._rate = max(kept / result.candidates, 1e-3)
@@ -113,8 +113,8 @@ class GenerateJob(GenerateRequest, SearchJob):
             ``grasps``, ``strict`` (those within the strict bounds) and ``profile`` (of the bounds that all are within);
             ``grasps_per_s``, ``strict_valid_per_s``, ``published_count_per_s`` (over the wall time of placement through
             filter), ``seconds`` (thread-seconds per stage; ``wall`` of placement through filter; hand, object, field),
-            ``survivors`` and ``counts`` per stage, ``near_duplicates`` (across shards), ``distinct_poses`` and what was
-            asked.
+            ``survivors`` and ``counts`` per stage, ``near_duplicates`` (across shards), ``distinct_poses``,
+            ``force_closure`` (share) and what was asked.
         """
         inputs, tree = self.inputs, self.inputs.hand.model.tree
         moving = tree.body_group[tree.link_body] >= 0
@@ -129,6 +129,7 @@ class GenerateJob(GenerateRequest, SearchJob):
         return {
             "grasps": outcome.rows,
             **{name: both[name] for name in counts},
+            "force_closure": closure_share(outcome.paths),
             "near_duplicates": _near_duplicates(outcome.paths, inputs.device.alias),
             "profile": self.pipeline.bounds.profile,
             **{f"{name}_per_s": made[of] / wall if wall else 0.0 for name, of in rates.items()},

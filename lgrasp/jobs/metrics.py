@@ -38,7 +38,7 @@ class MetricsJob(MetricsRequest, ShardJob):
         workers = self.workers or os.cpu_count() or 1
         if self._each is None:
             self._each = self._open.enter_context(process_map(workers))
-        columns = measure_shard(part.source, self.settings, self._each, 8 * workers * TASK_ROWS, progress)
+        columns = measure_shard(part.source, self.settings, self._each, 4 * workers * TASK_ROWS, progress)
         return Made(part.rows, {name: columns[name] for name in self.add})
 
     def write(self, part: Part, contents: Any) -> None:

@@ -1,17 +1,15 @@
 """What the jobs that search grasps by a pipeline share: of one object, and of several one after another."""
 
-import time
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.info import survivors
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.engine.events import Events, Part, PartProgress
+from lgrasp.engine.events import Events, Part
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard import add_counts, add_seconds, flat_statistics
@@ -143,7 +141,7 @@ class SearchJob(SearchRequest, Job):
 
     def sums(self, outcome: JobOutcome, stages: Sequence[str] = ()) -> dict[str, Any]:
         """Of the shards that a call made: ``counts`` and ``seconds`` (``wall``, thread-seconds per stage, loading); and
-        ``hits``, ``hand``, ``pipeline``, ``seed``."""
+        ``hits``, ``hand``, ``pipeline``, ``seed``, ``protocol``."""
         counts: dict[str, dict[str, int]] = {stage: {} for stage in stages}
         seconds = dict.fromkeys(stages, 0.0)
         for result in outcome.results:
@@ -157,15 +155,5 @@ class SearchJob(SearchRequest, Job):
             "hand": self.records(self.inputs)[0].name,
             "pipeline": self.pipeline.name,
             "seed": self.pipeline.seed,
+            "protocol": self.protocol,
         }
-
-
-def telling(progress: PartProgress) -> Callable[[int, Any], None]:
-    """Tells (rows, running result) with the rate and the survivors of each stage."""
-    start = time.monotonic()
-
-    def tell(rows: int, result: Any) -> None:
-        flow = "  ".join(f"{stage} {count:,}" for stage, count in survivors(result.counts).items())
-        progress(rows, f"{rows / max(time.monotonic() - start, 1e-9):,.0f}/s  {flow}")
-
-    return tell

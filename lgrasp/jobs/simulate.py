@@ -96,8 +96,7 @@ class SimulateJob(SimulateRequest, ShardJob):
             kept = KeptVerdicts(self.cache, self.part_key(part), name, largest=None if device == "cpu" else GPU_BLOCK)
 
             def told(done: int, held: int) -> None:
-                rate = (kept.rows + done) / max(kept.seconds_now, 1e-9)
-                progress(kept.rows + done, f"{kept.held + held:,} hold  {rate:.1f}/s")
+                progress(kept.rows + done, f"{kept.held + held:,} hold")
 
             while (block := kept.next_block(rows, threads)) or not kept.columns:
                 found = verdicts(

@@ -34,7 +34,7 @@ class Watch(Events):
     def __init__(self):
         self.done, self.seen = {}, []
 
-    def advanced(self, part, done, note=""):
+    def advanced(self, part, done, *more):
         self.done[part.number] = done
         self.seen.append(sum(self.done.values()))
 

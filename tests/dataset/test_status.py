@@ -89,7 +89,7 @@ def test_verify_reads_the_files(tmp_path):
 
 def test_running(tmp_path):
     class Look(Events):
-        def advanced(self, part, done, note=""):
+        def advanced(self, part, done, *more):
             found.extend(folder_states([tmp_path]))
 
     found: list = []

@@ -174,7 +174,7 @@ def test_tasks_that_write_at_once(tmp_path):
 
 def test_a_working_process_is_seen(tmp_path):
     class Look(Events):
-        def advanced(self, part, done, note=""):
+        def advanced(self, part, done, *more):
             found.extend(workers(tmp_path))
 
     found: list = []

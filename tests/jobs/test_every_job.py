@@ -34,6 +34,7 @@ from lgrasp.learn.params import LearnParams
 from lgrasp.planning.params import PlanParams
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.stages.refine.params import RefineParams
+from lgrasp_cli.progress import Bar, JobProgress
 
 NAMES = ("generate", "sequence", "refine", "plan", "simulate", "scenes", "learn", "metrics", "export")
 
@@ -146,10 +147,21 @@ class Stop(Events):
         return True
 
 
+class Shown(Bar):
+    """The last that a bar showed: done, of all."""
+
+    last = (0, 0)
+
+    def show(self, what, done=None, total=0, note="", ahead=0.0):
+        self.last = done, total
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_tasks_resume_and_stop(jobs, tmp_path: Path, name: str):
-    whole = run(jobs(name, tmp_path / "whole"))
+    bar = Shown()
+    whole = run(jobs(name, tmp_path / "whole"), JobProgress(bar, "rows"))
     assert whole.rows > 0
+    assert bar.last == (sum(part.rows for part in whole.parts) or whole.rows,) * 2
     expected = contents(tmp_path / "whole")
     for task in (1, 0):
         run(jobs(name, tmp_path / "array"), array=(task, 2))

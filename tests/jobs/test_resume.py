@@ -249,7 +249,7 @@ def test_cancelled_run_keeps_whole_shards(job, whole, raw_grasps, tmp_path):
     class Stop(Events):
         asked = False
 
-        def advanced(self, part, done, note=""):
+        def advanced(self, part, done, *more):
             self.asked = True
 
         def cancelled(self):

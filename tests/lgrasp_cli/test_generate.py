@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -33,8 +34,11 @@ STAGES = {"place", "domain", "ik", "search", "filter"}
 def test_report(generate, tmp_path):
     result = generate("--shard-rows", 8, "--json", tmp_path / "report.json")
     assert (result.code, result.err) == (0, "")
-    assert result.out.startswith("grasps ")
-    assert "20 of 20 requested" in result.out
+    told = dict(re.split(r"  +", line) for line in result.out.splitlines())
+    assert list(told) == ["grasps", "diversity", "force closure", "time", "where", "next"]
+    assert told["grasps"] == "20 of 20 requested"
+    assert told["next"] == f"lgrasp simulate {tmp_path / 'out'}"
+    assert "survivors " in generate("--shard-rows", 8, "--verbose").out
     data = json.loads((tmp_path / "report.json").read_text())
     assert set(data) >= KEYS
     assert set(data["survivors"]) == STAGES
@@ -58,7 +62,7 @@ def test_rows_of_looser_bounds_are_not_strict(generate):
     assert data["strict"] < data["grasps"] == 20
     assert data["strict_valid_per_s"] == pytest.approx(data["strict"] / data["seconds"]["wall"])
     assert data["grasps_per_s"] == pytest.approx(20 / data["seconds"]["wall"])
-    assert "by own bounds" in generate(*loose, "--overwrite").out
+    assert "meet only those of the pipeline" in generate(*loose, "--overwrite").out
 
 
 def test_rows_of_higher_friction_are_not_strict(generate):

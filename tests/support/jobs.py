@@ -60,7 +60,7 @@ class StopAfter(Events):
     def __init__(self, parts: int) -> None:
         self.left = parts
 
-    def advanced(self, part, done, note=""):
+    def advanced(self, part, done, *more):
         self.left -= 1
 
     def cancelled(self) -> bool:

@@ -1,6 +1,5 @@
 """Try a hand on a ball, a box and a cylinder: survivors per stage, reasons for losses, pictures."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import trimesh
 from lgrasp.dataset.info import survivors
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import Events
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.errors import HandError
@@ -87,18 +87,18 @@ def check_hand(
     device: str = "auto",
     workers: int = 0,
     cache: Cache | None = None,
-    report: Callable[[str], None] | None = None,
+    events: Events | None = None,
 ) -> HandCheck:
     """Generate on three objects of 5 cm, bounded in effort; shards go to a temporary folder, pictures to ``out``.
 
     Args:
         hand: name, folder, URDF or hand of an installed package.
-        report: called with what is being done.
+        events: told what is being done.
 
     Raises:
         LgraspError: the hand cannot be used, or ``out`` cannot be written.
     """
-    say = report or (lambda line: None)
+    events = events or Events()
     cache = cache or Cache()
     bounded = pipeline.model_copy(update={"effort": _CANDIDATES_PER_ROW})
     checks: list[ObjectCheck] = []
@@ -106,7 +106,7 @@ def check_hand(
     inputs = None
     with temporary_folder() as folder:
         for name, mesh in check_objects(folder).items():
-            say(f"{name} of 5 cm")
+            events.said(f"trying {name} of 5 cm")
             job = GenerateJob(
                 hand=hand,
                 object=str(mesh),
@@ -118,7 +118,7 @@ def check_hand(
                 shard_rows=rows,
                 cache=cache,
             )
-            outcome = generate(job)
+            outcome = generate(job, events)
             inputs = job.inputs
             done = outcome.results[0]
             reasons = diagnose(inputs, done.counts, outcome.rows, rows)
@@ -132,10 +132,10 @@ def check_hand(
     if not any(check.reasons for check in checks):
         found = hand_findings(model, inputs.field.model, dict(source.spec.fingers))
         hints = [line for stage in ("domain", "place", "ik", "search") for line in found[stage]]
-    say("opposition spaces")
+    events.loading("opposition spaces")
     spaces = check_spaces(inputs)
     sequence = longest_sequence(inputs, spaces)
-    say("pictures")
+    events.loading("pictures")
     pictures = _draw(inputs, shards, [space.name for space in spaces if all(space.areas)], out)
     return HandCheck(model.name, source.note, list(model.notes), hints, checks, spaces, sequence, pictures)
 

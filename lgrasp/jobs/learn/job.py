@@ -80,7 +80,7 @@ class FitJob(FitRequest, Job):
             )
         trainer = Trainer(hand, train, p, device=device)
         start = time.perf_counter()
-        trainer.fit_poses(p.steps, p.rate, lambda step, loss: progress(step, f"on poses, loss {loss:.3f}"))
+        trainer.fit_poses(p.steps, p.rate, lambda step, loss: progress(step, f"loss {loss:.3f}"))
         seconds = {"poses": time.perf_counter() - start}
         report: dict[str, Any] = {"hand": hand.name, "objects": [e.model.name for e in train]}
         report["frozen"] = _numbers(measure(trainer, held_out))
@@ -90,7 +90,7 @@ class FitJob(FitRequest, Job):
             report["longer"] = _numbers(measure(trainer, held_out))
             trainer.net.load_state_dict(before)
             start = time.perf_counter()
-            trainer.fit_jointly(lambda step, energy: progress(p.steps + step, f"jointly, energy {energy:.3f}"))
+            trainer.fit_jointly(lambda step, energy: progress(p.steps + step, f"energy {energy:.3f}"))
             seconds["joint"] = time.perf_counter() - start
             report["joint"] = _numbers(measure(trainer, held_out))
             report["lowered"] = {

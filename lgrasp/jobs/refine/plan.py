@@ -10,6 +10,7 @@ from pydantic import InstanceOf, PrivateAttr
 
 from lgrasp.cloud.model import cloud_object
 from lgrasp.cloud.read import Cloud, read_cloud
+from lgrasp.dataset.info import closure_share
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
@@ -124,10 +125,10 @@ class PlanJob(PlanRequest, Job):
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``starts``, ``counts`` (what became of the starts), medians of ``epsilon`` and
-        ``unresisted_load``, ``seconds_planning``, ``valid`` by the bounds of ``profile``."""
+        ``unresisted_load``, ``seconds_planning``, ``force_closure`` (share), ``valid`` by the bounds of ``profile``."""
         _, hand, model, _ = self._models()
         data: dict[str, Any] = {"hand": hand.name, "object": model.name, "starts": self.starts, "grasps": outcome.rows}
-        data["profile"] = self.params.bounds.profile
+        data |= {"profile": self.params.bounds.profile, "force_closure": closure_share(outcome.paths)}
         data |= {"counts": {}, "seconds_planning": 0.0, "epsilon": None, "unresisted_load": None, "valid": 0}
         for result in outcome.results:
             data |= {"counts": result["counts"], "seconds_planning": result["seconds"]}

@@ -12,6 +12,7 @@ from pydantic import PrivateAttr
 from lgrasp import __version__
 from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.exports.formats import read_grasps
+from lgrasp.dataset.info import closure_share
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
@@ -132,8 +133,12 @@ class RefineJob(RefineRequest, ShardJob):
         return Made(len(moved.rows), self.marked(part, replace(shard, header=header, grasps=moved.rows), counts))
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
-        """``results``: of each shard hand, object, rows, refined, valid before and after, mean energies, seconds."""
-        return {"results": [_entry(path) for path in outcome.paths]}
+        """``results``: of each shard hand, object, rows, refined, valid before and after, mean energies, seconds;
+        ``force_closure`` (share)."""
+        return {
+            "results": [_entry(path) for path in outcome.paths],
+            "force_closure": closure_share(outcome.paths),
+        }
 
     def _hand(self, path: Path, shard: Shard) -> HandArrays:
         """The hand of a shard, whatever is installed under its name; ``hand`` is only compared with it."""

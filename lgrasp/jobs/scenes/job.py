@@ -49,7 +49,7 @@ class SceneJob(SceneRequest, Job):
     def loaded(self) -> Stock:
         """Hand, objects and grasps; loaded, and grasps generated, when they are asked for."""
         if self._stock is None:
-            self._stock = load_stock(self, self.cache, self.device_used, self.events.loading)
+            self._stock = load_stock(self, self.cache, self.device_used, self.events)
         return self._stock
 
     def key(self) -> str:

@@ -16,7 +16,7 @@ from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.jobs.requests.search import SequenceRequest
-from lgrasp.jobs.search import SearchJob, telling
+from lgrasp.jobs.search import SearchJob
 from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.records import object_records, sequence_rows
 from lgrasp.jobs.sequence.round import Verdicts, add_spaces
@@ -74,8 +74,7 @@ class SequenceJob(SequenceRequest, SearchJob):
             part.number,
             part.rows,
             self.threads(),
-            check=progress.check,
-            progress=telling(progress),
+            progress=lambda rows, ahead: progress(rows, ahead=ahead),
             verdicts=simulated(self.inputs, self.simulate) if self.simulate else None,
         )
         forgotten = replace(result, levels=[])

@@ -64,14 +64,14 @@ def run_round(
     shard: int,
     number: int,
     workers: int,
-    check: Callable[[], None] = lambda: None,
+    tell: Callable[[float], None] = lambda share: None,
     verdicts: Verdicts | None = None,
 ) -> Round:
     """Sequences of round ``number`` of a shard: a pure function of its arguments but the number of threads.
 
     Args:
         workers: threads.
-        check: called before each step; what it raises ends the round.
+        tell: called with the share of the round that is done; what it raises ends the round.
         verdicts: simulates the rows of each step; only those that hold are continued.
     """
     model, result = inputs.hand, Round()
@@ -79,10 +79,10 @@ def run_round(
     rows = empty_sequences(pipeline.params("sequence").width, model.dofs, model.groups + 1)
     with ThreadPoolExecutor(workers) as pool:
         while rows.steps < len(inputs.objects) and len(rows):
-            check()
+            tell(rows.steps / len(inputs.objects))
             result.spaces.append({})
             start = time.perf_counter()
-            rows = _Step(pipeline, inputs, rows, seed, pool, result).run()
+            rows = _Step(pipeline, inputs, rows, seed, pool, result, tell).run()
             result.walls.append(time.perf_counter() - start)
             result.levels.append(rows)
             if verdicts and len(rows):
@@ -101,9 +101,10 @@ class _Step:
         seed: int,
         pool: ThreadPoolExecutor,
         result: Round,
+        tell: Callable[[float], None],
     ) -> None:
         self._pipeline, self._inputs, self._rows, self._seed = pipeline, inputs, rows, seed
-        self._pool, self._result = pool, result
+        self._pool, self._result, self._tell = pool, result, tell
         self._params = pipeline.params("sequence")
         self._have = np.zeros(len(rows), int)
         self._found: dict[int, list[GraspTable]] = {}
@@ -117,6 +118,7 @@ class _Step:
         if params.method != "field":
             self._optimise(order[:, 0])
         for wave in range(params.waves if params.method == "field" else 0):
+            self._tell((rows.steps + wave / params.waves) / len(self._inputs.objects))
             space = order[np.arange(len(rows)), wave % np.maximum((order >= 0).sum(1), 1)]
             for number in np.unique(space[space >= 0]):
                 self._go_on(np.flatnonzero((space == number) & self._wanting), int(number), wave)

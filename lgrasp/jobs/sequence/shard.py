@@ -55,16 +55,15 @@ def make_sequences(
     rows: int,
     workers: int,
     *,
-    check: Callable[[], None] = lambda: None,
-    progress: Callable[[int, SequenceResult], None] | None = None,
+    progress: Callable[[int, float], None] = lambda rows, ahead: None,
     verdicts: Verdicts | None = None,
 ) -> SequenceResult:
     """The first ``rows`` whole sequences of a shard, near-duplicates left out, with the rows that they extend.
 
     Args:
         workers: threads; they do not change the rows.
-        check: called before each step of a round; what it raises ends the shard.
-        progress: called with (sequences so far, running result) after each round; what it raises ends the shard.
+        progress: called with (sequences so far, how many more the work on the running round is worth); what it raises
+            ends the shard.
         verdicts: see :func:`run_round`.
     """
     result = SequenceResult()
@@ -73,7 +72,16 @@ def make_sequences(
     parts: list[list[SequenceTable]] = []
     start = time.perf_counter()
     while kept.count < rows and not result.exhausted:
-        found = run_round(pipeline, inputs, shard, result.rounds, workers, check, verdicts)
+        expected = min(rows - kept.count, pipeline.params("sequence").width)
+        found = run_round(
+            pipeline,
+            inputs,
+            shard,
+            result.rounds,
+            workers,
+            lambda share, rows=kept.count, expected=expected: progress(rows, share * expected),
+            verdicts,
+        )
         result.add(found)
         if len(found.levels) == objects:
             last = found.levels[-1]
@@ -82,8 +90,7 @@ def make_sequences(
             new, duplicates = kept.add(pose, last.q[:, -1], rows - kept.count)
             result.duplicates += duplicates
             parts.append(_lineage(found.levels, new))
-        if progress:
-            progress(kept.count, result)
+        progress(kept.count, 0.0)
         missing = len(result.reached) < objects or min(result.reached) == 0
         hopeless = result.rounds >= _EMPTY_ROUNDS and missing
         result.exhausted = kept.count < rows and (hopeless or result.rounds >= most_rounds(pipeline, rows))

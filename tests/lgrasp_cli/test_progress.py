@@ -1,0 +1,86 @@
+"""Progress and tables on a terminal of 80 columns."""
+
+import io
+import re
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from lgrasp_cli import progress
+from lgrasp_cli.progress import Bar
+from lgrasp_cli.tables import TextTable, print_report
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """clock(*seconds): what the clock will say."""
+
+    def clock(*seconds):
+        monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=iter(seconds).__next__))
+
+    return clock
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """terminal(): standard error becomes a terminal of 80 columns."""
+
+    def terminal():
+        for name, value in {"COLUMNS": "80", "TERM": "xterm"}.items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setattr(sys, "stderr", Terminal())
+        return sys.stderr
+
+    return terminal
+
+
+def lines(terminal) -> list[str]:
+    return [line for line in re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())) if line]
+
+
+def test_nothing_but_the_bar_is_cut(terminal, clock):
+    clock(0, 0, 10)
+    screen = terminal()
+    with Bar() as bar:
+        bar.show("sequences", 1_000_000, 2_000_000, "612,345 hold")
+        bar.show("sequences", 1_010_000, 2_000_000, "612,345 hold")
+    found = lines(screen)
+    assert max(map(len, found)) <= 80
+    assert re.search(r"^sequences .*1,010,000/2,000,000 .* 0:16:30 left  1,000/s  612,345 hold$", found[-1])
+
+
+def test_work_on_rows_to_come_counts(terminal, clock):
+    """A round of sequences takes long and gives all of them at its end."""
+    clock(0, 0, 30)
+    screen = terminal()
+    with Bar() as bar:
+        bar.show("sequences", 0, 100)
+        bar.show("sequences", 0, 100, ahead=25)
+    assert re.search(r"0/100 .* 0:01:30 left  0.8/s", lines(screen)[-1])
+
+
+def test_lines_where_there_is_no_terminal(clock, capsys):
+    clock(0, 0, 5, 11, 11, 11, 11)
+    with Bar() as bar:
+        for done in (0, 10):
+            bar.show("rows", done, 100, "7 hold")
+    assert capsys.readouterr().err == "rows  10/100  0:01:39 left  0.9/s  7 hold\n"
+
+
+def test_tables_fit(monkeypatch, capsys):
+    table = TextTable(("part", "value", "meaning"), [("search", "1" * 300, "what it is " * 9)], right=("value",))
+    monkeypatch.setenv("COLUMNS", "80")
+    print_report({}, None, [table])
+    found = capsys.readouterr().out
+    assert max(map(len, found.splitlines())) <= 80
+    assert found.count("1") == 300
+    assert found.count("what") == 9
+    monkeypatch.delenv("COLUMNS")  # a file
+    print_report({}, None, [table])
+    assert len(capsys.readouterr().out.splitlines()) == 2
