@@ -83,7 +83,7 @@ def print_report(data: Any, json_path: str | None, blocks: Iterable[Block]) -> N
 
 def _fitting(widths: list[int]) -> list[int]:
     """Widths of columns with which a table fits the terminal: the widest ones give way."""
-    width = shutil.get_terminal_size((sys.maxsize, 0)).columns
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     room = max(width - 2 * (len(widths) - 1), _LEAST * len(widths))
     while sum(widths) > room:
         most, *others = sorted({*widths, _LEAST}, reverse=True)

@@ -73,14 +73,13 @@ def test_lines_where_there_is_no_terminal(clock, capsys):
     assert capsys.readouterr().err == "rows  10/100  0:01:39 left  0.9/s  7 hold\n"
 
 
-def test_tables_fit(monkeypatch, capsys):
+def test_tables_fit(monkeypatch):
     table = TextTable(("part", "value", "meaning"), [("search", "1" * 300, "what it is " * 9)], right=("value",))
-    monkeypatch.setenv("COLUMNS", "80")
-    print_report({}, None, [table])
-    found = capsys.readouterr().out
-    assert max(map(len, found.splitlines())) <= 80
-    assert found.count("1") == 300
-    assert found.count("what") == 9
-    monkeypatch.delenv("COLUMNS")  # a file
-    print_report({}, None, [table])
-    assert len(capsys.readouterr().out.splitlines()) == 2
+    for screen, widest in ((Terminal(), 80), (io.StringIO(), 500)):
+        monkeypatch.setenv("COLUMNS", "80")
+        monkeypatch.setattr(sys, "stdout", screen)
+        print_report({}, None, [table])
+        text = screen.getvalue()
+        assert max(map(len, text.splitlines())) <= widest
+        assert (text.count("1"), text.count("what")) == (300, 9)
+    assert len(text.splitlines()) == 2  # a file is not made narrower
