@@ -9,32 +9,31 @@ from typing import Any
 import typer
 
 _PAGE = Path(__file__).parents[1] / "docs" / "reference" / "cli.md"
-_MANY = 3  # commands from which on an option is explained once for all
+_MANY = 2  # commands from which on an option is explained once for all
 _MARK = "## Common options\n"
 _JOB = ("--device", "--workers", "--array", "--overwrite", "--rebuild", "--json", "--cache-dir", "--quiet")
 _Row = tuple[str, str, str]  # names, meaning, default and range of an option
 
 
 def cli_page() -> str:
-    """The page: its head as it is, then every command with its help, arguments and options."""
+    """The page: its head as it is, then every command with its help and example; of those for users the options too."""
     from lgrasp_cli.main import app
 
     commands = list(_commands(typer.main.get_command(app), None, "lgrasp"))
-    counts = Counter(row[:2] for command in commands for row in _options(*command))
-    defaults = Counter(row for command in commands for row in _options(*command))
+    every = [row for command in commands for row in _options(*command)]
+    counts, defaults = Counter(row[:2] for row in every), Counter(every)
     common: dict[str, _Row] = {}
     for (names, what), count in counts.most_common():
         if count >= _MANY and _flag(names) not in common:
             rows = [row for row, _ in defaults.most_common() if row[:2] == (names, what)]
             common[_flag(names)] = rows[0]
-    lines = [_MARK, "Commands name these options without repeating their meaning, and their default where it differs."]
+    lines = [_MARK, "Commands name these options without repeating their meaning. Brackets hold defaults. For commands"]
+    lines += ["of developers, which have no list of options here, `--help` gives them.", ""]
     lines += [f"*Job options* are {_code(_JOB)}.", ""]
     lines += [*(f"- `{names}`: {what}{default}" for _, (names, what, default) in sorted(common.items())), ""]
-    rows: list[_Row] = []
     for command, context in commands:
-        before, rows = rows, _options(command, context)
         if context.parent is not None:
-            lines += _section(command, context, rows, common, same=bool(rows) and rows == before)
+            lines += _section(command, context, _options(command, context), common)
         if context.command_path == "lgrasp run":
             lines += _config_keys()
     return _PAGE.read_text(encoding="utf-8").partition(_MARK)[0] + "\n".join(lines).rstrip() + "\n"
@@ -50,15 +49,24 @@ def _commands(command: Any, parent: typer.Context | None, name: str) -> Iterator
 
 
 def _options(command: Any, context: typer.Context) -> list[_Row]:
-    """The options of a command."""
+    """The options of a command for users; those of others are told by ``--help``."""
+    if _panel(context) == "Developer":
+        return []
     records = [p.get_help_record(context) for p in command.get_params(context) if "--help" not in p.opts]
     return [_row(names, what) for names, what in filter(None, records)]
 
 
 def _row(names: str, what: str) -> _Row:
-    names = re.sub(r" (<\w+) range>$", r" \1>", _line(names))  # the range follows the default
-    what, _, default = re.sub(r"\[default: \((.*?)\)", r"[default: \1", _line(what)).partition(" [")
-    return names, what, f" [{default}" if default else ""
+    names = re.sub(r" (<\w+) range>$", r" \1>", _line(names))
+    what, _, rest = _line(what).partition(" [")
+    default = re.search(r"default: \(?([^;\])]*)|required", rest)
+    return names, what, f" [{default[1] or default[0]}]" if default else ""
+
+
+def _panel(context: typer.Context) -> str:
+    """The panel of ``lgrasp --help`` that names a command or the group that it is in."""
+    above = context.parent
+    return str(getattr(context.command, "rich_help_panel", "")) if not above or not above.parent else _panel(above)
 
 
 def _code(names: Iterable[str]) -> str:
@@ -70,13 +78,11 @@ def _flag(names: str) -> str:
     return names.split(", ")[-1].split()[0]
 
 
-def _section(command: Any, context: typer.Context, rows: list[_Row], common: dict[str, _Row], same: bool) -> list[str]:
-    """The part of one command; ``same``: its options are those of the command before."""
+def _section(command: Any, context: typer.Context, rows: list[_Row], common: dict[str, _Row]) -> list[str]:
+    """The part of one command."""
     text, _, example = (command.help or "").replace("\b", "").partition("Example: ")
     paragraphs = [" ".join(paragraph.split()) for paragraph in text.split("\n\n") if paragraph.strip()]
     lines = [f"## {context.command_path}", ""]
-    if same and len(rows) > 5:
-        return [*lines, f"{paragraphs[0]} Options are those of the command above.", ""]
     for paragraph in paragraphs:
         lines += [paragraph, ""]
     if example.strip() != context.command_path and example:
@@ -98,7 +104,7 @@ def _config_keys() -> list[str]:
         default = field.get_default(call_default_factory=True)
         shown = ", ".join(default) if isinstance(default, tuple) else "" if default is None else str(default)
         what = _line(field.description or "") or "As the option."
-        lines.append(f"- `{name}`: {what}" + (f" [default: {shown}]" if shown else ""))
+        lines.append(f"- `{name}`: {what}" + (f" [{shown}]" if shown else ""))
     return [*lines, ""]
 
 
