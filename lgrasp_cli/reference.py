@@ -57,13 +57,14 @@ def _options(command: Any, context: typer.Context) -> list[_Row]:
 
 
 def _row(names: str, what: str) -> _Row:
-    names = re.sub(r" (<\w+) range>$", r" \1>", _line(names))
-    what, _, rest = _line(what).partition(" [")
-    default = re.search(r"default: \(?([^;\])]*)|required", rest)
+    """A line of a command's help, without types and ranges."""
+    names = re.sub(r" <.*>$", "", _line(names))
+    what, *rest = re.split(r" (?=\[(?:default: |required|x[<>]|[\d.]+<)[^\[]*\]$)", _line(what))
+    default = re.search(r"default: \(?([^;\])]*)|required", "".join(rest))
     return names, what, f" [{default[1] or default[0]}]" if default else ""
 
 
-def _panel(context: typer.Context) -> str:
+def _panel(context: Any) -> str:
     """The panel of ``lgrasp --help`` that names a command or the group that it is in."""
     above = context.parent
     return str(getattr(context.command, "rich_help_panel", "")) if not above or not above.parent else _panel(above)
@@ -81,7 +82,8 @@ def _flag(names: str) -> str:
 def _section(command: Any, context: typer.Context, rows: list[_Row], common: dict[str, _Row]) -> list[str]:
     """The part of one command."""
     text, _, example = (command.help or "").replace("\b", "").partition("Example: ")
-    paragraphs = [" ".join(paragraph.split()) for paragraph in text.split("\n\n") if paragraph.strip()]
+    example, _, after = example.partition("\n\n")
+    paragraphs = [_line(paragraph) for paragraph in f"{text}\n\n{after}".split("\n\n") if paragraph.strip()]
     lines = [f"## {context.command_path}", ""]
     for paragraph in paragraphs:
         lines += [paragraph, ""]
@@ -99,12 +101,14 @@ def _config_keys() -> list[str]:
     """The keys of a config, from its model."""
     from lgrasp.jobs.config import JobConfig
 
+    fields = JobConfig.model_fields
     lines = ["Keys of a config:", ""]
-    for name, field in JobConfig.model_fields.items():
+    for name, field in fields.items():
         default = field.get_default(call_default_factory=True)
         shown = ", ".join(default) if isinstance(default, tuple) else "" if default is None else str(default)
-        what = _line(field.description or "") or "As the option."
-        lines.append(f"- `{name}`: {what}" + (f" [{shown}]" if shown else ""))
+        if field.description:
+            lines.append(f"- `{name}`: {_line(field.description)}" + (f" [{shown}]" if shown else ""))
+    lines.append(f"- As the options: {_code(name for name, field in fields.items() if not field.description)}.")
     return [*lines, ""]
 
 

@@ -20,7 +20,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.M | re.S)
 
 def test_names_are_those_of_the_page():
     page = (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8")
-    assert sorted(re.findall(r"^\| `lg\.(\w+)", page, re.M)) == sorted(lg.__all__)
+    assert sorted(re.findall(r"^- `lg\.(\w+)", page, re.M)) == sorted(lg.__all__)
 
 
 def test_every_name_is_there():

@@ -49,7 +49,7 @@ class JobConfig(Params):
     workers: Workers = 0
     batch: int = Field(0, ge=0)
     shard_rows: int = Field(10_000, ge=1)
-    passes: int | None = Field(None, ge=1, le=64, description="Replaces the pipelines' own search.passes.")
+    passes: int | None = Field(None, ge=1, le=64)
     reuse: bool = False
     sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn.")
 

@@ -16,5 +16,5 @@ def test_page_names_commands_options_and_keys():
     page = cli_page()
     assert "## lgrasp generate\n" in page
     assert "## lgrasp dataset merge\n" in page
-    assert "- `-n, --rows <int>`: " in page
+    assert "- `-n, --rows`: " in page
     assert "- `object_dir`: " in page
