@@ -51,7 +51,7 @@ def render(
 
     check_image(out)
     found = SceneRows(paths)
-    chosen = found.spread(count) if rows is None else _numbers(rows)
+    chosen = found.sound(found.spread(count)) if rows is None else _numbers(rows)
     with Bar(quiet=quiet) as bar:
         image = draw_rows(
             found,

@@ -39,23 +39,17 @@ def gather(
         ShardError: A path does not exist, a file that was named cannot be used, or no shard is left.
     """
     found: list[Gathered[T]] = []
-    unusable: list[str] = []
     first: dict[Any, int] = {}  # rows -> number of their best file so far
     twice: dict[int, int] = {}  # number of a file -> of the one that it repeats
     by_name = set(named_files(paths))
-    for path, folder in shards_below(paths, leave_out):
-        named = path in by_name
-        try:
-            with ShardReader(path) as reader:
-                value, rows = look(reader), _rows_of(reader)
-        except ShardError as error:
-            if named:
-                raise
-            unusable.append(str(error))
-            continue
-        number = len(found)
+
+    def read(path: Path) -> tuple[T, Any]:
+        with ShardReader(path) as reader:
+            return look(reader), _rows_of(reader)
+
+    for number, (path, folder, (value, rows)) in enumerate(sound_files(paths, read, leave_out=leave_out)):
         found.append(Gathered(path, path.relative_to(folder), value))
-        if rows is None or named:
+        if rows is None or path in by_name:
             continue
         best = first.setdefault(rows, number)
         if best == number or found[best].path.parent == path.parent:
@@ -64,15 +58,40 @@ def gather(
             first[rows], twice[best] = number, number
         else:
             twice[number] = best
-    if not found:
-        raise ShardError(unusable[0])
-    if unusable:
-        notice(f"{len(unusable)} of {len(unusable) + len(found)} files are left out, first {unusable[0]}")
     if twice:
         other, best = min(twice.items())
         told = f"{found[other].path} (rows of {found[best].path})"
         notice(f"{len(twice)} of {len(found)} shards repeat rows of others and are left out, first {told}")
     return [one for number, one in enumerate(found) if number not in twice]
+
+
+def sound_files(
+    paths: Paths, read: Callable[[Path], T], *, leave_out: Path | None = None
+) -> list[tuple[Path, Path, T]]:
+    """Files as of :func:`lgrasp.dataset.files.shards_below`, each with what was read of it; those in folders that
+    cannot be used are left out, and reported in one line.
+
+    Args:
+        read: Raises ShardError where the file cannot be used.
+
+    Raises:
+        ShardError: As of :func:`gather`.
+    """
+    found: list[tuple[Path, Path, T]] = []
+    unusable: list[str] = []
+    by_name = set(named_files(paths))
+    for path, folder in shards_below(paths, leave_out):
+        try:
+            found.append((path, folder, read(path)))
+        except ShardError as error:
+            if path in by_name:
+                raise
+            unusable.append(str(error))
+    if not found:
+        raise ShardError(unusable[0])
+    if unusable:
+        notice(f"{len(unusable)} of {len(unusable) + len(found)} files are left out, first {unusable[0]}")
+    return found
 
 
 def _rows_of(reader: ShardReader) -> Any:

@@ -320,9 +320,6 @@ def compare(files: Iterable[Path], manifest: Manifest, *, verify: bool = True) -
 
     Args:
         verify: Read the files for their SHA-256; else their sizes are compared.
-
-    Raises:
-        ShardError: A file cannot be read.
     """
     there = {path.name: path for path in files}
     missing, changed = [], {}
@@ -392,10 +389,13 @@ def _difference(shard: ListedShard, path: Path, verify: bool) -> str:
     """How a file differs from its entry; "" if it does not, or is being replaced."""
     if shard.rows and not shard.sha256:
         return ""
-    with parsing(path):
-        size = path.stat().st_size
-    if size != shard.bytes:
-        return f"it has {size:,} bytes, {MANIFEST} says {shard.bytes or 0:,}"
-    if verify and (digest := sha256(path)) != shard.sha256:
-        return f"SHA-256 is {digest[:12]}…, {MANIFEST} says {str(shard.sha256)[:12]}…"
+    try:
+        with parsing(path):
+            size = path.stat().st_size
+        if size != shard.bytes:
+            return f"it has {size:,} bytes, {MANIFEST} says {shard.bytes or 0:,}"
+        if verify and (digest := sha256(path)) != shard.sha256:
+            return f"SHA-256 is {digest[:12]}…, {MANIFEST} says {str(shard.sha256)[:12]}…"
+    except ShardError as error:
+        return f"it cannot be read: {str(error).removeprefix(f'{path}: ')}"
     return ""

@@ -2,7 +2,7 @@
 
 import os
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import accumulate
@@ -13,10 +13,12 @@ import numpy as np
 from PIL import Image
 
 from lgrasp.dataset.conditions import Condition
-from lgrasp.dataset.files import Paths, check_heaps, shards_below
+from lgrasp.dataset.files import Paths, check_heaps
+from lgrasp.dataset.gather import sound_files
 from lgrasp.dataset.reader import ShardReader, count_rows
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.notices import notice
 from lgrasp.picture.draw import draw_scene
 from lgrasp.picture.scene import GraspScene, HandShape, scene_of_row
 from lgrasp.picture.sheet import sheet
@@ -39,13 +41,16 @@ class SceneRows:
     Args:
         paths: Shard files, or folders that hold some at any depth.
 
+    Files in folders that cannot be read are left out, with a notice.
+
     Raises:
-        ShardError: No shard is found, one cannot be read, or none has a row.
+        ShardError: No shard is found, one that was named cannot be read, or none has a row.
     """
 
     def __init__(self, paths: Paths) -> None:
-        self.files = [file for file, _ in shards_below(paths)]
-        self._ends = list(accumulate(map(count_rows, self.files)))
+        found = sound_files(paths, count_rows)
+        self.files = [file for file, _, _ in found]
+        self._ends = list(accumulate(rows for _, _, rows in found))
         if not len(self):
             raise ShardError(f"{self.files[0]}: no row to look at (shards: {len(self.files)})")
         self._contents = lru_cache(_KEPT)(_contents)
@@ -69,6 +74,33 @@ class SceneRows:
         """So many rows evenly over all of them, or all if there are fewer."""
         count = min(count, len(self))
         return [(2 * k + 1) * len(self) // (2 * count) for k in range(count)]
+
+    def sound(self, rows: Iterable[int], most: int | None = None) -> list[int]:
+        """The first of some rows that can be read; a shard with one that cannot is left out from there on.
+
+        Raises:
+            ShardError: None can be read.
+            ConfigError: There is no such row.
+        """
+        sound: list[int] = []
+        damaged: dict[Path, ShardError] = {}
+        for row in rows:
+            path, _ = self.place(row)
+            if path in damaged:
+                continue
+            try:
+                self.scene(row)
+            except ShardError as error:
+                damaged[path] = error
+                continue
+            sound.append(row)
+            if len(sound) == most:
+                break
+        if not sound:
+            raise next(iter(damaged.values()))
+        for error in damaged.values():
+            notice(f"{error}; it is left out")
+        return sound
 
     def scene(self, row: int) -> GraspScene:
         """The scene of a row.

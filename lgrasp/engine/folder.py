@@ -24,6 +24,8 @@ class Found(NamedTuple):
     """Candidates (or rounds), when they were all that the file may try; else 0."""
     protocols: tuple[str, ...] = ()
     """Those of ``lgrasp simulate`` that the rows have verdicts of."""
+    shard: int = -1
+    """Index of the shard in its run; -1 where the key tells."""
 
 
 def shard_path(out: Path, hand: str, name: str, shard: int) -> Path:
@@ -81,7 +83,8 @@ def found_shard(path: Path) -> Found:
         rows = int(statistics.get("sequences", len(reader)))
         tried = statistics.get("rounds" if "sequences" in statistics else "candidates", 0)
         simulated = tuple(name for name in get_args(ProtocolName) if f"{name}_tried" in statistics)
-        return Found(config.get("run_key"), rows, int(tried) if statistics.get("exhausted") else 0, simulated)
+        tried = int(tried) if statistics.get("exhausted") else 0
+        return Found(config.get("run_key"), rows, tried, simulated, reader.header.shard_index)
 
 
 def _stem(path: Path) -> str:

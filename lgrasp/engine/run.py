@@ -109,6 +109,9 @@ class Job(Request, ABC):
             if found is None:
                 continue
             self._check_run(part.file, found, self.part_key(part))
+            if found.shard not in (-1, part.shard_index):
+                self.cache.warn(f"{part.file} holds shard {found.shard}, not {part.shard_index}; rebuilding it")
+                continue
             if found.rows >= part.rows or found.tried >= self.effort(part.rows):
                 present[part.number] = found.rows
             else:

@@ -54,6 +54,11 @@ class SceneReader(FileReader):
         with reading(self.path):
             return json.loads(self.attributes["config"])
 
+    @property
+    def index(self) -> int:
+        """Number of the scene in its run."""
+        return int(self.attributes["scene_index"])
+
     def layout(self) -> Layout:
         """The objects on the table, and their poses."""
         with reading(self.path):
@@ -83,7 +88,7 @@ class SceneReader(FileReader):
         with reading(self.path):
             return SceneRecord(
                 seed=int(attributes["seed"]),
-                index=int(attributes["scene_index"]),
+                index=self.index,
                 hand=self.hand(),
                 objects=self.objects(),
                 **layout,

@@ -82,4 +82,5 @@ def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) ->
         mesh = trimesh.Trimesh(np.asarray(found.vertices, float), np.asarray(found.faces), process=False)
         return partial(ObjectView, name=found.name, mesh=mesh, notes=tuple(found.notes))
     rows = SceneRows([Path(one).expanduser() for one in what])
-    return lambda server: RowsView(server, rows, shlex.join(what), where, row)
+    (first,) = rows.sound(range(row, max(len(rows), row + 1)), most=1)
+    return lambda server: RowsView(server, rows, shlex.join(what), where, first)

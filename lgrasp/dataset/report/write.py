@@ -51,7 +51,7 @@ def _pictures(paths: Paths) -> str:
     """Some rows, drawn."""
     try:
         rows = SceneRows(paths)
-        chosen = rows.spread(_PICTURES)
+        chosen = rows.sound(rows.spread(_PICTURES))
         image = draw_rows(rows, chosen, size=_SIZE, columns=_PICTURES // 2)
     except LgraspError as error:  # what is reported need not be of a hand that can be drawn
         return f'<p class="note">No pictures: {escape(str(error))}</p>'

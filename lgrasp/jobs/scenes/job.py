@@ -67,7 +67,7 @@ class SceneJob(SceneRequest, Job):
         if problems := check_scene(part.file):
             raise ShardError(problems[0])
         with SceneReader(part.file) as reader:
-            return Found(reader.config.get("run_key"), 1)
+            return Found(reader.config.get("run_key"), 1, shard=reader.index)
 
     def load(self, events: Events, missing: bool) -> None:
         if missing:

@@ -1,0 +1,82 @@
+"""Folders in which files are damaged, missing or in each other's place: what can be used is, the rest is told."""
+
+import shutil
+from dataclasses import replace
+
+import h5py
+import pytest
+from support.jaws import jaw_rows, jaw_shard
+
+from lgrasp import notices
+from lgrasp.dataset.scenes import SceneRows
+from lgrasp.dataset.status import folder_states
+from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.errors import ShardError
+
+
+@pytest.fixture
+def told(monkeypatch):
+    """Notices."""
+    lines: list[str] = []
+    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(notices, "_listeners", [lines.append])
+    return lines
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A shard of four rows; one with a damaged column; one that is no shard; a link that leads nowhere; a loop."""
+    (tmp_path / "urdf").mkdir()
+    shards = tmp_path / "shards"
+    shard = jaw_shard(tmp_path / "urdf", jaw_rows(0.002, count=4))
+    for number in (0, 1):
+        write_shard(shards / f"{number}.h5", replace(shard, header=replace(shard.header, shard_index=number)))
+    with h5py.File(shards / "1.h5") as file:
+        chunk = file["grasps/q"].id.get_chunk_info(0)
+    with open(shards / "1.h5", "r+b") as file:
+        file.seek(chunk.byte_offset)
+        file.write(b"\xff" * chunk.size)
+    (shards / "2.h5").write_bytes(b"no shard")
+    (shards / "3.h5").symlink_to("nowhere")
+    (shards / "loop").symlink_to(".")
+    return shards
+
+
+def test_what_is_damaged_is_not_drawn(folder, told):
+    rows = SceneRows([folder, folder])
+    assert [path.name for path in rows.files] == ["0.h5", "1.h5"]
+    assert rows.sound(range(len(rows))) == [0, 1, 2, 3]
+    assert rows.sound(range(2, 8), most=1) == [2]
+    assert [line.partition(": ")[0] for line in told] == [
+        f"2 of 4 files are left out, first {folder / '2.h5'}",
+        str(folder / "1.h5"),
+    ]
+    for asked in ([5], range(4, 8)):
+        with pytest.raises(ShardError, match=r"1\.h5: .*damaged"):
+            rows.sound(asked)
+    with pytest.raises(ShardError, match=r"2\.h5: "):  # it was named
+        SceneRows([folder / "0.h5", folder / "2.h5"])
+
+
+def test_a_shard_in_the_place_of_another(run, raw_grasps, cache_root, tmp_path):
+    run(rows=40)
+    out = tmp_path / "out"
+    whole = raw_grasps(out)
+    first, second = sorted(out.glob("*.h5"))
+    shutil.copy(first, second)
+    told: list[str] = []
+    again = run(rows=40, cache=Cache(cache_root, told.append))
+    assert (again.made, again.present) == (20, 20)
+    assert told == [f"{second} holds shard 0, not 1; rebuilding it"]
+    assert raw_grasps(out) == whole
+
+
+def test_states_of_files_that_cannot_be_read(run, tmp_path):
+    run(rows=40)
+    first, _ = sorted((tmp_path / "out").glob("*.h5"))
+    first.unlink()
+    first.symlink_to("nowhere")
+    (state,) = folder_states([tmp_path])
+    assert state["state"] == "damaged"
+    assert state["changed"] == {first.name: "it cannot be read: No such file or directory"}
