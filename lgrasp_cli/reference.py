@@ -32,7 +32,7 @@ def cli_page() -> str:
     lines += [f"*Job options* are {_code(_JOB)}.", ""]
     lines += [*(f"- `{names}`: {what}{default}" for _, (names, what, default) in sorted(common.items())), ""]
     for command, context in commands:
-        if context.parent is not None:
+        if not getattr(command, "commands", {}) or getattr(command, "invoke_without_command", False):
             lines += _section(command, context, _options(command, context), common)
         if context.command_path == "lgrasp run":
             lines += _config_keys()
@@ -87,7 +87,7 @@ def _section(command: Any, context: typer.Context, rows: list[_Row], common: dic
     lines = [f"## {context.command_path}", ""]
     for paragraph in paragraphs:
         lines += [paragraph, ""]
-    if example.strip() != context.command_path and example:
+    if len(example.split()) > len(context.command_path.split()) + 1:
         lines += ["```", *(line.strip() for line in example.strip().splitlines()), "```", ""]
     shared = [row for row in rows if row[:2] == common.get(_flag(row[0]), row[1:])[:2]]
     lines += [f"- `{names}`: {what}{default}" for names, what, default in rows if (names, what, default) not in shared]
