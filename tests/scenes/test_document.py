@@ -18,7 +18,7 @@ def test_every_dataset_with_its_type_and_shape():
         assert f"`{spec.path}`" in TEXT, spec.path
         if spec.path.split("/")[0] in ("scene", "views", "cloud", "grasps"):
             shape = ", ".join(map(str, spec.shape))
-            assert f"| `{spec.path}` | {NAMES[spec.dtype]} | [{shape}] |" in TEXT, spec.path
+            assert f"- `{spec.path}` ({NAMES[spec.dtype]} [{shape}]): " in TEXT, spec.path
 
 
 def test_every_attribute():
