@@ -11,7 +11,7 @@ import typer
 _PAGE = Path(__file__).parents[1] / "docs" / "reference" / "cli.md"
 _MANY = 2  # commands from which on an option is explained once for all
 _MARK = "## Common options\n"
-_JOB = ("--device", "--workers", "--array", "--overwrite", "--rebuild", "--json", "--cache-dir", "--quiet")
+_JOB = ("--device", "--workers", "--array", "--overwrite", "--rebuild", "--json", "--cache-dir", "--quiet", "--verbose")
 _Row = tuple[str, str, str]  # names, meaning, default and range of an option
 
 

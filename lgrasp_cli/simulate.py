@@ -29,10 +29,8 @@ def simulate(
     """Simulate grasps with MuJoCo and add the verdicts to the shards, as columns physics/PROTOCOL_...
 
     The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
-    directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects: the
-    hand starts at q, and every object must still touch it. docs/guides/physics.md describes the simulation.
-
-    A shard that has the verdicts already is left as it is. A run that was interrupted loses less than a minute of work.
+    directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects. A shard
+    that has the verdicts already is left as it is.
 
     Example: lgrasp simulate grasps/allegro-mug/robust --protocol fc
     """

@@ -50,4 +50,6 @@ def test_all_pages_are_reached():
 
 def test_every_metric_is_explained():
     page = (DOCS / "reference" / "metrics.md").read_text(encoding="utf-8")
-    assert [name for name in (*METRICS, "contacts", "valid", "refined", "energy", "room") if f"- `{name}`" not in page] == []
+    assert [
+        name for name in (*METRICS, "contacts", "valid", "refined", "energy", "room") if f"- `{name}`" not in page
+    ] == []

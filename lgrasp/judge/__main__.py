@@ -26,8 +26,7 @@ def judge(
 ) -> None:
     """Judge every row of shards by the strict bounds, from the URDF and the meshes alone.
 
-    Shares no code with what makes grasps: its own kinematics, distances and solvers. It judges any shard of the
-    format, imported ones included, and trusts no stored number. Rows that a file itself calls invalid count apart.
+    It shares no code with what makes grasps and trusts no stored number. Rows that a file calls invalid count apart.
 
     Exit code: 0 when every row is strictly valid, 1 when not, 2 for a file that cannot be judged.
 
