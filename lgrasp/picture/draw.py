@@ -77,7 +77,7 @@ def choose_viewpoint(
     points = points[((points > low) & (points < high)).all(1)]
     turn, rise = np.meshgrid(2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS, np.radians(_ELEVATIONS))
     ways = np.stack([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)], -1).reshape(-1, 3)
-    poses = np.concatenate([_framing(points, way) for way in ways])
+    poses = np.concatenate([framing(points, way) for way in ways])
     dots = balls(contacts, 0.003, 1) if len(contacts) else None
     parts = [*((m, _HAND) for m in links), *((m, _OBJECT) for m in objects), *([(dots, _CONTACT)] if dots else [])]
     surface = join_surfaces([LabelledMesh(m.vertices, m.faces, np.full(len(m.faces), label)) for m, label in parts])
@@ -87,7 +87,7 @@ def choose_viewpoint(
     return Viewpoint(central_camera(size, size, ANGLE), poses[int(np.argmax(score))])
 
 
-def _framing(points: np.ndarray, way: np.ndarray) -> np.ndarray:
+def framing(points: np.ndarray, way: np.ndarray) -> np.ndarray:
     """Pose (1, 7) of the camera in a direction (3,) from points (n, 3) that sees all of them, as near as it can."""
     right = np.cross([0.0, 0.0, 1.0], way) / np.linalg.norm(way[:2])
     axes = np.stack([right, np.cross(way, right), way])

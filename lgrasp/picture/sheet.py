@@ -15,23 +15,36 @@ FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP"}
 _INK = "#3c4650"
 
 
-def sheet(pictures: Sequence[np.ndarray], captions: Sequence[str] = (), columns: int = 0) -> Image.Image:
+def sheet(
+    pictures: Sequence[np.ndarray],
+    captions: Sequence[str] = (),
+    columns: int = 0,
+    key: Sequence[tuple[str, str]] = (),
+) -> Image.Image:
     """Pictures of one size, shape (h, w, 3), uint8, in rows, each with its caption below.
 
     Args:
         columns: 0: about as many as rows.
+        key: words and what colour stands for them, written in a last line.
     """
     columns = columns or int(np.ceil(np.sqrt(len(pictures))))
     h, w = pictures[0].shape[:2]
     size = max(11, w // 20)
     tall = h + (2 * size if any(captions) else 0)
-    out = Image.new("RGB", (min(columns, len(pictures)) * w, -(-len(pictures) // columns) * tall), "#ffffff")
+    wide, high = min(columns, len(pictures)) * w, -(-len(pictures) // columns) * tall
+    line = max(11, wide // 56) if key else 0
+    out = Image.new("RGB", (wide, high + 2 * line), "#ffffff")
     draw, font = ImageDraw.Draw(out), ImageFont.load_default(size)
     for i, picture in enumerate(pictures):
         x, y = i % columns * w, i // columns * tall
         out.paste(Image.fromarray(picture), (x, y))
         if i < len(captions):
             draw.text((x + w / 2, y + h + size / 4), captions[i], _INK, font, anchor="ma")
+    x, font = line, ImageFont.load_default(line or size)
+    for words, colour in key:
+        draw.rectangle((x, high + line / 2, x + line, high + 1.5 * line), colour)
+        draw.text((x + 1.5 * line, high + line), words, _INK, font, anchor="lm")
+        x += int(3 * line + draw.textlength(words, font))
     return out
 
 

@@ -1,5 +1,6 @@
 """Try a hand on a ball, a box and a cylinder: survivors per stage, reasons for losses, pictures."""
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,20 +8,20 @@ import numpy as np
 import trimesh
 
 from lgrasp.dataset.info import survivors
-from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.scenes import SceneRows, draw_rows
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.errors import HandError
-from lgrasp.files import temporary_folder
-from lgrasp.grasp.records import Shard
+from lgrasp.files import temporary_folder, write_file
 from lgrasp.hand.opposition.facing import space_opening, space_postures
 from lgrasp.hand.opposition.spaces import hand_spaces, longest, space_sides
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.hand_check.diagnose import diagnose, finger_label, hand_findings
-from lgrasp.jobs.hand_check.pictures import draw_grasps, draw_hand, draw_palmar, draw_spaces, draw_workspace
+from lgrasp.jobs.hand_check.pictures import draw_hand, draw_palmar, draw_spaces, draw_workspace
+from lgrasp.picture.sheet import image_bytes
 
 _CANDIDATES_PER_ROW = 300  # candidates per row before an object is given up
 
@@ -102,7 +103,7 @@ def check_hand(
     cache = cache or Cache()
     bounded = pipeline.model_copy(update={"effort": _CANDIDATES_PER_ROW})
     checks: list[ObjectCheck] = []
-    shards: dict[str, Shard] = {}
+    pictures: list[Path] = []
     inputs = None
     with temporary_folder() as folder:
         for name, mesh in check_objects(folder).items():
@@ -124,8 +125,8 @@ def check_hand(
             reasons = diagnose(inputs, done.counts, outcome.rows, rows)
             left = survivors(done.counts)
             checks.append(ObjectCheck(name, rows, outcome.rows, done.wall, left, done.counts, reasons))
-            if outcome.rows:
-                shards[name] = read_shard(outcome.paths[0])
+        if any(check.rows for check in checks):
+            pictures.append(_draw_grasps(folder, out / "grasps.png", events))
     assert inputs is not None
     model, source = inputs.hand.model, inputs.keys.source
     hints = []
@@ -136,7 +137,7 @@ def check_hand(
     spaces = check_spaces(inputs)
     sequence = longest_sequence(inputs, spaces)
     events.loading("pictures")
-    pictures = _draw(inputs, shards, [space.name for space in spaces if all(space.areas)], out)
+    pictures[:0] = _draw_hand(inputs, [space.name for space in spaces if all(space.areas)], out)
     return HandCheck(model.name, source.note, list(model.notes), hints, checks, spaces, sequence, pictures)
 
 
@@ -170,19 +171,23 @@ def longest_sequence(inputs: Inputs, checks: list[SpaceCheck]) -> int:
     return longest(spaces, (), np.zeros(len(tree.joint_names), bool))
 
 
-def _draw(inputs: Inputs, shards: dict[str, Shard], spaces: list[str], out: Path) -> list[Path]:
+def _draw_hand(inputs: Inputs, spaces: list[str], out: Path) -> list[Path]:
     pictures = [
         draw_hand(inputs, out / "hand.png"),
         draw_palmar(inputs, out / "palmar.png"),
         draw_workspace(inputs, out / "workspace.png"),
     ]
-    pictures += [draw_spaces(inputs, spaces, out / "spaces.png")] if spaces else []
-    pictures += [draw_grasps(inputs, _samples(shards), out / "grasps.png")] if shards else []
-    return pictures
+    return [*pictures, draw_spaces(inputs, spaces, out / "spaces.png")] if spaces else pictures
 
 
-def _samples(shards: dict[str, Shard]) -> list[tuple[str, Shard, int]]:
+def _draw_grasps(shards: Path, path: Path, events: Events) -> Path:
     """Three grasps, of different objects where there are some: those with the largest epsilon."""
-    best = {name: np.argsort(-shard.grasps.metrics["epsilon"], kind="stable") for name, shard in shards.items()}
-    turns = [(name, turn) for turn in range(3) for name in shards if turn < len(best[name])]
-    return [(name, shards[name], int(best[name][turn])) for name, turn in turns[:3]]
+    rows, turns = SceneRows(shards), Counter()
+    ranked = []
+    for row in np.argsort(-rows.column("metrics/epsilon"), kind="stable").tolist():
+        file, _ = rows.place(row)
+        ranked.append((turns[file], row))
+        turns[file] += 1
+    best = [row for _, row in sorted(ranked, key=lambda rank: rank[0])[:3]]
+    write_file(path, image_bytes(draw_rows(rows, best, size=480, columns=3, loading=events.loading)))
+    return path
