@@ -88,7 +88,7 @@ def _section(command: Any, context: typer.Context, rows: list[_Row], common: dic
     for paragraph in paragraphs:
         lines += [paragraph, ""]
     if len(example.split()) > len(context.command_path.split()) + 1:
-        lines += ["```", *(line.strip() for line in example.strip().splitlines()), "```", ""]
+        lines += [*(f"    {line.strip()}" for line in example.strip().splitlines()), ""]
     shared = [row for row in rows if row[:2] == common.get(_flag(row[0]), row[1:])[:2]]
     lines += [f"- `{names}`: {what}{default}" for names, what, default in rows if (names, what, default) not in shared]
     named = {_flag(row[0]): row[2] if row != common[_flag(row[0])] else "" for row in shared}

@@ -17,9 +17,9 @@ def status(
 ) -> Answer:
     """Show how far the runs in folders are: rows and shards there of those asked, and what is missing or wrong.
 
-    Reads the manifest.json that every run keeps in its folder. States: complete, incomplete, running (a process works
-    on it), starved (no more rows were found), damaged (a file is not as it was written), foreign (no run of the folder
-    made these files), unlisted (there is no manifest.json), bad list (it is damaged).
+    States: complete, incomplete, running (a process works on it), starved (no more rows were found), damaged (a file is
+    not as it was written), foreign (no run of the folder made these files), unlisted (no manifest.json), bad list (it
+    is damaged).
 
     Example: lgrasp status grasps
     """
