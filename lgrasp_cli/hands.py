@@ -96,6 +96,12 @@ def add_hand(
 
     Of a robot: lgrasp hands add robot.urdf --root left_palm --mesh-dir meshes
     """
+    from lgrasp.hand.drafting.cut_hand import cut_hand
+    from lgrasp.hand.urdf import read_robot
+
+    robot, _ = read_robot(urdf)
+    if root is not None:
+        cut_hand(urdf, robot, root)
     from lgrasp.hand.drafting.import_urdf import import_urdf
     from lgrasp_cli.progress import Bar
 

@@ -194,7 +194,7 @@ def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], changes: li
     if suffix == ".obj":
         for library in re.findall(rb"^mtllib\s+(.+?)\s*$", file.read_bytes(), re.MULTILINE):
             material = file.parent / Path(library.decode("utf-8", "replace")).name
-            if material.is_file():
+            if material.is_file() and material.resolve().is_relative_to(file.parent):
                 shutil.copyfile(material, target.parent / material.name)
     return name
 
