@@ -23,7 +23,7 @@ app = typer.Typer(name="dataset", help="Inspect, check and merge grasp files (sh
 def info(paths: Shards) -> Answer:
     """Show rows, hand, objects, pipeline, size and metrics of each shard; for sequences, rows by number of objects.
 
-    Example: lgrasp dataset info out/mug
+    Example: lgrasp dataset info grasps
     """
     from lgrasp.dataset.files import shards_below
 
@@ -46,7 +46,7 @@ def check(paths: Shards) -> Answer:
 
     Exit code 2 if a file has a problem, or one that is listed is missing.
 
-    Example: lgrasp dataset check out/mug
+    Example: lgrasp dataset check grasps
     """
     from lgrasp.dataset.files import shards_below
 
@@ -71,7 +71,7 @@ def merge(
 ) -> None:
     """Put the rows of shards of one hand, object and run into one file.
 
-    Example: lgrasp dataset merge out/mug -o mug.h5
+    Example: lgrasp dataset merge grasps/allegro-mug/robust -o mug.h5
     """
     from lgrasp.dataset.files import find_shards
 

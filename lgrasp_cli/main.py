@@ -74,7 +74,7 @@ def _options(
 
     A hand (URDF) and an object (mesh) go in, force-balanced collision-free grasps come out as HDF5 files.
 
-    Example: lgrasp generate --object mug.obj -n 10000
+    Example: lgrasp generate --object mug -n 10000
     """
 
 

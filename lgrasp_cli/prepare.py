@@ -72,7 +72,7 @@ def preprocess(
 ) -> Answer:
     """Check and preprocess a mesh, report repairs, and cache the result.
 
-    Example: lgrasp preprocess mug.obj --scale 0.001
+    Example: lgrasp preprocess my_mesh.stl --scale 0.001
     """
     cache = open_cache(cache_dir, fresh=rebuild)
     params = choose_pipeline(pipeline).object
@@ -161,7 +161,7 @@ def _up_to(stage: str):
     Runs the pipeline up to this stage on one batch of candidates and caches every table; stages with a cached table are
     skipped.
 
-    Example: lgrasp {stage} --object mug.obj
+    Example: lgrasp {stage} --object mug
     """
     return reporting(run)
 

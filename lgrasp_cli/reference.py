@@ -27,8 +27,11 @@ def cli_page() -> str:
         if count >= _MANY and _flag(names) not in common:
             rows = [row for row, _ in defaults.most_common() if row[:2] == (names, what)]
             common[_flag(names)] = rows[0]
-    lines = [_MARK, "Commands name these options without repeating their meaning. Brackets hold defaults. For commands"]
-    lines += ["of developers, which have no list of options here, `--help` gives them.", ""]
+    lines = [
+        _MARK,
+        "Commands name these options without repeating their meaning. Brackets hold defaults. Of commands for",
+    ]
+    lines += ["developers there is only a summary: `--help` tells the rest.", ""]
     lines += [f"*Job options* are {_code(_JOB)}.", ""]
     lines += [*(f"- `{names}`: {what}{default}" for _, (names, what, default) in sorted(common.items())), ""]
     for command, context in commands:
@@ -58,7 +61,7 @@ def _options(command: Any, context: typer.Context) -> list[_Row]:
 
 def _row(names: str, what: str) -> _Row:
     """A line of a command's help, without types and ranges."""
-    names = re.sub(r" <.*>$", "", _line(names))
+    names = re.sub(r" <[^|]*>$", "", _line(names))
     what, *rest = re.split(r" (?=\[(?:default: |required|x[<>]|[\d.]+<)[^\[]*\]$)", _line(what))
     default = re.search(r"default: \(?([^;\])]*)|required", "".join(rest))
     return names, what, f" [{default[1] or default[0]}]" if default else ""
@@ -85,7 +88,7 @@ def _section(command: Any, context: typer.Context, rows: list[_Row], common: dic
     example, _, after = example.partition("\n\n")
     paragraphs = [_line(paragraph) for paragraph in f"{text}\n\n{after}".split("\n\n") if paragraph.strip()]
     lines = [f"## {context.command_path}", ""]
-    for paragraph in paragraphs:
+    for paragraph in paragraphs[: 1 if _panel(context) == "Developer" else None]:
         lines += [paragraph, ""]
     if len(example.split()) > len(context.command_path.split()) + 1:
         lines += [*(f"    {line.strip()}" for line in example.strip().splitlines()), ""]

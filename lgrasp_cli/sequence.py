@@ -42,8 +42,8 @@ def sequence(
     """Grasp several objects one after another, each with joints that are still free, and write shards.
 
     Each grasp uses one opposition space of the hand (hand.yaml); joints and objects of earlier grasps stay in place.
-    The shards hold the whole sequences and the rows of fewer objects that these continue. Exit code 3 when fewer
-    than asked were found; what was found is kept.
+    The shards hold the whole sequences and the rows of fewer objects that these continue. The exit code is 3 if fewer
+    are found than requested; those found are kept.
 
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10
     """

@@ -31,7 +31,7 @@ def judge(
     Exit code: 0 when every row is strictly valid, 1 when not, 2 for a file that cannot be judged.
 
     \b
-    Example: lgrasp judge grasps/mug
+    Example: lgrasp judge grasps
     lgrasp judge grasps --rows 1000 --json verdict.json
     lgrasp judge mug.h5 --urdf allegro.urdf --mesh mug=mug.obj
     """
