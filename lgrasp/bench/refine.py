@@ -1,6 +1,5 @@
 """The tables of DiPGrasp for our hands and objects: plans on meshes and noisy clouds, coarse poses refined."""
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -33,6 +32,7 @@ from lgrasp.planning.starts import STAND_OFF
 from lgrasp.refine.params import COARSE
 from lgrasp.refine.refiner import Pose, Refiner, table_pose
 from lgrasp.refine.surface import hand_surface
+from lgrasp.runtime.cores import cores
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.simulate.protocol import Protocol, find_protocol
 from lgrasp.simulate.run import verdicts
@@ -149,7 +149,7 @@ def _bench_hand(
             holds = np.zeros(0, bool)
             if len(grasps):
                 rows = grasp_rows(press(grasps), model.tree, target.center)
-                verdict = verdicts(scene, rows, protocol, threads=os.cpu_count() or 1)
+                verdict = verdicts(scene, rows, protocol, threads=cores())
                 holds = verdict[f"{protocol.name}_holds"].astype(bool)
             what = f"{hand}, {name}, {on}, {'one hand' if hands == 'one' else f'best of {params.rolls}'}"
             progress(f"{what}: {int(holds.sum())} of {starts}, {seconds:.1f} s")

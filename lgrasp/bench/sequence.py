@@ -1,6 +1,5 @@
 """The tables of SeqGrasp, measured: success by opposition space and by number of objects, for several methods."""
 
-import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,6 +17,7 @@ from lgrasp.jobs.sequence.inputs import SequenceInputs, load_sequence_inputs
 from lgrasp.jobs.sequence.job import SequenceJob, simulated
 from lgrasp.jobs.sequence.records import object_records
 from lgrasp.jobs.sequence.round import Verdicts, run_round
+from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 
@@ -82,7 +82,7 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
             progress(f"{params.method}, {' '.join(inputs.object_ids)}: {params.width} attempts")
         seen: list[SequenceTable] = []
         watched = _watched(simulated(inputs, job.simulate), seen)
-        found = run_round(pipeline, inputs, 0, 0, job.workers or os.cpu_count() or 1, verdicts=watched)
+        found = run_round(pipeline, inputs, 0, 0, threads(job.workers), verdicts=watched)
         for name, counts in ((name, counts) for step in found.spaces for name, counts in step.items()):
             grown, ran = counts.get("sequence", {}), counts.get("simulate", {})
             more = {"tried": grown.get("sequences", 0), "found": ran.get("tried", 0), "held": ran.get("held", 0)}

@@ -1,6 +1,5 @@
 """Rows of shards as scenes to look at, read as they are asked for; pictures of them."""
 
-import os
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +21,7 @@ from lgrasp.notices import notice
 from lgrasp.picture.draw import draw_scene
 from lgrasp.picture.scene import GraspScene, HandShape, scene_of_row
 from lgrasp.picture.sheet import sheet
+from lgrasp.runtime.cores import cores
 from lgrasp.runtime.device import start
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 
@@ -202,7 +202,7 @@ def draw_rows(
     pictures: list[np.ndarray] = []
     scenes = [rows.scene(row) for row in chosen]
     known = sorted({scene.objects[0].record.id for scene in scenes})
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for picture in pool.map(lambda s: draw_scene(s, size, stage, known.index(s.objects[0].record.id)), scenes):
             pictures.append(picture)
             if progress:

@@ -26,6 +26,7 @@ from lgrasp.errors import LgraspError, OutputError, ShardError
 from lgrasp.files import check_folder
 from lgrasp.notices import notice
 from lgrasp.runtime.array import Array
+from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.runtime.kernels import first_time, kernel_modules, load_kernels
 
@@ -201,7 +202,7 @@ class Job(Request, ABC):
 
     def threads(self) -> int:
         """Workers as asked, else one per core, or one on a GPU."""
-        return self.workers or (1 if self._device.is_cuda else os.cpu_count() or 1)
+        return threads(self.workers or int(self._device.is_cuda))
 
 
 @dataclass

@@ -1,6 +1,5 @@
 """Copies of shards with more quality metrics."""
 
-import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any, ClassVar
@@ -14,6 +13,7 @@ from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.jobs.requests.shards import MetricsRequest
+from lgrasp.runtime.cores import threads
 
 
 class MetricsJob(MetricsRequest, ShardJob):
@@ -35,7 +35,7 @@ class MetricsJob(MetricsRequest, ShardJob):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
-        workers = self.workers or os.cpu_count() or 1
+        workers = threads(self.workers)
         if self._each is None:
             self._each = self._open.enter_context(process_map(workers))
         columns = measure_shard(part.source, self.settings, self._each, 4 * workers * TASK_ROWS, progress)

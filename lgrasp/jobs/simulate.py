@@ -1,7 +1,6 @@
 """Simulates the rows of shards and adds the verdicts to them, or to copies."""
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,6 +24,7 @@ from lgrasp.jobs.difference import config_difference
 from lgrasp.jobs.kept_verdicts import GPU_BLOCK, KeptVerdicts
 from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.jobs.shard_inputs import mesh_hash
+from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.run import check_installed, protocol_text, verdicts
@@ -90,7 +90,7 @@ class SimulateJob(SimulateRequest, ShardJob):
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
         protocol, device, name = self.protocol, self.device_used.alias, self.protocol.name
-        threads = self.workers or os.cpu_count() or 1
+        workers = threads(self.workers)
         with ShardReader(part.source) as reader:
             scene, rows = self._scene_of(reader.hand(), reader.objects()), len(reader)
             kept = KeptVerdicts(self.cache, self.part_key(part), name, largest=None if device == "cpu" else GPU_BLOCK)
@@ -98,12 +98,12 @@ class SimulateJob(SimulateRequest, ShardJob):
             def told(done: int, held: int) -> None:
                 progress(kept.rows + done, f"{kept.held + held:,} hold")
 
-            while (block := kept.next_block(rows, threads)) or not kept.columns:
+            while (block := kept.next_block(rows, workers)) or not kept.columns:
                 found = verdicts(
                     scene,
                     reader.rows(kept.rows, kept.rows + block),
                     protocol,
-                    threads=threads,
+                    threads=workers,
                     progress=told,
                     all_directions=self.all_directions,
                     device=device,

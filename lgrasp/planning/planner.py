@@ -1,6 +1,5 @@
 """Grasp planning: many starts before a surface, a parallel local search, the best of each start."""
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.surface import farthest_points, hand_surface
 from lgrasp.refine.volume import upload_target
+from lgrasp.runtime.cores import cores
 
 _CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
 _COLLIDES = 1.0e-3  # [m]
@@ -77,7 +77,7 @@ class Planner:
         """
         device = self.hand.device
         points = farthest_points(self.model.contact_points.astype(float), count)
-        some, workers = (_CPU_STARTS, os.cpu_count() or 1) if device == "cpu" else (_GPU_STARTS, 1)
+        some, workers = (_CPU_STARTS, cores()) if device == "cpu" else (_GPU_STARTS, 1)
         counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *REASONS], 0)
         tables = []
         with ThreadPoolExecutor(workers) as pool:

@@ -1,6 +1,5 @@
 """Hands moved until they pass the checks: a local search, evaluated on its way, restarted nearby if it fails."""
 
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
@@ -16,6 +15,7 @@ from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
+from lgrasp.runtime.cores import cores
 
 _ROUNDS_PER_LOOK = 4  # matching rounds between two looks
 _START_SHIFT, _START_BEND = 0.003, 0.03  # spread of further starts [m], [rad or m]
@@ -52,7 +52,7 @@ def improve(
     parts = [slice(first, first + _CPU_ROWS) for first in range(0, len(q), _CPU_ROWS)]
     if search.device != "cpu" or len(parts) < 2:
         return _improved(search, hand, obj, pose, q, bounds, tries, index)
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         jobs = [pool.submit(_improved, search, hand, obj, pose[p], q[p], bounds, tries[p], index[p]) for p in parts]
         tables, outcomes = zip(*(job.result() for job in jobs), strict=True)
     return join_rows(list(tables)), np.concatenate(outcomes)

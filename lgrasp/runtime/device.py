@@ -13,6 +13,7 @@ import warp as wp
 
 from lgrasp.errors import DeviceError
 from lgrasp.paths import cache_dir
+from lgrasp.runtime.cores import cores
 from lgrasp.runtime.kernel_cache import drop_damaged, enter, note_checksums, usable_folder
 
 KERNEL_OPTIONS = {"enable_backward": False, "max_unroll": 1}
@@ -104,4 +105,4 @@ def _cpu_name() -> str:
             model = next(line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))
     except (OSError, StopIteration):
         model = "CPU"
-    return f"{model} ({os.cpu_count()} cores)"
+    return f"{model} ({cores()} cores)"

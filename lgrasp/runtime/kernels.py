@@ -1,7 +1,6 @@
 """Compiles (or loads from the kernel cache) the kernels of a job, before the clock of its stages starts."""
 
 import importlib
-import os
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator
@@ -12,6 +11,7 @@ from types import ModuleType
 import warp as wp
 
 import lgrasp
+from lgrasp.runtime.cores import cores
 from lgrasp.runtime.kernel_cache import has_compiled, note_checksums
 
 
@@ -53,7 +53,7 @@ def load_kernels(device: str, modules: list[str], progress: Callable[[str, float
         device: ``cpu`` or ``cuda:N``.
         progress: called with (module that is ready, share done).
     """
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
+    with ThreadPoolExecutor(min(cores(), 4)) as pool:
         waiting = {pool.submit(wp.load_module, name, device): name for name in modules}
         for done, future in enumerate(as_completed(waiting), 1):
             future.result()

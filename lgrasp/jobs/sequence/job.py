@@ -1,6 +1,5 @@
 """The job: hand + objects in an order -> shards of sequences in a folder."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -22,6 +21,7 @@ from lgrasp.jobs.sequence.records import object_records, sequence_rows
 from lgrasp.jobs.sequence.round import Verdicts, add_spaces
 from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_rounds
 from lgrasp.jobs.sets import sequence_name
+from lgrasp.runtime.cores import cores
 from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts
@@ -140,7 +140,7 @@ def simulated(inputs: SequenceInputs, name: str) -> Verdicts:
     def run(levels: list[SequenceTable]) -> dict[str, np.ndarray]:
         last = replace(levels[-1], physics={})
         rows = sequence_rows([last], inputs, 0, objects=len(inputs.objects))
-        return verdicts(scene, rows, protocol, threads=os.cpu_count() or 1, device=inputs.device.alias, keep=kept.get)
+        return verdicts(scene, rows, protocol, threads=cores(), device=inputs.device.alias, keep=kept.get)
 
     return run
 

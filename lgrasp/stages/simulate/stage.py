@@ -1,6 +1,5 @@
 """simulate: finished grasps -> those that hold their object in a physics simulation, with the verdicts."""
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.rows import grasp_rows
 from lgrasp.grasp.tables import GraspTable, take_grasps
+from lgrasp.runtime.cores import cores
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts
 from lgrasp.stages.context import Context
@@ -30,7 +30,7 @@ def run(inputs: GraspTable, params: SimulateParams, context: Context) -> tuple[G
     if context.scene is None:
         raise PhysicsError("stage simulate needs a scene")
     protocol = find_protocol(params.protocol)
-    threads = 1 if context.device == "cpu" else os.cpu_count() or 1  # on the CPU, batches run side by side
+    threads = 1 if context.device == "cpu" else cores()  # on the CPU, batches run side by side
     rows = grasp_rows(inputs, context.hand.model.tree, context.object.model.center)
     found = verdicts(context.scene, rows, protocol, threads=threads, device=context.device, keep=context.kept.get)
     holds = found[f"{protocol.name}_holds"]
