@@ -10,6 +10,8 @@ FieldIndex = Literal["voxel", "bvh"]
 """How a contact field is looked up."""
 ProtocolName = Literal["fc", "gravity6", "gravity6_mu1", "seq6", "seq6_mu06"]
 """Protocols of the simulation (:mod:`lgrasp.simulate.protocol`)."""
+EngineName = Literal["mujoco", "physx"]
+"""Simulators."""
 FormatName = Literal["dexgraspnet", "dexgraspbench", "isaac-grasp", "mjcf"]
 """Formats of other programs (:mod:`lgrasp.dataset.exports.formats`)."""
 MetricName = Literal["volume", "epsilon_exact"]

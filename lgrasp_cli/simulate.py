@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from typer import Option
 
-from lgrasp.choices import ProtocolName
+from lgrasp.choices import EngineName, ProtocolName
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Shards
 from lgrasp_cli.tables import Block, TextTable, following, place, share, took
@@ -19,6 +19,7 @@ def simulate(
     protocol: Annotated[
         str, Option("--protocol", "-p", **one_of(ProtocolName, "PROTOCOL", "What a grasp must withstand."))
     ] = "fc",
+    engine: Annotated[str | None, Option(**one_of(EngineName, "ENGINE", "Simulator; default mujoco."))] = None,
     out: Annotated[
         Path | None, Option(help="Write copies into this folder; by default the shards get the verdicts.")
     ] = None,
@@ -26,17 +27,19 @@ def simulate(
         bool, Option("--all-directions", help="Continue after the first direction in which an object is lost.")
     ] = False,
 ) -> None:
-    """Simulate grasps with MuJoCo and add the verdicts to the shards, as columns physics/PROTOCOL_...
+    """Simulate grasps and add the verdicts to the shards, as columns physics/PROTOCOL_...
 
     The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
     directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects. A shard
     that has the verdicts already is left as it is.
 
+    Contacts are hard in PhysX (pip install "lgrasp[physx]"), whose columns are physics/physx_PROTOCOL_....
+
     Example: lgrasp simulate grasps/allegro-mug/robust --protocol fc
     """
     from lgrasp.jobs.requests.shards import SimulateRequest
 
-    what = {"shards": shards, "protocol": protocol, "out": out, "all_directions": all_directions}
+    what = {"shards": shards, "protocol": protocol, "engine": engine, "out": out, "all_directions": all_directions}
     how.run(how.job(SimulateRequest, "simulate", **what), _show, _profile)
 
 

@@ -84,7 +84,7 @@ class SimulateJob(SimulateRequest, ShardJob):
         return config_difference(_told(text, settings), settings) or "other grasps"
 
     def parts(self) -> list[Part]:
-        check_installed(resolve_device(self.device).alias)
+        check_installed(resolve_device(self.device).alias, self.protocol.engine)
         return super().parts()
 
     def make(self, part: Part, progress: PartProgress) -> Made:
@@ -93,7 +93,9 @@ class SimulateJob(SimulateRequest, ShardJob):
         workers = threads(self.workers)
         with ShardReader(part.source) as reader:
             scene, rows = self._scene_of(reader.hand(), reader.objects()), len(reader)
-            kept = KeptVerdicts(self.cache, self.part_key(part), name, largest=None if device == "cpu" else GPU_BLOCK)
+            kept = KeptVerdicts(
+                self.cache, self.part_key(part), name, largest=GPU_BLOCK if self._kind() == "gpu" else None
+            )
 
             def told(done: int, held: int) -> None:
                 progress(kept.rows + done, f"{kept.held + held:,} hold")
@@ -156,7 +158,7 @@ class SimulateJob(SimulateRequest, ShardJob):
             )
 
     def _kind(self) -> str:
-        return "gpu" if self.device_used.is_cuda else "cpu"
+        return "gpu" if self.device_used.is_cuda and self.protocol.engine == "mujoco" else "cpu"
 
     def _scene_of(self, hand: HandRecord, objects: Sequence[ObjectRecord]) -> Scene:
         """What is simulated of a shard: hand and objects cut into convex pieces."""
@@ -179,7 +181,7 @@ def _told(text: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     except (ValueError, AttributeError, RecursionError):
         return {}
     device = "gpu" if simulator.startswith("mujoco_warp") else "cpu"
-    return {name: told.get(name) for name in settings} | {"device": device}
+    return {"engine": "mujoco"} | {name: told[name] for name in settings if name in told} | {"device": device}
 
 
 @dataclass(frozen=True)

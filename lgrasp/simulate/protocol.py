@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
+from lgrasp.choices import EngineName
 from lgrasp.config import Params
 from lgrasp.errors import ConfigError
 from lgrasp.math.constants import DRIVE_STIFFNESS, SLIDING_ARM
@@ -51,6 +52,7 @@ class Protocol(Physics):
     """Close the hand on free objects, then pull them in six directions; they must stay in the hand."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", description="Columns are named physics/NAME_...")
+    engine: EngineName = Field(default="mujoco", description="The simulator.")
     stiffness: float = Field(
         default=DRIVE_STIFFNESS, gt=0, description="Of position control, per newton of load if scaled [N m/rad]."
     )
@@ -91,6 +93,11 @@ class Protocol(Physics):
         default=0.05, gt=0, description="Of an object's centre of mass from its start [m]."
     )
     most_rotation: float = Field(default=15.0, gt=0, le=180, description="Of an object from its start [deg].")
+
+    def by(self, engine: EngineName) -> "Protocol":
+        """The same in a simulator; its columns are named physics/ENGINE_NAME_... unless that is MuJoCo."""
+        name = self.name if engine == "mujoco" else f"{engine}_{self.name}"
+        return self.model_copy(update={"engine": engine, "name": name})
 
     def load(self, volume: float) -> Load:
         """Mass, pull and stiffness for an object of some volume [m^3]."""
@@ -138,11 +145,13 @@ that sequences of objects were published with, ``seq6_mu06`` the same on smoothe
 
 
 def find_protocol(name: str) -> Protocol:
-    """A protocol by name.
+    """A protocol by name; physx_NAME is NAME in PhysX.
 
     Raises:
         ConfigError: no protocol of that name.
     """
+    if (bare := name.removeprefix("physx_")) != name and bare in PROTOCOLS:
+        return PROTOCOLS[bare].by("physx")
     if name not in PROTOCOLS:
         raise ConfigError(f"unknown protocol '{name}'; choose {', '.join(PROTOCOLS)}")
     return PROTOCOLS[name]

@@ -14,6 +14,7 @@ from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.model import Model, build_model
+from lgrasp.simulate.physx_world import import_physx
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.trial import Trial
@@ -103,13 +104,13 @@ def verdicts(
         progress: called on this thread with (rows done, rows held); what it raises ends the simulation.
         all_directions: continue after the first direction in which an object is lost.
         settled_stop: end a direction when the objects have come to rest well inside their bounds.
-        device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0).
+        device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0); PhysX runs on the CPU.
         keep: called with (kind, key, make), gives what it made for the key before, or makes it: what a GPU is given
             then serves further calls.
         prepared: called with the seconds that models and, on a GPU, kernels took to be made.
 
     Raises:
-        PhysicsError: MuJoCo is missing or refuses the scene, or a row has an object that the scene lacks.
+        PhysicsError: a simulator is missing or refuses the scene, or a row has an object that the scene lacks.
     """
     slots = np.full(np.shape(rows.object_index), -1)
     found: dict[int, Verdict] = {}
@@ -124,7 +125,8 @@ def verdicts(
         begin = time.perf_counter()
         model = build_model(scene, protocol, rows.q[0], group.objects)
         _check_held(model, group.rows)
-        worlds = None if device == "cpu" else _worlds(model, device, len(group.rows), threads, options, keep)
+        on_cpu = device == "cpu" or protocol.engine == "physx"
+        worlds = None if on_cpu else _worlds(model, device, len(group.rows), threads, options, keep)
         if prepared:
             prepared(time.perf_counter() - begin)
         if worlds is None:
@@ -137,10 +139,12 @@ def verdicts(
     return stack_verdicts(protocol, [found[row] for row in range(len(rows))], slots)
 
 
-def check_installed(device: str) -> None:
+def check_installed(device: str, engine: str = "mujoco") -> None:
     """Raises PhysicsError unless there is a simulator for a device."""
     import_mujoco()
-    if device != "cpu":
+    if engine == "physx":
+        import_physx()
+    elif device != "cpu":
         import_mujoco_warp()
 
 
@@ -160,7 +164,7 @@ def _worlds(
 def _on_threads(
     model: Model, rows: GraspRows, threads: int, progress: Callable[[int, int], None], options: dict[str, bool]
 ) -> list[Verdict]:
-    """A verdict of every row, by MuJoCo."""
+    """A verdict of every row, each on a thread of the CPU."""
     own = threading.local()
 
     def judge(i: int) -> Verdict:
@@ -204,8 +208,12 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
         | protocol.load(solid.volume).model_dump()
         for solid in scene.objects
     ]
+    if protocol.engine == "physx":
+        simulator = f"physx by sapien {import_physx().__version__}"
+    else:
+        simulator = f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}"
     return protocol.text(
-        simulator=f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}",
+        simulator=simulator,
         all_directions=all_directions,
         ends_early=True,
         objects=objects,

@@ -2,11 +2,11 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, ClassVar, cast
+from typing import Annotated, ClassVar, Self, cast
 
-from pydantic import BeforeValidator, Field, field_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from lgrasp.choices import FormatName, MetricName
+from lgrasp.choices import EngineName, FormatName, MetricName
 from lgrasp.config import DeviceName, ShardPaths, apply_settings, parse_model
 from lgrasp.dataset.files import find_shards, shards_below
 from lgrasp.engine.request import Request, ShardRequest
@@ -30,6 +30,7 @@ class SimulateRequest(ShardRequest):
     maker: ClassVar[str] = "lgrasp.jobs.simulate:SimulateJob"
 
     protocol: Protocol = Field(description="Named protocol.")
+    engine: EngineName | None = Field(default=None, description="Simulator; default: the protocol's, MuJoCo.")
     out: Path | None = Field(default=None, description="Folder of copies; default: the shards get the verdicts.")
     device: DeviceName = "cpu"
     all_directions: bool = Field(
@@ -40,6 +41,12 @@ class SimulateRequest(ShardRequest):
     @classmethod
     def _named(cls, value: object) -> object:
         return find_protocol(value) if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _by_engine(self) -> Self:
+        if self.engine not in (None, self.protocol.engine):
+            self.protocol = find_protocol(self.protocol.name.removeprefix("physx_")).by(self.engine)
+        return self
 
     @property
     def folder(self) -> Path:

@@ -1,0 +1,92 @@
+"""One hand and its objects in MuJoCo: set, driven, pushed, stepped and read."""
+
+from typing import Any
+
+import numpy as np
+
+from lgrasp.simulate.model import Model
+from lgrasp.simulate.verdict import WILD, links_touching
+
+
+class MujocoWorld:
+    """A simulation of one thread; O objects, B bodies as MuJoCo counts them.
+
+    Args:
+        model: O objects in the order of the rows.
+        near: hand and objects touch within 1 mm.
+    """
+
+    def __init__(self, model: Model, *, near: bool = False) -> None:
+        import mujoco
+
+        self._lib: Any = mujoco
+        self._model, self._m = model, model.mujoco_near if near else model.mujoco
+        self.data = mujoco.MjData(self._m)
+        self._of_object = np.isin(self._m.geom_bodyid, model.object_body)
+
+    def begin(self, q: np.ndarray, poses: np.ndarray) -> None:
+        """Hand at q (K,), objects at poses (O, 7) in the base frame, everything at rest; contacts are found."""
+        model, lib, data = self._model, self._lib, self.data
+        lib.mj_resetData(self._m, data)
+        data.qpos[model.joint_address] = model.joint_matrix @ q + model.joint_offset
+        data.ctrl[:] = model.controls(q)
+        lib.mj_kinematics(self._m, data)
+        at, turn = np.zeros(3), np.zeros(4)
+        base = model.base_body
+        for address, pose in zip(model.object_address, poses.astype(float), strict=True):
+            lib.mju_mulPose(at, turn, data.xpos[base], data.xquat[base], pose[:3], pose[3:])
+            data.qpos[address] = [*at, *(turn / np.linalg.norm(turn))]
+        lib.mj_kinematics(self._m, data)
+        lib.mj_comPos(self._m, data)
+        lib.mj_collision(self._m, data)
+
+    def drive(self, targets: np.ndarray) -> None:
+        """Set the targets of the drives (nu,) [rad or m]."""
+        self.data.ctrl[:] = targets
+
+    def push(self, forces: np.ndarray) -> None:
+        """Pull on the objects' centres of mass from now on (O, 3) [N], world frame."""
+        self.data.xfrc_applied[self._model.object_body, :3] = forces
+
+    def step(self, steps: int) -> None:
+        """Go on for some steps of the protocol."""
+        self._lib.mj_step(self._m, self.data, steps)
+
+    def save(self) -> np.ndarray:
+        """Everything that decides what comes next."""
+        spec = self._lib.mjtState.mjSTATE_INTEGRATION
+        state = np.zeros(self._lib.mj_stateSize(self._m, spec))
+        self._lib.mj_getState(self._m, self.data, state, spec)
+        return state
+
+    def load(self, state: np.ndarray) -> None:
+        """Inverse of :meth:`save`."""
+        self._lib.mj_setState(self._m, self.data, state, self._lib.mjtState.mjSTATE_INTEGRATION)
+
+    def objects(self) -> np.ndarray:
+        """Poses of the objects (O, 7)."""
+        return self.data.qpos[self._model.object_address]
+
+    def velocities(self) -> np.ndarray:
+        """Linear [m/s] and angular [rad/s] velocities of the objects (O, 6)."""
+        return self.data.qvel[self._model.object_velocity]
+
+    def frames(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (B, 3) [m] and rotations (B, 3, 3) of the bodies in the world."""
+        self._lib.mj_kinematics(self._m, self.data)
+        return self.data.xpos, self.data.xmat.reshape(-1, 3, 3)
+
+    def links_touching(self) -> np.ndarray:
+        """Number of the hand's bodies in contact with each object (O,)."""
+        bodies = self._m.geom_bodyid[self.data.contact.geom]
+        return links_touching(bodies, self._model.object_body, self._m.nbody)[0]
+
+    def deepest(self, *, of_links: bool = False) -> float:
+        """Deepest penetration of any object, in a link or in another object; of links in links too if asked [m]."""
+        contact = self.data.contact
+        chosen = slice(None) if of_links else self._of_object[contact.geom].any(1)
+        return max(0.0, -float(contact.dist[chosen].min(initial=0.0)))
+
+    def wild(self) -> bool:
+        """True if the simulation has diverged."""
+        return not np.abs(self.data.qvel).max() < WILD or not np.isfinite(self.data.qpos).all()
