@@ -1,9 +1,10 @@
 """The report as one HTML page: charts inline, no script, no other file."""
 
 from collections import Counter
-from collections.abc import Mapping
-from importlib.resources import files
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import jinja2
 
 from lgrasp.dataset.report.coverage import principal_postures
 from lgrasp.dataset.report.gather import HandRows
@@ -17,39 +18,42 @@ from lgrasp.dataset.report.plots import (
     quantity_chart,
 )
 from lgrasp.dataset.report.tables import (
+    Block,
     diversity_table,
-    escape,
-    figure,
     held_tables,
     number,
     physics_table,
     protocol_list,
     run_tables,
-    tiles,
     validity_table,
 )
 
 
-def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows], pictures: str = "") -> str:
+def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows], pictures: Sequence[Block] = ()) -> str:
     """The page of the numbers of a report, and of the hands that they were made of, for the samples.
 
     Args:
-        pictures: some of the rows as HTML.
+        pictures: some of the rows.
     """
     objects = [" + ".join(group["objects"]) for hand in numbers["hands"] for group in hand["objects"]]
     names = [hand["hand"] for hand in numbers["hands"]]
     what = names[0] if len(names) == 1 else f"{len(names)} hands"
     whole = objects[0] if len(names) == len(objects) == 1 else f"{len(objects)} object{'s' * (len(objects) != 1)}"
     title = f"Grasps: {number(numbers['rows'])} of {what} with {whole}"
-    css = files("lgrasp.dataset.report").joinpath("page.css").read_text(encoding="utf-8")
-    hand_sections = [_hand(data, rows) for data, rows in zip(numbers["hands"], hands.values(), strict=True)]
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n"
-        + "\n".join([_head(title, numbers), pictures, *hand_sections])
-        + "\n</body>\n</html>\n"
-    )
+    blocks = [*_head(numbers), *pictures]
+    for data, rows in zip(numbers["hands"], hands.values(), strict=True):
+        blocks += _hand(data, rows)
+    loader = jinja2.PackageLoader("lgrasp.dataset.report", ".")
+    pages = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return pages.get_template("page.html").render(title=title, blocks=blocks)
+
+
+def _chapter(heading: str, level: int = 3) -> Block:
+    return {"heading": heading, "level": level}
+
+
+def _figure(svg: str, caption: str = "") -> Block:
+    return {"svg": svg, "caption": caption}
 
 
 def _groups(groups: list[dict[str, Any]]) -> str:
@@ -58,7 +62,7 @@ def _groups(groups: list[dict[str, Any]]) -> str:
     return "pairs of hand and object" if len(groups) != 1 else "object"
 
 
-def _head(title: str, numbers: dict[str, Any]) -> str:
+def _head(numbers: dict[str, Any]) -> list[Block]:
     groups = [group for hand in numbers["hands"] for group in hand["objects"]]
     compared = sum(group["near_duplicates"]["compared"] for group in groups)
     near = sum(group["near_duplicates"]["duplicates"] for group in groups)
@@ -77,50 +81,47 @@ def _head(title: str, numbers: dict[str, Any]) -> str:
         run = sum(f["run"] for f in found)
         if run:
             shown.append((f"{sum(f['held'] for f in found) / run:.1%}", f"hold in physics ({name})"))
-    remarks = "".join(f'<p class="note">{escape(line)}</p>' for line in numbers["remarks"])
     lead = "Numbers are those stored in the shards; near-duplicates, poses and coverage are computed from the rows."
-    return f'<h1>{escape(title)}</h1>\n<p class="dim">{lead}</p>\n{remarks}{tiles(shown)}'
+    remarks = [{"words": line, "kind": "note"} for line in numbers["remarks"]]
+    return [{"words": lead, "kind": "dim"}, *remarks, {"tiles": shown}]
 
 
-def _hand(data: dict[str, Any], hand: HandRows) -> str:
-    parts = [f"<h2>{escape(data['hand'])}</h2>", run_tables(data)]
+def _hand(data: dict[str, Any], hand: HandRows) -> list[Block]:
+    parts = [_chapter(data["hand"], 2), *run_tables(data)]
     if not data["rows"]:
-        return "\n".join([*parts, "<p>No rows.</p>"])
+        return [*parts, {"words": "No rows."}]
     held = held_tables(data)
     contacts: Counter[int] = Counter()
     for group in data["objects"]:
         contacts.update({int(n): rows for n, rows in group["contacts"].items()})
-    return "\n".join(
-        [
-            *parts,
-            *("<h3>Validity</h3>", validity_table(data), *_histograms(hand)),
-            *(("<h3>Objects in the hand</h3>", held) if held else ()),
-            *(_physics(data) if any(group["physics"] for group in data["objects"]) else ()),
-            *("<h3>Contacts</h3>", figure(contact_chart(contacts, data["contact_links"]), "")),
-            *("<h3>Diversity</h3>", diversity_table(data)),
-            *_dots(data, hand),
-        ]
-    )
+    return [
+        *(*parts, _chapter("Validity"), validity_table(data), *_histograms(hand)),
+        *((_chapter("Objects in the hand"), *held) if held else ()),
+        *(_physics(data) if any(group["physics"] for group in data["objects"]) else ()),
+        *(_chapter("Contacts"), _figure(contact_chart(contacts, data["contact_links"]))),
+        *(_chapter("Diversity"), diversity_table(data)),
+        *_dots(data, hand),
+    ]
 
 
-def _histograms(hand: HandRows) -> list[str]:
+def _histograms(hand: HandRows) -> list[Block]:
     together = [d for d in hand.together().values() if d.rows]
     bounded = [d for d in together if d.quantity.bound is not None]
     free = [d for d in together if d.quantity.bound is None]
     out = []
     if bounded:
         text = "Orange: the strict bound. The last bar holds what lies beyond."
-        out.append(figure(quantity_chart(bounded), text))
+        out.append(_figure(quantity_chart(bounded), text))
     if free:
         text = (
             "Epsilon and volume as docs/reference/metrics.md defines them: friction 0.5, eight-edge cones, torque over "
             "the object's radius. 0: the origin is not inside the hull, so some load cannot be held at this friction."
         )
-        out += ["<h3>Quality</h3>", figure(quantity_chart(free), text)]
+        out += [_chapter("Quality"), _figure(quantity_chart(free), text)]
     return out
 
 
-def _physics(data: dict[str, Any]) -> list[str]:
+def _physics(data: dict[str, Any]) -> list[Block]:
     total: dict[str, dict[str, dict[str, int]]] = {}
     for group in data["objects"]:
         for name, verdicts in group["physics"].items():
@@ -130,11 +131,11 @@ def _physics(data: dict[str, Any]) -> list[str]:
                 into[way] = {key: found[key] + counts[key] for key in found}
     tried = [(name, ways) for name, ways in total.items() if any(way["run"] for way in ways.values())]
     text = "Of the grasps run in a direction; a grasp that failed in one may not have been run in the others."
-    chart = [figure(failure_chart(tried), text)] if tried else []
-    return ["<h3>Physics</h3>", physics_table(data), *chart, protocol_list(data)]
+    chart = [_figure(failure_chart(tried), text)] if tried else []
+    return [_chapter("Physics"), physics_table(data), *chart, *protocol_list(data)]
 
 
-def _dots(data: dict[str, Any], hand: HandRows) -> list[str]:
+def _dots(data: dict[str, Any], hand: HandRows) -> list[Block]:
     """Where objects are, from where hands come, and the postures: charts of the sampled rows."""
     sample, every, names = hand.sample.columns(), data["sample"]["every"], [" + ".join(names) for names in hand.objects]
     dots = f"Dots: {number(data['sample']['rows'])} of {number(data['rows'])} grasps"
@@ -155,8 +156,8 @@ def _dots(data: dict[str, Any], hand: HandRows) -> list[str]:
         f"{found['components_for_95_percent']} components explain 95 %. {dots}"
     )
     return [
-        *("<h3>Object positions</h3>", figure(position_chart(sample["position"], sample["group"], names), where)),
-        *("<h3>Approach directions</h3>", figure(direction_maps(maps), ways)),
-        "<h3>Postures</h3>",
-        figure(posture_chart(posture, posture.scores(sample["q"]), sample["group"], names), postures),
+        *(_chapter("Object positions"), _figure(position_chart(sample["position"], sample["group"], names), where)),
+        *(_chapter("Approach directions"), _figure(direction_maps(maps), ways)),
+        _chapter("Postures"),
+        _figure(posture_chart(posture, posture.scores(sample["q"]), sample["group"], names), postures),
     ]

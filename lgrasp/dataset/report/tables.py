@@ -1,28 +1,16 @@
-"""The report's tables and pieces of HTML."""
+"""The report's tables."""
 
-import html
 import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-escape = html.escape
+Block = dict[str, Any]
+"""A part of the page, as page.html takes it."""
 
 
 def number(value: int) -> str:
     """An integer with separators."""
     return f"{value:,}"
-
-
-def tiles(pairs: Iterable[tuple[str, str]]) -> str:
-    """Large values with labels."""
-    inner = "".join(f"<li><b>{escape(value)}</b><span>{escape(what)}</span></li>" for value, what in pairs)
-    return f'<ul class="tiles">{inner}</ul>'
-
-
-def figure(svg: str, caption: str) -> str:
-    """A chart with its explanation."""
-    below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f"<figure>{svg}{below}</figure>"
 
 
 def table(
@@ -33,7 +21,7 @@ def table(
     caption: str = "",
     text: Sequence[int] = (),
     total: bool = False,
-) -> str:
+) -> Block:
     """A table.
 
     Args:
@@ -44,23 +32,7 @@ def table(
         text: Columns of words besides the first.
         total: Whether the last row sums up.
     """
-    above = "".join(f'<th colspan="{span}">{escape(name)}</th>' for name, span in groups)
-    head = f"<tr>{above}</tr>" if groups else ""
-    head += "<tr>" + "".join(f"<th{_kind(i, text)}>{escape(name)}</th>" for i, name in enumerate(columns)) + "</tr>"
-    body = "".join("<tr>" + "".join(_cell(i, cell, text) for i, cell in enumerate(row)) + "</tr>" for row in rows)
-    title = f'<p class="dim">{escape(caption)}</p>' if caption else ""
-    plain = "" if total else ' class="plain"'
-    return f'{title}<div class="wide"><table><thead>{head}</thead><tbody{plain}>{body}</tbody></table></div>'
-
-
-def _kind(column: int, text: Sequence[int], more: str = "") -> str:
-    return f' class="text{more}"' if column in text else ""
-
-
-def _cell(column: int, cell: str, text: Sequence[int]) -> str:
-    if cell.startswith("!"):
-        return f'<td class="bad">{escape(cell[1:])}</td>'
-    return f"<td{_kind(column, text, ' wrap' if len(cell) > 60 else '')}>{escape(cell)}</td>"
+    return {"columns": columns, "rows": rows, "groups": groups, "caption": caption, "text": text, "total": total}
 
 
 _METRIC_COLUMNS = (  # metric, head, format
@@ -82,7 +54,7 @@ _VERDICT_COLUMNS = (  # column, head, factor, format
 )
 
 
-def run_tables(data: dict[str, Any]) -> str:
+def run_tables(data: dict[str, Any]) -> list[Block]:
     """The origin of a hand's rows, and the survivors of each stage."""
     about = [
         ("hand", f"{data['hand']} ({data['sha256'][:12]}…), {len(data['joints'])} joints"),
@@ -103,14 +75,14 @@ def run_tables(data: dict[str, Any]) -> str:
         if rows:
             caption = f"Survivors per stage of {run['pipeline']}, all shards together"
             out.append(table(("stage", "survivors", "seconds", "counts"), rows, caption=caption, text=(3,)))
-    return table(("", ""), about, text=(1,)) + "".join(out)
+    return [table(("", ""), about, text=(1,)), *out]
 
 
 def _number(value: float | None, style: str) -> str:
     return "-" if value is None else f"{value:{style}}"
 
 
-def validity_table(data: dict[str, Any]) -> str:
+def validity_table(data: dict[str, Any]) -> Block:
     """Median and worst of each metric, a row per object (or set of objects held at once) and one for all."""
     shown = [s for s in _METRIC_COLUMNS if s[0] in data["metrics"]]
     columns = ["object", "rows", *(w for s in shown for w in ("median", "best" if s[0] == "epsilon" else "worst"))]
@@ -132,7 +104,7 @@ def _metrics(of: dict[str, Any], shown: list[tuple[str, str, str]]) -> list[str]
     return cells
 
 
-def diversity_table(data: dict[str, Any]) -> str:
+def diversity_table(data: dict[str, Any]) -> Block:
     """Poses, near-duplicates and coverage, a row per object (or set of objects held at once)."""
     columns = ["object", "rows", "poses", "near-dup.", "contacts", "approach", "if uniform", "rotation", "if uniform"]
     rows = []
@@ -153,12 +125,12 @@ def diversity_table(data: dict[str, Any]) -> str:
     return table(columns, rows, caption=caption)
 
 
-def held_tables(data: dict[str, Any]) -> str:
-    """Rows by the number of objects in the hand, and by the opposition space of the last step; "" if all hold one."""
+def held_tables(data: dict[str, Any]) -> list[Block]:
+    """Rows by the number of objects in the hand, and by the opposition space of the last step; none if all hold one."""
     held, counts = data["held"], list(data["held"])
     spaces = list(dict.fromkeys(name for group in held.values() for name in group["spaces"]))
     if counts in ([], ["1"]) and not spaces:
-        return ""
+        return []
     protocols = sorted({name for group in held.values() for name in group["physics"]})
     holds = [f"hold ({name})" for name in protocols]
 
@@ -171,7 +143,7 @@ def held_tables(data: dict[str, Any]) -> str:
         depth = [f"{deep['median']:.2f}", f"{'!' * bool(deep['over_bound'])}{deep['max']:.2f}"] if deep else ["-", "-"]
         rows.append([n, number(group["rows"]), *depth, *shares(group)])
     caption = "By the number of objects in the hand. Orange: above the strict bound."
-    out = table(["objects", "rows", "penetration [mm]: median", "max", *holds], rows, caption=caption)
+    out = [table(["objects", "rows", "penetration [mm]: median", "max", *holds], rows, caption=caption)]
     if spaces:
         rows = []
         for name in spaces:
@@ -179,11 +151,11 @@ def held_tables(data: dict[str, Any]) -> str:
             rows.append([name, *(cell for part in found for cell in (number(part["rows"]), *shares(part)))])
         groups = [("", 1), *((f"as object {n}", 1 + len(holds)) for n in counts)]
         caption = "Rows by the opposition space that took their last object, by which object it is."
-        out += table(["space", *["rows", *holds] * len(counts)], rows, groups=groups, caption=caption)
+        out.append(table(["space", *["rows", *holds] * len(counts)], rows, groups=groups, caption=caption))
     return out
 
 
-def physics_table(data: dict[str, Any]) -> str:
+def physics_table(data: dict[str, Any]) -> Block:
     """Verdicts of each protocol for each object: share that holds, the object's mass, means of other verdicts."""
     rows = []
     columns = ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in _VERDICT_COLUMNS)]
@@ -211,7 +183,7 @@ def _mass(protocols: list[Any]) -> str:
     return ", ".join(masses) or "-"
 
 
-def protocol_list(data: dict[str, Any]) -> str:
+def protocol_list(data: dict[str, Any]) -> list[Block]:
     """What the protocols of the verdicts say, each text once, with its objects."""
     found: dict[tuple[str, str], list[str]] = {}
     for group in data["objects"]:
@@ -219,8 +191,6 @@ def protocol_list(data: dict[str, Any]) -> str:
             for text in verdicts["protocols"]:
                 shown = text if isinstance(text, str) else json.dumps(text, indent=1)
                 found.setdefault((name, shown), []).append(" + ".join(group["objects"]))
-    return "".join(
-        f"<details><summary>Protocol {escape(name)}: {escape(', '.join(objects))}</summary>"
-        f"<pre>{escape(shown)}</pre></details>"
-        for (name, shown), objects in found.items()
-    )
+    return [
+        {"summary": f"Protocol {name}: {', '.join(objects)}", "text": shown} for (name, shown), objects in found.items()
+    ]

@@ -14,7 +14,7 @@ from lgrasp.dataset.report.gather import HandRows, ObjectRows
 from lgrasp.dataset.report.page import page
 from lgrasp.dataset.report.quantity import Distribution
 from lgrasp.dataset.report.survey import Head, survey
-from lgrasp.dataset.report.tables import escape, figure
+from lgrasp.dataset.report.tables import Block
 from lgrasp.dataset.report.verdicts import held_numbers
 from lgrasp.dataset.scenes import SceneRows, draw_rows
 from lgrasp.errors import LgraspError, OutputError
@@ -43,21 +43,21 @@ def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], No
     if out.exists() and not out.is_file():
         raise OutputError(f"report {out} cannot be written: it is no regular file; name another")
     numbers, hands = read_dataset(paths, progress=progress)
-    write_file(out, page(numbers, hands, _pictures(paths) if numbers["rows"] else ""))
+    write_file(out, page(numbers, hands, _pictures(paths) if numbers["rows"] else ()))
     return numbers
 
 
-def _pictures(paths: Paths) -> str:
+def _pictures(paths: Paths) -> list[Block]:
     """Some rows, drawn."""
     try:
         rows = SceneRows(paths)
         chosen = rows.sound(rows.spread(_PICTURES))
         image = draw_rows(rows, chosen, size=_SIZE, columns=_PICTURES // 2)
     except LgraspError as error:  # what is reported need not be of a hand that can be drawn
-        return f'<p class="note">No pictures: {escape(str(error))}</p>'
+        return [{"words": f"No pictures: {error}", "kind": "note"}]
     data = base64.b64encode(image_bytes(image, ".jpg")).decode()
     caption = f"{len(chosen)} of {len(rows):,} rows, evenly spread. Dots are contacts. More: lgrasp render, lgrasp view"
-    return figure(f'<img alt="grasps" src="data:image/jpeg;base64,{data}" style="max-width:100%">', caption)
+    return [{"jpeg": data, "caption": caption}]
 
 
 def read_dataset(
