@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from lgrasp.cloud.read import Cloud
 from lgrasp.cloud.read import read_cloud as _read_cloud
 from lgrasp.config import parse_model
 from lgrasp.dataset.files import find_shards
+from lgrasp.dataset.frame import grasp_frame
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.writer import write_shard
@@ -28,6 +29,10 @@ from lgrasp.jobs.shard_inputs import named_hand, named_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.device import resolve_device
 from lgrasp.simulate.protocol import Protocol, find_protocol
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from PIL.Image import Image
 
 Name = str | Path
 Hand = HandModel
@@ -65,6 +70,31 @@ class Grasps(GraspRows):
         """
         write_shard(path, self.shard)
         return Path(path)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """A table with a line per grasp: see :func:`lgrasp.dataset.frame.grasp_frame`.
+
+        Raises:
+            ConfigError: pandas is not installed.
+        """
+        return grasp_frame(self, self.hand.joint_names, self.objects)
+
+    def show(self, rows: int | Sequence[int] = 8, *, stage: str = "grasp", size: int = 256) -> "Image":
+        """A picture of some grasps side by side, which a notebook shows.
+
+        Args:
+            rows: numbers of rows, or how many, evenly spread.
+            stage: pregrasp, grasp or squeeze.
+            size: pixels of a side of each.
+
+        Raises:
+            LgraspError: there is no such row, or the hand cannot be drawn.
+        """
+        from lgrasp.dataset.scenes import SceneRows, draw_rows
+
+        with _files(self) as files:
+            found = SceneRows(files)
+            return draw_rows(found, found.spread(rows) if isinstance(rows, int) else list(rows), stage=stage, size=size)
 
     def __repr__(self) -> str:
         names = ", ".join(record.name for record in self.objects)

@@ -1,5 +1,6 @@
 """The verbs of ``import lgrasp as lg`` one after another, in memory and in files."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,26 @@ def test_some_of_the_rows(grasps, tmp_path):
     read = lg.read_shard(some.save(tmp_path / "some.h5"))
     assert len(read.grasps) == 6
     np.testing.assert_array_equal(read.grasps.contact_links, some.contact_links)
+
+
+def test_table(grasps, monkeypatch):
+    table = grasps.to_pandas()
+    joints = [name for name in table.columns if name.startswith("q/")]
+    assert joints == [f"q/{name}" for name in grasps.hand.joint_names]
+    np.testing.assert_array_equal(table[joints].to_numpy(np.float32), grasps.q)
+    np.testing.assert_array_equal(table["object_pose/qz"], grasps.object_pose[:, 0, 6])
+    np.testing.assert_array_equal(table["metrics/epsilon"], grasps.metrics["epsilon"])
+    assert set(table["objects"]) == {"mug"}
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(lg.LgraspError, match="pip install pandas"):
+        grasps.to_pandas()
+
+
+def test_picture(grasps):
+    assert grasps.show([0, 5, 7], size=40).width == 80
+    assert grasps.show(1, size=40)._repr_png_().startswith(b"\x89PNG")  # what notebooks ask for
+    with pytest.raises(lg.LgraspError, match="row 12 does not exist"):
+        grasps.show([12])
 
 
 def test_refine_simulate_judge(grasps):
