@@ -58,13 +58,9 @@ def generate(
         Option(
             min=1,
             max=64,
-            help="Searches per successful pose: faster, but fewer poses; default: the pipeline's, or 8 with --reuse.",
+            help="Searches per successful pose: faster, but fewer poses; default: the pipeline's.",
         ),
     ] = None,
-    reuse: Annotated[
-        bool,
-        Option("--reuse", help="Cache the state of shards, so that a later run with a larger -n continues from there."),
-    ] = False,
     dry_run: DryRun = False,
 ) -> None:
     """Generate grasps of an object and write them as shards.
@@ -78,10 +74,10 @@ def generate(
     from lgrasp.jobs.config import pair_requests
     from lgrasp.object.find import all_objects
 
-    chosen = choose_pipeline(pipeline, seed, contacts, settings).with_passes(passes, reuse)
+    chosen = choose_pipeline(pipeline, seed, contacts, settings).with_passes(passes)
     chosen = chosen.with_simulation(simulate) if simulate else chosen
     pairs = all_hands(hands), all_objects(meshes)
-    what = {"rows": rows, "scale": scale, "batch": batch, "shard_rows": shard_rows, "reuse": reuse}
+    what = {"rows": rows, "scale": scale, "batch": batch, "shard_rows": shard_rows}
     requests = pair_requests(*pairs, chosen, out or Path("grasps"), simulate, **what, **how.shared)
     if len(requests) > 1 or pairs != (tuple(hands), tuple(meshes)):
         run_all(requests, how, dry_run=dry_run)

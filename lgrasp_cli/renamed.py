@@ -10,6 +10,7 @@ _NEW = {
     "--no-resume": ("--overwrite",),
     "--physics": ("--simulate",),
     "--resume": (),  # the default
+    "--reuse": ("--passes=8",),
     "--threads": ("--workers",),
 }
 _REBUILD = ("build-field", "preprocess", "place", "domain", "ik", "search", "filter")

@@ -17,8 +17,6 @@ from lgrasp.stages.migration import ALIASES, move_to_bounds, stage_name
 
 _ORDER_VERSION = 2
 """Raised whenever the same candidates give the rows of a shard in another order."""
-REUSE_PASSES = 8
-"""Passes of a run that keeps a bank, unless it or its pipeline says otherwise."""
 
 
 class _Head(Params):
@@ -98,15 +96,13 @@ class Pipeline(_Head):
         shared = {name: made[name] for name in ("bounds", "object", "field")} | {"sequence": made.get("sequence")}
         return self.model_copy(update=shared | {"stages": tuple((name, made[name]) for name in self.order)})
 
-    def with_passes(self, passes: int | None, reuse: bool = False) -> "Pipeline":
-        """A copy with some passes over its candidates: those given, else REUSE_PASSES where a bank is kept.
+    def with_passes(self, passes: int | None) -> "Pipeline":
+        """A copy with some passes over its candidates, if they are given.
 
         Raises:
             ConfigError: passes out of range.
         """
-        if passes is None and (not reuse or self.params("search").passes > 1):
-            return self
-        return self.with_params("search", passes=passes or REUSE_PASSES)
+        return self if passes is None else self.with_params("search", passes=passes)
 
     def with_simulation(self, protocol: str) -> "Pipeline":
         """A copy that keeps only grasps which hold under a protocol of :mod:`lgrasp.simulate.protocol`.

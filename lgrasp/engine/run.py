@@ -54,6 +54,7 @@ class Job(Request, ABC):
     _device: Device = PrivateAttr()
     _events: Events = PrivateAttr(default_factory=Events)
     _manifests: Listing | Renewing | None = PrivateAttr(None)
+    _growing: set[int] = PrivateAttr(default_factory=set)  # numbers of parts that are there with fewer rows
 
     @property
     def title(self) -> str:
@@ -116,8 +117,9 @@ class Job(Request, ABC):
             if found.rows >= part.rows or found.tried >= self.effort(part.rows):
                 present[part.number] = found.rows
             else:
+                self._growing.add(part.number)
                 lost = f", and its verdicts ({', '.join(found.protocols)}) are lost" if found.protocols else ""
-                notice(f"{part.file} has {found.rows:,} of {part.rows:,} {self.unit}: it is made again{lost}")
+                notice(f"{part.file} has {found.rows:,} of {part.rows:,} {self.unit}: it is completed{lost}")
         return present
 
     def found(self, part: Part) -> Found | None:

@@ -183,6 +183,7 @@ def make_shard(
     execution: Execution,
     *,
     bank_cache: Cache | None = None,
+    resume: bool = True,
     progress: Callable[[int, ShardResult], None] | None = None,
 ) -> ShardResult:
     """The first ``rows`` grasps of a shard's candidate stream, near-duplicates left out, shuffled.
@@ -190,8 +191,8 @@ def make_shard(
     The rows of the last block of candidates that is needed (:func:`block_size`) are drawn from all that it gives.
 
     Args:
-        bank_cache: continue from the shard's bank there, and update it; counts and seconds are then those of
-            all runs together.
+        bank_cache: keep the shard's bank there.
+        resume: continue from the bank; counts and seconds are then those of all runs together.
         progress: called with (rows so far, running result) after each batch; what it raises ends the shard.
     """
     device = inputs.device.alias
@@ -201,7 +202,7 @@ def make_shard(
     block = block_size(pipeline)
     found = _Rows(inputs, RowOrder(pipeline.seed, shard, block), rows, graphs.capturing if graphs else nullcontext())
     result = found.result
-    if bank and (account := bank.load(rows)):
+    if bank and resume and (account := bank.load(rows)):
         found.restore(account)
     earlier, start = result.wall, time.perf_counter()
     fixed, passes = _fixed_batch(context, execution), pipeline.params("search").passes

@@ -26,6 +26,7 @@ from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.hand.names import all_hands, hand_path
 from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest
 from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
+from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object
 
 
@@ -50,8 +51,16 @@ class JobConfig(Params):
     batch: int = Field(0, ge=0)
     shard_rows: int = Field(10_000, ge=1)
     passes: int | None = Field(None, ge=1, le=64)
-    reuse: bool = False
     sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_reuse(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "reuse" not in data:
+            return data
+        notice("reuse is now passes: 8, and every short shard is continued; the old key works in this release only")
+        rest = {name: value for name, value in data.items() if name != "reuse"}
+        return {"passes": 8} | rest if data["reuse"] else rest
 
     @model_validator(mode="after")
     def _has_objects(self) -> "JobConfig":
@@ -136,8 +145,8 @@ def plan_requests(config: JobConfig) -> list[Request]:
     for pipeline in _pipelines(config):
         if not sets:
             meshes = [in_folder(config.object_dir, mesh) for mesh in objects]
-            own = pipeline.with_passes(config.passes, config.reuse)
-            more = config.model_dump(include={"scale", "batch", "reuse"})
+            own = pipeline.with_passes(config.passes)
+            more = config.model_dump(include={"scale", "batch"})
             found += pair_requests(hands, meshes, own, config.out, **shared, **more)
             continue
         changes = {name: value for name in ("method", "policy") if (value := getattr(sets, name))}

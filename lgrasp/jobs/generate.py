@@ -71,7 +71,7 @@ class GenerateJob(GenerateRequest, SearchJob):
         return self._rate if self._inputs else self.rate
 
     def own_config(self) -> dict[str, Any]:
-        return {"object": self.object, "scale": self.scale, "reuse": self.reuse}
+        return {"object": self.object, "scale": self.scale}
 
     def key(self) -> str:
         return run_key(self.pipeline.describe(), self.keys, self.shard_rows)
@@ -94,7 +94,8 @@ class GenerateJob(GenerateRequest, SearchJob):
             part.number,
             part.rows,
             Execution(self.threads(), self.batch, self._rate, self._graphs),
-            bank_cache=self.cache if self.reuse else None,
+            bank_cache=self.cache if part.rows < self.shard_rows or part.number in self._growing else None,
+            resume=part.number in self._growing,
             progress=lambda rows, _: progress(rows),
         )
         kept = result.counts.get("simulate", {}).get("held", result.counts.get("filter", {}).get("kept", 0))

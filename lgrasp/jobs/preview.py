@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from lgrasp.engine.bank import Bank
 from lgrasp.engine.run import Job, look
 from lgrasp.files import temporary_folder
 from lgrasp.jobs.generate import GenerateJob
@@ -29,7 +28,7 @@ def preview(job: Job, *, array: Array | tuple[int, int] = (0, 1), resume: bool =
         LgraspError: bad input, as :func:`lgrasp.engine.run.run` would raise it before computing.
     """
     with _no_kernel_folder():
-        _, device, _, parts, present = look(job, array=array, resume=resume)
+        _, _, _, parts, present = look(job, array=array, resume=resume)
     lines = _inputs(job) if isinstance(job, GenerateJob) else []
     for part in parts:
         number, file = str(part.number), str(part.file)
@@ -38,9 +37,6 @@ def preview(job: Job, *, array: Array | tuple[int, int] = (0, 1), resume: bool =
                 PlanLine("shard", number, "present", f"nothing, {present[part.number]:,} rows are there", file)
             )
             continue
-        if isinstance(job, GenerateJob) and job.reuse:
-            bank = Bank(job.cache, job.pipeline, job.keys, part.number, device.alias)
-            lines.append(_cached(job, "bank", number, bank.key, "keep how far the shard comes"))
         what = f"{part.rows:,} {job.unit}" + (", replacing the file" if part.file.exists() else "")
         lines.append(PlanLine("shard", number, "missing", what, file))
     return lines

@@ -189,13 +189,14 @@ def test_damaged_artifact_is_made_again(job, inputs, cache_root, raw_grasps, lin
     cache = Cache(tmp_path / "cache", lines.append)
     for name in ("hand", "object", "field"):
         shutil.copytree(cache_root / name, cache.root / name)
-    generate(job(rows=20, reuse=True, cache=cache, out=tmp_path / "first"))
+    generate(job(rows=10, shard_rows=100, cache=cache, out=tmp_path / "second"))
     path = next((cache.root / kind).iterdir()) if kind == "bank" else cache.path(kind, getattr(inputs.keys, kind))
     whole = path.read_bytes()
     broken = bytearray(whole)
     broken[len(whole) // 2] ^= 1
     path.write_bytes(broken if damage == "flip" else whole[: len(whole) // 3])
-    generate(job(rows=20, reuse=True, cache=cache, out=tmp_path / "second"))
+    generate(job(rows=20, shard_rows=100, cache=cache, out=tmp_path / "second"))
+    generate(job(rows=20, shard_rows=100, cache=Cache(cache_root), out=tmp_path / "first"))
     assert raw_grasps(tmp_path / "first") == raw_grasps(tmp_path / "second")
     assert len(lines) == 1
     assert str(path) in lines[0]
@@ -205,9 +206,9 @@ def test_damaged_artifact_is_made_again(job, inputs, cache_root, raw_grasps, lin
 
 def test_job_without_a_writable_cache(job, raw_grasps, lines, tmp_path):
     (tmp_path / "file").touch()
-    generate(job(rows=20, out=tmp_path / "first"))
+    generate(job(rows=20, shard_rows=100, out=tmp_path / "first"))
     cache = Cache(tmp_path / "file" / "cache", lines.append)
-    generate(job(rows=20, cache=cache, reuse=True, out=tmp_path / "second"))
+    generate(job(rows=20, cache=cache, shard_rows=100, out=tmp_path / "second"))
     assert raw_grasps(tmp_path / "first") == raw_grasps(tmp_path / "second")
     assert len(lines) == 1
 

@@ -9,7 +9,6 @@ import pytest
 from lgrasp.engine.bank import Bank
 from lgrasp.engine.batch import PASS_BLOCK, run_batch
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.pipeline import REUSE_PASSES
 from lgrasp.engine.registry import STAGES
 from lgrasp.engine.shard import Execution, make_shard
 from lgrasp.errors import ConfigError
@@ -169,20 +168,35 @@ def test_passes_over_nothing(swift, context):
 
 def test_how_many_passes(swift, several):
     assert swift.with_passes(None) == swift
-    assert swift.with_passes(None, reuse=True).params("search").passes == REUSE_PASSES
-    assert several.with_passes(None, reuse=True) == several
-    assert several.with_passes(1, reuse=True).params("search").passes == 1
+    assert several.with_passes(1).params("search").passes == 1
     with pytest.raises(ConfigError, match="passes"):
         swift.with_passes(65)
 
 
-def test_a_folder_that_grows(run, several, grasps, tmp_path):
-    """Twice with more rows asked, and once: the same file."""
-    common = {"pipeline": several, "shard_rows": 1000}
-    run(rows=50, reuse=True, out=tmp_path / "a", **common)
-    run(rows=600, reuse=True, out=tmp_path / "a", **common)
+@pytest.mark.parametrize("passes", [1, PASSES])
+def test_a_folder_that_grows(run, swift, grasps, calls, tmp_path, passes):
+    """Twice with more rows asked, and once: the same file; rows that were there stay, and are not made again."""
+    common = {"pipeline": swift.with_passes(passes), "shard_rows": 10_000, "batch": 512}
+    run(rows=200, out=tmp_path / "a", **common)
+    few = grasps(tmp_path / "a")["q"]
+    before = calls["place"]
+    run(rows=600, out=tmp_path / "a", **common)
+    grown = calls["place"] - before
     run(rows=600, out=tmp_path / "b", **common)
+    assert grown < calls["place"] - before - grown
     twice, once = grasps(tmp_path / "a"), grasps(tmp_path / "b")
     assert twice.keys() == once.keys()
     for name, values in once.items():
         np.testing.assert_array_equal(twice[name], values, err_msg=name)
+    assert {row.tobytes() for row in few} < {row.tobytes() for row in once["q"]}
+
+
+def test_a_new_folder_is_computed(run, swift, calls, tmp_path):
+    """What was cached of a shard serves only to complete it: a run that is timed works."""
+    common = {"pipeline": swift, "shard_rows": 10_000}
+    run(rows=50, out=tmp_path / "a", **common)
+    first = calls["place"]
+    run(rows=50, out=tmp_path / "b", **common)
+    second = calls["place"]
+    run(rows=50, out=tmp_path / "a", resume=False, **common)
+    assert 0 < first < second < calls["place"]

@@ -91,7 +91,7 @@ def test_resume_counts_what_is_there(generate, tmp_path):
 
 
 def test_more_rows_later(cli, generate, tmp_path):
-    """Whole shards stay as they are, verdicts included; the last one is made again, which is told."""
+    """Whole shards stay as they are, verdicts included; the last one is completed, which is told."""
     pytest.importorskip("mujoco")
     generate("--shard-rows", 4, rows=6)
     assert cli("simulate", tmp_path / "out").code == 0
@@ -100,7 +100,7 @@ def test_more_rows_later(cli, generate, tmp_path):
     result = generate("--shard-rows", 4, "--json", "-", rows=8)
     data = json.loads(result.out)
     assert (data["grasps"], data["made"], data["present"]) == (8, 4, 4)
-    assert f"{last} has 2 of 4 grasps: it is made again, and its verdicts (fc) are lost" in result.err
+    assert f"{last} has 2 of 4 grasps: it is completed, and its verdicts (fc) are lost" in result.err
     assert whole.read_bytes() == before
     assert "fc_holds" not in read_shard(last).grasps.physics
 
@@ -136,9 +136,9 @@ def snapshot(folder):
 def test_dry_run_has_no_side_effects(generate, tmp_path, built):
     own = ("--cache-dir", tmp_path / "cache")
     if built:
-        generate("--shard-rows", 8, "--reuse", *own, rows=8)
+        generate("--shard-rows", 8, *own, rows=8)
     before = snapshot(tmp_path)
-    result = generate("--shard-rows", 8, "--dry-run", "--reuse", *own)
+    result = generate("--shard-rows", 8, "--dry-run", *own)
     assert result.code == 0
     lines = [line.split() for line in result.out.splitlines()]
     states = {(words[0], words[1]): words[2] for words in lines}

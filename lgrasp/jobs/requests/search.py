@@ -46,7 +46,6 @@ class GenerateRequest(SearchRequest):
     scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
     batch: int = Field(default=0, description="Candidates per batch; 0: by device.")
     rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
-    reuse: bool = Field(default=False, description="Cache the state of shards; later runs continue from there.")
 
     @property
     def title(self) -> str:
