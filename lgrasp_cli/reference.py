@@ -38,7 +38,7 @@ def cli_page() -> str:
         if not getattr(command, "commands", {}) or getattr(command, "invoke_without_command", False):
             lines += _section(command, context, _options(command, context), common)
         if context.command_path == "lgrasp run":
-            lines += _config_keys()
+            lines += _config_keys(common)
     return _PAGE.read_text(encoding="utf-8").partition(_MARK)[0] + "\n".join(lines).rstrip() + "\n"
 
 
@@ -100,18 +100,19 @@ def _section(command: Any, context: typer.Context, rows: list[_Row], common: dic
     return [*lines, *([f"- [Common](#common-options): {', '.join(words)}."] if words else []), *([""] if rows else [])]
 
 
-def _config_keys() -> list[str]:
-    """The keys of a config, from its model."""
+def _config_keys(common: dict[str, _Row]) -> list[str]:
+    """The keys of a config, from its model; those that are options by name only."""
     from lgrasp.jobs.config import JobConfig
 
     fields = JobConfig.model_fields
+    alike = [name for name, field in fields.items() if not field.description or f"--{name}" in common]
     lines = ["Keys of a config:", ""]
     for name, field in fields.items():
         default = field.get_default(call_default_factory=True)
         shown = ", ".join(default) if isinstance(default, tuple) else "" if default is None else str(default)
-        if field.description:
-            lines.append(f"- `{name}`: {_line(field.description)}" + (f" [{shown}]" if shown else ""))
-    lines.append(f"- As the options: {_code(name for name, field in fields.items() if not field.description)}.")
+        if name not in alike:
+            lines.append(f"- `{name}`: {_line(field.description or '')}" + (f" [{shown}]" if shown else ""))
+    lines.append(f"- As the options: {_code(alike)}.")
     return [*lines, ""]
 
 

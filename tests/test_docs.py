@@ -53,3 +53,9 @@ def test_every_metric_is_explained():
     assert [
         name for name in (*METRICS, "contacts", "valid", "refined", "energy", "room") if f"- `{name}`" not in page
     ] == []
+
+
+def test_pages_are_short():
+    words = sum(len(page.read_text(encoding="utf-8").split()) for page in DOCS.rglob("*.md"))
+    assert words <= 25_000, f"docs have {words} words: tell each fact once, and link to it"
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
