@@ -92,9 +92,9 @@ def add_hand(
 ) -> None:
     """Draft a hand from its URDF: fingers, palmar surface, canonical box, open posture.
 
+    \b
     Example: lgrasp hands add my_hand.urdf
-
-    Of a robot: lgrasp hands add robot.urdf --root left_palm --mesh-dir meshes
+    lgrasp hands add robot.urdf --root left_palm --mesh-dir meshes
     """
     from lgrasp.hand.drafting.cut_hand import cut_hand
     from lgrasp.hand.urdf import read_robot
