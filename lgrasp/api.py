@@ -235,7 +235,7 @@ def simulate(
     *,
     all_directions: bool = False,
     device: str = "cpu",
-    threads: int = 0,
+    workers: int = 0,
     out: Name | None = None,
 ) -> Grasps:
     """The same grasps with verdicts of MuJoCo in ``physics``, such as ``fc_holds``.
@@ -252,7 +252,7 @@ def simulate(
     from lgrasp.jobs.simulate import SimulateJob
 
     found = find_protocol(protocol) if isinstance(protocol, str) else protocol
-    what: dict[str, Any] = {"workers": threads, "device": device, "all_directions": all_directions}
+    what: dict[str, Any] = {"workers": workers, "device": device, "all_directions": all_directions}
     with _files(grasps) as files:
         return _done(SimulateJob, out, shards=files, protocol=found, **what)
 

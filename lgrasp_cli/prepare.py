@@ -130,7 +130,7 @@ def _up_to(stage: str):
         pipeline: PipelineName = "robust",
         candidates: Annotated[int, Option(min=1, help="Candidates in the batch.")] = 1024,
         first: Annotated[int, Option(min=0, help="First candidate of the batch.")] = 0,
-        shard_index: Annotated[int, Option(min=0, help="Shard whose candidate stream is used.")] = 0,
+        shard: Annotated[int, Option(min=0, help="Shard whose candidate stream is used.")] = 0,
         seed: Seed = None,
         contacts: Contacts = None,
         scale: Scale = 1.0,
@@ -142,7 +142,7 @@ def _up_to(stage: str):
         chosen = choose_pipeline(pipeline, seed, contacts)
         from lgrasp.jobs.onestage import run_up_to
 
-        runs = run_up_to(stage, chosen, hand, mesh, first, candidates, shard_index, cache, scale=scale, device=device)
+        runs = run_up_to(stage, chosen, hand, mesh, first, candidates, shard, cache, scale=scale, device=device)
         rows = [
             (
                 r.stage,

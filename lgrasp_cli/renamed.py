@@ -13,8 +13,8 @@ _NEW = {
     "--reuse": ("--passes=8",),
     "--threads": ("--workers",),
 }
-_REBUILD = ("build-field", "preprocess", "place", "domain", "ik", "search", "filter")
-_OF_COMMANDS = {name: {"--force": ("--rebuild",)} for name in _REBUILD} | {
+_PREPARE = ("build-field", "preprocess", "place", "domain", "ik", "search", "filter")
+_OF_COMMANDS = {name: {"--force": ("--rebuild",), "--shard-index": ("--shard",)} for name in _PREPARE} | {
     "hands": {"--force": ("--overwrite",)},
     "bench": {"--resume": ("--resume",)},
 }

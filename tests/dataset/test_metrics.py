@@ -192,7 +192,7 @@ def test_what_cannot_be_done(tmp_path, make_shard):
 def test_command(tmp_path, make_shard):
     write_shard(tmp_path / "in" / "0.h5", make_shard(4))
     arguments = ["metrics", str(tmp_path / "in"), "--add", "volume, epsilon_exact", "-o", str(tmp_path / "out")]
-    assert "1 shard, 4 rows" in CliRunner().invoke(app, [*arguments, "--workers", "1"]).stdout
-    assert "0 rows, 0 rows/s; 4 rows there already" in CliRunner().invoke(app, arguments).stdout
+    assert "(1 shard)" in CliRunner().invoke(app, [*arguments, "--workers", "1"]).stdout
+    assert "rows     0; 4 were there already" in CliRunner().invoke(app, arguments).stdout
     assert CliRunner().invoke(app, [*arguments, "--quiet"]).stdout == ""
     assert set(read_shard(tmp_path / "out" / "0.h5").grasps.metrics) >= set(BOTH)

@@ -16,6 +16,8 @@ from lgrasp_cli.renamed import renew
         ("hands add my.urdf --force", "hands add my.urdf --overwrite"),
         ("generate --force -n 3", "generate --overwrite --rebuild -n 3"),
         ("generate --resume", "generate"),
+        ("place --object mug --shard-index 2", "place --object mug --shard 2"),
+        ("generate --object mug --reuse", "generate --object mug --passes=8"),
         ("bench table1 --resume", "bench table1 --resume"),
         ("bench sequence --physics=seq6", "bench sequence --simulate=seq6"),
         ("simulate x --threads 2", "simulate x --workers 2"),

@@ -97,9 +97,9 @@ def test_report(sequence, tmp_path):
     assert data["reached"][0] >= data["reached"][1] >= 6
     assert data["penetration"][1] < 2.0
     assert "6 of 6 requested" in result.out
-    assert "index-palm" in result.out
-    again = sequence("sphere", "mug", "-n", "6", "--scale", "0.06:0.08")
+    again = sequence("sphere", "mug", "-n", "6", "--scale", "0.06:0.08", "--verbose")
     assert "(6 already present)" in again.out
+    assert "policy lookahead" in again.out
 
 
 def test_sets(cli, small, tmp_path):

@@ -91,11 +91,10 @@ def export_shards(
         ShardError: A shard is damaged, of another hand, lacks a column, holds what the format cannot; no row is left.
         OutputError: The folder is not empty or cannot be written.
     """
-    if to not in FORMATS:
-        raise ConfigError(f"--to '{to}': choose one of {', '.join(FORMATS)}")
     if limit is not None and limit < 1:
         raise ConfigError(f"--limit {limit}: must be at least 1")
-    form, conditions, out = FORMATS[to], [parse_condition(text) for text in where], Path(out)
+    to = to.replace("_", "-")
+    form, conditions, out = _format(to), [parse_condition(text) for text in where], Path(out)
     check_empty(out, run_key)
     selection = select_rows(paths, where=conditions, limit=limit, single=form.single)
     frames = HandFrames(selection.hand.urdf, selection.hand.base_link, selection.hand.joint_names, selection.shards[0])
@@ -133,6 +132,12 @@ def read_grasps(path: str | PathLike[str], form: str, *, joint_names: Sequence[s
         ConfigError: An unknown format.
         ShardError: A file is missing, damaged, of another format, or names other joints.
     """
-    if form not in FORMATS:
-        raise ConfigError(f"unknown format '{form}': choose one of {', '.join(FORMATS)}")
-    return FORMATS[form].read(Path(path), joint_names=joint_names)
+    return _format(form).read(Path(path), joint_names=joint_names)
+
+
+def _format(name: str) -> Format:
+    """A format; - and _ are the same."""
+    found = FORMATS.get(name.replace("_", "-"))
+    if found is None:
+        raise ConfigError(f"unknown format '{name}': choose one of {', '.join(FORMATS)}")
+    return found

@@ -200,7 +200,7 @@ def test_wrong_dexgraspnet(tmp_path, entry, words):
 @pytest.mark.parametrize("form", FORMATS)
 def test_damaged_exports(tmp_path, shards, form):
     shards.make(tmp_path / "a.h5", n=2)
-    export_shards(tmp_path / "a.h5", tmp_path / "out", form)
+    export_shards(tmp_path / "a.h5", tmp_path / "out", form.replace("-", "_"))
     with pytest.raises(ConfigError, match="choose one of"):
         read_grasps(tmp_path / "out", "h5")
     other = next(name for name in FORMATS if name != form)
