@@ -99,7 +99,7 @@ def test_report(sequence, tmp_path):
     assert "6 of 6 requested" in result.out
     again = sequence("sphere", "mug", "-n", "6", "--scale", "0.06:0.08", "--verbose")
     assert "(6 already present)" in again.out
-    assert "policy lookahead" in again.out
+    assert "method field" in again.out
 
 
 def test_sets(cli, small, tmp_path):
