@@ -67,7 +67,7 @@ def contact_arrays(
         key = b"".join(np.round(m.vertices, 9).tobytes() for m in meshes[entry.link])
         grid = (known or {}).get(entry.link) or made.get(key)
         grids.append(grid or made.setdefault(key, link_grid(meshes[entry.link], device)))
-    joined = [joined_mesh(meshes[entry.link]) for entry in links]
+    joined = [outer_mesh(meshes[entry.link]) for entry in links]
     # grids in the order given, points group by group
     order = sorted(range(len(links)), key=lambda i: links[i].group)
     flat = [links[i] for i in order]
@@ -125,6 +125,15 @@ def joined_mesh(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     whole = trimesh.util.concatenate(meshes)
     assert isinstance(whole, trimesh.Trimesh)
     return whole
+
+
+def outer_mesh(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """The surface of the union of solids, without what one covers of another; all of it where they are no solids."""
+    if len(meshes) > 1 and all(mesh.is_volume for mesh in meshes):
+        whole = trimesh.boolean.union(meshes, engine="manifold")
+        if whole.is_volume:
+            return whole
+    return joined_mesh(meshes)
 
 
 class ContactSurface(NamedTuple):

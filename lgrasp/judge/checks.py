@@ -12,6 +12,7 @@ from lgrasp.judge.collision import PlacedSolids, hand_in_object, object_in_objec
 from lgrasp.judge.hand import pose_transforms
 from lgrasp.judge.meshes import PROBES
 from lgrasp.judge.shard import JudgedShard
+from lgrasp.judge.solids import on_links
 from lgrasp.judge.wrench import ferrari_canny, force_errors, wrench_residual
 
 CHECKS: dict[str, tuple[str, float]] = {
@@ -177,7 +178,8 @@ class RowChecks:
             object_normals[m] = obj.surface.normals(points[m])
         links = self.link_of[r, o, c]
         T = np.linalg.inv(T_objects[i, o]) @ T_links[i, links]  # object from link
-        on_link, link_normals = self._on_links(links, np.einsum("nji,nj->ni", T[:, :3, :3], points - T[:, :3, 3]))
+        local = np.einsum("nji,nj->ni", T[:, :3, :3], points - T[:, :3, 3])
+        on_link, link_normals = on_links(self.hand.solids, links, local, -np.einsum("nji,nj->ni", T[:, :3, :3], given))
         link_normals = np.einsum("nij,npj->npi", T[:, :3, :3], link_normals)
         between = angle_deg(-link_normals[:, :, None], object_normals[:, None])  # (n, P, P)
         length = np.linalg.norm(given, axis=1, keepdims=True)
@@ -192,21 +194,6 @@ class RowChecks:
         nominal = between[:, :, 0].min(axis=1) <= bounds.NORMAL_DEG
         chosen = np.where(nominal, 0, between.min(axis=1).argmin(axis=1))
         self.normals[r, o, c] = object_normals[np.arange(len(r)), chosen]
-
-    def _on_links(self, links: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Signed distance to the union of the named link's solids and the admissible normals there (link frame)."""
-        distance = np.full(len(points), np.inf)
-        normals = np.zeros((len(points), len(PROBES) + 1, 3))
-        for solid in self.hand.solids:
-            m = np.flatnonzero(links == solid.link)
-            signed = solid.signed(points[m])
-            closer = signed < distance[m]
-            m, signed = m[closer], signed[closer]
-            if len(m):
-                found = solid.normals(points[m])
-                distance[m] = signed
-                normals[m] = found[:, [*range(found.shape[1]), *[0] * (normals.shape[1] - found.shape[1])]]
-        return distance, normals
 
     def _wrenches(self, row: int, epsilon: bool) -> None:
         """Of several objects the worst; an object without contacts is held by nothing."""

@@ -2,13 +2,14 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import trimesh
 
 from lgrasp.judge.bounds import JudgeError
-from lgrasp.judge.meshes import PROBES, MeshDistance, surface_samples
+from lgrasp.judge.meshes import FEATURE, PROBES, MeshDistance, surface_samples
 
 try:
     import coal
@@ -19,6 +20,8 @@ SAMPLES = 2_000
 """Sampled points of a solid, beside every vertex."""
 DENT = 5e-4
 """A mesh whose hull is nowhere further from its surface counts as convex [m]."""
+
+_EXIT_STEPS = 12  # along the way out of a link's solids
 
 
 class JudgedSolid(ABC):
@@ -164,3 +167,42 @@ def mesh_solids(link: int, T: np.ndarray, mesh: trimesh.Trimesh) -> list[JudgedS
     if len(parts) > 1 and all(p.is_watertight and p.volume > 0 for p in parts):
         return [MeshSolid(link, T, p) for p in parts]
     return [MeshSolid(link, T, mesh)]
+
+
+def on_links(
+    solids: Sequence[JudgedSolid], links: np.ndarray, points: np.ndarray, ways: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distance to the union of the named link's solids and the admissible normals there (link frame).
+
+    Inside of two solids the nearest face may be covered by the other one; admissible are then also the normals
+    where the way into the object (n, 3) leaves the union, at most twice as far as its surface is.
+    """
+    distance, normals = _union(solids, links, points)
+    leave, end = points.copy(), np.where(distance < 0, FEATURE - 2.0 * distance, 0.0)
+    gone, depth = np.zeros(len(points)), -distance
+    for _ in range(_EXIT_STEPS):
+        gone = np.where(depth > 0, gone + np.maximum(depth, 1e-6), gone)
+        leave = points + ways * np.minimum(gone, end)[:, None]
+        depth = -_union(solids, links, leave, with_normals=False)[0]
+    out = (distance < 0) & (depth <= 1e-6) & (gone <= end)
+    more = normals.copy()
+    more[out] = _union(solids, links[out], leave[out])[1]
+    return distance, np.concatenate([normals, more], axis=1)
+
+
+def _union(
+    solids: Sequence[JudgedSolid], links: np.ndarray, points: np.ndarray, *, with_normals: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distance (n,), and admissible normals (n, P, 3) of the solid that is nearest, or deepest about."""
+    distance = np.full(len(points), np.inf)
+    normals = np.zeros((len(points), len(PROBES) + 1, 3))
+    for solid in solids:
+        m = np.flatnonzero(links == solid.link)
+        signed = solid.signed(points[m])
+        closer = signed < distance[m]
+        m, signed = m[closer], signed[closer]
+        distance[m] = signed
+        if len(m) and with_normals:
+            found = solid.normals(points[m])
+            normals[m] = found[:, [*range(found.shape[1]), *[0] * (normals.shape[1] - found.shape[1])]]
+    return distance, normals

@@ -15,7 +15,7 @@ from lgrasp.hand.geometry import convex_piece, geometry_mesh, inner_spheres, lin
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
 from lgrasp.hand.piece import Piece
-from lgrasp.hand.surface import joined_mesh
+from lgrasp.hand.surface import joined_mesh, outer_mesh
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Geometry, Joint, read_urdf
 
@@ -288,3 +288,15 @@ def test_recessed_surface_is_no_contact():
     assert (points[up, 2] > 0.0074).mean() > 0.5
     assert not (up & (np.abs(points[:, 0]) < 0.005)).any()
     assert (normals[:, 2] < -0.99).sum() > 50
+
+
+def test_what_one_solid_covers_of_another_is_no_surface():
+    balls = [trimesh.creation.icosphere(4, 0.01).apply_translation([x, 0, 0]) for x in (0.0, 0.01)]
+    whole = outer_mesh(balls)
+    assert whole.is_volume
+    for x in (0.0, 0.01):  # icospheres lie inside of their spheres by up to 0.1 mm
+        assert np.linalg.norm(whole.triangles_center - [x, 0, 0], axis=1).min() > 0.0098
+    cap = np.pi * 0.005**2 * (3 * 0.01 - 0.005) / 3
+    assert whole.volume == pytest.approx(2 * (4 / 3 * np.pi * 0.01**3 - cap), rel=0.01)
+    open_ball = trimesh.Trimesh(balls[0].vertices, balls[0].faces[1:], process=False)
+    assert len(outer_mesh([balls[1], open_ball]).faces) == len(balls[1].faces) + len(open_ball.faces)

@@ -26,7 +26,7 @@ from lgrasp.judge.hand import origin
 from lgrasp.judge.meshes import MeshDistance
 from lgrasp.judge.run import judge
 from lgrasp.judge.shard import _resolver
-from lgrasp.judge.solids import SAMPLES, BoxSolid, CylinderSolid, MeshSolid, SphereSolid
+from lgrasp.judge.solids import SAMPLES, BoxSolid, CylinderSolid, MeshSolid, SphereSolid, on_links
 from lgrasp.judge.wrench import cone_forces, ferrari_canny, wrench_residual
 from lgrasp_cli.main import app
 
@@ -318,6 +318,20 @@ def test_primitives_against_their_mesh(kind: str) -> None:
     np.testing.assert_allclose(solid.normals(points)[smooth, 0], gradient[smooth], atol=1e-4)
     assert len(solid.samples) >= 0.95 * SAMPLES
     np.testing.assert_allclose(solid.signed(solid.samples), 0.0, atol=1e-12)
+
+
+def test_a_face_that_another_solid_covers_has_no_say() -> None:
+    """A rod whose end is inside a ball, 0.2 mm under its cap: the surface there is the ball's, or the rod's side."""
+    up = origin(None)
+    up[2, 3] = 0.02
+    rod, ball = CylinderSolid(0, origin(None), np.array([0.007, 0.02])), SphereSolid(0, up, np.array([0.0075]))
+    points = np.array([[0.0067, 0.0, 0.0198], [0.0067, 0.0, 0.0198], [0.0067, 0.0, 0.0]])
+    ways = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 1.0, 0]])
+    distance, normals = on_links([rod, ball], np.zeros(3, int), points, ways)
+    assert (distance > -1e-3).all()
+    angle = np.degrees(np.arccos(np.clip(np.einsum("npk,nk->np", normals, ways), -1, 1))).min(axis=1)
+    assert angle[0] < 3  # the way out is through the ball
+    assert (angle[1:] > 60).all()  # askew of the surfaces
 
 
 def test_dented_meshes_are_not_hulls() -> None:
