@@ -31,7 +31,14 @@ _RERUN = 900.0  # [s] that a command may take
 _TWICE = 0.3  # [s] between two Ctrl-C
 _MOST_WORDS = 2000  # letters of an output that are reported
 _EVERY = 0.02  # [s] between looks at processes
-_OWN = {"created", "bytes", "sha256", "text_sha256", "seconds"}  # of each run: times, and sums of what holds times
+_OWN = {
+    "created",
+    "bytes",
+    "sha256",
+    "text_sha256",
+    "seconds",
+    "seconds_load",
+}  # of each run: times, and sums of what holds times
 
 
 class Command(NamedTuple):

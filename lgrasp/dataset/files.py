@@ -30,12 +30,23 @@ def parsing(path: str | os.PathLike[str], what: str = "", kinds: tuple[type[Exce
         raise ShardError(f"{path}: not {what}: {reason}") from error
 
 
+def check_regular(path: str | os.PathLike[str]) -> None:
+    """Refuse a pipe or device, which would be waited for.
+
+    Raises:
+        ShardError: It is there, and is a pipe, a device or a folder.
+    """
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise ShardError(f"{path}: no regular file")
+
+
 def sha256(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file, in hexadecimal digits.
 
     Raises:
         ShardError: It cannot be read.
     """
+    check_regular(path)
     with parsing(path), open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -88,6 +99,8 @@ def _found(paths: Paths, pattern: str, leave_out: Path | None = None) -> list[tu
     for path in given:
         if not path.exists():
             raise ShardError(f"{path}: no such file or folder")
+        if not path.is_dir():
+            check_regular(path)
         found += [(file, path) for file in sorted(path.glob(pattern))] if path.is_dir() else [(path, path.parent)]
     if leave_out is not None:
         found = [(file, top) for file, top in found if not file.resolve().is_relative_to(leave_out.resolve())]
@@ -109,6 +122,7 @@ def check_heaps(path: str | os.PathLike[str]) -> None:
     Raises:
         ShardError: The file cannot be read, or an entry of a heap does not fit.
     """
+    check_regular(path)
     with parsing(path), open(path, "rb") as file:
         if os.fstat(file.fileno()).st_size == 0:
             return  # opening it reports this better

@@ -11,7 +11,7 @@ from typing import Any, Self
 import h5py
 import numpy as np
 
-from lgrasp.dataset.files import check_heaps
+from lgrasp.dataset.files import check_heaps, check_regular
 from lgrasp.dataset.structure import expand, format_problems, shard_problems
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
@@ -38,6 +38,7 @@ def open_hdf5(path: str | os.PathLike[str]) -> h5py.File:
         ShardError: No such file, not permitted, or not a whole HDF5 file.
     """
     try:
+        check_regular(path)
         with open(path, "rb"):
             return h5py.File(path, "r", locking=False)
     except OSError as error:

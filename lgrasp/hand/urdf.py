@@ -87,6 +87,8 @@ def read_robot(path: Path) -> tuple[etree._Element, bytes]:
         HandError: a file that cannot be read or is too large, and as of :func:`parse_robot`.
     """
     try:
+        if not path.is_file() and path.exists():
+            raise HandError(f"URDF {path} cannot be read: no regular file")
         if path.stat().st_size > _MOST_BYTES:
             raise HandError(f"URDF {path} has {path.stat().st_size:,} bytes; at most {_MOST_BYTES:,} are read")
         raw = path.read_bytes()

@@ -18,7 +18,7 @@ def find_shards(given: Sequence[str | Path]) -> list[Path]:
         files = sorted(path.rglob("*.h5")) if path.is_dir() else [path]
         if not files:
             raise JudgeError(f"{path}: no shard (*.h5) in this folder")
-        found += files
+        found += map(existing, files)
     return list(dict.fromkeys(found))
 
 
@@ -30,6 +30,8 @@ def existing(path: str | Path) -> Path:
     """
     if not Path(path).exists():
         raise JudgeError(f"{path}: no such file or folder")
+    if not Path(path).is_dir() and not Path(path).is_file():
+        raise JudgeError(f"{path}: no regular file")
     return Path(path)
 
 

@@ -54,6 +54,9 @@ def judge(
     start = time.perf_counter()
     sources = {k: existing(p) for k, p in meshes.items()}
     read = [read_shard(p, None if urdf is None else existing(urdf), sources) for p in paths]
+    known = {name for s in read for name in s.object_ids}
+    if unknown := [name for name in sources if name and name not in known]:
+        raise JudgeError(f"mesh of object '{unknown[0]}': the shards hold {', '.join(sorted(known))}")
     counts = [len(s.kept_invalid) for s in read]
     total = sum(counts)
     if not total:

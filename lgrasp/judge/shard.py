@@ -51,6 +51,7 @@ class JudgedShard:
     hand_key: str
     joint_names: list[str]
     link_names: list[str]
+    object_ids: list[str]
     objects: list[JudgedObject]
     object_keys: list[str]
     grasps: dict[str, np.ndarray]
@@ -205,6 +206,7 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
         hand_key=hand_key,
         joint_names=joint_names,
         link_names=link_names,
+        object_ids=list(objects),
         objects=[obj for obj, _ in objects.values()],
         object_keys=[key for _, key in objects.values()],
         grasps=grasps,

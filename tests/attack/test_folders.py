@@ -1,5 +1,6 @@
 """Folders in which files are damaged, missing or in each other's place: what can be used is, the rest is told."""
 
+import os
 import shutil
 from dataclasses import replace
 
@@ -8,11 +9,16 @@ import pytest
 from support.jaws import jaw_rows, jaw_shard
 
 from lgrasp import notices
+from lgrasp.dataset.files import check_heaps, sha256
+from lgrasp.dataset.reader import open_hdf5
 from lgrasp.dataset.scenes import SceneRows
 from lgrasp.dataset.status import folder_states
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.errors import ShardError
+from lgrasp.errors import HandError, ShardError
+from lgrasp.hand.urdf import read_robot
+from lgrasp.judge.bounds import JudgeError
+from lgrasp.judge.run import judge
 
 
 @pytest.fixture
@@ -80,3 +86,24 @@ def test_states_of_files_that_cannot_be_read(run, tmp_path):
     (state,) = folder_states([tmp_path])
     assert state["state"] == "damaged"
     assert state["changed"] == {first.name: "it cannot be read: No such file or directory"}
+
+
+def test_pipes_are_not_waited_for(folder, told):
+    os.mkfifo(folder / "4.h5")
+    assert [path.name for path in SceneRows(folder).files] == ["0.h5", "1.h5"]
+    for read, refused in (
+        (SceneRows, ShardError),
+        (check_heaps, ShardError),
+        (sha256, ShardError),
+        (open_hdf5, ShardError),
+        (judge, JudgeError),
+        (read_robot, HandError),
+    ):
+        with pytest.raises(refused, match=r"4\.h5.*no regular file"):
+            read(folder / "4.h5")
+
+
+def test_a_mesh_of_no_object_is_not_ignored(folder, tmp_path):
+    (tmp_path / "box.obj").touch()
+    with pytest.raises(JudgeError, match="mesh of object 'other': the shards hold cube"):
+        judge(folder / "0.h5", mesh={"other": tmp_path / "box.obj"})
