@@ -30,6 +30,7 @@ def main() -> None:
     _fill_streams()
     heed_signals()
     _gather_temporaries()
+    os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is drawn with it; looking for a screen takes a process
     from lgrasp_cli.main import main as command
 
     try:

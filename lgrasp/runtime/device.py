@@ -48,6 +48,7 @@ def start() -> None:
     wp.config.log_level = wp.LOG_ERROR
     if "WARP_CACHE_PATH" not in os.environ:
         wp.config.kernel_cache_dir = str(usable_folder(cache_dir() / "kernels"))
+    _share_memory()
     with _without_driver_warning():
         wp.init()
     folder = Path(wp.config.kernel_cache_dir)  # Warp added its version
@@ -55,6 +56,14 @@ def start() -> None:
     drop_damaged(folder)
     atexit.register(note_checksums, folder)
     _started = True
+
+
+def _share_memory() -> None:
+    """Have threads of the C library's allocator share memory: else what batches free in one place stays unused for all
+    others, and a process grows by megabytes a shard. A ``MALLOC_ARENA_MAX`` set by the user wins."""
+    if "MALLOC_ARENA_MAX" not in os.environ:
+        with contextlib.suppress(OSError, AttributeError):  # another C library
+            ctypes.CDLL(None).mallopt(-8, cores())  # M_ARENA_MAX; 8 a core by default
 
 
 @contextlib.contextmanager

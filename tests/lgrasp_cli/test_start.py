@@ -108,3 +108,20 @@ def test_generating_from_the_cache_imports_nothing_slow(run, cache_root, tmp_pat
     assert slow == "[]"
     assert set(ast.literal_eval(others)) <= {"lgrasp.refine.params"}
     assert list((tmp_path / "other").glob("*.h5"))
+
+
+def test_mujoco_looks_for_no_screen():
+    """It starts a process for that, which a signal leaves behind with a traceback."""
+    pytest.importorskip("mujoco")
+    code = """
+import os, sys
+from lgrasp_cli import __main__ as command
+os._exit = lambda code: None
+sys.argv = ["lgrasp", "--version"]
+command.main()
+import mujoco
+print("glfw" in sys.modules)
+"""
+    environment = {name: text for name, text in os.environ.items() if name != "MUJOCO_GL"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert done.stdout.split()[-1] == "False"
