@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         Object,
         generate,
         hands,
+        load,
         load_hand,
         load_object,
         objects,
@@ -60,6 +61,7 @@ __all__ = [
     "generate",
     "hands",
     "judge",
+    "load",
     "load_hand",
     "load_object",
     "load_pipeline",
@@ -82,7 +84,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "lgrasp.api": "Grasps Hand Object generate hands load_hand load_object objects open pipelines plan read_cloud "
+    "lgrasp.api": "Grasps Hand Object generate hands load load_hand load_object objects open pipelines plan read_cloud "
     "refine sequence simulate",
     "lgrasp.dataset.exports.formats": "export_shards read_grasps",
     "lgrasp.dataset.merge": "merge_shards",

@@ -266,6 +266,10 @@ def open(path: Name) -> Grasps:
     return _made(find_shards([Path(path)]))
 
 
+load = open
+"""The same by the name that other libraries give it."""
+
+
 def read_cloud(path: Name, mask: Name | None = None, label: int | None = None, **options: Any) -> Cloud:
     """A point cloud of a file (.ply, .npy, .npz, ... or a scene of this project), with its target.
 

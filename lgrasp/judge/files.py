@@ -1,7 +1,7 @@
 """Which files are judged; light to import, so that a missing one is told at once."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from lgrasp.judge.bounds import JudgeError
@@ -41,10 +41,11 @@ def check_report(path: str) -> None:
     Raises:
         JudgeError: they cannot.
     """
-    from lgrasp.files import check_file
-
-    with _telling():
-        check_file(path)
+    target = Path(path)
+    if target.is_dir():
+        raise JudgeError(f"file {path} cannot be written: it is a folder; name a file")
+    if not os.access(target.parent, os.W_OK):
+        raise JudgeError(f"file {path} cannot be written: its folder is missing or read-only")
 
 
 def write_report(path: str, text: str) -> None:
@@ -53,18 +54,10 @@ def write_report(path: str, text: str) -> None:
     Raises:
         JudgeError: it cannot be written.
     """
-    from lgrasp.files import write_file
-
-    with _telling():
-        write_file(path, text)
-
-
-@contextmanager
-def _telling() -> Iterator[None]:
-    """Files are all that the judge shares with the rest, and those only where it is asked to write one."""
-    from lgrasp.errors import OutputError
-
+    made = Path(f"{path}.tmp")
     try:
-        yield
-    except OutputError as error:
-        raise JudgeError(str(error)) from error
+        made.write_text(text, encoding="utf-8")
+        made.replace(path)
+    except OSError as error:
+        made.unlink(missing_ok=True)
+        raise JudgeError(f"file {path} cannot be written: {error.strerror}") from error

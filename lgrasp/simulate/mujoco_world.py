@@ -52,15 +52,15 @@ class MujocoWorld:
         """Go on for some steps of the protocol."""
         self._lib.mj_step(self._m, self.data, steps)
 
-    def save(self) -> np.ndarray:
+    def state(self) -> np.ndarray:
         """Everything that decides what comes next."""
         spec = self._lib.mjtState.mjSTATE_INTEGRATION
         state = np.zeros(self._lib.mj_stateSize(self._m, spec))
         self._lib.mj_getState(self._m, self.data, state, spec)
         return state
 
-    def load(self, state: np.ndarray) -> None:
-        """Inverse of :meth:`save`."""
+    def restore(self, state: np.ndarray) -> None:
+        """Inverse of :meth:`state`."""
         self._lib.mj_setState(self._m, self.data, state, self._lib.mjtState.mjSTATE_INTEGRATION)
 
     def objects(self) -> np.ndarray:

@@ -100,13 +100,13 @@ class PhysxWorld:
                     joint.set_drive_target(float(multiplier * now[source] + offset))
             self._system.step()
 
-    def save(self) -> Any:
+    def state(self) -> Any:
         """Everything that decides what comes next, as far as PhysX gives it: not the contacts that it remembers."""
         targets = [float(joint.get_drive_target()[0]) for joint in self._driven]
         return self._system.pack(), targets, self._forces.copy()
 
-    def load(self, state: Any) -> None:
-        """Inverse of :meth:`save`."""
+    def restore(self, state: Any) -> None:
+        """Inverse of :meth:`state`."""
         packed, targets, forces = state
         self._forget()
         self._system.unpack(packed)

@@ -94,19 +94,19 @@ class Trial:
 
     def _touching_at_rest(self) -> int:
         """Fewest links on any object, at rest at the targets; the trial then continues from the previous state."""
-        before = self._world.save()
+        before = self._world.state()
         self._step(self._steps(self._protocol.settle))
         touching = self._world.links_touching()
-        self._world.load(before)
+        self._world.restore(before)
         return int(touching.min())
 
     def _pull_all(self, closed: Closed, pulls: Pulls) -> bool:
         """Run directions into ``pulls`` until all is decided; True if one diverged."""
         diverged, holds, stays = False, True, True
-        squeezed = self._world.save()
+        squeezed = self._world.state()
         base = self._world.frames()[1][self._model.base_body]
         for k, direction in enumerate(AXES @ base.T):
-            self._world.load(squeezed)
+            self._world.restore(squeezed)
             pulls.moved[k], pulls.depth[k] = self._pull(direction, closed)
             if self._world.wild():
                 diverged, pulls.held[k], pulls.moved[k] = True, 0, np.nan
