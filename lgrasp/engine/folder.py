@@ -82,7 +82,8 @@ def found_shard(path: Path) -> Found:
         # of a file with sequences only the whole ones count, and rounds are tried
         rows = int(statistics.get("sequences", len(reader)))
         tried = statistics.get("rounds" if "sequences" in statistics else "candidates", 0)
-        simulated = tuple(name for name in get_args(ProtocolName) if f"{name}_tried" in statistics)
+        names = [prefix + name for prefix in ("", "physx_") for name in get_args(ProtocolName)]
+        simulated = tuple(name for name in names if f"{name}_tried" in statistics)
         tried = int(tried) if statistics.get("exhausted") else 0
         return Found(config.get("run_key"), rows, tried, simulated, reader.header.shard_index)
 
