@@ -1,7 +1,7 @@
 """The same hand and objects in PhysX (package sapien): hard contacts, no torsional friction."""
 
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,7 +16,8 @@ CONTACT_OFFSET = 0.002
 ITERATIONS = (25, 1)
 """Of the solver (TGS), on positions and velocities."""
 
-_COUPLING = 1.0e5  # stiffness of the tendons that couple joints
+_TENDON = 1.0e5  # stiffness of a tendon that couples joints
+_COUPLING = 5.0  # stiffness of a mimic joint's drive over that of its source
 _AWAY = 10.0  # [m] where objects wait while the contacts of the grasp before are forgotten
 _ROTATE_X_TO_Z = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # w x y z: PhysX's capsules lie along x, MuJoCo's along z
 
@@ -39,12 +40,22 @@ def import_physx() -> Any:
     return sapien
 
 
+class _Follower(NamedTuple):
+    """A mimic joint: multiplier x source + offset."""
+
+    joint: int
+    source: int
+    multiplier: float
+    offset: float
+    stiffness: float
+
+
 class PhysxWorld:
     """A PhysX scene made of what MuJoCo compiled: its bodies, inertias, shapes, joints and drives, number by number.
 
     The interface is that of :class:`lgrasp.simulate.mujoco_world.MujocoWorld`. Contacts are hard; friction
     acts at the points of a contact patch without torsional term, and a mimic joint is held to its source by a stiff
-    tendon where one can run between them, by a drive that follows it elsewhere.
+    tendon if it is the next one, else driven after its source, which bears its torque.
 
     Args:
         model: O objects in the order of the rows.
@@ -66,7 +77,7 @@ class PhysxWorld:
         self._hand.set_qpos(positions)
         self._hand.set_qvel(np.zeros_like(positions))
         self.drive(model.controls(q))
-        base = self._links[model.base_body].entity.pose
+        base = self.links[model.base_body].entity.pose
         for component, pose in zip(self._objects, poses.astype(float), strict=True):
             component.entity.pose = base * self._sapien.Pose(pose[:3], pose[3:] / np.linalg.norm(pose[3:]))
             component.set_linear_velocity(np.zeros(3))
@@ -95,10 +106,19 @@ class PhysxWorld:
             for component, force in zip(self._objects, self._forces, strict=True):
                 component.add_force_torque(force, np.zeros(3))
             if self._followers:
-                now = self._hand.get_qpos()
-                for joint, source, multiplier, offset in self._followers:
-                    joint.set_drive_target(float(multiplier * now[source] + offset))
+                self._follow()
             self._system.step()
+
+    def _follow(self) -> None:
+        """Mimic joints go where their sources are, which bear their torques."""
+        q, speed = self._hand.get_qpos(), self._hand.get_qvel()
+        borne = np.zeros_like(q)
+        for f in self._followers:
+            target, velocity = f.multiplier * q[f.source] + f.offset, f.multiplier * speed[f.source]
+            self._joints[f.joint].set_drive_target(float(target))
+            self._joints[f.joint].set_drive_velocity_target(float(velocity))
+            borne[f.source] -= f.multiplier * f.stiffness * (target - q[f.joint])
+        self._hand.set_qf(borne)
 
     def state(self) -> Any:
         """Everything that decides what comes next, as far as PhysX gives it: not the contacts that it remembers."""
@@ -174,18 +194,18 @@ class PhysxWorld:
         self._scene = self._sapien.Scene([self._system])
         self._material = px.PhysxMaterial(model.protocol.friction, model.protocol.friction, 0.0)
         self._objects: list[Any] = []
-        self._links: dict[int, Any] = {}
+        self.links: dict[int, Any] = {}
         self._build()
-        self._number = {component: body for body, component in self._links.items()}
+        self._number = {component: body for body, component in self.links.items()}
         self._number |= {c: int(b) for b, c in zip(model.object_body, self._objects, strict=True)}
-        self._hand = self._links[0].articulation
+        self._hand = self.links[0].articulation
         self._joints = list(self._hand.get_active_joints())
         order = {joint.child_link: k for k, joint in enumerate(self._joints)}
         hand_joints = [j for j in range(m.njnt) if m.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
-        self._column = np.array([order[self._links[int(m.jnt_bodyid[j])]] for j in hand_joints])
+        self._column = np.array([order[self.links[int(m.jnt_bodyid[j])]] for j in hand_joints])
         row = {j: k for k, j in enumerate(hand_joints)}
         self._driven = [self._joints[self._column[row[int(m.actuator_trnid[a, 0])]]] for a in range(m.nu)]
-        self._followers: list[tuple[Any, int, float, float]] = []
+        self._followers: list[_Follower] = []
         self._couple(row)
         self._forces = np.zeros((len(self._objects), 3), np.float32)
 
@@ -211,9 +231,9 @@ class PhysxWorld:
                 component = px.PhysxRigidDynamicComponent()
                 self._objects.append(component)
             else:
-                parent = self._links[int(m.body_parentid[body])] if body else None
+                parent = self.links[int(m.body_parentid[body])] if body else None
                 component = px.PhysxArticulationLinkComponent(parent)
-                self._links[body] = component
+                self.links[body] = component
                 self._join(body, component)
             self._add_shapes(body, component)
             if body:
@@ -276,33 +296,22 @@ class PhysxWorld:
             component.attach(shape)
 
     def _couple(self, row: dict[int, int]) -> None:
-        """Hold mimic joints to their sources."""
+        """Hold mimic joints to their sources: by tendons where one link follows the other, else by :meth:`_follow`."""
         m = self._m
-        for e in range(m.neq):
-            if m.eq_type[e] != self._mujoco.mjtEq.mjEQ_JOINT:
-                continue
-            follower, source = int(m.eq_obj1id[e]), int(m.eq_obj2id[e])
+        for e in np.flatnonzero(m.eq_type == self._mujoco.mjtEq.mjEQ_JOINT):
+            follower, source = (int(self._column[row[int(j)]]) for j in (m.eq_obj1id[e], m.eq_obj2id[e]))
             offset, multiplier = (float(x) for x in m.eq_data[e, :2])
-            joint, leader = (self._joints[self._column[row[j]]] for j in (follower, source))
-            if joint.parent_link == leader.child_link:
-                root = leader.parent_link
-            elif joint.parent_link == leader.parent_link:
-                root = joint.parent_link
-            else:
-                root = None
-            if root is None or not multiplier:
-                drive = [self._joints.index(d) for d in self._driven]
-                a = drive.index(self._joints.index(leader)) if self._joints.index(leader) in drive else None
-                kp, kd = (
-                    (self._driven[a].get_stiffness(), self._driven[a].get_damping()) if a is not None else (5.0, 0.1)
+            joint, leader = self._joints[follower], self._joints[source]
+            if joint.parent_link == leader.child_link and multiplier:
+                self._hand.create_fixed_tendon(
+                    [leader.parent_link, leader.child_link, joint.child_link],
+                    [0, -multiplier, 1],
+                    [0, -multiplier, 1],  # forces, by virtual work
+                    rest_length=offset,
+                    stiffness=_TENDON,
                 )
-                joint.set_drive_property(float(kp), float(kd))
-                self._followers.append((joint, int(self._column[row[source]]), multiplier, offset))
                 continue
-            self._hand.create_fixed_tendon(
-                [root, leader.child_link, joint.child_link],
-                [0, -multiplier, 1],
-                [0, -1 / multiplier, 1],
-                rest_length=offset,
-                stiffness=_COUPLING,
-            )
+            stiffness = float(_COUPLING * m.actuator_gainprm[:, 0].max())
+            damping = 2.0 * np.sqrt(stiffness * m.dof_M0[m.jnt_dofadr[m.eq_obj1id[e]]])
+            joint.set_drive_property(stiffness, float(damping))
+            self._followers.append(_Follower(follower, source, multiplier, offset, stiffness))
