@@ -125,7 +125,7 @@ class GraspDataset(torch.utils.data.Dataset):
         """
         if by not in ("object", "pose") or not shares or min(shares) <= 0:
             raise ValueError(
-                f"by={by!r}, shares={tuple(shares)}: by is object or pose (a data set has one hand), shares positive"
+                f"by={by!r}, shares={tuple(shares)}: by is object or pose (it has one hand), shares are positive"
             )
         names = self._object_groups() if by == "object" else self._pose_groups()
         groups, group_of, sizes = np.unique(names, return_inverse=True, return_counts=True)
