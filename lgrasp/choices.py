@@ -1,6 +1,6 @@
 """Names of which one is chosen, as types: parameters, configs and options of the command line take the same ones."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 Method = Literal["field", "anneal", "mala"]
 """How a sequence continues with the next object."""
@@ -12,6 +12,12 @@ ProtocolName = Literal["fc", "gravity6", "gravity6_mu1", "seq6", "seq6_mu06"]
 """Protocols of the simulation (:mod:`lgrasp.simulate.protocol`)."""
 EngineName = Literal["mujoco", "physx"]
 """Simulators."""
+VERDICTS: dict[str, tuple[ProtocolName, EngineName]] = {
+    protocol if engine == "mujoco" else f"{engine}_{protocol}": (protocol, engine)
+    for engine in get_args(EngineName)
+    for protocol in get_args(ProtocolName)
+}
+"""How the verdicts of a protocol by a simulator are named."""
 FormatName = Literal["dexgraspnet", "dexgraspbench", "isaac-grasp", "mjcf"]
 """Formats of other programs (:mod:`lgrasp.dataset.exports.formats`)."""
 MetricName = Literal["volume", "epsilon_exact"]

@@ -45,7 +45,6 @@ def new_file(path: str | os.PathLike[str], *, flush: bool = True) -> Iterator[IO
     """
     path = Path(path)
     with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
         temporary = hold_file(path)
         try:
             with open(_held[temporary], "r+b", closefd=False) as file:
@@ -154,11 +153,13 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def hold_file(path: Path) -> Path:
-    """A new temporary file beside a path that is there until this process ends; see :func:`is_held`.
+    """A new temporary file beside a path that is there until this process ends; see :func:`is_held`. Missing parent
+    folders are made.
 
     Raises:
         OSError: The folder cannot be written.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     return _hold(path, lambda name: os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666))
 
 
@@ -173,7 +174,6 @@ def held_file(path: str | os.PathLike[str], data: bytes) -> Iterator[None]:
     """
     path = Path(path)
     with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
         temporary = hold_file(path)
     try:
         with writing(path):

@@ -244,13 +244,15 @@ def bench_refine(
     Example: lgrasp bench refine --objects bottle,mug --starts 40
     """
     check_report(json_path)
+    from lgrasp.hand.names import hand_path
     from lgrasp.jobs.requests.plan import plan_params
-    from lgrasp.jobs.requests.shards import check_hand, check_object
+    from lgrasp.jobs.requests.shards import look_up
+    from lgrasp.object.find import find_object
 
     params = plan_params(settings or ())
-    for names, check in ((hands, check_hand), (objects, check_object)):
+    for names, find in ((hands, hand_path), (objects, find_object)):
         for name in split(names):
-            check(name)
+            look_up(name, find)
     cache = open_cache(cache_dir)
     from lgrasp.bench.refine import NOISES, bench_hands, refine_page
 

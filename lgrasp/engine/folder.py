@@ -3,9 +3,9 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
-from lgrasp.choices import ProtocolName
+from lgrasp.choices import VERDICTS
 from lgrasp.dataset.files import check_heaps
 from lgrasp.errors import ConfigError
 from lgrasp.files import remove_leftovers
@@ -82,8 +82,7 @@ def found_shard(path: Path) -> Found:
         # of a file with sequences only the whole ones count, and rounds are tried
         rows = int(statistics.get("sequences", len(reader)))
         tried = statistics.get("rounds" if "sequences" in statistics else "candidates", 0)
-        names = [prefix + name for prefix in ("", "physx_") for name in get_args(ProtocolName)]
-        simulated = tuple(name for name in names if f"{name}_tried" in statistics)
+        simulated = tuple(name for name in VERDICTS if f"{name}_tried" in statistics)
         tried = int(tried) if statistics.get("exhausted") else 0
         return Found(config.get("run_key"), rows, tried, simulated, reader.header.shard_index)
 

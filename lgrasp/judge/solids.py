@@ -178,15 +178,16 @@ def on_links(
     where the way into the object (n, 3) leaves the union, at most twice as far as its surface is.
     """
     distance, normals = _union(solids, links, points)
-    leave, end = points.copy(), np.where(distance < 0, FEATURE - 2.0 * distance, 0.0)
-    gone, depth = np.zeros(len(points)), -distance
+    more, inside = normals.copy(), np.flatnonzero(distance < 0)
+    leave, depth = points[inside], -distance[inside]
+    gone, end = np.zeros(len(inside)), FEATURE + 2.0 * depth
     for _ in range(_EXIT_STEPS):
-        gone = np.where(depth > 0, gone + np.maximum(depth, 1e-6), gone)
-        leave = points + ways * np.minimum(gone, end)[:, None]
-        depth = -_union(solids, links, leave, with_normals=False)[0]
-    out = (distance < 0) & (depth <= 1e-6) & (gone <= end)
-    more = normals.copy()
-    more[out] = _union(solids, links[out], leave[out])[1]
+        on = np.flatnonzero((depth > 0) & (gone <= end))
+        gone[on] += np.maximum(depth[on], 1e-6)
+        leave[on] = points[inside[on]] + ways[inside[on]] * np.minimum(gone[on], end[on])[:, None]
+        depth[on] = -_union(solids, links[inside[on]], leave[on], with_normals=False)[0]
+    out = (depth <= 1e-6) & (gone <= end)
+    more[inside[out]] = _union(solids, links[inside[out]], leave[out])[1]
     return distance, np.concatenate([normals, more], axis=1)
 
 

@@ -93,6 +93,7 @@ class PhysxWorld:
 
     def drive(self, targets: np.ndarray) -> None:
         """Set the targets of the drives (nu,) [rad or m]."""
+        self._targets = targets
         for joint, target in zip(self._driven, targets, strict=True):
             joint.set_drive_target(float(target))
 
@@ -122,15 +123,14 @@ class PhysxWorld:
 
     def state(self) -> Any:
         """Everything that decides what comes next, as far as PhysX gives it: not the contacts that it remembers."""
-        targets = [float(joint.get_drive_target()[0]) for joint in self._driven]
-        return self._system.pack(), targets, self._forces.copy()
+        return self._system.pack(), self._targets, self._forces.copy()
 
     def restore(self, state: Any) -> None:
         """Inverse of :meth:`state`."""
         packed, targets, forces = state
         self._forget()
         self._system.unpack(packed)
-        self.drive(np.array(targets))
+        self.drive(targets)
         self._forces[:] = forces
 
     def objects(self) -> np.ndarray:
@@ -157,10 +157,10 @@ class PhysxWorld:
         bodies = np.array(bodies, int).reshape(-1, 2)
         return links_touching(bodies, self._model.object_body, self._m.nbody)[0]
 
-    def deepest(self, *, of_links: bool = False) -> float:
-        """Deepest penetration of any object, in a link or in another object; of links in links too if asked [m]."""
+    def deepest(self) -> float:
+        """Deepest penetration of any object, in a link or in another object [m]."""
         own = set(self._model.object_body.tolist())
-        found = [p.separation for pair, points in self._contacts() if of_links or own & {*pair} for p in points]
+        found = [p.separation for pair, points in self._contacts() if own & {*pair} for p in points]
         return max(0.0, -min(found, default=0.0))
 
     def wild(self) -> bool:

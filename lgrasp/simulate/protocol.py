@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from lgrasp.choices import EngineName
+from lgrasp.choices import VERDICTS, EngineName
 from lgrasp.config import Params
 from lgrasp.errors import ConfigError
 from lgrasp.math.constants import DRIVE_STIFFNESS, SLIDING_ARM
@@ -96,8 +96,10 @@ class Protocol(Physics):
 
     def by(self, engine: EngineName) -> "Protocol":
         """The same in a simulator; its columns are named physics/ENGINE_NAME_... unless that is MuJoCo."""
-        name = self.name if engine == "mujoco" else f"{engine}_{self.name}"
-        return self.model_copy(update={"engine": engine, "name": name})
+        if engine == self.engine:
+            return self
+        bare = self.name.removeprefix(f"{self.engine}_")
+        return self.model_copy(update={"engine": engine, "name": bare if engine == "mujoco" else f"{engine}_{bare}"})
 
     def load(self, volume: float) -> Load:
         """Mass, pull and stiffness for an object of some volume [m^3]."""
@@ -145,13 +147,12 @@ that sequences of objects were published with, ``seq6_mu06`` the same on smoothe
 
 
 def find_protocol(name: str) -> Protocol:
-    """A protocol by name; physx_NAME is NAME in PhysX.
+    """A protocol by the name of its verdicts (:data:`lgrasp.choices.VERDICTS`): physx_fc is fc in PhysX.
 
     Raises:
         ConfigError: no protocol of that name.
     """
-    if (bare := name.removeprefix("physx_")) != name and bare in PROTOCOLS:
-        return PROTOCOLS[bare].by("physx")
-    if name not in PROTOCOLS:
+    if name not in VERDICTS:
         raise ConfigError(f"unknown protocol '{name}'; choose {', '.join(PROTOCOLS)}")
-    return PROTOCOLS[name]
+    protocol, engine = VERDICTS[name]
+    return PROTOCOLS[protocol].by(engine)

@@ -7,10 +7,9 @@ import pytest
 import trimesh
 from support.jaws import Jaws, mesh_record, shipped_hand
 from support.kinematics import link_poses
-from support.solids import YOU, prism
+from support.solids import YOU, no_cut, prism
 
 from lgrasp.engine.cache import Cache
-from lgrasp.errors import DecomposeError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.protocol import PROTOCOLS
@@ -21,10 +20,6 @@ mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra si
 
 FC = PROTOCOLS["fc"]
 HANDS = ("allegro", "barrett", "dclaw", "leap", "schunk_svh", "shadow")
-
-
-def no_cut(*_: object, **__: object) -> list[np.ndarray]:
-    raise DecomposeError("made up")
 
 
 @pytest.mark.parametrize("name", HANDS)

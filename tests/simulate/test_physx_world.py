@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 from support.jaws import mesh_record, shipped_hand
+from support.solids import no_cut
 
-from lgrasp.errors import DecomposeError
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.mujoco_world import MujocoWorld
 from lgrasp.simulate.physx_world import PhysxWorld
@@ -14,10 +14,6 @@ from lgrasp.simulate.scene import Scene, hand_of_record, object_of_record
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
-
-
-def no_cut(*_: object, **__: object) -> list[np.ndarray]:
-    raise DecomposeError("made up")
 
 
 def worlds(name: str):

@@ -3,6 +3,8 @@
 import numpy as np
 import trimesh
 
+from lgrasp.errors import DecomposeError
+
 ELL = np.array([[0, 0], [40, 0], [40, 10], [10, 10], [10, 40], [0, 40]]) * 1e-3
 YOU = np.array([[-15, 0], [15, 0], [15, 20], [6, 20], [6, 5], [-6, 5], [-6, 20], [-15, 20]]) * 1e-3
 """A slot 12 mm wide and 15 mm deep in a block of 30 mm by 20 mm."""
@@ -23,3 +25,8 @@ def prism(outline: np.ndarray, length: float = 0.02) -> trimesh.Trimesh:
     assert mesh.is_watertight
     assert mesh.volume > 0
     return mesh
+
+
+def no_cut(*_: object, **__: object) -> list[np.ndarray]:
+    """A decomposition that fails: hulls collide."""
+    raise DecomposeError("made up")

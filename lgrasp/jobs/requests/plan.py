@@ -11,7 +11,9 @@ from lgrasp.config import apply_settings, parse_model
 from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
-from lgrasp.jobs.requests.shards import check_hand, check_object
+from lgrasp.hand.names import hand_path
+from lgrasp.jobs.requests.shards import look_up
+from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
 from lgrasp.planning.params import PlanParams
 
@@ -66,9 +68,9 @@ class PlanRequest(Request):
             )
         if not self.params.distal + self.params.other > 0:
             raise ConfigError("--distal 0 --other 0: nothing pulls the hand to the object; give one of them a weight")
-        check_hand(self.hand)
+        look_up(self.hand, hand_path)
         if self.object is not None:
-            check_object(self.object)
+            look_up(self.object, find_object)
         if isinstance(self.cloud, Path):
             check_file(self.cloud, CLOUD_SUFFIXES, "a point cloud", CloudError)
         if self.mask is not None:

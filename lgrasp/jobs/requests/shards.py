@@ -1,6 +1,7 @@
 """What is asked of the jobs that read shards."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, ClassVar, Self, cast
 
@@ -15,7 +16,6 @@ from lgrasp.files import check_folder
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.names import hand_path
 from lgrasp.learn.params import LearnParams
-from lgrasp.object.find import find_object
 from lgrasp.refine.params import COARSE, LocalSearch
 from lgrasp.simulate.protocol import Protocol, find_protocol
 from lgrasp.stages.refine.params import RefineParams
@@ -44,8 +44,8 @@ class SimulateRequest(ShardRequest):
 
     @model_validator(mode="after")
     def _by_engine(self) -> Self:
-        if self.engine not in (None, self.protocol.engine):
-            self.protocol = find_protocol(self.protocol.name.removeprefix("physx_")).by(self.engine)
+        if self.engine:
+            self.protocol = self.protocol.by(self.engine)
         return self
 
     @property
@@ -97,7 +97,7 @@ class RefineRequest(ShardRequest):
     def check(self) -> None:
         self.numbers(GraspBounds())
         if self.hand is not None:
-            check_hand(self.hand)
+            look_up(self.hand, hand_path)
         if self.form is None:
             super().check()
             return
@@ -156,28 +156,16 @@ class ExportRequest(Request):
         check_folder(self.out)
 
 
-def check_hand(name: str) -> None:
-    """Look up a hand: a name, a path, or a shard that is to hold it.
+def look_up(name: str, find: Callable[[str], object]) -> None:
+    """Look up a hand (``find`` is hand_path) or an object (find_object): a name, a file, or a shard that is to hold it.
 
     Raises:
-        HandError, ShardError: there is none.
+        HandError, ObjectError, ShardError: there is none.
     """
     if name.endswith(".h5"):
         find_shards(Path(name).expanduser())
     else:
-        hand_path(name)
-
-
-def check_object(name: str) -> None:
-    """Look up an object: a name, a mesh file, or a shard that is to hold it.
-
-    Raises:
-        ObjectError, ShardError: there is none.
-    """
-    if name.endswith(".h5"):
-        find_shards(Path(name).expanduser())
-    else:
-        find_object(name)
+        find(name)
 
 
 def refine_params(*, coarse: bool = False, **options: int | None) -> RefineParams:
