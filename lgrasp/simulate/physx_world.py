@@ -15,6 +15,12 @@ CONTACT_OFFSET = 0.002
 """Shapes closer than this have contact points, which press when they are closer than 0 [m]."""
 ITERATIONS = (25, 1)
 """Of the solver (TGS), on positions and velocities."""
+SOLVER = {
+    "contact_offset": CONTACT_OFFSET,
+    "iterations": ITERATIONS,
+    "not_used": ("torsion", "impratio", "noslip"),
+}
+"""What decides a verdict besides the protocol, and the numbers of the protocol that mean nothing here."""
 
 _TENDON = 1.0e5  # stiffness of a tendon that couples joints
 _COUPLING = 5.0  # stiffness of a mimic joint's drive over that of its source

@@ -14,7 +14,7 @@ from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.model import Model, build_model
-from lgrasp.simulate.physx_world import import_physx
+from lgrasp.simulate.physx_world import SOLVER, import_physx
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.trial import Trial
@@ -208,8 +208,9 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
         | protocol.load(solid.volume).model_dump()
         for solid in scene.objects
     ]
+    more: dict[str, Any] = {}
     if protocol.engine == "physx":
-        simulator = f"physx by sapien {import_physx().__version__}"
+        simulator, more = f"physx by sapien {import_physx().__version__}", {"solver": SOLVER}
     else:
         simulator = f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}"
     return protocol.text(
@@ -217,6 +218,7 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
         all_directions=all_directions,
         ends_early=True,
         objects=objects,
+        **more,
     )
 
 

@@ -54,6 +54,20 @@ def test_adds_columns_and_keeps_the_rest(cli, grasps, tmp_path, raw_grasps, plac
         assert after.statistics["fc_held"] == sum(holds)
 
 
+def test_a_second_simulator_adds_its_own_columns(cli, grasps):
+    pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
+    for engine in ("mujoco", "physx", "physx"):
+        result = cli("simulate", grasps, "--engine", engine)
+        assert result.code == 0, result
+    rows = read_shard(grasps / "jaws-cube-00000.h5").grasps
+    assert rows.physics["fc_holds"].tolist() == rows.physics["physx_fc_holds"].tolist() == [True]
+    protocol = json.loads(rows.physics_protocols["physx_fc_holds"])
+    assert (protocol["engine"], protocol["simulator"][:5]) == ("physx", "physx")
+    assert "torsion" in protocol["solver"]["not_used"]
+    assert json.loads(rows.physics_protocols["fc_holds"])["engine"] == "mujoco"
+    assert cli("simulate", grasps, "--engine", "bullet").code == 2
+
+
 def test_several_objects(cli, tmp_path):
     """A line for every set of objects held, in the order of their slots; verdicts of each object beside its row."""
     rows = twin_rows(count=3)
