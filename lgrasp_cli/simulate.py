@@ -30,8 +30,9 @@ def simulate(
     """Simulate grasps and add the verdicts to the shards, as columns physics/PROTOCOL_...
 
     The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
-    directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects. A shard
-    that has the verdicts already is left as it is.
+    directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects.
+    fc_random is fc in 8 random draws of friction, mass, drives and the object's pose (CPU only). A shard that has the
+    verdicts already is left as it is.
 
     Contacts are hard in PhysX (pip install "lgrasp[physx]"), whose columns are physics/physx_PROTOCOL_....
 
@@ -46,13 +47,16 @@ def simulate(
 def _show(data: dict[str, Any]) -> list[Block]:
     entries = data["results"]
     stay = ("stay",) if any(entry["stay"] is not None for entry in entries) else ()
-    names = ("hand", "object", "grasps", "hold", *stay, "/s")
+    drawn = data["protocol"]["draws"]
+    names = ("hand", "object", "grasps", *(("hold in all", "hold, mean") if drawn else ("hold",)), *stay, "/s")
     rows = [
         (
             entry["hand"],
             entry["object"],
             f"{entry['rows']:,}",
-            *(share(entry[name], entry["rows"]) for name in ("held", *stay)),
+            share(entry["held"], entry["rows"]),
+            *((f"{entry['share']:.1%}",) if drawn else ()),
+            *(share(entry[name], entry["rows"]) for name in stay),
             "-" if entry["per_s"] is None else f"{entry['per_s']:.1f}",
         )
         for entry in entries
@@ -61,13 +65,20 @@ def _show(data: dict[str, Any]) -> list[Block]:
     lost = {name: sum(entry[name] for entry in entries) for name in ("pregrasp_too_deep", "diverged")}
     told = {"pregrasp_too_deep": f"penetrate too deeply at {start} and are not simulated", "diverged": "count as lost"}
     pairs = [
-        ("protocol", f"{name}, friction {data['protocol']['friction']:g}"),
+        ("protocol", f"{name}, {_friction(data['protocol'])}"),
         *((cause.split("_", 1)[-1].replace("_", " "), f"{n:,} {told[cause]}") for cause, n in lost.items() if n),
         *took(data, "grasps"),
         place(data),
         following("dataset report", data["out"]),
     ]
     return [TextTable(names, rows, right=names[2:]), pairs]
+
+
+def _friction(protocol: dict[str, Any]) -> str:
+    if not protocol["draws"]:
+        return f"friction {protocol['friction']:g}"
+    count, (low, high) = protocol["draws"]["count"], protocol["draws"]["friction"]
+    return f"{count} draws of each grasp, friction {low:g} to {high:g}"
 
 
 def _profile(data: dict[str, Any]) -> list[Block]:
@@ -80,8 +91,8 @@ def _profile(data: dict[str, Any]) -> list[Block]:
             entry["object"],
             *map(share, entry["directions_held"], entry["directions_run"]),
             *(share(entry[name], entry["rows"]) for name in ("contact_at_q", "contact_at_grasp")),
-            f"{1e3 * entry['mass']:.0f} g",
-            f"{entry['stiffness']:.3g}",
+            "drawn" if entry["mass"] is None else f"{1e3 * entry['mass']:.0f} g",
+            "drawn" if entry["stiffness"] is None else f"{entry['stiffness']:.3g}",
         )
         for entry in data["results"]
     ]

@@ -59,9 +59,10 @@ class SearchJob(SearchRequest, Job):
     def parts(self) -> list[Part]:
         rows, size = self.rows, self.shard_rows
         if self.protocol:
+            from lgrasp.simulate.protocol import find_protocol
             from lgrasp.simulate.run import check_installed
 
-            check_installed(resolve_device(self.device).alias)
+            check_installed(resolve_device(self.device).alias, find_protocol(self.protocol))
         hand, name = self.keys.source.name, self.object_name
         return [
             Part(s, shard_path(self.out, hand, name, s), min(size, rows - s * size)) for s in range(-(-rows // size))

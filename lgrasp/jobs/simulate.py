@@ -27,10 +27,10 @@ from lgrasp.jobs.shard_inputs import mesh_hash
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
 from lgrasp.simulate.protocol import Protocol
-from lgrasp.simulate.run import check_installed, protocol_text, verdicts
+from lgrasp.simulate.run import check_installed, on_cpu, protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
-from lgrasp.simulate.verdict import COLUMNS, OBJECT_COLUMNS
+from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, OBJECT_COLUMNS
 from lgrasp.stages.context import Keeper
 
 _MIN_HOLDING_LINKS = 2  # links that it takes to hold anything
@@ -84,7 +84,7 @@ class SimulateJob(SimulateRequest, ShardJob):
         return config_difference(_told(text, settings), settings) or "other grasps"
 
     def parts(self) -> list[Part]:
-        check_installed(resolve_device(self.device).alias, self.protocol.engine)
+        check_installed(resolve_device(self.device).alias, self.protocol)
         return super().parts()
 
     def make(self, part: Part, progress: PartProgress) -> Made:
@@ -152,13 +152,15 @@ class SimulateJob(SimulateRequest, ShardJob):
                 objects=self._scene_of(hand, reader.objects()).objects,
                 object_index=reader.column("object_index"),
                 columns={
-                    n: reader.column(prefix + n) for n in COLUMNS | OBJECT_COLUMNS if prefix + n in reader.columns
+                    n: reader.column(prefix + n)
+                    for n in COLUMNS | OBJECT_COLUMNS | DRAWN_COLUMNS
+                    if prefix + n in reader.columns
                 },
                 seconds=seconds,
             )
 
     def _kind(self) -> str:
-        return "gpu" if self.device_used.is_cuda and self.protocol.engine == "mujoco" else "cpu"
+        return "cpu" if on_cpu(self.device_used.alias, self.protocol) else "gpu"
 
     def _scene_of(self, hand: HandRecord, objects: Sequence[ObjectRecord]) -> Scene:
         """What is simulated of a shard: hand and objects cut into convex pieces."""
@@ -181,7 +183,7 @@ def _told(text: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     except (ValueError, AttributeError, RecursionError):
         return {}
     device = "gpu" if simulator.startswith("mujoco_warp") else "cpu"
-    return {"engine": "mujoco"} | {name: told[name] for name in settings if name in told} | {"device": device}
+    return {"engine": "mujoco", "draws": None} | {name: told[name] for name in settings if name in told} | {"device": device}
 
 
 @dataclass(frozen=True)
@@ -197,7 +199,10 @@ class Simulated:
 
 
 def summary(done: Sequence[Simulated], protocol: Protocol) -> list[dict[str, Any]]:
-    """One entry per hand and objects of a grasp, in the order of its slots: shares that hold, contacts, load, speed."""
+    """One entry per hand and objects of a grasp, in the order of its slots: shares that hold, contacts, load, speed.
+
+    ``share``: of the draws of a row that hold, mean; ``mass``, ``friction``, ``stiffness`` are None if they are drawn.
+    """
     groups: dict[tuple[str, tuple[str, ...]], list[Simulated]] = {}
     for one in done:
         sets, which = np.unique(one.object_index, axis=0, return_inverse=True)
@@ -232,6 +237,7 @@ def _entry(group: list[Simulated], protocol: Protocol) -> dict[str, Any]:
         "objects": [solid.name for solid in solids],
         "rows": rows,
         "held": int(columns["holds"].sum()),
+        "share": float(columns["share"].mean()) if "share" in columns and rows else None,
         "stay": int(columns["stays"].sum()) if "stays" in columns else None,
         "penetration": float(np.median(columns["penetration"])) if "penetration" in columns else None,
         "directions_held": (columns["directions"] == 1).sum(0).tolist(),
@@ -240,9 +246,9 @@ def _entry(group: list[Simulated], protocol: Protocol) -> dict[str, Any]:
         "contact_at_grasp": int((columns["contact_at_grasp"] >= _MIN_HOLDING_LINKS).sum()),
         "pregrasp_too_deep": int((columns["pregrasp_penetration"] > protocol.most_penetration).sum()),
         "diverged": int(columns["diverged"].sum()),
-        "mass": sum(load.mass for load in loads),
-        "friction": protocol.friction,
-        "stiffness": max(load.stiffness for load in loads),
+        "mass": None if protocol.draws else sum(load.mass for load in loads),
+        "friction": None if protocol.draws else protocol.friction,
+        "stiffness": None if protocol.draws else max(load.stiffness for load in loads),
         "pieces": sum(len(solid.pieces) for solid in solids),
         "notes": [f"object {solid.name}: {note}" for solid in solids for note in solid.notes],
         "seconds": seconds,

@@ -1,7 +1,8 @@
 """Scene and protocol -> a MuJoCo model, with the tables that map rows of a shard to its state."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -52,6 +53,10 @@ class Model:
     def controls(self, q: np.ndarray) -> np.ndarray:
         """Targets of the drives at joint positions q (..., K)."""
         return np.where(self.columns >= 0, q[..., self.columns], 0.0)
+
+    def own(self) -> "Model":
+        """The same with a copy of ``mujoco``, whose numbers may be changed."""
+        return replace(self, mujoco=copy(self.mujoco))
 
 
 def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequence[int] = (0,)) -> Model:

@@ -18,7 +18,7 @@ ITERATIONS = (25, 1)
 SOLVER = {
     "contact_offset": CONTACT_OFFSET,
     "iterations": ITERATIONS,
-    "not_used": ("torsion", "impratio", "noslip"),
+    "not_used": ("torsion", "impratio", "noslip", "softness"),
 }
 """What decides a verdict besides the protocol, and the numbers of the protocol that mean nothing here."""
 
@@ -198,7 +198,8 @@ class PhysxWorld:
         self._system = px.PhysxCpuSystem()
         self._system.timestep = m.opt.timestep
         self._scene = self._sapien.Scene([self._system])
-        self._material = px.PhysxMaterial(model.protocol.friction, model.protocol.friction, 0.0)
+        friction = float(m.geom_friction[:, 0].max())
+        self._material = px.PhysxMaterial(friction, friction, 0.0)
         self._objects: list[Any] = []
         self.links: dict[int, Any] = {}
         self._build()

@@ -1,11 +1,11 @@
 """Named protocols of the simulation with all their numbers, which are stored with each verdict."""
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, model_validator
 
 from lgrasp.choices import VERDICTS, EngineName
-from lgrasp.config import Params
+from lgrasp.config import Params, Seed
 from lgrasp.errors import ConfigError
 from lgrasp.math.constants import DRIVE_STIFFNESS, SLIDING_ARM
 
@@ -46,6 +46,44 @@ class Physics(Params):
     torsion: float = Field(default=0.02, ge=0, le=1, description="Torsional friction of every contact [m].")
     impratio: float = Field(default=10.0, ge=1, description="Stiffness of friction against that of contact normals.")
     noslip: int = Field(default=2, ge=0, description="Iterations of the solver that takes the creep out of friction.")
+
+
+def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError("the smaller number of a range comes first")
+    return ends
+
+
+_NotNegative, _Positive = Annotated[float, Field(ge=0)], Annotated[float, Field(gt=0)]
+Range = Annotated[tuple[_NotNegative, _NotNegative], AfterValidator(_in_order)]
+"""Smallest and largest value."""
+PositiveRange = Annotated[tuple[_Positive, _Positive], AfterValidator(_in_order)]
+"""Likewise, both above 0."""
+
+
+class Draws(Params):
+    """What is drawn at random, each number evenly from its range, in place of the protocol's own of that name.
+
+    A draw depends on the seed, the row's ``candidate`` and its own number alone.
+    """
+
+    count: int = Field(default=8, ge=1, le=1000, description="Draws of each row.")
+    seed: Seed = 0
+    friction: Range = Field(default=(0.4, 0.8), description="Sliding friction of every contact.")
+    torsion: Range = Field(default=(0.0, 0.005), description="Torsional friction of every contact [m]; MuJoCo's alone.")
+    mass: PositiveRange = Field(default=(0.05, 0.2), description="Of each object [kg].")
+    stiffness: PositiveRange = Field(default=(3.0, 10.0), description="Of position control [N m/rad].")
+    damping_ratio: PositiveRange = Field(default=(0.3, 1.0), description="Of the position control; 1 is critical.")
+    softness: PositiveRange = Field(
+        default=(0.008, 0.02),
+        description="Time constant of every contact [s], two time steps at least; MuJoCo's alone.",
+    )
+    shift: float = Field(
+        default=0.003, ge=0, description="Most error of each object's place at the start [m], even in the ball."
+    )
+    turn: float = Field(
+        default=3.0, ge=0, le=180, description="Most error of its rotation [deg], about its centre of mass, likewise."
+    )
 
 
 class Protocol(Physics):
@@ -93,6 +131,15 @@ class Protocol(Physics):
         default=0.05, gt=0, description="Of an object's centre of mass from its start [m]."
     )
     most_rotation: float = Field(default=15.0, gt=0, le=180, description="Of an object from its start [deg].")
+    draws: Draws | None = Field(
+        default=None, description="All is done once for each of them, and a grasp holds if it holds in all."
+    )
+
+    @model_validator(mode="after")
+    def _drawable(self) -> Self:
+        if self.draws and (self.kind != "force" or self.stiffness_range is not None):
+            raise ValueError("draws are of mass and stiffness: kind must be force, and stiffness_range none")
+        return self
 
     def by(self, engine: EngineName) -> "Protocol":
         """The same in a simulator; its columns are named physics/ENGINE_NAME_... unless that is MuJoCo."""
@@ -137,13 +184,15 @@ def _protocols() -> dict[str, Protocol]:
         Protocol(name="gravity6_mu1", friction=1.0, **gravity),
         Protocol(name="seq6", friction=2.0, **gravity, **sequence),
         Protocol(name="seq6_mu06", friction=FRICTION, **gravity, **sequence),
+        Protocol(name="fc_random", draws=Draws()),
     )
     return {protocol.name: protocol for protocol in made}
 
 
 PROTOCOLS: dict[str, Protocol] = _protocols()
 """The named protocols: ``fc`` is DexGraspBench's, ``gravity6`` and ``gravity6_mu1`` ask for more; ``seq6`` is the one
-that sequences of objects were published with, ``seq6_mu06`` the same on smoother objects."""
+that sequences of objects were published with, ``seq6_mu06`` the same on smoother objects; ``fc_random`` is ``fc`` with
+random numbers, several times."""
 
 
 def find_protocol(name: str) -> Protocol:

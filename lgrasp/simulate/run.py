@@ -15,7 +15,7 @@ from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.physx_world import SOLVER, import_physx
-from lgrasp.simulate.protocol import Protocol
+from lgrasp.simulate.protocol import PROTOCOLS, Protocol
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import Verdict, stack_verdicts
@@ -91,7 +91,8 @@ def verdicts(
     prepared: Callable[[float], None] | None = None,
 ) -> dict[str, np.ndarray]:
     """Simulate every grasp: columns PROTOCOL_... of :data:`lgrasp.simulate.COLUMNS`, and of
-    :data:`lgrasp.simulate.OBJECT_COLUMNS` where rows have several slots or the protocol's success is to touch.
+    :data:`lgrasp.simulate.OBJECT_COLUMNS` where rows have several slots or the protocol's success is to touch, and of
+    :data:`lgrasp.simulate.DRAWN_COLUMNS` where it has draws.
 
     A verdict depends on its row only, not on the number of threads or the other rows; a row sees the objects that it
     has and no others of the scene.
@@ -110,8 +111,10 @@ def verdicts(
         prepared: called with the seconds that models and, on a GPU, kernels took to be made.
 
     Raises:
-        PhysicsError: a simulator is missing or refuses the scene, or a row has an object that the scene lacks.
+        PhysicsError: a simulator is missing or refuses the scene or the protocol, or a row has an object that the
+            scene lacks.
     """
+    _check_device(device, protocol)
     slots = np.full(np.shape(rows.object_index), -1)
     found: dict[int, Verdict] = {}
     options = {"all_directions": all_directions, "settled_stop": settled_stop}
@@ -125,8 +128,7 @@ def verdicts(
         begin = time.perf_counter()
         model = build_model(scene, protocol, rows.q[0], group.objects)
         _check_held(model, group.rows)
-        on_cpu = device == "cpu" or protocol.engine == "physx"
-        worlds = None if on_cpu else _worlds(model, device, len(group.rows), threads, options, keep)
+        worlds = None if on_cpu(device, protocol) else _worlds(model, device, len(group.rows), threads, options, keep)
         if prepared:
             prepared(time.perf_counter() - begin)
         if worlds is None:
@@ -139,13 +141,28 @@ def verdicts(
     return stack_verdicts(protocol, [found[row] for row in range(len(rows))], slots)
 
 
-def check_installed(device: str, engine: str = "mujoco") -> None:
-    """Raises PhysicsError unless there is a simulator for a device."""
+def on_cpu(device: str, protocol: Protocol) -> bool:
+    """Whether a protocol runs on the CPU, as PhysX always does."""
+    return device == "cpu" or protocol.engine == "physx"
+
+
+def check_installed(device: str, protocol: Protocol) -> None:
+    """Raises PhysicsError unless there is a simulator of a protocol for a device."""
+    _check_device(device, protocol)
     import_mujoco()
-    if engine == "physx":
+    if protocol.engine == "physx":
         import_physx()
     elif device != "cpu":
         import_mujoco_warp()
+
+
+def _check_device(device: str, protocol: Protocol) -> None:
+    if protocol.draws and not on_cpu(device, protocol):
+        others = ", ".join(other.name for other in PROTOCOLS.values() if not other.draws)
+        raise PhysicsError(
+            f"protocol {protocol.name} has random draws, which run on the CPU alone: give --device cpu, or one of "
+            f"the protocols {others}"
+        )
 
 
 def _worlds(
@@ -205,7 +222,7 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
     """
     objects = [
         {"name": solid.name, "pieces": len(solid.pieces), "excess": round(solid.excess, 6), "notes": list(solid.notes)}
-        | protocol.load(solid.volume).model_dump()
+        | protocol.load(solid.volume).model_dump(exclude={"mass", "stiffness"} if protocol.draws else None)
         for solid in scene.objects
     ]
     more: dict[str, Any] = {}

@@ -5,9 +5,10 @@ from itertools import pairwise
 import numpy as np
 
 from lgrasp.grasp.records import GraspRows
+from lgrasp.simulate.draws import draw_of, tune
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.mujoco_world import MujocoWorld
-from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude, moved
+from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude, moved, worst
 
 
 class Trial:
@@ -20,7 +21,8 @@ class Trial:
     """
 
     def __init__(self, model: Model, *, all_directions: bool = False, settled_stop: bool = True) -> None:
-        self._model, self._protocol = model, model.protocol
+        self._compiled, self._protocol = model, model.protocol
+        self._model = model = model.own() if self._protocol.draws else model
         self._near, self._still = MujocoWorld(model, near=True), MujocoWorld(model)
         self._world = self._still
         if self._protocol.engine == "physx":
@@ -37,14 +39,35 @@ class Trial:
         return max(1, round(seconds / self._timestep))
 
     def run(self, rows: GraspRows, i: int) -> Verdict:
-        """Judge row ``i``."""
-        look = self.look(rows, i)
+        """Judge row ``i``; if its protocol has draws, in all of them."""
+        pose, at_q = rows.object_pose[i], self._look_at_q(rows, i)
+        draws, found = self._protocol.draws, []
+        if draws is None:
+            return self._judge(rows, i, pose, self._look(rows, i, pose, at_q))
+        for number in range(draws.count):
+            draw = draw_of(draws, int(rows.candidate[i]), number, len(pose))
+            tune(self._model, self._compiled, draw)
+            start = draw.placed(pose, self._model.centers)
+            found.append(self._judge(rows, i, start, self._look(rows, i, start, at_q)))
+        return worst(found)
+
+    def look(self, rows: GraspRows, i: int) -> Look:
+        """Row ``i`` before it is simulated, hand where the protocol starts; the geometry is MuJoCo's."""
+        return self._look(rows, i, rows.object_pose[i], self._look_at_q(rows, i))
+
+    def _look(self, rows: GraspRows, i: int, pose: np.ndarray, at_q: tuple[np.ndarray, np.ndarray]) -> Look:
+        still = self._still
+        still.begin(self._protocol.stops(rows)[0][i], pose)
+        return Look(*at_q, still.deepest(of_links=True), still.deepest(), still.data.qpos.copy())
+
+    def _judge(self, rows: GraspRows, i: int, pose: np.ndarray, look: Look) -> Verdict:
+        """Simulate row ``i`` with its objects at poses (O, 7)."""
         objects = len(self._model.object_body)
         closed = Closed(0, np.nan, False, np.full((objects, 2), np.nan), look.object_depth)
         pulls, diverged = Pulls.of(objects), False
         if look.depth <= self._protocol.most_penetration:
             if self._world is not self._still:
-                self._world.begin(self._protocol.stops(rows)[0][i], rows.object_pose[i])
+                self._world.begin(self._protocol.stops(rows)[0][i], pose)
             self._start = self._world.objects()
             closed = self._close(rows, i, look)
             diverged = self._world.wild()
@@ -53,13 +76,6 @@ class Trial:
             else:
                 diverged = self._pull_all(closed, pulls)
         return conclude(self._bounds, look, closed, pulls, diverged)
-
-    def look(self, rows: GraspRows, i: int) -> Look:
-        """Row ``i`` before it is simulated, hand where the protocol starts; the geometry is MuJoCo's."""
-        points, contact_at_q = self._look_at_q(rows, i)
-        still = self._still
-        still.begin(self._protocol.stops(rows)[0][i], rows.object_pose[i])
-        return Look(points, contact_at_q, still.deepest(of_links=True), still.deepest(), still.data.qpos.copy())
 
     def base_rotation(self) -> np.ndarray:
         """Of the hand's base in the world, (3, 3)."""

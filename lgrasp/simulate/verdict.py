@@ -39,6 +39,7 @@ class Verdict(NamedTuple):
     object_touches: np.ndarray  # (O,) i8
     object_displacement: np.ndarray  # (O,) [m]
     object_rotation: np.ndarray  # (O,) [rad]
+    share: float = np.nan  # NaN: nothing was drawn
 
 
 class Look(NamedTuple):
@@ -155,6 +156,21 @@ def conclude(bounds: Bounds, look: Look, closed: Closed, pulls: Pulls, diverged:
     )
 
 
+def worst(draws: Sequence[Verdict]) -> Verdict:
+    """The verdict of one grasp from those of its draws: the share that holds, and the worst of everything else."""
+    least, most = (
+        {name: reduce([getattr(verdict, name) for verdict in draws]) for name in Verdict._fields}
+        for reduce in (np.fmin.reduce, np.fmax.reduce)
+    )
+    lost = {
+        name: np.where((np.array([getattr(verdict, name) for verdict in draws]) == 0).any(0), 0, least[name])
+        for name in ("directions", "object_touches")
+    }
+    good = ("holds", "contact_at_q", "contact_at_grasp", "settled", "stays")
+    share = float(np.mean([verdict.holds for verdict in draws]))
+    return Verdict(**(most | {name: least[name] for name in good} | lost | {"share": share}))
+
+
 def moved(pose: np.ndarray, home: np.ndarray, centers: np.ndarray) -> np.ndarray:
     """How far objects are from where they started: displacement [m] and rotation [rad], (..., O, 2).
 
@@ -234,6 +250,11 @@ OBJECT_COLUMNS: dict[str, str] = {
 }
 """The same for what is written where rows may have several objects, and by protocols whose success is to touch."""
 
+DRAWN_COLUMNS: dict[str, str] = {
+    "share": "float32 [N]: share of the draws in which the grasp holds",
+}
+"""The same for what is written by protocols with draws, whose other columns are the worst of all draws."""
+
 
 def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.ndarray) -> dict[str, np.ndarray]:
     """Columns NAME_... of one protocol from the verdicts of its rows.
@@ -242,8 +263,9 @@ def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.nd
         slots: (N, O) which of its verdict's objects is in each slot of a row, -1 absent.
     """
     several = slots.shape[1] > 1 or protocol.success == "touches"
+    columns = COLUMNS | (OBJECT_COLUMNS if several else {}) | (DRAWN_COLUMNS if protocol.draws else {})
     out = {}
-    for column, text in (COLUMNS | (OBJECT_COLUMNS if several else {})).items():
+    for column, text in columns.items():
         values = [getattr(verdict, column) for verdict in verdicts]
         dtype = np.dtype(text.partition(" ")[0])
         if "[N, O]" in text:

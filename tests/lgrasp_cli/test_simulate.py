@@ -18,6 +18,7 @@ from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.listing import Renewing
 from lgrasp.jobs import kept_verdicts, simulate
+from lgrasp.simulate.protocol import find_protocol
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -66,6 +67,43 @@ def test_a_second_simulator_adds_its_own_columns(cli, grasps):
     assert "torsion" in protocol["solver"]["not_used"]
     assert json.loads(rows.physics_protocols["fc_holds"])["engine"] == "mujoco"
     assert cli("simulate", grasps, "--engine", "bullet").code == 2
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "physx"])
+def test_random_draws(cli, grasps, tmp_path, engine):
+    """The shares that hold in all draws and on the mean; readers take the columns, beside those of fc."""
+    if engine == "physx":
+        pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
+    name = find_protocol("fc_random").by(engine).name
+    assert cli("simulate", grasps).code == 0
+    for _ in range(2):
+        result = cli("simulate", grasps, "-p", "fc_random", "--engine", engine, "--json", tmp_path / "report.json")
+        assert result.code == 0, result
+        head, line = result.out.splitlines()[:2]
+        assert "hold in all  hold, mean" in head
+        assert line.split()[:5] == ["jaws", "cube", "3", "33.3%", "33.3%"]
+        assert "8 draws of each grasp, friction 0.4 to 0.8" in result.out
+    (entry,) = json.loads((tmp_path / "report.json").read_text())["results"]
+    assert (entry["held"], entry["share"], entry["friction"]) == (1, pytest.approx(1 / 3), None)
+    path, other = sorted(grasps.glob("*.h5"))
+    shard = read_shard(path)
+    assert not validate_shard(path)
+    assert shard.grasps.physics[f"{name}_holds"].tolist() == shard.grasps.physics["fc_holds"].tolist() == [True]
+    share = shard.grasps.physics[f"{name}_share"]
+    assert (share.dtype, share.tolist()) == (np.float32, [1.0])
+    assert json.loads(shard.grasps.physics_protocols[f"{name}_share"])["draws"]["seed"] == 0
+    assert cli("simulate", grasps, "-p", "fc_random", "--engine", engine, "--verbose").code == 0
+    assert cli("dataset", "report", grasps, "--json", tmp_path / "data.json").code == 0
+    (told,) = json.loads((tmp_path / "data.json").read_text())["objects"]
+    assert told["physics"][name]["means"]["share"] == pytest.approx(1 / 3)
+    assert told["physics"]["fc"]["means"].keys() == told["physics"][name]["means"].keys() - {"share"}
+    assert cli("dataset", "merge", path, other, "--out", tmp_path / "all.h5").code == 0
+    exported = cli(
+        "dataset", "export", tmp_path / "all.h5", "--to", "mjcf", "--out", tmp_path / "e",
+        "--where", f"physics/{name}_share >= 0.9", "--json", "-",
+    )  # fmt: skip
+    assert exported.code == 0, exported
+    assert json.loads(exported.out)["grasps"] == 1
 
 
 def test_several_objects(cli, tmp_path):

@@ -46,6 +46,7 @@ _METRIC_COLUMNS = (  # metric, head, format
 
 _NEAR_SHARE = 0.01  # most near-duplicates of a good data set
 _VERDICT_COLUMNS = (  # column, head, factor, format
+    ("share", "draws [%]", 100, ".1f"),
     ("contact_at_q", "links at q", 1, ".1f"),
     ("contact_at_grasp", "links at grasp", 1, ".1f"),
     ("slip", "slip [mm]", 1e3, ".1f"),
@@ -158,16 +159,20 @@ def held_tables(data: dict[str, Any]) -> list[Block]:
 def physics_table(data: dict[str, Any]) -> Block:
     """Verdicts of each protocol for each object: share that holds, the object's mass, means of other verdicts."""
     rows = []
-    columns = ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in _VERDICT_COLUMNS)]
+    drawn = any("share" in found["means"] for group in data["objects"] for found in group["physics"].values())
+    more = [entry for entry in _VERDICT_COLUMNS if drawn or entry[0] != "share"]
+    columns = ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in more)]
     for group in data["objects"]:
         for name, found in sorted(group["physics"].items()):
             cells = [" + ".join(group["objects"]), name, number(found["run"]), _number(found["share"], ".1%")]
             cells.append(_mass(found["protocols"]))
-            for column, _, factor, style in _VERDICT_COLUMNS:
+            for column, _, factor, style in more:
                 mean = found["means"].get(column)
                 cells.append(_number(None if mean is None else factor * mean, style))
             rows.append(cells)
     caption = "Means over the grasps that were run; links: of the hand, in contact with the object."
+    if drawn:
+        caption += " Draws: share of a grasp's draws in which it holds; a grasp holds if it holds in all."
     return table(columns, rows, caption=caption, text=(1,))
 
 
@@ -178,7 +183,9 @@ def _mass(protocols: list[Any]) -> str:
         said = protocol if isinstance(protocol, dict) else {}
         resolved = said.get("resolved")
         mass = (said | resolved if isinstance(resolved, dict) else said).get("mass")
-        if isinstance(mass, int | float):
+        if said.get("draws"):
+            masses["drawn"] = None
+        elif isinstance(mass, int | float):
             masses[f"{1000 * mass:.0f}"] = None
     return ", ".join(masses) or "-"
 

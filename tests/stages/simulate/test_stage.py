@@ -14,7 +14,7 @@ from lgrasp.errors import ConfigError, OutputError, PhysicsError
 from lgrasp.grasp.tables import GraspTable, grasp_arrays
 from lgrasp.jobs.generate import generate
 from lgrasp.jobs.records import make_scene, mesh_blobs, object_record
-from lgrasp.simulate.protocol import PROTOCOLS
+from lgrasp.simulate.protocol import PROTOCOLS, find_protocol
 from lgrasp.simulate.run import check_installed, verdicts
 from lgrasp.simulate.scene import scene_of
 from lgrasp.simulate.verdict import COLUMNS
@@ -115,6 +115,8 @@ def test_simulates_where_the_job_runs(grasps, context, monkeypatch):
 
 def test_a_gpu_needs_a_simulator_of_its_own(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
-    check_installed("cpu")
+    check_installed("cpu", find_protocol("fc"))
     with pytest.raises(PhysicsError, match="--device cpu"):
-        check_installed("cuda:0")
+        check_installed("cuda:0", find_protocol("fc"))
+    with pytest.raises(PhysicsError, match="fc_random has random draws.*--device cpu, or one of the protocols fc, gra"):
+        check_installed("cuda:0", find_protocol("fc_random"))
