@@ -31,8 +31,7 @@ def simulate(
 
     The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
     directions; a grasp holds if they stay in all of them. seq6 and seq6_mu06 are made for sequences of objects.
-    fc_random is fc in 8 random draws of friction, mass, drives and the object's pose (CPU only). A shard that has the
-    verdicts already is left as it is.
+    fc_random is fc in 8 random draws (CPU only). A shard that has the verdicts already is left as it is.
 
     Contacts are hard in PhysX (pip install "lgrasp[physx]"), whose columns are physics/physx_PROTOCOL_....
 

@@ -183,7 +183,8 @@ def _told(text: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     except (ValueError, AttributeError, RecursionError):
         return {}
     device = "gpu" if simulator.startswith("mujoco_warp") else "cpu"
-    return {"engine": "mujoco", "draws": None} | {name: told[name] for name in settings if name in told} | {"device": device}
+    older = {"engine": "mujoco", "draws": None}  # what shards do not tell that were written before there was a choice
+    return older | {name: told[name] for name in settings if name in told} | {"device": device}
 
 
 @dataclass(frozen=True)

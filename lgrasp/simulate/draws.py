@@ -43,7 +43,7 @@ def draw_of(draws: Draws, candidate: int, number: int, objects: int) -> Draw:
     numbers = ends[:, 0] + rng.random(len(ends)) * (ends[:, 1] - ends[:, 0])
     errors = [(_in_ball(rng, draws.shift), _in_ball(rng, np.radians(draws.turn))) for _ in range(objects)]
     shifts, turns = np.array(errors).swapaxes(0, 1)
-    return Draw(*numbers.tolist(), shifts, turns)
+    return Draw(**dict(zip(_NUMBERS, numbers.tolist(), strict=True)), shifts=shifts, turns=turns)
 
 
 def _in_ball(rng: np.random.Generator, radius: float) -> np.ndarray:

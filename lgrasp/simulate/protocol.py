@@ -54,7 +54,8 @@ def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
-_NotNegative, _Positive = Annotated[float, Field(ge=0)], Annotated[float, Field(gt=0)]
+_NotNegative = Annotated[float, Field(ge=0)]
+_Positive = Annotated[float, Field(gt=0)]
 Range = Annotated[tuple[_NotNegative, _NotNegative], AfterValidator(_in_order)]
 """Smallest and largest value."""
 PositiveRange = Annotated[tuple[_Positive, _Positive], AfterValidator(_in_order)]
@@ -69,11 +70,11 @@ class Draws(Params):
 
     count: int = Field(default=8, ge=1, le=1000, description="Draws of each row.")
     seed: Seed = 0
-    friction: Range = Field(default=(0.4, 0.8), description="Sliding friction of every contact.")
-    torsion: Range = Field(default=(0.0, 0.005), description="Torsional friction of every contact [m]; MuJoCo's alone.")
+    friction: Range = Field(default=(0.4, 0.8), description="Sliding, of every contact.")
+    torsion: Range = Field(default=(0.0, 0.005), description="Friction against twisting, likewise [m]; MuJoCo's alone.")
     mass: PositiveRange = Field(default=(0.05, 0.2), description="Of each object [kg].")
     stiffness: PositiveRange = Field(default=(3.0, 10.0), description="Of position control [N m/rad].")
-    damping_ratio: PositiveRange = Field(default=(0.3, 1.0), description="Of the position control; 1 is critical.")
+    damping_ratio: PositiveRange = Field(default=(0.3, 1.0), description="Of position control, over critical damping.")
     softness: PositiveRange = Field(
         default=(0.008, 0.02),
         description="Time constant of every contact [s], two time steps at least; MuJoCo's alone.",

@@ -18,6 +18,7 @@ AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0,
 """Directions of the load in the hand's base frame."""
 
 _REST = (0.01, 0.1)  # [m/s], [rad/s]: slower is at rest
+_LEAST_IS_WORST = ("holds", "stays", "settled", "contact_at_q", "contact_at_grasp")
 _LOST_DISTANCE = 0.5  # [m]: an object that got so far from its start will not touch the hand again
 
 
@@ -158,17 +159,13 @@ def conclude(bounds: Bounds, look: Look, closed: Closed, pulls: Pulls, diverged:
 
 def worst(draws: Sequence[Verdict]) -> Verdict:
     """The verdict of one grasp from those of its draws: the share that holds, and the worst of everything else."""
-    least, most = (
-        {name: reduce([getattr(verdict, name) for verdict in draws]) for name in Verdict._fields}
-        for reduce in (np.fmin.reduce, np.fmax.reduce)
-    )
-    lost = {
-        name: np.where((np.array([getattr(verdict, name) for verdict in draws]) == 0).any(0), 0, least[name])
-        for name in ("directions", "object_touches")
-    }
-    good = ("holds", "contact_at_q", "contact_at_grasp", "settled", "stays")
-    share = float(np.mean([verdict.holds for verdict in draws]))
-    return Verdict(**(most | {name: least[name] for name in good} | lost | {"share": share}))
+    every = {name: np.array([getattr(verdict, name) for verdict in draws]) for name in Verdict._fields}
+    found: dict[str, Any] = {name: np.fmax.reduce(values) for name, values in every.items()}
+    found |= {name: every[name].min(0) for name in _LEAST_IS_WORST}
+    for name in ("directions", "object_touches"):  # lost in one draw is lost; -1: not run in one
+        found[name] = np.where((every[name] == 0).any(0), 0, every[name].min(0)).astype(np.int8)
+    found["share"] = every["holds"].mean()
+    return Verdict(**found)
 
 
 def moved(pose: np.ndarray, home: np.ndarray, centers: np.ndarray) -> np.ndarray:

@@ -75,6 +75,9 @@ def test_random_draws(cli, grasps, tmp_path, engine):
     if engine == "physx":
         pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
     name = find_protocol("fc_random").by(engine).name
+    path, other = sorted(grasps.glob("*.h5"))
+    shard = read_shard(other)
+    write_shard(other, replace(shard, header=replace(shard.header, shard_index=1)))
     assert cli("simulate", grasps).code == 0
     for _ in range(2):
         result = cli("simulate", grasps, "-p", "fc_random", "--engine", engine, "--json", tmp_path / "report.json")
@@ -85,7 +88,6 @@ def test_random_draws(cli, grasps, tmp_path, engine):
         assert "8 draws of each grasp, friction 0.4 to 0.8" in result.out
     (entry,) = json.loads((tmp_path / "report.json").read_text())["results"]
     assert (entry["held"], entry["share"], entry["friction"]) == (1, pytest.approx(1 / 3), None)
-    path, other = sorted(grasps.glob("*.h5"))
     shard = read_shard(path)
     assert not validate_shard(path)
     assert shard.grasps.physics[f"{name}_holds"].tolist() == shard.grasps.physics["fc_holds"].tolist() == [True]
@@ -93,14 +95,17 @@ def test_random_draws(cli, grasps, tmp_path, engine):
     assert (share.dtype, share.tolist()) == (np.float32, [1.0])
     assert json.loads(shard.grasps.physics_protocols[f"{name}_share"])["draws"]["seed"] == 0
     assert cli("simulate", grasps, "-p", "fc_random", "--engine", engine, "--verbose").code == 0
-    assert cli("dataset", "report", grasps, "--json", tmp_path / "data.json").code == 0
-    (told,) = json.loads((tmp_path / "data.json").read_text())["objects"]
-    assert told["physics"][name]["means"]["share"] == pytest.approx(1 / 3)
-    assert told["physics"]["fc"]["means"].keys() == told["physics"][name]["means"].keys() - {"share"}
+    page, data = tmp_path / "page.html", tmp_path / "data.json"
+    assert cli("dataset", "report", grasps, "--out", page, "--json", data).code == 0
+    (told,) = json.loads(data.read_text())["hands"][0]["objects"]
+    means = {protocol: found["means"] for protocol, found in told["physics"].items()}
+    assert means[name]["share"] == pytest.approx(1 / 3)
+    assert means["fc"].keys() == means[name].keys() - {"share"}
+    assert "draws [%]" in page.read_text()
     assert cli("dataset", "merge", path, other, "--out", tmp_path / "all.h5").code == 0
     exported = cli(
-        "dataset", "export", tmp_path / "all.h5", "--to", "mjcf", "--out", tmp_path / "e",
-        "--where", f"physics/{name}_share >= 0.9", "--json", "-",
+        "export", tmp_path / "all.h5", "--to", "mjcf", "--out", tmp_path / "e", "--where",
+        f"physics/{name}_share >= 0.9", "--json", "-",
     )  # fmt: skip
     assert exported.code == 0, exported
     assert json.loads(exported.out)["grasps"] == 1

@@ -11,7 +11,7 @@ from lgrasp.grasp.records import GraspRows, Shard
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
 from lgrasp.simulate.scene import scene_of
-from lgrasp.simulate.verdict import COLUMNS, OBJECT_COLUMNS
+from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, OBJECT_COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -22,7 +22,8 @@ SLIDING = 500.0  # [N/m] of a jaw
 
 def judge(shard: Shard, protocol=SEQ, rows: GraspRows | None = None, **more) -> dict[str, np.ndarray]:
     found = verdicts(scene_of(shard.hand, shard.objects), rows or shard.grasps, protocol, **more)
-    assert set(found) == {f"{protocol.name}_{name}" for name in COLUMNS | OBJECT_COLUMNS}
+    columns = COLUMNS | OBJECT_COLUMNS | (DRAWN_COLUMNS if protocol.draws else {})
+    assert set(found) == {f"{protocol.name}_{name}" for name in columns}
     return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
 
 
@@ -65,7 +66,7 @@ def test_one_in_the_air_is_lost(name: str):
     if protocol.success == "touches":
         assert found["object_touches"].tolist() == [[1, 0]]
         np.testing.assert_allclose(found["displacement"], 0.5 * 9.8 * 0.25**2, rtol=0.02)
-    assert found["object_displacement"][0, 0] < 2e-3
+    assert found["object_displacement"][0, 0] < (5e-3 if protocol.draws else 2e-3)  # softer drives are drawn
     assert found["object_displacement"][0, 1] > protocol.most_displacement
 
 

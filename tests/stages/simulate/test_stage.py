@@ -118,5 +118,7 @@ def test_a_gpu_needs_a_simulator_of_its_own(monkeypatch):
     check_installed("cpu", find_protocol("fc"))
     with pytest.raises(PhysicsError, match="--device cpu"):
         check_installed("cuda:0", find_protocol("fc"))
-    with pytest.raises(PhysicsError, match="fc_random has random draws.*--device cpu, or one of the protocols fc, gra"):
+    with pytest.raises(
+        PhysicsError, match=r"fc_random has random draws.*--device cpu, or one of the protocols fc, gra"
+    ):
         check_installed("cuda:0", find_protocol("fc_random"))
