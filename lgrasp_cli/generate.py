@@ -12,6 +12,8 @@ from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Sett
 from lgrasp_cli.tables import Block, closed, counted, following, held, place, plural, took
 from lgrasp_cli.working import How, working
 
+_LIKELY = 0.05  # probability of a resting pose that is named when it has no grasps
+
 
 @working
 def generate(
@@ -61,6 +63,7 @@ def generate(
             help="Searches per successful pose: faster, but fewer poses; default: the pipeline's.",
         ),
     ] = None,
+    table: Annotated[bool, Option("--table", help="Leave room for the table that the object rests on.")] = False,
     dry_run: DryRun = False,
 ) -> None:
     """Generate grasps of an object and write them as shards.
@@ -76,6 +79,7 @@ def generate(
 
     chosen = choose_pipeline(pipeline, seed, contacts, settings).with_passes(passes)
     chosen = chosen.with_simulation(simulate) if simulate else chosen
+    chosen = chosen.with_table() if table else chosen
     pairs = all_hands(hands), all_objects(meshes)
     what = {"rows": rows, "scale": scale, "batch": batch, "shard_rows": shard_rows}
     requests = pair_requests(*pairs, chosen, out or Path("grasps"), simulate, **what, **how.shared)
@@ -98,12 +102,27 @@ def _show(data: dict[str, Any]) -> list[Block]:
         *held(data),
         ("diversity", f"{plural(data['distinct_poses'], 'object pose')}, {plural(near, 'near-duplicate')}"),
         closed(data),
+        *_resting(data.get("resting", [])),
         *([("strict bounds", f"{looser:,} grasps meet only those of the pipeline")] if looser else ()),
         *took(data, "grasps"),
         place(data),
         following("render" if data["protocol"] else "simulate", data["out"]),
     ]
     return [pairs]
+
+
+def _resting(poses: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """How many resting poses of the object have grasps, and which likely ones have none."""
+    if not poses:
+        return []
+    without = [(k, p["probability"]) for k, p in enumerate(poses) if not p["rows"]]
+    likely = ", ".join(f"{k} ({100 * share:.0f} %)" for k, share in without if share >= _LIKELY)
+    return [
+        (
+            "resting poses",
+            f"{len(poses) - len(without)} of {len(poses)} have grasps" + (f"; none: {likely}" if likely else ""),
+        )
+    ]
 
 
 def _profile(data: dict[str, Any]) -> list[Block]:

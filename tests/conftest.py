@@ -80,7 +80,8 @@ def load(swift: Pipeline, cache_root: Path) -> Callable[..., Inputs]:
     def load(name: str = OBJECT, pipeline: Pipeline = swift) -> Inputs:
         keys = input_keys(find_hand("allegro"), name, 1.0, pipeline.object, pipeline.field)
         cache = Cache(cache_root, pytest.fail)
-        return load_inputs(cache, keys, 1.0, pipeline.object, pipeline.field, resolve_device("cpu"))
+        parts = keys, 1.0, pipeline.object, pipeline.field, resolve_device("cpu")
+        return load_inputs(cache, *parts, table=pipeline.on_table)
 
     return load
 

@@ -73,6 +73,8 @@ def object_problems(record: ObjectRecord) -> list[str]:
             problems.append(f"{where}/normals: {len(record.normals)} for {len(record.vertices)} vertices")
         elif not are_unit(record.normals).all():
             problems.append(f"{where}/normals: not of unit length")
+    if record.tables is not None and not (are_unit(record.tables[:, :3]) & np.isfinite(record.tables).all(1)).all():
+        problems.append(f"{where}/tables: a normal is not of unit length, or a number not finite")
     if not 0 < record.scale < np.inf:
         problems.append(f"{where}: scale is {record.scale}, must be positive")
     return problems
@@ -98,6 +100,9 @@ def row_problems(
         require(~((rows.q < limits[0]) | (rows.q > limits[1])), "q: outside the joint limits by more than 1e-4")
         _check_poses(rows, len(object_ids), require)
         _check_contacts(rows, len(hand.link_names), require)
+        if rows.table:
+            require(rows.table["pose"] >= 0, "table/pose: negative")
+            require(are_unit(rows.table["approach"]), "table/approach: not of unit length")
         if rows.sequence is not None:
             _check_steps(rows, rows.sequence, *limits, require)
             _check_parents(rows, rows.sequence, column, first_row, require)

@@ -17,10 +17,10 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import column_texts, create_rows, finish, write_context
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, Shard, ShardHeader
-from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS
+from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS, TABLE_FIELDS
 from lgrasp.notices import notice
 
-_FIELDS = GRASP_FIELDS | SEQUENCE_FIELDS
+_FIELDS = GRASP_FIELDS | SEQUENCE_FIELDS | TABLE_FIELDS
 
 
 def merge_shards(

@@ -15,7 +15,7 @@ from lgrasp.dataset.files import check_heaps, check_regular
 from lgrasp.dataset.structure import expand, format_problems, shard_problems
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
-from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS
+from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, TABLE_FIELDS
 
 _RENAMED = {"metrics/disturbance": "metrics/unresisted_load"}
 """Flat names of columns in shards of earlier releases -> their names; readers give the columns by these."""
@@ -119,7 +119,7 @@ class FileReader:
                 watertight=bool(group.attrs["watertight"]),
                 vertices=group["vertices"][()],
                 faces=group["faces"][()],
-                normals=group["normals"][()] if "normals" in group else None,
+                **{name: group[name][()] for name in ("normals", "tables") if name in group},
             )
 
     def objects(self) -> tuple[ObjectRecord, ...]:
@@ -154,6 +154,7 @@ class ShardReader(FileReader):
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
         """Shape and dtype of every row dataset by its flat name (``q``, ``metrics/gap``, ...)."""
         names = [*GRASP_FIELDS, *(SEQUENCE_FIELDS if self.space_names is not None else ())]
+        names += TABLE_FIELDS if "table" in self._file["grasps"] else ()
         for path in (path for group in ("metrics", "physics") for path in expand(self._file, f"grasps/{group}/*")):
             name = path.removeprefix("grasps/")
             names.append(_RENAMED.get(name, name))
@@ -187,6 +188,7 @@ class ShardReader(FileReader):
             members = {n.partition("/")[2]: v for n, v in values.items() if n.startswith(f"{group}/")}
             fields[group] = members
             fields[texts] = {n: self._dataset(f"{group}/{n}").attrs[attribute] for n in members}
+        fields["table"] = {n.partition("/")[2]: v for n, v in values.items() if n in TABLE_FIELDS}
         if self.space_names is not None:
             steps = {name.removeprefix("sequence/"): values[name] for name in SEQUENCE_FIELDS}
             fields["sequence"] = SequenceRows(space_names=self.space_names, **steps)

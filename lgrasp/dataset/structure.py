@@ -16,6 +16,7 @@ from lgrasp.grasp.schema import (
     FORMAT,
     FORMAT_VERSION,
     SEQUENCE_DATASETS,
+    TABLE_FIELDS,
     AttributeSpec,
     DatasetSpec,
 )
@@ -83,10 +84,11 @@ def _foreign_data(dataset: h5py.Dataset) -> str:
 
 def structure_problems(file: h5py.File) -> list[str]:
     """All differences between a file and the schema of shards, one line each; empty when it conforms."""
-    sequences = SEQUENCE_DATASETS if any(spec.path in file for spec in SEQUENCE_DATASETS) else ()
+    groups = (SEQUENCE_DATASETS, tuple(TABLE_FIELDS.values()))
+    found = [spec for group in groups if any(spec.path in file for spec in group) for spec in group]
     return [
         *([] if expand(file, "objects/*") else ["objects: no object"]),
-        *schema_problems(file, (*DATASETS, *sequences), ATTRIBUTES),
+        *schema_problems(file, (*DATASETS, *found), ATTRIBUTES),
         *([] if "statistics" in file else ["statistics: missing group"]),
     ]
 

@@ -14,7 +14,15 @@ from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.structure import structure_problems, text_sha256
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, object_set_sha256
-from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, DatasetSpec
+from lgrasp.grasp.schema import (
+    CHUNK_ROWS,
+    FORMAT,
+    FORMAT_VERSION,
+    GRASP_FIELDS,
+    SEQUENCE_FIELDS,
+    TABLE_FIELDS,
+    DatasetSpec,
+)
 from lgrasp.paths import name_problem
 
 
@@ -116,6 +124,8 @@ def _write_object(group: h5py.Group, record: ObjectRecord) -> None:
     create_array(group, "faces", record.faces, "i4")
     if record.normals is not None:
         create_array(group, "normals", record.normals, "f4")
+    if record.tables is not None:
+        create_array(group, "tables", record.tables, "f4")
 
 
 def create_rows(file: h5py.File, name: str, shape: Sequence[int], dtype: np.dtype, text: str = "") -> h5py.Dataset:
@@ -157,8 +167,8 @@ def _as_format(rows: GraspRows, *, where: Any) -> GraspRows:
     def converted(source: Any, specs: Mapping[str, DatasetSpec]) -> dict[str, Any]:
         columns = {}
         for name, spec in specs.items():
-            member = name.removeprefix("sequence/")
-            values = np.asarray(getattr(source, member))
+            member = name.rpartition("/")[2]
+            values = np.asarray(source[member] if isinstance(source, Mapping) else getattr(source, member))
             columns[member] = values.astype(spec.numpy, copy=False)
             if spec.numpy.kind in "biu" and not np.array_equal(columns[member], values):
                 raise ShardError(f"cannot write {where}: {spec.path} holds values that do not fit {spec.numpy}")
@@ -170,4 +180,6 @@ def _as_format(rows: GraspRows, *, where: Any) -> GraspRows:
     metrics = {name: np.asarray(values, dtype="f4") for name, values in sorted(rows.metrics.items())}
     physics = {name: np.asarray(values) for name, values in sorted(rows.physics.items())}
     steps = rows.sequence and replace(rows.sequence, **converted(rows.sequence, SEQUENCE_FIELDS))
-    return replace(rows, **converted(rows, GRASP_FIELDS), metrics=metrics, physics=physics, sequence=steps)
+    table = rows.table and converted(rows.table, TABLE_FIELDS)
+    kept = {"metrics": metrics, "physics": physics, "sequence": steps, "table": table}
+    return replace(rows, **converted(rows, GRASP_FIELDS), **kept)

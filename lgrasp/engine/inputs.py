@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.errors import ObjectError
 from lgrasp.field.arrays import FieldArrays, upload_field
@@ -25,6 +27,7 @@ from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
+from lgrasp.object.resting import RESTING_VERSION, resting_planes
 from lgrasp.runtime.device import Device
 from lgrasp.stages.context import Keeper
 
@@ -133,6 +136,11 @@ class Loader:
             notice(f"object '{model.name}': {line}")
         return model
 
+    def planes(self, obj: ObjectModel, key: str) -> np.ndarray:
+        """Planes that an object of a key rests on (:func:`~lgrasp.object.resting.resting_planes`)."""
+        key = content_key("resting", RESTING_VERSION, object=key)
+        return self.cache.get("resting", key, lambda: {"planes": resting_planes(obj)})[0]["planes"]
+
     def field(self, hand: HandArrays, key: str, params: FieldParams) -> ContactField:
         def make() -> ContactField:
             from lgrasp.field.build import build_field
@@ -160,16 +168,23 @@ def load_inputs(
     fields: FieldParams,
     device: Device,
     report: Report | None = None,
+    *,
+    table: bool = False,
 ) -> Inputs:
-    """Load or make hand, object and field, and put them on the device."""
+    """Load or make hand, object and field, and put them on the device.
+
+    Args:
+        table: also the planes that the object rests on.
+    """
     assert keys.mesh is not None
     load, alias = Loader(cache, device.alias, report), device.alias
     hand_model = load.hand(keys.source, keys.hand)
     object_model = load.object(keys.mesh, keys.object, scale, objects)
+    planes = load.planes(object_model, keys.object) if table else None
     hand = upload_hand(hand_model, alias)
     field_model = load.field(hand, keys.field, fields)
     start = time.perf_counter()
-    obj, field = upload_object(object_model, alias), upload_field(field_model, hand_model, alias)
+    obj, field = upload_object(object_model, alias, planes), upload_field(field_model, hand_model, alias)
     load.seconds["upload"] = time.perf_counter() - start
     return Inputs(hand, obj, field, keys, device, load.seconds, load.hits)
 

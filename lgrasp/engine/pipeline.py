@@ -58,6 +58,11 @@ class Pipeline(_Head):
         return self.order.index("ik") < self.order.index("search")
 
     @property
+    def on_table(self) -> bool:
+        """True if grasps leave room for the table that the object rests on."""
+        return self.params("place").table
+
+    @property
     def sections(self) -> tuple[tuple[Stage, BaseModel], ...]:
         """Everything that has parameters and a version: the stages, and ``sequence`` where there is one."""
         stages = tuple((STAGES[name], params) for name, params in self.stages)
@@ -103,6 +108,10 @@ class Pipeline(_Head):
             ConfigError: passes out of range.
         """
         return self if passes is None else self.with_params("search", passes=passes)
+
+    def with_table(self) -> "Pipeline":
+        """A copy whose grasps leave room for the table that the object rests on."""
+        return self.with_params("place", table=True)
 
     def with_simulation(self, protocol: str) -> "Pipeline":
         """A copy that keeps only grasps which hold under a protocol of :mod:`lgrasp.simulate.protocol`.

@@ -68,6 +68,9 @@ class GraspBounds(Params):
     min_pregrasp_distance: float = Field(
         default=0.001, ge=0, le=0.05, description="Least distance of touching fingers and object in q_pregrasp."
     )
+    min_table_distance: float = Field(
+        default=0.001, ge=0, le=0.05, description="Least distance of the hand from the table, where there is one."
+    )
     squeeze_force: float = Field(
         default=15.0, ge=0, le=1000, description="Normal forces together that q_squeeze presses with [N]."
     )

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from lgrasp.grasp.approach_kernels import RETREATS, Palm, check_table, choose_approach, try_retreats
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check_kernels import (
     ALL,
@@ -24,9 +25,10 @@ from lgrasp.grasp.control_kernels import FINGER_TRIES, control_poses, open_finge
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS
 from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, grasp_epsilon, resist_loads
-from lgrasp.grasp.tables import GraspTable
+from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.surface import palm_axis
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.runtime.scan import running_sums
@@ -35,6 +37,7 @@ from lgrasp.runtime.tally import Tally, empty_tally, read_tallies
 
 _MAX_RANKED_PENETRATION = 0.03  # [m] penetrations above this are not distinguished
 _LOAD_DIRECTIONS = 6
+_ON_TABLE = {"resting": "pose", "approach": "approach"}  # columns of rows on a table, and their names in it
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,12 @@ class Check:
         inputs = [self.hand.struct, self.obj.struct, self.held.struct, self.limits, self.at]
         wp.launch(measure_held_penetration, (self.bodies, len(self)), inputs, [self.found], device=self.hand.device)
 
+    def clear_table(self, part: int) -> None:
+        """Refuse hands of which a part is not above the table of the object, if there is one."""
+        if self.obj.planes is not None:
+            inputs = [self.hand.struct, self.obj.struct, self.limits, part, self.at]
+            wp.launch(check_table, (self.bodies, len(self)), inputs, [self.found], device=self.hand.device)
+
     def decide(self) -> tuple[Tally, wp.array]:
         """The remaining checks, of the contacts' forces: hands by outcome, and for each hand whether it passed."""
         d, n = self.hand.device, len(self)
@@ -87,24 +96,41 @@ class Check:
         running_sums(upto)
         row = wp.full(len(self), -1, dtype=wp.int32, device=self.hand.device)
         wp.launch(list_kept, len(self), [self.found, upto], [row], device=self.hand.device)
-        columns = self._columns(seed, row)
+        packed = self._pack(seed, row)
+        if self.obj.planes is not None:
+            self._approach(row, packed, tally)
+        columns = _columns(packed)
         fetched = read_tallies([tally], list(columns.values()))
-        return _table(dict(zip(columns, fetched, strict=True)), tally["kept"]), tally
+        table = _table(dict(zip(columns, fetched, strict=True)), tally["kept"] + tally["approach"])
+        return take_rows(table, np.isfinite(table.table["approach"]).all(1)) if table.table else table, tally
 
     def every(self, seed: wp.array) -> tuple[GraspTable, np.ndarray]:
         """All hands as rows in their order, and their outcomes (:class:`~lgrasp.grasp.outcomes.Outcome`), (n,)."""
         self.decide()
-        columns = self._columns(seed, wp.array(np.arange(len(self)), dtype=wp.int32, device=self.hand.device))
-        return _table({n: values.numpy() for n, values in columns.items()}, len(self)), self.found.outcome.numpy()
+        packed = self._pack(seed, wp.array(np.arange(len(self)), dtype=wp.int32, device=self.hand.device))
+        columns = {name: values.numpy() for name, values in _columns(packed).items()}
+        return _table(columns, len(self)), self.found.outcome.numpy()
 
-    def _columns(self, seed: wp.array, row: wp.array) -> dict[str, wp.array]:
+    def _approach(self, row: wp.array, packed: Packed, tally: Tally) -> None:
+        """A straight way for the open hand to the hands ``row``; those without one are counted as such."""
+        d, m = self.hand.device, len(self)
+        centre, facing = palm_axis(self.hand.model)
+        palm = make_struct(Palm, centre=wp.vec3(*map(float, centre)), facing=wp.vec3(*map(float, facing)))
+        packed.resting, packed.approach = wp.empty(m, dtype=wp.int32, device=d), wp.empty(m, dtype=wp.vec3, device=d)
+        clear = wp.zeros(m, dtype=wp.int32, device=d)
+        inputs = [self.hand.struct, self.obj.struct, self.limits, palm, self.at, row, packed]
+        wp.launch(try_retreats, (m, RETREATS), inputs, [clear], device=d)
+        wp.launch(choose_approach, m, [self.obj.struct, palm, self.at, row, clear], [packed, tally.device], device=d)
+
+    def _pack(self, seed: wp.array, row: wp.array) -> Packed:
         """What is stored of the hands ``row`` (-1: none), arrays as long as there are hands."""
         d, m, model = self.hand.device, len(self), self.hand.model
         hand, obj, limits, places = self.hand.struct, self.obj.struct, self.limits, self.places
         at, found = self.at, self.found
         postures = {n: wp.empty((m, model.dofs), dtype=wp.float32, device=d) for n in ("q", "q_pregrasp", "q_squeeze")}
         numbers = wp.empty((len(MEASURED), m), dtype=wp.float32, device=d)
-        packed = empty_struct(Packed, d, m, at.contact.shape[1], numbers=numbers, **postures)
+        none = {"resting": wp.empty(0, dtype=wp.int32, device=d), "approach": wp.empty(0, dtype=wp.vec3, device=d)}
+        packed = empty_struct(Packed, d, m, at.contact.shape[1], numbers=numbers, **postures, **none)
         opened = wp.empty((m, model.groups), dtype=vec_dof, device=d)
         wp.launch(center_forces, m, [limits, places, at, row], [found], device=d)
         inputs = [hand, limits, places, at, found, row]
@@ -118,17 +144,24 @@ class Check:
         wp.launch(open_fingers, m, inputs, [packed], device=d)
         wp.launch(grasp_epsilon, m, [obj, seed, limits, places, at, row], [packed], device=d)
         wp.launch(pack_rows, m, [hand, places, at, found, row], [packed], device=d)
-        return {name: getattr(packed, name) for name in Packed.vars}
+        return packed
+
+
+def _columns(packed: Packed) -> dict[str, wp.array]:
+    """The arrays that there are."""
+    arrays = {name: getattr(packed, name) for name in Packed.vars}
+    return {name: array for name, array in arrays.items() if name not in _ON_TABLE or array.size}
 
 
 def _table(columns: dict[str, np.ndarray], count: int) -> GraspTable:
-    """The first ``count`` rows of what :meth:`Check._columns` gave."""
+    """The first ``count`` rows of what :func:`_columns` gave."""
     x: dict[str, Any] = {name: values[:count] for name, values in columns.items() if name != "numbers"}
     numbers = dict(zip(MEASURED, columns["numbers"][:, :count], strict=True))
     numbers |= {name: x.pop(name) for name in ("epsilon", "self_penetration", "pregrasp_opening")}
     numbers["force_closure"] = (numbers["epsilon"] > 0).astype(np.float32)
     numbers["normal_error"] = np.arccos(np.clip(numbers["facing"], -1, 1))
     x["index"] = x["index"].astype(np.int64)
+    x["table"] = {name: x.pop(column) for column, name in _ON_TABLE.items() if column in x}
     return GraspTable(**x, metrics={name: numbers[name] for name in METRICS})
 
 
@@ -182,6 +215,7 @@ def check_grasps(
         pose=wp.array(pose, dtype=wp.transform, device=d),
         of=wp.array(rows, dtype=wp.int32, device=d),
         index=zeros,
+        resting=wp.full(n, -1, dtype=wp.int32, device=d),
         slot=zeros,
         body=wp.empty((n, len(model.piece_first) - 2), dtype=wp.transform, device=d),
         contact=contacts.link,

@@ -27,6 +27,7 @@ class Limits:
     max_unresisted_load: wp.float32
     pregrasp_distance: wp.float32
     min_pregrasp_distance: wp.float32
+    min_table_distance: wp.float32
     squeeze_force: wp.float32
     squeeze_stiffness: wp.float32
     deepest: wp.float32  # penetrations above this are not distinguished
@@ -39,6 +40,7 @@ class CheckedPostures:
 
     pose: wp.array(dtype=wp.transform)  # (P,) T_hand_object of the internal frame
     index: wp.array(dtype=wp.int32)  # (P,) candidate, which tells what the hand holds already
+    resting: wp.array(dtype=wp.int32)  # (P,) resting pose of the object, -1 none
     of: wp.array(dtype=wp.int32)  # (n,) pose of each
     slot: wp.array(dtype=wp.int32)  # (n,)
     chosen: wp.array2d(dtype=wp.int32)  # (n, G) -1: the group does not touch the object
@@ -92,6 +94,8 @@ class Packed:
     epsilon: wp.array(dtype=wp.float32)  # (m,)
     self_penetration: wp.array(dtype=wp.float32)  # (m,) [m]
     pregrasp_opening: wp.array(dtype=wp.float32)  # (m,) [rad or m]
+    resting: wp.array(dtype=wp.int32)  # (m,) resting pose of the object; only where there is a table, as the next
+    approach: wp.array(dtype=wp.vec3)  # (m,) direction in which the open hand comes, base frame; NaN none
 
 
 def device_limits(bounds: GraspBounds, *, deepest: float | None = None) -> Limits:

@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.arrays import Hand, hand_grid
-from lgrasp.math.convex import point_depth
+from lgrasp.math.convex import Pieces, point_depth
 from lgrasp.math.sdf import sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -12,6 +12,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 wp.set_module_options(KERNEL_OPTIONS)
 
 _CLUSTER = wp.constant(CLUSTER_SIZE)
+_FAR_BELOW = wp.constant(1.0e6)  # [m]
 
 
 @wp.func
@@ -94,6 +95,56 @@ def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: 
                 if depth > limit:
                     return depth
     return depth
+
+
+@wp.func
+def plane_height(plane: wp.vec4, p: wp.vec3):
+    """Height of a point above a plane [m]."""
+    return plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2] - plane[3]
+
+
+@wp.func
+def body_height(pieces: Pieces, body: wp.int32, T: wp.transform, plane: wp.vec4, enough: wp.float32):
+    """Least height of a body above a plane [m]: of its convex pieces, or less than that where it is above ``enough``.
+
+    Args:
+        T: pose of the body in the frame of the plane.
+        plane: unit normal up, and height of the plane along it [m].
+    """
+    low = float(1.0e9)
+    s = pieces.body_sphere[body]
+    if s[3] < 0.0:
+        return low
+    centre = plane_height(plane, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])))
+    if centre - s[3] > enough:
+        return centre - s[3]
+    for piece in range(pieces.body_first[body], pieces.body_first[body + 1]):
+        for k in range(pieces.vertex_first[piece], pieces.vertex_first[piece + 1]):
+            height = plane_height(plane, wp.transform_point(T, pieces.vertices[k]))
+            low = wp.min(low, height - pieces.radius[piece])
+    return low
+
+
+@wp.func
+def finger_above(hand: Hand, g: wp.int32, X: wp.array(dtype=wp.transform), plane: wp.vec4, margin: wp.float32):
+    """True if all bodies of a finger are above a plane by ``margin`` [m]; X holds the poses of its bodies."""
+    j0 = hand.kin.joint_first[g]
+    for j in range(hand.kin.joint_first[g + 1] - j0):
+        if body_height(hand.pieces, 1 + j0 + j, X[j], plane, margin) < margin:
+            return False
+    return True
+
+
+@wp.func
+def resting_plane(obj: Object, T: wp.transform, pose: wp.int32):
+    """Plane that an object at T rests on in one of its resting poses, as :func:`body_height` takes it, in the frame of
+    T; of pose -1 one that is below everything."""
+    plane = wp.vec4(0.0, 0.0, 0.0, -_FAR_BELOW)
+    if pose >= 0:
+        up = wp.transform_vector(T, obj.resting.up[pose])
+        height = obj.resting.height[pose] + wp.dot(up, wp.transform_get_translation(T))
+        plane = wp.vec4(up[0], up[1], up[2], height)
+    return plane
 
 
 @wp.func

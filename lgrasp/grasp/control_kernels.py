@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.grasp.check_kernels import hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
-from lgrasp.grasp.collision import body_apart
+from lgrasp.grasp.collision import body_apart, body_height, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.constants import SLIDING_ARM
@@ -134,13 +134,19 @@ def finger_clear(
     limits: Limits,
     h: wp.int32,
     g: wp.int32,
-    T_object: wp.transform,
+    T: wp.transform,
+    pose: wp.int32,
     X: wp.array(dtype=wp.transform),
 ):
-    """1 if the bodies of a finger are off the object and what is held; X[j] = pose of body 1 + j."""
+    """1 if the bodies of a finger are off the object at T, its table and what is held; X[j] = pose of body 1 + j."""
+    T_object = wp.transform_inverse(T)
+    plane = resting_plane(obj, T, pose)
+    above = limits.min_table_distance
     clear = int(1)
     for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
         if clear == 1 and not body_apart(hand, obj, 1 + k, T_object * X[k], limits.min_pregrasp_distance):
+            clear = 0
+        if clear == 1 and body_height(hand.pieces, 1 + k, X[k], plane, above) < above:
             clear = 0
         if clear == 1 and not body_clear_of_held(hand, held, h, 1 + k, X[k], limits.min_self_distance):
             clear = 0
@@ -185,7 +191,7 @@ def open_poses(
         return
     h = at.index[at.of[s]] // held.tries
     G = hand.kin.groups
-    T_object = wp.transform_inverse(at.pose[at.of[s]])
+    T = at.pose[at.of[s]]
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     share = float(1.0)
     for t in range(_OPENING_SHARES):
@@ -195,7 +201,7 @@ def open_poses(
             x = at.posture[s, g] + share * (opened[i, g] - at.posture[s, g])
             group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
             if clear == 1 and at.chosen[s, g] >= 0:
-                clear = finger_clear(hand, obj, held, limits, h, g, T_object, X)
+                clear = finger_clear(hand, obj, held, limits, h, g, T, at.resting[at.of[s]], X)
         for b in range(G):
             for a in range(b + 2):
                 moves = wp.where(at.chosen[s, b] >= 0 or (a > 0 and at.chosen[s, wp.max(a - 1, 0)] >= 0), 1, 0)
@@ -261,7 +267,8 @@ def try_fingers(
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     x = opened_finger(hand, held, h, g, t, at.posture[s, g], opened[i, g])
     group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
-    if finger_clear(hand, obj, held, limits, h, g, wp.transform_inverse(at.pose[at.of[s]]), X) == 1:
+    r = at.of[s]
+    if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X) == 1:
         wp.atomic_or(clear_out, k, g, 1 << t)
 
 

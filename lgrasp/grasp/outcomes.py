@@ -15,6 +15,8 @@ class Outcome(IntEnum):
     CONTACT = 4
     BALANCE = 5
     UNRESISTED_LOAD = 6
+    TABLE = 7
+    APPROACH = 8
 
 
 KEPT = wp.constant(int(Outcome.KEPT))
@@ -24,8 +26,13 @@ OBJECT_COLLISION = wp.constant(int(Outcome.OBJECT_COLLISION))
 CONTACT = wp.constant(int(Outcome.CONTACT))
 BALANCE = wp.constant(int(Outcome.BALANCE))
 UNRESISTED_LOAD = wp.constant(int(Outcome.UNRESISTED_LOAD))
+TABLE = wp.constant(int(Outcome.TABLE))
+APPROACH = wp.constant(int(Outcome.APPROACH))
 
-REASONS = ("kept", "unused finger", "self-collision", "object collision", "contact", "balance", "unresisted load")
+REASONS = (
+    *("kept", "unused finger", "self-collision", "object collision", "contact", "balance", "unresisted load"),
+    *("table", "approach"),
+)
 """Outcomes in words, by code."""
 
 MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")

@@ -58,6 +58,8 @@ class ObjectRecord:
     """Vertex indices of triangles, shape [F, 3], int32; none of a point cloud, whose points are the vertices."""
     normals: np.ndarray | None = None
     """Outward unit normals of the vertices, shape [V, 3], float32, where they are known, as of a point cloud."""
+    tables: np.ndarray | None = None
+    """Planes that it rests on: unit normal up, height along it [m], probability; user frame, shape [T, 5], float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +118,9 @@ class GraspRows:
     """Simulator verdicts, each shape [N, ...]."""
     physics_protocols: Mapping[str, str] = field(default_factory=dict)
     """Protocol of each verdict (one per name in ``physics``)."""
+    table: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Of objects on a table: ``pose``, the place of its plane in ``tables`` of the object, shape [N], int32, and
+    ``approach``, the unit direction in which the open hand comes, hand base frame, shape [N, 3], float32."""
     sequence: SequenceRows | None = None
     """Steps, where objects were taken one after another; then ``q...`` are those of the last step."""
 
@@ -123,10 +128,11 @@ class GraspRows:
         return int(np.shape(self.q)[0])
 
     def columns(self) -> dict[str, np.ndarray]:
-        """All row arrays by flat name: fields, then ``sequence/NAME``, ``metrics/NAME`` and ``physics/NAME``."""
+        """Row arrays by flat name: fields, ``sequence/NAME``, ``table/NAME``, ``metrics/NAME``, ``physics/NAME``."""
         flat = {name: getattr(self, name) for name in GRASP_FIELDS}
         if self.sequence is not None:
             flat |= {name: getattr(self.sequence, name.removeprefix("sequence/")) for name in SEQUENCE_FIELDS}
+        flat |= {f"table/{name}": values for name, values in self.table.items()}
         flat |= {f"metrics/{name}": values for name, values in self.metrics.items()}
         return flat | {f"physics/{name}": values for name, values in self.physics.items()}
 

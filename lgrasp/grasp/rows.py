@@ -55,6 +55,7 @@ def grasp_rows(
         metric_units=METRIC_UNITS,
         physics=table.physics,
         physics_protocols=dict.fromkeys(table.physics, protocol),
+        table=table.table,
     )
 
 

@@ -1,4 +1,4 @@
-"""The shard format 1.1 as data: the one place that names its groups, datasets, attributes, dtypes and shapes.
+"""The shard format 1.2 as data: the one place that names its groups, datasets, attributes, dtypes and shapes.
 
 Capital letters in a shape hold across the file (``N`` rows, ``K`` actuated joints, ``L`` links, ``O`` objects in a row,
 ``C`` most contacts per object, ``S`` opposition spaces); lower-case letters are free per dataset; ``...`` is any number
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 FORMAT = "lgrasp-shard"
-FORMAT_VERSION = "1.1"
+FORMAT_VERSION = "1.2"
 CHUNK_ROWS = 4096
 MADE_FROM = "made_from"
 """Statistic of a shard that a job made of another: content key of the job and of the rows that it was made of."""
@@ -79,6 +79,12 @@ SEQUENCE_FIELDS: dict[str, DatasetSpec] = {
 }
 """Row datasets of sequences by their flat name; all or none of them are there."""
 
+TABLE_FIELDS: dict[str, DatasetSpec] = {
+    "table/pose": DatasetSpec("grasps/table/pose", "i4", ("N",)),
+    "table/approach": DatasetSpec("grasps/table/approach", "f4", ("N", 3)),
+}
+"""Row datasets of grasps of an object on a table by their flat name; all or none of them are there."""
+
 ROW_GROUPS: dict[str, DatasetSpec] = {
     "metrics": DatasetSpec("grasps/metrics/*", "f4", ("N",)),
     "physics": DatasetSpec("grasps/physics/*", "any", ("N", "...")),
@@ -100,6 +106,7 @@ MODEL_DATASETS: tuple[DatasetSpec, ...] = (
 DATASETS: tuple[DatasetSpec, ...] = (
     *MODEL_DATASETS,
     DatasetSpec("objects/*/normals", "f4", ("v", 3), required=False),
+    DatasetSpec("objects/*/tables", "f4", ("t", 5), "m", required=False),
     *GRASP_FIELDS.values(),
     *ROW_GROUPS.values(),
 )

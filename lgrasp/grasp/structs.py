@@ -25,6 +25,7 @@ class Poses:
     palm_point: wp.array(dtype=wp.int32)  # (P,) hand contact point that touches, -1 none
     palm_surface: wp.array(dtype=wp.int32)  # (P,) object contact point that touches, -1 none
     setting: wp.array(dtype=wp.int32)  # (P,) setting of the hand's shared joints
+    resting: wp.array(dtype=wp.int32)  # (P,) resting pose of the object, -1 none
     anchor: wp.array2d(dtype=wp.int32)  # (P, G) object contact point about which the group can touch, -1 unknown
     rows: wp.array(dtype=wp.int32)  # (1,) rows in use
 

@@ -15,7 +15,7 @@ import warp as wp
 from lgrasp.grasp.structs import Candidates, Poses, Sets
 from lgrasp.runtime.structs import empty_arrays, make_struct
 
-_FAMILIES = ("metrics", "physics")  # columns of a table in memory that come by name
+_FAMILIES = ("metrics", "physics", "table")  # columns of a table in memory that come by name
 
 
 class DeviceTable:
@@ -77,6 +77,7 @@ class PoseTable(DeviceTable):
     palm_point: wp.array
     palm_surface: wp.array
     setting: wp.array
+    resting: wp.array
     anchor: wp.array
     rows: wp.array
 
@@ -128,6 +129,7 @@ class GraspTable:
     contact_forces: np.ndarray  # (N, C, 3) object frame
     metrics: dict[str, np.ndarray]  # (N,) each
     physics: dict[str, np.ndarray] = field(default_factory=dict)  # (N, ...) each: verdicts of a simulator
+    table: dict[str, np.ndarray] = field(default_factory=dict)  # pose (N,) i32, approach (N, 3): where there is one
 
     def __len__(self) -> int:
         return len(self.index)
@@ -156,11 +158,11 @@ def select_poses(table: CandidateTable, rows: np.ndarray, device: str) -> Candid
 
 
 Rows = TypeVar("Rows")
-"""A table in memory: a dataclass of arrays of N rows and of mappings of such, ``metrics`` and ``physics``."""
+"""A table in memory: a dataclass of arrays of N rows and of mappings of such, by the names of families."""
 
 
 def grasp_arrays(table: Any) -> dict[str, np.ndarray]:
-    """A table in memory as flat NumPy arrays (metrics as ``metrics.NAME``, verdicts as ``physics.NAME``)."""
+    """A table in memory as flat NumPy arrays (metrics as ``metrics.NAME``, and so on)."""
     out = {f.name: getattr(table, f.name) for f in fields(table) if f.name not in _FAMILIES}
     for family in _FAMILIES:
         out |= {f"{family}.{name}": values for name, values in getattr(table, family).items()}

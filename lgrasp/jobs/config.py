@@ -51,6 +51,7 @@ class JobConfig(Params):
     batch: int = Field(0, ge=0)
     shard_rows: int = Field(10_000, ge=1)
     passes: int | None = Field(None, ge=1, le=64)
+    table: bool = Field(False, description="Grasps leave room for the table that the object rests on.")
     sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn.")
 
     @model_validator(mode="before")
@@ -146,6 +147,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
         if not sets:
             meshes = [in_folder(config.object_dir, mesh) for mesh in objects]
             own = pipeline.with_passes(config.passes)
+            own = own.with_table() if config.table else own
             more = config.model_dump(include={"scale", "batch"})
             found += pair_requests(hands, meshes, own, config.out, **shared, **more)
             continue
@@ -177,8 +179,9 @@ def pair_requests(
         ConfigError: a value out of range, or two pairs with the same folder.
     """
     found: dict[Path, GenerateRequest] = {}
+    name = f"{pipeline.name}-table" if pipeline.on_table else pipeline.name
     for hand, mesh in itertools.product(hands, objects):
-        out = run_folder(top, *_names(hand, mesh), pipeline.name, protocol)
+        out = run_folder(top, *_names(hand, mesh), name, protocol)
         what = {"hand": hand, "object": mesh, "pipeline": pipeline, "out": out}
         request = parse_model(GenerateRequest, what | shared, "generate")
         if other := found.get(out):

@@ -82,10 +82,11 @@ class GenerateJob(GenerateRequest, SearchJob):
     def load_inputs(self, events: Events) -> Inputs:
         pipeline, device, self._rate = self.pipeline, self.device_used, self.rate
         self._graphs = GraphCache(pipeline) if device.is_cuda and self.threads() == 1 else None
-        return load_inputs(self.cache, self.keys, self.scale, pipeline.object, pipeline.field, device, events.loading)
+        what = self.keys, self.scale, pipeline.object, pipeline.field, device, events.loading
+        return load_inputs(self.cache, *what, table=pipeline.on_table)
 
     def records(self, inputs: Inputs) -> tuple[HandModel, list[ObjectRecord]]:
-        return inputs.hand.model, [object_record(inputs.object.model)]
+        return inputs.hand.model, [object_record(inputs.object.model, tables=inputs.object.planes)]
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         result = make_shard(
@@ -115,7 +116,8 @@ class GenerateJob(GenerateRequest, SearchJob):
             ``grasps_per_s``, ``strict_valid_per_s``, ``published_count_per_s`` (over the wall time of placement through
             filter), ``seconds`` (thread-seconds per stage; ``wall`` of placement through filter; hand, object, field),
             ``survivors`` and ``counts`` per stage, ``near_duplicates`` (across shards), ``distinct_poses``,
-            ``force_closure`` (share) and what was asked.
+            ``force_closure`` (share), what was asked, and of objects on a table ``resting``: ``probability`` and
+            ``rows`` of each resting pose.
         """
         inputs, tree = self.inputs, self.inputs.hand.model.tree
         moving = tree.body_group[tree.link_body] >= 0
@@ -127,6 +129,12 @@ class GenerateJob(GenerateRequest, SearchJob):
         wall, both = sums["seconds"]["wall"], made + present
         rates = {"grasps": "rows", "strict_valid": "strict", "published_count": "published_count"}
         counts = ("strict", "distinct_poses", "published_count")
+        planes = inputs.object.planes
+        resting = (
+            [{"probability": float(p), "rows": both[f"pose {k}"]} for k, p in enumerate(planes[:, 4])]
+            if planes is not None
+            else []
+        )
         return {
             "grasps": outcome.rows,
             **{name: both[name] for name in counts},
@@ -137,6 +145,7 @@ class GenerateJob(GenerateRequest, SearchJob):
             "survivors": survivors(sums["counts"]),
             "asked": self.rows,
             "object": inputs.object.model.name,
+            **({"resting": resting} if resting else {}),
             **sums,
         }
 
@@ -167,6 +176,8 @@ def _tally(paths: Collection[Path], moving: np.ndarray) -> tuple[Counter[str], d
                 published_count=int(((fingers >= 3) & (fswo**2 < PUBLISHED_FSWO)).sum()),
                 distinct_poses=len(np.unique(reader.column("candidate") & POSE_BITS)),
             )
+            if "table/pose" in reader.columns:
+                found.update(Counter(f"pose {k}" for k in reader.column("table/pose").tolist()))
             return found, stage_counts(reader.statistics)
 
     whole: Counter[str] = Counter()

@@ -5,6 +5,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lgrasp.engine.cache import Cache
 from lgrasp.geometry.decompose import decompose
 from lgrasp.grasp.records import HandRecord, ObjectRecord
@@ -46,8 +48,8 @@ def hand_record(hand: HandModel, meshes: dict[str, bytes]) -> HandRecord:
     )
 
 
-def object_record(obj: ObjectModel, id: str | None = None) -> ObjectRecord:
-    """The object, in the user's frame; its name defaults to its id."""
+def object_record(obj: ObjectModel, id: str | None = None, tables: np.ndarray | None = None) -> ObjectRecord:
+    """The object, in the user's frame, and planes that it rests on; its name defaults to its id."""
     return ObjectRecord(
         id=id or obj.name,
         name=obj.name,
@@ -56,6 +58,7 @@ def object_record(obj: ObjectModel, id: str | None = None) -> ObjectRecord:
         watertight=obj.watertight,
         vertices=obj.vertices,
         faces=obj.faces,
+        tables=tables,
     )
 
 

@@ -15,6 +15,11 @@ NORMAL_DEG = 20.0
 RESIDUAL = 0.05
 """Least wrench that contact forces with normal parts of sum 1 leave over."""
 
+RESTING_GAP = 1e-3
+"""Lowest point of an object from the table that it rests on [m]."""
+APPROACH_LENGTH, APPROACH_STEP = 0.15, 0.01
+"""Way of the open hand to the grasp of an object on a table, and between the places where it is judged [m]."""
+
 MU = 0.5
 CONE_EDGES = 8
 TORQUE_SCALE = 10.0

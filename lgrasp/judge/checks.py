@@ -13,6 +13,7 @@ from lgrasp.judge.hand import pose_transforms
 from lgrasp.judge.meshes import PROBES
 from lgrasp.judge.shard import JudgedShard
 from lgrasp.judge.solids import on_links
+from lgrasp.judge.table import on_table
 from lgrasp.judge.wrench import ferrari_canny, force_errors, wrench_residual
 
 CHECKS: dict[str, tuple[str, float]] = {
@@ -29,6 +30,9 @@ CHECKS: dict[str, tuple[str, float]] = {
     "stored_normal": ("stored_normal_deg", bounds.NORMAL_DEG),
     "residual": ("residual", bounds.RESIDUAL),
     "object_object": ("object_object_mm", 1e3 * bounds.PENETRATION),
+    "table": ("below_table_mm", 0.0),
+    "resting": ("resting_gap_mm", 1e3 * bounds.RESTING_GAP),
+    "approach": ("approach_mm", 1e3 * bounds.PENETRATION),
     "frozen": ("", 0.0),
     "parent": ("", 0.0),
 }
@@ -76,6 +80,8 @@ class RowChecks:
             self._self_penetration(T_links)
             self._penetration(T_links, T_objects)
             self._contacts(T_links, T_objects)
+            if shard.table:
+                self._table(T_links, T_objects[:, 0])
             for row in good:
                 self._wrenches(int(row), epsilon)
         if shard.steps:
@@ -111,12 +117,26 @@ class RowChecks:
         self.link_of = known[np.where((links >= 0) & (links < len(names)), links, len(names))]
         absent = (self.index >= len(self.shard.objects)).any(axis=1) | ~present.any(axis=1)
         self.failed["indices"][:] = (self.used & (self.link_of < 0)).any(axis=(1, 2)) | absent
+        if self.shard.table:
+            self._form_of_table()
+
+    def _form_of_table(self) -> None:
+        """Tables that exist, and directions of unit length."""
+        self.table = {k: np.asarray(v[self.rows], float) for k, v in self.shard.table.items()}
+        with np.errstate(invalid="ignore", over="ignore"):
+            unit = np.abs(np.linalg.norm(self.table["approach"], axis=1) - 1.0) <= bounds.UNIT_NORMAL
+        self.failed["finite"] |= ~unit
+        tables = np.array([len(t) for t in self.shard.tables] + [0])
+        known = tables[np.clip(self.index[:, 0], -1, len(tables) - 1)]
+        pose = self.table["pose"]
+        self.failed["indices"] |= (
+            ~((pose >= 0) & (pose < known)) | (self.index.shape[1] > 1) | ("q_pregrasp" not in self.g)
+        )
 
     def _joints(self) -> dict[str, np.ndarray]:
         """Limits and mimic relations; values of all joints."""
         n = len(self.good)
-        stored = dict(zip(self.shard.joint_names, np.asarray(self.g["q"], float)[self.good].T, strict=True))
-        full = self.hand.resolve_joints(stored, n)
+        stored, full = self._values("q"), self._full("q")
         own, driven, relation = (np.zeros(n) for _ in range(3))
         for name, j in self.hand.movable.items():
             excess = np.maximum(np.maximum(j.lower - full[name], full[name] - j.upper), 0.0)
@@ -129,6 +149,26 @@ class RowChecks:
         self._set("mimic_limits", driven)
         self._set("mimic", relation)
         return full
+
+    def _values(self, posture: str) -> dict[str, np.ndarray]:
+        return dict(zip(self.shard.joint_names, np.asarray(self.g[posture], float)[self.good].T, strict=True))
+
+    def _full(self, posture: str) -> dict[str, np.ndarray]:
+        """Values of all joints."""
+        return self.hand.resolve_joints(self._values(posture), len(self.good))
+
+    def _table(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
+        """The hand above the table at the grasp, before it and along the way; the way clear of the object."""
+        good, hand = self.good, self.hand
+        pose, back = self.table["pose"][good].astype(int), -self.table["approach"][good]
+        T_open = hand.forward(self._full("q_pregrasp"), len(good))
+        found = np.zeros((3, len(good)))
+        for k, obj in enumerate(self.shard.objects):
+            m = np.flatnonzero(self.index[good, 0] == k)
+            planes = self.shard.tables[k][pose[m]]
+            found[:, m] = on_table(hand, obj, planes, T_objects[m], T_links[m], T_open[m], back[m])
+        for check, value in zip(("table", "resting", "approach"), found, strict=True):
+            self._set(check, 1e3 * value)
 
     def _self_penetration(self, T_links: np.ndarray) -> None:
         hand, depth = self.hand, np.zeros(len(self.good))

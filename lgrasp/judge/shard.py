@@ -39,6 +39,7 @@ STEPS: dict[str, tuple[str, ...]] = {
     "q_pregrasp": ("O", "K"),
     "q_squeeze": ("O", "K"),
 }
+TABLE: dict[str, tuple[str, ...]] = {"pose": (), "approach": ("3",)}
 OPTIONAL = ("q_pregrasp", "q_squeeze", "contact_forces")
 
 
@@ -56,6 +57,8 @@ class JudgedShard:
     object_keys: list[str]
     grasps: dict[str, np.ndarray]
     steps: dict[str, np.ndarray]
+    table: dict[str, np.ndarray]  # of rows on a table
+    tables: list[np.ndarray]  # (T, 5) of each object
     metrics: dict[str, tuple[np.ndarray, str]]
     kept_invalid: np.ndarray  # (n,), rows that the file itself calls invalid
     claims: dict[str, str]
@@ -153,6 +156,14 @@ def read_object(group: h5py.Group, source: Path | None) -> tuple[JudgedObject, s
     return _cached(key, lambda: JudgedObject(clean_mesh(vertices, faces))), key
 
 
+def read_tables(group: h5py.Group) -> np.ndarray:
+    """Planes that an object rests on, (T, 5); none where the shard tells none."""
+    tables = _array(group, "tables") if "tables" in group else np.zeros((0, 5))
+    if tables.ndim != 2 or tables.shape[1] != 5 or tables.dtype.kind != "f":
+        raise JudgeError(f"{group.name}/tables: {tables.dtype} of shape {tables.shape}, not numbers of shape (T, 5)")
+    return tables.astype(float)
+
+
 def read_shard(path: Path, urdf: Path | None = None, mesh: Mapping[str, Path] | None = None) -> JudgedShard:
     """Read one shard of format 1.
 
@@ -194,6 +205,7 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
     g, sizes = f["grasps"], {"K": len(joint_names)}
     grasps = _columns(g, COLUMNS, sizes)
     steps = _columns(g["sequence"], STEPS, sizes) if "sequence" in g else {}
+    table = _columns(g["table"], TABLE, sizes) if "table" in g else {}
     columns = _columns(g["metrics"], dict.fromkeys(g["metrics"], ()), sizes) if "metrics" in g else {}
     metrics = {k: (column, _text(g[f"metrics/{k}"].attrs.get("unit", ""))) for k, column in columns.items()}
     claims = {k: _text(f.attrs[k]) for k in ("pipeline", "lgrasp_version") if k in f.attrs}
@@ -211,6 +223,8 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
         object_keys=[key for _, key in objects.values()],
         grasps=grasps,
         steps=steps,
+        table=table,
+        tables=[read_tables(f["objects"][name]) for name in objects],
         metrics=metrics,
         kept_invalid=columns["valid"] == 0 if "valid" in columns else np.zeros(sizes["N"], bool),
         claims=claims,

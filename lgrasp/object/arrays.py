@@ -14,6 +14,16 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 
 @wp.struct
+class Resting:
+    """Planes that an object rests on; none unless grasps must leave room for a table."""
+
+    up: wp.array(dtype=wp.vec3)  # (T,) unit normals
+    height: wp.array(dtype=wp.float32)  # (T,) of the plane along its normal, internal frame [m]
+    weight: wp.array(dtype=wp.float32)  # (T,) how often each is drawn
+    count: wp.int32
+
+
+@wp.struct
 class Object:
     """All of an object that kernels read; internal frame (bounding-box centre at the origin) [m]."""
 
@@ -27,6 +37,7 @@ class Object:
     clusters: wp.int32
     com: wp.vec3
     radius: wp.float32  # largest distance of the surface from the centre of mass
+    resting: Resting
 
 
 @dataclass(frozen=True)
@@ -36,10 +47,16 @@ class ObjectArrays:
     model: ObjectModel
     device: str
     struct: "Object"
+    planes: np.ndarray | None = None
+    """That it rests on (:func:`~lgrasp.object.resting.resting_planes`), if grasps must leave room for a table."""
 
 
-def upload_object(model: ObjectModel, device: str) -> ObjectArrays:
-    """Copy an object to a device."""
+def upload_object(model: ObjectModel, device: str, planes: np.ndarray | None = None) -> ObjectArrays:
+    """Copy an object to a device.
+
+    Args:
+        planes: that it rests on, (T, 5) (:func:`~lgrasp.object.resting.resting_planes`); grasps leave room for them.
+    """
     nx, ny, nz = map(int, model.sdf.shape)
     grid = {"values": model.sdf.ravel(), "origin": model.sdf_origin, "inv_cell": 1.0 / float(model.sdf_cell)}
     same = {name: getattr(model, name) for name in ("contact_points", "contact_normals", "contact_opposite", "com")}
@@ -51,5 +68,10 @@ def upload_object(model: ObjectModel, device: str) -> ObjectArrays:
         "clusters": len(model.cluster_radius),
         "radius": float(np.linalg.norm(model.obstacle_points - model.com, axis=1).max()),
     }
+    if planes is not None:
+        up = planes[:, :3]
+        # the root: poses that are rare get grasps as well
+        resting = {"up": up, "height": planes[:, 3] - up @ model.center, "weight": np.sqrt(planes[:, 4])}
+        others["resting"] = upload_struct(Resting, device, resting | {"count": len(planes)})
     struct = upload_struct(Object, device, same | others)
-    return ObjectArrays(model, device, struct)
+    return ObjectArrays(model, device, struct, planes)

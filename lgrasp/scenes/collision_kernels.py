@@ -2,29 +2,12 @@
 
 import warp as wp
 
-from lgrasp.grasp.collision import body_depth
+from lgrasp.grasp.collision import body_depth, body_height
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.convex import Pieces
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
-
-
-@wp.func
-def _lowest(pieces: Pieces, body: wp.int32, T: wp.transform):
-    """Least z of a body's convex pieces [m]. T = T_scene_body."""
-    low = float(1.0e9)
-    s = pieces.body_sphere[body]
-    if s[3] < 0.0:
-        return low
-    centre = wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))
-    if centre[2] - s[3] > 0.0:
-        return centre[2] - s[3]
-    for piece in range(pieces.body_first[body], pieces.body_first[body + 1]):
-        for k in range(pieces.vertex_first[piece], pieces.vertex_first[piece + 1]):
-            low = wp.min(low, wp.transform_point(T, pieces.vertices[k])[2] - pieces.radius[piece])
-    return low
 
 
 @wp.kernel
@@ -54,7 +37,7 @@ def hand_depths(
     """
     i, b = wp.tid()
     T = T_scene_hand[i] * body[i, b]
-    table = -_lowest(hand.pieces, b, T)
+    table = -body_height(hand.pieces, b, T, wp.vec4(0.0, 0.0, 1.0, 0.0), 0.0)
     if table > 0.0:
         wp.atomic_max(table_out, i, table)
     depth = float(0.0)

@@ -33,6 +33,10 @@ class SearchRequest(Request):
         if self.shard_rows <= 0:
             raise ConfigError(f"--shard-rows {self.shard_rows}: must be at least 1")
         check_number(-(-self.rows // self.shard_rows), "shards; use larger --shard-rows or several --out")
+        if self.pipeline.on_table and (self.pipeline.sequence is not None or "refine" in self.pipeline.order):
+            raise ConfigError(
+                f"pipeline '{self.pipeline.name}' with place.table: only for one object, and without stage refine"
+            )
         hand_path(self.hand)
         check_folder(self.out)
 

@@ -6,14 +6,18 @@ from typing import Any
 import warp as wp
 
 from lgrasp.field.arrays import Boxes, Field, boxes_pick, field_has, field_pick, field_seed
+from lgrasp.grasp.collision import finger_above, resting_plane
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.grasp.structs import Candidates
 from lgrasp.hand.arrays import Hand
+from lgrasp.math.kinematics import group_forward
+from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
+_TABLE_SLACK = wp.constant(0.005)  # [m] that a posture may be below its least height above the table before IK
 _NEIGHBOURS = wp.constant(16.0)  # contact points before and after one, in order, that lie near it
 
 
@@ -34,6 +38,7 @@ class DomainValues:
     cosine: wp.float32  # least, of hand and object normal
     fingers: wp.int32
     stride: wp.int32  # coprime to the number of contact points: multiples of it visit every one
+    min_table_distance: wp.float32  # [m]
 
 
 def _drawing(voxels: bool) -> Any:
@@ -62,6 +67,8 @@ def _drawing(voxels: bool) -> Any:
         state = wp.rand_init(seed[0], poses.index[row] * hand.kin.groups + g)
         R = wp.transform_get_rotation(poses.pose[row])
         t = wp.transform_get_translation(poses.pose[row])
+        plane = resting_plane(obj, poses.pose[row], poses.resting[row])
+        X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
         n = int(0)
         i = int(0)
         attempts = params.attempts
@@ -93,6 +100,10 @@ def _drawing(voxels: bool) -> Any:
                         record = pick[0]
             else:
                 record = boxes_pick(boxes, field, slot, p, normal, params.cosine, wp.rand_init(wp.randi(state)))
+            if record >= 0 and obj.resting.count > 0:
+                group_forward(hand.kin, g, field_seed(field, hand.kin, slot, record), X, 0)
+                if not finger_above(hand, g, X, plane, params.min_table_distance - _TABLE_SLACK):
+                    record = int(-1)
             if record >= 0:
                 candidates_out.surface[row, g, n] = i
                 candidates_out.record[row, g, n] = record

@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.field.arrays import Field, field_seed
 from lgrasp.grasp.check_kernels import fit_contacts, hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Places
-from lgrasp.grasp.collision import body_clear
+from lgrasp.grasp.collision import body_clear, body_height, resting_plane
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.grasp.outcomes import CONTACT, KEPT, OBJECT_COLLISION, SELF_COLLISION, UNUSED_FINGER
 from lgrasp.hand.arrays import Hand
@@ -107,7 +107,7 @@ def fill_unused(
 ):
     """Postures of fingers without contact: random ones of the field, drawn ever closer to the open posture.
 
-    A posture is taken when it is clear of the object, the palm and the fingers placed before.
+    A posture is taken when it is clear of the object, the table, the palm and the fingers placed before.
 
     Args:
         seed: (1,) random seed.
@@ -123,6 +123,8 @@ def fill_unused(
     h = at_out.index[row] // held.tries
     state = wp.rand_init(seed[0], at_out.index[row] * 64 + at_out.slot[i])
     T_object = wp.transform_inverse(at_out.pose[row])
+    plane = resting_plane(obj, at_out.pose[row], at_out.resting[row])
+    above = limits.min_table_distance
     X = at_out.body[i]
     for g in range(G):
         if at_out.chosen[i, g] < 0 and not group_fixed(hand, held, h, g):
@@ -147,6 +149,8 @@ def fill_unused(
                 clear = int(1)
                 for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
                     if clear == 1 and not body_clear(hand, obj, 1 + k, T_object * X[k], limits.allowed_penetration):
+                        clear = 0
+                    if clear == 1 and body_height(hand.pieces, 1 + k, X[k], plane, above) < above:
                         clear = 0
                 if clear == 1 and not hand_pairs_clear(hand, 0, g + 1, X, limits.min_self_distance):
                     clear = 0

@@ -34,9 +34,11 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     found = new_findings(n, at.contact.shape[1], d)
     check = Check(context.hand, context.object, context.held, limits, places, at, found)
     wp.launch(place_touching, n, [hand, field, held, limits, places, sets], [at, found], device=d)
+    check.clear_table(TOUCHING)
     check.measure(TOUCHING)
     seed = context.seed("filter")
     wp.launch(fill_unused, n, [hand, field, obj, held, limits, seed, params.draws, sets], [at, found], device=d)
+    check.clear_table(OTHERS)
     check.measure(OTHERS)
     if context.space:
         check.measure_held()
@@ -47,5 +49,12 @@ def _postures(inputs: ContactSets, context: Context) -> CheckedPostures:
     d, n, model, poses = context.device, inputs.pose.shape[0], context.hand.model, inputs.candidates.poses
     contact, surface = (wp.empty((n, model.groups + 1), dtype=wp.int32, device=d) for _ in range(2))
     body = wp.empty((n, len(model.piece_first) - 2), dtype=wp.transform, device=d)
-    given = {"pose": poses.pose, "index": poses.index, "of": inputs.pose, "slot": inputs.slot, "chosen": inputs.chosen}
+    given = {
+        "pose": poses.pose,
+        "index": poses.index,
+        "resting": poses.resting,
+        "of": inputs.pose,
+        "slot": inputs.slot,
+        "chosen": inputs.chosen,
+    }
     return empty_struct(CheckedPostures, d, n, model.groups, body=body, contact=contact, surface=surface, **given)

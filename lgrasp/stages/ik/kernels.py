@@ -5,7 +5,7 @@ from enum import IntEnum
 import warp as wp
 
 from lgrasp.field.arrays import Field
-from lgrasp.grasp.collision import body_clear
+from lgrasp.grasp.collision import body_clear, finger_above, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.grasp.structs import Candidates, Sets, State
 from lgrasp.hand.arrays import Hand, hand_grid
@@ -47,6 +47,7 @@ class IkValues:
     check_collision: wp.int32
     allowed_penetration: wp.float32  # [m] of inner spheres
     min_self_distance: wp.float32  # [m]
+    min_table_distance: wp.float32  # [m]
 
 
 @wp.kernel
@@ -151,6 +152,10 @@ def realise_contacts(
             T = T_object * X[j]
             if state == State.REALISED and not body_clear(hand, obj, 1 + j0 + j, T, params.allowed_penetration):
                 state = State.BLOCKED
+    if state == State.REALISED and obj.resting.count > 0:
+        plane = resting_plane(obj, candidates_out.poses.pose[row], candidates_out.poses.resting[row])
+        if not finger_above(hand, g, X, plane, params.min_table_distance):
+            state = State.BLOCKED
     candidates_out.q[row, g, m] = q
     candidates_out.state[row, g, m] = state
     wp.atomic_add(counts_out, IkCount.TRIED, 1)

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.field.arrays import Field, field_has, field_pair, field_seed
-from lgrasp.grasp.collision import body_clear, body_depth
+from lgrasp.grasp.collision import body_clear, body_depth, body_height, plane_height, resting_plane
 from lgrasp.grasp.structs import Poses
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_forward
@@ -26,6 +26,7 @@ _PINCH_DRAWS = wp.constant(32)  # of two opposite points and two opposed contact
 _PINCH_TOLERANCE = wp.constant(0.002)  # [m] difference of their distances
 _PINCH_ROLL_SIGMA = wp.constant(0.3)  # [rad] about the roll that brings the first normals together
 _PINCH_MIN_SINE = wp.constant(0.1)  # of a normal to the line; below that any roll is as good
+_LEAST_CONTACT_HEIGHT = wp.constant(0.01)  # [m] above the table, of contacts that rate a pose
 _PALM_COSINE = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched object's normal to the palm's
 
 
@@ -42,7 +43,7 @@ class Rating(IntEnum):
 
     HOPELESS = 0  # the hand can hold nothing there
     CLEAR = 1  # of static links; not rated further, or one opposed pair
-    BLOCKED = -1  # by static links
+    BLOCKED = -1  # by static links, or these by every table
 
 
 @wp.struct
@@ -57,6 +58,7 @@ class PlaceValues:
     allowed_penetration: wp.float32  # [m]
     spins: wp.int32
     min_object_distance: wp.float32  # [m]
+    min_table_distance: wp.float32  # [m]
 
 
 @wp.struct
@@ -67,6 +69,7 @@ class ProposedPoses:
     palm_point: wp.array2d(dtype=wp.int32)  # (N, B) hand contact point on ``surface``, -1 none
     surface: wp.array2d(dtype=wp.int32)  # (N, B) object contact point that placed it
     setting: wp.array2d(dtype=wp.int32)  # (N, B) setting of the hand's shared joints
+    resting: wp.array2d(dtype=wp.int32)  # (N, B) resting pose of the object, -1 none
     anchor: wp.array3d(dtype=wp.int32)  # (N, B, G) object contact point that the group can touch, -1 unknown
     rating: wp.array2d(dtype=wp.int32)  # (N, B) opposed pairs of contacts, or a Rating
 
@@ -144,6 +147,7 @@ def _rate(
     obj: Object,
     params: PlaceValues,
     T: wp.transform,
+    plane: wp.vec4,
     setting: wp.int32,
     palm: wp.int32,
     anchor: wp.array(dtype=wp.int32),
@@ -152,8 +156,8 @@ def _rate(
     """How many pairs of reachable contacts of different groups oppose each other about the centre of mass.
 
     A pair counts when each contact's inward normal is within 40 degrees of the line to the other, and the line passes
-    the centre of mass within ``max_com_distance``. ``anchor`` holds an object contact point that each group can touch,
-    or gets one.
+    the centre of mass within ``max_com_distance``; contacts near the table ``plane`` do not. ``anchor`` holds an object
+    contact point that each group can touch, or gets one.
     """
     com = wp.transform_point(T, obj.com)
     points = wp.zeros(shape=(_MAX_HITS,), dtype=wp.vec3)
@@ -170,7 +174,8 @@ def _rate(
                 i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
             p = wp.quat_rotate(R, obj.contact_points[i]) + t
             n = -wp.quat_rotate(R, obj.contact_normals[i])
-            if field_has(field, setting * hand.kin.groups + g, p, n) >= 0:
+            within = plane_height(plane, p) > _LEAST_CONTACT_HEIGHT
+            if within and field_has(field, setting * hand.kin.groups + g, p, n) >= 0:
                 points[m] = p
                 normals[m] = n
                 owner[m] = g
@@ -199,6 +204,21 @@ def _rate(
                     if wp.length(com - points[i] - d * u) < params.max_com_distance:
                         rating += 1
     return rating
+
+
+@wp.func
+def _draw_resting(hand: Hand, obj: Object, params: PlaceValues, T: wp.transform, state: wp.uint32):
+    """A resting pose of an object at T whose table is below the static links, drawn by weight; -1: there is none."""
+    pose = int(-1)
+    total = float(0.0)
+    for k in range(obj.resting.count):
+        plane = resting_plane(obj, T, k)
+        height = body_height(hand.pieces, 0, wp.transform_identity(), plane, params.min_table_distance)
+        if height >= params.min_table_distance:
+            total += obj.resting.weight[k]
+            if wp.randf(state) * total < obj.resting.weight[k]:
+                pose = k
+    return pose
 
 
 @wp.kernel
@@ -268,14 +288,21 @@ def propose_poses(
         else:
             rating = Rating.HOPELESS
     T_object = wp.transform_inverse(T)
+    resting = int(-1)
     if rating != Rating.HOPELESS and body_clear(hand, obj, 0, T_object, params.allowed_penetration):
         rating = Rating.CLEAR
-        if params.samples > 0:
-            rating = _rate(hand, field, obj, params, T, setting, palm, anchor, wp.rand_init(wp.randi(state)))
+        if obj.resting.count > 0:
+            resting = _draw_resting(hand, obj, params, T, wp.rand_init(wp.randi(state)))
+            if resting < 0:
+                rating = Rating.BLOCKED
+        if rating == Rating.CLEAR and params.samples > 0:
+            plane = resting_plane(obj, T, resting)
+            rating = _rate(hand, field, obj, params, T, plane, setting, palm, anchor, wp.rand_init(wp.randi(state)))
     proposals_out.pose[row, b] = T
     proposals_out.palm_point[row, b] = palm
     proposals_out.surface[row, b] = i
     proposals_out.setting[row, b] = setting
+    proposals_out.resting[row, b] = resting
     for k in range(G):
         proposals_out.anchor[row, b, k] = anchor[k]
     proposals_out.rating[row, b] = rating
@@ -362,5 +389,6 @@ def take_poses(
     poses_out.palm_point[i] = palm_point
     poses_out.palm_surface[i] = wp.where(palm_point >= 0, proposals.surface[row, b], -1)
     poses_out.setting[i] = proposals.setting[row, b]
+    poses_out.resting[i] = proposals.resting[row, b]
     for k in range(proposals.anchor.shape[2]):
         poses_out.anchor[i, k] = proposals.anchor[row, b, k]

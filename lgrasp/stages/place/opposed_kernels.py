@@ -143,6 +143,7 @@ def propose_opposed(
     for g in range(hand.kin.groups):
         proposals_out.anchor[row, b, g] = -1
     proposals_out.palm_point[row, b] = -1
+    proposals_out.resting[row, b] = -1
     proposals_out.surface[row, b] = -1
     proposals_out.rating[row, b] = Rating.HOPELESS
     setting = held.setting[h]

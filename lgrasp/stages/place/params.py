@@ -38,6 +38,9 @@ class PlaceParams(Params):
         description="Contacts rate a pose when the line between two passes this near the centre of mass [m]; "
         "10, farther than any object is large, bounds nothing.",
     )
+    table: bool = Field(
+        default=False, description="The object rests on a table that grasps leave room for, the way to them included."
+    )
     spins: int = Field(
         default=16,
         ge=1,

@@ -1,0 +1,84 @@
+"""Grasps of an object that rests on a table."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.errors import ConfigError
+from lgrasp.geometry.poses import pose_matrix
+from lgrasp.jobs.requests.search import SearchRequest
+from lgrasp.judge.run import judge
+
+
+@pytest.fixture
+def on_table(run, swift):
+    """A shard of grasps on a table, and what the job reports of it."""
+    outcome = run(pipeline=swift.with_table(), rows=80, shard_rows=80)
+    (path,) = outcome.paths
+    return path, outcome.job.report(outcome)
+
+
+def test_hands_are_above_the_table(on_table, solids, link_poses):
+    """At the grasp, open, and all the way there, by points of the links and the planes in the shard."""
+    path, report = on_table
+    assert validate_shard(path) == []
+    shard = read_shard(path)
+    rows, (obj,) = shard.grasps, shard.objects
+    T = pose_matrix(rows.object_pose[:, 0].astype(float))
+    plane = obj.tables[rows.table["pose"]].astype(float)
+    up = np.einsum("nij,nj->ni", T[:, :3, :3], plane[:, :3])
+    height = plane[:, 3] + np.einsum("ni,ni->n", up, T[:, :3, 3])
+    back = -rows.table["approach"]
+    assert (np.einsum("ni,ni->n", back, up) > -1e-5).all()
+    for q, way in ((rows.q, 0.0), (rows.q_pregrasp, 0.0), (rows.q_pregrasp, 0.15)):
+        links = link_poses(q)
+        for solid in solids.solids:
+            L = links[:, solid.link]
+            points = np.einsum("nij,pj->npi", L[:, :3, :3], solid.samples) + (L[:, :3, 3] + way * back)[:, None]
+            assert (np.einsum("npi,ni->np", points, up) - height[:, None]).min() > 0.0009
+    assert [pose["rows"] for pose in report["resting"]] == np.bincount(
+        rows.table["pose"], minlength=len(obj.tables)
+    ).tolist()
+    assert sum(pose["probability"] for pose in report["resting"]) == pytest.approx(1.0, abs=1e-5)
+    likely = [pose["rows"] > 0 for pose in report["resting"] if pose["probability"] >= 0.05]
+    assert np.mean(likely) >= 0.8
+
+
+def test_judge_agrees_and_finds_rows_in_the_table(on_table, tmp_path):
+    path, _ = on_table
+    assert judge(path).valid_share == 1.0
+    for check in ("table", "resting", "approach"):
+        moved = tmp_path / f"{check}.h5"
+        shutil.copy(path, moved)
+        with h5py.File(moved, "r+") as file:
+            tables, pose, way = (file[n] for n in ("objects/mug/tables", "grasps/table/pose", "grasps/table/approach"))
+            if check == "table":  # the plane that faces the one of row 0
+                pose[0] = int(np.argmin(tables[:, :3] @ tables[pose[0], :3]))
+            elif check == "resting":
+                tables[:, 3] = tables[:, 3] - 0.002
+            else:
+                way[0] = -way[0]
+        failed = judge(moved).failed
+        assert failed[check][0]
+        assert check == "resting" or not failed[check][1:].any()
+
+
+def test_asked_for_or_not(run, job, swift):
+    """Without a table nothing of it is stored; a table is part of what decides the rows."""
+    (path,) = run(rows=20, shard_rows=20).paths
+    shard = read_shard(path)
+    assert shard.grasps.table == {}
+    assert shard.objects[0].tables is None
+    assert job().key() != job(pipeline=swift.with_table()).key()
+
+
+def test_pipelines_without_tables(job):
+    """Grasps that are moved later, and sequences, have none."""
+    for name in ("swift-refine", "sequence"):
+        with pytest.raises(ConfigError, match=r"place\.table"):
+            SearchRequest.check(job(pipeline=load_pipeline(name).with_table()))
