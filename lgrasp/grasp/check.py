@@ -102,7 +102,9 @@ class Check:
         columns = _columns(packed)
         fetched = read_tallies([tally], list(columns.values()))
         table = _table(dict(zip(columns, fetched, strict=True)), tally["kept"] + tally["approach"])
-        return take_rows(table, np.isfinite(table.table["approach"]).all(1)) if table.table else table, tally
+        if table.table:
+            table = take_rows(table, ~np.isnan(table.table["approach"][:, 0]))
+        return table, tally
 
     def every(self, seed: wp.array) -> tuple[GraspTable, np.ndarray]:
         """All hands as rows in their order, and their outcomes (:class:`~lgrasp.grasp.outcomes.Outcome`), (n,)."""
