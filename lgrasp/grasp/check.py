@@ -96,13 +96,13 @@ class Check:
         running_sums(upto)
         row = wp.full(len(self), -1, dtype=wp.int32, device=self.hand.device)
         wp.launch(list_kept, len(self), [self.found, upto], [row], device=self.hand.device)
-        packed = self._pack(seed, row)
-        if self.obj.planes is not None:
+        packed, on_table = self._pack(seed, row), self.obj.planes is not None
+        if on_table:
             self._approach(row, packed, tally)
-        columns = _columns(packed)
+        columns = _columns(packed, on_table)
         fetched = read_tallies([tally], list(columns.values()))
         table = _table(dict(zip(columns, fetched, strict=True)), tally["kept"] + tally["approach"])
-        if table.table:
+        if on_table:
             table = take_rows(table, ~np.isnan(table.table["approach"][:, 0]))
         return table, tally
 
@@ -110,7 +110,7 @@ class Check:
         """All hands as rows in their order, and their outcomes (:class:`~lgrasp.grasp.outcomes.Outcome`), (n,)."""
         self.decide()
         packed = self._pack(seed, wp.array(np.arange(len(self)), dtype=wp.int32, device=self.hand.device))
-        columns = {name: values.numpy() for name, values in _columns(packed).items()}
+        columns = {name: values.numpy() for name, values in _columns(packed, False).items()}
         return _table(columns, len(self)), self.found.outcome.numpy()
 
     def _approach(self, row: wp.array, packed: Packed, tally: Tally) -> None:
@@ -149,10 +149,9 @@ class Check:
         return packed
 
 
-def _columns(packed: Packed) -> dict[str, wp.array]:
-    """The arrays that there are."""
-    arrays = {name: getattr(packed, name) for name in Packed.vars}
-    return {name: array for name, array in arrays.items() if name not in _ON_TABLE or array.size}
+def _columns(packed: Packed, on_table: bool) -> dict[str, wp.array]:
+    """The arrays of rows, on a table or not."""
+    return {name: getattr(packed, name) for name in Packed.vars if on_table or name not in _ON_TABLE}
 
 
 def _table(columns: dict[str, np.ndarray], count: int) -> GraspTable:

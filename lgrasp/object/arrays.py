@@ -19,7 +19,7 @@ class Resting:
 
     up: wp.array(dtype=wp.vec3)  # (T,) unit normals
     height: wp.array(dtype=wp.float32)  # (T,) of the plane along its normal, internal frame [m]
-    weight: wp.array(dtype=wp.float32)  # (T,) how often each is drawn
+    upto: wp.array(dtype=wp.float32)  # (T,) shares in which they are drawn, summed up to each
     count: wp.int32
 
 
@@ -71,7 +71,8 @@ def upload_object(model: ObjectModel, device: str, planes: np.ndarray | None = N
     if planes is not None:
         up = planes[:, :3]
         # the root: poses that are rare get grasps as well
-        resting = {"up": up, "height": planes[:, 3] - up @ model.center, "weight": np.sqrt(planes[:, 4])}
+        upto = np.cumsum(np.sqrt(planes[:, 4]))
+        resting = {"up": up, "height": planes[:, 3] - up @ model.center, "upto": upto / upto[-1]}
         others["resting"] = upload_struct(Resting, device, resting | {"count": len(planes)})
     struct = upload_struct(Object, device, same | others)
     return ObjectArrays(model, device, struct, planes)

@@ -26,7 +26,7 @@ _PINCH_DRAWS = wp.constant(32)  # of two opposite points and two opposed contact
 _PINCH_TOLERANCE = wp.constant(0.002)  # [m] difference of their distances
 _PINCH_ROLL_SIGMA = wp.constant(0.3)  # [rad] about the roll that brings the first normals together
 _PINCH_MIN_SINE = wp.constant(0.1)  # of a normal to the line; below that any roll is as good
-_LEAST_CONTACT_HEIGHT = wp.constant(0.01)  # [m] above the table, of contacts that rate a pose
+_LEAST_CONTACT_HEIGHT = wp.constant(0.005)  # [m] above the table, of contacts that rate a pose
 _PALM_COSINE = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched object's normal to the palm's
 
 
@@ -43,7 +43,7 @@ class Rating(IntEnum):
 
     HOPELESS = 0  # the hand can hold nothing there
     CLEAR = 1  # of static links; not rated further, or one opposed pair
-    BLOCKED = -1  # by static links, or these by every table
+    BLOCKED = -1  # by static links, or these by the table
 
 
 @wp.struct
@@ -207,17 +207,13 @@ def _rate(
 
 
 @wp.func
-def _draw_resting(hand: Hand, obj: Object, params: PlaceValues, T: wp.transform, state: wp.uint32):
-    """A resting pose of an object at T whose table is below the static links, drawn by weight; -1: there is none."""
+def _draw_resting(obj: Object, state: wp.uint32):
+    """A resting pose of an object, drawn by the shares; -1: it rests on nothing."""
     pose = int(-1)
-    total = float(0.0)
+    u = wp.randf(state)
     for k in range(obj.resting.count):
-        plane = resting_plane(obj, T, k)
-        height = body_height(hand.pieces, 0, wp.transform_identity(), plane, params.min_table_distance)
-        if height >= params.min_table_distance:
-            total += obj.resting.weight[k]
-            if wp.randf(state) * total < obj.resting.weight[k]:
-                pose = k
+        if pose < 0 and u < obj.resting.upto[k]:
+            pose = k
     return pose
 
 
@@ -288,15 +284,15 @@ def propose_poses(
         else:
             rating = Rating.HOPELESS
     T_object = wp.transform_inverse(T)
-    resting = int(-1)
+    # the same of all proposals: else those that are hard to reach would lose against the others
+    resting = _draw_resting(obj, wp.rand_init(seed[0] - SEED_STRIDE, first[0] + row))
     if rating != Rating.HOPELESS and body_clear(hand, obj, 0, T_object, params.allowed_penetration):
         rating = Rating.CLEAR
-        if obj.resting.count > 0:
-            resting = _draw_resting(hand, obj, params, T, wp.rand_init(wp.randi(state)))
-            if resting < 0:
-                rating = Rating.BLOCKED
+        plane = resting_plane(obj, T, resting)
+        above = params.min_table_distance
+        if body_height(hand.pieces, 0, wp.transform_identity(), plane, above) < above:
+            rating = Rating.BLOCKED
         if rating == Rating.CLEAR and params.samples > 0:
-            plane = resting_plane(obj, T, resting)
             rating = _rate(hand, field, obj, params, T, plane, setting, palm, anchor, wp.rand_init(wp.randi(state)))
     proposals_out.pose[row, b] = T
     proposals_out.palm_point[row, b] = palm

@@ -25,4 +25,5 @@ def test_hand_below_the_table_is_refused(swift, load):
     assert len(refused) == reasons["kept"] == 0
     assert reasons["table"] > reasons["unused finger"] == 0
     assert sum(reasons.values()) == len(sets)
+    assert set(refused.table) == {"pose", "approach"}
     assert len(run_stages(pipeline, raised, 0, 512, "place")) == 0
