@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lgrasp.dataset.writer import write_shard
-from lgrasp.grasp.schema import ATTRIBUTES, DATASETS, FORMAT_VERSION, SEQUENCE_DATASETS
+from lgrasp.grasp.schema import ATTRIBUTES, DATASETS, FORMAT_VERSION, SEQUENCE_DATASETS, TABLE_FIELDS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "reference" / "file-format.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
@@ -16,7 +16,7 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
 
 def test_every_member_is_documented():
     assert f"version {FORMAT_VERSION}" in TEXT
-    for spec in (*DATASETS, *SEQUENCE_DATASETS):
+    for spec in (*DATASETS, *SEQUENCE_DATASETS, *TABLE_FIELDS.values()):
         assert f"`{spec.path}`" in TEXT, spec.path
     for attribute in ATTRIBUTES:
         assert f"`{attribute.name}`" in TEXT, attribute.name

@@ -56,6 +56,17 @@ def test_report(generate, tmp_path):
     assert not [line for p in paths for line in validate_shard(p)]
 
 
+def test_table(generate, tmp_path):
+    result = generate("--table", "--json", tmp_path / "report.json")
+    assert (result.code, result.err) == (0, "")
+    poses = json.loads((tmp_path / "report.json").read_text())["resting"]
+    some = [pose for pose in poses if pose["rows"]]
+    assert f"{len(some)} of {len(poses)} have grasps" in result.out
+    assert sum(pose["rows"] for pose in poses) == 20
+    (path,) = (tmp_path / "out").glob("*.h5")
+    assert sorted(set(read_shard(path).grasps.table["pose"].tolist())) == [k for k, p in enumerate(poses) if p["rows"]]
+
+
 def test_rows_of_looser_bounds_are_not_strict(generate):
     loose = ("--set", "bounds.max_gap=0.01", "--set", "bounds.max_penetration=0.008")
     data = json.loads(generate(*loose, "--json", "-").out)

@@ -89,6 +89,16 @@ def sample_shard(n=5, *, objects=1, shard_index=0, seed=0, created="2026-01-02T0
     )
 
 
+def sample_on_table(n=5, **shape) -> Shard:
+    """The same of an object that rests on two planes."""
+    shard = sample_shard(n, **shape)
+    rng = np.random.default_rng(0)
+    tables = np.array([[0, 0, 1, 0, 0.75], [0, 1, 0, -0.01, 0.25]], "f4")
+    table = {"pose": rng.integers(0, 2, n).astype("i4"), "approach": unit(rng, (n,))}
+    objects = [replace(obj, tables=tables) for obj in shard.objects]
+    return replace(shard, objects=objects, grasps=replace(shard.grasps, table=table))
+
+
 def sample_sequence(counts=(4, 5, 3), *, joints=6, contacts=3, spaces=4, seed=0, shard_index=0, columns=None) -> Shard:
     """A shard with ``counts[n - 1]`` rows of n objects; each space frees two joints of a ring of joints."""
     shard = sample_shard(
