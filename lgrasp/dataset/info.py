@@ -83,6 +83,7 @@ SURVIVORS = {
     "search": "sets",
     "filter": "kept",
     "refine": "tried",
+    "hold": "held",
     "sequence": "kept",
     "simulate": "held",
 }

@@ -38,7 +38,7 @@ def block_size(pipeline: Pipeline) -> int:
 
     Smaller where a candidate takes long.
     """
-    slow = pipeline.params("search").passes > 1 or "simulate" in pipeline.order
+    slow = pipeline.params("search").passes > 1 or bool({"hold", "simulate"} & {*pipeline.order})
     return PASS_BLOCK if slow else _BLOCK
 
 

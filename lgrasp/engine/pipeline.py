@@ -83,8 +83,25 @@ class Pipeline(_Head):
         return self.model_copy(update={"stages": stages})
 
     def with_bounds(self, **changes: Any) -> "Pipeline":
-        """A copy with some of the bounds replaced and checked."""
-        return self.model_copy(update={"bounds": self.bounds.changed(**changes)})
+        """A copy with some of the bounds replaced and checked.
+
+        Raises:
+            ConfigError: a bound that no stage of the pipeline can meet.
+        """
+        return self.model_copy(update={"bounds": self.bounds.changed(**changes)}).checked()
+
+    def checked(self) -> "Pipeline":
+        """Itself, unless a bound asks for a stage that it lacks.
+
+        Raises:
+            ConfigError: such a bound.
+        """
+        if self.bounds.min_hold_probability > 0 and "hold" not in self.order:
+            raise ConfigError(
+                f"pipeline {self.name}: bounds.min_hold_probability is {self.bounds.min_hold_probability:g}, which only "
+                f"stage hold tells; use pipeline robust-hold, or add '- hold: {{}}' after the stages"
+            )
+        return self
 
     def with_settings(self, settings: Sequence[str]) -> "Pipeline":
         """A copy with parameters replaced and checked.
@@ -99,7 +116,7 @@ class Pipeline(_Head):
         parts |= {part.name: params for part, params in self.sections}
         made = apply_settings(parts, settings, f"pipeline {self.name}")
         shared = {name: made[name] for name in ("bounds", "object", "field")} | {"sequence": made.get("sequence")}
-        return self.model_copy(update=shared | {"stages": tuple((name, made[name]) for name in self.order)})
+        return self.model_copy(update=shared | {"stages": tuple((name, made[name]) for name in self.order)}).checked()
 
     def with_passes(self, passes: int | None) -> "Pipeline":
         """A copy with some passes over its candidates, if they are given.
@@ -171,4 +188,4 @@ def load_pipeline(name: str) -> Pipeline:
         field=parse_model(FieldParams, declared.field, f"{where}, field"),
         stages=tuple(stages),
         sequence=None if sequence is None else parse_model(SEQUENCE.params, sequence, f"{where}, {SEQUENCE.name}"),
-    )
+    ).checked()

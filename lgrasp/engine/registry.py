@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import combinations
 from typing import Any
 
 from pydantic import BaseModel
@@ -46,6 +47,7 @@ STAGES: dict[str, Stage] = {
     "search": Stage("search", "lgrasp.stages.search", "SearchParams"),
     "filter": Stage("filter", "lgrasp.stages.filter", "FilterParams"),
     "refine": Stage("refine", "lgrasp.stages.refine", "RefineParams"),
+    "hold": Stage("hold", "lgrasp.stages.hold", "HoldParams"),
     "simulate": Stage("simulate", "lgrasp.stages.simulate", "SimulateParams"),
 }
 
@@ -55,10 +57,10 @@ SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
 ORDERS = (("place", "domain", "ik", "search", "filter"), ("place", "domain", "search", "ik", "filter"))
 """Accepted orders: contacts realised before they are combined, or (the published order) after."""
 
-OPTIONAL = ("refine", "simulate")
-"""Stages that may follow, in this order: grasps are refined, simulated."""
+OPTIONAL = ("refine", "hold", "simulate")
+"""Stages that may follow, in this order: grasps are refined, tried, simulated."""
 
-_ENDS = ((), ("refine",), ("simulate",), ("refine", "simulate"))
+_ENDS = [end for n in range(len(OPTIONAL) + 1) for end in combinations(OPTIONAL, n)]
 
 
 def check_order(names: tuple[str, ...], where: str) -> None:

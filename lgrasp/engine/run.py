@@ -43,7 +43,7 @@ class Job(Request, ABC):
     """What a part is."""
     asks: ClassVar[bool] = False
     """True if fewer rows than requested may be found. A part without any then ends the job."""
-    kernels: ClassVar[tuple[str, ...]] = ("lgrasp.stages.", "lgrasp.grasp.")
+    kernels: ClassVar[tuple[str, ...]] = ("lgrasp.stages.", "lgrasp.grasp.", "lgrasp.hold.")
     """Prefixes of the modules whose kernels the parts launch; empty: none."""
     one_key: ClassVar[bool] = True
     """True if all parts have the key of the job, and so have all files of their name in the folder."""

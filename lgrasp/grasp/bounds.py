@@ -62,6 +62,13 @@ class GraspBounds(Params):
     max_unresisted_load: float = Field(
         default=1.0, gt=0, le=1, description="Largest part of a unit force that is not resisted; 1 asks for nothing."
     )
+    min_hold_probability: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Least share of the trials of stage hold in which a grasp holds, above 0 also in the trial without "
+        "random numbers; 0 asks for nothing.",
+    )
     pregrasp_distance: float = Field(
         default=0.015, ge=0, le=0.1, description="How far q_pregrasp backs off along the contact normals."
     )
@@ -113,6 +120,12 @@ class GraspBounds(Params):
         import numpy as np  # not above: bounds are told wrong before anything is loaded
 
         return np.logical_and.reduce([metrics[name] <= np.float32(limit) for name, limit in self.limits.items()])
+
+    def held_by(self, metrics: "Mapping[str, np.ndarray]") -> "np.ndarray":
+        """Rows that hold as often as is asked, by their metrics of the hold test, (N,) bool."""
+        if self.min_hold_probability == 0:
+            return metrics["hold_probability"] >= 0
+        return (metrics["hold_success"] > 0) & (metrics["hold_probability"] >= self.min_hold_probability - 1e-6)
 
     def describe(self) -> dict[str, Any]:
         """As shards store them: the profile, and every number."""

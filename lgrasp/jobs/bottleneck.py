@@ -6,6 +6,7 @@ _STEPS = (
     ("ik", "tried", "kept", "fingers cannot put their contact surface on the object without hitting it"),
     ("search", "poses", "yielding", "the contacts within reach do not balance, or the fingers would hit each other"),
     ("filter", "", "kept", "finished grasps collide"),
+    ("hold", "tried", "held", "grasps lose the object when it is pulled"),
     ("simulate", "tried", "held", "grasps lose the object in the physics simulation"),
 )
 

@@ -99,7 +99,10 @@ class GenerateJob(GenerateRequest, SearchJob):
             resume=part.number in self._growing,
             progress=lambda rows, _: progress(rows),
         )
-        kept = result.counts.get("simulate", {}).get("held", result.counts.get("filter", {}).get("kept", 0))
+        counts = result.counts
+        kept = next(
+            counts[s][n] for s, n in (("simulate", "held"), ("hold", "held"), ("filter", "kept")) if s in counts
+        )
         self._rate = max(kept / result.candidates, 1e-3)
         # poses and contacts go from the internal to the user's frame of the object
         tree, center = self.inputs.hand.model.tree, self.inputs.object.model.center

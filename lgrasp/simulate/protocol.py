@@ -62,28 +62,33 @@ PositiveRange = Annotated[tuple[_Positive, _Positive], AfterValidator(_in_order)
 """Likewise, both above 0."""
 
 
-class Draws(Params):
-    """What is drawn at random, each number evenly from its range, in place of the protocol's own of that name.
+class Ranges(Params):
+    """Numbers that are drawn at random, each evenly from its range."""
+
+    friction: Range = Field(default=(0.4, 0.8), description="Sliding, of every contact.")
+    mass: PositiveRange = Field(default=(0.05, 0.2), description="Of each object [kg].")
+    stiffness: PositiveRange = Field(default=(3.0, 10.0), description="Of position control [N m/rad].")
+    damping_ratio: PositiveRange = Field(default=(0.3, 1.0), description="Of position control, over critical damping.")
+    shift: float = Field(
+        default=0.003, ge=0, description="Most error of each object's place at the start [m], even in the ball."
+    )
+    turn: float = Field(
+        default=3.0, ge=0, le=180, description="Most error of its rotation [deg], about its centre of mass, likewise."
+    )
+
+
+class Draws(Ranges):
+    """What is drawn at random in place of the protocol's own number of that name.
 
     A draw depends on the seed, the row's ``candidate`` and its own number alone.
     """
 
     count: int = Field(default=8, ge=1, le=1000, description="Draws of each row.")
     seed: Seed = 0
-    friction: Range = Field(default=(0.4, 0.8), description="Sliding, of every contact.")
     torsion: Range = Field(default=(0.0, 0.005), description="Friction against twisting, likewise [m]; MuJoCo's alone.")
-    mass: PositiveRange = Field(default=(0.05, 0.2), description="Of each object [kg].")
-    stiffness: PositiveRange = Field(default=(3.0, 10.0), description="Of position control [N m/rad].")
-    damping_ratio: PositiveRange = Field(default=(0.3, 1.0), description="Of position control, over critical damping.")
     softness: PositiveRange = Field(
         default=(0.008, 0.02),
         description="Time constant of every contact [s], two time steps at least; MuJoCo's alone.",
-    )
-    shift: float = Field(
-        default=0.003, ge=0, description="Most error of each object's place at the start [m], even in the ball."
-    )
-    turn: float = Field(
-        default=3.0, ge=0, le=180, description="Most error of its rotation [deg], about its centre of mass, likewise."
     )
 
 

@@ -113,8 +113,10 @@ class RefineRequest(ShardRequest):
         Raises:
             ConfigError: a setting that cannot be.
         """
-        parts = {"bounds": self.bounds or told, "refine": self.params}
+        parts = {"bounds": self.bounds or told.changed(min_hold_probability=0.0), "refine": self.params}
         made = apply_settings(parts, self.settings, "lgrasp refine")
+        if cast(GraspBounds, made["bounds"]).min_hold_probability > 0:
+            raise ConfigError("lgrasp refine does not try how grasps hold: bounds.min_hold_probability must be 0")
         return cast(GraspBounds, made["bounds"]), cast(RefineParams, made["refine"])
 
 

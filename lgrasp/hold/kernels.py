@@ -1,0 +1,291 @@
+"""Trials of grasps: the hand closes on the free object, then the object is pulled in six directions."""
+
+import warp as wp
+
+from lgrasp.hand.arrays import Hand
+from lgrasp.hold.contacts import MAX_CONTACTS, Contact, find_contacts, follow_contacts
+from lgrasp.hold.energy import Body, Material, make_columns
+from lgrasp.hold.solve import MAX_HAND_DOFS, solve_step
+from lgrasp.math.constants import SLIDING_ARM
+from lgrasp.math.kinematics import group_forward, vec_dof
+from lgrasp.math.limits import MAX_BODIES, MAX_DOFS
+from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_COLUMNS = MAX_CONTACTS * MAX_DOFS
+_ARM = wp.constant(SLIDING_ARM)
+_PULLS = wp.constant(6)
+_REACH = wp.constant(2.0e-3)  # [m] contacts are looked for within
+_TRAVEL = wp.constant(1.0e-3)  # [m] of hand and object after which they are looked for afresh
+_OVER = wp.constant(1)  # a phase is over, and the object is held
+_LOST = wp.constant(2)
+
+
+@wp.struct
+class Course:
+    """What all trials go through."""
+
+    closing_steps: wp.int32  # from pregrasp to grasp, and again from there to squeeze
+    closing_time: wp.float32  # of a step [s]
+    pull_steps: wp.int32  # in each direction
+    pull_time: wp.float32  # of a step [s]
+    force: wp.float32  # the pull [N]
+    most_displacement: wp.float32  # of the centre of mass [m]
+    most_rotation: wp.float32  # [rad]
+    drive_inertia: wp.float32  # of a joint and what it moves, by which its damping is measured [kg m^2]
+    com: wp.vec3  # centre of mass of the object, internal frame [m]
+    inertia: wp.mat33  # about it, over the mass, internal frame [m^2]
+
+
+@wp.struct
+class Spread:
+    """Ranges that numbers are drawn from, evenly; ``shift`` and ``turn`` bound the error of the object's pose."""
+
+    friction: wp.vec2
+    torsion: wp.vec2  # [m]
+    mass: wp.vec2  # [kg]
+    stiffness: wp.vec2  # of revolute joints [N m/rad]
+    damping_ratio: wp.vec2
+    contact_stiffness: wp.vec2  # [N/m], its logarithm is even
+    shift: wp.float32  # [m]
+    turn: wp.float32  # [rad]
+
+
+@wp.struct
+class Grasps:
+    """Rows to try, (N,) or (N, K)."""
+
+    pregrasp: wp.array2d(dtype=wp.float32)  # [rad or m]
+    grasp: wp.array2d(dtype=wp.float32)  # [rad or m]
+    squeeze: wp.array2d(dtype=wp.float32)  # [rad or m]
+    pose: wp.array(dtype=wp.transform)  # T_hand_object, internal frame
+    number: wp.array(dtype=wp.int32)  # from which a row's random numbers come
+
+
+@wp.struct
+class Outcome:
+    """What came of each trial, (T,)."""
+
+    held: wp.array(dtype=wp.int32)  # directions in which the object was held
+    displacement: wp.array2d(dtype=wp.float32)  # (T, 6) at worst, closing included [m]; NaN: not pulled
+    rotation: wp.array2d(dtype=wp.float32)  # (T, 6) [rad]
+
+
+@wp.struct
+class State:
+    """Of the object during a trial."""
+
+    pose: wp.transform  # T_hand_object
+    velocity: wp.spatial_vector  # [m/s], [rad/s]
+    displacement: wp.float32  # at worst until now [m]
+    rotation: wp.float32  # at worst until now [rad]
+
+
+@wp.func
+def _between(rng: wp.uint32, ends: wp.vec2):
+    return ends[0] + (ends[1] - ends[0]) * wp.randf(rng)
+
+
+@wp.func
+def _in_ball(rng: wp.uint32, radius: float):
+    return wp.sample_unit_sphere(rng) * radius
+
+
+@wp.func
+def _turned(T: wp.transform, com: wp.vec3, dx: wp.spatial_vector):
+    """A pose after the motion dx of its centre of mass, which is at com in the object's frame."""
+    w = wp.spatial_bottom(dx)
+    angle = wp.length(w)
+    r = wp.transform_get_rotation(T)
+    c = wp.transform_point(T, com) + wp.spatial_top(dx)
+    if angle > 1.0e-9:
+        r = wp.normalize(wp.quat_from_axis_angle(w / angle, angle) * r)
+    return wp.transform(c - wp.quat_rotate(r, com), r)
+
+
+@wp.func
+def _note(course: Course, s: State, start: wp.transform):
+    """The state with its worst displacement and rotation, its displacement and its rotation now."""
+    shift = wp.length(wp.transform_point(s.pose, course.com) - wp.transform_point(start, course.com))
+    a = wp.transform_get_rotation(s.pose)
+    b = wp.transform_get_rotation(start)
+    turn = 2.0 * wp.acos(wp.min(wp.abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]), 1.0))
+    s.displacement = wp.max(s.displacement, shift)
+    s.rotation = wp.max(s.rotation, turn)
+    return s, shift, turn
+
+
+@wp.func
+def _body(course: Course, s: State, mass: wp.float32, h: wp.float32, pull: wp.int32):
+    """The object in a step of h [s]; pull -1: none, else the direction +x, -x, +y, ..."""
+    body = Body()
+    body.com = wp.transform_point(s.pose, course.com)
+    body.mass = mass / (h * h)
+    R = wp.quat_to_matrix(wp.transform_get_rotation(s.pose))
+    body.inertia = R * course.inertia * wp.transpose(R) * body.mass
+    body.free = s.velocity * h
+    if pull >= 0:
+        body.force[pull // 2] = course.force * (1.0 - 2.0 * float(pull % 2))
+    return body
+
+
+@wp.func
+def _aim(
+    hand: Hand, grasps: Grasps, row: wp.int32, phase: wp.int32, share: wp.float32, target: wp.array(dtype=wp.float32)
+):
+    """Targets of the drives: phase 0 from pregrasp to grasp, 1 from grasp to squeeze, later the squeeze."""
+    for k in range(hand.kin.dof_first[hand.kin.groups]):
+        at = hand.kin.dof_index[k]
+        b = grasps.grasp[row, at]
+        if phase == 0:
+            a = grasps.pregrasp[row, at]
+            target[k] = a + share * (b - a)
+        else:
+            c = grasps.squeeze[row, at]
+            target[k] = wp.where(phase == 1, b + share * (c - b), c)
+
+
+@wp.func
+def _place(hand: Hand, q: wp.array(dtype=wp.float32), X: wp.array(dtype=wp.transform)):
+    """Write the pose of every moving body."""
+    for g in range(hand.kin.groups):
+        v = vec_dof()
+        first = hand.kin.dof_first[g]
+        for d in range(hand.kin.dof_first[g + 1] - first):
+            v[d] = q[first + d]
+        group_forward(hand.kin, g, v, X, hand.kin.joint_first[g])
+
+
+@wp.func
+def _copy(contacts: wp.array(dtype=Contact), count: wp.int32, out: wp.array(dtype=Contact)):
+    for c in range(count):
+        out[c] = contacts[c]
+
+
+@wp.func
+def _advance(
+    hand: Hand,
+    scale: wp.array(dtype=wp.float32),
+    q: wp.array(dtype=wp.float32),
+    dq: wp.array(dtype=wp.float32),
+    dx: wp.spatial_vector,
+):
+    """Move the joints; returns how far points of hand and object have come [m], roughly."""
+    far = wp.max(wp.length(wp.spatial_top(dx)), 0.5 * _ARM * wp.length(wp.spatial_bottom(dx)))
+    for k in range(hand.kin.dof_first[hand.kin.groups]):
+        q[k] = q[k] + dq[k]
+        far = wp.max(far, _ARM * wp.abs(dq[k]) * wp.sqrt(scale[k]))
+    return far
+
+
+@wp.kernel
+def run_trials(
+    hand: Hand,
+    obj: Object,
+    course: Course,
+    spread: Spread,
+    grasps: Grasps,
+    rows: wp.array(dtype=wp.int32),
+    seed: wp.int32,
+    outcome: Outcome,
+):
+    """One thread per trial: a row with numbers of its own.
+
+    Args:
+        rows: (T,) row of each trial.
+    """
+    i = wp.tid()
+    row = rows[i]
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    contacts = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
+    before = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
+    column = wp.zeros(shape=(_COLUMNS,), dtype=wp.vec3)
+    spin = wp.zeros(shape=(_COLUMNS,), dtype=wp.float32)
+    scale = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    q = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    dq = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    target = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    q_closed = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    contacts_closed = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
+    rng = wp.rand_init(seed, grasps.number[row])
+    m = Material()
+    m.friction = _between(rng, spread.friction)
+    m.torsion = _between(rng, spread.torsion)
+    mass = _between(rng, spread.mass)
+    m.drive = _between(rng, spread.stiffness)
+    damping = _between(rng, spread.damping_ratio) * 2.0 * wp.sqrt(m.drive * course.drive_inertia)
+    contact_log = wp.vec2(wp.log(spread.contact_stiffness[0]), wp.log(spread.contact_stiffness[1]))
+    m.contact = wp.exp(_between(rng, contact_log))
+    shift = _in_ball(rng, spread.shift)
+    error = _in_ball(rng, spread.turn)
+    start = _turned(grasps.pose[row], course.com, wp.spatial_vector(shift, error))
+    dofs = hand.kin.dof_first[hand.kin.groups]
+    _aim(hand, grasps, row, 0, 0.0, q)
+    for g in range(hand.kin.groups):
+        first = hand.kin.dof_first[g]
+        for d in range(hand.kin.dof_first[g + 1] - first):
+            scale[first + d] = 1.0
+        for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
+            if hand.kin.joint_prismatic[j] == 1:
+                scale[first + hand.kin.joint_dof[j]] = 1.0 / (_ARM * _ARM)
+    s = State()
+    s.pose = start
+    closed = s
+    count = int(0)
+    count_closed = int(0)
+    held = int(0)
+    end = int(0)
+    for phase in range(2 + _PULLS):
+        if end != _LOST:
+            pull = phase - 2
+            steps = wp.where(pull < 0, course.closing_steps, course.pull_steps)
+            h = wp.where(pull < 0, course.closing_time, course.pull_time)
+            if pull == 0:
+                closed = s
+                count_closed = count
+                _copy(contacts, count, contacts_closed)
+                for k in range(dofs):
+                    q_closed[k] = q[k]
+            elif pull > 0:
+                s = closed
+                count = count_closed
+                _copy(contacts_closed, count, contacts)
+                for k in range(dofs):
+                    q[k] = q_closed[k]
+            m.drag = damping / h
+            travel = float(1.0e9)
+            end = int(0)
+            for step in range(steps):
+                if end == 0:
+                    _aim(hand, grasps, row, phase, float(step + 1) / float(steps), target)
+                    _place(hand, q, X)
+                    if travel > _TRAVEL:
+                        _copy(contacts, count, before)
+                        count = find_contacts(hand, obj, X, s.pose, _REACH, before, count, contacts)
+                        travel = 0.0
+                    else:
+                        follow_contacts(hand, obj, X, s.pose, contacts, count)
+                    make_columns(hand, X, contacts, count, column, spin)
+                    body = _body(course, s, mass, h, pull)
+                    dx = solve_step(hand, m, body, contacts, count, column, spin, scale, q, target, dq)
+                    travel += _advance(hand, scale, q, dq, dx)
+                    s.velocity = dx / h
+                    s.pose = _turned(s.pose, course.com, dx)
+                    s, shifted, turned = _note(course, s, start)
+                    if not (s.displacement <= course.most_displacement and s.rotation <= course.most_rotation):
+                        end = _LOST
+                    elif pull >= 0 and step >= 2:
+                        # at four times this speed it stays well inside the bounds to the end
+                        ahead = 4.0 * float(steps - 1 - step)
+                        slide = shifted + ahead * wp.length(wp.spatial_top(dx))
+                        roll = turned + ahead * wp.length(wp.spatial_bottom(dx))
+                        if slide < 0.5 * course.most_displacement and roll < 0.5 * course.most_rotation:
+                            end = _OVER
+            if pull >= 0:
+                outcome.displacement[i, pull] = s.displacement
+                outcome.rotation[i, pull] = s.rotation
+                if end != _LOST:
+                    held += 1
+    outcome.held[i] = held

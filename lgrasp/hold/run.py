@@ -1,0 +1,186 @@
+"""The hold test of many grasps of one object on a device."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+import warp as wp
+
+from lgrasp.hand.arrays import HandArrays
+from lgrasp.hold.kernels import Course, Grasps, Outcome, Spread, run_trials
+from lgrasp.hold.params import HoldTest
+from lgrasp.object.arrays import ObjectArrays
+from lgrasp.object.model import ObjectModel
+from lgrasp.runtime.structs import empty_struct, upload_struct
+from lgrasp.simulate.protocol import PROTOCOLS
+
+METRIC_UNITS = {"hold_success": "", "hold_probability": "", "hold_drift": "m"}
+"""Metrics of the test and their units."""
+
+_CLOSING_STEPS, _PULL_STEPS = 10, 40
+_DRIVE_INERTIA = 4.0e-4  # [kg m^2] of a finger's joint, its drive and what it moves
+_CONTACT_STIFFNESS = 2.0e4  # [N/m] of the trial without draws
+_MIXER = 0x9E3779B9  # between the random streams of a row's draws
+
+
+@dataclass(frozen=True)
+class Postures:
+    """Grasps to test."""
+
+    pregrasp: np.ndarray
+    """(N, K) [rad or m], joints in the order of the hand's model."""
+    grasp: np.ndarray
+    squeeze: np.ndarray
+    pose: np.ndarray
+    """T_hand_object of the object's internal frame, device poses (N, 7)."""
+    number: np.ndarray
+    """(N,) integers from which random numbers come."""
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+
+class HoldTester:
+    """Tests grasps of one hand and one object.
+
+    Args:
+        hand, obj: on one device.
+        test: how often, and with what numbers.
+    """
+
+    def __init__(self, hand: HandArrays, obj: ObjectArrays, test: HoldTest) -> None:
+        self._hand, self._object, self._test = hand, obj, test
+        self._device = hand.device
+        self._course = self._make_course()
+
+    def run(
+        self,
+        postures: Postures,
+        seed: int,
+        *,
+        least: float = 0.0,
+        progress: Callable[[int], None] | None = None,
+    ) -> dict[str, np.ndarray]:
+        """The metrics of some grasps, each (N,) float32.
+
+        ``hold_success``: 1 if the object stays in the hand in the first trial; ``hold_probability``: share of the draws
+        in which it does; ``hold_drift``: the farthest that its centre of mass gets in the first trial [m], infinite if
+        it is lost.
+
+        Args:
+            seed: of the draws, which depend on it and the row's ``number`` alone.
+            least: grasps that cannot reach this probability any more are not tried on: theirs counts the draws that
+                were not tried as lost, and those lost in the first trial are not drawn at all.
+            progress: called with the trials done.
+        """
+        n, draws = len(postures), self._test.draws
+        grasps = self._put(postures)
+        held, drift = self._try(grasps, np.arange(n), _nominal(), seed)
+        done = n
+        hits, tried = np.zeros(n), np.zeros(n, int)
+        active = np.flatnonzero(held) if least > 0.0 else np.arange(n)
+        for draw in range(draws):
+            if not len(active):
+                break
+            stream = (seed + (draw + 1) * _MIXER) & 0x7FFFFFFF
+            hits[active] += self._try(grasps, active, _spread(self._test), stream)[0]
+            tried[active] += 1
+            done += len(active)
+            if progress:
+                progress(done)
+            active = active[hits[active] + draws - draw - 1 >= least * draws - 1e-6]
+        probability = hits / draws if draws else held.astype(float)
+        return {
+            "hold_success": held.astype(np.float32),
+            "hold_probability": probability.astype(np.float32),
+            "hold_drift": np.where(held, drift, np.inf).astype(np.float32),
+        }
+
+    def _put(self, postures: Postures) -> Any:
+        return upload_struct(
+            Grasps,
+            self._device,
+            {
+                "pregrasp": np.asarray(postures.pregrasp, np.float32),
+                "grasp": np.asarray(postures.grasp, np.float32),
+                "squeeze": np.asarray(postures.squeeze, np.float32),
+                "pose": np.asarray(postures.pose, np.float32),
+                "number": _fold(postures.number),
+            },
+        )
+
+    def _try(self, grasps: Any, rows: np.ndarray, spread: Any, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Whether each of some rows holds (T,), and its displacement at worst (T,) [m]."""
+        if not len(rows):
+            return np.zeros(0, bool), np.zeros(0)
+        outcome = empty_struct(Outcome, self._device, len(rows), 6)
+        index = wp.array(rows.astype(np.int32), dtype=wp.int32, device=self._device)
+        inputs = [self._hand.struct, self._object.struct, self._course, spread, grasps, index, int(seed)]
+        wp.launch(run_trials, len(rows), inputs, [outcome], device=self._device)
+        held = outcome.held.numpy() == outcome.displacement.shape[1]
+        return held, outcome.displacement.numpy().max(1)
+
+    def _make_course(self) -> Any:
+        fc = PROTOCOLS["fc"]
+        model = self._object.model
+        course = upload_struct(
+            Course,
+            self._device,
+            {
+                "closing_steps": _CLOSING_STEPS,
+                "closing_time": fc.phase / _CLOSING_STEPS,
+                "pull_steps": _PULL_STEPS,
+                "pull_time": fc.hold / _PULL_STEPS,
+                "force": fc.force,
+                "most_displacement": fc.most_displacement,
+                "most_rotation": float(np.radians(fc.most_rotation)),
+                "drive_inertia": _DRIVE_INERTIA,
+                "com": model.com,
+            },
+        )
+        course.inertia = wp.mat33(*map(float, inertia_over_mass(model).ravel()))
+        return course
+
+
+def inertia_over_mass(model: ObjectModel) -> np.ndarray:
+    """Second moments about the centre of mass over the mass at uniform density (3, 3) [m^2]; of an open mesh those of
+    its convex hull."""
+    mesh = trimesh.Trimesh(np.asarray(model.vertices, float), np.asarray(model.faces), process=False)
+    if not (model.watertight and mesh.volume > 0):
+        mesh = mesh.convex_hull
+    return np.asarray(mesh.moment_inertia, float) / float(mesh.volume)
+
+
+def _fold(number: np.ndarray) -> np.ndarray:
+    """31 bits of whole numbers (N,)."""
+    wide = np.asarray(number).astype(np.uint64)
+    return ((wide ^ (wide >> np.uint64(31))) & np.uint64(0x7FFFFFFF)).astype(np.int32)
+
+
+def _nominal() -> Any:
+    """The numbers of protocol fc, without torsional friction."""
+    fc = PROTOCOLS["fc"]
+    return _ranges(
+        friction=(fc.friction, fc.friction),
+        torsion=(0.0, 0.0),
+        mass=(fc.mass, fc.mass),
+        stiffness=(fc.stiffness, fc.stiffness),
+        damping_ratio=(fc.damping_ratio, fc.damping_ratio),
+        contact_stiffness=(_CONTACT_STIFFNESS, _CONTACT_STIFFNESS),
+    )
+
+
+def _spread(test: HoldTest) -> Any:
+    names = ("friction", "torsion", "mass", "stiffness", "damping_ratio", "contact_stiffness")
+    made = _ranges(**{name: getattr(test, name) for name in names})
+    made.shift, made.turn = test.shift, float(np.radians(test.turn))
+    return made
+
+
+def _ranges(**ends: tuple[float, float]) -> Any:
+    spread = Spread()
+    for name, pair in ends.items():
+        setattr(spread, name, wp.vec2(*pair))
+    return spread

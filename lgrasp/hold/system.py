@@ -1,0 +1,174 @@
+"""The linear system of a Newton step: fingers couple through the object only, so each is eliminated by itself.
+
+Flat arrays: A (dofs, WIDTH) lower triangles of the fingers' blocks, then their Cholesky factors; B (dofs, 7) the blocks
+between a finger and the object, and the gradient. C (6, 6) and g (6) are the object's.
+"""
+
+import warp as wp
+
+from lgrasp.hand.arrays import Hand
+from lgrasp.hold.contacts import Contact
+from lgrasp.hold.energy import WIDTH, Material, friction_stiffness, twist_stiffness
+from lgrasp.runtime.device import KERNEL_OPTIONS
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_LEAST = wp.constant(1.0e-9)  # of a pivot
+
+
+@wp.func
+def add_contact(
+    hand: Hand,
+    m: Material,
+    contact: Contact,
+    c: wp.int32,
+    y: wp.vec4,
+    com: wp.vec3,
+    column: wp.array(dtype=wp.vec3),
+    spin: wp.array(dtype=wp.float32),
+    A: wp.array(dtype=wp.float32),
+    B: wp.array(dtype=wp.float32),
+    C: wp.spatial_matrix,
+    g: wp.spatial_vector,
+):
+    """Add slope and curvature of contact c at its motion y; returns C and g."""
+    n = contact.normal
+    s = wp.vec3(y[0], y[1], y[2])
+    yn = wp.dot(n, s)
+    deep = wp.max(-(contact.gap + yn), 0.0)
+    limit = m.friction * contact.force
+    if deep == 0.0 and limit == 0.0:
+        return C, g
+    f = n * (-m.contact * deep)
+    H = wp.mat33(0.0)
+    if deep > 0.0:
+        H = wp.outer(n, n) * m.contact
+    if limit > 0.0:
+        slip = s - n * yn + contact.slip
+        far = wp.length(slip)
+        k = friction_stiffness(far, m.contact, limit)
+        f = f + slip * k
+        H = H + (wp.identity(n=3, dtype=wp.float32) - wp.outer(n, n)) * k
+        if k < m.contact:
+            H = H - wp.outer(slip, slip) * (k / (far * far))
+    turn = float(0.0)
+    turn_k = float(0.0)
+    if m.torsion > 0.0:
+        twist = y[3] + contact.twist
+        k = friction_stiffness(wp.abs(twist), twist_stiffness(m), m.torsion * contact.force)
+        turn = k * twist
+        if k == twist_stiffness(m):
+            turn_k = k
+    r = contact.point - com
+    R = wp.skew(r)
+    RH = R * H
+    K = RH * wp.transpose(R)
+    rf = wp.cross(r, f)
+    for a in range(3):
+        g[a] = g[a] - f[a]
+        g[3 + a] = g[3 + a] - rf[a] - n[a] * turn
+        for b in range(3):
+            C[a, b] += H[a, b]
+            C[3 + a, b] += RH[a, b]
+            C[b, 3 + a] += RH[a, b]
+            C[3 + a, 3 + b] += K[a, b] + turn_k * n[a] * n[b]
+    if contact.body > 0:
+        group = hand.body_group[contact.body]
+        first = hand.kin.dof_first[group]
+        for d in range(hand.kin.dof_first[group + 1] - first):
+            j = column[c * WIDTH + d]
+            t = spin[c * WIDTH + d]
+            h = H * j
+            rh = wp.cross(r, h)
+            at = (first + d) * 7
+            B[at + 6] += wp.dot(j, f) + t * turn
+            for a in range(3):
+                B[at + a] -= h[a]
+                B[at + 3 + a] -= rh[a] + turn_k * t * n[a]
+            for e in range(d + 1):
+                A[(first + d) * WIDTH + e] += wp.dot(column[c * WIDTH + e], h) + turn_k * t * spin[c * WIDTH + e]
+    return C, g
+
+
+@wp.func
+def eliminate_finger(
+    first: wp.int32,
+    dofs: wp.int32,
+    A: wp.array(dtype=wp.float32),
+    B: wp.array(dtype=wp.float32),
+    C: wp.spatial_matrix,
+    g: wp.spatial_vector,
+):
+    """Factor the block of a finger and take its part out of the object's; returns C (lower triangle) and g."""
+    for d in range(dofs):
+        k = first + d
+        for e in range(d + 1):
+            s = A[k * WIDTH + e]
+            for o in range(e):
+                s -= A[k * WIDTH + o] * A[(first + e) * WIDTH + o]
+            if e == d:
+                A[k * WIDTH + d] = wp.sqrt(wp.max(s, _LEAST))
+            else:
+                A[k * WIDTH + e] = s / A[(first + e) * WIDTH + e]
+        for col in range(7):
+            s = B[k * 7 + col]
+            for o in range(d):
+                s -= A[k * WIDTH + o] * B[(first + o) * 7 + col]
+            B[k * 7 + col] = s / A[k * WIDTH + d]
+        for a in range(6):
+            g[a] = g[a] - B[k * 7 + a] * B[k * 7 + 6]
+            for b in range(a + 1):
+                C[a, b] -= B[k * 7 + a] * B[k * 7 + b]
+    return C, g
+
+
+@wp.func
+def solve_object(C: wp.spatial_matrix, g: wp.spatial_vector):
+    """x of C x = -g by Cholesky; the lower triangle of C counts."""
+    x = wp.spatial_vector()
+    for a in range(6):
+        for b in range(a + 1):
+            s = C[a, b]
+            for o in range(b):
+                s -= C[a, o] * C[b, o]
+            if a == b:
+                C[a, a] = wp.sqrt(wp.max(s, _LEAST))
+            else:
+                C[a, b] = s / C[b, b]
+        s = -g[a]
+        for o in range(a):
+            s -= C[a, o] * x[o]
+        x[a] = s / C[a, a]
+    for back in range(6):
+        a = 5 - back
+        s = x[a]
+        for o in range(a + 1, 6):
+            s -= C[o, a] * x[o]
+        x[a] = s / C[a, a]
+    return x
+
+
+@wp.func
+def solve_finger(
+    first: wp.int32,
+    dofs: wp.int32,
+    A: wp.array(dtype=wp.float32),
+    B: wp.array(dtype=wp.float32),
+    x: wp.spatial_vector,
+    step: wp.array(dtype=wp.float32),
+):
+    """Replace the gradient in ``step`` by the step of a finger's joints, once the object moves by x; returns their
+    product."""
+    slope = float(0.0)
+    for back in range(dofs):
+        d = dofs - 1 - back
+        k = first + d
+        s = -B[k * 7 + 6]
+        for a in range(6):
+            s -= B[k * 7 + a] * x[a]
+        for o in range(d + 1, dofs):
+            s -= A[(first + o) * WIDTH + d] * step[first + o]
+        s = s / A[k * WIDTH + d]
+        slope += step[k] * s
+        step[k] = s
+    return slope

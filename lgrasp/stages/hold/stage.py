@@ -1,0 +1,36 @@
+"""hold: finished grasps -> those that hold the object in a quasi-static simulation, tried with random numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lgrasp.grasp.tables import GraspTable, take_grasps
+from lgrasp.hold.params import HoldTest
+from lgrasp.hold.run import HoldTester, Postures
+from lgrasp.seeding import stage_seed
+from lgrasp.stages.context import Context
+from lgrasp.stages.hold.params import HoldParams
+
+VERSION = 1
+
+
+def run(inputs: GraspTable, params: HoldParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
+    """Try every grasp and keep those within the bound, in their order; all of them if nothing is asked for.
+
+    Returns:
+        The grasps with metrics hold_success, hold_probability and hold_drift, and how many were tried and held.
+    """
+    least = context.bounds.min_hold_probability
+    seed = stage_seed(context.base_seed, context.shard, "hold", context.salt)
+    postures = Postures(inputs.q_pregrasp, inputs.q, inputs.q_squeeze, inputs.pose, inputs.index)
+    found = _tester(params, context).run(postures, seed, least=least)
+    keep = np.flatnonzero(context.bounds.held_by(found))
+    table = take_grasps(replace(inputs, metrics={**inputs.metrics, **found}), keep)
+    return table, {"tried": len(inputs), "held": len(keep)}
+
+
+def _tester(test: HoldTest, context: Context) -> HoldTester:
+    """That of a job: made by the first batch, used by all."""
+    model = context.object.model
+    key = (context.hand.model.sha256, model.sha256, model.scale, test, context.device)
+    return context.kept.get("hold", key, lambda: HoldTester(context.hand, context.object, test))
