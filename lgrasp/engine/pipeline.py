@@ -98,8 +98,8 @@ class Pipeline(_Head):
         """
         if self.bounds.min_hold_probability > 0 and "hold" not in self.order:
             raise ConfigError(
-                f"pipeline {self.name}: bounds.min_hold_probability is {self.bounds.min_hold_probability:g}, which only "
-                f"stage hold tells; use pipeline robust-hold, or add '- hold: {{}}' after the stages"
+                f"pipeline {self.name}: bounds.min_hold_probability is {self.bounds.min_hold_probability:g}, which "
+                f"only stage hold tells; use pipeline robust-hold, or add '- hold: {{}}' after the stages"
             )
         return self
 

@@ -99,10 +99,8 @@ class GenerateJob(GenerateRequest, SearchJob):
             resume=part.number in self._growing,
             progress=lambda rows, _: progress(rows),
         )
-        counts = result.counts
-        kept = next(
-            counts[s][n] for s, n in (("simulate", "held"), ("hold", "held"), ("filter", "kept")) if s in counts
-        )
+        last = ("simulate", "held"), ("hold", "held"), ("filter", "kept")
+        kept = next(result.counts[stage][count] for stage, count in last if stage in result.counts)
         self._rate = max(kept / result.candidates, 1e-3)
         # poses and contacts go from the internal to the user's frame of the object
         tree, center = self.inputs.hand.model.tree, self.inputs.object.model.center
