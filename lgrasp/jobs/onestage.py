@@ -75,7 +75,8 @@ def run_up_to(
     done = max((i for i, stage in enumerate(stages) if stage in found), default=-1) + 1
     if done == len(stages):
         return runs
-    inputs = load_inputs(cache, keys, scale, pipeline.object, pipeline.field, used, report)
+    what = keys, scale, pipeline.object, pipeline.field, used, report
+    inputs = load_inputs(cache, *what, table=pipeline.on_table)
     context = shard_context(pipeline, inputs, shard)
     table: Any = _table(found[stages[done - 1]], used.alias) if done else (first, count)
     load_kernels(used.alias, kernel_modules("lgrasp.stages.", "lgrasp.grasp."), report)

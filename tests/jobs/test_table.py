@@ -6,11 +6,13 @@ import h5py
 import numpy as np
 import pytest
 
+from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.jobs.config import JobConfig, plan_requests
 from lgrasp.jobs.requests.search import SearchRequest
 from lgrasp.judge.run import judge
 
@@ -75,6 +77,12 @@ def test_asked_for_or_not(run, job, swift):
     assert shard.grasps.table == {}
     assert shard.objects[0].tables is None
     assert job().key() != job(pipeline=swift.with_table()).key()
+
+
+def test_config_asks_for_a_table():
+    (request,) = plan_requests(parse_model(JobConfig, {"objects": ["mug"], "table": True}, "config"))
+    assert request.pipeline.on_table
+    assert request.out.name == "robust-table"
 
 
 def test_pipelines_without_tables(job):
