@@ -1,7 +1,12 @@
 """Why too few grasps came out, in words."""
 
 _STEPS = (
-    ("place", "tried", "kept", "object poses are blocked by the palm (or it by the table), or no two fingers could oppose each other"),
+    (
+        "place",
+        "tried",
+        "kept",
+        "the palm is in the object or the table, or no two fingers could oppose each other there",
+    ),
     ("domain", "poses", "rich", "too few fingers can reach the object's surface at these poses"),
     ("ik", "tried", "kept", "fingers cannot put their contact surface on the object without hitting it"),
     ("search", "poses", "yielding", "the contacts within reach do not balance, or the fingers would hit each other"),
