@@ -164,13 +164,18 @@ Rows = TypeVar("Rows")
 def grasp_arrays(table: Any) -> dict[str, np.ndarray]:
     """A table in memory as flat NumPy arrays (metrics as ``metrics.NAME``, and so on)."""
     out = {f.name: getattr(table, f.name) for f in fields(table) if f.name not in _FAMILIES}
-    for family in _FAMILIES:
+    for family in _families(table):
         out |= {f"{family}.{name}": values for name, values in getattr(table, family).items()}
     return out
 
 
+def _families(table: Any) -> list[str]:
+    """Families of a table in memory, or of its class."""
+    return [f.name for f in fields(table) if f.name in _FAMILIES]
+
+
 def _of_arrays(kind: type[Rows], arrays: dict[str, np.ndarray]) -> Rows:
-    own: dict[str, Any] = {family: {} for family in _FAMILIES}
+    own: dict[str, Any] = {family: {} for family in _families(kind)}
     for name, values in arrays.items():
         family, dot, member = name.partition(".")
         if dot:
