@@ -120,14 +120,17 @@ _STAGES = {
     "ik": "Move fingers to their contacts and keep those that do not collide with the object.",
     "search": "Combine contacts into sets that balance.",
     "filter": "Complete the grasps and check them exactly.",
+    "hold": "Try in a fast simulation how finished grasps hold.",
 }
 
 
 def _up_to(stage: str):
+    usual = "robust-hold" if stage == "hold" else "robust"
+
     def run(
         mesh: Mesh,
         hand: Hand = "allegro",
-        pipeline: PipelineName = "robust",
+        pipeline: PipelineName = usual,
         candidates: Annotated[int, Option(min=1, help="Candidates in the batch.")] = 1024,
         first: Annotated[int, Option(min=0, help="First candidate of the batch.")] = 0,
         shard: Annotated[int, Option(min=0, help="Shard whose candidate stream is used.")] = 0,

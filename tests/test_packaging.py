@@ -22,7 +22,7 @@ ORDER = (
     ("grasp",),
     ("picture",),
     ("simulate", "dataset", "refine"),
-    ("planning", "scenes"),
+    ("planning", "scenes", "hold"),
     ("stages",),
     ("sequence", "learn"),
     ("engine",),

@@ -54,27 +54,27 @@ class Spread:
 
 
 @wp.struct
-class Grasps:
-    """Rows to try, (N,) or (N, K)."""
+class TriedGrasps:
+    """Rows to try."""
 
-    pregrasp: wp.array2d(dtype=wp.float32)  # [rad or m]
-    grasp: wp.array2d(dtype=wp.float32)  # [rad or m]
-    squeeze: wp.array2d(dtype=wp.float32)  # [rad or m]
-    pose: wp.array(dtype=wp.transform)  # T_hand_object, internal frame
-    number: wp.array(dtype=wp.int32)  # from which a row's random numbers come
+    pregrasp: wp.array2d(dtype=wp.float32)  # (N, K) [rad or m]
+    grasp: wp.array2d(dtype=wp.float32)  # (N, K) [rad or m]
+    squeeze: wp.array2d(dtype=wp.float32)  # (N, K) [rad or m]
+    pose: wp.array(dtype=wp.transform)  # (N,) T_hand_object, internal frame
+    number: wp.array(dtype=wp.int32)  # (N,) from which a row's random numbers come
 
 
 @wp.struct
-class Outcome:
-    """What came of each trial, (T,)."""
+class Trials:
+    """What came of each trial."""
 
-    held: wp.array(dtype=wp.int32)  # directions in which the object was held
-    displacement: wp.array2d(dtype=wp.float32)  # (T, 6) at worst, closing included [m]; NaN: not pulled
+    held: wp.array(dtype=wp.int32)  # (T,) directions in which the object was held
+    displacement: wp.array2d(dtype=wp.float32)  # (T, 6) at worst, closing included [m]; unset: not pulled
     rotation: wp.array2d(dtype=wp.float32)  # (T, 6) [rad]
 
 
 @wp.struct
-class State:
+class Motion:
     """Of the object during a trial."""
 
     pose: wp.transform  # T_hand_object
@@ -106,7 +106,7 @@ def _turned(T: wp.transform, com: wp.vec3, dx: wp.spatial_vector):
 
 
 @wp.func
-def _note(course: Course, s: State, start: wp.transform):
+def _note(course: Course, s: Motion, start: wp.transform):
     """The state with its worst displacement and rotation, its displacement and its rotation now."""
     shift = wp.length(wp.transform_point(s.pose, course.com) - wp.transform_point(start, course.com))
     a = wp.transform_get_rotation(s.pose)
@@ -118,7 +118,7 @@ def _note(course: Course, s: State, start: wp.transform):
 
 
 @wp.func
-def _body(course: Course, s: State, mass: wp.float32, h: wp.float32, pull: wp.int32):
+def _body(course: Course, s: Motion, mass: wp.float32, h: wp.float32, pull: wp.int32):
     """The object in a step of h [s]; pull -1: none, else the direction +x, -x, +y, ..."""
     body = Body()
     body.com = wp.transform_point(s.pose, course.com)
@@ -133,7 +133,7 @@ def _body(course: Course, s: State, mass: wp.float32, h: wp.float32, pull: wp.in
 
 @wp.func
 def _aim(
-    hand: Hand, grasps: Grasps, row: wp.int32, phase: wp.int32, share: wp.float32, target: wp.array(dtype=wp.float32)
+    hand: Hand, grasps: TriedGrasps, row: wp.int32, phase: wp.int32, share: wp.float32, target: wp.array(dtype=wp.float32)
 ):
     """Targets of the drives: phase 0 from pregrasp to grasp, 1 from grasp to squeeze, later the squeeze."""
     for k in range(hand.kin.dof_first[hand.kin.groups]):
@@ -186,15 +186,16 @@ def run_trials(
     obj: Object,
     course: Course,
     spread: Spread,
-    grasps: Grasps,
+    grasps: TriedGrasps,
     rows: wp.array(dtype=wp.int32),
     seed: wp.int32,
-    outcome: Outcome,
+    trials_out: Trials,
 ):
     """One thread per trial: a row with numbers of its own.
 
     Args:
         rows: (T,) row of each trial.
+        trials_out: (T,).
     """
     i = wp.tid()
     row = rows[i]
@@ -230,7 +231,7 @@ def run_trials(
         for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
             if hand.kin.joint_prismatic[j] == 1:
                 scale[first + hand.kin.joint_dof[j]] = 1.0 / (_ARM * _ARM)
-    s = State()
+    s = Motion()
     s.pose = start
     closed = s
     count = int(0)
@@ -284,8 +285,8 @@ def run_trials(
                         if slide < 0.5 * course.most_displacement and roll < 0.5 * course.most_rotation:
                             end = _OVER
             if pull >= 0:
-                outcome.displacement[i, pull] = s.displacement
-                outcome.rotation[i, pull] = s.rotation
+                trials_out.displacement[i, pull] = s.displacement
+                trials_out.rotation[i, pull] = s.rotation
                 if end != _LOST:
                     held += 1
-    outcome.held[i] = held
+    trials_out.held[i] = held

@@ -9,7 +9,7 @@ import trimesh
 import warp as wp
 
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hold.kernels import Course, Grasps, Outcome, Spread, run_trials
+from lgrasp.hold.kernels import Course, Spread, Trials, TriedGrasps, run_trials
 from lgrasp.hold.params import HoldTest
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.object.model import ObjectModel
@@ -26,8 +26,8 @@ _MIXER = 0x9E3779B9  # between the random streams of a row's draws
 
 
 @dataclass(frozen=True)
-class Postures:
-    """Grasps to test."""
+class ControlPoses:
+    """TriedGrasps to test."""
 
     pregrasp: np.ndarray
     """(N, K) [rad or m], joints in the order of the hand's model."""
@@ -57,7 +57,7 @@ class HoldTester:
 
     def run(
         self,
-        postures: Postures,
+        postures: ControlPoses,
         seed: int,
         *,
         least: float = 0.0,
@@ -98,9 +98,9 @@ class HoldTester:
             "hold_drift": np.where(held, drift, np.inf).astype(np.float32),
         }
 
-    def _put(self, postures: Postures) -> Any:
+    def _put(self, postures: ControlPoses) -> Any:
         return upload_struct(
-            Grasps,
+            TriedGrasps,
             self._device,
             {
                 "pregrasp": np.asarray(postures.pregrasp, np.float32),
@@ -115,7 +115,7 @@ class HoldTester:
         """Whether each of some rows holds (T,), and its displacement at worst (T,) [m]."""
         if not len(rows):
             return np.zeros(0, bool), np.zeros(0)
-        outcome = empty_struct(Outcome, self._device, len(rows), 6)
+        outcome = empty_struct(Trials, self._device, len(rows), 6)
         index = wp.array(rows.astype(np.int32), dtype=wp.int32, device=self._device)
         inputs = [self._hand.struct, self._object.struct, self._course, spread, grasps, index, int(seed)]
         wp.launch(run_trials, len(rows), inputs, [outcome], device=self._device)

@@ -62,6 +62,8 @@ def run_up_to(
     """
     if first < 0 or count < 1 or shard < 0:
         raise ConfigError(f"--first {first} --candidates {count} --shard-index {shard}: need 0, 1 and 0 or more")
+    if last not in pipeline.order:
+        raise ConfigError(f"pipeline {pipeline.name} has no stage {last}; its stages: {', '.join(pipeline.order)}")
     used = resolve_device(device)
     keys = input_keys(hand_source(hand), mesh, scale, pipeline.object, pipeline.field)
     stages = pipeline.order[: pipeline.order.index(last) + 1]

@@ -6,7 +6,7 @@ import numpy as np
 
 from lgrasp.grasp.tables import GraspTable, take_grasps
 from lgrasp.hold.params import HoldTest
-from lgrasp.hold.run import HoldTester, Postures
+from lgrasp.hold.run import ControlPoses, HoldTester
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
 from lgrasp.stages.hold.params import HoldParams
@@ -22,7 +22,7 @@ def run(inputs: GraspTable, params: HoldParams, context: Context) -> tuple[Grasp
     """
     least = context.bounds.min_hold_probability
     seed = stage_seed(context.base_seed, context.shard, "hold", context.salt)
-    postures = Postures(inputs.q_pregrasp, inputs.q, inputs.q_squeeze, inputs.pose, inputs.index)
+    postures = ControlPoses(inputs.q_pregrasp, inputs.q, inputs.q_squeeze, inputs.pose, inputs.index)
     found = _tester(params, context).run(postures, seed, least=least)
     keep = np.flatnonzero(context.bounds.held_by(found))
     table = take_grasps(replace(inputs, metrics={**inputs.metrics, **found}), keep)
