@@ -133,7 +133,12 @@ def _body(course: Course, s: Motion, mass: wp.float32, h: wp.float32, pull: wp.i
 
 @wp.func
 def _aim(
-    hand: Hand, grasps: TriedGrasps, row: wp.int32, phase: wp.int32, share: wp.float32, target: wp.array(dtype=wp.float32)
+    hand: Hand,
+    grasps: TriedGrasps,
+    row: wp.int32,
+    phase: wp.int32,
+    share: wp.float32,
+    target: wp.array(dtype=wp.float32),
 ):
     """Targets of the drives: phase 0 from pregrasp to grasp, 1 from grasp to squeeze, later the squeeze."""
     for k in range(hand.kin.dof_first[hand.kin.groups]):
