@@ -25,7 +25,7 @@ MAX_HAND_DOFS = MAX_GROUPS * MAX_DOFS
 _BLOCKS = MAX_HAND_DOFS * MAX_DOFS
 _COUPLING = MAX_HAND_DOFS * 7
 _ITERATIONS = wp.constant(12)
-_STOP = wp.constant(1.0e-6)  # [J]
+_STOP = wp.constant(1.0e-8)  # [J]
 _FORCE_STOP = wp.constant(0.02)  # [N]
 _SEARCH = wp.constant(10)  # points tried along a step
 
