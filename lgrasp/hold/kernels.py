@@ -14,13 +14,11 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
+_DOFS = wp.constant(MAX_HAND_DOFS)
 _COLUMNS = MAX_CONTACTS * MAX_DOFS
 _ARM = wp.constant(SLIDING_ARM)
-_PULLS = wp.constant(6)
 _REACH = wp.constant(2.0e-3)  # [m] contacts are looked for within
 _TRAVEL = wp.constant(1.0e-3)  # [m] of hand and object after which they are looked for afresh
-_OVER = wp.constant(1)  # a phase is over, and the object is held
-_LOST = wp.constant(2)
 
 
 @wp.struct
@@ -65,22 +63,37 @@ class TriedGrasps:
 
 
 @wp.struct
-class Trials:
-    """What came of each trial."""
+class Motion:
+    """A trial at one moment."""
 
-    held: wp.array(dtype=wp.int32)  # (T,) directions in which the object was held
-    displacement: wp.array2d(dtype=wp.float32)  # (T, 6) at worst, closing included [m]; unset: not pulled
-    rotation: wp.array2d(dtype=wp.float32)  # (T, 6) [rad]
+    pose: wp.transform  # T_hand_object
+    velocity: wp.spatial_vector  # of the object [m/s], [rad/s]
+    displacement: wp.float32  # at worst until now [m]
+    rotation: wp.float32  # at worst until now [rad]
+    contacts: wp.int32  # how many there are
+    lost: wp.int32  # 1: the object is out of its bounds
 
 
 @wp.struct
-class Motion:
-    """Of the object during a trial."""
+class Trials:
+    """Trials, and where they stand once the hand has closed."""
 
-    pose: wp.transform  # T_hand_object
-    velocity: wp.spatial_vector  # [m/s], [rad/s]
-    displacement: wp.float32  # at worst until now [m]
-    rotation: wp.float32  # at worst until now [rad]
+    row: wp.array(dtype=wp.int32)  # (T,)
+    seed: wp.array(dtype=wp.int32)  # (T,) of its numbers, with that of its grasp
+    start: wp.array(dtype=wp.transform)  # (T,) T_hand_object
+    material: wp.array(dtype=Material)  # (T,) its ``drag`` is the damping [N m s/rad]
+    mass: wp.array(dtype=wp.float32)  # (T,) [kg]
+    motion: wp.array(dtype=Motion)  # (T,)
+    contacts: wp.array2d(dtype=Contact)  # (T, MAX_CONTACTS)
+    q: wp.array2d(dtype=wp.float32)  # (T, MAX_HAND_DOFS) [rad or m]
+
+
+@wp.struct
+class TrialPulls:
+    """What came of each direction of each trial."""
+
+    held: wp.array2d(dtype=wp.int32)  # (T, 6) 1 held, 0 not held or not tried
+    displacement: wp.array2d(dtype=wp.float32)  # (T, 6) at worst, closing included [m]; 0 not tried
 
 
 @wp.func
@@ -107,13 +120,15 @@ def _turned(T: wp.transform, com: wp.vec3, dx: wp.spatial_vector):
 
 @wp.func
 def _note(course: Course, s: Motion, start: wp.transform):
-    """The state with its worst displacement and rotation, its displacement and its rotation now."""
+    """The motion with its worst displacement and rotation and whether it is lost; displacement and rotation now."""
     shift = wp.length(wp.transform_point(s.pose, course.com) - wp.transform_point(start, course.com))
     a = wp.transform_get_rotation(s.pose)
     b = wp.transform_get_rotation(start)
     turn = 2.0 * wp.acos(wp.min(wp.abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]), 1.0))
     s.displacement = wp.max(s.displacement, shift)
     s.rotation = wp.max(s.rotation, turn)
+    if not (s.displacement <= course.most_displacement and s.rotation <= course.most_rotation):
+        s.lost = 1
     return s, shift, turn
 
 
@@ -170,6 +185,18 @@ def _copy(contacts: wp.array(dtype=Contact), count: wp.int32, out: wp.array(dtyp
 
 
 @wp.func
+def _scales(hand: Hand, scale: wp.array(dtype=wp.float32)):
+    """Write the stiffness of each joint over that of a revolute one."""
+    for g in range(hand.kin.groups):
+        first = hand.kin.dof_first[g]
+        for d in range(hand.kin.dof_first[g + 1] - first):
+            scale[first + d] = 1.0
+        for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
+            if hand.kin.joint_prismatic[j] == 1:
+                scale[first + hand.kin.joint_dof[j]] = 1.0 / (_ARM * _ARM)
+
+
+@wp.func
 def _advance(
     hand: Hand,
     scale: wp.array(dtype=wp.float32),
@@ -185,113 +212,133 @@ def _advance(
     return far
 
 
+@wp.func
+def _go(
+    hand: Hand,
+    obj: Object,
+    course: Course,
+    grasps: TriedGrasps,
+    trials: Trials,
+    i: wp.int32,
+    phase: wp.int32,
+    s: Motion,
+    q: wp.array(dtype=wp.float32),
+    contacts: wp.array(dtype=Contact),
+    scale: wp.array(dtype=wp.float32),
+):
+    """Take trial i through a phase: 0 to the grasp, 1 to the squeeze, 2 ... 7 pulls; returns its motion at the end."""
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    before = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
+    column = wp.zeros(shape=(_COLUMNS,), dtype=wp.vec3)
+    spin = wp.zeros(shape=(_COLUMNS,), dtype=wp.float32)
+    dq = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    target = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    pull = phase - 2
+    steps = wp.where(pull < 0, course.closing_steps, course.pull_steps)
+    h = wp.where(pull < 0, course.closing_time, course.pull_time)
+    m = trials.material[i]
+    m.drag = m.drag / h
+    travel = float(1.0e9)
+    over = int(0)
+    for step in range(steps):
+        if over == 0:
+            _aim(hand, grasps, trials.row[i], phase, float(step + 1) / float(steps), target)
+            _place(hand, q, X)
+            if travel > _TRAVEL:
+                _copy(contacts, s.contacts, before)
+                s.contacts = find_contacts(hand, obj, X, s.pose, _REACH, before, s.contacts, contacts)
+                travel = 0.0
+            else:
+                follow_contacts(hand, obj, X, s.pose, contacts, s.contacts)
+            make_columns(hand, X, contacts, s.contacts, column, spin)
+            body = _body(course, s, trials.mass[i], h, pull)
+            dx = solve_step(hand, m, body, contacts, s.contacts, column, spin, scale, q, target, dq)
+            travel += _advance(hand, scale, q, dq, dx)
+            s.velocity = dx / h
+            s.pose = _turned(s.pose, course.com, dx)
+            s, shift, turn = _note(course, s, trials.start[i])
+            if s.lost == 1:
+                over = 1
+            elif pull >= 0 and step >= 2:
+                # at four times this speed it stays well inside the bounds to the end
+                ahead = 4.0 * float(steps - 1 - step)
+                slide = shift + ahead * wp.length(wp.spatial_top(dx))
+                roll = turn + ahead * wp.length(wp.spatial_bottom(dx))
+                if slide < 0.5 * course.most_displacement and roll < 0.5 * course.most_rotation:
+                    over = 1
+    return s
+
+
 @wp.kernel
-def run_trials(
+def close_hands(
     hand: Hand,
     obj: Object,
     course: Course,
     spread: Spread,
     grasps: TriedGrasps,
-    rows: wp.array(dtype=wp.int32),
-    seed: wp.int32,
-    trials_out: Trials,
+    trials: Trials,
 ):
-    """One thread per trial: a row with numbers of its own.
+    """One thread per trial: draw its numbers and close the hand on the object.
 
     Args:
-        rows: (T,) row of each trial.
-        trials_out: (T,).
+        trials: ``row`` and ``seed`` are given, all else is written.
     """
     i = wp.tid()
-    row = rows[i]
-    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    row = trials.row[i]
     contacts = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
-    before = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
-    column = wp.zeros(shape=(_COLUMNS,), dtype=wp.vec3)
-    spin = wp.zeros(shape=(_COLUMNS,), dtype=wp.float32)
     scale = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
     q = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    dq = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    target = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    q_closed = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    contacts_closed = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
-    rng = wp.rand_init(seed, grasps.number[row])
+    rng = wp.rand_init(trials.seed[i], grasps.number[row])
     m = Material()
     m.friction = _between(rng, spread.friction)
     m.torsion = _between(rng, spread.torsion)
-    mass = _between(rng, spread.mass)
+    trials.mass[i] = _between(rng, spread.mass)
     m.drive = _between(rng, spread.stiffness)
-    damping = _between(rng, spread.damping_ratio) * 2.0 * wp.sqrt(m.drive * course.drive_inertia)
-    contact_log = wp.vec2(wp.log(spread.contact_stiffness[0]), wp.log(spread.contact_stiffness[1]))
-    m.contact = wp.exp(_between(rng, contact_log))
+    m.drag = _between(rng, spread.damping_ratio) * 2.0 * wp.sqrt(m.drive * course.drive_inertia)
+    logarithms = wp.vec2(wp.log(spread.contact_stiffness[0]), wp.log(spread.contact_stiffness[1]))
+    m.contact = wp.exp(_between(rng, logarithms))
+    trials.material[i] = m
     shift = _in_ball(rng, spread.shift)
     error = _in_ball(rng, spread.turn)
-    start = _turned(grasps.pose[row], course.com, wp.spatial_vector(shift, error))
-    dofs = hand.kin.dof_first[hand.kin.groups]
-    _aim(hand, grasps, row, 0, 0.0, q)
-    for g in range(hand.kin.groups):
-        first = hand.kin.dof_first[g]
-        for d in range(hand.kin.dof_first[g + 1] - first):
-            scale[first + d] = 1.0
-        for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-            if hand.kin.joint_prismatic[j] == 1:
-                scale[first + hand.kin.joint_dof[j]] = 1.0 / (_ARM * _ARM)
     s = Motion()
-    s.pose = start
-    closed = s
-    count = int(0)
-    count_closed = int(0)
-    held = int(0)
-    end = int(0)
-    for phase in range(2 + _PULLS):
-        if end != _LOST:
-            pull = phase - 2
-            steps = wp.where(pull < 0, course.closing_steps, course.pull_steps)
-            h = wp.where(pull < 0, course.closing_time, course.pull_time)
-            if pull == 0:
-                closed = s
-                count_closed = count
-                _copy(contacts, count, contacts_closed)
-                for k in range(dofs):
-                    q_closed[k] = q[k]
-            elif pull > 0:
-                s = closed
-                count = count_closed
-                _copy(contacts_closed, count, contacts)
-                for k in range(dofs):
-                    q[k] = q_closed[k]
-            m.drag = damping / h
-            travel = float(1.0e9)
-            end = int(0)
-            for step in range(steps):
-                if end == 0:
-                    _aim(hand, grasps, row, phase, float(step + 1) / float(steps), target)
-                    _place(hand, q, X)
-                    if travel > _TRAVEL:
-                        _copy(contacts, count, before)
-                        count = find_contacts(hand, obj, X, s.pose, _REACH, before, count, contacts)
-                        travel = 0.0
-                    else:
-                        follow_contacts(hand, obj, X, s.pose, contacts, count)
-                    make_columns(hand, X, contacts, count, column, spin)
-                    body = _body(course, s, mass, h, pull)
-                    dx = solve_step(hand, m, body, contacts, count, column, spin, scale, q, target, dq)
-                    travel += _advance(hand, scale, q, dq, dx)
-                    s.velocity = dx / h
-                    s.pose = _turned(s.pose, course.com, dx)
-                    s, shifted, turned = _note(course, s, start)
-                    if not (s.displacement <= course.most_displacement and s.rotation <= course.most_rotation):
-                        end = _LOST
-                    elif pull >= 0 and step >= 2:
-                        # at four times this speed it stays well inside the bounds to the end
-                        ahead = 4.0 * float(steps - 1 - step)
-                        slide = shifted + ahead * wp.length(wp.spatial_top(dx))
-                        roll = turned + ahead * wp.length(wp.spatial_bottom(dx))
-                        if slide < 0.5 * course.most_displacement and roll < 0.5 * course.most_rotation:
-                            end = _OVER
-            if pull >= 0:
-                trials_out.displacement[i, pull] = s.displacement
-                trials_out.rotation[i, pull] = s.rotation
-                if end != _LOST:
-                    held += 1
-    trials_out.held[i] = held
+    s.pose = _turned(grasps.pose[row], course.com, wp.spatial_vector(shift, error))
+    trials.start[i] = s.pose
+    _scales(hand, scale)
+    _aim(hand, grasps, row, 0, 0.0, q)
+    for phase in range(2):
+        if s.lost == 0:
+            s = _go(hand, obj, course, grasps, trials, i, phase, s, q, contacts, scale)
+    trials.motion[i] = s
+    for c in range(s.contacts):
+        trials.contacts[i, c] = contacts[c]
+    for k in range(_DOFS):
+        trials.q[i, k] = q[k]
+
+
+@wp.kernel
+def pull_objects(
+    hand: Hand,
+    obj: Object,
+    course: Course,
+    grasps: TriedGrasps,
+    trials: Trials,
+    each: wp.int32,
+    pulls_out: TrialPulls,
+):
+    """One thread per trial and run of ``each`` directions, which ends at the first that is not held."""
+    i, part = wp.tid()
+    contacts = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
+    scale = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    q = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    _scales(hand, scale)
+    s = trials.motion[i]
+    for pull in range(part * each, (part + 1) * each):
+        if s.lost == 0:
+            s = trials.motion[i]
+            for c in range(s.contacts):
+                contacts[c] = trials.contacts[i, c]
+            for k in range(_DOFS):
+                q[k] = trials.q[i, k]
+            s = _go(hand, obj, course, grasps, trials, i, 2 + pull, s, q, contacts, scale)
+            pulls_out.held[i, pull] = 1 - s.lost
+            pulls_out.displacement[i, pull] = s.displacement

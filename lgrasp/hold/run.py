@@ -9,12 +9,14 @@ import trimesh
 import warp as wp
 
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hold.kernels import Course, Spread, Trials, TriedGrasps, run_trials
+from lgrasp.hold.contacts import MAX_CONTACTS, Contact
+from lgrasp.hold.kernels import Course, Spread, TrialPulls, Trials, TriedGrasps, close_hands, pull_objects
 from lgrasp.hold.params import HoldTest
+from lgrasp.hold.solve import MAX_HAND_DOFS
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.object.model import ObjectModel
-from lgrasp.runtime.structs import empty_struct, upload_struct
-from lgrasp.simulate.protocol import PROTOCOLS
+from lgrasp.runtime.structs import empty_struct, make_struct, upload_struct
+from lgrasp.simulate.protocol import DIRECTIONS, PROTOCOLS
 
 METRIC_UNITS = {"hold_success": "", "hold_probability": "", "hold_drift": "m"}
 """Metrics of the test and their units."""
@@ -22,6 +24,8 @@ METRIC_UNITS = {"hold_success": "", "hold_probability": "", "hold_drift": "m"}
 _CLOSING_STEPS, _PULL_STEPS = 10, 40
 _DRIVE_INERTIA = 4.0e-4  # [kg m^2] of a finger's joint, its drive and what it moves
 _CONTACT_STIFFNESS = 2.0e4  # [N/m] of the trial without draws
+_BLOCK = 32  # threads of a block
+_MOST_TRIALS = 1 << 16  # at a time; each takes 4 KB
 _MIXER = 0x9E3779B9  # between the random streams of a row's draws
 
 
@@ -77,20 +81,20 @@ class HoldTester:
         """
         n, draws = len(postures), self._test.draws
         grasps = self._put(postures)
-        held, drift = self._try(grasps, np.arange(n), _nominal(), seed)
-        done = n
-        hits, tried = np.zeros(n), np.zeros(n, int)
+        held, drift = self._try(grasps, np.arange(n), _nominal(), np.full(n, seed))
+        done, hits = n, np.zeros(n)
         active = np.flatnonzero(held) if least > 0.0 else np.arange(n)
-        for draw in range(draws):
-            if not len(active):
-                break
-            stream = (seed + (draw + 1) * _MIXER) & 0x7FFFFFFF
-            hits[active] += self._try(grasps, active, _spread(self._test), stream)[0]
-            tried[active] += 1
-            done += len(active)
+        # a GPU is fast if it has much to do at once
+        together = 1 if self._device == "cpu" else max(draws, 1)
+        for first in range(0, draws, together):
+            streams = (seed + np.arange(first + 1, first + together + 1) * _MIXER) & 0x7FFFFFFF
+            rows = np.repeat(active, together)
+            found = self._try(grasps, rows, _spread(self._test), np.tile(streams, len(active)))[0]
+            hits[active] += found.reshape(-1, together).sum(1)
+            done += len(rows)
             if progress:
                 progress(done)
-            active = active[hits[active] + draws - draw - 1 >= least * draws - 1e-6]
+            active = active[hits[active] + draws - first - together >= least * draws - 1e-6]
         probability = hits / draws if draws else held.astype(float)
         return {
             "hold_success": held.astype(np.float32),
@@ -111,16 +115,32 @@ class HoldTester:
             },
         )
 
-    def _try(self, grasps: Any, rows: np.ndarray, spread: Any, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Whether each of some rows holds (T,), and its displacement at worst (T,) [m]."""
-        if not len(rows):
-            return np.zeros(0, bool), np.zeros(0)
-        outcome = empty_struct(Trials, self._device, len(rows), 6)
-        index = wp.array(rows.astype(np.int32), dtype=wp.int32, device=self._device)
-        inputs = [self._hand.struct, self._object.struct, self._course, spread, grasps, index, int(seed)]
-        wp.launch(run_trials, len(rows), inputs, [outcome], device=self._device)
-        held = outcome.held.numpy() == outcome.displacement.shape[1]
-        return held, outcome.displacement.numpy().max(1)
+    def _try(self, grasps: Any, rows: np.ndarray, spread: Any, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whether each of some rows, with a seed each, holds (T,), and its displacement at worst (T,) [m]."""
+        cuts = [slice(at, at + _MOST_TRIALS) for at in range(0, len(rows), _MOST_TRIALS)]
+        parts = [self._launch(grasps, rows[cut], spread, seeds[cut]) for cut in cuts]
+        held, drift = zip(*parts, strict=True) if parts else ((np.zeros(0, bool),), (np.zeros(0),))
+        return np.concatenate(held), np.concatenate(drift)
+
+    def _launch(self, grasps: Any, rows: np.ndarray, spread: Any, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        n, ways, device = len(rows), len(DIRECTIONS), self._device
+        given = {
+            "row": wp.array(rows.astype(np.int32), dtype=wp.int32, device=device),
+            "seed": wp.array(seeds.astype(np.int32), dtype=wp.int32, device=device),
+            "contacts": wp.empty((n, MAX_CONTACTS), dtype=Contact, device=device),
+            "q": wp.empty((n, MAX_HAND_DOFS), dtype=wp.float32, device=device),
+        }
+        trials = empty_struct(Trials, device, n, **given)
+        held = wp.zeros((n, ways), dtype=wp.int32, device=device)
+        displacement = wp.zeros((n, ways), dtype=wp.float32, device=device)
+        pulls = make_struct(TrialPulls, held=held, displacement=displacement)
+        both = [self._hand.struct, self._object.struct, self._course]
+        # on a GPU short blocks spread few long threads over all of it, and every thread pulls one way only
+        each = ways if device == "cpu" else 1
+        wp.launch(close_hands, n, [*both, spread, grasps, trials], device=device, block_dim=_BLOCK)
+        dim = (n, ways // each)
+        wp.launch(pull_objects, dim, [*both, grasps, trials, each], [pulls], device=device, block_dim=_BLOCK)
+        return held.numpy().all(1), displacement.numpy().max(1)
 
     def _make_course(self) -> Any:
         fc = PROTOCOLS["fc"]
