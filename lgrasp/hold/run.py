@@ -31,7 +31,7 @@ _MIXER = 0x9E3779B9  # between the random streams of a row's draws
 
 @dataclass(frozen=True)
 class ControlPoses:
-    """TriedGrasps to test."""
+    """Grasps to test."""
 
     pregrasp: np.ndarray
     """(N, K) [rad or m], joints in the order of the hand's model."""
