@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from lgrasp.grasp.outcomes import METRICS
+from lgrasp.hold.run import METRIC_UNITS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -50,9 +51,9 @@ def test_all_pages_are_reached():
 
 def test_every_metric_is_explained():
     page = (DOCS / "reference" / "metrics.md").read_text(encoding="utf-8")
-    assert [
-        name for name in (*METRICS, "contacts", "valid", "refined", "energy", "room") if f"- `{name}`" not in page
-    ] == []
+    names = (*METRICS, "contacts", "valid", "refined", "energy", "room")
+    assert [name for name in names if f"- `{name}`" not in page] == []
+    assert [name for name in METRIC_UNITS if f"`{name}`" not in page] == []
 
 
 def test_pages_are_short():

@@ -34,6 +34,7 @@ from lgrasp.object.find import find_object
         (["--out", "/proc/nothing"], "cannot be"),
         (["--json", "/proc/nothing/x.json"], "cannot be"),
         (["--objct", "x"], "--objct"),
+        (["--set", "bounds.min_hold_probability=0.5"], "only stage hold tells; use pipeline robust-hold"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -42,6 +43,11 @@ def test_options(cli, tmp_path, changes, words, quick):
     base |= dict([changes])
     assert words in cli("generate", *(x for pair in base.items() for x in pair)).error()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_stage_that_the_pipeline_lacks(cli):
+    error = cli("hold", "--object", "tiny", "--pipeline", "robust").error()
+    assert "pipeline robust has no stage hold; its stages: place, domain, ik, search, filter" in error
 
 
 def test_unknown_command(cli):
