@@ -18,8 +18,8 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.structs import empty_struct, make_struct, upload_struct
 from lgrasp.simulate.protocol import DIRECTIONS, PROTOCOLS
 
-METRIC_UNITS = {"hold_success": "", "hold_probability": "", "hold_drift": "m"}
-"""Metrics of the test and their units."""
+METRICS = ("hold_success", "hold_probability", "hold_drift")
+"""Of the test."""
 
 _CLOSING_STEPS, _PULL_STEPS = 10, 40
 _DRIVE_INERTIA = 4.0e-4  # [kg m^2] of a finger's joint, its drive and what it moves

@@ -24,7 +24,7 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.records import GraspRows, Shard
 from lgrasp.grasp.schema import GRASP_FIELDS
-from lgrasp.hold.run import METRIC_UNITS as HOLD_UNITS
+from lgrasp.hold.run import METRICS
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.simulate import SimulateJob
@@ -207,15 +207,13 @@ def test_invalid_rows_are_kept_when_asked_with_their_own_metrics(source, refine,
 def test_metrics_of_the_hold_test_are_left_out(source, refine, tmp_path):
     """Refined postures were not tried, and the bound is not asked of them."""
     shard = read_shard(source)
-    tried = {name: np.ones(ROWS, "f4") for name in HOLD_UNITS}
-    rows = replace(
-        shard.grasps, metrics=shard.grasps.metrics | tried, metric_units=shard.grasps.metric_units | HOLD_UNITS
-    )
+    tried = {name: np.ones(ROWS, "f4") for name in METRICS}
+    rows = replace(shard.grasps, metrics=shard.grasps.metrics | tried)
     config = {**shard.header.config, "bounds": GraspBounds(min_hold_probability=1.0).describe()}
     write_shard(tmp_path / "tried.h5", replace(shard, grasps=rows, header=replace(shard.header, config=config)))
     done = read_shard(refine(tmp_path / "tried.h5", tmp_path / "out", params=RefineParams(matching_rounds=0)))
     assert len(done.grasps) > 0
-    assert not set(HOLD_UNITS) & set(done.grasps.metrics)
+    assert not set(METRICS) & set(done.grasps.metrics)
     assert done.header.config["bounds"]["numbers"]["min_hold_probability"] == 0
 
 

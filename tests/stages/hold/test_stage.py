@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 from lgrasp.config import parse_model
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, take_grasps
-from lgrasp.hold.run import METRIC_UNITS
+from lgrasp.hold.run import METRICS
+from lgrasp.jobs.generate import generate
 from lgrasp.jobs.requests.shards import RefineRequest
+from lgrasp.judge.run import judge
 from lgrasp.stages.context import Context
 from lgrasp.stages.hold.params import HoldParams
 from lgrasp.stages.hold.stage import run
@@ -36,7 +40,7 @@ def asking(context: Context, least: float) -> Context:
 def test_a_bound_of_0_keeps_all_rows(grasps, all_rows):
     table, counts = all_rows
     assert counts == {"tried": len(grasps), "held": len(grasps)}
-    assert set(table.metrics) - set(grasps.metrics) == set(METRIC_UNITS)
+    assert set(table.metrics) - set(grasps.metrics) == set(METRICS)
     for name, values in grasp_arrays(grasps).items():
         np.testing.assert_array_equal(grasp_arrays(table)[name], values, err_msg=name)
     assert 0 < table.metrics["hold_success"].sum() < len(table)
@@ -60,7 +64,7 @@ def test_open_hands_hold_nothing(grasps, context):
     opened = replace(grasps, q=grasps.q_pregrasp, q_squeeze=grasps.q_pregrasp)
     table, counts = run(opened, FEW, asking(context, 0.5))
     assert counts["held"] == len(table) == 0
-    assert set(METRIC_UNITS) <= set(table.metrics)
+    assert set(METRICS) <= set(table.metrics)
 
 
 def test_no_grasps(grasps, context):
@@ -81,3 +85,17 @@ def test_refine_refuses_the_bound():
         parse_model(RefineRequest, asked, "refine").numbers(GraspBounds())
     told = GraspBounds(min_hold_probability=1.0)
     assert parse_model(RefineRequest, asked | {"settings": []}, "refine").numbers(told)[0].min_hold_probability == 0
+
+
+def test_robust_hold_writes_valid_rows_with_its_metrics(swift, job, tmp_path):
+    pipeline = load_pipeline("robust-hold").with_settings(["hold.draws=2"]).model_copy(update={"field": swift.field})
+    (path,) = generate(job(pipeline=pipeline, rows=12, shard_rows=12, out=tmp_path / "made")).paths
+    shard = read_shard(path)
+    metrics = shard.grasps.metrics
+    assert len(shard.grasps) == 12
+    assert (metrics["hold_success"] == 1).all()
+    assert (metrics["hold_probability"] == 1).all()
+    assert (metrics["hold_drift"] < 0.05).all()
+    assert [shard.grasps.metric_units[name] for name in METRICS] == ["", "", "m"]
+    assert validate_shard(path) == []
+    assert judge(path).valid.all()
