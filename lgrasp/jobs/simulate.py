@@ -1,7 +1,7 @@
 """Simulates the rows of shards and adds the verdicts to them, or to copies."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.run import check_installed, on_cpu, protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
-from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, OBJECT_COLUMNS
+from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, LIFT_COLUMNS, OBJECT_COLUMNS
 from lgrasp.stages.context import Keeper
 
 _MIN_HOLDING_LINKS = 2  # links that it takes to hold anything
@@ -43,7 +43,7 @@ class SimulateJob(SimulateRequest, ShardJob):
 
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)
-    _scene: tuple[tuple[str, ...], Scene] | None = PrivateAttr(None)  # the latest
+    _scene: tuple[Hashable, Scene] | None = PrivateAttr(None)  # the latest
 
     def key(self) -> str:
         return content_key("simulate", 2, settings=self._settings())
@@ -153,7 +153,7 @@ class SimulateJob(SimulateRequest, ShardJob):
                 object_index=reader.column("object_index"),
                 columns={
                     n: reader.column(prefix + n)
-                    for n in COLUMNS | OBJECT_COLUMNS | DRAWN_COLUMNS
+                    for n in COLUMNS | OBJECT_COLUMNS | DRAWN_COLUMNS | LIFT_COLUMNS
                     if prefix + n in reader.columns
                 },
                 seconds=seconds,
@@ -164,7 +164,8 @@ class SimulateJob(SimulateRequest, ShardJob):
 
     def _scene_of(self, hand: HandRecord, objects: Sequence[ObjectRecord]) -> Scene:
         """What is simulated of a shard: hand and objects cut into convex pieces."""
-        key = (hand.sha256, *(f"{record.id} {mesh_hash(record)}" for record in objects))
+        planes = [b"" if record.tables is None else record.tables.tobytes() for record in objects]
+        key = (hand.sha256, *((o.id, mesh_hash(o), plane) for o, plane in zip(objects, planes, strict=True)))
         if self._scene is None or self._scene[0] != key:
             scene = scene_of(hand, objects, partial(decompose, store=self.cache), self.device_used.alias)
             for line in (f"object {solid.name}: {note}" for solid in scene.objects for note in solid.notes):
@@ -183,7 +184,8 @@ def _told(text: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     except (ValueError, AttributeError, RecursionError):
         return {}
     device = "gpu" if simulator.startswith("mujoco_warp") else "cpu"
-    older = {"engine": "mujoco", "draws": None}  # what shards do not tell that were written before there was a choice
+    # what shards do not tell that were written before there was a choice
+    older = {"engine": "mujoco", "draws": None, "lift": None}
     return older | {name: told[name] for name in settings if name in told} | {"device": device}
 
 
@@ -202,7 +204,9 @@ class Simulated:
 def summary(done: Sequence[Simulated], protocol: Protocol) -> list[dict[str, Any]]:
     """One entry per hand and objects of a grasp, in the order of its slots: shares that hold, contacts, load, speed.
 
-    ``share``: of the draws of a row that hold, mean; ``mass``, ``friction``, ``stiffness`` are None if they are drawn.
+    Of what is lifted, ``directions_held``, ``directions_run`` and ``contact_at_grasp`` are None; of all else,
+    ``on_table`` and ``pushed``. ``share``: of the draws of a row that hold, mean; ``mass``, ``friction``, ``stiffness``
+    are None if they are drawn.
     """
     groups: dict[tuple[str, tuple[str, ...]], list[Simulated]] = {}
     for one in done:
@@ -229,7 +233,7 @@ def _entry(group: list[Simulated], protocol: Protocol) -> dict[str, Any]:
     columns = {n: np.concatenate([one.columns[n] for one in group]) for n in group[0].columns if "object_" not in n}
     rows, simulated = len(columns["holds"]), sum(len(one.columns["holds"]) for one in group if one.seconds)
     seconds = float(sum(one.seconds for one in group))
-    run = columns["directions"] >= 0
+    pulled = columns.get("directions")
     solids = group[0].objects
     loads = [protocol.load(solid.volume) for solid in solids]
     return {
@@ -241,10 +245,12 @@ def _entry(group: list[Simulated], protocol: Protocol) -> dict[str, Any]:
         "share": float(columns["share"].mean()) if "share" in columns and rows else None,
         "stay": int(columns["stays"].sum()) if "stays" in columns else None,
         "penetration": float(np.median(columns["penetration"])) if "penetration" in columns else None,
-        "directions_held": (columns["directions"] == 1).sum(0).tolist(),
-        "directions_run": run.sum(0).tolist(),
+        "directions_held": None if pulled is None else (pulled == 1).sum(0).tolist(),
+        "directions_run": None if pulled is None else (pulled >= 0).sum(0).tolist(),
+        "on_table": int(columns["on_table"].sum()) if "on_table" in columns else None,
+        "pushed": float(np.nanmedian(columns["pushed"])) if np.isfinite(columns.get("pushed", np.nan)).any() else None,
         "contact_at_q": int((columns["contact_at_q"] >= _MIN_HOLDING_LINKS).sum()),
-        "contact_at_grasp": int((columns["contact_at_grasp"] >= _MIN_HOLDING_LINKS).sum()),
+        "contact_at_grasp": None if pulled is None else int((columns["contact_at_grasp"] >= _MIN_HOLDING_LINKS).sum()),
         "pregrasp_too_deep": int((columns["pregrasp_penetration"] > protocol.most_penetration).sum()),
         "diverged": int(columns["diverged"].sum()),
         "mass": None if protocol.draws else sum(load.mass for load in loads),

@@ -13,7 +13,16 @@ from scipy.spatial.transform import Rotation
 from lgrasp.errors import PhysicsError
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.urdf import numbers, parse_robot
-from lgrasp.simulate.builder import add_drive, add_hull, add_solid, set_compiler, set_contact, set_joint, set_options
+from lgrasp.simulate.builder import (
+    add_drive,
+    add_hull,
+    add_solid,
+    add_table,
+    set_compiler,
+    set_contact,
+    set_joint,
+    set_options,
+)
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import HandSolids
 from lgrasp.simulate.solid import Solid
@@ -85,6 +94,8 @@ def _weld(joint: etree._Element, value: float) -> None:
 
 OBJECT = "lgrasp object"
 """Begins the name of every object's body; its number follows."""
+TABLE = "lgrasp table"
+"""Names the body of the table, where there is one."""
 
 _SAMPLED_POSTURES = 200
 _ALMOST_ALWAYS = 0.95  # of all postures; links that touch so often are left to touch
@@ -117,6 +128,8 @@ def assemble(
         add_solid(mujoco, spec, f"{OBJECT} {number}", solid, load.mass, inertia)
     for geom in spec.geoms:  # links slide on links without friction
         set_contact(geom, protocol, 4 if geom.parent.name.startswith(OBJECT) else 1)
+    if protocol.lift:
+        add_table(mujoco, spec, TABLE, protocol)
     _exclude_neighbours(spec, hand)
     model = spec.compile()
     for a, b in _always_touching(mujoco, model):

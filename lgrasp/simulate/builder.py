@@ -14,6 +14,10 @@ from lgrasp.simulate.solid import Solid
 ROLLING = 1.0e-4
 """Rolling friction [m]; contacts of dimension 4 have none."""
 
+_TABLE_HALF, _TABLE_THICKNESS = 1.0, 0.2  # [m]
+_TABLE_AWAY = 100.0  # [m]
+_TABLE_MASS = 100.0  # [kg], and [kg m^2]: what presses on it does not move it within one step
+
 _COMPILER = {"strippath": "false", "discardvisual": "true", "balanceinertia": "true", "fusestatic": "false"}
 
 
@@ -108,6 +112,19 @@ def add_solid(mujoco: Any, spec: Any, name: str, solid: Solid, mass: float, iner
     body.ipos = solid.center
     body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     body.explicitinertial = True
+
+
+def add_table(mujoco: Any, spec: Any, name: str, physics: Physics) -> None:
+    """A box whose top is the plane z = 0 of its body, which is moved as wanted; it waits far below."""
+    body = spec.worldbody.add_body(name=name, pos=[0, 0, -_TABLE_AWAY])
+    body.add_freejoint()
+    half = 0.5 * _TABLE_THICKNESS
+    set_contact(
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[_TABLE_HALF, _TABLE_HALF, half], pos=[0, 0, -half]),
+        physics,
+        4,
+    )
+    body.mass, body.inertia, body.explicitinertial = _TABLE_MASS, [_TABLE_MASS] * 3, True
 
 
 def add_hull(mujoco: Any, spec: Any, body: Any, vertices: np.ndarray, name: str) -> None:

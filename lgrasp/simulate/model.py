@@ -4,17 +4,28 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lgrasp.errors import PhysicsError
-from lgrasp.simulate.assemble import OBJECT, assemble, welded_joints
+from lgrasp.simulate.assemble import OBJECT, TABLE, assemble, welded_joints
 from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import Scene
 
 _NEAR_DISTANCE = 1.0e-3  # [m]
+
+
+class TableBody(NamedTuple):
+    """A heavy free body that is put where it is wanted before each step."""
+
+    body: int
+    """-1: there is none."""
+    address: np.ndarray
+    """(7,) places of its position and quaternion in qpos."""
+    velocity: np.ndarray
+    """(6,) places of its velocity in qvel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +60,11 @@ class Model:
     """(L,) body of each of the shard's links, -1: none."""
     centers: np.ndarray
     """(O, 3) centre of mass in each object's frame [m]."""
+
+    table: TableBody
+    """Of protocols with a lift."""
+    tables: tuple[np.ndarray | None, ...]
+    """Planes that each object rests on (T, 5)."""
 
     def controls(self, q: np.ndarray) -> np.ndarray:
         """Targets of the drives at joint positions q (..., K)."""
@@ -87,6 +103,9 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
             if geom.parent.name.startswith(OBJECT):
                 geom.margin = _NEAR_DISTANCE
         near = spec.compile()
+        if protocol.lift:
+            for made in (model, near):  # the solver's tolerance is as without a table
+                made.stat.meaninertia = np.delete(made.dof_M0, _table_of(made).velocity).mean()
     except (ValueError, KeyError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:300]
         names = ", ".join(f"'{solid.name}'" for solid in solids)
@@ -127,4 +146,13 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
         base_body=base,
         link_body=np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in hand.link_names]),
         centers=np.stack([solid.center for solid in solids]),
+        table=_table_of(model) if protocol.lift else TableBody(-1, np.zeros(0, int), np.zeros(0, int)),
+        tables=tuple(solid.tables for solid in solids),
     )
+
+
+def _table_of(model: Any) -> TableBody:
+    body = model.body(TABLE)
+    joint = int(body.jntadr[0])
+    place, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+    return TableBody(int(body.id), place + np.arange(7), dof + np.arange(6))

@@ -48,6 +48,17 @@ class MujocoWorld:
         """Pull on the objects' centres of mass from now on (O, 3) [N], world frame."""
         self.data.xfrc_applied[self._model.object_body, :3] = forces
 
+    def place_table(self, pose: np.ndarray) -> None:
+        """Put the table, whose top is z = 0 of its frame, at a pose (7,) in the world."""
+        self.data.qpos[self._model.table.address] = self._table = np.array(pose, float)
+
+    def slide_table(self, by: np.ndarray) -> None:
+        """In the next step the table moves by a vector (3,) [m] and nothing else, whatever presses on it."""
+        table = self._model.table
+        self.data.qpos[table.address] = self._table
+        self.data.qvel[table.velocity] = [*(by / self._m.opt.timestep), 0, 0, 0]
+        self._table[:3] += by
+
     def step(self, steps: int) -> None:
         """Go on for some steps of the protocol."""
         self._lib.mj_step(self._m, self.data, steps)
@@ -80,6 +91,11 @@ class MujocoWorld:
         """Number of the hand's bodies in contact with each object (O,)."""
         bodies = self._m.geom_bodyid[self.data.contact.geom]
         return links_touching(bodies, self._model.object_body, self._m.nbody)[0]
+
+    def on_table(self) -> bool:
+        """Whether an object touches the table."""
+        bodies = self._m.geom_bodyid[self.data.contact.geom[self.data.contact.dist < 0]]
+        return bool(((bodies == self._model.table.body).any(1) & np.isin(bodies, self._model.object_body).any(1)).any())
 
     def deepest(self, *, of_links: bool = False) -> float:
         """Deepest penetration of any object, in a link or in another object; of links in links too if asked [m]."""

@@ -107,6 +107,16 @@ class PhysxWorld:
         """Pull on the objects' centres of mass from now on (O, 3) [N], world frame."""
         self._forces[:] = forces
 
+    def place_table(self, pose: np.ndarray) -> None:
+        """Put the table, whose top is z = 0 of its frame, at a pose (7,) in the world."""
+        self._table.entity.pose = self._sapien.Pose(pose[:3], pose[3:])
+        self._table_pose = np.array(pose, float)
+
+    def slide_table(self, by: np.ndarray) -> None:
+        """In the next step the table moves by a vector (3,) [m] and nothing else, whatever presses on it."""
+        self._table_pose[:3] += by
+        self._table.set_kinematic_target(self._sapien.Pose(self._table_pose[:3], self._table_pose[3:]))
+
     def step(self, steps: int) -> None:
         """Go on for some steps of the protocol."""
         for _ in range(steps):
@@ -163,6 +173,11 @@ class PhysxWorld:
         bodies = np.array(bodies, int).reshape(-1, 2)
         return links_touching(bodies, self._model.object_body, self._m.nbody)[0]
 
+    def on_table(self) -> bool:
+        """Whether an object touches the table."""
+        pairs = {frozenset(pair) for pair, points in self._contacts() if min(p.separation for p in points) < 0.0}
+        return any({self._model.table.body, int(body)} in pairs for body in self._model.object_body)
+
     def deepest(self) -> float:
         """Deepest penetration of any object, in a link or in another object [m]."""
         own = set(self._model.object_body.tolist())
@@ -205,6 +220,8 @@ class PhysxWorld:
         self._build()
         self._number = {component: body for body, component in self.links.items()}
         self._number |= {c: int(b) for b, c in zip(model.object_body, self._objects, strict=True)}
+        if model.table.body >= 0:
+            self._number[self._table] = model.table.body
         self._hand = self.links[0].articulation
         self._joints = list(self._hand.get_active_joints())
         order = {joint.child_link: k for k, joint in enumerate(self._joints)}
@@ -231,12 +248,16 @@ class PhysxWorld:
 
     def _build(self) -> None:
         sapien, px, m = self._sapien, self._px, self._m
-        objects, entities = {int(body) for body in self._model.object_body}, []
+        objects, table, entities = {int(body) for body in self._model.object_body}, self._model.table.body, []
         for body in range(m.nbody):
             entity = sapien.Entity()
             if body in objects:
                 component = px.PhysxRigidDynamicComponent()
                 self._objects.append(component)
+            elif body == table:
+                component = self._table = px.PhysxRigidDynamicComponent()
+                component.kinematic = True
+                entity.pose = sapien.Pose(m.body_pos[body])
             else:
                 parent = self.links[int(m.body_parentid[body])] if body else None
                 component = px.PhysxArticulationLinkComponent(parent)
@@ -295,6 +316,8 @@ class PhysxWorld:
                 )
             elif kind == self._mujoco.mjtGeom.mjGEOM_SPHERE:
                 shape = px.PhysxCollisionShapeSphere(float(size[0]), self._material)
+            elif kind == self._mujoco.mjtGeom.mjGEOM_BOX:
+                shape = px.PhysxCollisionShapeBox(np.asarray(size, np.float32), self._material)
             else:
                 shape = px.PhysxCollisionShapeCapsule(float(size[0]), float(size[1]), self._material)
                 pose = pose * sapien.Pose(q=_ROTATE_X_TO_Z)

@@ -92,6 +92,25 @@ class Draws(Ranges):
     )
 
 
+class Lift(Params):
+    """How a hand comes to an object on a table and takes it away: in place of six pulls.
+
+    ``force`` of the protocol is the object's weight, which the table bears at first.
+    """
+
+    coming: float = Field(default=1.0, gt=0, description="The hand's straight way to the grasp [s].")
+    way: float = Field(default=0.15, gt=0, le=1, description="How long that way is [m].")
+    rising: float = Field(default=1.0, gt=0, description="The way up [s].")
+    height: float = Field(default=0.15, gt=0, le=1, description="How long that one is [m].")
+    shake: float = Field(
+        default=2.0,
+        ge=0,
+        description="Most acceleration of the hand while it holds [m/s^2], a sine: half of the time along one "
+        "horizontal axis, then along the other.",
+    )
+    frequency: float = Field(default=2.0, gt=0, description="Of the shaking [1/s].")
+
+
 class Protocol(Physics):
     """Close the hand on free objects, then pull them in six directions; they must stay in the hand."""
 
@@ -140,11 +159,16 @@ class Protocol(Physics):
     draws: Draws | None = Field(
         default=None, description="All is done once for each of them, and a grasp holds if it holds in all."
     )
+    lift: Lift | None = Field(
+        default=None, description="The object is lifted off a table and shaken in place of the pulls."
+    )
 
     @model_validator(mode="after")
     def _drawable(self) -> Self:
         if self.draws and (self.kind != "force" or self.stiffness_range is not None):
             raise ValueError("draws are of mass and stiffness: kind must be force, and stiffness_range none")
+        if self.lift and (self.draws or self.start != "pregrasp" or self.success != "stays"):
+            raise ValueError("lift has no draws, starts at pregrasp, and its success is stays")
         return self
 
     def by(self, engine: EngineName) -> "Protocol":
@@ -191,6 +215,7 @@ def _protocols() -> dict[str, Protocol]:
         Protocol(name="seq6", friction=2.0, **gravity, **sequence),
         Protocol(name="seq6_mu06", friction=FRICTION, **gravity, **sequence),
         Protocol(name="fc_random", draws=Draws()),
+        Protocol(name="lift", lift=Lift(), force=0.981, rest=0.2),
     )
     return {protocol.name: protocol for protocol in made}
 
@@ -198,7 +223,7 @@ def _protocols() -> dict[str, Protocol]:
 PROTOCOLS: dict[str, Protocol] = _protocols()
 """The named protocols: ``fc`` is DexGraspBench's, ``gravity6`` and ``gravity6_mu1`` ask for more; ``seq6`` is the one
 that sequences of objects were published with, ``seq6_mu06`` the same on smoother objects; ``fc_random`` is ``fc`` with
-random numbers, several times."""
+random numbers, several times; ``lift`` takes the 0.1 kg of ``fc`` off a table."""
 
 
 def find_protocol(name: str) -> Protocol:

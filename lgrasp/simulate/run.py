@@ -13,6 +13,7 @@ import numpy as np
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
+from lgrasp.simulate.lift import check_on_table
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.physx_world import SOLVER, import_physx
 from lgrasp.simulate.protocol import PROTOCOLS, Protocol
@@ -64,6 +65,7 @@ def group_rows(rows: GraspRows, objects: int) -> Iterator[Group]:
         slots = order[found, : len(taken)]
         arrays = {name: getattr(rows, name)[found[:, None], slots] for name in _BY_SLOT}
         arrays |= {name: getattr(rows, name)[found] for name in ("q", "q_pregrasp", "q_squeeze", "candidate")}
+        arrays["table"] = {name: values[found] for name, values in rows.table.items()}
         bare = replace(rows, **arrays, metrics={}, metric_units={}, physics={}, physics_protocols={}, sequence=None)
         yield Group(taken, found, rank[found], bare)
 
@@ -92,7 +94,8 @@ def verdicts(
 ) -> dict[str, np.ndarray]:
     """Simulate every grasp: columns PROTOCOL_... of :data:`lgrasp.simulate.COLUMNS`, and of
     :data:`lgrasp.simulate.OBJECT_COLUMNS` where rows have several slots or the protocol's success is to touch, and of
-    :data:`lgrasp.simulate.DRAWN_COLUMNS` where it has draws.
+    :data:`lgrasp.simulate.DRAWN_COLUMNS` where it has draws; of a protocol with a lift, those of
+    :data:`lgrasp.simulate.verdict.LIFT_COLUMNS`.
 
     A verdict depends on its row only, not on the number of threads or the other rows; a row sees the objects that it
     has and no others of the scene.
@@ -115,6 +118,8 @@ def verdicts(
             scene lacks.
     """
     _check_device(device, protocol)
+    if protocol.lift:
+        check_on_table(scene, rows)
     slots = np.full(np.shape(rows.object_index), -1)
     found: dict[int, Verdict] = {}
     options = {"all_directions": all_directions, "settled_stop": settled_stop}
@@ -157,11 +162,11 @@ def check_installed(device: str, protocol: Protocol) -> None:
 
 
 def _check_device(device: str, protocol: Protocol) -> None:
-    if protocol.draws and not on_cpu(device, protocol):
-        others = ", ".join(other.name for other in PROTOCOLS.values() if not other.draws)
+    if (protocol.draws or protocol.lift) and not on_cpu(device, protocol):
+        others = ", ".join(other.name for other in PROTOCOLS.values() if not (other.draws or other.lift))
+        why = "has random draws, which run" if protocol.draws else "moves a table, which runs"
         raise PhysicsError(
-            f"protocol {protocol.name} has random draws, which run on the CPU alone: give --device cpu, or one of "
-            f"the protocols {others}"
+            f"protocol {protocol.name} {why} on the CPU alone: give --device cpu, or one of the protocols {others}"
         )
 
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -100,4 +100,4 @@ def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, devi
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         mesh = trimesh.Trimesh(np.asarray(record.vertices, float), np.asarray(record.faces), process=True)
-    return solid_of_mesh(record.name, mesh, decompose, device)
+    return replace(solid_of_mesh(record.name, mesh, decompose, device), tables=record.tables)

@@ -32,6 +32,8 @@ class Solid:
     """Second moments about the centre of mass at density 1 (3, 3) [m^5]."""
     excess: float
     """How far the pieces reach out of the mesh [m]: the dents that are filled."""
+    tables: np.ndarray | None = None
+    """Planes that it rests on, as of an object's record, (T, 5)."""
     notes: tuple[str, ...] = ()
     """What a user should know: the hull stands for the mesh, the mesh is not closed."""
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.draws import draw_of, tune
+from lgrasp.simulate.lift import Lifted, conclude_lift, lift_row
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.mujoco_world import MujocoWorld
 from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude, moved, worst
@@ -42,6 +43,8 @@ class Trial:
         """Judge row ``i``; if its protocol has draws, in all of them."""
         pose, at_q = rows.object_pose[i], self._look_at_q(rows, i)
         draws, found = self._protocol.draws, []
+        if self._protocol.lift:
+            return self._lift(rows, i, self._look(rows, i, pose, at_q))
         if draws is None:
             return self._judge(rows, i, pose, self._look(rows, i, pose, at_q))
         for number in range(draws.count):
@@ -76,6 +79,14 @@ class Trial:
             else:
                 diverged = self._pull_all(closed, pulls)
         return conclude(self._bounds, look, closed, pulls, diverged)
+
+    def _lift(self, rows: GraspRows, i: int, look: Look) -> Verdict:
+        """Take the object of row ``i`` off its table."""
+        found = Lifted()
+        if look.depth <= self._protocol.most_penetration:
+            found = lift_row(self._world, self._model, rows, i)
+            self.steps += found.steps
+        return conclude_lift(self._bounds, look, found)
 
     def base_rotation(self) -> np.ndarray:
         """Of the hand's base in the world, (3, 3)."""

@@ -41,6 +41,8 @@ class Verdict(NamedTuple):
     object_displacement: np.ndarray  # (O,) [m]
     object_rotation: np.ndarray  # (O,) [rad]
     share: float = np.nan  # NaN: nothing was drawn
+    pushed: float = np.nan  # [m]; NaN: not lifted
+    on_table: bool = False
 
 
 class Look(NamedTuple):
@@ -252,6 +254,20 @@ DRAWN_COLUMNS: dict[str, str] = {
 }
 """The same for what is written by protocols with draws, whose other columns are the worst of all draws."""
 
+LIFT_COLUMNS: dict[str, str] = {
+    "holds": "bool [N]: the object stayed in the hand and touches no table at the end",
+    "displacement": "float32 [N]: farthest that its centre of mass got from where it was in the hand when that began "
+    "to rise [m]; NaN: not run or diverged",
+    "rotation": "float32 [N]: farthest that it turned in the hand since then [rad]; NaN as above",
+    "pushed": "float32 [N]: how far it was moved before the hand closed [m]; NaN as above",
+    "on_table": "bool [N]: it touches the table at the end, or when it is lost",
+    "contact_at_q": COLUMNS["contact_at_q"],
+    "pregrasp_penetration": COLUMNS["pregrasp_penetration"],
+    "settled": "bool [N]: the object at rest when the hand begins to rise (below 1 cm/s and 0.1 rad/s)",
+    "diverged": COLUMNS["diverged"],
+}
+"""What is written by protocols with a lift in place of all of these."""
+
 
 def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.ndarray) -> dict[str, np.ndarray]:
     """Columns NAME_... of one protocol from the verdicts of its rows.
@@ -261,6 +277,8 @@ def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.nd
     """
     several = slots.shape[1] > 1 or protocol.success == "touches"
     columns = COLUMNS | (OBJECT_COLUMNS if several else {}) | (DRAWN_COLUMNS if protocol.draws else {})
+    if protocol.lift:
+        columns = LIFT_COLUMNS
     out = {}
     for column, text in columns.items():
         values = [getattr(verdict, column) for verdict in verdicts]
