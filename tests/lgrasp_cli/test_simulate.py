@@ -9,7 +9,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from support.jaws import Jaws
+from support.jaws import EDGE, Jaws
 from support.twins import twin_rows, twin_shard
 
 from lgrasp.dataset.manifest import write_manifest
@@ -286,3 +286,27 @@ def test_what_a_shard_holds_besides_is_copied(cli, grasps, tmp_path):
     with h5py.File(tmp_path / "out" / path.name) as file:
         assert file["notes"].attrs["by"] == "someone"
     assert validate_shard(tmp_path / "out" / path.name) == []
+
+
+def test_lift_needs_a_table(cli, grasps, tmp_path):
+    """One line for grasps without a table; the columns of those that have one are read and reported."""
+    line = cli("simulate", grasps, "--protocol", "lift").error()
+    assert "lgrasp generate --table" in line
+    path = sorted(grasps.glob("*.h5"))[0]
+    shard = read_shard(path)
+    down = np.array([[0, 0, 1]], "f4")
+    plane = np.array([[0, 0, -1, -EDGE / 2, 1.0]], "f4")
+    pose = shard.grasps.object_pose.copy()
+    pose[..., 2] = 0.078
+    rows = replace(shard.grasps, object_pose=pose, table={"pose": np.zeros(1, "i4"), "approach": down})
+    write_shard(path, replace(shard, objects=[replace(shard.objects[0], tables=plane)], grasps=rows))
+    for _ in range(2):  # the second time from what is there
+        result = cli("simulate", path, "-p", "lift", "--verbose", "--json", tmp_path / "report.json")
+        assert result.code == 0, result
+        assert result.out.splitlines()[1].split()[:4] == ["jaws", "cube", "1", "100.0%"]
+    (entry,) = json.loads((tmp_path / "report.json").read_text())["results"]
+    assert (entry["held"], entry["on_table"], entry["directions_held"]) == (1, 0, None)
+    assert not validate_shard(path)
+    assert cli("dataset", "report", path, "--out", tmp_path / "page.html", "--json", tmp_path / "data.json").code == 0
+    told = json.loads((tmp_path / "data.json").read_text())["hands"][0]["objects"][0]["physics"]["lift"]
+    assert (told["held"], told["means"]["on_table"]) == (1, 0)
