@@ -4,11 +4,12 @@ import numpy as np
 
 from lgrasp.object.model import ObjectModel
 
-RESTING_VERSION = 1
+RESTING_VERSION = 2
 """Raised whenever the planes of an object change."""
 MOST_PLANES = 32
 """Planes of an object; those of a ball stand for all its others."""
 
+_LEAST_PROBABILITY = 0.05  # over that of the most probable; of rarer ones a breath tips the object
 _SAME_ANGLE = 1.0  # [deg] between normals of one pose; doubled until there are few enough
 _SAME_HEIGHT = 5.0e-4  # [m]
 
@@ -21,7 +22,8 @@ def resting_planes(obj: ObjectModel) -> np.ndarray:
 
     Returns:
         Unit normal up, height [m] and probability of each, shape (T, 5), float32; in the object's user frame, where
-        ``normal . p >= height`` for all of its points p. Probabilities sum to 1.
+        ``normal . p >= height`` for all of its points p. Probabilities sum to 1; planes twenty times rarer than the
+        most probable are left out.
     """
     import trimesh  # slow to load
 
@@ -35,6 +37,8 @@ def resting_planes(obj: ObjectModel) -> np.ndarray:
     while len(kept := _merge(up, height, probability, np.cos(np.radians(angle)), span)[0]) > MOST_PLANES:
         angle, span = 2.0 * angle, np.inf
     kept, together = _merge(up, height, probability, np.cos(np.radians(angle)), span)
+    often = together >= _LEAST_PROBABILITY * together.max()
+    kept, together = kept[often], together[often]
     planes = np.column_stack([up[kept], height[kept], together / together.sum()])
     return planes[np.argsort(-planes[:, 4], kind="stable")].astype(np.float32)
 

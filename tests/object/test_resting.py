@@ -47,3 +47,10 @@ def test_round_objects_rest_on_few_planes(mesh, fast):
     around = np.linspace(0, 2 * np.pi, 36)
     ways = np.column_stack([np.cos(around), np.sin(around), 0 * around])
     assert (ways @ planes[:, :3].T).max(1).min() > np.cos(np.radians(45))
+
+
+def test_planes_that_hardly_carry_are_left_out(fast):
+    """A thin plate lies flat; on an edge it would tip at a touch."""
+    _, planes = made(trimesh.creation.box([0.1, 0.1, 0.01]), fast)
+    np.testing.assert_allclose(np.abs(planes[:, 2]), [1.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(planes[:, 4], [0.5, 0.5], atol=1e-4)
