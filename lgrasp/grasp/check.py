@@ -28,7 +28,7 @@ from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, grasp_ep
 from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.surface import palm_axis
+from lgrasp.hand.palm import palm_axis
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.runtime.scan import running_sums

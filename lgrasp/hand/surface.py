@@ -1,4 +1,4 @@
-"""Surfaces of a hand's links, where they may touch and where the palm faces; the contact arrays made of them."""
+"""Surfaces of a hand's links, where they may touch; the contact arrays made of them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,12 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from lgrasp.errors import HandError
 from lgrasp.hand.contacts import LinkGrid, cover_patches, grid_arrays, link_grid
 from lgrasp.hand.model import HandModel, csr, stack_rows
 from lgrasp.hand.tree import Tree
-
-_MIN_AXIS = 0.01  # [m] between the middle of the first joints and that of the canonical box
 
 
 @dataclass(frozen=True)
@@ -152,27 +149,3 @@ class ContactSurface(NamedTuple):
 def contact_surface(model: HandModel) -> ContactSurface:
     """The palmar side where hand.yaml lets a hand touch."""
     return ContactSurface(model.contact_link, model.contact_body, model.contact_points, model.contact_normals)
-
-
-def palm_axis(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of the palm's contact surface (3,) [m] and the unit direction it faces (3,), base frame.
-
-    A hand without a palm faces, from the middle of its fingers' first joints, the middle of its canonical box.
-
-    Raises:
-        HandError: that middle is that of the joints.
-    """
-    first, end = model.contact_first[-2:]
-    if first < end:
-        facing = model.contact_normals[first:end].mean(0)
-        return model.contact_points[first:end].mean(0), facing / np.linalg.norm(facing)
-    tree = model.tree
-    centre = tree.T_parent_joint[np.flatnonzero(tree.joint_parent < 0), :3, 3].mean(0)
-    facing = model.canonical_box.mean(0) - centre
-    length = np.linalg.norm(facing)
-    if length < _MIN_AXIS:
-        raise HandError(
-            f"hand '{model.name}' has no palm, and its canonical_box is about its fingers' first joints: no side of it "
-            "can face an object (hand.yaml: palm or canonical_box)"
-        )
-    return centre, facing / length

@@ -7,7 +7,7 @@ from lgrasp.differentiable.solids import HandPoints, hand_solids
 from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import HandArrays, body_poses
-from lgrasp.hand.surface import palm_axis
+from lgrasp.hand.palm import palm_axis
 from lgrasp.refine.descent_kernels import Moments, Schedule, advance, descend, penetration
 from lgrasp.refine.energy_gradient import MAX_COLUMNS, Search
 from lgrasp.refine.hands import Hands

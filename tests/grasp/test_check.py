@@ -34,7 +34,7 @@ SMALLER = {"lightning": ("domain.attempts=1000", "search.restarts=32", "search.p
 MORE = {("shadow", "lightning"): 600, ("dclaw", "swift-refine"): 300}
 """Where these give no row: candidates with the pipeline's own settings."""
 
-FEW = {("schunk_svh", "lightning")}
+FEW = {("leap", "robust"), ("schunk_svh", "lightning")}
 """Where so few candidates give no row."""
 
 SAME = {"fswo", "penetration", "self_penetration", "gap", "normal_error"}
