@@ -1,5 +1,7 @@
 """Sequences as the rows of a shard: poses and contacts go from internal frames to the user's."""
 
+from typing import Any
+
 import numpy as np
 
 from lgrasp.grasp.records import GraspRows, ObjectRecord, SequenceRows
@@ -37,11 +39,12 @@ def sequence_rows(
     candidate = np.concatenate([table.candidate for table in levels])
     links = columns["contact_links"]
     width = used_width(links)
+    shared: dict[str, Any] = {name: columns[name][last] for name in POSTURES}
+    shared |= {name: columns[name][:, :, :width] for name in CONTACTS}
     return GraspRows(
-        **{name: columns[name][last] for name in POSTURES},
+        **shared,
         object_pose=columns["object_pose"],
         object_index=columns["object_index"],
-        **{name: columns[name][:, :, :width] for name in CONTACTS},
         candidate=row_numbers(shard, candidate),
         metrics=metrics | {"contacts": (links >= 0).sum((1, 2)).astype(np.float32)},
         metric_units=METRIC_UNITS,
