@@ -75,7 +75,7 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
         inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device)
         scene = make_scene(cache, inputs.hand, object_records(inputs), mesh_blobs(keys.source.urdf), device.alias)
         inputs = replace(inputs, scene=scene)
-        load_kernels(device.alias, kernel_modules("lgrasp.stages.", "lgrasp.grasp."))
+        load_kernels(device.alias, kernel_modules(*job.kernels))
         assert job.simulate
         params = pipeline.params("sequence")
         if progress:

@@ -5,6 +5,7 @@ import warp as wp
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.math.sdf import sdf_gradient, sdf_value
+from lgrasp.math.transforms import tangent
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -31,15 +32,6 @@ class Contact:
     force: wp.float32  # along the normal [N]
     slip: wp.vec3  # across the normal that friction holds against, as a spring does [m]
     twist: wp.float32  # the same about the normal [rad]
-
-
-@wp.func
-def _aside(n: wp.vec3):
-    """A unit vector at right angles to n."""
-    a = wp.vec3(1.0, 0.0, 0.0)
-    if wp.abs(n[0]) > 0.7:
-        a = wp.vec3(0.0, 1.0, 0.0)
-    return wp.normalize(wp.cross(n, a))
 
 
 @wp.func
@@ -137,7 +129,7 @@ def find_contacts(
                 x0 = hand.samples[deepest]
                 g = sdf_gradient(obj.sdf, wp.transform_point(T_b, x0))
                 n = wp.transform_vector(wp.transform_inverse(T_b), wp.vec3(g[0], g[1], g[2]))
-                u = _aside(n)
+                u = tangent(n)
                 v = wp.cross(n, u)
                 for k in range(hand.cluster_first[b], hand.cluster_first[b + 1]):
                     s = hand.cluster_sphere[k]

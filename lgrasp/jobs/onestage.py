@@ -14,6 +14,7 @@ from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import InputKeys, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
+from lgrasp.engine.run import Job
 from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import CandidateTable, ContactSets, DeviceTable, PoseTable, grasp_arrays
@@ -81,7 +82,7 @@ def run_up_to(
     inputs = load_inputs(cache, *what, table=pipeline.on_table)
     context = shard_context(pipeline, inputs, shard)
     table: Any = _table(found[stages[done - 1]], used.alias) if done else (first, count)
-    load_kernels(used.alias, kernel_modules("lgrasp.stages.", "lgrasp.grasp."), report)
+    load_kernels(used.alias, kernel_modules(*Job.kernels), report)
     runs = [run for run in runs if run.stage in stages[:done]]
     for stage in stages[done:]:
         start = time.perf_counter()
