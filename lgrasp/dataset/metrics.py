@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from lgrasp.config import apply_settings
 from lgrasp.dataset.reader import ShardReader
@@ -20,6 +19,7 @@ from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
+from lgrasp.object.mass import mass_properties
 from lgrasp.signals import spared
 
 METRICS = {"epsilon_exact": "", "volume": ""}
@@ -84,12 +84,14 @@ def row_metrics(
 
 
 def mass_frame(record: ObjectRecord) -> tuple[np.ndarray, float]:
-    """Centre of mass at uniform density (of the surface if the mesh is open) [m], shape [3], and the largest distance
-    of the surface from there [m]."""
-    mesh = trimesh.Trimesh(np.asarray(record.vertices, float), record.faces, process=False)
-    solid = record.watertight and mesh.volume > 1e-12 * mesh.extents.max() ** 3
-    center = np.asarray(mesh.center_mass if solid else mesh.centroid)
-    return center, float(np.linalg.norm(mesh.triangles.reshape(-1, 3) - center, axis=1).max())
+    """Centre of mass [m], shape [3], and the largest distance of the surface from there [m].
+
+    Raises:
+        ObjectError: a flat object.
+    """
+    vertices = np.asarray(record.vertices, float)
+    center = mass_properties(vertices, record.faces).center
+    return center, float(np.linalg.norm(vertices - center, axis=1).max())
 
 
 def is_extended(target: Path, source: Path, names: Sequence[str]) -> bool:

@@ -31,7 +31,7 @@ from lgrasp.object.resting import RESTING_VERSION, resting_planes
 from lgrasp.runtime.device import Device
 from lgrasp.stages.context import Keeper
 
-OBJECT_VERSION = 2
+OBJECT_VERSION = 3
 """Raised whenever preprocessing gives other arrays."""
 
 Report = Callable[[str, float], None]

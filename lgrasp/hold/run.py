@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 import warp as wp
 
 from lgrasp.hand.arrays import HandArrays
@@ -14,7 +13,7 @@ from lgrasp.hold.kernels import Course, Spread, TrialPulls, Trials, TriedGrasps,
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.solve import MAX_HAND_DOFS
 from lgrasp.object.arrays import ObjectArrays
-from lgrasp.object.model import ObjectModel
+from lgrasp.object.mass import mass_properties
 from lgrasp.runtime.structs import empty_struct, make_struct, upload_struct
 from lgrasp.simulate.protocol import DIRECTIONS, PROTOCOLS
 
@@ -160,17 +159,9 @@ class HoldTester:
                 "com": model.com,
             },
         )
-        course.inertia = wp.mat33(*map(float, inertia_over_mass(model).ravel()))
+        body = mass_properties(model.vertices, model.faces)
+        course.inertia = wp.mat33(*map(float, (body.inertia / body.volume).ravel()))
         return course
-
-
-def inertia_over_mass(model: ObjectModel) -> np.ndarray:
-    """Second moments about the centre of mass over the mass at uniform density (3, 3) [m^2]; of an open mesh those of
-    its convex hull."""
-    mesh = trimesh.Trimesh(np.asarray(model.vertices, float), np.asarray(model.faces), process=False)
-    if not (model.watertight and mesh.volume > 0):
-        mesh = mesh.convex_hull
-    return np.asarray(mesh.moment_inertia, float) / float(mesh.volume)
 
 
 def _fold(number: np.ndarray) -> np.ndarray:

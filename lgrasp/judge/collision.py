@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from lgrasp.judge.hand import LinkTree, parse, read_joint, read_solids
-from lgrasp.judge.meshes import MeshDistance, surface_samples
+from lgrasp.judge.meshes import MeshDistance, mass_centre, surface_samples
 from lgrasp.judge.solids import JudgedSolid
 
 POSTURES = 200
@@ -104,7 +104,7 @@ class JudgedObject:
         self.depth = self.surface.depth
         self.samples = surface_samples(mesh, SAMPLES)
         self.tree = cKDTree(self.samples)
-        self.centre_of_mass = np.asarray(mesh.center_mass if mesh.is_watertight else mesh.centroid)
+        self.centre_of_mass = mass_centre(mesh)
         self.radius = float(np.linalg.norm(mesh.vertices - self.centre_of_mass, axis=1).max())
 
 

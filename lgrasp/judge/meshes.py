@@ -2,13 +2,14 @@
 
 import io
 import math
+from collections import Counter
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from scipy.ndimage import label
-from scipy.spatial import cKDTree
+from scipy.spatial import QhullError, cKDTree
 from scipy.spatial.transform import Rotation
 
 TESTS = 400_000  # points x triangles tested at once
@@ -285,6 +286,21 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
     if mesh.volume < 0:
         mesh.invert()
     return mesh
+
+
+def mass_centre(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Centre of mass at uniform density, (3,): of the mesh if it is closed, else of its convex hull.
+
+    Raises:
+        ValueError: not closed, and flat.
+    """
+    there, back = (Counter(map(tuple, edges.tolist())) for edges in (mesh.edges, mesh.edges[:, ::-1]))
+    if there == back and mesh.volume > 1e-12 * mesh.extents.max() ** 3:
+        return np.asarray(mesh.center_mass)
+    try:
+        return np.asarray(mesh.convex_hull.center_mass)
+    except QhullError:
+        raise ValueError("a mesh that is not closed is flat") from None
 
 
 def load_mesh(source: Path | bytes, name: str) -> trimesh.Trimesh:

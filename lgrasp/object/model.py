@@ -21,7 +21,7 @@ class ObjectModel:
         vertices: Repaired mesh in the user's frame, scaled [m], shape (v, 3).
         faces: Vertex indices, outward winding, shape (f, 3), int32.
         watertight: Whether the repaired mesh is closed.
-        com: Centre of mass at uniform density (area centroid if not watertight) [m], shape (3,).
+        com: Centre of mass (:func:`~lgrasp.object.mass.mass_properties`) [m], shape (3,).
         extents: Sides of the bounding box [m], shape (3,).
         notes: What was repaired or relaxed, one sentence each.
         contact_points: Points a finger may touch, neighbours mostly near each other in order [m], shape (n, 3).

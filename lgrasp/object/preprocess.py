@@ -6,7 +6,8 @@ import numpy as np
 import trimesh
 
 from lgrasp.geometry.clusters import bounding_spheres, cluster_order
-from lgrasp.object.load import LoadedMesh, load_mesh
+from lgrasp.object.load import load_mesh
+from lgrasp.object.mass import mass_properties
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.sdf import SdfGrid, build_sdf
@@ -68,7 +69,7 @@ def preprocess_object(
         vertices=mesh.vertices.astype(np.float32),
         faces=faces,
         watertight=mesh.closed,
-        com=_mass_centre(vertices, mesh).astype(np.float32),
+        com=mass_properties(vertices, faces).center.astype(np.float32),
         extents=np.ptp(vertices, axis=0).astype(np.float32),
         notes=notes,
         contact_points=contact_points,
@@ -82,16 +83,6 @@ def preprocess_object(
         sdf_origin=sdf.origin,
         sdf_cell=sdf.cell,
     )
-
-
-def _mass_centre(vertices: np.ndarray, mesh: LoadedMesh) -> np.ndarray:
-    """Volume centroid of a closed mesh, else area centroid [m], shape (3,)."""
-    corners = vertices[mesh.faces]
-    weight = np.linalg.det(corners) / 6.0  # signed tetrahedra with the origin
-    if mesh.closed and weight.sum() > 1e-12 * np.ptp(vertices, axis=0).max() ** 3:
-        return weight @ corners.sum(axis=1) / 4.0 / weight.sum()
-    area = face_normals(vertices, mesh.faces)[1]
-    return area @ corners.mean(axis=1) / area.sum()
 
 
 def _contacts(

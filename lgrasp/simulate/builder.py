@@ -108,8 +108,13 @@ def add_solid(mujoco: Any, spec: Any, name: str, solid: Solid, mass: float, iner
     body.add_freejoint()
     for number, vertices in enumerate(solid.pieces):
         add_hull(mujoco, spec, body, vertices, f"{name} {number}")
+    set_mass(body, mass, solid.center, inertia)
+
+
+def set_mass(body: Any, mass: float, center: np.ndarray, inertia: np.ndarray) -> None:
+    """Mass [kg], centre of mass (3,) [m] and inertia about it (3, 3) [kg m^2] of a body, whatever it collides with."""
     body.mass = mass
-    body.ipos = solid.center
+    body.ipos = center
     body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     body.explicitinertial = True
 

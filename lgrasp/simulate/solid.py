@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 from lgrasp.errors import DecomposeError, ObjectError
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.distance import signed_distance
+from lgrasp.object.mass import mass_properties
 
 _ALLOWED_DENT = 2.0e-3  # dents shallower than this [m] may stay filled
 _MOST_PIECES = 128
@@ -52,9 +53,9 @@ def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device
         hull = ConvexHull(mesh.vertices)
     except QhullError:
         raise ObjectError(f"object '{name}' is flat; a rigid body needs volume") from None
-    body, notes = mesh, []
-    if not (mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0):
-        body = mesh.convex_hull
+    notes = []
+    body = mass_properties(mesh.vertices, mesh.faces)
+    if not body.solid:
         notes.append("the mesh is not closed; mass and inertia are those of its convex hull")
     pieces = [mesh.vertices[hull.vertices]]
     excess = _excess(mesh, pieces, device)
@@ -72,9 +73,9 @@ def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device
     return Solid(
         name=name,
         pieces=tuple(np.ascontiguousarray(piece, float) for piece in pieces),
-        volume=float(body.volume),
-        center=np.array(body.center_mass, float),
-        inertia=np.array(body.moment_inertia, float),
+        volume=body.volume,
+        center=body.center,
+        inertia=body.inertia,
         excess=excess,
         notes=tuple(notes),
     )

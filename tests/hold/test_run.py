@@ -5,7 +5,7 @@ import pytest
 from support.holding import certain, press
 
 from lgrasp.hold.params import HoldTest
-from lgrasp.hold.run import ControlPoses, HoldTester, inertia_over_mass
+from lgrasp.hold.run import ControlPoses, HoldTester
 
 FORCES = np.linspace(0.5, 4.0, 12)
 
@@ -17,7 +17,7 @@ def tester(two_fingers, box) -> HoldTester:
 
 @pytest.fixture(scope="module")
 def rows() -> ControlPoses:
-    return press(FORCES)
+    return press(FORCES.tolist())
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +97,3 @@ def test_a_hand_that_does_not_touch_loses_the_object(two_fingers, box):
     assert found["hold_success"] == 0
     assert found["hold_probability"] == 0
     assert found["hold_drift"] == np.inf
-
-
-def test_inertia_of_a_box(box):
-    x, y, z = 0.04, 0.06, 0.06
-    np.testing.assert_allclose(
-        inertia_over_mass(box.model), np.diag([y * y + z * z, x * x + z * z, x * x + y * y]) / 12, atol=1e-9
-    )

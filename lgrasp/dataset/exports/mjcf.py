@@ -18,6 +18,7 @@ from lgrasp.errors import ShardError
 from lgrasp.files import write_file
 from lgrasp.geometry.poses import inverse
 from lgrasp.grasp.records import ObjectRecord
+from lgrasp.object.mass import mass_properties
 
 Cut = Callable[[ObjectRecord], Sequence[np.ndarray]]
 """Convex pieces of an object, vertices [m] of each, shape [V, 3]."""
@@ -99,7 +100,7 @@ class MjcfWriter:
             mesh=f"{OBJECTS}/{item.code}.obj",
             text=object_text(item).encode(),
             pieces={f"{OBJECTS}/{item.code}/piece_{i:02d}.obj": mesh_text(h).encode() for i, h in enumerate(hulls)},
-            volumes=[float(hull.volume) for hull in hulls],
+            body=mass_properties(item.mesh().vertices, item.mesh().faces),
         )
 
 

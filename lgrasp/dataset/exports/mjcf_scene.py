@@ -8,7 +8,16 @@ from lxml import etree
 
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.errors import PhysicsError
-from lgrasp.simulate.builder import add_drive, import_mujoco, set_compiler, set_contact, set_joint, set_options
+from lgrasp.object.mass import MassProperties
+from lgrasp.simulate.builder import (
+    add_drive,
+    import_mujoco,
+    set_compiler,
+    set_contact,
+    set_joint,
+    set_mass,
+    set_options,
+)
 from lgrasp.simulate.protocol import PROTOCOLS
 
 if TYPE_CHECKING:
@@ -39,8 +48,8 @@ class SceneObject(NamedTuple):
     """The file ``mesh``."""
     pieces: Mapping[str, bytes]
     """Convex pieces that collide; none: the hull of the mesh does."""
-    volumes: Sequence[float]
-    """Of the pieces [m^3]."""
+    body: MassProperties
+    """Of the mesh."""
 
 
 class MjcfScene:
@@ -129,20 +138,20 @@ class MjcfScene:
 
 
 def _add_object(mujoco, spec: "mujoco.MjSpec", name: str, item: SceneObject) -> None:
-    """The mesh is what is seen; its pieces collide and weigh."""
+    """The mesh is what is seen and weighs; its pieces collide."""
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint(name=name)
+    set_mass(body, _PROTOCOL.mass, item.body.center, item.body.inertia * (_PROTOCOL.mass / item.body.volume))
     spec.add_mesh(name=name, file=item.mesh)
     shape = {"type": mujoco.mjtGeom.mjGEOM_MESH}
     if not item.pieces:
-        body.add_geom(name=name, meshname=name, mass=_PROTOCOL.mass, **shape)
+        body.add_geom(name=name, meshname=name, **shape)
         return
-    body.add_geom(name=name, meshname=name, mass=0, contype=0, conaffinity=0, group=2, **shape)
-    for number, (file, volume) in enumerate(zip(item.pieces, item.volumes, strict=True)):
+    body.add_geom(name=name, meshname=name, contype=0, conaffinity=0, group=2, **shape)
+    for number, file in enumerate(item.pieces):
         piece = f"{name}_{number}"
         spec.add_mesh(name=piece, file=file)
-        mass = _PROTOCOL.mass * volume / sum(item.volumes)
-        body.add_geom(name=piece, meshname=piece, mass=mass, group=3, **shape)
+        body.add_geom(name=piece, meshname=piece, group=3, **shape)
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.object.mass import mass_properties
 
 SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp"]
 HANDS = ["allegro", "schunk_svh", "barrett", "shadow"]
@@ -154,8 +155,13 @@ def check_scenes(mujoco, folder: Path, shard) -> None:
             base = ours.get_transform(shard.hand.base_link)
             present = np.flatnonzero(shard.grasps.object_index[row] >= 0)
             for place, column in enumerate(present):
-                code = shard.objects[shard.grasps.object_index[row, column]].id
-                body = data.body(f"object_{place}_{code}")
+                record = shard.objects[shard.grasps.object_index[row, column]]
+                body = data.body(f"object_{place}_{record.id}")
+                seen, weighed = model.body(body.id), mass_properties(record.vertices, record.faces)
+                assert seen.mass == pytest.approx(0.1)
+                np.testing.assert_allclose(seen.ipos, weighed.center, atol=1e-6)
+                inertia = np.linalg.eigvalsh(weighed.inertia) * 0.1 / weighed.volume
+                np.testing.assert_allclose(np.sort(seen.inertia), inertia, rtol=1e-4)
                 T = matrix(body.xpos, Rotation.from_quat(body.xquat, scalar_first=True))
                 np.testing.assert_allclose(T, base @ pose_matrix(shard.grasps.object_pose[row, column]), atol=1e-5)
         for joint in ours.robot.joints:
