@@ -24,7 +24,8 @@ def grasp_frame(rows: GraspRows, joints: Sequence[str], objects: Sequence[Object
     Returns:
         For each of N grasps: ``objects`` (names, joined by +), ``object_pose/x`` ... ``object_pose/qz`` (x y z [m] and
         quaternion in the hand base frame; of several objects ``object_pose/1/x`` ...), ``q/JOINT`` [rad or m],
-        ``metrics/NAME``, ``physics/NAME`` (verdicts with one value a grasp) and ``candidate``.
+        ``table/pose`` and ``table/approach/x`` ... (of objects on a table), ``metrics/NAME``, ``physics/NAME``
+        (verdicts with one value a grasp) and ``candidate``.
 
     Raises:
         ConfigError: pandas is not installed.
@@ -40,6 +41,9 @@ def grasp_frame(rows: GraspRows, joints: Sequence[str], objects: Sequence[Object
         prefix = "object_pose/" if index.shape[1] == 1 else f"object_pose/{slot + 1}/"
         columns |= {prefix + name: rows.object_pose[:, slot, k] for k, name in enumerate(_POSE)}
     columns |= {f"q/{name}": rows.q[:, k] for k, name in enumerate(joints)}
+    if rows.table:
+        columns["table/pose"] = rows.table["pose"]
+        columns |= {f"table/approach/{axis}": rows.table["approach"][:, k] for k, axis in enumerate("xyz")}
     columns |= {f"metrics/{name}": values for name, values in rows.metrics.items()}
     columns |= {f"physics/{name}": values for name, values in rows.physics.items() if np.ndim(values) == 1}
     return pd.DataFrame(columns | {"candidate": rows.candidate})

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lgrasp.grasp.check_kernels import TOUCHING
+from lgrasp.grasp.check_kernels import ALL, TOUCHING
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed
 from lgrasp.grasp.collision import body_depth, body_height, resting_plane
 from lgrasp.grasp.outcomes import APPROACH, KEPT, TABLE
@@ -61,12 +61,14 @@ def retreat(palm: Palm, up: wp.vec3, com: wp.vec3, k: wp.int32):
 
 @wp.kernel
 def check_table(hand: Hand, obj: Object, limits: Limits, part: wp.int32, at: CheckedPostures, found_out: Findings):
-    """One thread per (body, hand): hands fail if a body of a part (TOUCHING or OTHERS) is not above the table."""
+    """One thread per (body, hand): hands fail if a body of a part (TOUCHING, OTHERS or ALL) is not above the table."""
     b, i = wp.tid()
     row = at.of[i]
     g = hand.body_group[b]
-    touching = g < 0 or at.chosen[i, wp.max(g, 0)] >= 0
-    if at.resting[row] < 0 or found_out.outcome[i] != KEPT or touching != (part == TOUCHING):
+    touching = g < 0 or (part != ALL and at.chosen[i, wp.max(g, 0)] >= 0)
+    if at.resting[row] < 0 or found_out.outcome[i] != KEPT:
+        return
+    if part != ALL and touching != (part == TOUCHING):
         return
     B = wp.transform_identity()
     if b > 0:

@@ -23,7 +23,7 @@ from lgrasp.grasp.check_kernels import (
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
 from lgrasp.grasp.control_kernels import FINGER_TRIES, control_poses, open_fingers, open_poses, try_fingers
 from lgrasp.grasp.held import HeldArrays, hold_nothing
-from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS
+from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, Outcome
 from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, grasp_epsilon, resist_loads
 from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays
@@ -106,12 +106,23 @@ class Check:
             table = take_rows(table, ~np.isnan(table.table["approach"][:, 0]))
         return table, tally
 
-    def every(self, seed: wp.array) -> tuple[GraspTable, np.ndarray]:
-        """All hands as rows in their order, and their outcomes (:class:`~lgrasp.grasp.outcomes.Outcome`), (n,)."""
-        self.decide()
-        packed = self._pack(seed, wp.array(np.arange(len(self)), dtype=wp.int32, device=self.hand.device))
-        columns = {name: values.numpy() for name, values in _columns(packed, False).items()}
-        return _table(columns, len(self)), self.found.outcome.numpy()
+    def every(self, seed: wp.array, *, on_table: bool = False) -> tuple[GraspTable, np.ndarray]:
+        """All hands as rows in their order, and their outcomes (:class:`~lgrasp.grasp.outcomes.Outcome`), (n,).
+
+        Args:
+            on_table: each object rests on one of its planes; NaN as ``approach`` where the hand has no way there.
+        """
+        tally, _ = self.decide()
+        row = wp.array(np.arange(len(self)), dtype=wp.int32, device=self.hand.device)
+        packed = self._pack(seed, row)
+        if on_table:
+            self._approach(row, packed, tally)
+        columns = {name: values.numpy() for name, values in _columns(packed, on_table).items()}
+        table, outcome = _table(columns, len(self)), self.found.outcome.numpy()
+        if on_table:
+            lost = np.isnan(table.table["approach"][:, 0]) & (outcome == Outcome.KEPT)
+            outcome = np.where(lost, Outcome.APPROACH, outcome)
+        return table, outcome
 
     def _approach(self, row: wp.array, packed: Packed, tally: Tally) -> None:
         """A straight way for the open hand to the hands ``row``; those without one are counted as such."""
@@ -193,6 +204,7 @@ def check_grasps(
     bounds: GraspBounds,
     *,
     around: ObjectArrays | None = None,
+    resting: np.ndarray | None = None,
     index: np.ndarray | None = None,
     seed: wp.array | None = None,
 ) -> tuple[GraspTable, np.ndarray]:
@@ -203,6 +215,7 @@ def check_grasps(
         q: joint positions within their limits [rad or m], (n, K).
         contacts: what touches (:func:`known_contacts`, :func:`~lgrasp.grasp.find_contacts.find_contacts`).
         around: what else the hand must not penetrate, in the object's internal frame.
+        resting: plane of ``obj`` that is each row's table, which the hand and its way there must clear, (n,) int.
         index: candidate of each row; default: the row.
         seed: of the random rays of epsilon; default: 0.
     """
@@ -216,7 +229,7 @@ def check_grasps(
         pose=wp.array(pose, dtype=wp.transform, device=d),
         of=wp.array(rows, dtype=wp.int32, device=d),
         index=zeros,
-        resting=wp.full(n, -1, dtype=wp.int32, device=d),
+        resting=wp.array(np.full(n, -1) if resting is None else resting, dtype=wp.int32, device=d),
         slot=zeros,
         body=wp.empty((n, len(model.piece_first) - 2), dtype=wp.transform, device=d),
         contact=contacts.link,
@@ -230,7 +243,10 @@ def check_grasps(
     for solid in (obj, around):
         if solid is not None:
             check.measure(ALL, solid)
-    table, outcome = check.every(wp.zeros(1, dtype=wp.int32, device=d) if seed is None else seed)
+    if resting is not None:
+        check.clear_table(ALL)
+    seed = wp.zeros(1, dtype=wp.int32, device=d) if seed is None else seed
+    table, outcome = check.every(seed, on_table=resting is not None)
     table.index[:] = rows if index is None else index
     return table, outcome
 

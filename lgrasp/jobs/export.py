@@ -20,6 +20,7 @@ from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import OutputError
 from lgrasp.grasp.records import ObjectRecord
+from lgrasp.grasp.schema import TABLE_FIELDS
 from lgrasp.jobs.requests.shards import ExportRequest
 from lgrasp.simulate.protocol import HOLDS
 
@@ -38,7 +39,7 @@ class ExportJob(ExportRequest, Job):
         return self.out
 
     def key(self) -> str:
-        columns = {parse_condition(text).column for text in self.where} | {HOLDS}
+        columns = {parse_condition(text).column for text in self.where} | {HOLDS, *TABLE_FIELDS}
 
         def digest(reader: ShardReader) -> str:
             return rows_digest(reader, sorted(columns & reader.columns.keys()))

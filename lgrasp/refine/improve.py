@@ -31,6 +31,7 @@ def improve(
     bounds: GraspBounds,
     *,
     tries: np.ndarray,
+    resting: np.ndarray | None = None,
     index: np.ndarray | None = None,
 ) -> tuple[GraspTable, np.ndarray]:
     """Hands at their best: of the postures that pass the checks the one that resists loads best.
@@ -43,6 +44,7 @@ def improve(
         pose: T_hand_object of the object's internal frame, x y z [m] qx qy qz qw, (n, 7).
         q: joint positions within their limits [rad or m], (n, K).
         tries: most searches of each hand, (n,).
+        resting: as of :func:`~lgrasp.grasp.check.check_grasps`.
         index: candidate of each row; default: the row.
 
     Returns:
@@ -51,9 +53,13 @@ def improve(
     index = np.arange(len(q)) if index is None else index
     parts = [slice(first, first + _CPU_ROWS) for first in range(0, len(q), _CPU_ROWS)]
     if search.device != "cpu" or len(parts) < 2:
-        return _improved(search, hand, obj, pose, q, bounds, tries, index)
+        return _improved(search, hand, obj, pose, q, bounds, tries, resting, index)
+    planes = [None if resting is None else resting[p] for p in parts]
     with ThreadPoolExecutor(cores()) as pool:
-        jobs = [pool.submit(_improved, search, hand, obj, pose[p], q[p], bounds, tries[p], index[p]) for p in parts]
+        jobs = [
+            pool.submit(_improved, search, hand, obj, pose[p], q[p], bounds, tries[p], plane, index[p])
+            for p, plane in zip(parts, planes, strict=True)
+        ]
         tables, outcomes = zip(*(job.result() for job in jobs), strict=True)
     return join_rows(list(tables)), np.concatenate(outcomes)
 
@@ -66,6 +72,7 @@ def _improved(
     q: np.ndarray,
     bounds: GraspBounds,
     tries: np.ndarray,
+    resting: np.ndarray | None,
     index: np.ndarray,
 ) -> tuple[GraspTable, np.ndarray]:
     table: GraspTable | None = None
@@ -77,7 +84,8 @@ def _improved(
         start = _start(search, hand, pose[rows], q[rows], number)
         for back, joints in _looks(search, start, number):
             contacts = find_contacts(hand, obj, back, joints, bounds)
-            found, now = check_grasps(hand, obj, back, joints, contacts, bounds, index=index[rows])
+            planes = None if resting is None else resting[rows]
+            found, now = check_grasps(hand, obj, back, joints, contacts, bounds, resting=planes, index=index[rows])
             if table is None:
                 table, outcome = found, now
                 continue

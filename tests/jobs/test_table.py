@@ -1,6 +1,8 @@
 """Grasps of an object that rests on a table."""
 
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -9,12 +11,18 @@ import pytest
 from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
+from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
-from lgrasp.errors import ConfigError
+from lgrasp.engine.run import run as run_job
+from lgrasp.errors import ConfigError, ShardError
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.grasp.records import Shard
 from lgrasp.jobs.config import JobConfig, plan_requests
+from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.requests.search import SearchRequest
 from lgrasp.judge.run import judge
+from lgrasp.stages.refine.params import RefineParams
 
 
 @pytest.fixture
@@ -32,7 +40,8 @@ def test_hands_are_above_the_table(on_table, solids, link_poses):
     shard = read_shard(path)
     rows, (obj,) = shard.grasps, shard.objects
     T = pose_matrix(rows.object_pose[:, 0].astype(float))
-    plane = obj.tables[rows.table["pose"]].astype(float)
+    tables = np.asarray(obj.tables)
+    plane = tables[rows.table["pose"]].astype(float)
     up = np.einsum("nij,nj->ni", T[:, :3, :3], plane[:, :3])
     height = plane[:, 3] + np.einsum("ni,ni->n", up, T[:, :3, 3])
     back = -rows.table["approach"]
@@ -44,7 +53,7 @@ def test_hands_are_above_the_table(on_table, solids, link_poses):
             points = np.einsum("nij,pj->npi", L[:, :3, :3], solid.samples) + (L[:, :3, 3] + way * back)[:, None]
             assert (np.einsum("npi,ni->np", points, up) - height[:, None]).min() > 0.0009
     assert [pose["rows"] for pose in report["resting"]] == np.bincount(
-        rows.table["pose"], minlength=len(obj.tables)
+        rows.table["pose"], minlength=len(tables)
     ).tolist()
     assert sum(pose["probability"] for pose in report["resting"]) == pytest.approx(1.0, abs=1e-5)
     likely = [pose["rows"] > 0 for pose in report["resting"] if pose["probability"] >= 0.05]
@@ -68,6 +77,58 @@ def test_judge_agrees_and_finds_rows_in_the_table(on_table, tmp_path):
         failed = judge(moved).failed
         assert failed[check][0]
         assert check == "resting" or not failed[check][1:].any()
+
+
+@pytest.fixture
+def refined(cache_root, tmp_path):
+    """refined(shard, **changes): the shard that ``lgrasp refine`` makes of one."""
+
+    def refined(shard: Shard, out: str = "refined", **changes) -> Path:
+        write_shard(tmp_path / "given.h5", shard)
+        cache = Cache(cache_root, pytest.fail)
+        job = RefineJob(shards=(tmp_path / "given.h5",), out=tmp_path / out, device="cpu", cache=cache, **changes)
+        return run_job(job).paths[0]
+
+    return refined
+
+
+def test_refined_rows_stay_above_their_table(on_table, refined):
+    """Every second hand is moved by millimetres: what is written passes the judge, table and way included."""
+    shard = read_shard(on_table[0])
+    rows, n = shard.grasps, len(shard.grasps)
+    pose, spoilt = rows.object_pose.copy(), np.arange(n) % 2 == 0
+    pose[spoilt, 0, :3] += 0.003 * np.random.default_rng(0).normal(size=(int(spoilt.sum()), 3)).astype("f4")
+    given = replace(rows, object_pose=pose, candidate=np.arange(n, dtype=np.uint64))
+    path = refined(replace(shard, grasps=given))
+    assert validate_shard(path) == []
+    after = read_shard(path)
+    assert after.objects[0].tables is not None
+    found = judge(path)
+    assert found.valid_share == 1.0
+    assert {"table", "resting", "approach"} <= set(found.failed)
+    source = after.grasps.candidate.astype(int)
+    np.testing.assert_array_equal(after.grasps.table["pose"], rows.table["pose"][source])
+    same = after.grasps.metrics["refined"] == 0
+    assert (same & ~spoilt[source]).any()
+    assert (~same).any()
+    np.testing.assert_array_equal(after.grasps.table["approach"][same], rows.table["approach"][source][same])
+
+
+def test_rows_below_their_table_are_invalid(on_table, refined):
+    """Nothing is searched: hands whose table is the plane that faces theirs are left out, or kept as invalid."""
+    shard = read_shard(on_table[0])
+    rows, (obj,), n = shard.grasps, shard.objects, len(shard.grasps)
+    pose = rows.table["pose"].copy()
+    up = np.asarray(obj.tables)[:, :3]
+    pose[:5] = np.argmin(up @ up[pose[:5]].T, axis=0)
+    given = replace(rows, table={**rows.table, "pose": pose}, candidate=np.arange(n, dtype=np.uint64))
+    given = replace(shard, grasps=given)
+    after = read_shard(refined(given, params=RefineParams(matching_rounds=0), keep_invalid=True)).grasps
+    np.testing.assert_array_equal(after.metrics["valid"], np.arange(n) >= 5)
+    np.testing.assert_array_equal(after.table["pose"], pose)
+    np.testing.assert_allclose(after.table["approach"][5:], rows.table["approach"][5:], atol=1e-5)
+    with pytest.raises(ShardError, match="table/pose: "):
+        refined(replace(given, grasps=replace(given.grasps, table={**rows.table, "pose": pose + 99})), "none")
 
 
 def test_asked_for_or_not(run, job, swift):
@@ -95,6 +156,7 @@ def test_same_rows_however_they_are_made(run, swift, grasps, tmp_path):
 
 def test_config_asks_for_a_table():
     (request,) = plan_requests(parse_model(JobConfig, {"objects": ["mug"], "table": True}, "config"))
+    assert isinstance(request, SearchRequest)
     assert request.pipeline.on_table
     assert request.out.name == "robust-table"
 

@@ -26,7 +26,7 @@ grasps/CODE/NUMBER.npy    DexGraspBench (BODex) layout: np.load(FILE, allow_pick
   grasp_qpos       the same at the grasp
   squeeze_qpos     the same with joint targets that press on the object
   joint_names      order of the joints, an addition of lgrasp
-
+{table}
 {root} is the root link of hand/hand.urdf. A model of the hand that is turned or shifted against this URDF (as some
 MJCF files are) needs that turn applied to the first seven numbers.
 """
@@ -37,6 +37,7 @@ def write_dexgraspbench(selection: Selection, frames: HandFrames, out: Path, adv
     for batch in selection.batches():
         pose = frames.root_in_object(batch.object_pose[:, 0], batch.q)  # (n, 7)
         postures = [np.concatenate([pose, q], -1) for q in batch.postures]
+        tables = batch.tables()
         for row, number in enumerate(batch.number):
             code = selection.objects[batch.object_index[row, 0]].code
             entry = {
@@ -45,6 +46,7 @@ def write_dexgraspbench(selection: Selection, frames: HandFrames, out: Path, adv
                 "obj_pose": np.array([0, 0, 0, 1.0, 0, 0, 0]),
                 **{name: values[row] for name, values in zip(_POSTURES, postures, strict=True)},
                 "joint_names": list(frames.joint_names),
+                **{name: np.array(values) for name, values in tables[row].items()},
             }
             save_object(out / GRASPS / code / f"{number:08d}.npy", entry)
             advance(1)

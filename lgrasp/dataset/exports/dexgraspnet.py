@@ -26,7 +26,7 @@ grasps/CODE.npy    DexGraspNet layout: np.load(FILE, allow_pickle=True) is an ar
                    (sxyz): R = Rz(WRJRz) Ry(WRJRy) Rx(WRJRx);
                    then one value per joint, by name
   qpos_pregrasp    the same before closing; qpos_squeeze: targets that press. Both are additions of lgrasp.
-
+{table}
 The object is at the origin. {root} is the root link of hand/hand.urdf.
 """
 
@@ -42,9 +42,10 @@ def _entries(batch: Batch, frames: HandFrames) -> Iterator[dict[str, Any]]:
     pose = frames.root_in_object(batch.object_pose[:, 0], batch.q)  # (n, 7)
     wrist = np.concatenate([pose[:, :3], euler_from_quaternion(pose[:, 3:])], -1)  # (n, 6)
     names = (*_WRIST, *frames.joint_names)
-    for values in zip(*(np.concatenate([wrist, q], -1).tolist() for q in batch.postures), strict=True):
+    postures = zip(*(np.concatenate([wrist, q], -1).tolist() for q in batch.postures), strict=True)
+    for values, table in zip(postures, batch.tables(), strict=True):
         qpos = (dict(zip(names, v, strict=True)) for v in values)
-        yield {"scale": 1.0} | dict(zip(_POSTURES, qpos, strict=True))
+        yield {"scale": 1.0} | dict(zip(_POSTURES, qpos, strict=True)) | table
 
 
 def read_dexgraspnet(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:

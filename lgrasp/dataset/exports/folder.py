@@ -154,8 +154,15 @@ Joint order, where values have no names:
 {mimics}"""
 
 
+_TABLE = """\
+  table_plane      where the object stands on a table: unit normal up and height along it [m], in the object's frame
+  table_approach   unit direction in which the open hand comes, same frame; both are additions of lgrasp
+"""
+
+
 def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Sequence[str]) -> str:
-    """The text; ``notes`` on the format may hold ``{root}`` and ``{base}`` for the names of the two links."""
+    """The text; ``notes`` on the format may hold ``{root}`` and ``{base}`` for the names of the two links, and
+    ``{table}`` where it tells of tables."""
     width = max(map(len, frames.joint_names))
     limits = zip(frames.joint_names, selection.hand.joint_lower, selection.hand.joint_upper, strict=True)
     mimics = [f"  {name} = {m:g} * {source} + {b:g}" for name, (source, m, b) in frames.mimics.items()]
@@ -169,7 +176,7 @@ def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Seq
         hand_folder=HAND,
         objects_folder=OBJECTS,
         objects=_few([f"{item.code} ({count:,})" for item, count in counts]),
-        notes=notes.format(root=frames.root, base=frames.base),
+        notes=notes.format(root=frames.root, base=frames.base, table=_TABLE if selection.on_table else ""),
         joints="\n".join(f"  {i:3d}  {name:{width}s}  {a:8.4f} to {b:.4f}" for i, (name, a, b) in enumerate(limits)),
         mimics="\n".join(["", heading, *mimics, ""]) if mimics else "",
     )

@@ -30,7 +30,7 @@ grasps/CODE.yaml   isaac_grasp format, version 1.0: all grasps of one object by 
   cspace_position  joints at the grasp by name [rad or m]
   pregrasp_cspace_position    joints before closing
   squeeze_cspace_position     joint targets that press on the object, an addition of lgrasp
-"""
+{table}"""
 
 
 def write_isaac_grasp(selection: Selection, frames: HandFrames, out: Path, advance: Callable[[int], None]) -> None:
@@ -49,7 +49,7 @@ def _entries(batch: Batch, frames: HandFrames) -> str:
     """Grasps in YAML; numbers have nine decimals, names are quoted as in JSON, which YAML understands."""
     pose = inverse(batch.object_pose[:, 0])  # (n, 7)
     form = ", ".join(f"{json.dumps(name).replace(chr(37), chr(37) * 2)}: %.9f" for name in frames.joint_names)
-    lines = []
+    lines, tables = [], batch.tables()
     for row, number in enumerate(batch.number):
         x, y, z, w, *v = (f"{value:.9f}" for value in pose[row])
         lines += [
@@ -58,6 +58,7 @@ def _entries(batch: Batch, frames: HandFrames) -> str:
             f"    position: [{x}, {y}, {z}]",
             f"    orientation: {{w: {w}, xyz: [{', '.join(v)}]}}",
             *(f"    {name}: {{{form % tuple(q[row])}}}" for name, q in zip(_POSTURES, batch.postures, strict=True)),
+            *(f"    {name}: [{', '.join(f'{v:.9f}' for v in values)}]" for name, values in tables[row].items()),
         ]
     return "\n".join(lines) + "\n"
 

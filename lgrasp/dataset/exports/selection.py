@@ -1,12 +1,13 @@
 """The contents of an export: which rows of which shards, chosen by conditions, in which order, of which objects."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset.conditions import OBJECTS_HELD, Condition
 from lgrasp.dataset.exports.hand import free_name
@@ -50,6 +51,14 @@ class Batch(NamedTuple):
     """Position in the selection's objects, shape [n, O]; -1 where absent."""
     holds: np.ndarray
     """1 where a simulator saw the grasp hold or none ran, 0 where it saw it fail, shape [n]."""
+    table: Mapping[str, np.ndarray]
+    """Of grasps of an object on a table, else empty; by the names that are written: ``table_plane``, unit normal up and
+    height along it [m], shape [n, 4], and ``table_approach``, unit direction in which the open hand comes, shape
+    [n, 3]; object's frame, float64."""
+
+    def tables(self) -> list[dict[str, list[float]]]:
+        """``table`` row by row, length n."""
+        return [{name: values[row].tolist() for name, values in self.table.items()} for row in range(len(self.q))]
 
     @property
     def postures(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,6 +72,8 @@ class _Source(NamedTuple):
     index: np.ndarray  # (n, O) of the chosen rows, in the selection's objects
     columns: list[int]  # column of q for each joint of the selection
     first: int  # running number of the first chosen row
+    planes: list[np.ndarray | None]  # that each of the shard's objects rests on
+    on_table: bool
 
 
 @dataclass(frozen=True)
@@ -78,6 +89,11 @@ class Selection:
     single: bool
     """True if every row holds exactly one object."""
     _sources: tuple[_Source, ...]
+
+    @property
+    def on_table(self) -> bool:
+        """True if rows are of objects on a table."""
+        return any(source.on_table for source in self._sources)
 
     @property
     def shards(self) -> list[Path]:
@@ -115,7 +131,13 @@ class Selection:
             index = np.take_along_axis(index, present, 1)
         holds = (read(HOLDS) > 0).astype(np.float64) if HOLDS in reader.columns else np.ones(len(some))
         q, before, squeeze = (read(name)[:, source.columns] for name in ("q", "q_pregrasp", "q_squeeze"))
-        return Batch(source.first + some, q, before, squeeze, pose, index, holds)
+        table = {}
+        if source.on_table:  # such rows hold one object
+            planes = zip(read("object_index")[:, 0], read("table/pose"), strict=True)
+            table["table_plane"] = np.array([_plane(source, int(item), int(plane)) for item, plane in planes])
+            turned = Rotation.from_quat(pose[:, 0, 3:], scalar_first=True)
+            table["table_approach"] = turned.inv().apply(read("table/approach"))
+        return Batch(source.first + some, q, before, squeeze, pose, index, holds, table)
 
 
 def select_rows(
@@ -161,11 +183,13 @@ def select_rows(
                     f"{path}: another hand ({this.name}) than {source} ({hand.name}); export one at a time"
                 )
             columns = [list(this.joint_names).index(name) for name in hand.joint_names]
-            places = np.array([*(_place(record, path, known) for record in reader.objects()), -1])  # -1: absent
+            records, on_table = reader.objects(), "table/pose" in reader.columns
+            places = np.array([*(_place(record, path, known) for record in records), -1])  # -1: absent
         rows = rows[: None if limit is None else limit - chosen]
         index = index[: len(rows)]
         seen += number
-        sources.append(_Source(path, rows, places[index], columns, chosen))
+        planes = [record.tables for record in records]
+        sources.append(_Source(path, rows, places[index], columns, chosen, planes, on_table))
         chosen += len(rows)
         if chosen == limit:
             break
@@ -187,6 +211,14 @@ def select_rows(
         single=single,
         _sources=tuple(s._replace(index=place[s.index]) for s in sources if len(s.rows)),
     )
+
+
+def _plane(source: _Source, item: int, plane: int) -> np.ndarray:
+    """Normal and height of a plane that an object of a shard rests on, (4,)."""
+    planes = source.planes[item]
+    if planes is None or plane >= len(planes):
+        raise ShardError(f"{source.path}: table/pose {plane}: its object has no such plane")
+    return planes[plane, :4]
 
 
 def _place(record: ObjectRecord, path: Path, known: dict[tuple[str, str, float], ExportObject]) -> int:

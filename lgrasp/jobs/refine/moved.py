@@ -1,8 +1,8 @@
 """Rows of one object moved by a local search, checked, and kept where they became better."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -57,6 +57,7 @@ def move_rows(
     params: RefineParams,
     bounds: GraspBounds,
     *,
+    planes: np.ndarray | None = None,
     keep_invalid: bool = False,
     stored: bool = True,
     measured: bool = True,
@@ -68,13 +69,14 @@ def move_rows(
     Rows that pass in neither posture are left out.
 
     Args:
+        planes: those that the object rests on, (T, 5), where rows are of objects on a table: they must stay above it.
         keep_invalid: those rows are kept too, refined, with their own metrics and ``valid`` 0.
         stored: contacts of the rows are known, and rows that are not replaced stay as they are.
         measured: metrics of the rows are of these bounds.
         progress: called with rows done.
     """
     refiner = Refiner(hand.model, obj, params, device=hand.device)
-    arrays = upload_object(obj, hand.device)
+    arrays = upload_object(obj, hand.device, planes)
     outside = _outside(rows, hand)
     parts = []
     for first in range(0, len(rows), _BATCH_ROWS):
@@ -90,7 +92,7 @@ def move_rows(
     extra = {"energy": last_energy.sum(0), **terms, "valid": valid, "refined": taken}
     extra = {name: np.asarray(values, np.float32) for name, values in extra.items()}
     made = grasp_rows(press(table), hand.model.tree, obj.center, extra=extra)
-    made = replace(made, candidate=rows.candidate)
+    made = replace(made, candidate=rows.candidate, table=_ways(rows.table, made.table))
     if stored:
         made = _kept(rows, made, taken | outside | ~known, measured)
     if not keep_invalid:
@@ -119,8 +121,9 @@ def _moved_part(
 ) -> _Part:
     pose, q = _hands(rows, part, hand, obj.model)
     index = np.arange(len(rows))[part]
+    resting = rows.table["pose"][part] if obj.planes is not None else None
     found = find_contacts(hand, obj, pose, q, bounds)
-    old, outcome = check_grasps(hand, obj, pose, q, found, bounds, index=index)
+    old, outcome = check_grasps(hand, obj, pose, q, found, bounds, resting=resting, index=index)
     given = table_pose(old, hand.device)
     was = outcome == Outcome.KEPT
     known: np.ndarray = np.zeros(len(q), bool)
@@ -129,13 +132,13 @@ def _moved_part(
             np.asarray(a)[part, 0] for a in (rows.contact_links, rows.contact_points, rows.contact_normals)
         )
         own = known_contacts(links, points - obj.model.center, normals, hand.device)
-        told, outcome = check_grasps(hand, obj, pose, q, own, _rounded(bounds), index=index)
+        told, outcome = check_grasps(hand, obj, pose, q, own, _rounded(bounds), resting=resting, index=index)
         known = outcome == Outcome.KEPT
         width = max(old.contact_links.shape[1], told.contact_links.shape[1])
         at = np.flatnonzero(known)
         old, was = choose_grasps(widen_grasps(old, width), widen_grasps(told, width), at, at), was | known
     tries = np.where(was | (params.matching_rounds == 0), 1, params.tries)
-    new, outcome = improve(refiner.search, hand, obj, pose, q, bounds, tries=tries, index=index)
+    new, outcome = improve(refiner.search, hand, obj, pose, q, bounds, tries=tries, resting=resting, index=index)
     good = outcome == Outcome.KEPT
     lower = new.metrics["unresisted_load"] < old.metrics["unresisted_load"] - _MIN_GAIN
     taken = ~was | (good & lower)
@@ -154,6 +157,7 @@ def _rounded(bounds: GraspBounds) -> GraspBounds:
             "max_gap": bounds.max_gap + _POSE_ROUNDING,
             "max_penetration": bounds.max_penetration + _POSE_ROUNDING,
             "min_self_distance": max(bounds.min_self_distance - _POSE_ROUNDING, 0.0),
+            "min_table_distance": max(bounds.min_table_distance - _POSE_ROUNDING, 0.0),
             "max_normal_angle": bounds.max_normal_angle + np.degrees(10 * _POSE_ROUNDING),
             "max_gswo": bounds.max_gswo + 100 * _POSE_ROUNDING,
             "max_unresisted_load": bounds.max_unresisted_load + 1000 * _POSE_ROUNDING,
@@ -163,8 +167,15 @@ def _rounded(bounds: GraspBounds) -> GraspBounds:
 
 def _some(rows: GraspRows, chosen: np.ndarray) -> GraspRows:
     """The rows that are chosen, (N,) bool."""
-    fields = {name: np.asarray(getattr(rows, name))[chosen] for name in GRASP_FIELDS}
-    return replace(rows, **fields, metrics={name: np.asarray(x)[chosen] for name, x in rows.metrics.items()})
+    fields: dict[str, Any] = {name: np.asarray(getattr(rows, name))[chosen] for name in GRASP_FIELDS}
+    for family in ("metrics", "table"):
+        fields[family] = {name: np.asarray(x)[chosen] for name, x in getattr(rows, family).items()}
+    return replace(rows, **fields)
+
+
+def _ways(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns of rows on a table; hands without a way, which are invalid, keep the one that they had."""
+    return {name: np.where(np.isnan(values), old[name], values).astype(old[name].dtype) for name, values in new.items()}
 
 
 def _outside(rows: GraspRows, hand: HandArrays) -> np.ndarray:
@@ -204,12 +215,18 @@ def _kept(old: GraspRows, new: GraspRows, take: np.ndarray, measured: bool) -> G
         x, y = (np.asarray(getattr(rows, name)) for rows in (old, new))
         if name in CONTACTS:
             x, y = _padded(x, width), _padded(y, width)
-        changes[name] = np.where(take.reshape(-1, *(1,) * (x.ndim - 1)), y, x).astype(x.dtype)
+        changes[name] = _chosen(take, y, x)
     metrics = {
         name: np.where(take, values, old.metrics[name]) if measured and name in old.metrics else values
         for name, values in new.metrics.items()
     }
-    return replace(new, **changes, metrics=metrics)
+    table = {name: _chosen(take, values, np.asarray(old.table[name])) for name, values in new.table.items()}
+    return replace(new, **changes, metrics=metrics, table=table)
+
+
+def _chosen(take: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    """Rows (N, ...) of ``new`` where ``take`` (N,) says so, else of ``old``."""
+    return np.where(take.reshape(-1, *(1,) * (old.ndim - 1)), new, old).astype(old.dtype)
 
 
 def _padded(x: np.ndarray, width: int) -> np.ndarray:

@@ -31,7 +31,7 @@ from lgrasp.jobs.requests.shards import RefineRequest
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
 from lgrasp.object.load import load_mesh
 
-VERSION = 2
+VERSION = 3
 """Raised whenever refined shards change for the same parameters."""
 
 
@@ -103,6 +103,7 @@ class RefineJob(RefineRequest, ShardJob):
             shard.grasps,
             params,
             bounds,
+            planes=shard.objects[0].tables if shard.grasps.table else None,
             keep_invalid=self.keep_invalid,
             stored=self.form is None,
             measured=(told.friction, told.torque_scale) == (bounds.friction, bounds.torque_scale),
@@ -180,7 +181,10 @@ def _entry(path: Path) -> dict[str, Any]:
 
 def _check_rows(path: Path, shard: Shard) -> None:
     """Refuse what cannot be repaired; joints outside their limits can."""
-    rows, hand = shard.grasps, shard.hand
+    rows, hand, tables = shard.grasps, shard.hand, shard.objects[0].tables
+    known = 0 if tables is None else len(tables)
+    if rows.table and int(np.max(rows.table["pose"])) >= known:
+        raise ShardError(f"{path}: table/pose: {int(np.max(rows.table['pose']))}, its object has {known} planes")
     q = np.where(np.isfinite(rows.q), np.clip(rows.q, hand.joint_lower, hand.joint_upper), rows.q)
     columns = rows.columns()
     problems = row_problems(

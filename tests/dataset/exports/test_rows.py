@@ -5,10 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from lxml import etree
 
 from lgrasp.dataset.conditions import Condition, parse_condition
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
+from lgrasp.dataset.exports.npy import load_objects
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 
@@ -46,6 +49,36 @@ def test_failed_verdicts_lower_the_confidence(tmp_path, shards):
     export_shards(tmp_path / "a.h5", tmp_path / "out", "isaac-grasp")
     text = (tmp_path / "out" / "grasps" / "cup.yaml").read_text()
     assert [line.split()[1] for line in text.splitlines() if "confidence" in line] == ["1.0", "0.0", "1.0"]
+
+
+def entries(folder, form: str) -> list[dict]:
+    """What is written of each grasp of the cup."""
+    if form == "isaac-grasp":
+        grasps = yaml.safe_load((folder / "grasps" / "cup.yaml").read_text())["grasps"]
+        return [grasps[f"grasp_{number}"] for number in range(len(grasps))]
+    if form == "dexgraspnet":
+        return load_objects(folder / "grasps" / "cup.npy")
+    return [load_objects(file)[0] for file in sorted((folder / "grasps" / "cup").iterdir())]
+
+
+@pytest.mark.parametrize("form", SINGLE)
+def test_tables_come_along(tmp_path, shards, form):
+    """Plane and approach in the object's frame; the shard has the approach in the hand's."""
+    shard, planes = shards.make(tmp_path / "plain.h5", n=4), np.array([[0, 0, 1, -0.025], [0, 1, 0, -0.005]], "f4")
+    pose, way = np.array([1, 0, 1, 1], "i4"), np.array([[0, 0, -1], [0, -1, 0], [0.6, 0, -0.8], [1, 0, 0]], "f4")
+    rows = replace(shard.grasps, table={"pose": pose, "approach": way})
+    cup = replace(shard.objects[0], tables=np.column_stack([planes, np.full((2, 1), 0.5, "f4")]))
+    write_shard(tmp_path / "table.h5", replace(shard, grasps=rows, objects=[cup]))
+    export_shards(tmp_path / "table.h5", tmp_path / "out", form)
+    R = pose_matrix(rows.object_pose[:, 0].astype(float))[:, :3, :3]
+    for row, entry in enumerate(entries(tmp_path / "out", form)):
+        np.testing.assert_allclose(entry["table_plane"], planes[pose[row]], atol=1e-6)
+        np.testing.assert_allclose(R[row] @ entry["table_approach"], way[row], atol=1e-6)
+    assert "table_plane" in (tmp_path / "out" / "README.txt").read_text()
+    np.testing.assert_allclose(read_grasps(tmp_path / "out", form).grasps.q, rows.q, atol=1e-6)
+    export_shards(tmp_path / "plain.h5", tmp_path / "without", form)
+    assert "table" not in (tmp_path / "without" / "README.txt").read_text()
+    assert not any("table_plane" in entry for entry in entries(tmp_path / "without", form))
 
 
 @pytest.mark.parametrize(
