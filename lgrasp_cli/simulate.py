@@ -31,9 +31,9 @@ def simulate(
 
     The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
     directions; a grasp holds if they stay in all of them. lift is for grasps of generate --table: the hand comes down,
-    closes, lifts the object by 15 cm and is shaken sideways (CPU only). seq6 and seq6_mu06 are made for
-    sequences of objects. fc_random is fc in 8 random draws (CPU only). A shard that has the verdicts already is left as
-    it is.
+    closes, lifts the object by 15 cm and is shaken sideways; dipgrasp lifts a free object by 20 cm and turns gravity;
+    fc_random is fc in 8 random draws (these on the CPU only). seq6 and seq6_mu06 are made for sequences of objects. A
+    shard that has the verdicts already is left as it is.
 
     Contacts are hard in PhysX (pip install "lgrasp[physx]"), whose columns are physics/physx_PROTOCOL_....
 
@@ -85,14 +85,19 @@ def _friction(protocol: dict[str, Any]) -> str:
 def _profile(data: dict[str, Any]) -> list[Block]:
     from lgrasp.simulate.protocol import DIRECTIONS
 
-    lifted = data["protocol"]["lift"] is not None
-    ways, at = (("on table", "pushed"), ("at q",)) if lifted else (DIRECTIONS, ("at q", "at grasp"))
+    lift, title = data["protocol"]["lift"], "shares of the grasps"
+    if lift is None:
+        title, ways, at = f"{title} run in a direction", DIRECTIONS, ("at q", "at grasp")
+    elif "way" in lift:
+        title, ways, at = f"{title}; how far the coming hand pushed, median", ("on table", "pushed"), ("at q",)
+    else:
+        ways, at = (), ("at q",)
     names = ("hand", "object", *ways, *at, "mass", "stiffness")
     rows = [
         (
             entry["hand"],
             entry["object"],
-            *(_carried(entry) if lifted else map(share, entry["directions_held"], entry["directions_run"])),
+            *_ways(entry),
             *(share(entry[f"contact_{name.replace(' ', '_')}"], entry["rows"]) for name in at),
             "drawn" if entry["mass"] is None else f"{1e3 * entry['mass']:.0f} g",
             "drawn" if entry["stiffness"] is None else f"{entry['stiffness']:.3g}",
@@ -100,15 +105,13 @@ def _profile(data: dict[str, Any]) -> list[Block]:
         for entry in data["results"]
     ]
     compiling = f"{data['seconds_compile']:.1f} s for models and kernels, not part of /s"
-    return [
-        "shares of the grasps; how far the coming hand pushed, median"
-        if lifted
-        else "shares of the grasps run in a direction",
-        TextTable(names, rows, right=names[2:]),
-        [("compiling", compiling)],
-    ]
+    return [title, TextTable(names, rows, right=names[2:]), [("compiling", compiling)]]
 
 
-def _carried(entry: dict[str, Any]) -> tuple[str, str]:
+def _ways(entry: dict[str, Any]) -> tuple[str, ...]:
+    if entry["directions_held"] is not None:
+        return tuple(map(share, entry["directions_held"], entry["directions_run"]))
+    if entry["on_table"] is None:
+        return ()
     pushed = entry["pushed"]
     return share(entry["on_table"], entry["rows"]), "-" if pushed is None else f"{1e3 * pushed:.1f} mm"

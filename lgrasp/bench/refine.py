@@ -11,6 +11,7 @@ import torch
 import trimesh
 
 from lgrasp.bench.page import Page, Table, caveats, load_published, number, over
+from lgrasp.choices import EngineName
 from lgrasp.cloud.model import cloud_object
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Loader, object_key
@@ -35,7 +36,7 @@ from lgrasp.refine.surface import hand_surface
 from lgrasp.runtime.cores import cores
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.simulate.protocol import Protocol, find_protocol
-from lgrasp.simulate.run import verdicts
+from lgrasp.simulate.run import check_installed, verdicts
 from lgrasp.simulate.scene import scene_of
 
 NOISES = (0.0, 0.002, 0.005, 0.01)
@@ -75,8 +76,9 @@ def bench_hands(
     hands: Sequence[str],
     objects: Sequence[str],
     starts: int,
-    protocol: str = "fc",
+    protocol: str = "dipgrasp",
     *,
+    engine: EngineName = "mujoco",
     params: PlanParams | None = None,
     noises: Sequence[float] = NOISES,
     device: str = "auto",
@@ -87,8 +89,8 @@ def bench_hands(
 
     Tables I and IV: ``starts`` on each object, on its mesh and for each noise on points of its surface with the normals
     of the clean surface, once with one hand at each start and once with the best of several. A plan is valid when it
-    holds the true object under the protocol. Table III: the valid plans on meshes, displaced as a network would
-    (1 cm and 0.15 rad an axis, 0.15 rad a joint), refined by ``COARSE``.
+    holds the true object under the protocol in the simulator. Table III: the valid plans on meshes, displaced as a
+    network would (1 cm and 0.15 rad an axis, 0.15 rad a joint), refined by ``COARSE``.
 
     Returns:
         What was asked; ``published``; ``best_of``, the hands at a start; and for each hand ``planning`` (``mesh`` or
@@ -97,9 +99,10 @@ def bench_hands(
         ``milliseconds`` (of one pose there, all side by side) and ``poses``.
 
     Raises:
-        LgraspError: hand, object, device or protocol are unknown.
+        LgraspError: hand, object, device or protocol are unknown, or the simulator is missing.
     """
-    rules, best = find_protocol(protocol), params or PlanParams()
+    rules, best = find_protocol(protocol).by(engine), params or PlanParams()
+    check_installed("cpu", rules)
     store, at = cache or Cache(), resolve_device(device)
     planners = {
         (_named(noise), hands): (noise, own if noise is None else cloud_params(own))
@@ -110,7 +113,7 @@ def bench_hands(
         "device": at.name,
         "objects": list(objects),
         "starts": starts,
-        "protocol": protocol,
+        "protocol": rules.name,
         "best_of": best.rolls,
         "steps": list(STEPS),
         "published": load_published("dipgrasp").model_dump(mode="json"),
@@ -214,13 +217,16 @@ def refine_page(result: dict[str, Any]) -> Page:
         paper, planning, energy = papers.get(hand), one["planning"], one["energy"]
         for hands, ours in whose.items():
             own = planning["mesh"][hands]
-            planned = f"{own['planned'] / max(own['starts'], 1):.1%}"
-            plans.append((hand, ours, *_plan(own["epsilon"], own["share"], own["seconds_each"]), planned))
+            planned = own["planned"] / max(own["starts"], 1), over(own["valid"], own["planned"])
+            shares = (number(share, ".1%") for share in planned)
+            plans.append((hand, ours, *_plan(own["epsilon"], own["share"], own["seconds_each"]), *shares))
             on_clouds = [planning[name][hands] for name in clouds]
             if clouds:
                 noisy.append((hand, ours, *_noisy([p["share"] for p in on_clouds], on_clouds[-1]["seconds_each"])))
             if paper and hands == "one":
-                plans.append((hand, "paper", *_plan(paper["epsilon"], paper["valid"][0], paper["seconds"][0]), "-"))
+                plans.append(
+                    (hand, "paper", *_plan(paper["epsilon"], paper["valid"][0], paper["seconds"][0]), "-", "-")
+                )
                 if clouds and len(paper["valid"]) == len(clouds):
                     noisy.append((hand, "paper", *_noisy(paper["valid"], paper["seconds"][-1])))
         fall, each = number(over(energy[0], energy[-1]), ".1f", "x"), f"{one['milliseconds'][-1]:.1f}"
@@ -229,7 +235,7 @@ def refine_page(result: dict[str, Any]) -> Page:
             energy = paper["energy"]
             energies.append((hand, "paper", *(f"{e:.0f}" for e in energy), f"{energy[0] / energy[-1]:.1f}x", "-"))
     columns = {
-        "Table I: plans on meshes": ("epsilon", "valid", "s each", "planned"),
+        "Table I: plans on meshes": ("epsilon", "valid", "s each", "planned", "success"),
         "Table III: energy of coarse poses after rounds of matching": (*map(str, result["steps"]), "falls", "ms"),
         "Table IV: valid plans on points of the surface, by noise": (
             *(name[6:].replace("_", " ") for name in clouds),

@@ -204,9 +204,9 @@ class Simulated:
 def summary(done: Sequence[Simulated], protocol: Protocol) -> list[dict[str, Any]]:
     """One entry per hand and objects of a grasp, in the order of its slots: shares that hold, contacts, load, speed.
 
-    Of what is lifted, ``directions_held``, ``directions_run`` and ``contact_at_grasp`` are None; of all else,
-    ``on_table`` and ``pushed``. ``share``: of the draws of a row that hold, mean; ``mass``, ``friction``, ``stiffness``
-    are None if they are drawn.
+    Of what is lifted, ``directions_held``, ``directions_run`` and ``contact_at_grasp`` are None; of what is not lifted
+    off a table, ``on_table`` and ``pushed``. ``share``: of the draws of a row that hold, mean; ``mass``, ``friction``,
+    ``stiffness`` are None if they are drawn.
     """
     groups: dict[tuple[str, tuple[str, ...]], list[Simulated]] = {}
     for one in done:

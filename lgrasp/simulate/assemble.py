@@ -128,7 +128,7 @@ def assemble(
         add_solid(mujoco, spec, f"{OBJECT} {number}", solid, load.mass, inertia)
     for geom in spec.geoms:  # links slide on links without friction
         set_contact(geom, protocol, 4 if geom.parent.name.startswith(OBJECT) else 1)
-    if protocol.lift:
+    if protocol.table:
         add_table(mujoco, spec, TABLE, protocol)
     _exclude_neighbours(spec, hand)
     model = spec.compile()

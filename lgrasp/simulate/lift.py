@@ -1,4 +1,4 @@
-"""Protocol ``lift``: the hand comes to an object on a table, closes, takes it up and shakes it.
+"""Protocols that lift: the hand comes to an object on a table or is at a free one, closes, takes it up and holds it.
 
 All is told from the hand, whose base stands still as in every protocol: the table moves by the opposite of the hand's
 way, and the object feels its weight and the inertia of the hand's acceleration. Nothing pulls at the hand's own links:
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.model import Model
-from lgrasp.simulate.protocol import Protocol
+from lgrasp.simulate.protocol import FreeLift, Lift, Protocol
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.verdict import CHUNK, Bounds, Look, Verdict, at_rest, moved
@@ -32,6 +32,8 @@ class LiftCourse(NamedTuple):
     """Where its base is before each step and at the end, seen from the grasp, base frame (T + 1, 3) [m]."""
     targets: np.ndarray
     """Of the drives in each step (T, nu) [rad or m]."""
+    down: np.ndarray
+    """Gravity over its strength in each step, base frame (T, 3)."""
     closes: int
     """Step in which it begins to close."""
     rises: int
@@ -49,9 +51,14 @@ class Lifted(NamedTuple):
     steps: int = 0
 
 
-def check_on_table(scene: Scene, rows: GraspRows) -> None:
-    """Raises PhysicsError unless each row names a plane that its one object rests on, and a way to it."""
+def check_liftable(protocol: Protocol, scene: Scene, rows: GraspRows) -> None:
+    """Raises PhysicsError unless each row has one object and, to lift it off a table, names a plane that this rests
+    on, and a way to it."""
     index = np.asarray(rows.object_index)
+    if protocol.table is None:
+        if index.shape[1] != 1:
+            raise PhysicsError(f"protocol {protocol.name} cannot simulate these grasps: they have several objects")
+        return
     if not {"pose", "approach"} <= set(rows.table) or any(solid.tables is None for solid in scene.objects):
         said = "they do not say how the object lies on a table"
     elif index.shape[1] != 1:
@@ -67,13 +74,20 @@ def _known(pose: np.ndarray, solid: Solid) -> bool:
     return bool((pose < len(solid.tables if solid.tables is not None else ())).all())
 
 
-def course_of(protocol: Protocol, stops: Sequence[np.ndarray], up: np.ndarray, approach: np.ndarray) -> LiftCourse:
+def course_of(
+    protocol: Protocol,
+    stops: Sequence[np.ndarray],
+    up: np.ndarray,
+    approach: np.ndarray | None = None,
+    candidate: int = 0,
+) -> LiftCourse:
     """The hand's course.
 
     Args:
         protocol: with a ``lift``.
         stops: targets of the drives (nu,) [rad or m]: open, grasp, squeeze.
-        up, approach: unit vectors, base frame (3,).
+        up, approach: unit vectors, base frame (3,); no approach: the hand is at the grasp from the start.
+        candidate: of the row.
     """
     lift, dt = protocol.lift, protocol.timestep
     assert lift
@@ -81,21 +95,32 @@ def course_of(protocol: Protocol, stops: Sequence[np.ndarray], up: np.ndarray, a
     def steps(seconds: float) -> int:
         return max(1, round(seconds / dt))
 
-    coming, closing, rest, rising = map(steps, (lift.coming, protocol.phase, protocol.rest + dt, lift.rising))
-    come = -lift.way * (1.0 - _smooth(coming))[:, None] * approach
+    closing, rest, rising = map(steps, (protocol.phase, protocol.rest + dt, lift.rising))
+    come, push = np.zeros((1, 3)), np.zeros((steps(protocol.hold), 3))
+    if isinstance(lift, Lift):
+        assert approach is not None
+        come, push = -lift.way * (1.0 - _smooth(steps(lift.coming)))[:, None] * approach, _shaking(lift, push, dt, up)
+    closes = len(come) - 1
     closed = np.zeros(((len(stops) - 1) * closing + rest, 3))
     rise = lift.height * _smooth(rising)[:, None] * up
-    push = _shaking(protocol, up)
-    shaken = rise[-1] + np.cumsum(np.cumsum(push, axis=0), axis=0) * dt**2
+    held = rise[-1] + np.cumsum(np.cumsum(push, axis=0), axis=0) * dt**2
     even = np.arange(1, closing + 1)[:, None] / closing
     close = [a + (b - a) * even for a, b in pairwise(stops)]
+    rises = closes + len(closed)
+    down = np.tile(-up, (rises + rising + len(push), 1))
+    if isinstance(lift, FreeLift):
+        down[:rises] = 0.0
+        turned = _turns(lift, steps(lift.turning), candidate)
+        first = len(down) - (len(push) + len(turned)) // 2
+        down[first : first + len(turned)] = turned
     return LiftCourse(
-        way=np.concatenate([come, closed, rise[1:], shaken]),
+        way=np.concatenate([come, closed, rise[1:], held]),
         targets=np.concatenate(
-            [np.tile(stops[0], (coming, 1)), *close, np.tile(stops[-1], (rest + rising + len(push), 1))]
+            [np.tile(stops[0], (closes, 1)), *close, np.tile(stops[-1], (rest + rising + len(push), 1))]
         ),
-        closes=coming,
-        rises=coming + len(closed),
+        down=down,
+        closes=closes,
+        rises=rises,
     )
 
 
@@ -105,69 +130,73 @@ def _smooth(steps: int) -> np.ndarray:
     return t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
 
 
-def _shaking(protocol: Protocol, up: np.ndarray) -> np.ndarray:
-    """Acceleration of the hand in each step of the hold, base frame (n, 3) [m/s^2]."""
-    lift, count = protocol.lift, max(1, round(protocol.hold / protocol.timestep))
-    assert lift
+def _shaking(lift: Lift, still: np.ndarray, dt: float, up: np.ndarray) -> np.ndarray:
+    """Acceleration of the hand in each step of the hold, base frame [m/s^2], shaped as ``still`` (n, 3)."""
+    count = len(still)
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     sideways = np.stack([first, np.cross(up, first)])
     second = np.arange(count) >= count // 2
-    time = (np.arange(count) - second * (count // 2)) * protocol.timestep
+    time = (np.arange(count) - second * (count // 2)) * dt
     return lift.shake * np.sin(2.0 * np.pi * lift.frequency * time)[:, None] * sideways[second.astype(int)]
+
+
+def _turns(lift: FreeLift, steps: int, candidate: int) -> np.ndarray:
+    """Directions of gravity in each step in which it is turned, even on the sphere, (steps, 3); none: (0, 3)."""
+    ways = np.random.default_rng([lift.seed, candidate]).standard_normal((lift.turns, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    return ways[np.arange(steps) * lift.turns // steps] if lift.turns else ways
 
 
 def lift_row(world: "MujocoWorld | PhysxWorld", model: Model, rows: GraspRows, i: int) -> Lifted:
     """Simulate row ``i``, whose object has the planes of ``model``."""
     protocol, pose = model.protocol, rows.object_pose[i].astype(float)
-    table, up = _table_at(model, pose[0], int(rows.table["pose"][i]))
     stops = [targets[i].astype(float) for targets in protocol.stops(rows)]
-    approach = rows.table["approach"][i].astype(float)
-    course = course_of(protocol, [model.controls(q) for q in stops], up, approach / np.linalg.norm(approach))
-    away = np.concatenate([-course.way[0], np.zeros(4)])
+    controls, candidate = [model.controls(q) for q in stops], int(rows.candidate[i])
     world.begin(stops[0], pose)
     home = world.objects().copy()
-    world.begin(stops[0], pose + away)
     at, turn = (found[model.base_body].copy() for found in world.frames())
-    world.place_table(_placed(at, turn, table + away))
-    return _carry(world, model, course, home, course.way @ turn.T, turn @ up)
+    if protocol.table:
+        table, up = _table_at(model, pose[0], int(rows.table["pose"][i]))
+        approach = rows.table["approach"][i].astype(float)
+        course = course_of(protocol, controls, up, approach / np.linalg.norm(approach), candidate)
+        away = np.concatenate([-course.way[0], np.zeros(4)])
+        world.begin(stops[0], pose + away)
+        world.place_table(_placed(at, turn, table + away))
+    else:
+        up = Rotation.from_quat(pose[0, 3:], scalar_first=True).as_matrix()[:, 2]
+        course = course_of(protocol, controls, up, candidate=candidate)
+    return _carry(world, model, course._replace(way=course.way @ turn.T, down=course.down @ turn.T), home)
 
 
-def _carry(
-    world: "MujocoWorld | PhysxWorld",
-    model: Model,
-    course: LiftCourse,
-    home: np.ndarray,
-    way: np.ndarray,
-    up: np.ndarray,
-) -> Lifted:
+def _carry(world: "MujocoWorld | PhysxWorld", model: Model, course: LiftCourse, home: np.ndarray) -> Lifted:
     """Go through a course from where everything stands.
 
     Args:
+        course: in the world frame.
         home: poses of the objects at the grasp, world frame (O, 7).
-        way: of ``course``, world frame (T + 1, 3) [m].
-        up: world frame (3,).
     """
-    dt, bounds = model.protocol.timestep, Bounds(model.protocol)
-    mass = model.mujoco.body_mass[model.object_body][:, None]
-    weight = -model.forces[:, None] * up
+    dt, bounds, table = model.protocol.timestep, Bounds(model.protocol), model.protocol.table
+    mass, weight = model.mujoco.body_mass[model.object_body][:, None], model.forces[:, None]
     speed, pushed, settled = np.zeros(3), np.nan, False
-    far = np.zeros((len(home), 2))
+    far, counts = np.zeros((len(home), 2)), course.rises if table else 0
     chunk, total = max(1, round(CHUNK / dt)), len(course.targets)
     for step in range(total):
         if step == course.closes:
             pushed = float(moved(world.objects(), home, model.centers)[:, 0].max())
         if step == course.rises:
-            home, settled = world.objects().copy(), bool(at_rest(world.velocities()))
-        before, speed = speed, (way[step + 1] - way[step]) / dt
+            home = world.objects().copy() if table else home
+            settled = bool(at_rest(world.velocities()))
+        before, speed = speed, (course.way[step + 1] - course.way[step]) / dt
         world.drive(course.targets[step])
-        world.push(weight - mass * (speed - before) / dt)
-        world.slide_table(-dt * speed)
+        world.push(weight * course.down[step] - mass * (speed - before) / dt)
+        if table:
+            world.slide_table(-dt * speed)
         world.step(1)
         if (step + 1) % chunk == 0 or step + 1 == total:
             if world.wild():
                 return Lifted(pushed, settled=settled, diverged=True, steps=step + 1)
-            if step >= course.rises:
+            if step >= counts:
                 far = np.maximum(far, moved(world.objects(), home, model.centers))
                 if bounds.lost(far):
                     return Lifted(pushed, far.max(0), settled, world.on_table(), steps=step + 1)

@@ -62,7 +62,7 @@ class Model:
     """(O, 3) centre of mass in each object's frame [m]."""
 
     table: TableBody
-    """Of protocols with a lift."""
+    """Of protocols that lift off a table."""
     tables: tuple[np.ndarray | None, ...]
     """Planes that each object rests on (T, 5)."""
 
@@ -103,7 +103,7 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
             if geom.parent.name.startswith(OBJECT):
                 geom.margin = _NEAR_DISTANCE
         near = spec.compile()
-        if protocol.lift:
+        if protocol.table:
             for made in (model, near):  # the solver's tolerance is as without a table
                 made.stat.meaninertia = np.delete(made.dof_M0, _table_of(made).velocity).mean()
     except (ValueError, KeyError, RuntimeError) as error:
@@ -146,7 +146,7 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
         base_body=base,
         link_body=np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in hand.link_names]),
         centers=np.stack([solid.center for solid in solids]),
-        table=_table_of(model) if protocol.lift else TableBody(-1, np.zeros(0, int), np.zeros(0, int)),
+        table=_table_of(model) if protocol.table else TableBody(-1, np.zeros(0, int), np.zeros(0, int)),
         tables=tuple(solid.tables for solid in solids),
     )
 

@@ -92,16 +92,21 @@ class Draws(Ranges):
     )
 
 
-class Lift(Params):
-    """How a hand comes to an object on a table and takes it away: in place of six pulls.
+class Rise(Params):
+    """How a hand that has closed takes an object up and holds it: in place of six pulls.
 
-    ``force`` of the protocol is the object's weight, which the table bears at first.
+    ``force`` of the protocol is the object's weight.
     """
 
-    coming: float = Field(default=1.0, gt=0, description="The hand's straight way to the grasp [s].")
-    way: float = Field(default=0.15, gt=0, le=1, description="How long that way is [m].")
     rising: float = Field(default=1.0, gt=0, description="The way up [s].")
-    height: float = Field(default=0.15, gt=0, le=1, description="How long that one is [m].")
+    height: float = Field(default=0.15, gt=0, le=1, description="How long that way is [m].")
+
+
+class Lift(Rise):
+    """The hand comes to an object on a table, which bears the weight at first, and shakes it at the end."""
+
+    coming: float = Field(default=1.0, gt=0, description="The hand's straight way to the grasp [s].")
+    way: float = Field(default=0.15, gt=0, le=1, description="How long that one is [m].")
     shake: float = Field(
         default=2.0,
         ge=0,
@@ -109,6 +114,17 @@ class Lift(Params):
         "horizontal axis, then along the other.",
     )
     frequency: float = Field(default=2.0, gt=0, description="Of the shaking [1/s].")
+
+
+class FreeLift(Rise):
+    """Nothing bears the object, which weighs nothing until the hand rises along +z of the object's frame.
+
+    In the middle of the hold gravity takes random directions, which depend on the seed and the row's ``candidate``.
+    """
+
+    turns: int = Field(default=5, ge=0, le=1000, description="Directions of gravity, one after the other.")
+    turning: float = Field(default=1.0, gt=0, description="All of them together [s].")
+    seed: Seed = 0
 
 
 class Protocol(Physics):
@@ -159,9 +175,7 @@ class Protocol(Physics):
     draws: Draws | None = Field(
         default=None, description="All is done once for each of them, and a grasp holds if it holds in all."
     )
-    lift: Lift | None = Field(
-        default=None, description="The object is lifted off a table and shaken in place of the pulls."
-    )
+    lift: Lift | FreeLift | None = Field(default=None, description="The object is lifted in place of the pulls.")
 
     @model_validator(mode="after")
     def _drawable(self) -> Self:
@@ -169,7 +183,14 @@ class Protocol(Physics):
             raise ValueError("draws are of mass and stiffness: kind must be force, and stiffness_range none")
         if self.lift and (self.draws or self.start != "pregrasp" or self.success != "stays"):
             raise ValueError("lift has no draws, starts at pregrasp, and its success is stays")
+        if isinstance(self.lift, FreeLift) and self.lift.turning > self.hold:
+            raise ValueError("lift.turning is part of hold")
         return self
+
+    @property
+    def table(self) -> Lift | None:
+        """The lift, if it is off a table."""
+        return self.lift if isinstance(self.lift, Lift) else None
 
     def by(self, engine: EngineName) -> "Protocol":
         """The same in a simulator; its columns are named physics/ENGINE_NAME_... unless that is MuJoCo."""
@@ -216,6 +237,7 @@ def _protocols() -> dict[str, Protocol]:
         Protocol(name="seq6_mu06", friction=FRICTION, **gravity, **sequence),
         Protocol(name="fc_random", draws=Draws()),
         Protocol(name="lift", lift=Lift(), force=0.981, rest=0.2),
+        Protocol(name="dipgrasp", lift=FreeLift(height=0.2), force=0.981, rest=0.2, hold=3.0, most_rotation=180.0),
     )
     return {protocol.name: protocol for protocol in made}
 
@@ -223,7 +245,7 @@ def _protocols() -> dict[str, Protocol]:
 PROTOCOLS: dict[str, Protocol] = _protocols()
 """The named protocols: ``fc`` is DexGraspBench's, ``gravity6`` and ``gravity6_mu1`` ask for more; ``seq6`` is the one
 that sequences of objects were published with, ``seq6_mu06`` the same on smoother objects; ``fc_random`` is ``fc`` with
-random numbers, several times; ``lift`` takes the 0.1 kg of ``fc`` off a table."""
+random numbers, several times; ``lift`` takes the 0.1 kg of ``fc`` off a table; ``dipgrasp`` is that paper's lift."""
 
 
 def find_protocol(name: str) -> Protocol:

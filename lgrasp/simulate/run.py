@@ -13,7 +13,7 @@ import numpy as np
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
-from lgrasp.simulate.lift import check_on_table
+from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.physx_world import SOLVER, import_physx
 from lgrasp.simulate.protocol import PROTOCOLS, Protocol
@@ -119,7 +119,7 @@ def verdicts(
     """
     _check_device(device, protocol)
     if protocol.lift:
-        check_on_table(scene, rows)
+        check_liftable(protocol, scene, rows)
     slots = np.full(np.shape(rows.object_index), -1)
     found: dict[int, Verdict] = {}
     options = {"all_directions": all_directions, "settled_stop": settled_stop}
@@ -164,7 +164,7 @@ def check_installed(device: str, protocol: Protocol) -> None:
 def _check_device(device: str, protocol: Protocol) -> None:
     if (protocol.draws or protocol.lift) and not on_cpu(device, protocol):
         others = ", ".join(other.name for other in PROTOCOLS.values() if not (other.draws or other.lift))
-        why = "has random draws, which run" if protocol.draws else "moves a table, which runs"
+        why = "has random draws, which run" if protocol.draws else "lifts the object, which runs"
         raise PhysicsError(
             f"protocol {protocol.name} {why} on the CPU alone: give --device cpu, or one of the protocols {others}"
         )

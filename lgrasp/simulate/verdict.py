@@ -266,7 +266,16 @@ LIFT_COLUMNS: dict[str, str] = {
     "settled": "bool [N]: the object at rest when the hand begins to rise (below 1 cm/s and 0.1 rad/s)",
     "diverged": COLUMNS["diverged"],
 }
-"""What is written by protocols with a lift in place of all of these."""
+"""What is written by protocols that lift off a table in place of all of these."""
+
+FREE_LIFT_COLUMNS: dict[str, str] = LIFT_COLUMNS | {
+    "holds": "bool [N]: the object stayed in the hand",
+    "displacement": "float32 [N]: farthest that its centre of mass got from its start, seen from the hand [m]; NaN: "
+    "not run or diverged",
+    "rotation": "float32 [N]: farthest that it turned from its start, likewise [rad]; NaN as above",
+}
+del FREE_LIFT_COLUMNS["pushed"], FREE_LIFT_COLUMNS["on_table"]
+"""The same without a table."""
 
 
 def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.ndarray) -> dict[str, np.ndarray]:
@@ -278,7 +287,7 @@ def stack_verdicts(protocol: Protocol, verdicts: Sequence[Verdict], slots: np.nd
     several = slots.shape[1] > 1 or protocol.success == "touches"
     columns = COLUMNS | (OBJECT_COLUMNS if several else {}) | (DRAWN_COLUMNS if protocol.draws else {})
     if protocol.lift:
-        columns = LIFT_COLUMNS
+        columns = LIFT_COLUMNS if protocol.table else FREE_LIFT_COLUMNS
     out = {}
     for column, text in columns.items():
         values = [getattr(verdict, column) for verdict in verdicts]

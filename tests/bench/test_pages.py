@@ -36,11 +36,11 @@ def test_paper_stands_beside_one_hand_a_start(refined):
     page = refine_page(refined)
     plan, energy, clouds = page.tables
     assert plan.rows == [
-        ("barrett", "ours, one hand", "0.100", "50.0%", "0.05", "83.3%"),
-        ("barrett", "paper", "0.201", "67.7%", "0.03", "-"),
-        ("barrett", "ours, best of 30", "0.100", "75.0%", "0.5", "83.3%"),
-        ("allegro", "ours, one hand", "0.100", "50.0%", "0.05", "83.3%"),
-        ("allegro", "ours, best of 30", "0.100", "75.0%", "0.5", "83.3%"),
+        ("barrett", "ours, one hand", "0.100", "50.0%", "0.05", "83.3%", "60.0%"),
+        ("barrett", "paper", "0.201", "67.7%", "0.03", "-", "-"),
+        ("barrett", "ours, best of 30", "0.100", "75.0%", "0.5", "83.3%", "90.0%"),
+        ("allegro", "ours, one hand", "0.100", "50.0%", "0.05", "83.3%", "60.0%"),
+        ("allegro", "ours, best of 30", "0.100", "75.0%", "0.5", "83.3%", "90.0%"),
     ]
     assert [row[1] for row in clouds.rows if row[0] == "barrett"] == ["ours, one hand", "paper", "ours, best of 30"]
     assert clouds.columns == ("hand", "whose", "0 mm", "2 mm", "5 mm", "10 mm", "kept", "s each")

@@ -19,6 +19,7 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.listing import Renewing
 from lgrasp.jobs import kept_verdicts, simulate
 from lgrasp.simulate.protocol import find_protocol
+from lgrasp.simulate.verdict import FREE_LIFT_COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -286,6 +287,24 @@ def test_what_a_shard_holds_besides_is_copied(cli, grasps, tmp_path):
     with h5py.File(tmp_path / "out" / path.name) as file:
         assert file["notes"].attrs["by"] == "someone"
     assert validate_shard(tmp_path / "out" / path.name) == []
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "physx"])
+def test_dipgrasp_needs_no_table(cli, grasps, tmp_path, engine):
+    """The columns of what is lifted without a table are read and reported, the second time from what is there."""
+    if engine == "physx":
+        pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
+    name, path = find_protocol("dipgrasp").by(engine).name, sorted(grasps.glob("*.h5"))[0]
+    for _ in range(2):
+        run = ("simulate", path, "-p", "dipgrasp", "--engine", engine, "--verbose", "--json", tmp_path / "report.json")
+        result = cli(*run)
+        assert result.code == 0, result
+        assert result.out.splitlines()[1].split()[:4] == ["jaws", "cube", "1", "100.0%"]
+    (entry,) = json.loads((tmp_path / "report.json").read_text())["results"]
+    assert (entry["held"], entry["on_table"], entry["pushed"], entry["directions_held"]) == (1, None, None, None)
+    assert not validate_shard(path)
+    assert set(read_shard(path).grasps.physics) == {f"{name}_{column}" for column in FREE_LIFT_COLUMNS}
+    assert cli("dataset", "report", path, "--out", tmp_path / "page.html").code == 0
 
 
 def test_lift_needs_a_table(cli, grasps, tmp_path):

@@ -1,4 +1,4 @@
-"""Protocol lift: a cube on a table is taken up by two jaws, or is not, for the reason that statics names."""
+"""Protocols lift and dipgrasp: a cube is taken up by two jaws, or is not, for the reason that statics names."""
 
 import json
 from dataclasses import replace
@@ -6,28 +6,40 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.jaws import EDGE, Jaws
+from support.twins import twin_rows, twin_shard
 
-from lgrasp.errors import PhysicsError
+from lgrasp.config import parse_model
+from lgrasp.errors import ConfigError, PhysicsError
 from lgrasp.simulate.lift import course_of
-from lgrasp.simulate.protocol import PROTOCOLS, Lift, Protocol
+from lgrasp.simulate.protocol import PROTOCOLS, FreeLift, Lift, Protocol
 from lgrasp.simulate.run import protocol_text, verdicts
 from lgrasp.simulate.scene import scene_of
-from lgrasp.simulate.verdict import LIFT_COLUMNS
+from lgrasp.simulate.verdict import FREE_LIFT_COLUMNS, LIFT_COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
-LIFT = PROTOCOLS["lift"]
+LIFT, FREE = PROTOCOLS["lift"], PROTOCOLS["dipgrasp"]
 SLIDING = LIFT.stiffness / LIFT.lever**2  # [N/m] of a jaw
 ABOVE = 0.078  # of the cube over the hand's base [m]: the jaws' tips end 3 mm above the table
 DOWN, UP = np.array([0, 0, 1.0]), np.array([0, 0, -1.0])  # the jaws point along +z of the hand, to the table
 
 
 @pytest.fixture(params=["mujoco", "physx"])
-def lift(request):
-    """The protocol in each simulator."""
+def engine(request):
+    """Each simulator."""
     if request.param == "physx":
         pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
-    return LIFT.by(request.param)
+    return request.param
+
+
+@pytest.fixture
+def lift(engine):
+    return LIFT.by(engine)
+
+
+@pytest.fixture
+def free(engine):
+    return FREE.by(engine)
 
 
 def standing(jaws: Jaws, press: float, *, approach: np.ndarray = DOWN, count: int = 1):
@@ -41,9 +53,18 @@ def standing(jaws: Jaws, press: float, *, approach: np.ndarray = DOWN, count: in
     return replace(shard, objects=[cube], grasps=replace(shard.grasps, object_pose=pose, table=table))
 
 
+def below(jaws: Jaws, press: float, count: int = 1):
+    """The jaws around a cube whose +z is away from where they point: they take it up from above."""
+    shard = jaws.shard(press / SLIDING, count=count)
+    pose = shard.grasps.object_pose.copy()
+    pose[..., 3:] = [0, 1, 0, 0]
+    return replace(shard, grasps=replace(shard.grasps, object_pose=pose))
+
+
 def judge(shard, protocol, rows=None, **more):
     found = verdicts(scene_of(shard.hand, shard.objects), rows or shard.grasps, protocol, **more)
-    assert set(found) == {f"{protocol.name}_{name}" for name in LIFT_COLUMNS}
+    columns = LIFT_COLUMNS if protocol.table else FREE_LIFT_COLUMNS
+    assert set(found) == {f"{protocol.name}_{name}" for name in columns}
     return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
 
 
@@ -139,5 +160,85 @@ def test_bad_input(jaws: Jaws):
     bad = replace(shard.grasps, table=shard.grasps.table | {"pose": np.full(1, 2, "i4")})
     with pytest.raises(PhysicsError, match="names a plane that the object does not have"):
         judge(shard, LIFT, rows=bad)
-    with pytest.raises(PhysicsError, match="lift moves a table, which runs on the CPU alone: give --device cpu"):
+    with pytest.raises(PhysicsError, match="lift lifts the object, which runs on the CPU alone: give --device cpu"):
         judge(shard, LIFT, device="cuda:0")
+
+
+@pytest.mark.parametrize(("over", "holds"), [(0.8, False), (1.4, True)])
+def test_free_cube_needs_jaws_that_bear_its_weight_whatever_way_it_pulls(jaws: Jaws, free, over: float, holds: bool):
+    """Two jaws bear 2 mu F against 0.98 N, and against 12 % more while they rise."""
+    press = over * FREE.force / (2.0 * FREE.friction)
+    found = judge(below(jaws, press, count=3), free)
+    assert (found["holds"] == holds).all()
+    assert found["settled"].all()
+    assert not found["diverged"].any()
+
+
+def test_free_cube_falls_out_of_a_hand_that_does_not_grip(jaws: Jaws, free):
+    """Open jaws, smooth jaws, and jaws that close beside the cube."""
+    good = below(jaws, 4.0)
+    assert judge(good, free)["holds"] == [True]
+    opened = good.grasps.q_pregrasp
+    beside = good.grasps.object_pose.copy()
+    beside[..., 1] += 0.05
+    for rows in (Jaws.rows(good, q=opened, q_squeeze=opened), Jaws.rows(good, object_pose=beside)):
+        found = judge(good, free, rows=rows)
+        assert found["holds"] == [False]
+        assert found["displacement"] > FREE.most_displacement
+    assert judge(good, free.model_copy(update={"friction": 0.05}))["holds"] == [False]
+
+
+def test_hand_that_only_carries_holds_until_gravity_turns(jaws: Jaws, free):
+    """A cube that lies on the hand between open jaws."""
+    shard = jaws.shard()
+    pose = shard.grasps.object_pose.copy()
+    pose[..., 2] = 0.03 + EDGE / 2
+    opened = shard.grasps.q_pregrasp
+    carried = Jaws.rows(shard, q=opened, q_squeeze=opened, object_pose=pose)
+    assert judge(shard, free.model_copy(update={"lift": FreeLift(turns=0)}), rows=carried)["holds"] == [True]
+    assert judge(shard, free, rows=carried)["holds"] == [False]
+
+
+def test_where_gravity_points():
+    """Nowhere until the hand rises by 20 cm, then down; in the middle second of three in five random directions."""
+    up, stops = np.array([0, 0.6, 0.8]), [np.zeros(1), np.ones(1), np.full(1, 3.0)]
+    course, other = (course_of(FREE, stops, up, candidate=k) for k in (7, 8))
+    second = round(1 / FREE.timestep)
+    assert len(course.down) == len(course.targets) == len(course.way) - 1 == course.rises + 4 * second
+    assert course.closes == 0
+    assert not course.down[: course.rises].any()
+    np.testing.assert_allclose(course.way[[0, course.rises, -1]], [0 * up, 0 * up, 0.2 * up])
+    lifted = course.rises + second
+    for upright in (course.down[course.rises : lifted + second], course.down[lifted + 2 * second :]):
+        np.testing.assert_array_equal(upright, np.tile(-up, (len(upright), 1)))
+    turned = course.down[lifted + second : lifted + 2 * second]
+    ways = np.unique(turned, axis=0)
+    assert len(ways) == 5
+    np.testing.assert_allclose(np.linalg.norm(ways, axis=1), 1.0)
+    assert all((turned == way).all(1).sum() == second // 5 for way in ways)
+    np.testing.assert_array_equal(course_of(FREE, stops, up, candidate=7).down, course.down)
+    assert (other.down != course.down).any()
+
+
+def test_free_rows_stand_alone_and_their_text_says_all(jaws: Jaws, free):
+    shard = below(jaws, 1.0, count=3)
+    depth = np.array([[0.3], [4.0], [1.2]], "f4") / np.float32(SLIDING)
+    rows = Jaws.rows(shard, q_squeeze=shard.grasps.q - depth)
+    one, two = (judge(shard, free, rows=rows, threads=n) for n in (1, 2))
+    assert one["holds"].tolist() == [False, True, True]
+    single = judge(shard, free, rows=replace(rows, **{name: values[-1:] for name, values in rows.columns().items()}))
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, two[name], err_msg=name)
+        np.testing.assert_array_equal(values[-1:], single[name], err_msg=name)
+    text = json.loads(protocol_text(scene_of(shard.hand, shard.objects), free))
+    assert text["lift"] == {"rising": 1, "height": 0.2, "turns": 5, "turning": 1, "seed": 0}
+    assert Protocol.model_validate({name: text[name] for name in Protocol.model_fields}) == free
+
+
+def test_free_lift_refuses_several_objects_a_gpu_and_more_turning_than_hold(jaws: Jaws):
+    with pytest.raises(PhysicsError, match="protocol dipgrasp cannot simulate these grasps: they have several objects"):
+        judge(twin_shard(twin_rows()), FREE)
+    with pytest.raises(PhysicsError, match="dipgrasp lifts the object, which runs on the CPU alone: give --device cpu"):
+        judge(jaws.shard(), FREE, device="cuda:0")
+    with pytest.raises(ConfigError, match=r"lift.turning is part of hold"):
+        parse_model(Protocol, FREE.model_dump() | {"hold": 0.5}, "protocol")

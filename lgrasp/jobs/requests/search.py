@@ -16,6 +16,7 @@ from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.object.find import find_object
 from lgrasp.sequence.size import parse_size
+from lgrasp.simulate.protocol import PROTOCOLS
 
 
 class SearchRequest(Request):
@@ -98,6 +99,9 @@ class SequenceRequest(SearchRequest):
             raise ConfigError(
                 f"a sequence needs at least two objects, got {named}; for one object: lgrasp generate --object MESH"
             )
+        if self.simulate and PROTOCOLS[self.simulate].lift:
+            several = ", ".join(name for name, protocol in PROTOCOLS.items() if not protocol.lift)
+            raise ConfigError(f"protocol {self.simulate} lifts one object alone; of several choose {several}")
         parse_size(self.scale)
         for name in self.objects:
             find_object(name)
