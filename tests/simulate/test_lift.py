@@ -113,7 +113,7 @@ def test_rows_stand_alone(jaws: Jaws, lift):
     shard = standing(jaws, 1.0, count=3)
     depth = np.array([[0.3], [4.0], [2.0]], "f4") / np.float32(SLIDING)
     approach = np.array([[0, 0, 1], [0, 0, 1], [0, 0.6, 0.8]], "f4")
-    table = shard.grasps.table | {"approach": approach}
+    table = dict(shard.grasps.table) | {"approach": approach}
     rows = replace(shard.grasps, q_squeeze=shard.grasps.q - depth, table=table)
     one, two = (judge(shard, lift, rows=rows, threads=n) for n in (1, 2))
     assert one["holds"].tolist() == [False, True, True]
@@ -133,7 +133,8 @@ def test_where_the_hand_is():
     np.testing.assert_allclose(course.way[0], -0.15 * approach)
     assert course.rises - course.closes == pytest.approx(seconds / dt, abs=2)
     np.testing.assert_allclose(course.way[course.closes : course.rises + 1], 0.0, atol=1e-12)
-    risen = course.rises + round(LIFT.lift.rising / dt)
+    assert LIFT.table
+    risen = course.rises + round(LIFT.table.rising / dt)
     np.testing.assert_allclose(course.way[risen], 0.15 * up)
     push = np.diff(course.way[risen - 1 :], 2, axis=0) / dt**2
     assert np.linalg.norm(push[2:], axis=1).max() == pytest.approx(2.0, rel=1e-3)
@@ -157,7 +158,7 @@ def test_bad_input(jaws: Jaws):
     with pytest.raises(PhysicsError, match="do not say how the object lies on a table; lgrasp generate --table makes"):
         judge(jaws.shard(), LIFT)
     shard = standing(jaws, 1.0)
-    bad = replace(shard.grasps, table=shard.grasps.table | {"pose": np.full(1, 2, "i4")})
+    bad = replace(shard.grasps, table=dict(shard.grasps.table) | {"pose": np.full(1, 2, "i4")})
     with pytest.raises(PhysicsError, match="names a plane that the object does not have"):
         judge(shard, LIFT, rows=bad)
     with pytest.raises(PhysicsError, match="lift lifts the object, which runs on the CPU alone: give --device cpu"):
