@@ -20,5 +20,5 @@ VERDICTS: dict[str, tuple[ProtocolName, EngineName]] = {
 """How the verdicts of a protocol by a simulator are named."""
 FormatName = Literal["dexgraspnet", "dexgraspbench", "isaac-grasp", "mjcf"]
 """Formats of other programs (:mod:`lgrasp.dataset.exports.formats`)."""
-MetricName = Literal["volume", "epsilon_exact"]
-"""Metrics that can be added to shards (:mod:`lgrasp.dataset.metrics`)."""
+MetricName = Literal["volume", "epsilon_exact", "hold"]
+"""Metrics that can be added to shards (:mod:`lgrasp.dataset.metrics`); ``hold``: those of the hold test."""

@@ -93,12 +93,12 @@ def metrics(
         list[str] | None,
         Option(
             "--set",
-            metavar="bounds.KEY=VALUE",
-            help="Measure with another value than that of the rows, such as bounds.friction=0.8.",
+            metavar="PART.KEY=VALUE",
+            help="Measure with another value, such as bounds.friction=0.8 or hold.draws=16.",
         ),
     ] = None,
 ) -> None:
-    """Copy shards and add quality metrics to the copies; existing copies are kept.
+    """Copy shards and add quality metrics to the copies; existing copies are kept. hold tries how grasps hold.
 
     Subfolders are searched and recreated in --out. docs/reference/metrics.md defines the metrics.
 

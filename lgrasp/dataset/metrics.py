@@ -12,11 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.config import apply_settings
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.errors import OutputError, ShardError
-from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 from lgrasp.object.mass import mass_properties
@@ -31,13 +29,13 @@ _Map = Callable[..., Iterable[np.ndarray]]
 
 
 def measure_shard(
-    path: Path, settings: Sequence[str], each: _Map, step: int, report: Callable[[int], None]
+    path: Path, friction: float, each: _Map, step: int, report: Callable[[int], None]
 ) -> dict[str, np.ndarray]:
     """All metrics of a shard by name, each shape [N]; ``step`` rows at a time, ``report`` is called with rows done.
 
     Args:
         path: The shard.
-        settings: ``bounds.KEY=VALUE`` each, in place of what the rows passed.
+        friction: Coefficient of friction.
         each: As of :func:`row_metrics`.
 
     Raises:
@@ -47,12 +45,9 @@ def measure_shard(
         raise ShardError(f"{path}: {problem}")
     with ShardReader(path) as reader:
         frames = [mass_frame(record) for record in reader.objects()]
-        bounds = stored_bounds(reader.header.config)
-        bounds = apply_settings({"bounds": bounds}, settings, "dataset metrics")["bounds"]
-        assert isinstance(bounds, GraspBounds)
         table = np.zeros((len(reader), len(METRICS)), np.float32)
         for start in range(0, len(reader), step):
-            table[start : start + step] = row_metrics(reader.rows(start, start + step), frames, bounds.friction, each)
+            table[start : start + step] = row_metrics(reader.rows(start, start + step), frames, friction, each)
             report(min(start + step, len(reader)))
     return dict(zip(METRICS, table.T, strict=True))
 

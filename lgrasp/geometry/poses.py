@@ -164,6 +164,15 @@ def user_poses(pose: np.ndarray, center: np.ndarray) -> np.ndarray:
     return out
 
 
+def internal_poses(stored: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Inverse of :func:`user_poses`: device poses of the object's internal frame, shape [n, 7], float32."""
+    from scipy.spatial.transform import Rotation
+
+    pose = np.asarray(stored, float)
+    turned = Rotation.from_quat(pose[:, 3:], scalar_first=True)
+    return device_pose(pose[:, :3] + turned.apply(center), turned).astype(np.float32)
+
+
 def shortest_rotation(z: np.ndarray) -> "Rotation":
     """The shortest rotations that turn the third axis to unit vectors, shape [n, 3]."""
     from scipy.spatial.transform import Rotation

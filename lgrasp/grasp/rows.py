@@ -21,7 +21,8 @@ METRIC_UNITS = {
 
 POSTURES = ("q", "q_pregrasp", "q_squeeze")
 CONTACTS = ("contact_points", "contact_normals", "contact_links", "contact_forces")
-_SHARD_BITS = np.uint64(40)
+SHARD_BITS = 40
+"""Bits of the column ``candidate`` below the number of the shard."""
 _MIN_FORCE_SHARE = 1e-3  # of the normal forces together, which are 1
 
 
@@ -93,7 +94,7 @@ def used_width(links: np.ndarray) -> int:
 
 def row_numbers(shard: int, index: np.ndarray) -> np.ndarray:
     """Global candidate index: the shard and the candidate in its stream."""
-    return (np.uint64(shard) << _SHARD_BITS) + index.astype(np.uint64)
+    return (np.uint64(shard) << np.uint64(SHARD_BITS)) + index.astype(np.uint64)
 
 
 def press(table: GraspTable) -> GraspTable:

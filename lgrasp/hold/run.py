@@ -1,6 +1,5 @@
 """The hold test of many grasps of one object on a device."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,7 +63,6 @@ class HoldTester:
         seed: int,
         *,
         least: float = 0.0,
-        progress: Callable[[int], None] | None = None,
     ) -> dict[str, np.ndarray]:
         """The metrics of some grasps, each (N,) float32.
 
@@ -76,12 +74,11 @@ class HoldTester:
             seed: of the draws, which depend on it and the row's ``number`` alone.
             least: grasps that cannot reach this probability any more are not tried on: theirs counts the draws that
                 were not tried as lost, and those lost in the first trial are not drawn at all.
-            progress: called with the trials done.
         """
         n, draws = len(postures), self._test.draws
         grasps = self._put(postures)
         held, drift = self._try(grasps, np.arange(n), _nominal(), np.full(n, seed))
-        done, hits = n, np.zeros(n)
+        hits = np.zeros(n)
         active = np.flatnonzero(held) if least > 0.0 else np.arange(n)
         # a GPU is fast if it has much to do at once
         together = 1 if self._device == "cpu" else max(draws, 1)
@@ -90,9 +87,6 @@ class HoldTester:
             rows = np.repeat(active, together)
             found = self._try(grasps, rows, _spread(self._test), np.tile(streams, len(active)))[0]
             hits[active] += found.reshape(-1, together).sum(1)
-            done += len(rows)
-            if progress:
-                progress(done)
             active = active[hits[active] + draws - first - together >= least * draws - 1e-6]
         probability = hits / draws if draws else held.astype(float)
         return {

@@ -1,49 +1,84 @@
-"""Copies of shards with more quality metrics."""
+"""Copies of shards with more metrics."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import PrivateAttr
 
 from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.metrics import METRICS, TASK_ROWS, is_extended, measure_shard, process_map
+from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
+from lgrasp.errors import ShardError
+from lgrasp.grasp.bounds import stored_bounds
+from lgrasp.grasp.rows import METRIC_UNITS
+from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.requests.shards import MetricsRequest
+from lgrasp.jobs.shard_inputs import hand_of_shard, object_of_shard
+from lgrasp.object.arrays import upload_object
 from lgrasp.runtime.cores import threads
+
+HOLD = "hold"
 
 
 class MetricsJob(MetricsRequest, ShardJob):
-    """Metrics that are computed from the shards alone, added to copies of them."""
+    """More metrics of the rows of shards, added to copies of them."""
 
     command: ClassVar[str] = "dataset metrics"
+    kernels: ClassVar[tuple[str, ...]] = ("lgrasp.hold.",)
 
     _open: ExitStack = PrivateAttr(default_factory=ExitStack)
     _each: Any = PrivateAttr(None)
+    _models: dict[str, HandArrays] = PrivateAttr(default_factory=dict)  # by hash
 
     def key(self) -> str:
         return content_key("metrics", 1, names=list(self.add), settings=list(self.settings))
 
+    def check_source(self, reader: ShardReader) -> None:
+        if HOLD not in self.add:
+            return
+        names = reader.object_ids
+        if len(names) != 1 or reader.columns["object_index"][0][1] != 1:
+            raise ShardError(f"{reader.path}: rows of several objects cannot be tried; one object a shard is accepted")
+        if not len(reader.object(names[0]).faces):
+            raise ShardError(f"{reader.path}: object '{names[0]}' is a point cloud; the hold test needs a mesh")
+
     def present(self, parts: Sequence[Part]) -> dict[int, int]:
-        """A copy tells by its rows and metrics whether it may stay; other bounds are not seen in it."""
+        """A copy tells by its rows and metrics whether it may stay; other numbers are not seen in it."""
         if self.settings:
             return {}
-        return {p.number: p.rows for p in parts if p.source and is_extended(p.file, p.source, self.add)}
+        return {p.number: p.rows for p in parts if p.source and is_extended(p.file, p.source, self._names())}
+
+    def load(self, events: Events, missing: bool) -> None:
+        if HOLD in self.add:
+            import lgrasp.hold.stored  # noqa: F401  now, so that its kernels are compiled before the clock starts
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
-        workers = threads(self.workers)
-        if self._each is None:
-            self._each = self._open.enter_context(process_map(workers))
-        columns = measure_shard(part.source, self.settings, self._each, 4 * workers * TASK_ROWS, progress)
-        return Made(part.rows, {name: columns[name] for name in self.add})
+        with ShardReader(part.source) as reader:
+            friction = self.numbers(stored_bounds(reader.header.config))[0].friction
+        workers, others = threads(self.workers), [name for name in self.add if name != HOLD]
+        kinds, columns = (HOLD in self.add) + bool(others), {}
+        if others:
+            if self._each is None:
+                self._each = self._open.enter_context(process_map(workers))
+            found = measure_shard(
+                part.source, friction, self._each, 4 * workers * TASK_ROWS, lambda done: progress(done // kinds)
+            )
+            columns |= {name: found[name] for name in others}
+        if HOLD in self.add:
+            first = part.rows * (kinds - 1)
+            columns |= self._tried(part, workers, lambda done: progress((first + done) // kinds))
+        return Made(part.rows, columns)
 
     def write(self, part: Part, contents: Any) -> None:
         assert part.source is not None
-        extend_shard(part.source, part.file, contents, METRICS)
+        extend_shard(part.source, part.file, contents, METRIC_UNITS | METRICS)
 
     def close(self) -> None:
         self._open.close()
@@ -54,5 +89,34 @@ class MetricsJob(MetricsRequest, ShardJob):
         return {
             "rows": outcome.made,
             "rows_per_s": outcome.made / seconds if seconds else 0.0,
-            "metrics": list(self.add),
+            "metrics": self._names(),
         }
+
+    def _names(self) -> list[str]:
+        """All metrics that are added."""
+        if HOLD not in self.add:
+            return list(self.add)
+        from lgrasp.hold.run import METRICS as TRIED  # slow to load
+
+        return [name for asked in self.add for name in (TRIED if asked == HOLD else (asked,))]
+
+    def _tried(self, part: Part, workers: int, progress: Callable[[int], None]) -> dict[str, np.ndarray]:
+        """Metrics of the hold test."""
+        from lgrasp.hold.stored import try_rows
+
+        assert part.source is not None
+        shard, device = read_shard(part.source), self.device_used
+        if shard.hand.sha256 not in self._models:
+            model = hand_of_shard(self.cache, shard.hand, shard.header.config, device)[1]
+            self._models[shard.hand.sha256] = upload_hand(model, device.alias)
+        obj = upload_object(object_of_shard(self.cache, shard.objects[0], device), device.alias)
+        test = self.numbers(stored_bounds(shard.header.config))[1]
+        return try_rows(
+            self._models[shard.hand.sha256],
+            obj,
+            test,
+            shard.grasps,
+            shard.header.seed,
+            workers=workers,
+            progress=progress,
+        )

@@ -172,7 +172,7 @@ def test_what_cannot_be_done(tmp_path, make_shard):
     write_shard(tmp_path / "a" / "0.h5", make_shard(4))
     write_shard(tmp_path / "b" / "0.h5", make_shard(4, seed=1))
     out = tmp_path / "out"
-    with pytest.raises(ValueError, match="should be 'volume' or 'epsilon_exact'"):
+    with pytest.raises(ValueError, match="should be 'volume', 'epsilon_exact' or 'hold'"):
         add_metrics(tmp_path / "a", out, ["volum"])
     with pytest.raises(OutputError, match="is the folder of the shards"):
         add_metrics(tmp_path / "a" / "0.h5", tmp_path / "a", ["volume"])

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
+from lgrasp.geometry.poses import internal_poses
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.find_contacts import find_contacts
@@ -187,12 +187,10 @@ def _outside(rows: GraspRows, hand: HandArrays) -> np.ndarray:
 def _hands(rows: GraspRows, part: slice, hand: HandArrays, obj: ObjectModel) -> tuple[np.ndarray, np.ndarray]:
     """T_hand_object of the object's internal frame (n, 7), and joints within their limits (n, K); row by row, so that
     none depends on the others."""
-    pose = np.asarray(rows.object_pose, float)[part, 0]
-    turned = Rotation.from_quat(pose[:, 3:], scalar_first=True)
     tree = hand.model.tree
     q = np.clip(np.asarray(rows.q)[part, : hand.model.dofs], tree.joint_lower, tree.joint_upper)
-    made = np.concatenate([pose[:, :3] + turned.apply(obj.center), turned.as_quat()], 1)
-    return made.astype(np.float32), np.ascontiguousarray(q, np.float32)
+    pose = internal_poses(np.asarray(rows.object_pose)[part, 0], obj.center)
+    return pose, np.ascontiguousarray(q, np.float32)
 
 
 def _distance(pose: Pose, refiner: Refiner) -> np.ndarray:

@@ -15,6 +15,7 @@ from lgrasp.errors import ConfigError, OutputError, ShardError
 from lgrasp.files import check_folder
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.names import hand_path
+from lgrasp.hold.params import HoldTest
 from lgrasp.learn.params import LearnParams
 from lgrasp.refine.params import COARSE, LocalSearch
 from lgrasp.simulate.protocol import Protocol, find_protocol
@@ -61,22 +62,32 @@ class SimulateRequest(ShardRequest):
 
 
 class MetricsRequest(ShardRequest):
-    """Metrics that are computed from the shards alone, added to copies of them."""
+    """More metrics of the rows of shards, added to copies of them."""
 
     maker: ClassVar[str] = "lgrasp.jobs.metrics:MetricsJob"
     unit: ClassVar[str] = "rows"
 
-    add: tuple[MetricName, ...] = Field(min_length=1, description="Metrics: volume, epsilon_exact.")
+    add: tuple[MetricName, ...] = Field(min_length=1, description="Metrics: volume, epsilon_exact, hold (three).")
     settings: tuple[str, ...] = Field(
-        default=(), description="bounds.KEY=VALUE each, in place of what the rows passed."
+        default=(),
+        description="PART.KEY=VALUE each: bounds, in place of what the rows passed, or hold, in place of its defaults.",
     )
 
     def check(self) -> None:
-        apply_settings({"bounds": GraspBounds()}, self.settings, "dataset metrics")
+        self.numbers(GraspBounds())
         for folder in (path if path.is_dir() else path.parent for path in self.shards):
             if folder.resolve() == self.folder.resolve():
                 raise OutputError(f"--out {self.out} is the folder of the shards themselves; choose another")
         super().check()
+
+    def numbers(self, told: GraspBounds) -> tuple[GraspBounds, HoldTest]:
+        """What rows that passed ``told`` are measured with.
+
+        Raises:
+            ConfigError: a setting that cannot be.
+        """
+        made = apply_settings({"bounds": told, "hold": HoldTest()}, self.settings, "dataset metrics")
+        return cast(GraspBounds, made["bounds"]), cast(HoldTest, made["hold"])
 
 
 class RefineRequest(ShardRequest):
