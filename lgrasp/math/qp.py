@@ -268,6 +268,20 @@ def balance(
 
 
 @wp.func
+def balances(arms: vec3s, normals: vec3s, k: wp.int32, mu: wp.float32, torque_scale: wp.float32, limit: wp.float32):
+    """True if :func:`balance` with round cones is ``limit`` at most, as soon as that is known."""
+    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    p = Program()
+    p.friction = mu
+    p.torque_scale = torque_scale
+    p.total = 1.0
+    p.stop = limit
+    p.limit = limit
+    p.exact = _EXACT
+    return _least_norm(arms, normals, k, p, forces) <= limit
+
+
+@wp.func
 def unresisted(
     arms: vec3s,
     normals: vec3s,
@@ -306,14 +320,29 @@ def unresisted(
 
 
 @wp.func
-def unresisted_load(arms: vec3s, normals: vec3s, k: wp.int32, mu: wp.float32, turn: wp.quat, limit: wp.float32):
-    """The worst of six directions of :func:`unresisted`; some value above the limit when it is above."""
-    worst = float(0.0)
+def by_difficulty(normals: vec3s, k: wp.int32, mu: wp.float32, turn: wp.quat, rank: wp.int32):
+    """The direction of :func:`unresisted` that is ``rank``-th (0: first) of the six in what contacts lack along it.
+
+    What they lack is a bound from forces alone, so that loads which nothing resists come first.
+    """
+    lack = vec6()
     for direction in range(6):
-        worst = wp.max(worst, unresisted(arms, normals, k, mu, turn, direction, worst, limit))
-        if worst > limit:
-            break
-    return worst
+        e = wp.vec3(0.0)
+        e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
+        e = wp.quat_rotate(turn, e)
+        least = float(0.0)
+        for i in range(k):
+            least = wp.min(least, wp.dot(e, _best_direction(e, normals[i], mu, 0)))
+        lack[direction] = least
+    found = int(0)
+    for a in range(6):
+        before = int(0)
+        for b in range(6):
+            if lack[b] > lack[a] or (lack[b] == lack[a] and b < a):
+                before += 1
+        if before == rank:
+            found = a
+    return found
 
 
 @wp.func

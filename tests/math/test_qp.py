@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.wrench import cone_forces, is_balanced, residual, unresisted
 
-from lgrasp.math.qp import MAX_CONTACTS, balance, frictionless, unresisted_load
+from lgrasp.math import qp
+from lgrasp.math.qp import MAX_CONTACTS, balance, balances, by_difficulty, frictionless
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -84,13 +85,20 @@ def _disturbance(
     limit: wp.float32,
     worst_out: wp.array(dtype=wp.float32),
 ):
+    """The worst of six directions, those first that contacts lack most; some value above the limit if it is above."""
     i = wp.tid()
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     for c in range(arm.shape[1]):
         arms[c] = arm[i, c]
         normals[c] = normal[i, c]
-    worst_out[i] = unresisted_load(arms, normals, arm.shape[1], mu, turn[i], limit)
+    k = arm.shape[1]
+    worst = float(0.0)
+    for rank in range(6):
+        if worst <= limit:
+            direction = by_difficulty(normals, k, mu, turn[i], rank)
+            worst = wp.max(worst, qp.unresisted(arms, normals, k, mu, turn[i], direction, worst, limit))
+    worst_out[i] = worst
 
 
 def unheld(device, arms, normals, turn, mu=0.5, limit=1.0) -> np.ndarray:
@@ -100,6 +108,27 @@ def unheld(device, arms, normals, turn, mu=0.5, limit=1.0) -> np.ndarray:
     worst = wp.empty(len(arms), dtype=wp.float32, device=device)
     wp.launch(_disturbance, len(arms), [*inputs, mu, limit], [worst], device=device)
     return worst.numpy()
+
+
+@wp.kernel
+def _decide(
+    arm: wp.array2d(dtype=wp.vec3),
+    normal: wp.array2d(dtype=wp.vec3),
+    mu: wp.float32,
+    limit: wp.float32,
+    balances_out: wp.array(dtype=wp.bool),
+    order_out: wp.array2d(dtype=wp.int32),
+):
+    """Whether friction balances each problem, and the order of its directions, (n, 6)."""
+    i = wp.tid()
+    arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    for c in range(arm.shape[1]):
+        arms[c] = arm[i, c]
+        normals[c] = normal[i, c]
+    balances_out[i] = balances(arms, normals, arm.shape[1], mu, SCALE, limit)
+    for rank in range(6):
+        order_out[i, rank] = by_difficulty(normals, arm.shape[1], mu, wp.quat_identity(), rank)
 
 
 def units(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -207,6 +236,23 @@ def test_stop_returns_early_and_below(device):
     assert ((early <= 0.2) == (full <= 0.2)).all()
     assert (early >= full - 1e-3).all()
     np.testing.assert_allclose((forces[:, :4] * normals).sum((1, 2)), 1.0, atol=1e-5)
+
+
+def test_decisions_are_those_of_the_whole_answer(device):
+    arms, normals = problems(300, 3, 8)
+    limit = 0.1
+    full, _ = solve(device, arms, normals, mu=0.4)
+    given = [wp.array(a, dtype=wp.vec3, device=device) for a in (arms, normals)]
+    balanced = wp.empty(300, dtype=wp.bool, device=device)
+    order = wp.empty((300, 6), dtype=wp.int32, device=device)
+    wp.launch(_decide, 300, [*given, 0.4, limit], [balanced, order], device=device)
+    clear = np.abs(full - limit) > 1e-4
+    assert 30 < balanced.numpy().sum() < 270
+    np.testing.assert_array_equal(balanced.numpy()[clear], full[clear] <= limit)
+    np.testing.assert_array_equal(np.sort(order.numpy(), 1), np.tile(np.arange(6), (300, 1)))
+    most = np.argmax(order.numpy() == 2, 1)  # +z: hardest where no normal points down
+    down = -normals[..., 2].min(1)
+    assert down[most == 0].mean() < down[most == 5].mean()
 
 
 def test_never_improved_start_keeps_the_normal(device):

@@ -10,10 +10,11 @@ from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.constants import INSCRIBED
 from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_JOINTS
-from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted_load
+from lgrasp.math.qp import MAX_CONTACTS, balances, by_difficulty, unresisted
+from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.stages.search.sets import FoundSets, SearchValues, TriedSets, Usable, centred, put_contact
+from lgrasp.stages.search.sets import FoundSets, Hits, SearchValues, TriedSets, Usable, centred, put_contact
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -43,70 +44,86 @@ def list_usable(obj: Object, state: wp.int32, candidates: Candidates, usable_out
 
 
 @wp.kernel
-def list_hits(tried: TriedSets, number_out: wp.array(dtype=wp.int32), hits_out: wp.array(dtype=wp.int32)):
-    """The starts that found a set, in any order.
-
-    Args:
-        number_out: how many, (1,), zero on entry.
-        hits_out: their flat places, (P L,).
-    """
+def list_hits(tried: TriedSets, hits_out: Hits):
+    """The starts that found a set, in any order; their number is zero on entry."""
     row, lane = wp.tid()
     if tried.score[row, lane] >= 0.0:
-        hits_out[wp.atomic_add(number_out, 0, 1)] = row * tried.score.shape[1] + lane
+        hits_out.start[wp.atomic_add(hits_out.number, 0, 1)] = row * tried.score.shape[1] + lane
+
+
+@wp.func
+def _hit(hits: Hits, tried: TriedSets, i: wp.int32):
+    """Row and lane of hit i; the row is -1 if there is no such hit or it has failed already."""
+    if i >= hits.number[0]:
+        return int(-1), int(0)
+    row = hits.start[i] // tried.score.shape[1]
+    lane = hits.start[i] - row * tried.score.shape[1]
+    if tried.score[row, lane] < 0.0:
+        row = -1
+    return row, lane
+
+
+@wp.func
+def _contacts(
+    obj: Object,
+    candidates: Candidates,
+    tried: TriedSets,
+    row: wp.int32,
+    lane: wp.int32,
+    points: vec3s,
+    normals: vec3s,
+):
+    """Number of contacts of a set, the palm's last, in ``points`` and ``normals``."""
+    n = int(0)
+    for g in range(tried.chosen.shape[2]):
+        if tried.chosen[row, lane, g] >= 0:
+            n = put_contact(obj, candidates.surface[row, g, tried.chosen[row, lane, g]], n, points, normals)
+    if candidates.poses.palm_surface[row] >= 0:
+        n = put_contact(obj, candidates.poses.palm_surface[row], n, points, normals)
+    return n
 
 
 @wp.kernel
-def check_starts(
-    number: wp.array(dtype=wp.int32),
-    hits: wp.array(dtype=wp.int32),
-    hand: Hand,
-    obj: Object,
-    params: SearchValues,
-    realised: wp.int32,
-    candidates: Candidates,
-    tried_out: TriedSets,
-):
-    """Scores of hits go below 0 when friction does not balance them or lets go of the object, or when fingers meet.
-
-    Args:
-        number: hits, (1,).
-        hits: flat places of the starts that found a set, (P L,).
-        realised: 1 if postures make the contacts, so that fingers can be tested against each other.
-    """
-    i = wp.tid()
-    if i >= number[0]:
+def check_balance(hits: Hits, obj: Object, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
+    """Scores of hits go below 0 when friction does not balance them."""
+    row, lane = _hit(hits, tried_out, wp.tid())
+    if row < 0:
         return
-    row = hits[i] // tried_out.score.shape[1]
-    lane = hits[i] - row * tried_out.score.shape[1]
-    G = hand.kin.groups
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    n = int(0)
-    for g in range(G + 1):
-        s = int(-1)
-        if g == G:
-            s = candidates.poses.palm_surface[row]
-        elif tried_out.chosen[row, lane, g] >= 0:
-            s = candidates.surface[row, g, tried_out.chosen[row, lane, g]]
-        if s >= 0:
-            n = put_contact(obj, s, n, points, normals)
+    n = _contacts(obj, candidates, tried_out, row, lane, points, normals)
     centred(points, n, arms)
-    limit = params.max_gswo
-    if balance(arms, normals, n, params.friction * _INSCRIBED, 0, params.torque_scale, 0.5 * limit, forces) > limit:
+    if not balances(arms, normals, n, params.friction * _INSCRIBED, params.torque_scale, params.max_gswo):
         tried_out.score[row, lane] = -1.0
+
+
+@wp.kernel
+def check_load(hits: Hits, obj: Object, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
+    """One thread per (hit, direction), the hardest first: scores go below 0 when the set lets go of the object."""
+    i, rank = wp.tid()
+    row, lane = _hit(hits, tried_out, i)
+    if row < 0:
         return
-    if params.max_unresisted_load < 1.0:
-        for c in range(n):
-            points[c] = points[c] - obj.com
-        turn = wp.quat_inverse(wp.transform_get_rotation(candidates.poses.pose[row]))
-        limit = params.max_unresisted_load
-        if unresisted_load(points, normals, n, params.friction, turn, limit) > limit:
-            tried_out.score[row, lane] = -1.0
-            return
-    if realised == 0:
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    n = _contacts(obj, candidates, tried_out, row, lane, points, normals)
+    for c in range(n):
+        points[c] = points[c] - obj.com
+    turn = wp.quat_inverse(wp.transform_get_rotation(candidates.poses.pose[row]))
+    limit = params.max_unresisted_load
+    direction = by_difficulty(normals, n, params.friction, turn, rank)
+    if unresisted(points, normals, n, params.friction, turn, direction, limit, limit) > limit:
+        tried_out.score[row, lane] = -1.0
+
+
+@wp.kernel
+def check_fingers(hits: Hits, hand: Hand, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
+    """Scores of hits go below 0 when their fingers meet."""
+    row, lane = _hit(hits, tried_out, wp.tid())
+    if row < 0:
         return
+    G = hand.kin.groups
     Xa = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     Xb = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     for g in range(G):

@@ -60,6 +60,14 @@ class TriedSets:
 
 
 @wp.struct
+class Hits:
+    """The starts that found a set."""
+
+    number: wp.array(dtype=wp.int32)  # (1,) how many
+    start: wp.array(dtype=wp.int32)  # (P L,) flat places: the first ``number``
+
+
+@wp.struct
 class FoundSets:
     """Up to S sets of each pose."""
 

@@ -13,10 +13,19 @@ from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.search.kernels import SearchCount, check_starts, keep_sets, list_hits, list_usable, take_sets
+from lgrasp.stages.search.kernels import (
+    SearchCount,
+    check_balance,
+    check_fingers,
+    check_load,
+    keep_sets,
+    list_hits,
+    list_usable,
+    take_sets,
+)
 from lgrasp.stages.search.mutate_kernels import mutate_contacts
 from lgrasp.stages.search.params import MAX_KINDS, SearchParams
-from lgrasp.stages.search.sets import FoundSets, SearchValues, TriedSets, Usable, vec_kinds
+from lgrasp.stages.search.sets import FoundSets, Hits, SearchValues, TriedSets, Usable, vec_kinds
 from lgrasp.stages.search.swap_kernels import swap_contacts
 
 VERSION = 8
@@ -58,11 +67,14 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
         wp.launch(kernel, tried.score.shape, asked, [tried], device=d)
         if swap:
             # the few that found a set, side by side
-            hits = wp.empty(tried.score.size, dtype=wp.int32, device=d)
-            number_of_hits = wp.zeros(1, dtype=wp.int32, device=d)
-            wp.launch(list_hits, tried.score.shape, [tried], [number_of_hits, hits], device=d)
-            asked = [number_of_hits, hits, hand, obj, values, int(context.realised), inputs.struct]
-            wp.launch(check_starts, tried.score.size, asked, [tried], device=d)
+            size = tried.score.size
+            hits = empty_struct(Hits, d, size, number=wp.zeros(1, dtype=wp.int32, device=d))
+            wp.launch(list_hits, tried.score.shape, [tried], [hits], device=d)
+            wp.launch(check_balance, size, [hits, obj, values, inputs.struct], [tried], device=d)
+            if values.max_unresisted_load < 1.0:
+                wp.launch(check_load, (size, 6), [hits, obj, values, inputs.struct], [tried], device=d)
+            if context.realised:
+                wp.launch(check_fingers, size, [hits, hand, values, inputs.struct], [tried], device=d)
         wp.launch(keep_sets, n, [values, inputs.struct, tried], [found], device=d)
     upto = wp.clone(found.number)
     running_sums(upto)
