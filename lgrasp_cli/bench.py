@@ -282,7 +282,7 @@ def bench_soak(
     Example: lgrasp bench soak --hours 2 --json soak.json
     """
     check_report(json_path)
-    from lgrasp.bench.soak import run_soak, soak_page
+    from lgrasp.bench.soak.report import run_soak, soak_page
     from lgrasp.engine.report import write_json
 
     chosen = [split(names) if names else () for names in (commands, signals)]

@@ -98,6 +98,13 @@ class CandidateTable(DeviceTable):
     def __len__(self) -> int:
         return len(self.poses)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """As of every table; 0 in places beyond ``count``, which are never written."""
+        out = super().arrays()
+        used = np.arange(out["surface"].shape[2]) < out["count"][..., None]  # (P, G, M)
+        same = {name: np.where(used, out[name], 0).astype(out[name].dtype) for name in ("surface", "record", "state")}
+        return out | same | {"q": np.where(used[..., None], out["q"], 0).astype(out["q"].dtype)}
+
 
 @dataclass(frozen=True)
 class ContactSets(DeviceTable):

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.geometry.poses import user_poses
-from lgrasp.grasp.tables import grasp_arrays, join_rows, select_poses, take_grasps
+from lgrasp.grasp.tables import CandidateTable, grasp_arrays, join_rows, select_poses, take_grasps
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +26,19 @@ def test_round_trip(tables, stage):
     table = tables[stage]
     arrays = {name: values.copy() for name, values in table.arrays().items()}
     assert_same(arrays, type(table).of(arrays, "cpu").arrays())
+
+
+def test_places_that_nothing_was_written_to_are_zero(tables):
+    """They hold whatever was in memory before: a cached table would have other bytes each time."""
+    table = tables["ik"]
+    width = table.surface.shape[2]
+    junk = {name: values.copy() for name, values in table.arrays().items()}
+    unused = np.arange(width) >= junk["count"][..., None]
+    assert unused.any()
+    for name in ("surface", "record", "q"):
+        junk[name][unused] = 77
+    assert_same(CandidateTable.of(junk, "cpu").arrays(), table.arrays())
+    assert not table.arrays()["surface"][unused].any()
 
 
 def test_select_poses(tables):

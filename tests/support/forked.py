@@ -41,7 +41,7 @@ class Forked:
 
 
 def start_forked(arguments: Sequence[str], folder: Path, environment: Mapping[str, str], said: Path) -> Forked:
-    """Start a command in a session of its own; see :func:`lgrasp.bench.soak.start_process`."""
+    """Start a command in a session of its own; see :func:`lgrasp.bench.soak.processes.start_process`."""
     context = get_context("forkserver")
     context.set_forkserver_preload(list(_IMPORTED))
     process = context.Process(target=_run, args=(list(arguments), folder, dict(environment), said))
