@@ -118,7 +118,21 @@ def _show_metrics(data: dict[str, Any]) -> list[Block]:
         place(data),
         following("dataset report", data["out"]),
     ]
-    return [pairs]
+    return [_set_table(data["sets"]), "", pairs] if data["sets"] else [pairs]
+
+
+def _set_table(sets: list[dict[str, Any]]) -> TextTable:
+    """What each set of grasps covers, and how different they are; docs/reference/metrics.md defines the columns."""
+    columns = ("hand", "object", "rows", "approach", "surface", "PCA 1", "PCA 5", "entropy", "std")
+    rows = []
+    for found in sets:
+        cover, spread = (next(iter(found[name].values())) for name in ("coverage", "diversity"))
+        ratio, entropy = spread["pca_ratio"], spread["joint_entropy"]
+        cells = [f"{cover[name]['share']:.1%}" for name in ("directions", "surface")]
+        cells += [f"{ratio[0]:.1%}", f"{ratio[-1]:.1%}"] if ratio else ["-", "-"]
+        cells += [f"{entropy[name]:.2f}" if entropy else "-" for name in ("mean", "std")]
+        rows.append((found["hand"], " + ".join(found["objects"]), f"{found['rows']:,}", *cells))
+    return TextTable(columns, rows, right=columns[2:])
 
 
 @app.command()
@@ -146,7 +160,9 @@ def report(
         numbers = report_dataset(paths, out, progress=lambda done, rows: bar.show("read", done, rows, "rows"))
     for line in numbers["remarks"]:
         warn(line)
-    return Answer(numbers, [] if quiet else [_report_pairs(numbers, out)])
+    sets = [{"hand": hand["hand"], **group} for hand in numbers["hands"] for group in hand["objects"]]
+    tables = [_set_table(sets), ""] if sets else []
+    return Answer(numbers, [] if quiet else [*tables, _report_pairs(numbers, out)])
 
 
 def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydantic import PrivateAttr
 from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.metrics import METRICS, TASK_ROWS, is_extended, measure_shard, process_map
 from lgrasp.dataset.reader import ShardReader, read_shard
+from lgrasp.dataset.report.write import read_dataset
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Events, Made, Part, PartProgress
 from lgrasp.engine.run import JobOutcome
@@ -84,12 +86,14 @@ class MetricsJob(MetricsRequest, ShardJob):
         self._open.close()
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
-        """``rows`` made, ``rows_per_s``, ``metrics``."""
+        """``rows`` made, ``rows_per_s``, ``metrics``; ``sets``: of all rows of a hand with an object ``coverage`` and
+        ``diversity``, as in the report of a data set."""
         seconds = outcome.seconds["parts"]
         return {
             "rows": outcome.made,
             "rows_per_s": outcome.made / seconds if seconds else 0.0,
             "metrics": self._names(),
+            "sets": _sets(outcome.paths),
         }
 
     def _names(self) -> list[str]:
@@ -120,3 +124,16 @@ class MetricsJob(MetricsRequest, ShardJob):
             workers=workers,
             progress=progress,
         )
+
+
+def _sets(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """What the rows of each hand with each object (or set of them) show together."""
+    if not paths:
+        return []
+    numbers, _ = read_dataset(list(paths), near=False)
+    same = ("objects", "rows", "coverage", "diversity")
+    return [
+        {"hand": hand["hand"], **{name: group[name] for name in same}}
+        for hand in numbers["hands"]
+        for group in hand["objects"]
+    ]

@@ -1,7 +1,7 @@
 """Reads shards once and keeps the counts and the sample that the report needs, not rows."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import reduce
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.report.coverage import Coverage
+from lgrasp.dataset.report.diversity import Spread, TouchedSurface
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.verdicts import HeldRows, Verdicts, add_held, add_verdicts
 from lgrasp.geometry.poses import pose_matrix
@@ -25,9 +26,12 @@ class NearRows:
 
     With one object every row is compared with all rows kept so far, up to two million. With several, all of which must
     be near, it is compared within the rows of one call.
+
+    Args:
+        device: None: poses are counted, and nothing is compared.
     """
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device: str | None) -> None:
         self.compared = self.duplicates = self.poses = 0
         self._device = device
         self._kept: KeptRows | None = None
@@ -38,8 +42,10 @@ class NearRows:
         if not len(pose):
             return
         self._count_poses(np.ascontiguousarray(pose.reshape(len(pose), -1)))
+        if self._device is None:
+            return
         if pose.shape[1] > 1:
-            self._compare_sets(pose, q)
+            self._compare_sets(pose, q, self._device)
             return
         self._kept = self._kept or KeptRows(q.shape[1], self._device)
         room = _MAX_ROWS - self._kept.count
@@ -52,9 +58,9 @@ class NearRows:
         """Forget the rows, keep the counts."""
         self._kept = None
 
-    def _compare_sets(self, pose: np.ndarray, q: np.ndarray) -> None:
+    def _compare_sets(self, pose: np.ndarray, q: np.ndarray, device: str) -> None:
         n = len(q)
-        near = [i * n + j for i, j in (near_pairs(pose[:, o], q, self._device).T for o in range(pose.shape[1]))]
+        near = [i * n + j for i, j in (near_pairs(pose[:, o], q, device).T for o in range(pose.shape[1]))]
         drop = np.zeros(n, bool)
         for i, j in np.stack(np.divmod(reduce(np.intersect1d, near), n), 1):  # by the earlier row, so it is decided
             drop[j] |= not drop[i]
@@ -108,16 +114,25 @@ class ObjectRows:
     """Rows by number of contacts."""
     coverage: dict[str, Coverage] = field(default_factory=dict)
     """By object."""
+    touched: dict[str, TouchedSurface] = field(default_factory=dict)
+    """By object."""
+    spread: dict[str, Spread] = field(default_factory=dict)
+    """By object."""
     verdicts: dict[str, Verdicts] = field(default_factory=dict)
     """By protocol."""
 
 
 class HandRows:
-    """All rows of one hand; near-duplicates are looked for on a device of Warp."""
+    """All rows of one hand; near-duplicates are looked for on a device of Warp, if one is named.
 
-    def __init__(self, hand: HandRecord, device: str) -> None:
+    Args:
+        locked: names of joints that are held fixed.
+    """
+
+    def __init__(self, hand: HandRecord, device: str | None, locked: Collection[str] = ()) -> None:
         k = len(hand.joint_names)
         self.hand = hand
+        self.locked = locked
         self.rows = 0
         self.links = np.zeros(len(hand.link_names), np.int64)
         """Contacts of each link."""
@@ -157,6 +172,14 @@ class HandRows:
         for group in self.objects.values():
             for name, distribution in group.quantities.items():
                 whole[name].merge(distribution)
+        return whole
+
+    def spread(self) -> Spread:
+        """Of the rows with all objects."""
+        whole = Spread(self.hand, self.locked)
+        for group in self.objects.values():
+            for found in group.spread.values():
+                whole.merge(found)
         return whole
 
     def directions(self) -> dict[str, np.ndarray]:
@@ -199,6 +222,11 @@ class HandRows:
             middle = (vertices.min(0) + vertices.max(0)) / 2
             T = pose_matrix(pose[:, o].astype(float))
             middles.append(group.coverage.setdefault(name, Coverage()).add(T, middle))
+            group.spread.setdefault(name, Spread(self.hand, self.locked)).add(T, q.astype(float))
+            if name not in group.touched:
+                group.touched[name] = TouchedSurface(records[index[o]])
+            contacts = (rows.contact_points[chosen, o], rows.contact_normals[chosen, o])
+            group.touched[name].add(*(values.reshape(-1, 3) for values in contacts))
         add_verdicts(group.verdicts, rows, chosen)
         place = np.full(len(chosen), list(self.objects).index(names))
         self.sample.add({"q": q, "position": middles[0].astype(np.float32), "group": place})

@@ -108,6 +108,7 @@ def _metrics(of: dict[str, Any], shown: list[tuple[str, str, str]]) -> list[str]
 def diversity_table(data: dict[str, Any]) -> Block:
     """Poses, near-duplicates and coverage, a row per object (or set of objects held at once)."""
     columns = ["object", "rows", "poses", "near-dup.", "contacts", "approach", "if uniform", "rotation", "if uniform"]
+    columns += ["surface", "PCA 1", "PCA 5", "entropy", "std"]
     rows = []
     for group in data["objects"]:
         near = group["near_duplicates"]
@@ -117,13 +118,25 @@ def diversity_table(data: dict[str, Any]) -> Block:
         first = next(iter(group["coverage"].values()), None)
         for what in ("directions", "rotations"):
             cells += [f"{first[what][share]:.0%}" if first else "-" for share in ("share", "share_if_uniform")]
-        rows.append(cells)
+        cells.append(f"{first['surface']['share']:.0%}" if first else "-")
+        rows.append([*cells, *_spread(next(iter(group["diversity"].values()), None))])
+    if len(rows) > 1:
+        rows.append(["all", number(data["rows"]), *[""] * 8, *_spread(data["diversity"])])
     caption = (
         "Poses: distinct object poses. Near-dup.: object within 5 mm and 5 deg and every joint within 0.1 rad of a row "
         "before; orange: over 1 %. Contacts: mean. Approach and rotation: share hit of equal-area bins of approach "
-        "directions and of equal-volume bins of rotations, and what as many uniform draws as there are poses would hit."
+        "directions and of equal-volume bins of rotations, and what as many uniform draws as there are poses would "
+        "hit. Surface: share within 5 mm of a contact. PCA: variance of poses and joints that the first 1 and 5 principal "
+        "components explain (DexGraspBench; less is more diverse). Entropy of the joints, mean and std (DexGraspNet)."
     )
-    return table(columns, rows, caption=caption)
+    return table(columns, rows, caption=caption, total=len(rows) > 1)
+
+
+def _spread(found: dict[str, Any] | None) -> list[str]:
+    """Cells of the PCA ratios and of the joints' entropy."""
+    ratio, entropy = (found["pca_ratio"], found["joint_entropy"]) if found else (None, None)
+    cells = [f"{ratio[0]:.0%}", f"{ratio[-1]:.0%}"] if ratio else ["-", "-"]
+    return cells + ([f"{entropy['mean']:.2f}", f"{entropy['std']:.2f}"] if entropy else ["-", "-"])
 
 
 def held_tables(data: dict[str, Any]) -> list[Block]:

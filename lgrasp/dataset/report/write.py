@@ -61,7 +61,7 @@ def _pictures(paths: Paths) -> list[Block]:
 
 
 def read_dataset(
-    paths: Paths, *, progress: Callable[[int, int], None] | None = None
+    paths: Paths, *, progress: Callable[[int, int], None] | None = None, near: bool = True
 ) -> tuple[dict[str, Any], dict[tuple[str, str], HandRows]]:
     """The numbers of a report, and the data of its charts, by name and hash of the hands.
 
@@ -69,11 +69,14 @@ def read_dataset(
     hand for the scatter plots, and poses and joints of one hand with one object at a time to find near-duplicates (some
     200 bytes a row, at most two million rows), on a GPU if there is one.
 
+    Args:
+        near: look for near-duplicates.
+
     Raises:
         ShardError: No shard is found, or one cannot be read.
     """
     heads, remarks = survey(paths)
-    total, done, device = sum(head.rows for head in heads), 0, resolve_device().alias
+    total, done, device = sum(head.rows for head in heads), 0, resolve_device().alias if near else None
     hands: dict[tuple[str, str], HandRows] = {}
     before = None
 
@@ -84,7 +87,7 @@ def read_dataset(
     for head in heads:
         with ShardReader(head.path) as reader:
             if head.hand not in hands:
-                hands[head.hand] = HandRows(reader.hand(), device)
+                hands[head.hand] = HandRows(reader.hand(), device, tuple(head.header.config.get("locked", ())))
             if before is not None and (head.hand, head.labels) != (before.hand, before.labels):
                 hands[before.hand].close()
             hands[head.hand].add(reader, head.labels, advanced)
@@ -114,6 +117,7 @@ def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, 
         "runs": [_run(name, [h for h in heads if h.header.pipeline == name]) for name in pipelines],
         "metrics": _metrics(hand.together()),
         "objects": [_objects(group) for group in hand.objects.values()],
+        "diversity": hand.spread().numbers(),
         "held": held_numbers(hand.held),
         "contact_links": dict(sorted(shares.items(), key=lambda item: -item[1])),
         "posture": principal_postures(hand.rows, hand.sum_q, hand.sum_qq).numbers(),
@@ -154,6 +158,10 @@ def _objects(group: ObjectRows) -> dict[str, Any]:
             "duplicates": near.duplicates,
             "share": near.duplicates / near.compared if near.compared else 0.0,
         },
-        "coverage": {name: coverage.numbers(near.poses) for name, coverage in group.coverage.items()},
+        "coverage": {
+            name: coverage.numbers(near.poses) | {"surface": group.touched[name].numbers()}
+            for name, coverage in group.coverage.items()
+        },
+        "diversity": {name: spread.numbers() for name, spread in group.spread.items()},
         "physics": {name: verdicts.numbers() for name, verdicts in group.verdicts.items()},
     }
