@@ -19,7 +19,7 @@ _COMPONENTS = 5
 _SURFACE_POINTS = 2048
 
 
-class Spread:
+class GraspSpread:
     """Two published measures of a set of grasps, from sums: the order of the rows and their cut do not matter.
 
     **PCA ratio**, as DexGraspBench (of BODex and Dexonomy) computes it: each grasp is the row (position of the hand's
@@ -57,7 +57,7 @@ class Spread:
         bins = np.clip((share * _BINS).astype(int), 0, _BINS - 1)
         np.add.at(self._bins, (np.arange(bins.shape[1]), bins), 1)
 
-    def merge(self, other: "Spread") -> None:
+    def merge(self, other: "GraspSpread") -> None:
         """Take the rows of another set of grasps of the hand."""
         self.rows += other.rows
         self._sum += other._sum

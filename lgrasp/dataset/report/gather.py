@@ -9,7 +9,7 @@ import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.report.coverage import Coverage
-from lgrasp.dataset.report.diversity import Spread, TouchedSurface
+from lgrasp.dataset.report.diversity import GraspSpread, TouchedSurface
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.verdicts import HeldRows, Verdicts, add_held, add_verdicts
 from lgrasp.geometry.poses import pose_matrix
@@ -116,7 +116,7 @@ class ObjectRows:
     """By object."""
     touched: dict[str, TouchedSurface] = field(default_factory=dict)
     """By object."""
-    spread: dict[str, Spread] = field(default_factory=dict)
+    spread: dict[str, GraspSpread] = field(default_factory=dict)
     """By object."""
     verdicts: dict[str, Verdicts] = field(default_factory=dict)
     """By protocol."""
@@ -174,9 +174,9 @@ class HandRows:
                 whole[name].merge(distribution)
         return whole
 
-    def spread(self) -> Spread:
+    def spread(self) -> GraspSpread:
         """Of the rows with all objects."""
-        whole = Spread(self.hand, self.locked)
+        whole = GraspSpread(self.hand, self.locked)
         for group in self.objects.values():
             for found in group.spread.values():
                 whole.merge(found)
@@ -222,7 +222,7 @@ class HandRows:
             middle = (vertices.min(0) + vertices.max(0)) / 2
             T = pose_matrix(pose[:, o].astype(float))
             middles.append(group.coverage.setdefault(name, Coverage()).add(T, middle))
-            group.spread.setdefault(name, Spread(self.hand, self.locked)).add(T, q.astype(float))
+            group.spread.setdefault(name, GraspSpread(self.hand, self.locked)).add(T, q.astype(float))
             if name not in group.touched:
                 group.touched[name] = TouchedSurface(records[index[o]])
             contacts = (rows.contact_points[chosen, o], rows.contact_normals[chosen, o])

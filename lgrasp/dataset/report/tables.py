@@ -126,8 +126,9 @@ def diversity_table(data: dict[str, Any]) -> Block:
         "Poses: distinct object poses. Near-dup.: object within 5 mm and 5 deg and every joint within 0.1 rad of a row "
         "before; orange: over 1 %. Contacts: mean. Approach and rotation: share hit of equal-area bins of approach "
         "directions and of equal-volume bins of rotations, and what as many uniform draws as there are poses would "
-        "hit. Surface: share within 5 mm of a contact. PCA: variance of poses and joints that the first 1 and 5 principal "
-        "components explain (DexGraspBench; less is more diverse). Entropy of the joints, mean and std (DexGraspNet)."
+        "hit. Surface: share within 5 mm of a contact. PCA: variance of poses and joints that the first 1 and 5 "
+        "principal components explain (DexGraspBench; less is more diverse). Entropy of the joints, mean and std "
+        "(DexGraspNet)."
     )
     return table(columns, rows, caption=caption, total=len(rows) > 1)
 

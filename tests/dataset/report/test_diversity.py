@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support.shards import sample_shard
 
-from lgrasp.dataset.report.diversity import Spread, TouchedSurface
+from lgrasp.dataset.report.diversity import GraspSpread, TouchedSurface
 from lgrasp.geometry.poses import pose_matrix
 
 K = 4
@@ -21,7 +21,7 @@ HAND = replace(
 
 
 def spread(T, q, **more):
-    found = Spread(HAND, **more)
+    found = GraspSpread(HAND, **more)
     for part in np.array_split(np.arange(len(q)), 3):  # the cut does not matter
         found.add(T[part], q[part])
     return found.numbers()
@@ -30,7 +30,7 @@ def spread(T, q, **more):
 def test_one_repeated_row():
     T, q = np.tile(np.eye(4), (50, 1, 1)), np.tile([0.5, 0.1, -1.3, 2.0], (50, 1))
     assert spread(T, q) == {"pca_ratio": None, "joint_entropy": {"mean": 0.0, "std": 0.0}}
-    assert Spread(HAND).numbers() == {"pca_ratio": None, "joint_entropy": None}
+    assert GraspSpread(HAND).numbers() == {"pca_ratio": None, "joint_entropy": None}
 
 
 def test_even_joints():
