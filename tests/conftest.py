@@ -81,7 +81,7 @@ def load(swift: Pipeline, cache_root: Path) -> Callable[..., Inputs]:
         keys = input_keys(find_hand("allegro"), name, 1.0, pipeline.object, pipeline.field)
         cache = Cache(cache_root, pytest.fail)
         parts = keys, 1.0, pipeline.object, pipeline.field, resolve_device("cpu")
-        return load_inputs(cache, *parts, table=pipeline.on_table)
+        return load_inputs(cache, *parts, table=pipeline.on_table, steer=pipeline.steer)
 
     return load
 

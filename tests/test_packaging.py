@@ -20,6 +20,7 @@ ORDER = (
     ("hand", "object"),
     ("cloud", "differentiable", "field"),
     ("grasp",),
+    ("steer",),
     ("picture",),
     ("simulate", "dataset", "refine"),
     ("planning", "scenes", "hold"),

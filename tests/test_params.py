@@ -14,6 +14,7 @@ ALLOWED = {
     "bounds": "a pipeline's file holds a mapping, the pipeline what is made of it",
     "object": "as bounds",
     "field": "as bounds",
+    "steer": "as bounds",
     "stages": "as bounds",
     "sequence": "as bounds",
     "description": "free text of a hand, a pipeline and a config, about itself",

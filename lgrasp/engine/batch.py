@@ -15,6 +15,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
 from lgrasp.stages.search.params import SearchParams
+from lgrasp.steer.arrays import SteerArrays
 
 Search = Callable[[Context, int, int], tuple[ContactSets, Meter]]
 """(context, first candidate, number of candidates) -> what search makes of them, counted."""
@@ -55,27 +56,27 @@ def run_stages(
 
 def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter) -> Any:
     """The table that one stage makes of another."""
-    params = _fitted(stage, pipeline.params(stage), context.hand.model)
+    params = _fitted(stage, pipeline.params(stage), context.hand.model, context.steered)
     start = meter.now()
     table, counts = STAGES[stage].run(table, params, context)
     meter.add(stage, counts, start, meter.now())
     return table
 
 
-def _fitted(stage: str, params: Any, hand: HandModel) -> Any:
+def _fitted(stage: str, params: Any, hand: HandModel, steer: SteerArrays) -> Any:
     """The parameters of a stage for a hand: how many finger contacts search asks for.
 
     A hand's own wish (hand.yaml: contacts) stands in for the default of search, and no more contacts are asked for than
-    there are fingers: asking three of a gripper with two jaws would give nothing. A pure function of parameters and
-    hand, both of which are in the content keys.
+    there are fingers: asking three of a gripper with two jaws would give nothing. Where a steering names the fingers,
+    it tells how many. A pure function of parameters, hand and steering, all of which are in the content keys.
     """
     if stage != "search":
         return params
     asked = params.contacts
     if hand.contacts and asked == SearchParams.model_fields["contacts"].default:
         asked = hand.contacts
-    fingers = int((np.diff(hand.contact_first[:-1]) > 0).sum())
-    contacts = tuple(min(k, max(2, fingers)) for k in asked)
+    fingers = int(((np.diff(hand.contact_first[:-1]) > 0) & steer.touching.groups).sum())
+    contacts = (steer.least,) if steer.least else tuple(min(k, max(2, fingers)) for k in asked)
     return params if contacts == params.contacts else params.model_copy(update={"contacts": contacts})
 
 

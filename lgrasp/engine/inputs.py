@@ -30,6 +30,10 @@ from lgrasp.object.params import ObjectParams
 from lgrasp.object.resting import RESTING_VERSION, resting_planes
 from lgrasp.runtime.device import Device
 from lgrasp.stages.context import Keeper
+from lgrasp.steer.arrays import SteerArrays, upload_steering
+from lgrasp.steer.field import steered_field
+from lgrasp.steer.params import NOTHING, Steering
+from lgrasp.steer.touch import find_touching
 
 OBJECT_VERSION = 3
 """Raised whenever preprocessing gives other arrays."""
@@ -61,6 +65,7 @@ class Inputs:
     seconds: dict[str, float] = with_default(default_factory=dict)
     hits: dict[str, bool] = with_default(default_factory=dict)
     scene: Any = None  # for a physics simulation, if there is one
+    steer: SteerArrays | None = None  # what is asked of grasps
     kept: Keeper = with_default(default_factory=Keeper)  # what stages keep from batch to batch
 
 
@@ -170,23 +175,32 @@ def load_inputs(
     report: Report | None = None,
     *,
     table: bool = False,
+    steer: Steering = NOTHING,
 ) -> Inputs:
     """Load or make hand, object and field, and put them on the device.
 
     Args:
         table: also the planes that the object rests on.
+        steer: what is asked of grasps.
+
+    Raises:
+        ConfigError: something that this hand cannot do.
     """
     assert keys.mesh is not None
     load, alias = Loader(cache, device.alias, report), device.alias
     hand_model = load.hand(keys.source, keys.hand)
+    touching = find_touching(steer, hand_model, keys.source.spec.fingers)
     object_model = load.object(keys.mesh, keys.object, scale, objects)
     planes = load.planes(object_model, keys.object) if table else None
     hand = upload_hand(hand_model, alias)
     field_model = load.field(hand, keys.field, fields)
     start = time.perf_counter()
+    if steer.asks:
+        field_model = steered_field(field_model, touching)
     obj, field = upload_object(object_model, alias, planes), upload_field(field_model, hand_model, alias)
     load.seconds["upload"] = time.perf_counter() - start
-    return Inputs(hand, obj, field, keys, device, load.seconds, load.hits)
+    steered = upload_steering(touching, hand)
+    return Inputs(hand, obj, field, keys, device, load.seconds, load.hits, steer=steered)
 
 
 def run_key(pipeline: dict, keys: InputKeys, shard_rows: int) -> str:

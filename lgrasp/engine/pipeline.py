@@ -14,9 +14,13 @@ from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.notices import notice
 from lgrasp.object.params import ObjectParams
 from lgrasp.stages.migration import ALIASES, move_to_bounds, stage_name
+from lgrasp.steer.params import NOTHING, Steering
 
 _ORDER_VERSION = 2
 """Raised whenever the same candidates give the rows of a shard in another order."""
+
+
+_PARTS = ("bounds", "steer", "object", "field")
 
 
 class _Head(Params):
@@ -32,6 +36,7 @@ class _Declared(_Head):
     """The file as written."""
 
     bounds: dict[str, Any] = Field(default_factory=dict)
+    steer: dict[str, Any] = Field(default_factory=dict)
     object: dict[str, Any] = Field(default_factory=dict)
     field: dict[str, Any] = Field(default_factory=dict)
     stages: list[dict[str, dict[str, Any] | None]]
@@ -42,6 +47,7 @@ class Pipeline(_Head):
     """What is computed."""
 
     bounds: GraspBounds = GraspBounds()
+    steer: Steering = NOTHING
     object: ObjectParams
     field: FieldParams
     stages: tuple[tuple[str, SerializeAsAny[BaseModel]], ...]
@@ -107,15 +113,15 @@ class Pipeline(_Head):
         """A copy with parameters replaced and checked.
 
         Args:
-            settings: ``PART.KEY=VALUE`` each; a part is ``bounds``, ``object``, ``field`` or a stage.
+            settings: ``PART.KEY=VALUE`` each; a part is ``bounds``, ``steer``, ``object``, ``field`` or a stage.
 
         Raises:
             ConfigError: an unknown part or key, or a value out of range.
         """
-        parts = {"bounds": self.bounds, "object": self.object, "field": self.field}
+        parts = {name: getattr(self, name) for name in _PARTS}
         parts |= {part.name: params for part, params in self.sections}
         made = apply_settings(parts, settings, f"pipeline {self.name}")
-        shared = {name: made[name] for name in ("bounds", "object", "field")} | {"sequence": made.get("sequence")}
+        shared = {name: made[name] for name in _PARTS} | {"sequence": made.get("sequence")}
         return self.model_copy(update=shared | {"stages": tuple((name, made[name]) for name in self.order)}).checked()
 
     def with_passes(self, passes: int | None) -> "Pipeline":
@@ -125,6 +131,14 @@ class Pipeline(_Head):
             ConfigError: passes out of range.
         """
         return self if passes is None else self.with_params("search", passes=passes)
+
+    def with_steering(self, **asked: Any) -> "Pipeline":
+        """A copy whose grasps obey more of :class:`~lgrasp.steer.params.Steering`.
+
+        Raises:
+            ConfigError: a value that cannot be.
+        """
+        return self.model_copy(update={"steer": parse_model(Steering, self.steer.model_dump() | asked, "steer")})
 
     def with_table(self) -> "Pipeline":
         """A copy whose grasps leave room for the table that the object rests on."""
@@ -146,6 +160,7 @@ class Pipeline(_Head):
             **self.model_dump(mode="json", include={"name", "seed", "effort", "object", "field"}),
             "order": _ORDER_VERSION,
             "bounds": self.bounds.describe(),
+            **({"steer": self.steer.describe()} if self.steer.asks else {}),
             "stages": [{s.name: {"version": s.version, **p.model_dump(mode="json")}} for s, p in self.sections],
         }
 
@@ -184,6 +199,7 @@ def load_pipeline(name: str) -> Pipeline:
     return Pipeline(
         **{name: getattr(declared, name) for name in _Head.model_fields},
         bounds=parse_model(GraspBounds, declared.bounds, f"{where}, bounds"),
+        steer=parse_model(Steering, declared.steer, f"{where}, steer"),
         object=parse_model(ObjectParams, declared.object, f"{where}, object"),
         field=parse_model(FieldParams, declared.field, f"{where}, field"),
         stages=tuple(stages),

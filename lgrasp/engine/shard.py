@@ -170,6 +170,7 @@ def shard_context(pipeline: Pipeline, inputs: Inputs, shard: int) -> Context:
         shard,
         bounds=pipeline.bounds,
         scene=inputs.scene,
+        steer=inputs.steer,
         realised=pipeline.realised,
         kept=inputs.kept,
     )

@@ -83,7 +83,7 @@ class GenerateJob(GenerateRequest, SearchJob):
         pipeline, device, self._rate = self.pipeline, self.device_used, self.rate
         self._graphs = GraphCache(pipeline) if device.is_cuda and self.threads() == 1 else None
         what = self.keys, self.scale, pipeline.object, pipeline.field, device, events.loading
-        return load_inputs(self.cache, *what, table=pipeline.on_table)
+        return load_inputs(self.cache, *what, table=pipeline.on_table, steer=pipeline.steer)
 
     def records(self, inputs: Inputs) -> tuple[HandModel, list[ObjectRecord]]:
         return inputs.hand.model, [object_record(inputs.object.model, tables=inputs.object.planes)]

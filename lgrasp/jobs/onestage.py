@@ -79,7 +79,7 @@ def run_up_to(
     if done == len(stages):
         return runs
     what = keys, scale, pipeline.object, pipeline.field, used, report
-    inputs = load_inputs(cache, *what, table=pipeline.on_table)
+    inputs = load_inputs(cache, *what, table=pipeline.on_table, steer=pipeline.steer)
     context = shard_context(pipeline, inputs, shard)
     table: Any = _table(found[stages[done - 1]], used.alias) if done else (first, count)
     load_kernels(used.alias, kernel_modules(*Job.kernels), report)
@@ -102,8 +102,11 @@ def _stage_keys(
     """Content key of each stage's table; it holds the key of the table before."""
     made: dict[str, str] = {}
     before = content_key("start", 1, inputs=[keys.hand, keys.object, keys.field], candidates=[first, count])
+    shared = {"bounds": pipeline.bounds.describe()} | (
+        {"steer": pipeline.steer.describe()} if pipeline.steer.asks else {}
+    )
     for stage in stages:
-        params = pipeline.params(stage).model_dump(mode="json") | {"bounds": pipeline.bounds.describe()}
+        params = pipeline.params(stage).model_dump(mode="json") | shared
         before = made[stage] = content_key(
             stage, STAGES[stage].version, params=params, seed=pipeline.seed, shard=shard, input=before
         )

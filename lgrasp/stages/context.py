@@ -15,6 +15,7 @@ from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.seeding import stage_seed
+from lgrasp.steer.arrays import SteerArrays, steer_nothing
 
 if TYPE_CHECKING:
     from lgrasp.hand.opposition.spaces import Space
@@ -56,6 +57,8 @@ class Context:
     """Opposition space that grasps must use; hand and field are then those of the space."""
     holding: HeldArrays | None = None
     """What the hand holds already, and what of it may not move; None: nothing."""
+    steer: SteerArrays | None = None
+    """What the user asks of grasps; None: nothing."""
     realised: bool = True
     """True if the candidates that search combines are already realised (ik comes before search)."""
     salt: int = 0
@@ -68,6 +71,11 @@ class Context:
     def held(self) -> HeldArrays:
         """What the hand holds already, of no rows but one if nothing."""
         return self.holding or hold_nothing(self.hand)
+
+    @cached_property
+    def steered(self) -> SteerArrays:
+        """What is asked, everything allowed if nothing is."""
+        return self.steer or steer_nothing(self.hand)
 
     def with_salt(self, salt: int) -> "Context":
         """The same in another pass."""

@@ -7,6 +7,7 @@ from lgrasp.engine.inputs import Inputs
 from lgrasp.field.model import ContactField
 from lgrasp.hand.drafting.contact_survey import static_depth
 from lgrasp.hand.drafting.reach import Touch, best_hold, still_touches
+from lgrasp.hand.fingers import finger_label
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.math.transforms import NORMAL_BINS
@@ -16,12 +17,6 @@ _NEAR_DISTANCE = 0.015  # [m]
 _MIN_FACING_COSINE = 0.95  # cosine
 _OBJECT_SIZE = 0.05  # [m] size of the objects that a hand is tried on
 _POOR_SURVIVAL = 0.02  # share of survivors below which a stage counts as the bottleneck
-
-
-def finger_label(model: HandModel, names: dict[str, tuple[str, ...]], group: int) -> str:
-    """Name of a dependency group: that of hand.yaml, else its last link."""
-    links = [n for n in model.tree.link_names if model.tree.group_of(n) == group]
-    return next((name for name, members in names.items() if set(members) & set(links)), links[-1])
 
 
 def field_vectors(field: ContactField, group: int, groups: int) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from lgrasp.engine.inputs import Inputs
 from lgrasp.files import write_file
+from lgrasp.hand.fingers import finger_label
 from lgrasp.hand.geometry import thin_mesh
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import space_sides
@@ -16,7 +17,7 @@ from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.surface import SurfaceSamples, joined_mesh
 from lgrasp.hand.surface_visibility import last_bodies, link_surfaces, visible_surface
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.jobs.hand_check.diagnose import field_vectors, finger_label
+from lgrasp.jobs.hand_check.diagnose import field_vectors
 from lgrasp.picture.camera import central_camera
 from lgrasp.picture.draw import ANGLE, Painted, Viewpoint, draw, framing
 from lgrasp.picture.scene import balls

@@ -38,6 +38,10 @@ class SearchRequest(Request):
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}' with place.table: only for one object, and without stage refine"
             )
+        if self.pipeline.steer.asks and (self.pipeline.sequence is not None or "refine" in self.pipeline.order):
+            raise ConfigError(
+                f"pipeline '{self.pipeline.name}' with steer: only for one object, and without stage refine"
+            )
         hand_path(self.hand)
         check_folder(self.out)
 

@@ -14,6 +14,7 @@ from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.steer.arrays import may_touch
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -39,6 +40,7 @@ class DomainValues:
     fingers: wp.int32
     stride: wp.int32  # coprime to the number of contact points: multiples of it visit every one
     min_table_distance: wp.float32  # [m]
+    groups: wp.int32  # bit g: group g may touch
 
 
 def _drawing(voxels: bool) -> Any:
@@ -62,6 +64,9 @@ def _drawing(voxels: bool) -> Any:
         row, g = wp.tid()
         poses = candidates_out.poses
         if row >= poses.rows[0]:
+            return
+        if not may_touch(params.groups, g):
+            candidates_out.count[row, g] = 0
             return
         slot = poses.setting[row] * hand.kin.groups + g
         state = wp.rand_init(seed[0], poses.index[row] * hand.kin.groups + g)

@@ -26,7 +26,8 @@ def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[Cand
     table = CandidateTable.empty(d, n, groups, params.keep, poses=inputs, count=count, state=state)
     hand, field, boxes = context.hand.struct, context.field.struct, context.field.boxes
     cosine, stride = math.cos(math.radians(params.angle)), _stride(len(context.object.model.contact_points))
-    values = make_struct(DomainValues, params, context.bounds, cosine=cosine, stride=stride)
+    may = context.steered.touching.bits
+    values = make_struct(DomainValues, params, context.bounds, cosine=cosine, stride=stride, groups=may)
     wp.launch(
         draw_domains["voxel" if boxes is None else "bvh"],
         dim=(n, groups),

@@ -14,6 +14,7 @@ from lgrasp.math.limits import MAX_GROUPS, MAX_JOINTS
 from lgrasp.math.transforms import random_rotation, rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.steer.arrays import Steer, may_touch, pick_group
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -146,6 +147,7 @@ def _rate(
     field: Field,
     obj: Object,
     params: PlaceValues,
+    groups: wp.int32,
     T: wp.transform,
     plane: wp.vec4,
     setting: wp.int32,
@@ -157,7 +159,7 @@ def _rate(
 
     A pair counts when each contact's inward normal is within 40 degrees of the line to the other, and the line passes
     the centre of mass within ``max_com_distance``; contacts near the table ``plane`` do not. ``anchor`` holds an object
-    contact point that each group can touch, or gets one.
+    contact point that each group can touch, or gets one. Bit g of ``groups``: group g may touch.
     """
     com = wp.transform_point(T, obj.com)
     points = wp.zeros(shape=(_MAX_HITS,), dtype=wp.vec3)
@@ -168,6 +170,8 @@ def _rate(
     t = wp.transform_get_translation(T)
     for g in range(hand.kin.groups):
         hits = int(0)
+        if not may_touch(groups, g):
+            continue
         for s in range(params.samples):
             i = anchor[g]
             if s > 0 or i < 0:
@@ -223,6 +227,7 @@ def propose_poses(
     field: Field,
     obj: Object,
     params: PlaceValues,
+    steer: Steer,
     seed: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
     proposals_out: ProposedPoses,
@@ -238,8 +243,7 @@ def propose_poses(
     row, b = wp.tid()
     state = wp.rand_init(seed[0] + b * SEED_STRIDE, first[0] + row)
     G = hand.kin.groups
-    palm0 = hand.contacts.first[G]
-    palms = hand.contacts.first[G + 1] - palm0
+    palms = steer.palm_points.shape[0]
     u = wp.randf(state)
     i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
     point = obj.contact_points[i]
@@ -263,11 +267,11 @@ def propose_poses(
         if setting < 0:
             rating = Rating.HOPELESS
     elif u < params.canonical + params.pinch + params.palm and palms > 0:
-        palm = palm0 + wp.min(int(wp.randf(state) * float(palms)), palms - 1)
+        palm = steer.palm_points[wp.min(int(wp.randf(state) * float(palms)), palms - 1)]
         n = hand.contacts.normals[palm]
         T = _aligned(hand.contacts.points[palm], n, point, normal, wp.rand_init(wp.randi(state)))
     else:
-        g = wp.min(int(wp.randf(state) * float(G)), G - 1)
+        g = pick_group(steer.groups, wp.randf(state))
         slot = setting * G + g
         r0 = field.start[field.cell_first[slot] * 64]
         r1 = field.start[field.cell_first[slot + 1] * 64]
@@ -293,7 +297,8 @@ def propose_poses(
         if body_height(hand.pieces, 0, wp.transform_identity(), plane, above) < above:
             rating = Rating.BLOCKED
         if rating == Rating.CLEAR and params.samples > 0:
-            rating = _rate(hand, field, obj, params, T, plane, setting, palm, anchor, wp.rand_init(wp.randi(state)))
+            draws = wp.rand_init(wp.randi(state))
+            rating = _rate(hand, field, obj, params, steer.groups, T, plane, setting, palm, anchor, draws)
     proposals_out.pose[row, b] = T
     proposals_out.palm_point[row, b] = palm
     proposals_out.surface[row, b] = i

@@ -41,9 +41,10 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     proposals = empty_struct(ProposedPoses, d, *shape, groups)
     shares = {name: getattr(params, name) / total for name in ("canonical", "pinch", "palm")}
     values = make_struct(PlaceValues, params, context.bounds, **shares)
-    asked = [values, context.seed("place"), first]
+    where = [context.seed("place"), first]
+    asked = [values, context.steered.struct, *where]
     if context.space:
-        asked = [context.held.struct, values, wp.vec2i(*context.space.groups), *asked[1:]]
+        asked = [context.held.struct, values, wp.vec2i(*context.space.groups), *where]
     kernel = propose_opposed if context.space else propose_poses
     wp.launch(kernel, shape, [hand, field, obj, *asked], [proposals], device=d)
     chosen, upto = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(2))

@@ -25,6 +25,7 @@ class SearchValues:
 
     contacts: vec_kinds
     kinds: wp.int32  # entries of ``contacts``
+    least: wp.int32  # fewest finger contacts
     threshold: wp.float32  # of the squared residual
     friction: wp.float32
     max_gswo: wp.float32
@@ -157,7 +158,7 @@ def start_set(
     k = params.contacts[wp.min(int(wp.randf(own) * float(params.kinds)), params.kinds - 1)]
     if k > available:
         # the palm's contact may stand in for one finger
-        if palm < 0 or k - 1 > available:
+        if palm < 0 or k - 1 > available or params.least > available:
             return int(0), int(0), chosen, owner, own
         k = available
     left = available

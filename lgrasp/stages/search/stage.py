@@ -93,6 +93,7 @@ def _values(params: SearchParams, context: Context) -> Any:
         context.bounds,
         contacts=vec_kinds(*params.contacts, *[0] * (MAX_KINDS - kinds)),
         kinds=kinds,
+        least=context.steered.least,
         max_gswo=params.gswo_share * context.bounds.max_gswo,
         mutation_sigma=params.mutation_sigma * math.sqrt(model.area / len(model.contact_points)),
     )
