@@ -50,7 +50,7 @@ def find_touching(steering: Steering, model: HandModel, fingers: Fingers) -> Tou
 
 def _group(name: str, model: HandModel, fingers: Fingers) -> int:
     found = finger_group(model, fingers, name)
-    able = np.flatnonzero(np.diff(model.contact_first[:-1]))
+    able = np.flatnonzero(np.diff(model.contact_first[:-1])).tolist()
     if found in able:
         return found
     known = [finger_label(model, fingers, g) for g in able]
