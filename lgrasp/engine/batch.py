@@ -55,7 +55,16 @@ def run_stages(
 
 
 def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter) -> Any:
-    """The table that one stage makes of another."""
+    """The table that one stage makes of another; where contacts are drawn in rounds, of all rounds."""
+    table = _run_once(stage, table, pipeline, context, meter)
+    if stage == "ik" and pipeline.realised:
+        for n in range(1, pipeline.params("domain").rounds):
+            for part in ("domain", "ik"):
+                table = _run_once(part, table, pipeline, replace(context, round=n), meter)
+    return table
+
+
+def _run_once(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter) -> Any:
     params = _fitted(stage, pipeline.params(stage), context.hand.model, context.steered)
     start = meter.now()
     table, counts = STAGES[stage].run(table, params, context)

@@ -63,6 +63,8 @@ class Context:
     """True if the candidates that search combines are already realised (ik comes before search)."""
     salt: int = 0
     """Number of the pass over these candidates."""
+    round: int = 0
+    """Number of the round in which contacts are drawn for them."""
     kept: Keeper = with_default(default_factory=Keeper, repr=False, compare=False)
     """What stages keep from batch to batch of a job."""
     seeds: dict[tuple[str, int], wp.array] = with_default(default_factory=dict, repr=False, compare=False)

@@ -8,7 +8,7 @@ import warp as wp
 from lgrasp.field.arrays import Boxes, Field, boxes_pick, field_has, field_pick, field_seed
 from lgrasp.grasp.collision import finger_above, resting_plane
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
-from lgrasp.grasp.structs import Candidates
+from lgrasp.grasp.structs import Candidates, Poses, State
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_JOINTS
@@ -19,6 +19,7 @@ from lgrasp.steer.arrays import may_touch
 wp.set_module_options(KERNEL_OPTIONS)
 
 _TABLE_SLACK = wp.constant(0.005)  # [m] that a posture may be below its least height above the table before IK
+_ROUND_STRIDE = wp.constant(6133)  # between the seeds of rounds
 _NEIGHBOURS = wp.constant(16.0)  # contact points before and after one, in order, that lie near it
 
 
@@ -41,6 +42,34 @@ class DomainValues:
     stride: wp.int32  # coprime to the number of contact points: multiples of it visit every one
     min_table_distance: wp.float32  # [m]
     groups: wp.int32  # bit g: group g may touch
+    round: wp.int32  # 0: the first time
+    enough: wp.int32
+
+
+@wp.func
+def _touching(poses: Poses, contacts: wp.array2d(dtype=wp.int32), row: wp.int32):
+    """How many fingers have contacts at a pose, and the palm."""
+    touching = wp.where(poses.palm_point[row] >= 0, 1, 0)
+    for g in range(contacts.shape[1]):
+        touching += wp.where(contacts[row, g] > 0, 1, 0)
+    return touching
+
+
+@wp.kernel
+def count_realised(candidates: Candidates, realised_out: wp.array2d(dtype=wp.int32)):
+    """How many contacts of each group are realised.
+
+    Args:
+        realised_out: (P, G).
+    """
+    row, g = wp.tid()
+    if row >= candidates.poses.rows[0]:
+        return
+    n = int(0)
+    for m in range(candidates.count[row, g]):
+        if candidates.state[row, g, m] == State.REALISED:
+            n += 1
+    realised_out[row, g] = n
 
 
 def _drawing(voxels: bool) -> Any:
@@ -54,12 +83,16 @@ def _drawing(voxels: bool) -> Any:
         obj: Object,
         params: DomainValues,
         seed: wp.array(dtype=wp.int32),
+        realised: wp.array2d(dtype=wp.int32),
         candidates_out: Candidates,
     ):
         """Contact domain of each (pose, group): surface points that a contact vector of the group meets.
 
+        In later rounds groups that have few realised contacts keep those, and get new candidates in place of others.
+
         Args:
             seed: of the stage, (1,).
+            realised: contacts of each group, (P, G); not read in round 0.
         """
         row, g = wp.tid()
         poses = candidates_out.poses
@@ -68,13 +101,23 @@ def _drawing(voxels: bool) -> Any:
         if not may_touch(params.groups, g):
             candidates_out.count[row, g] = 0
             return
+        n = int(0)
+        if params.round > 0:
+            if realised[row, g] >= params.enough or _touching(poses, realised, row) < params.fingers:
+                return
+            for m in range(candidates_out.count[row, g]):
+                if candidates_out.state[row, g, m] == State.REALISED:
+                    candidates_out.surface[row, g, n] = candidates_out.surface[row, g, m]
+                    candidates_out.record[row, g, n] = candidates_out.record[row, g, m]
+                    candidates_out.q[row, g, n] = candidates_out.q[row, g, m]
+                    candidates_out.state[row, g, n] = State.REALISED
+                    n += 1
         slot = poses.setting[row] * hand.kin.groups + g
-        state = wp.rand_init(seed[0], poses.index[row] * hand.kin.groups + g)
+        state = wp.rand_init(seed[0] + params.round * _ROUND_STRIDE, poses.index[row] * hand.kin.groups + g)
         R = wp.transform_get_rotation(poses.pose[row])
         t = wp.transform_get_translation(poses.pose[row])
         plane = resting_plane(obj, poses.pose[row], poses.resting[row])
         X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-        n = int(0)
         i = int(0)
         attempts = params.attempts
         if wp.static(not voxels):
@@ -113,6 +156,7 @@ def _drawing(voxels: bool) -> Any:
                 candidates_out.surface[row, g, n] = i
                 candidates_out.record[row, g, n] = record
                 candidates_out.q[row, g, n] = field_seed(field, hand.kin, slot, record)
+                candidates_out.state[row, g, n] = State.DRAWN
                 n += 1
                 if n == params.keep:
                     break
@@ -148,17 +192,12 @@ def drop_poor(params: DomainValues, candidates_out: Candidates, counts_out: wp.a
     row = wp.tid()
     if row >= candidates_out.poses.rows[0]:
         return
-    touching = int(0)
-    if candidates_out.poses.palm_point[row] >= 0:
-        touching = 1
     groups = candidates_out.count.shape[1]
     candidates = int(0)
     for g in range(groups):
-        if candidates_out.count[row, g] > 0:
-            touching += 1
-            candidates += candidates_out.count[row, g]
+        candidates += candidates_out.count[row, g]
     wp.atomic_add(counts_out, DomainCount.POSES, 1)
-    if touching >= params.fingers:
+    if _touching(candidates_out.poses, candidates_out.count, row) >= params.fingers:
         wp.atomic_add(counts_out, DomainCount.RICH, 1)
         wp.atomic_add(counts_out, DomainCount.CANDIDATES, candidates)
     else:

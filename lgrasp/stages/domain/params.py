@@ -14,3 +14,7 @@ class DomainParams(Params):
         default=20.0, gt=0, le=90, description="Largest angle of hand and object normal before IK [deg]."
     )
     fingers: int = Field(default=2, ge=1, le=8, description="Poses at which fewer fingers can touch are dropped.")
+    rounds: int = Field(
+        default=1, ge=1, le=16, description="Times that contacts are drawn, later ones where few could be realised."
+    )
+    enough: int = Field(default=6, ge=1, le=4096, description="Realised contacts of a finger that need no more.")

@@ -9,36 +9,47 @@ from lgrasp.grasp.tables import CandidateTable, PoseTable
 from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.domain.kernels import DomainCount, DomainValues, draw_domains, drop_poor, keep_frozen
+from lgrasp.stages.domain.kernels import DomainCount, DomainValues, count_realised, draw_domains, drop_poor, keep_frozen
 from lgrasp.stages.domain.params import DomainParams
 
 VERSION = 3
 
 
-def run(inputs: PoseTable, params: DomainParams, context: Context) -> tuple[CandidateTable, Tally]:
+def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Context) -> tuple[CandidateTable, Tally]:
     """Contact domain of every pose and group (merged over the group's patches).
+
+    Of candidates, once some are realised: new ones in place of those that are not, at promising poses, for groups that
+    have few.
 
     Returns:
         The candidates, and counts ``poses``, ``rich`` (poses where enough fingers can touch), ``candidates``.
     """
-    d, groups, n = context.device, context.hand.model.groups, inputs.index.shape[0]
-    count, state = (wp.zeros((n, groups, params.keep)[:axes], dtype=wp.int32, device=d) for axes in (2, 3))
-    table = CandidateTable.empty(d, n, groups, params.keep, poses=inputs, count=count, state=state)
+    d, groups, points = context.device, context.hand.model.groups, len(context.object.model.contact_points)
+    tally = empty_tally(DomainCount, d)
+    cosine, stride = math.cos(math.radians(params.angle)), _stride(points)
+    given = {"cosine": cosine, "stride": stride, "round": context.round, "groups": context.steered.touching.bits}
+    values = make_struct(DomainValues, params, context.bounds, **given)
+    if isinstance(inputs, CandidateTable):
+        table = inputs
+        realised = wp.empty(table.count.shape, dtype=wp.int32, device=d)
+        wp.launch(count_realised, realised.shape, [table.struct], [realised], device=d)
+    else:
+        n = inputs.index.shape[0]
+        count, state = (wp.zeros((n, groups, params.keep)[:axes], dtype=wp.int32, device=d) for axes in (2, 3))
+        table = CandidateTable.empty(d, n, groups, params.keep, poses=inputs, count=count, state=state)
+        realised = wp.empty((0, 0), dtype=wp.int32, device=d)
     hand, field, boxes = context.hand.struct, context.field.struct, context.field.boxes
-    cosine, stride = math.cos(math.radians(params.angle)), _stride(len(context.object.model.contact_points))
-    may = context.steered.touching.bits
-    values = make_struct(DomainValues, params, context.bounds, cosine=cosine, stride=stride, groups=may)
     wp.launch(
         draw_domains["voxel" if boxes is None else "bvh"],
-        dim=(n, groups),
-        inputs=[hand, field, boxes or Boxes(), context.object.struct, values, context.seed("domain")],
+        dim=table.count.shape,
+        inputs=[hand, field, boxes or Boxes(), context.object.struct, values, context.seed("domain"), realised],
         outputs=[table.struct],
         device=d,
     )
     if context.space:
-        wp.launch(keep_frozen, (n, groups), [hand, context.held.struct], [table.struct], device=d)
-    tally = empty_tally(DomainCount, d)
-    wp.launch(drop_poor, n, [values], [table.struct, tally.device], device=d)
+        wp.launch(keep_frozen, table.count.shape, [hand, context.held.struct], [table.struct], device=d)
+    if context.round == 0:
+        wp.launch(drop_poor, table.count.shape[0], [values], [table.struct, tally.device], device=d)
     return table, tally
 
 

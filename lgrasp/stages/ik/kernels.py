@@ -73,7 +73,7 @@ def realise_contacts(
         counts_out: IkCount, (3,) or (4,).
     """
     row, g, m = wp.tid()
-    if m >= candidates_out.count[row, g] or wanted[row, g, m] == 0:
+    if m >= candidates_out.count[row, g] or wanted[row, g, m] == 0 or candidates_out.state[row, g, m] != State.DRAWN:
         return
     T = candidates_out.poses.pose[row]
     s = candidates_out.surface[row, g, m]

@@ -102,3 +102,29 @@ def test_only_chosen_candidates_of_sets(lightning, load):
     good = [all(state[p, g, c] == 1 for g, c in enumerate(chosen[i]) if c >= 0) for i, p in enumerate(pose)]
     for name in ("pose", "slot", "chosen", "score"):
         np.testing.assert_array_equal(after[name], before[name][np.array(good, bool)], err_msg=name)
+
+
+def test_rounds_add_contacts_where_few_could_be_realised(context, swift):
+    """What was realised stays, fingers that have enough are left alone, and batches change nothing."""
+    params = swift.params("domain")
+
+    def table(first, count, rounds):
+        pipeline = swift.with_params("domain", rounds=rounds)
+        return run_stages(pipeline, context, first, count, "ik").arrays()
+
+    once, thrice = table(0, 100, 1), table(0, 100, 3)
+    before, after = ((t["state"] == 1).sum(2) for t in (once, thrice))
+    assert (after >= before).all()
+    assert after.sum() > 1.1 * before.sum()
+    touching = (before > 0).sum(1) + (once["poses.palm_point"] >= 0)
+    done = (before >= params.enough) | (touching < params.fingers)[:, None]
+    assert 0 < done.sum() < done.size
+    for name in ("count", "surface", "record", "state", "q"):
+        np.testing.assert_array_equal(thrice[name][done], once[name][done], err_msg=name)
+    for row, group in zip(*np.nonzero(before), strict=True):
+        for name in ("surface", "record", "q"):
+            kept = once[name][row, group][once["state"][row, group] == 1]
+            np.testing.assert_array_equal(thrice[name][row, group][thrice["state"][row, group] == 1][: len(kept)], kept)
+    parts = [table(0, 60, 3), table(60, 40, 3)]
+    for name, values in thrice.items():
+        np.testing.assert_array_equal(np.concatenate([part[name] for part in parts]), values, err_msg=name)
