@@ -16,9 +16,9 @@ from lgrasp.bench.soak.trials import Soak
 
 TIMES = {
     "generate": 2,
-    "dataset merge": 6,
-    "export --to dexgraspnet": 4,
-    "export --to mjcf": 2,
+    "dataset merge": 2,
+    "export --to dexgraspnet": 1,
+    "export --to mjcf": 1,
     "hands add": 1,
     "simulate": 1,
     "plan": 1,
@@ -29,10 +29,10 @@ TIMES = {
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks for processes in /proc")
-def test_twenty_moments(tmp_path):
+def test_random_moments(tmp_path):
     random, ways = np.random.default_rng(15), cycle(WAYS)
     place = Soak(tmp_path, Path(wp.config.kernel_cache_dir).parent, launch=start_forked)
     found = [place.end(name, next(ways), random.uniform()) for name, times in TIMES.items() for _ in range(times)]
-    assert len(found) == 20
-    assert sum(attack.died for attack in found) > 10
+    assert len(found) == sum(TIMES.values())
+    assert sum(attack.died for attack in found) > len(found) // 2
     assert not [f"{a.command}, {a.way} at {a.moment:.3f}: {fault}" for a in found for fault in a.faults]
