@@ -60,7 +60,7 @@ def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, mete
     if stage == "ik" and pipeline.realised:
         for n in range(1, pipeline.params("domain").rounds):
             for part in ("domain", "ik"):
-                table = _run_once(part, table, pipeline, replace(context, round=n), meter)
+                table = _run_once(part, table, pipeline, context.changed(round=n), meter)
     return table
 
 

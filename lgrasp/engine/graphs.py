@@ -1,7 +1,7 @@
 """CUDA graphs of batches: launches before the number of survivors is known are combined into one."""
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import warp as wp
 
@@ -67,7 +67,7 @@ class GraphCache:
 
     def _capture(self, context: Context, count: int) -> _CapturedGraph:
         device = context.device
-        own = replace(context, seeds={}, holding=context.held)
+        own = context.changed(seeds={})
         for stage in self._pipeline.order[: self._pipeline.order.index("search") + 1]:
             own.seed(stage)
         first = wp.zeros(1, dtype=wp.int32, device=device)

@@ -79,9 +79,13 @@ class Context:
         """What is asked, everything allowed if nothing is."""
         return self.steer or steer_nothing(self.hand)
 
+    def changed(self, **changes: Any) -> "Context":
+        """A copy with some fields replaced, and what this one has on its device."""
+        return replace(self, **{"holding": self.held, "steer": self.steered} | changes)
+
     def with_salt(self, salt: int) -> "Context":
         """The same in another pass."""
-        return self if salt == self.salt else replace(self, salt=salt, holding=self.held)
+        return self if salt == self.salt else self.changed(salt=salt)
 
     def seed(self, stage: str, salt: int = 0) -> wp.array:
         """31-bit seed of a stage in this shard, (1,) i32 on the device."""
