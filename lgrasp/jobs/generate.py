@@ -39,6 +39,9 @@ _TALLY_THREADS = 4
 _MOST_COMPARED = 4_000_000
 """Rows of a folder among which near-duplicates are looked for: some 400 MB."""
 
+_LOOSE_LOAD = 0.25
+"""Bound of the unresisted load that hands of few fingers meet."""
+
 
 class GenerateJob(GenerateRequest, SearchJob):
     """Grasps of one object by one hand."""
@@ -154,6 +157,8 @@ class GenerateJob(GenerateRequest, SearchJob):
         if not outcome.starved:
             return None
         stage, words = starving_stage(self.report(outcome)["counts"])
+        if stage in ("search", "hold") and self.pipeline.bounds.max_unresisted_load < _LOOSE_LOAD:
+            words += f"; grasps that resist less: --set bounds.max_unresisted_load={_LOOSE_LOAD}, or --pipeline swift"
         return StarvedError(f"{outcome.rows:,} of {self.rows:,} grasps found; stage {stage} is the bottleneck: {words}")
 
 
