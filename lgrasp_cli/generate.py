@@ -9,6 +9,7 @@ from lgrasp.choices import ProtocolName
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import HANDS, OBJECTS, one_of
 from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, choose_pipeline, given
+from lgrasp_cli.steer import Fingers, Links, Palm
 from lgrasp_cli.tables import Block, closed, counted, following, held, place, plural, took
 from lgrasp_cli.working import How, working
 
@@ -63,10 +64,9 @@ def generate(
             help="Searches per successful pose: faster, but fewer poses; default: the pipeline's.",
         ),
     ] = None,
-    fingers: Annotated[
-        str | None,
-        Option(help="Fingers that all touch, and no others, such as thumb,index.", rich_help_panel="Steer"),
-    ] = None,
+    fingers: Fingers = None,
+    links: Links = None,
+    palm: Palm = None,
     table: Annotated[bool, Option("--table", help="Leave room for the table that the object rests on.")] = False,
     dry_run: DryRun = False,
 ) -> None:
@@ -77,6 +77,7 @@ def generate(
 
     Example: lgrasp generate --object mug --object bowl --object "meshes/*.obj" -n 10000
     """
+    from lgrasp.errors import ConfigError
     from lgrasp.hand.names import all_hands
     from lgrasp.jobs.config import pair_requests
     from lgrasp.object.find import all_objects
@@ -84,7 +85,9 @@ def generate(
     chosen = choose_pipeline(pipeline, seed, contacts, settings).with_passes(passes)
     chosen = chosen.with_simulation(simulate) if simulate else chosen
     chosen = chosen.with_table() if table else chosen
-    chosen = chosen.with_steering(**given(fingers=fingers))
+    chosen = chosen.with_steering(**given(fingers=fingers, links=links, palm=palm))
+    if contacts is not None and chosen.steer.fingers:
+        raise ConfigError(f"--contacts {contacts}: --fingers says already how many touch; give one of them")
     pairs = all_hands(hands), all_objects(meshes)
     what = {"rows": rows, "scale": scale, "batch": batch, "shard_rows": shard_rows}
     requests = pair_requests(*pairs, chosen, out or Path("grasps"), simulate, **what, **how.shared)

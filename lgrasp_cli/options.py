@@ -25,7 +25,7 @@ Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.0
 Device = Annotated[str, Option(help="auto: the first GPU, else the CPU.", **DEVICE)]
 Workers = Annotated[int, Option(min=0, help="Threads or processes; 0: by device.")]
 CacheDir = Annotated[Path | None, Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.")]
-Contacts = Annotated[str | None, Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4.")]
+Contacts = Annotated[str | None, Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4 or 3:5.")]
 JsonPath = Annotated[
     str | None,
     Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
@@ -131,8 +131,11 @@ def choose_pipeline(
             raise ConfigError(f"--seed {seed}: need 0 <= seed < 2^63")
         pipeline = pipeline.model_copy(update={"seed": seed})
     if contacts is not None:
-        if not all(part.isdecimal() and 2 <= int(part) <= 5 for part in split(contacts)):
-            reason = "give numbers of fingers from 2 to 5, separated by commas, such as 3,4"
+        ends = [part.split(":") for part in split(contacts)]
+        ranges = [(int(end[0]), int(end[-1])) for end in ends if len(end) <= 2 and all(map(str.isdecimal, end))]
+        if len(ranges) < len(ends) or not all(2 <= low <= high <= 5 for low, high in ranges):
+            reason = "give numbers of fingers from 2 to 5, or ranges of them, separated by commas, such as 3,4 or 3:5"
             raise ConfigError(f"--contacts '{contacts}': {reason}")
-        pipeline = pipeline.with_params("search", contacts=tuple(map(int, split(contacts))))
+        numbers = tuple(k for low, high in ranges for k in range(low, high + 1))
+        pipeline = pipeline.with_params("search", contacts=numbers)
     return pipeline.with_settings(settings or ())

@@ -9,6 +9,7 @@ import warp as wp
 
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
+from lgrasp.errors import ConfigError
 from lgrasp.grasp.schema import PASS_SHIFT
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_rows, select_poses, take_rows
 from lgrasp.hand.model import HandModel
@@ -78,13 +79,22 @@ def _fitted(stage: str, params: Any, hand: HandModel, steer: SteerArrays) -> Any
     A hand's own wish (hand.yaml: contacts) stands in for the default of search, and no more contacts are asked for than
     there are fingers: asking three of a gripper with two jaws would give nothing. Where a steering names the fingers,
     it tells how many. A pure function of parameters, hand and steering, all of which are in the content keys.
+
+    Raises:
+        ConfigError: a steering leaves fewer fingers than the parameters ask for.
     """
     if stage != "search":
         return params
     asked = params.contacts
-    if hand.contacts and asked == SearchParams.model_fields["contacts"].default:
+    default = asked == SearchParams.model_fields["contacts"].default
+    if hand.contacts and default:
         asked = hand.contacts
-    fingers = int(((np.diff(hand.contact_first[:-1]) > 0) & steer.touching.groups).sum())
+    fingers = int(steer.touching.groups[np.diff(hand.contact_first[:-1]) > 0].sum())
+    if not (default or steer.least or steer.touching.groups.all()) and min(asked) > fingers:
+        raise ConfigError(
+            f"steer.links leaves {fingers} fingers of hand '{hand.name}', and search.contacts asks for {min(asked)} or "
+            f"more; give --contacts {fingers}, or more links"
+        )
     contacts = (steer.least,) if steer.least else tuple(min(k, max(2, fingers)) for k in asked)
     return params if contacts == params.contacts else params.model_copy(update={"contacts": contacts})
 

@@ -4,6 +4,7 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
+from lgrasp.choices import PalmUse
 from lgrasp.config import Params
 
 STEER_VERSION = 1
@@ -18,7 +19,17 @@ class Steering(Params):
         description="Fingers that all touch, and no others: names of hand.yaml, or one link of each; none: any.",
     )
 
-    @field_validator("fingers", mode="before")
+    links: tuple[str, ...] = Field(
+        default=(), description="Links whose contact surface may touch, and no other; none: any."
+    )
+    palm: PalmUse = Field(default="yes", description="Whether the palm touches: yes, it may; no; must.")
+
+    @field_validator("palm", mode="before")
+    @classmethod
+    def _word(cls, value: Any) -> Any:
+        return {True: "yes", False: "no"}[value] if isinstance(value, bool) else value  # as YAML reads them
+
+    @field_validator("fingers", "links", mode="before")
     @classmethod
     def _names(cls, value: Any) -> Any:
         return tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else value

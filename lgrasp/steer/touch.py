@@ -22,6 +22,7 @@ class Touching:
     points: np.ndarray  # (C,) bool: contact points of the HandModel
     groups: np.ndarray  # (G,) bool: fingers
     exact: bool = False  # all these fingers touch
+    palm: bool = False  # the palm touches
 
     @property
     def bits(self) -> int:
@@ -33,28 +34,59 @@ def find_touching(steering: Steering, model: HandModel, fingers: Fingers) -> Tou
     """What of a hand may touch under a steering; all of it if nothing is asked.
 
     Raises:
-        ConfigError: the hand has no such finger, or it has no contact surface.
+        ConfigError: the hand has no such finger or link, or too little of it is left to hold anything.
     """
-    touching = Touching(np.ones(len(model.contact_points), bool), np.ones(model.groups, bool))
-    if not steering.fingers:
-        return touching
+    points, groups = np.ones(len(model.contact_points), bool), np.ones(model.groups, bool)
     group = np.repeat(np.arange(model.groups + 1), np.diff(model.contact_first))
-    chosen = [_group(name, model, fingers) for name in steering.fingers]
-    for number, name in enumerate(steering.fingers):
-        if chosen[number] in chosen[:number]:
-            other = steering.fingers[chosen.index(chosen[number])]
-            raise ConfigError(f"steer.fingers: {other} and {name} of hand '{model.name}' are one; name it once")
-    groups = np.isin(np.arange(model.groups), chosen)
-    return Touching(touching.points & np.append(groups, True)[group], groups, True)
+    if steering.links:
+        points &= np.isin(model.contact_link, _links(steering.links, model))
+    if steering.palm == "no":
+        points &= group < model.groups
+    palm = bool(points[group == model.groups].any())
+    if steering.palm == "must" and not palm:
+        raise ConfigError(f"steer.palm: hand '{model.name}' has no palm surface that may touch; give yes or no")
+    if steering.fingers:
+        chosen = _groups(steering.fingers, model, fingers)
+        points &= np.isin(group, [*chosen, model.groups])
+        for name, g in zip(steering.fingers, chosen, strict=True):
+            if not points[group == g].any():
+                raise ConfigError(f"steer.links: none is on finger '{name}' of hand '{model.name}', which must touch")
+    if steering.fingers or steering.links:
+        groups = np.isin(np.arange(model.groups), group[points])
+    able = len({*group[points].tolist()} - {model.groups})
+    if able + palm < 2 or not able:
+        left = f"only {able} of its fingers, and {'the palm' if palm else 'no palm'}"
+        raise ConfigError(
+            f"steer: hand '{model.name}' would touch with {left}; a grasp needs a finger and something else"
+        )
+    return Touching(points, groups, bool(steering.fingers), steering.palm == "must" or able == 1)
 
 
-def _group(name: str, model: HandModel, fingers: Fingers) -> int:
-    found = finger_group(model, fingers, name)
+def _links(names: Sequence[str], model: HandModel) -> list[int]:
+    """Indices of contact links."""
+    known = [model.tree.link_names[link] for link in np.unique(model.contact_link)]
+    for name in names:
+        if name not in known:
+            raise ConfigError(
+                f"steer.links: hand '{model.name}' has no contact surface on '{name}'; {did_you_mean(name, known)}"
+                f"contact links: {', '.join(known)}"
+            )
+    return [model.tree.link_names.index(name) for name in names]
+
+
+def _groups(names: Sequence[str], model: HandModel, fingers: Fingers) -> list[int]:
+    """Groups of fingers with contact surface by their names or those of links, each once."""
     able = np.flatnonzero(np.diff(model.contact_first[:-1])).tolist()
-    if found in able:
-        return found
     known = [finger_label(model, fingers, g) for g in able]
-    raise ConfigError(
-        f"steer.fingers: hand '{model.name}' has no finger '{name}' that may touch; {did_you_mean(name, known)}"
-        f"its fingers: {', '.join(known)}"
-    )
+    found: dict[int, str] = {}
+    for name in names:
+        group = finger_group(model, fingers, name)
+        if group not in able:
+            raise ConfigError(
+                f"steer.fingers: hand '{model.name}' has no finger '{name}' that may touch; "
+                f"{did_you_mean(name, known)}its fingers: {', '.join(known)}"
+            )
+        if group in found:
+            raise ConfigError(f"steer.fingers: {found[group]} and {name} of hand '{model.name}' are one; name it once")
+        found[group] = name
+    return list(found)

@@ -56,14 +56,40 @@ def test_fingers_of_the_published_index(lightning, load):
     np.testing.assert_array_equal(sets["chosen"] >= 0, np.isin(range(4), groups)[None].repeat(len(sets["chosen"]), 0))
 
 
-def test_what_no_hand_has_is_told(run, swift):
-    for asked, words in (
+def test_only_these_links_touch(steered):
+    allowed = ["link_3.0_tip", "link_7.0_tip", "link_15.0_tip"]
+    assert set().union(*touching(steered(links=allowed))) == set(allowed)
+
+
+@pytest.mark.parametrize("palm", ["no", "must"])
+def test_the_palm_touches_as_asked(steered, palm):
+    touches = ["base_link" in links for links in touching(steered(palm=palm, rows=12))]
+    assert all(touches) if palm == "must" else not any(touches)
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
         ({"fingers": "thump"}, "did you mean 'thumb'.*index, middle, ring, thumb"),
         ({"fingers": "thumb,link_15.0_tip"}, "thumb and link_15.0_tip .* are one"),
         ({"fingers": "base_link"}, "no finger 'base_link'"),
-    ):
-        with pytest.raises(ConfigError, match=words):
-            run(pipeline=swift.with_steering(**asked))
+        ({"links": "link_3.0"}, "no contact surface on 'link_3.0'.*contact links: base_link, link_3.0_tip"),
+        ({"links": "link_3.0_tip", "fingers": "thumb"}, "none is on finger 'thumb'"),
+        ({"links": "base_link"}, "only 0 of its fingers, and the palm"),
+        ({"fingers": "thumb", "palm": "no"}, "only 1 of its fingers, and no palm"),
+        ({"links": "link_3.0_tip,link_15.0_tip", "palm": "must"}, "no palm surface that may touch"),
+        ({"palm": "maybe"}, "'yes', 'no' or 'must'"),
+    ],
+)
+def test_what_leaves_nothing_is_told(run, swift, asked, words):
+    with pytest.raises(ConfigError, match=words):
+        run(pipeline=swift.with_steering(**asked))
+
+
+def test_too_many_contacts_for_the_links_are_told(run, swift):
+    asked = swift.with_params("search", contacts=(4,)).with_steering(links="link_3.0_tip,link_15.0_tip")
+    with pytest.raises(ConfigError, match=r"leaves 2 fingers .* asks for 4 or more"):
+        run(pipeline=asked)
 
 
 def test_steered_and_unsteered_do_not_mix(job, swift):

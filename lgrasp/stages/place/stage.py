@@ -3,6 +3,7 @@
 import warp as wp
 
 from lgrasp.errors import ConfigError
+from lgrasp.field.arrays import FieldArrays
 from lgrasp.grasp.tables import PoseTable
 from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
@@ -30,16 +31,13 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
         ConfigError: all weights are zero.
     """
     first, count = inputs
-    total = params.canonical + params.exhaustive + params.pinch + params.palm
-    if total <= 0:
-        raise ConfigError("place: weights canonical, exhaustive, pinch and palm are all 0; one must be positive")
+    shares = _shares(params, context.field, palm=context.steered.touching.palm)
     d = context.device
     if not isinstance(first, wp.array):
         first = wp.full(1, first, dtype=wp.int32, device=d)
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
     groups, shape = context.hand.model.groups, (count, params.proposals)
     proposals = empty_struct(ProposedPoses, d, *shape, groups)
-    shares = {name: getattr(params, name) / total for name in ("canonical", "pinch", "palm")}
     values = make_struct(PlaceValues, params, context.bounds, **shares)
     where = [context.seed("place"), first]
     asked = [values, context.steered.struct, *where]
@@ -54,3 +52,16 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     table = PoseTable.empty(d, count, groups)
     wp.launch(take_poses, count, [upto, chosen, first, proposals], [table.struct], device=d)
     return table, tally
+
+
+def _shares(params: PlaceParams, field: FieldArrays, *, palm: bool) -> dict[str, float]:
+    """Share of each source in the proposals; where the palm must touch, of those that put the object on it."""
+    weights = {name: getattr(params, name) for name in ("canonical", "exhaustive", "pinch", "palm")}
+    if palm:
+        on_palm = bool((field.model.pair_slot < 0).any(1).all())  # pairs of a lone finger and the palm
+        weights |= {"canonical": 0.0, "exhaustive": 0.0, "palm": params.palm or 1.0}
+        weights["pinch"] = params.pinch if on_palm else 0.0
+    total = sum(weights.values())
+    if total <= 0:
+        raise ConfigError("place: weights canonical, exhaustive, pinch and palm are all 0; one must be positive")
+    return {name: weights[name] / total for name in ("canonical", "pinch", "palm")}
