@@ -1,5 +1,6 @@
 """Options that steer grasps."""
 
+from pathlib import Path
 from typing import Annotated
 
 from typer import Option
@@ -15,4 +16,28 @@ Fingers = Annotated[
 Links = Annotated[str | None, Option(help="Links that may touch, and no others.", rich_help_panel=_PANEL)]
 Palm = Annotated[
     str | None, Option(rich_help_panel=_PANEL, **one_of(PalmUse, "PALM", "Whether the palm may or must touch."))
+]
+Approach = Annotated[
+    str | None,
+    Option(
+        metavar="X,Y,Z:DEG",
+        help="Cone, in the object's frame, of directions that the palm faces, such as 0,0,-1:30 from above.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Above = Annotated[
+    str | None,
+    Option(
+        metavar="X,Y,Z,D",
+        help="Keep the hand and its way where X x + Y y + Z z >= D, object's frame [m].",
+        rich_help_panel=_PANEL,
+    ),
+]
+PoseFile = Annotated[
+    Path | None,
+    Option(
+        "--pose",
+        help="Object poses in the hand's frame (npz, csv or a shard); only fingers are searched.",
+        rich_help_panel=_PANEL,
+    ),
 ]

@@ -191,7 +191,7 @@ def load_inputs(
     hand_model = load.hand(keys.source, keys.hand)
     touching = find_touching(steer, hand_model, keys.source.spec.fingers)
     object_model = load.object(keys.mesh, keys.object, scale, objects)
-    planes = load.planes(object_model, keys.object) if table else None
+    planes = load.planes(object_model, keys.object) if table and not steer.above else steer.plane
     hand = upload_hand(hand_model, alias)
     field_model = load.field(hand, keys.field, fields)
     start = time.perf_counter()
@@ -199,7 +199,7 @@ def load_inputs(
         field_model = steered_field(field_model, touching)
     obj, field = upload_object(object_model, alias, planes), upload_field(field_model, hand_model, alias)
     load.seconds["upload"] = time.perf_counter() - start
-    steered = upload_steering(touching, hand)
+    steered = upload_steering(steer, touching, hand, object_model.center)
     return Inputs(hand, obj, field, keys, device, load.seconds, load.hits, steer=steered)
 
 

@@ -65,8 +65,8 @@ class Pipeline(_Head):
 
     @property
     def on_table(self) -> bool:
-        """True if grasps leave room for the table that the object rests on."""
-        return self.params("place").table
+        """True if grasps leave room for the table that the object rests on, or for a plane that is asked for."""
+        return self.params("place").table or self.steer.above is not None
 
     @property
     def sections(self) -> tuple[tuple[Stage, BaseModel], ...]:

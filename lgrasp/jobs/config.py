@@ -179,7 +179,7 @@ def pair_requests(
         ConfigError: a value out of range, or two pairs with the same folder.
     """
     found: dict[Path, GenerateRequest] = {}
-    name = f"{pipeline.name}-table" if pipeline.on_table else pipeline.name
+    name = f"{pipeline.name}-table" if pipeline.params("place").table else pipeline.name
     name = f"{name}-steered" if pipeline.steer.asks else name
     for hand, mesh in itertools.product(hands, objects):
         out = run_folder(top, *_names(hand, mesh), name, protocol)

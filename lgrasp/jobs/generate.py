@@ -136,7 +136,7 @@ class GenerateJob(GenerateRequest, SearchJob):
         planes = inputs.object.planes
         resting = (
             [{"probability": float(p), "rows": both[f"pose {k}"]} for k, p in enumerate(planes[:, 4])]
-            if planes is not None
+            if planes is not None and not self.pipeline.steer.above
             else []
         )
         return {

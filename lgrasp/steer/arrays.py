@@ -5,10 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from lgrasp.geometry.poses import internal_poses
 from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.palm import palm_axis
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
-from lgrasp.steer.params import Steering
+from lgrasp.steer.params import NOTHING, Steering
+from lgrasp.steer.poses import read_poses
 from lgrasp.steer.touch import Touching, find_touching
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -20,6 +23,10 @@ class Steer:
 
     groups: wp.int32  # bit g: group g may touch
     palm_points: wp.array(dtype=wp.int32)  # (P,) contact points of the palm that may touch
+    facing: wp.vec3  # unit vector that the palm faces along, base frame
+    approach: wp.vec3  # unit axis of the cone in which it must be, object's frame
+    cosine: wp.float32  # of the cone's half angle; below -1: any direction
+    poses: wp.array(dtype=wp.transform)  # (T,) T_hand_object of the internal frame that candidates take; none: drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,17 +47,34 @@ class SteerArrays:
         return self.fingers if self.touching.exact else 0
 
 
-def upload_steering(touching: Touching, hand: HandArrays) -> SteerArrays:
-    """Put a steering on the device of its hand."""
-    model = hand.model
-    palm = np.arange(*model.contact_first[-2:])
-    values = {"groups": touching.bits, "palm_points": palm[touching.points[palm]].astype(np.int32)}
+def upload_steering(
+    steering: Steering, touching: Touching, hand: HandArrays, center: np.ndarray | None = None
+) -> SteerArrays:
+    """Put a steering on the device of its hand.
+
+    Args:
+        touching: what it says of this hand.
+        center: origin of the object's internal frame in the user's [m], (3,).
+
+    Raises:
+        ConfigError: poses that cannot be read.
+        HandError: an approach is asked for, and the hand has no side to face an object with.
+    """
+    palm = np.arange(*hand.model.contact_first[-2:])
+    values = {"groups": touching.bits, "palm_points": palm[touching.points[palm]].astype(np.int32), "cosine": -2.0}
+    if steering.approach:
+        direction = np.array(steering.approach.direction) / np.linalg.norm(steering.approach.direction)
+        values |= {"facing": palm_axis(hand.model)[1], "approach": direction}
+        values["cosine"] = float(np.cos(np.radians(steering.approach.angle)))
+    if steering.pose:
+        poses = read_poses(steering.pose)
+        values["poses"] = internal_poses(poses, np.zeros(3) if center is None else center)
     return SteerArrays(touching, upload_struct(Steer, hand.device, values))
 
 
 def steer_nothing(hand: HandArrays) -> SteerArrays:
     """Everything of a hand may touch."""
-    return upload_steering(find_touching(Steering(), hand.model, {}), hand)
+    return upload_steering(NOTHING, find_touching(NOTHING, hand.model, {}), hand)
 
 
 @wp.func

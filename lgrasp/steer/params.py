@@ -1,14 +1,59 @@
 """What a user steers grasps by; a pipeline carries it as its section ``steer``."""
 
-from typing import Any
+import hashlib
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from lgrasp.choices import PalmUse
 from lgrasp.config import Params
 
+if TYPE_CHECKING:
+    import numpy as np
+
+Numbers = tuple[float, float, float]
+
 STEER_VERSION = 1
 """Raised whenever the same steering gives other grasps."""
+
+
+def _numbers(text: str, count: int) -> tuple[float, ...]:
+    """Numbers that commas separate.
+
+    Raises:
+        ValueError: other than ``count`` finite ones.
+    """
+    try:
+        found = tuple(map(float, text.split(",")))
+    except ValueError:
+        found = ()
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise ValueError(f"give {count} numbers, separated by commas")
+    return found
+
+
+class ApproachCone(Params):
+    """Directions about one of the object's frame; as text ``x,y,z:degrees``."""
+
+    direction: Numbers = Field(description="Its middle.")
+    angle: float = Field(default=30.0, gt=0, le=180, description="Largest angle to the middle [deg].")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_text(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        direction, colon, angle = value.partition(":")
+        return {"direction": _numbers(direction, 3)} | ({"angle": angle} if colon else {})
+
+    @field_validator("direction")
+    @classmethod
+    def _of_some_length(cls, value: Numbers) -> Numbers:
+        if not 1e-6 < math.hypot(*value) < math.inf:
+            raise ValueError("must not be zero")
+        return value
 
 
 class Steering(Params):
@@ -23,6 +68,45 @@ class Steering(Params):
         default=(), description="Links whose contact surface may touch, and no other; none: any."
     )
     palm: PalmUse = Field(default="yes", description="Whether the palm touches: yes, it may; no; must.")
+
+    approach: ApproachCone | None = Field(
+        default=None, description="Cone, object's frame, in which the direction lies that the palm faces."
+    )
+    above: tuple[float, float, float, float] | None = Field(
+        default=None,
+        description="nx, ny, nz, d, object's frame [m]: the hand, open and on its way too, stays where n x >= d.",
+    )
+    pose: Path | None = Field(
+        default=None, description="File of object poses in the hand's frame; only the fingers are searched."
+    )
+
+    @field_validator("above", mode="before")
+    @classmethod
+    def _plane(cls, value: Any) -> Any:
+        return _numbers(value, 4) if isinstance(value, str) else value
+
+    @field_validator("above")
+    @classmethod
+    def _has_normal(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and not (1e-6 < math.hypot(*value[:3]) < math.inf and math.isfinite(value[3])):
+            raise ValueError("the normal must not be zero")
+        return value
+
+    @field_validator("pose")
+    @classmethod
+    def _is_there(cls, value: Path | None) -> Path | None:
+        if value is not None and not value.expanduser().is_file():
+            raise ValueError("no such file")
+        return value and value.expanduser()
+
+    @model_validator(mode="after")
+    def _together(self) -> "Steering":
+        for name in ("approach", "above") if self.pose else ():
+            if getattr(self, name):
+                raise ValueError(f"pose says where the hand is: leave out {name}")
+        if self.pose and self.palm == "must":
+            raise ValueError("pose says where the hand is: the palm cannot be put on the object")
+        return self
 
     @field_validator("palm", mode="before")
     @classmethod
@@ -39,9 +123,21 @@ class Steering(Params):
         """True if it asks for something."""
         return self != NOTHING
 
+    @property
+    def plane(self) -> "np.ndarray | None":
+        """``above`` as one plane that the object rests on (:mod:`lgrasp.object.resting`), (1, 5)."""
+        if self.above is None:
+            return None
+        import numpy as np  # not above: options are told wrong before anything is loaded
+
+        plane = np.array(self.above) / np.linalg.norm(self.above[:3])
+        return np.append(plane, 1.0)[None].astype(np.float32)
+
     def describe(self) -> dict[str, Any]:
         """What is asked, for content keys and shards; empty if it is nothing."""
         told = self.model_dump(mode="json", exclude_defaults=True)
+        if self.pose:
+            told["pose"] = hashlib.sha256(self.pose.read_bytes()).hexdigest()
         return told | {"version": STEER_VERSION} if told else {}
 
 

@@ -9,6 +9,7 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
+from lgrasp.geometry.poses import device_matrix, pose_matrix
 from lgrasp.hand.find import find_hand
 
 FINGERS = find_hand("allegro").spec.fingers
@@ -67,6 +68,71 @@ def test_the_palm_touches_as_asked(steered, palm):
     assert all(touches) if palm == "must" else not any(touches)
 
 
+@pytest.mark.parametrize(("approach", "sources"), [("0,0,-1:30", {}), ("1,2,0:8", {}), ("0,1,0:15", {"palm": "must"})])
+def test_the_palm_faces_into_the_cone(steered, approach, sources):
+    """Also where the object is pressed on the palm; Allegro's palm faces along x of its base."""
+    rows = steered(rows=12, approach=approach, **sources).grasps
+    faces = pose_matrix(rows.object_pose[:, 0].astype(float))[:, 0, :3]
+    direction, _, angle = approach.partition(":")
+    middle = np.array(direction.split(","), float)
+    assert (faces @ middle / np.linalg.norm(middle) >= np.cos(np.radians(float(angle))) - 1e-3).all()
+
+
+def test_every_source_of_poses_stays_in_the_cone(swift, load):
+    for name in ("canonical", "exhaustive", "pinch", "palm"):
+        weights = dict.fromkeys(("canonical", "exhaustive", "pinch", "palm"), 0.0) | {name: 1.0}
+        pipeline = swift.with_params("place", samples=0, **weights).with_steering(approach="0,-2,0:20")
+        inputs = load(pipeline=pipeline)
+        poses = run_stages(pipeline, shard_context(pipeline, inputs, 0), 0, 2000, "place").arrays()["pose"]
+        faces = device_matrix(poses)[:, 0, :3]
+        assert len(poses) > 20, name
+        assert (faces[:, 1] <= -np.cos(np.radians(20.0)) + 1e-5).all()
+        assert np.ptp(np.arctan2(faces[:, 2], faces[:, 0])) > 5  # all around
+
+
+def test_the_hand_stays_above_the_plane(steered, solids, link_poses):
+    rows = steered(above="0,0.6,0.8,0.01", rows=12).grasps
+    T = pose_matrix(rows.object_pose[:, 0].astype(float))
+    for q in (rows.q, rows.q_pregrasp):
+        links = np.linalg.inv(T)[:, None] @ link_poses(q)
+        for solid in solids.solids:
+            L = links[:, solid.link]
+            points = np.einsum("nij,pj->npi", L[:, :3, :3], solid.samples) + L[:, None, :3, 3]
+            assert (points @ [0, 0.6, 0.8]).min() > 0.0109
+
+
+@pytest.mark.parametrize("kind", [".npz", ".csv", ".h5"])
+def test_the_object_is_where_the_file_says(steered, run, swift, tmp_path, kind):
+    (path,) = run(rows=20).paths[:1]
+    poses = read_shard(path).grasps.object_pose[:, 0].astype(float)
+    if kind != ".h5":
+        path = tmp_path / f"poses{kind}"
+    if kind == ".npz":
+        np.savez(path, pose_matrix(poses))
+    elif kind == ".csv":
+        np.savetxt(path, poses, delimiter=",", header="x,y,z,qw,qx,qy,qz", comments="")
+    found = steered(pose=path, rows=10).grasps.object_pose[:, 0]
+    assert np.abs(found[:, None] - poses[None]).max(2).min(1).max() < 1e-5
+    assert len(np.unique(found.round(4), axis=0)) > 1
+
+
+@pytest.mark.parametrize("values", [np.zeros((0, 7)), np.zeros((3, 4, 4)), np.ones((2, 7)), np.ones((2, 5))])
+def test_files_without_poses_are_told(run, swift, tmp_path, values):
+    np.save(tmp_path / "poses.npy", values)
+    with pytest.raises(ConfigError, match=r"steer.pose: .*poses.npy"):
+        run(pipeline=swift.with_steering(pose=tmp_path / "poses.npy"))
+
+
+def test_other_poses_are_other_grasps(job, swift, tmp_path):
+    """The content of the file counts, not its name."""
+    pose = np.array([[0.1, 0, 0, 1, 0, 0, 0.0]])
+    keys = []
+    for name, values in (("a", pose), ("b", pose), ("c", -pose)):
+        np.save(tmp_path / f"{name}.npy", values)
+        keys.append(job(pipeline=swift.with_steering(pose=tmp_path / f"{name}.npy")).key())
+    assert keys[0] == keys[1] != keys[2]
+
+
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
@@ -79,6 +145,12 @@ def test_the_palm_touches_as_asked(steered, palm):
         ({"fingers": "thumb", "palm": "no"}, "only 1 of its fingers, and no palm"),
         ({"links": "link_3.0_tip,link_15.0_tip", "palm": "must"}, "no palm surface that may touch"),
         ({"palm": "maybe"}, "'yes', 'no' or 'must'"),
+        ({"approach": "0,0,0:30"}, "must not be zero"),
+        ({"approach": "0,0:30"}, "give 3 numbers"),
+        ({"approach": "0,0,1:300"}, "less than or equal to 180"),
+        ({"above": "0,0,0,1"}, "the normal must not be zero"),
+        ({"pose": "nowhere.npz"}, "no such file"),
+        ({"pose": __file__, "approach": "0,0,1"}, "leave out approach"),
     ],
 )
 def test_what_leaves_nothing_is_told(run, swift, asked, words):

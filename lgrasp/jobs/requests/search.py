@@ -42,6 +42,8 @@ class SearchRequest(Request):
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}' with steer: only for one object, and without stage refine"
             )
+        if self.pipeline.steer.above and self.pipeline.params("place").table:
+            raise ConfigError(f"pipeline '{self.pipeline.name}': steer.above and place.table are one or the other")
         hand_path(self.hand)
         check_folder(self.out)
 

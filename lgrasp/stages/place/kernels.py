@@ -15,6 +15,7 @@ from lgrasp.math.transforms import random_rotation, rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.steer.arrays import Steer, may_touch, pick_group
+from lgrasp.steer.cone import in_cone, roll_in_cone, rotation_in_cone
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -27,6 +28,7 @@ _PINCH_DRAWS = wp.constant(32)  # of two opposite points and two opposed contact
 _PINCH_TOLERANCE = wp.constant(0.002)  # [m] difference of their distances
 _PINCH_ROLL_SIGMA = wp.constant(0.3)  # [rad] about the roll that brings the first normals together
 _PINCH_MIN_SINE = wp.constant(0.1)  # of a normal to the line; below that any roll is as good
+_CONE_DRAWS = wp.constant(32)  # of points of object and hand whose roll may bring the palm into its cone
 _LEAST_CONTACT_HEIGHT = wp.constant(0.005)  # [m] above the table, of contacts that rate a pose
 _PALM_COSINE = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched object's normal to the palm's
 
@@ -76,15 +78,22 @@ class ProposedPoses:
 
 
 @wp.func
-def _aligned(p: wp.vec3, n: wp.vec3, point: wp.vec3, normal: wp.vec3, state: wp.uint32):
-    """Pose that puts object point on p with opposite normals, and a random roll about the normal."""
-    roll = wp.quat_from_axis_angle(n, wp.randf(state, 0.0, wp.TAU))
-    R = roll * rotation_between(normal, -n)
-    return wp.transform(p - wp.quat_rotate(R, point), R)
+def _aligned(p: wp.vec3, n: wp.vec3, point: wp.vec3, normal: wp.vec3, steer: Steer, state: wp.uint32):
+    """Pose that puts object point on p with opposite normals, with a random roll about the normal of those that are
+    asked for; and whether there is one."""
+    R = rotation_between(normal, -n)
+    found = bool(True)
+    roll = float(0.0)
+    if steer.cosine < -1.0:
+        roll = wp.randf(state, 0.0, wp.TAU)
+    else:
+        roll, found = roll_in_cone(steer, R, n, wp.randf(state))
+    R = wp.quat_from_axis_angle(n, roll) * R
+    return wp.transform(p - wp.quat_rotate(R, point), R), found
 
 
 @wp.func
-def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int32), state: wp.uint32):
+def _pinch(hand: Hand, field: Field, obj: Object, steer: Steer, anchor: wp.array(dtype=wp.int32), state: wp.uint32):
     """Pose that puts two opposite object points between two fingers, or finger and palm, that press towards each other.
 
     ``anchor`` gets the two points; all of them stay below 0 when no pose was found.
@@ -117,7 +126,11 @@ def _pinch(hand: Hand, field: Field, obj: Object, anchor: wp.array(dtype=wp.int3
         angle = wp.atan2(y, x) + _PINCH_ROLL_SIGMA * wp.randn(state)
         if wp.length(side) < _PINCH_MIN_SINE or wp.length(wp.cross(want, axis)) < _PINCH_MIN_SINE:
             angle = wp.randf(state, 0.0, wp.TAU)
+            if steer.cosine >= -1.0:
+                angle, _ = roll_in_cone(steer, R, axis, wp.randf(state))
         R = wp.quat_from_axis_angle(axis, angle) * R
+        if not in_cone(steer, R):
+            continue
         middle = 0.5 * (obj.contact_points[i] + obj.contact_points[j])
         T = wp.transform(0.5 * (a + b) - wp.quat_rotate(R, middle), R)
         slot = field.pair_slot[pair]
@@ -246,8 +259,6 @@ def propose_poses(
     palms = steer.palm_points.shape[0]
     u = wp.randf(state)
     i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
-    point = obj.contact_points[i]
-    normal = obj.contact_normals[i]
     palm = int(-1)
     anchor = wp.zeros(shape=(MAX_GROUPS,), dtype=wp.int32)
     for k in range(G):
@@ -257,36 +268,59 @@ def propose_poses(
         setting = wp.min(int(wp.randf(state) * float(hand.kin.settings)), hand.kin.settings - 1)
     T = wp.transform_identity()
     rating = int(Rating.BLOCKED)
-    if u < params.canonical:
+    tries = wp.where(steer.cosine < -1.0, 1, _CONE_DRAWS)
+    found = bool(True)
+    if steer.poses.shape[0] > 0:
+        T = steer.poses[(first[0] + row) % steer.poses.shape[0]]
+    elif u < params.canonical:
         x = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
         p = hand.box_low + wp.cw_mul(x, hand.box_high - hand.box_low)
-        R = random_rotation(wp.rand_init(wp.randi(state)))
-        T = wp.transform(p - wp.quat_rotate(R, point), R)
+        R = wp.quat_identity()
+        if steer.cosine < -1.0:
+            R = random_rotation(wp.rand_init(wp.randi(state)))
+        else:
+            R = rotation_in_cone(steer, wp.rand_init(wp.randi(state)))
+        T = wp.transform(p - wp.quat_rotate(R, obj.contact_points[i]), R)
     elif u < params.canonical + params.pinch:
-        T, setting, palm, i = _pinch(hand, field, obj, anchor, wp.rand_init(wp.randi(state)))
+        T, setting, palm, i = _pinch(hand, field, obj, steer, anchor, wp.rand_init(wp.randi(state)))
         if setting < 0:
             rating = Rating.HOPELESS
     elif u < params.canonical + params.pinch + params.palm and palms > 0:
-        palm = steer.palm_points[wp.min(int(wp.randf(state) * float(palms)), palms - 1)]
-        n = hand.contacts.normals[palm]
-        T = _aligned(hand.contacts.points[palm], n, point, normal, wp.rand_init(wp.randi(state)))
+        for t in range(tries):
+            if t > 0:
+                i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+            palm = steer.palm_points[wp.min(int(wp.randf(state) * float(palms)), palms - 1)]
+            p = hand.contacts.points[palm]
+            n = hand.contacts.normals[palm]
+            draws = wp.rand_init(wp.randi(state))
+            T, found = _aligned(p, n, obj.contact_points[i], obj.contact_normals[i], steer, draws)
+            if found:
+                break
     else:
         g = pick_group(steer.groups, wp.randf(state))
         slot = setting * G + g
         r0 = field.start[field.cell_first[slot] * 64]
         r1 = field.start[field.cell_first[slot + 1] * 64]
         if r1 > r0:
-            r = r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1)
             X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-            j0 = group_forward(hand.kin, g, field_seed(field, hand.kin, slot, r), X, 0)
-            c = field.point[r]
-            B = X[hand.contacts.body[c] - 1 - j0]
-            p = wp.transform_point(B, hand.contacts.points[c])
-            n = wp.transform_vector(B, hand.contacts.normals[c])
-            T = _aligned(p, n, point, normal, wp.rand_init(wp.randi(state)))
+            for t in range(tries):
+                if t > 0:
+                    i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
+                r = r0 + wp.min(int(wp.randf(state) * float(r1 - r0)), r1 - r0 - 1)
+                j0 = group_forward(hand.kin, g, field_seed(field, hand.kin, slot, r), X, 0)
+                c = field.point[r]
+                B = X[hand.contacts.body[c] - 1 - j0]
+                p = wp.transform_point(B, hand.contacts.points[c])
+                n = wp.transform_vector(B, hand.contacts.normals[c])
+                draws = wp.rand_init(wp.randi(state))
+                T, found = _aligned(p, n, obj.contact_points[i], obj.contact_normals[i], steer, draws)
+                if found:
+                    break
             anchor[g] = i
         else:
             rating = Rating.HOPELESS
+    if not found:
+        rating = Rating.HOPELESS
     T_object = wp.transform_inverse(T)
     # the same of all proposals: else those that are hard to reach would lose against the others
     resting = _draw_resting(obj, wp.rand_init(seed[0] - SEED_STRIDE, first[0] + row))
@@ -297,8 +331,8 @@ def propose_poses(
         if body_height(hand.pieces, 0, wp.transform_identity(), plane, above) < above:
             rating = Rating.BLOCKED
         if rating == Rating.CLEAR and params.samples > 0:
-            draws = wp.rand_init(wp.randi(state))
-            rating = _rate(hand, field, obj, params, steer.groups, T, plane, setting, palm, anchor, draws)
+            numbers = wp.rand_init(wp.randi(state))
+            rating = _rate(hand, field, obj, params, steer.groups, T, plane, setting, palm, anchor, numbers)
     proposals_out.pose[row, b] = T
     proposals_out.palm_point[row, b] = palm
     proposals_out.surface[row, b] = i

@@ -1,0 +1,64 @@
+"""Object poses that a user gives: a file of them."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.errors import ConfigError
+from lgrasp.geometry.poses import pose_from_matrix
+
+_UNIT = 1e-3  # of the lengths of quaternions, and of the products of the axes of a matrix
+
+
+def read_poses(path: Path) -> np.ndarray:
+    """T_hand_object, x y z [m] qw qx qy qz, shape [n, 7]: of a shard's rows, or of a NumPy file or a CSV file with
+    matrices (16 numbers a pose, row by row) or such poses (7).
+
+    Raises:
+        ConfigError: the file cannot be read or holds no pose.
+    """
+    where = f"steer.pose: {path}"
+    try:
+        poses = _read(path)
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"{where} cannot be read: {' '.join(str(error).split())[:200]}") from None
+    if poses.ndim == 3 and poses.shape[1:] == (4, 4):
+        poses = poses.reshape(-1, 16)
+    if poses.ndim != 2 or poses.shape[1] not in (7, 16) or not len(poses) or poses.dtype.kind not in "fiu":
+        raise ConfigError(
+            f"{where} holds {poses.dtype} of shape {poses.shape}; give poses of shape (n, 4, 4) or (n, 7)"
+        )
+    poses = poses.astype(float)
+    if poses.shape[1] == 16:
+        T = poses.reshape(-1, 4, 4)
+        R = T[:, :3, :3]
+        good = (np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) < _UNIT).all((1, 2)) & (np.linalg.det(R) > 0)
+        good &= (np.abs(T[:, 3] - [0, 0, 0, 1]) < _UNIT).all(1)
+        poses = pose_from_matrix(np.where(good[:, None, None], T, np.eye(4)))
+    else:
+        good = np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) < _UNIT
+    good &= np.isfinite(poses).all(1)
+    if not good.all():
+        raise ConfigError(f"{where}: pose {int(np.argmin(good))} is no rotation and translation")
+    return poses
+
+
+def _read(path: Path) -> np.ndarray:
+    if path.suffix in (".h5", ".hdf5"):
+        with ShardReader(path) as reader:
+            return reader.column("object_pose")[:, 0]
+    data = path.read_bytes()
+    if path.suffix in (".npy", ".npz"):
+        found = np.load(io.BytesIO(data), allow_pickle=False)
+        if isinstance(found, np.ndarray):
+            return found
+        names = [name for name in ("poses", "T_hand_object") if name in found.files] or found.files
+        if len(names) != 1:
+            raise ValueError(f"arrays {', '.join(found.files)}; name one of them poses")
+        return found[names[0]]
+    lines = [line for line in data.decode("utf-8").splitlines() if line.strip()]
+    if lines and any(c.isalpha() and c not in "eE" for c in lines[0]):  # a header
+        lines = lines[1:]
+    return np.atleast_2d(np.array([[float(x) for x in line.split(",")] for line in lines]))
