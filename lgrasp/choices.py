@@ -24,3 +24,5 @@ FormatName = Literal["dexgraspnet", "dexgraspbench", "isaac-grasp", "mjcf"]
 """Formats of other programs (:mod:`lgrasp.dataset.exports.formats`)."""
 MetricName = Literal["volume", "epsilon_exact", "hold"]
 """Metrics that can be added to shards (:mod:`lgrasp.dataset.metrics`); ``hold``: those of the hold test."""
+VariationName = Literal["joint_limit", "link_scale", "finger_spacing"]
+"""What can be varied of a hand (:mod:`lgrasp.hand.drafting.vary`)."""

@@ -1,14 +1,27 @@
 """``lgrasp hands``: the hands there are."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from typer import Argument, Option
 
+from lgrasp.choices import ProtocolName, VariationName
 from lgrasp_cli.look import view_hand
-from lgrasp_cli.options import CacheDir, Device, HandArgument, PipelineName, Quiet, Workers, choose_pipeline, open_cache
+from lgrasp_cli.names import HANDS, OBJECTS, PIPELINE, one_of
+from lgrasp_cli.options import (
+    CacheDir,
+    Device,
+    HandArgument,
+    PipelineName,
+    Quiet,
+    Seed,
+    Workers,
+    choose_pipeline,
+    open_cache,
+)
 from lgrasp_cli.tables import Answer, Block, TextTable, plural, reporting
+from lgrasp_cli.working import How, working
 
 if TYPE_CHECKING:
     from lgrasp.jobs.hand_check.check import HandCheck
@@ -158,6 +171,63 @@ def check_hand(
         *(f"wrote {picture}" for picture in found.pictures),
     ]
     return Answer(asdict(found) | {"pictures": [str(p) for p in found.pictures]}, blocks)
+
+
+@app.command("compare")
+@working
+def compare_hands(
+    hands: Annotated[list[str], Argument(help="Names of hands, URDF files, folders, or globs.", **HANDS)],
+    how: How,
+    objects: Annotated[
+        list[str] | None,
+        Option(
+            "--object",
+            "-o",
+            help="Name, mesh file, folder or glob; repeatable.",
+            show_default="bottle, box, capsule, mug",
+            **OBJECTS,
+        ),
+    ] = None,
+    rows: Annotated[int | None, Option("-n", "--rows", help="Grasps per hand and object.", show_default="200")] = None,
+    vary: Annotated[
+        list[str] | None,
+        Option(
+            metavar="KIND:VALUES",
+            help="Also compare variants of each hand, such as link_scale:0.8,1.2 or joint_limit:+-20%; repeatable; "
+            f"kinds: {', '.join(get_args(VariationName))}.",
+        ),
+    ] = None,
+    simulate: Annotated[
+        str | None, Option(**one_of(ProtocolName, "PROTOCOL", "Also simulate the grasps (MuJoCo)."))
+    ] = None,
+    pipeline: Annotated[
+        str | None, Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.", **PIPELINE)
+    ] = None,
+    seed: Seed = None,
+    out: Annotated[Path | None, Option(help="Folder of the shards and of compare.html; default: compare.")] = None,
+) -> None:
+    """Compare hands, and variants of their design, by their grasps: yield, coverage, diversity, quality, hold test.
+
+    Example: lgrasp hands compare allegro leap --object mug --vary link_scale:0.8,1.2
+    """
+    from lgrasp.jobs.requests.compare import CompareRequest
+
+    what: dict[str, Any] = {"hands": hands, "objects": objects, "rows": rows, "vary": vary, "simulate": simulate}
+    what |= {"pipeline": pipeline, "seed": seed, "out": out}
+    how.run(how.job(CompareRequest, "hands compare", **what), _show_comparison)
+
+
+def _show_comparison(data: dict[str, Any]) -> list[Block]:
+    from lgrasp.jobs.compare.page import HAND_COLUMNS, cells, shown_columns
+
+    columns = shown_columns(data["hands"])
+    heads = [head for _, head, _, _ in (*columns, *HAND_COLUMNS)]
+    rows = [
+        (hand["hand"], *cells(hand["all"], columns), *cells(hand["workspace"], HAND_COLUMNS)) for hand in data["hands"]
+    ]
+    missing = [("missing", f"{plural(data['missing'], 'hand')} with an object")] if data["missing"] else []
+    table = TextTable(("hand", *heads), rows, right=heads)
+    return [table, "", [*missing, ("time", f"{data['seconds']['total']:.1f} s"), ("page", str(data["page"]))]]
 
 
 def _show_spaces(found: "HandCheck") -> list[Block]:

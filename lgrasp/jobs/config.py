@@ -109,6 +109,7 @@ KINDS = {
     "learn": "lgrasp.jobs.requests.shards:FitRequest",
     "metrics": "lgrasp.jobs.requests.shards:MetricsRequest",
     "export": "lgrasp.jobs.requests.shards:ExportRequest",
+    "compare": "lgrasp.jobs.requests.compare:CompareRequest",
 }
 """Kind of a job, as key ``job`` of a config names it, and its keys; those of ``generate`` are :class:`JobConfig`."""
 

@@ -178,7 +178,7 @@ def _tally(paths: Collection[Path], moving: np.ndarray) -> tuple[Counter[str], d
             fingers = (moving[np.maximum(links, 0)] & (links >= 0)).sum((1, 2))
             found = Counter(
                 rows=len(reader),
-                strict=_strict_rows(reader),
+                strict=strict_rows(reader),
                 published_count=int(((fingers >= 3) & (fswo**2 < PUBLISHED_FSWO)).sum()),
                 distinct_poses=len(np.unique(reader.column("candidate") & POSE_BITS)),
             )
@@ -210,7 +210,7 @@ def _near_duplicates(paths: Collection[Path], device: str) -> int:
     return len(np.unique(near_pairs(np.concatenate(poses), np.concatenate(postures), device)[:, 1]))
 
 
-def _strict_rows(reader: ShardReader) -> int:
+def strict_rows(reader: ShardReader) -> int:
     """Rows within the strict bounds; none where friction was taken to be higher, since forces were balanced with it."""
     strict = GraspBounds()
     if stored_bounds(reader.header.config).friction > strict.friction:

@@ -21,6 +21,7 @@ from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import Job, run
 from lgrasp.hand.find import find_hand
+from lgrasp.jobs.compare.job import CompareJob
 from lgrasp.jobs.export import ExportJob
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.learn.job import FitJob, load_predictor
@@ -36,7 +37,7 @@ from lgrasp.simulate.protocol import find_protocol
 from lgrasp.stages.refine.params import RefineParams
 from lgrasp_cli.progress import Bar, JobProgress
 
-NAMES = ("generate", "sequence", "refine", "plan", "simulate", "scenes", "learn", "metrics", "export")
+NAMES = ("generate", "sequence", "refine", "plan", "simulate", "scenes", "learn", "metrics", "export", "compare")
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +107,8 @@ def jobs(swift, source: Path, shards, two_spaces: str, cache_root: Path) -> Call
             return PlanJob(**base, object="sphere", starts=2, params=PlanParams(rolls=8, finalists=2))
         if name == "export":
             return ExportJob(**made, to="dexgraspnet")
+        if name == "compare":
+            return CompareJob(**base, hands=("allegro",), objects=("sphere", "mug"), rows=3, pipeline="swift")
         if name == "refine":
             return RefineJob(**made, params=RefineParams(matching_rounds=1))
         return MetricsJob(**made, add=("volume",))

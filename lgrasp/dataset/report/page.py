@@ -43,12 +43,18 @@ def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows], pic
     blocks = [*_head(numbers), *pictures]
     for data, rows in zip(numbers["hands"], hands.values(), strict=True):
         blocks += _hand(data, rows)
+    return render_page(title, blocks)
+
+
+def render_page(title: str, blocks: Sequence[Block]) -> str:
+    """Blocks as one HTML page that needs nothing else."""
     loader = jinja2.PackageLoader("lgrasp.dataset.report", ".")
     pages = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return pages.get_template("page.html").render(title=title, blocks=blocks)
 
 
-def _chapter(heading: str, level: int = 3) -> Block:
+def chapter(heading: str, level: int = 3) -> Block:
+    """A heading."""
     return {"heading": heading, "level": level}
 
 
@@ -87,7 +93,7 @@ def _head(numbers: dict[str, Any]) -> list[Block]:
 
 
 def _hand(data: dict[str, Any], hand: HandRows) -> list[Block]:
-    parts = [_chapter(data["hand"], 2), *run_tables(data)]
+    parts = [chapter(data["hand"], 2), *run_tables(data)]
     if not data["rows"]:
         return [*parts, {"words": "No rows."}]
     held = held_tables(data)
@@ -95,11 +101,11 @@ def _hand(data: dict[str, Any], hand: HandRows) -> list[Block]:
     for group in data["objects"]:
         contacts.update({int(n): rows for n, rows in group["contacts"].items()})
     return [
-        *(*parts, _chapter("Validity"), validity_table(data), *_histograms(hand)),
-        *((_chapter("Objects in the hand"), *held) if held else ()),
+        *(*parts, chapter("Validity"), validity_table(data), *_histograms(hand)),
+        *((chapter("Objects in the hand"), *held) if held else ()),
         *(_physics(data) if any(group["physics"] for group in data["objects"]) else ()),
-        *(_chapter("Contacts"), _figure(contact_chart(contacts, data["contact_links"]))),
-        *(_chapter("Diversity"), diversity_table(data)),
+        *(chapter("Contacts"), _figure(contact_chart(contacts, data["contact_links"]))),
+        *(chapter("Diversity"), diversity_table(data)),
         *_dots(data, hand),
     ]
 
@@ -117,7 +123,7 @@ def _histograms(hand: HandRows) -> list[Block]:
             "Epsilon and volume as docs/reference/metrics.md defines them: friction 0.5, eight-edge cones, torque over "
             "the object's radius. 0: the origin is not inside the hull, so some load cannot be held at this friction."
         )
-        out += [_chapter("Quality"), _figure(quantity_chart(free), text)]
+        out += [chapter("Quality"), _figure(quantity_chart(free), text)]
     return out
 
 
@@ -132,7 +138,7 @@ def _physics(data: dict[str, Any]) -> list[Block]:
     tried = [(name, ways) for name, ways in total.items() if any(way["run"] for way in ways.values())]
     text = "Of the grasps run in a direction; a grasp that failed in one may not have been run in the others."
     chart = [_figure(failure_chart(tried), text)] if tried else []
-    return [_chapter("Physics"), physics_table(data), *chart, *protocol_list(data)]
+    return [chapter("Physics"), physics_table(data), *chart, *protocol_list(data)]
 
 
 def _dots(data: dict[str, Any], hand: HandRows) -> list[Block]:
@@ -156,8 +162,8 @@ def _dots(data: dict[str, Any], hand: HandRows) -> list[Block]:
         f"{found['components_for_95_percent']} components explain 95 %. {dots}"
     )
     return [
-        *(_chapter("Object positions"), _figure(position_chart(sample["position"], sample["group"], names), where)),
-        *(_chapter("Approach directions"), _figure(direction_maps(maps), ways)),
-        _chapter("Postures"),
+        *(chapter("Object positions"), _figure(position_chart(sample["position"], sample["group"], names), where)),
+        *(chapter("Approach directions"), _figure(direction_maps(maps), ways)),
+        chapter("Postures"),
         _figure(posture_chart(posture, posture.scores(sample["q"]), sample["group"], names), postures),
     ]

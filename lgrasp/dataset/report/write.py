@@ -43,16 +43,16 @@ def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], No
     if out.exists() and not out.is_file():
         raise OutputError(f"report {out} cannot be written: it is no regular file; name another")
     numbers, hands = read_dataset(paths, progress=progress)
-    write_file(out, page(numbers, hands, _pictures(paths) if numbers["rows"] else ()))
+    write_file(out, page(numbers, hands, pictures(paths) if numbers["rows"] else ()))
     return numbers
 
 
-def _pictures(paths: Paths) -> list[Block]:
-    """Some rows, drawn."""
+def pictures(paths: Paths, most: int = _PICTURES, columns: int = _PICTURES // 2) -> list[Block]:
+    """Some rows, drawn side by side; a note if none can be."""
     try:
         rows = SceneRows(paths)
-        chosen = rows.sound(rows.spread(_PICTURES))
-        image = draw_rows(rows, chosen, size=_SIZE, columns=_PICTURES // 2)
+        chosen = rows.sound(rows.spread(most))
+        image = draw_rows(rows, chosen, size=_SIZE, columns=columns)
     except LgraspError as error:  # what is reported need not be of a hand that can be drawn
         return [{"words": f"No pictures: {error}", "kind": "note"}]
     data = base64.b64encode(image_bytes(image, ".jpg")).decode()

@@ -1,0 +1,86 @@
+"""A comparison of hands as one HTML page."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lgrasp.dataset.report.page import chapter, render_page
+from lgrasp.dataset.report.tables import Block, table
+from lgrasp.dataset.report.write import pictures
+from lgrasp.files import write_file
+from lgrasp.jobs.compare.measure import MEANS
+
+COLUMNS = (  # number, head, factor, format
+    ("rows", "rows", 1, ",.0f"),
+    ("yield", "rows/pose", 1, ".3f"),
+    ("strict_per_s", "rows/s", 1, ",.0f"),
+    ("approach", "approach [%]", 100, ".0f"),
+    ("surface", "surface [%]", 100, ".0f"),
+    ("pca_ratio", "PCA 1 [%]", 100, ".0f"),
+    ("joint_entropy", "entropy", 1, ".2f"),
+    ("contacts", "contacts", 1, ".1f"),
+    ("epsilon", "epsilon", 1, ".3f"),
+    ("hold", "hold [%]", 100, ".0f"),
+    ("simulated", "simulated [%]", 100, ".0f"),
+)
+HAND_COLUMNS = (
+    ("volume", "space [cm3]", 1e6, ",.0f"),
+    ("shared", "shared [cm3]", 1e6, ",.0f"),
+    ("manipulability", "manip. [cm3]", 1e6, ",.0f"),
+)
+"""Numbers of a hand alone."""
+
+
+def cells(found: Mapping[str, Any], columns: Sequence[tuple[str, str, float, str]]) -> list[str]:
+    """Numbers as texts, ``-`` for None; of a PCA ratio the first, of an entropy the mean."""
+    texts = []
+    for name, _, factor, style in columns:
+        value = found[name]
+        if isinstance(value, Mapping):
+            value = value["mean"]
+        elif isinstance(value, Sequence):
+            value = value[0]
+        texts.append("-" if value is None else f"{factor * value:{style}}")
+    return texts
+
+
+def shown_columns(hands: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, float, str]]:
+    """Those of which there is a number."""
+    return [column for column in COLUMNS if any(hand["all"][column[0]] is not None for hand in hands)]
+
+
+def write_page(data: Mapping[str, Any], files: Mapping[str, Sequence[Path]], out: Path) -> None:
+    """Write the page of the report of a comparison.
+
+    Args:
+        data: see :meth:`lgrasp.jobs.compare.job.CompareJob.report`.
+        files: shards by hand.
+
+    Raises:
+        OutputError: the page cannot be written.
+    """
+    hands, columns = data["hands"], shown_columns(data["hands"])
+    heads = [head for _, head, _, _ in columns]
+    alone = [head for _, head, _, _ in HAND_COLUMNS]
+    rows = [[h["hand"], *cells(h["all"], columns), *cells(h["workspace"], HAND_COLUMNS)] for h in hands]
+    words = (
+        f"Pipeline {data['pipeline']}, {data['asked_rows']:,} grasps of each hand with each object, "
+        f"on {data['device']}. Means over the objects; PCA and entropy of all rows together. "
+    )
+    words += "; ".join(f"{name.replace('_', ' ')}: {what}" for name, what in MEANS.items() if name != "simulated")
+    blocks: list[Block] = [
+        {"words": f"{words}. docs/guides/compare-hands.md explains the rest.", "kind": "dim"},
+        chapter("All objects", 2),
+        table(["hand", *heads, *alone], rows),
+        chapter("By object", 2),
+    ]
+    for name in dict.fromkeys(name for hand in hands for name in hand["objects"]):
+        found = [[h["hand"], *cells(h["objects"][name], columns)] for h in hands if name in h["objects"]]
+        blocks += [chapter(name), table(["hand", *heads], found)]
+    blocks.append(chapter("Pictures", 2))
+    for hand in hands:
+        drawn = (
+            pictures(files[hand["hand"]], 4, 4) if hand["all"]["rows"] else [{"words": "No grasps.", "kind": "note"}]
+        )
+        blocks += [chapter(hand["hand"]), *drawn]
+    write_file(out, render_page(f"Hands compared: {', '.join(hand['hand'] for hand in hands)}", blocks))

@@ -1,0 +1,100 @@
+"""lgrasp hands compare: numbers of its shards, variants as hands of their own, the page, requests that cannot be."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.report import job_report
+from lgrasp.engine.run import run
+from lgrasp.errors import ConfigError, HandError
+from lgrasp.jobs.compare.job import CompareJob
+from lgrasp.jobs.requests.compare import CompareRequest, parse_variations
+
+
+@pytest.fixture(scope="module")
+def compared(cache_root, tmp_path_factory):
+    """The report of a hand and a variant on one object, and the folder."""
+    out = tmp_path_factory.mktemp("compare")
+    given = {
+        "hands": ("allegro",),
+        "objects": ("sphere",),
+        "vary": ("link_scale:1.1",),
+        "rows": 30,
+        "pipeline": "swift",
+    }
+    job = CompareJob(**given, out=out, device="cpu", workers=1, cache=Cache(cache_root))
+    return job_report(run(job)), out
+
+
+def test_numbers_are_those_of_the_shards(compared):
+    data, out = compared
+    assert json.loads(json.dumps(data)) == data
+    assert [(hand["hand"], hand["of"], hand["variation"]) for hand in data["hands"]] == [
+        ("allegro", "allegro", None),
+        ("allegro-link_scale-1.1", "allegro", "link_scale-1.1"),
+    ]
+    for hand in data["hands"]:
+        (path,) = (out / f"{hand['hand']}-sphere").rglob("*.h5")
+        assert validate_shard(path) == []
+        cell = hand["objects"]["sphere"]
+        with ShardReader(path) as reader:
+            assert cell["rows"] == len(reader) == 30
+            assert cell["hold"] == pytest.approx(reader.column("metrics/hold_success").mean())
+            assert cell["epsilon"] == pytest.approx(float(np.median(reader.column("metrics/epsilon"))))
+            kept, tried = reader.statistics["filter_kept"], reader.statistics["candidates"]
+            assert cell["yield"] == pytest.approx(kept / tried)  # all rows of swift are strict
+        assert 0 < cell["surface"] < 1
+        assert 0 < cell["approach"] <= 30 / 288
+        assert hand["all"]["yield"] == cell["yield"]  # the mean over one object
+        assert hand["all"]["pca_ratio"] == cell["pca_ratio"]
+    small, large = (hand["workspace"] for hand in data["hands"])
+    assert large["manipulability"] == pytest.approx(1.1**3 * small["manipulability"], rel=1e-3)
+    assert large["volume"] > small["volume"]
+
+
+def test_page_stands_alone(compared):
+    data, out = compared
+    assert data["page"] == str(out / "compare.html")
+    text = (out / "compare.html").read_text(encoding="utf-8")
+    assert text.count("data:image/jpeg;base64,") == 2
+    assert "allegro-link_scale-1.1" in text
+    assert "<script" not in text
+    assert not re.search(r'(src|href)="(?!data:)', text)
+
+
+def test_a_task_reports_what_is_there(compared, cache_root, tmp_path):
+    given = {"hands": ("allegro",), "objects": ("sphere", "mug"), "rows": 2, "pipeline": "swift"}
+    job = CompareJob(**given, out=tmp_path, device="cpu", workers=1, cache=Cache(cache_root))
+    first = job_report(run(job, array=(0, 2)))
+    assert (first["missing"], list(first["hands"][0]["objects"])) == (1, ["sphere"])
+    second = job_report(run(job.changed(), array=(1, 2)))
+    assert (second["missing"], list(second["hands"][0]["objects"])) == (0, ["sphere", "mug"])
+
+
+def test_variations():
+    found = parse_variations(["joint_limit:+-20% link_scale:0.8,1.2", "joint_limit:±20%,+50%", "finger_spacing:-10%"])
+    assert [variation.label for variation in found] == [
+        "joint_limit-0.8",
+        "joint_limit-1.2",
+        "link_scale-0.8",
+        "link_scale-1.2",
+        "joint_limit-1.5",
+        "finger_spacing-0.9",
+    ]
+    for text in ("link_scale:1", "link_scale:20%", "link_scale:+0.2", "link_scale:", "link_scale:9", "link_scale:a"):
+        with pytest.raises(ConfigError, match="is no change; give factors"):
+            parse_variations([text])
+    with pytest.raises(ConfigError, match="did you mean 'link_scale'"):
+        parse_variations(["link_scal:2"])
+
+
+def test_what_cannot_be_asked(tmp_path):
+    with pytest.raises(HandError, match="unknown hand 'alegro'"):
+        CompareRequest(hands=("alegro",), out=tmp_path).check()
+    with pytest.raises(ConfigError, match="is for several objects"):
+        CompareRequest(hands=("allegro",), out=tmp_path, pipeline="sequence").check()
