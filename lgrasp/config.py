@@ -35,6 +35,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**63, description="Decides every random dr
 DeviceName = Annotated[str, AfterValidator(device_name), Field(description="auto, cpu or cuda:N.")]
 Workers = Annotated[int, Field(ge=0, description="Threads or processes; 0: by device.")]
 HandName = Annotated[str, Field(description="Name or path.")]
+HandNames = Annotated[tuple[str, ...], Field(min_length=1, description="Names, paths, folders of hands, or globs.")]
 MeshScale = Annotated[float, Field(gt=0, description="Factor from the meshes' unit to metres.")]
 ShardPaths = Annotated[tuple[Path, ...], Field(description="Shard files, or folders of them at any depth.")]
 ShardFolder = Annotated[Path, Field(description="Folder of the shards.")]

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from lgrasp.config import (
     DeviceName,
+    HandNames,
     MeshScale,
     Params,
     Workers,
@@ -34,7 +35,7 @@ class JobConfig(Params):
     """Many hands and objects in one run: configs/NAME.yaml. Paths are relative to the current folder."""
 
     description: str = ""
-    hands: tuple[str, ...] = Field(("allegro",), min_length=1, description="Names, paths, folders of hands, or globs.")
+    hands: HandNames = ("allegro",)
     hand_dir: Path | None = Field(None, description="Folder where NAME/NAME.urdf is looked up first.")
     objects: tuple[str, ...] = Field(
         (), description="Names, paths, folders of meshes, or globs; none: all meshes of object_dir."

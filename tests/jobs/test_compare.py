@@ -46,7 +46,7 @@ def test_numbers_are_those_of_the_shards(compared):
             assert cell["rows"] == len(reader) == 30
             assert cell["hold"] == pytest.approx(reader.column("metrics/hold_success").mean())
             assert cell["epsilon"] == pytest.approx(float(np.median(reader.column("metrics/epsilon"))))
-            kept, tried = reader.statistics["filter_kept"], reader.statistics["candidates"]
+            kept, tried = (float(reader.statistics[name]) for name in ("filter_kept", "candidates"))
             assert cell["yield"] == pytest.approx(kept / tried)  # all rows of swift are strict
         assert 0 < cell["surface"] < 1
         assert 0 < cell["approach"] <= 30 / 288

@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple, cast, get_args
 from pydantic import Field, field_validator
 
 from lgrasp.choices import ProtocolName, VariationName
-from lgrasp.config import did_you_mean
+from lgrasp.config import HandNames, did_you_mean
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError
@@ -37,7 +37,7 @@ class CompareRequest(Request):
 
     maker: ClassVar[str] = "lgrasp.jobs.compare.job:CompareJob"
 
-    hands: tuple[str, ...] = Field(min_length=1, description="Names, paths, folders of hands, or globs.")
+    hands: HandNames
     objects: tuple[str, ...] = Field(
         default=("bottle", "box", "capsule", "mug"), min_length=1, description="Names, paths, folders, or globs."
     )
