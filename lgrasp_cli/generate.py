@@ -9,7 +9,7 @@ from lgrasp.choices import ProtocolName
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import HANDS, OBJECTS, one_of
 from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, choose_pipeline, given
-from lgrasp_cli.steer import Above, Approach, Fingers, Links, Palm, PoseFile
+from lgrasp_cli.steer import Above, Approach, Avoid, Fingers, Links, Palm, PoseFile, Touch
 from lgrasp_cli.tables import Block, closed, counted, following, held, place, plural, took
 from lgrasp_cli.working import How, working
 
@@ -70,6 +70,8 @@ def generate(
     approach: Approach = None,
     above: Above = None,
     pose: PoseFile = None,
+    touch: Touch = None,
+    avoid: Avoid = None,
     table: Annotated[bool, Option("--table", help="Leave room for the table that the object rests on.")] = False,
     dry_run: DryRun = False,
 ) -> None:
@@ -89,7 +91,8 @@ def generate(
     chosen = chosen.with_simulation(simulate) if simulate else chosen
     chosen = chosen.with_table() if table else chosen
     chosen = chosen.with_steering(
-        **given(fingers=fingers, links=links, palm=palm, approach=approach, above=above, pose=pose)
+        **given(fingers=fingers, links=links, palm=palm, approach=approach, above=above, pose=pose),
+        **given(touch=touch or None, avoid=avoid or None),
     )
     if contacts is not None and chosen.steer.fingers:
         raise ConfigError(f"--contacts {contacts}: --fingers says already how many touch; give one of them")

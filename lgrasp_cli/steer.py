@@ -41,3 +41,16 @@ PoseFile = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
+Touch = Annotated[
+    list[str] | None,
+    Option(
+        metavar="REGION",
+        help="Region that all contacts are in, or with :0.7 behind it 70 % of the force: box:x0,y0,z0:x1,y1,z1, "
+        "sphere:x,y,z:r, group:NAME, color:#rrggbb, a closed mesh, an .npz of weights per vertex; repeatable.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Avoid = Annotated[
+    list[str] | None,
+    Option(metavar="REGION", help="Region without contacts; repeatable.", rich_help_panel=_PANEL),
+]

@@ -75,6 +75,12 @@ def object_problems(record: ObjectRecord) -> list[str]:
             problems.append(f"{where}/normals: not of unit length")
     if record.tables is not None and not (are_unit(record.tables[:, :3]) & np.isfinite(record.tables).all(1)).all():
         problems.append(f"{where}/tables: a normal is not of unit length, or a number not finite")
+    if record.regions is not None:
+        weights = record.regions[:, 3:]
+        if not np.isfinite(record.regions).all() or not ((weights >= 0) & (weights <= 1)).all():
+            problems.append(f"{where}/regions: a number is not finite, or a weight not from 0 to 1")
+        if not 0 < record.touch_share <= 1:
+            problems.append(f"{where}: touch_share is {record.touch_share}, must be above 0, at most 1")
     if not 0 < record.scale < np.inf:
         problems.append(f"{where}: scale is {record.scale}, must be positive")
     return problems

@@ -119,7 +119,8 @@ class FileReader:
                 watertight=bool(group.attrs["watertight"]),
                 vertices=group["vertices"][()],
                 faces=group["faces"][()],
-                **{name: group[name][()] for name in ("normals", "tables") if name in group},
+                **{name: group[name][()] for name in ("normals", "tables", "regions") if name in group},
+                touch_share=float(group.attrs.get("touch_share", 1.0)),
             )
 
     def objects(self) -> tuple[ObjectRecord, ...]:

@@ -126,6 +126,9 @@ def _write_object(group: h5py.Group, record: ObjectRecord) -> None:
         create_array(group, "normals", record.normals, "f4")
     if record.tables is not None:
         create_array(group, "tables", record.tables, "f4")
+    if record.regions is not None:
+        create_array(group, "regions", record.regions, "f4")
+        group.attrs["touch_share"] = float(record.touch_share)
 
 
 def create_rows(file: h5py.File, name: str, shape: Sequence[int], dtype: np.dtype, text: str = "") -> h5py.Dataset:

@@ -28,6 +28,7 @@ from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.resting import RESTING_VERSION, resting_planes
+from lgrasp.object.steered import steer_object, surface_weights
 from lgrasp.runtime.device import Device
 from lgrasp.stages.context import Keeper
 from lgrasp.steer.arrays import SteerArrays, upload_steering
@@ -184,7 +185,7 @@ def load_inputs(
         steer: what is asked of grasps.
 
     Raises:
-        ConfigError: something that this hand cannot do.
+        ConfigError: something that this hand cannot do, or that this object does not have.
     """
     assert keys.mesh is not None
     load, alias = Loader(cache, device.alias, report), device.alias
@@ -192,12 +193,16 @@ def load_inputs(
     touching = find_touching(steer, hand_model, keys.source.spec.fingers)
     object_model = load.object(keys.mesh, keys.object, scale, objects)
     planes = load.planes(object_model, keys.object) if table and not steer.above else steer.plane
+    left = object_model
+    if steer.touch or steer.avoid:
+        weights = surface_weights(object_model, steer.touch_regions, steer.avoid_regions, keys.mesh, device=alias)
+        left = steer_object(object_model, weights, seed=objects.seed, device=alias)
     hand = upload_hand(hand_model, alias)
     field_model = load.field(hand, keys.field, fields)
     start = time.perf_counter()
     if steer.asks:
         field_model = steered_field(field_model, touching)
-    obj, field = upload_object(object_model, alias, planes), upload_field(field_model, hand_model, alias)
+    obj, field = upload_object(left, alias, planes), upload_field(field_model, hand_model, alias)
     load.seconds["upload"] = time.perf_counter() - start
     steered = upload_steering(steer, touching, hand, object_model.center)
     return Inputs(hand, obj, field, keys, device, load.seconds, load.hits, steer=steered)

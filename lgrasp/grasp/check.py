@@ -23,8 +23,8 @@ from lgrasp.grasp.check_kernels import (
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
 from lgrasp.grasp.control_kernels import FINGER_TRIES, control_poses, open_fingers, open_poses, try_fingers
 from lgrasp.grasp.held import HeldArrays, hold_nothing
-from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, Outcome
-from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, grasp_epsilon, resist_loads
+from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome
+from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, drop_light, grasp_epsilon, resist_loads
 from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.model import HandModel
@@ -82,7 +82,8 @@ class Check:
         wp.launch(balance_grasps, n, [self.limits, self.places, self.at], [self.found], device=d)
         inputs = [self.obj.struct, self.limits, self.places, self.at]
         wp.launch(resist_loads, (_LOAD_DIRECTIONS, n), inputs, [self.found], device=d)
-        tally, passed = empty_tally(REASONS, d), wp.empty(n, dtype=wp.int32, device=d)
+        reasons = REASONS if self.obj.touch is None else SHARED
+        tally, passed = empty_tally(reasons, d), wp.empty(n, dtype=wp.int32, device=d)
         wp.launch(count_outcomes, n, [self.limits], [self.found, passed, tally.device], device=d)
         return tally, passed
 
@@ -97,14 +98,17 @@ class Check:
         row = wp.full(len(self), -1, dtype=wp.int32, device=self.hand.device)
         wp.launch(list_kept, len(self), [self.found, upto], [row], device=self.hand.device)
         packed, on_table = self._pack(seed, row), self.obj.planes is not None
+        self._share(row, tally)
         if on_table:
             self._approach(row, packed, tally)
         columns = _columns(packed, on_table)
-        fetched = read_tallies([tally], list(columns.values()))
-        table = _table(dict(zip(columns, fetched, strict=True)), tally["kept"] + tally["approach"])
+        fetched = read_tallies([tally], [*columns.values(), *([] if self.obj.touch is None else [row])])
+        count = sum(tally[reason] for reason in tally.names if reason in ("kept", "approach", "touch"))
+        table = _table(dict(zip(columns, fetched, strict=False)), count)
+        kept = np.ones(count, bool) if self.obj.touch is None else fetched[-1][:count] >= 0
         if on_table:
-            table = take_rows(table, ~np.isnan(table.table["approach"][:, 0]))
-        return table, tally
+            kept &= ~np.isnan(table.table["approach"][:, 0])
+        return table if kept.all() else take_rows(table, kept), tally
 
     def every(self, seed: wp.array, *, on_table: bool = False) -> tuple[GraspTable, np.ndarray]:
         """All hands as rows in their order, and their outcomes (:class:`~lgrasp.grasp.outcomes.Outcome`), (n,).
@@ -123,6 +127,13 @@ class Check:
             lost = np.isnan(table.table["approach"][:, 0]) & (outcome == Outcome.KEPT)
             outcome = np.where(lost, Outcome.APPROACH, outcome)
         return table, outcome
+
+    def _share(self, row: wp.array, tally: Tally) -> None:
+        """Of the hands ``row`` those are dropped whose forces are not on the region to touch, as far as they must."""
+        if self.obj.touch is not None and self.obj.steered:
+            least = self.obj.steered.weights.share
+            inputs = [self.places, self.obj.touch, least, self.at, self.found]
+            wp.launch(drop_light, len(self), inputs, [row, tally.device], device=self.hand.device)
 
     def _approach(self, row: wp.array, packed: Packed, tally: Tally) -> None:
         """A straight way for the open hand to the hands ``row``; those without one are counted as such."""

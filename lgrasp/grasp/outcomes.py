@@ -17,6 +17,7 @@ class Outcome(IntEnum):
     UNRESISTED_LOAD = 6
     TABLE = 7
     APPROACH = 8
+    TOUCH = 9
 
 
 KEPT = wp.constant(int(Outcome.KEPT))
@@ -28,12 +29,15 @@ BALANCE = wp.constant(int(Outcome.BALANCE))
 UNRESISTED_LOAD = wp.constant(int(Outcome.UNRESISTED_LOAD))
 TABLE = wp.constant(int(Outcome.TABLE))
 APPROACH = wp.constant(int(Outcome.APPROACH))
+TOUCH = wp.constant(int(Outcome.TOUCH))
 
 REASONS = (
     *("kept", "unused finger", "self-collision", "object collision", "contact", "balance", "unresisted load"),
     *("table", "approach"),
 )
-"""Outcomes in words, by code."""
+"""Outcomes in words, by code; where a share of the force must be on a region there is one more, SHARED."""
+
+SHARED = (*REASONS, "touch")
 
 MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
 """Rows of the numbers that the checks leave on the device; ``facing`` is the least cosine of opposed normals."""

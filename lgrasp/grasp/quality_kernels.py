@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
-from lgrasp.grasp.outcomes import BALANCE, KEPT, OBJECT_COLLISION
+from lgrasp.grasp.outcomes import BALANCE, KEPT, OBJECT_COLLISION, TOUCH
 from lgrasp.math.constants import BALANCED, CONE_EDGES
 from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted
 from lgrasp.math.quality import epsilon_bound
@@ -101,6 +101,43 @@ def resist_loads(obj: Object, limits: Limits, places: Places, at: CheckedPosture
     turn = wp.quat_inverse(wp.transform_get_rotation(at.pose[at.of[i]]))
     load = unresisted(points, normals, k, limits.friction, turn, direction, worst, most)
     wp.atomic_max(found_out.unresisted_load, i, load)
+
+
+@wp.kernel
+def drop_light(
+    places: Places,
+    touch: wp.array(dtype=wp.int32),
+    least: wp.float32,
+    at: CheckedPostures,
+    found: Findings,
+    row_out: wp.array(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
+):
+    """Rows with less than a share of the normal force on contacts in a region become none.
+
+    Args:
+        touch: 1 for places on the object in the region, (o,).
+        least: of the share.
+        row_out: (m,) hand of each row, -1 none.
+        counts_out: (reasons,) these rows are moved from those that are kept.
+    """
+    i = wp.tid()
+    s = row_out[i]
+    if s < 0:
+        return
+    on = float(0.0)
+    whole = float(0.0)
+    for k in range(at.surface.shape[1]):
+        c = at.surface[s, k]
+        if c >= 0:
+            push = -wp.dot(found.force[s, k], places.normals[c])
+            whole += push
+            if touch[c] > 0:
+                on += push
+    if on < least * whole:
+        row_out[i] = -1
+        wp.atomic_sub(counts_out, KEPT, 1)
+        wp.atomic_add(counts_out, TOUCH, 1)
 
 
 @wp.kernel

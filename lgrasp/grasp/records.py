@@ -60,6 +60,11 @@ class ObjectRecord:
     """Outward unit normals of the vertices, shape [V, 3], float32, where they are known, as of a point cloud."""
     tables: np.ndarray | None = None
     """Planes that it rests on: unit normal up, height along it [m], probability; user frame, shape [T, 5], float32."""
+    regions: np.ndarray | None = None
+    """Surface points in the object's user frame [m], and how much each belongs to the regions that grasps must touch
+    and avoid, 0 to 1 (from 0.5 on it does), shape [S, 5], float32."""
+    touch_share: float = 1.0
+    """Least share of the normal force that contacts in the region to touch carry; 1: every contact is there."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -107,6 +107,7 @@ DATASETS: tuple[DatasetSpec, ...] = (
     *MODEL_DATASETS,
     DatasetSpec("objects/*/normals", "f4", ("v", 3), required=False),
     DatasetSpec("objects/*/tables", "f4", ("t", 5), "m", required=False),
+    DatasetSpec("objects/*/regions", "f4", ("s", 5), "m", required=False),
     *GRASP_FIELDS.values(),
     *ROW_GROUPS.values(),
 )
@@ -144,6 +145,7 @@ ATTRIBUTES: tuple[AttributeSpec, ...] = (
     AttributeSpec("", "merged_from", "json", required=False),
     AttributeSpec("", "text_sha256", "sha256", required=False),
     *MODEL_ATTRIBUTES,
+    AttributeSpec("objects/*", "touch_share", "float", required=False),
     AttributeSpec("grasps/metrics/*", "unit", "text"),
     AttributeSpec("grasps/physics/*", "protocol", "text"),
 )

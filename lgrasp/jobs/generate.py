@@ -89,7 +89,9 @@ class GenerateJob(GenerateRequest, SearchJob):
         return load_inputs(self.cache, *what, table=pipeline.on_table, steer=pipeline.steer)
 
     def records(self, inputs: Inputs) -> tuple[HandModel, list[ObjectRecord]]:
-        return inputs.hand.model, [object_record(inputs.object.model, tables=inputs.object.planes)]
+        return inputs.hand.model, [
+            object_record(inputs.object.model, tables=inputs.object.planes, steered=inputs.object.steered)
+        ]
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         result = make_shard(

@@ -14,6 +14,7 @@ from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.object.model import ObjectModel
+from lgrasp.object.steered import SteeredObject
 
 if TYPE_CHECKING:
     from lgrasp.simulate.scene import Scene
@@ -48,8 +49,14 @@ def hand_record(hand: HandModel, meshes: dict[str, bytes]) -> HandRecord:
     )
 
 
-def object_record(obj: ObjectModel, id: str | None = None, tables: np.ndarray | None = None) -> ObjectRecord:
-    """The object, in the user's frame, and planes that it rests on; its name defaults to its id."""
+def object_record(
+    obj: ObjectModel,
+    id: str | None = None,
+    tables: np.ndarray | None = None,
+    steered: SteeredObject | None = None,
+) -> ObjectRecord:
+    """The object, in the user's frame, planes that it rests on, and where it must be touched; its name defaults to
+    its id."""
     return ObjectRecord(
         id=id or obj.name,
         name=obj.name,
@@ -59,6 +66,7 @@ def object_record(obj: ObjectModel, id: str | None = None, tables: np.ndarray | 
         vertices=obj.vertices,
         faces=obj.faces,
         tables=tables,
+        **({"regions": steered.weights.table(), "touch_share": steered.weights.share} if steered else {}),
     )
 
 

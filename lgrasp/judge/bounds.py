@@ -19,6 +19,10 @@ RESTING_GAP = 1e-3
 """Lowest point of an object from the table that it rests on [m]."""
 APPROACH_LENGTH, APPROACH_STEP = 0.15, 0.01
 """Way of the open hand to the grasp of an object on a table, and between the places where it is judged [m]."""
+REGION_WEIGHT = 0.5
+"""Least weight of a surface point that belongs to a region."""
+SHARE_TOLERANCE = 1e-3
+"""Missing share of the normal force, or of the contacts, in the region that is to be touched."""
 
 MU = 0.5
 CONE_EDGES = 8

@@ -33,6 +33,8 @@ CHECKS: dict[str, tuple[str, float]] = {
     "table": ("below_table_mm", 0.0),
     "resting": ("resting_gap_mm", 1e3 * bounds.RESTING_GAP),
     "approach": ("approach_mm", 1e3 * bounds.PENETRATION),
+    "touch": ("touch_missing", bounds.SHARE_TOLERANCE),
+    "avoid": ("avoid_contacts", 0.0),
     "frozen": ("", 0.0),
     "parent": ("", 0.0),
 }
@@ -82,6 +84,7 @@ class RowChecks:
             self._contacts(T_links, T_objects)
             if shard.table:
                 self._table(T_links, T_objects[:, 0])
+            self._regions()
             for row in good:
                 self._wrenches(int(row), epsilon)
         if shard.steps:
@@ -169,6 +172,22 @@ class RowChecks:
             found[:, m] = on_table(hand, obj, planes, T_objects[m], T_links[m], T_open[m], back[m])
         for check, value in zip(("table", "resting", "approach"), found, strict=True):
             self._set(check, 1e3 * value)
+
+    def _regions(self) -> None:
+        """Contacts where the objects' regions ask for them, and nowhere else."""
+        for o, (k, regions) in itertools.product(range(self.index.shape[1]), enumerate(self.shard.regions)):
+            rows = np.flatnonzero(self.index[self.good, o] == k)
+            if regions is None or not len(rows):
+                continue
+            r = self.good[rows]
+            points, normals = (np.asarray(self.g[name], float)[r, o] for name in ("contact_points", "contact_normals"))
+            forces = np.asarray(self.g["contact_forces"], float)[r, o] if "contact_forces" in self.g else 0.0 * normals
+            for check, value in zip(
+                ("touch", "avoid"), regions.judge(points, normals, forces, self.used[r, o]), strict=True
+            ):
+                own = self.values[CHECKS[check][0]][self.good]
+                own[rows] = np.fmax(own[rows], value)
+                self._set(check, np.nan_to_num(own))
 
     def _self_penetration(self, T_links: np.ndarray) -> None:
         hand, depth = self.hand, np.zeros(len(self.good))

@@ -17,6 +17,7 @@ import trimesh
 from lgrasp.judge.bounds import LIMIT_EXCESS, JudgeError
 from lgrasp.judge.collision import POSTURES, JudgedHand, JudgedObject
 from lgrasp.judge.meshes import clean_mesh, load_mesh
+from lgrasp.judge.regions import JudgedRegions
 
 MOST_BYTES = 4 << 30
 """Of one dataset."""
@@ -59,6 +60,7 @@ class JudgedShard:
     steps: dict[str, np.ndarray]
     table: dict[str, np.ndarray]  # of rows on a table
     tables: list[np.ndarray]  # (T, 5) of each object
+    regions: list[JudgedRegions | None]  # of each object
     metrics: dict[str, tuple[np.ndarray, str]]
     kept_invalid: np.ndarray  # (n,), rows that the file itself calls invalid
     claims: dict[str, str]
@@ -164,6 +166,16 @@ def read_tables(group: h5py.Group) -> np.ndarray:
     return tables.astype(float)
 
 
+def read_regions(group: h5py.Group) -> JudgedRegions | None:
+    """What of an object must be touched and avoided; None where the shard tells nothing."""
+    if "regions" not in group:
+        return None
+    points, share = _array(group, "regions"), float(group.attrs.get("touch_share", 1.0))
+    if points.ndim != 2 or points.shape[1] != 5 or not len(points) or points.dtype.kind != "f":
+        raise JudgeError(f"{group.name}/regions: {points.dtype} of shape {points.shape}, not numbers of shape (S, 5)")
+    return JudgedRegions(points.astype(float), share)
+
+
 def read_shard(path: Path, urdf: Path | None = None, mesh: Mapping[str, Path] | None = None) -> JudgedShard:
     """Read one shard of format 1.
 
@@ -225,6 +237,7 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
         steps=steps,
         table=table,
         tables=[read_tables(f["objects"][name]) for name in objects],
+        regions=[read_regions(f["objects"][name]) for name in objects],
         metrics=metrics,
         kept_invalid=columns["valid"] == 0 if "valid" in columns else np.zeros(sizes["N"], bool),
         claims=claims,

@@ -7,6 +7,7 @@ import warp as wp
 
 from lgrasp.math.sdf import Sdf
 from lgrasp.object.model import ObjectModel
+from lgrasp.object.steered import SteeredObject
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
 
@@ -49,14 +50,24 @@ class ObjectArrays:
     struct: "Object"
     planes: np.ndarray | None = None
     """That it rests on (:func:`~lgrasp.object.resting.resting_planes`), if grasps must leave room for a table."""
+    steered: SteeredObject | None = None
+    """What of its surface grasps must touch and avoid, if anything; the model is then that one's."""
+    touch: wp.array | None = None
+    """1 for contact points in the region to touch, else 0, (C,) i32, where only a share of the force must be there."""
 
 
-def upload_object(model: ObjectModel, device: str, planes: np.ndarray | None = None) -> ObjectArrays:
+def upload_object(model: ObjectModel | SteeredObject, device: str, planes: np.ndarray | None = None) -> ObjectArrays:
     """Copy an object to a device.
 
     Args:
+        model: the object, or what is left of it for contacts.
         planes: that it rests on, (T, 5) (:func:`~lgrasp.object.resting.resting_planes`); grasps leave room for them.
     """
+    steered, touch = None, None
+    if isinstance(model, SteeredObject):
+        steered, model = model, model.model
+        if steered.weights.share < 1.0:
+            touch = wp.array(steered.touch.astype(np.int32), dtype=wp.int32, device=device)
     nx, ny, nz = map(int, model.sdf.shape)
     grid = {"values": model.sdf.ravel(), "origin": model.sdf_origin, "inv_cell": 1.0 / float(model.sdf_cell)}
     same = {name: getattr(model, name) for name in ("contact_points", "contact_normals", "contact_opposite", "com")}
@@ -75,4 +86,4 @@ def upload_object(model: ObjectModel, device: str, planes: np.ndarray | None = N
         resting = {"up": up, "height": planes[:, 3] - up @ model.center, "upto": upto / upto[-1]}
         others["resting"] = upload_struct(Resting, device, resting | {"count": len(planes)})
     struct = upload_struct(Object, device, same | others)
-    return ObjectArrays(model, device, struct, planes)
+    return ObjectArrays(model, device, struct, planes, steered, touch)

@@ -1,4 +1,4 @@
-"""Warp kernels of the object preprocessing; host functions live in ``sdf.py`` and ``surface.py``."""
+"""Warp kernels of objects; host functions live in ``sdf.py``, ``surface.py`` and ``regions.py``."""
 
 import warp as wp
 
@@ -257,3 +257,27 @@ def fold_spread(
                         if wp.length(m) > 0.0:
                             worst = wp.min(worst, wp.dot(n, wp.normalize(m)))
     dot_out[t] = worst
+
+
+@wp.kernel
+def locate_points(
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    reach: float,
+    face_out: wp.array(dtype=wp.int32),
+    corner_out: wp.array(dtype=wp.vec3),
+    inside_out: wp.array(dtype=wp.int32),
+):
+    """Nearest face of each point, and whether the winding number says that the point is inside.
+
+    Args:
+        points: [m], (n,).
+        face_out: (n,).
+        corner_out: barycentric coordinates of the nearest place, by corner, (n,).
+        inside_out: 1 or 0, (n,).
+    """
+    i = wp.tid()
+    hit = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach, 2.0, 0.5)
+    face_out[i] = hit.face
+    corner_out[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
+    inside_out[i] = wp.where(hit.sign < 0.0, 1, 0)

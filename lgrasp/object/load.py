@@ -163,8 +163,12 @@ def _check_archive(data: bytes) -> None:
         raise ValueError(f"it unpacks to {size:,} bytes, at most {_MOST_UNPACKED:,} are read")
 
 
-def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarray, int]:
-    """Vertices, faces and the number of geometries of a mesh file's bytes."""
+def mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
+    """The geometries of a mesh file's bytes, of which nothing is merged.
+
+    Raises:
+        ObjectError: it cannot be read, or holds no faces.
+    """
     kind = path.suffix.lower()[1:]
     options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
     if kind == "gltf":
@@ -180,6 +184,12 @@ def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarr
         raise ObjectError(f"{path}: {why}") from error
     if not meshes:
         raise ObjectError(f"{path}: 0 faces; a .{kind} file with a triangle mesh of a solid is accepted")
+    return meshes
+
+
+def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Vertices, faces and the number of geometries of a mesh file's bytes."""
+    meshes = mesh_parts(path, files)
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
     faces = np.concatenate([np.asarray(m.faces, np.int64) + start for m, start in zip(meshes, starts, strict=False)])
     vertices = np.concatenate([np.asarray(m.vertices, np.float64) for m in meshes])

@@ -3,12 +3,13 @@
 import hashlib
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import Field, field_validator, model_validator
 
 from lgrasp.choices import PalmUse
 from lgrasp.config import Params
+from lgrasp.object.region_text import ACCEPTED, Region, describe_region, parse_regions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -80,6 +81,13 @@ class Steering(Params):
         default=None, description="File of object poses in the hand's frame; only the fingers are searched."
     )
 
+    touch: tuple[str, ...] = Field(
+        default=(),
+        description="Regions of the object; contacts are in one of them, or as large a share of the normal force as "
+        "a number behind the last colon says: " + ACCEPTED + ".",
+    )
+    avoid: tuple[str, ...] = Field(default=(), description="Regions of the object that no contact is in.")
+
     @field_validator("above", mode="before")
     @classmethod
     def _plane(cls, value: Any) -> Any:
@@ -113,6 +121,30 @@ class Steering(Params):
     def _word(cls, value: Any) -> Any:
         return {True: "yes", False: "no"}[value] if isinstance(value, bool) else value  # as YAML reads them
 
+    @field_validator("touch", "avoid", mode="before")
+    @classmethod
+    def _one(cls, value: Any) -> Any:
+        return (value,) if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _are_regions(self) -> Self:
+        _ = self.touch_regions, self.avoid_regions  # what cannot be is told before anything is loaded
+        return self
+
+    @property
+    def touch_regions(self) -> tuple[Region, ...]:
+        """Regions that are to be touched.
+
+        Raises:
+            ConfigError: see :func:`~lgrasp.object.region_text.parse_regions`, as the next.
+        """
+        return parse_regions(self.touch, "steer.touch", share=True)
+
+    @property
+    def avoid_regions(self) -> tuple[Region, ...]:
+        """Regions without contacts."""
+        return parse_regions(self.avoid, "steer.avoid")
+
     @field_validator("fingers", "links", mode="before")
     @classmethod
     def _names(cls, value: Any) -> Any:
@@ -138,6 +170,8 @@ class Steering(Params):
         told = self.model_dump(mode="json", exclude_defaults=True)
         if self.pose:
             told["pose"] = hashlib.sha256(self.pose.read_bytes()).hexdigest()
+        regions = {"touch": self.touch_regions, "avoid": self.avoid_regions}
+        told |= {name: [describe_region(region) for region in found] for name, found in regions.items() if found}
         return told | {"version": STEER_VERSION} if told else {}
 
 

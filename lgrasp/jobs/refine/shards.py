@@ -131,7 +131,10 @@ class RefineJob(RefineRequest, ShardJob):
         }
         config = {**shard.header.config, "bounds": bounds.describe(), "refine": params.model_dump(mode="json")}
         header = replace(shard.header, config=config, created=now(), lgrasp_version=__version__)
-        return Made(len(moved.rows), self.marked(part, replace(shard, header=header, grasps=moved.rows), counts))
+        # contacts are found anew, wherever they are
+        objects = [replace(record, regions=None, touch_share=1.0) for record in shard.objects]
+        refined = replace(shard, header=header, objects=objects, grasps=moved.rows)
+        return Made(len(moved.rows), self.marked(part, refined, counts))
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``results``: of each shard hand, object, rows, refined, valid before and after, mean energies, seconds;

@@ -38,7 +38,10 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
     groups, shape = context.hand.model.groups, (count, params.proposals)
     proposals = empty_struct(ProposedPoses, d, *shape, groups)
-    values = make_struct(PlaceValues, params, context.bounds, **shares)
+    regions = context.object.steered
+    # of contacts that must be far from the centre of mass, the line between two is far from it as well
+    reach = params.max_com_distance + (regions.off_centre if regions else 0.0)
+    values = make_struct(PlaceValues, params, context.bounds, **shares, max_com_distance=reach)
     where = [context.seed("place"), first]
     asked = [values, context.steered.struct, *where]
     if context.space:
