@@ -19,6 +19,7 @@ from lgrasp.jobs.difference import config_difference
 from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs
 from lgrasp.jobs.requests.search import SearchRequest
 from lgrasp.runtime.device import resolve_device
+from lgrasp.steer.touch import describe_touching
 
 
 class SearchJob(SearchRequest, Job):
@@ -108,6 +109,13 @@ class SearchJob(SearchRequest, Job):
             **hand_config(self.keys.source),
         }
 
+    def asked(self) -> dict[str, Any]:
+        """What the config also tells once the inputs are loaded: what is asked of the rows in the words of the hand."""
+        steer, inputs = self.pipeline.steer, self.inputs
+        if not steer.asks:
+            return {}
+        return {"steered": describe_touching(steer, inputs.steer.touching, inputs.hand.model)}
+
     def difference(self, path: Path) -> str:
         with ShardReader(path) as reader:
             return config_difference(reader.header.config, self.config()) or self.differs
@@ -123,7 +131,10 @@ class SearchJob(SearchRequest, Job):
         }
         return Shard(
             header=ShardHeader(
-                pipeline=self.pipeline.name, seed=self.pipeline.seed, shard_index=part.number, config=self.config()
+                pipeline=self.pipeline.name,
+                seed=self.pipeline.seed,
+                shard_index=part.number,
+                config=self.config() | self.asked(),
             ),
             hand=hand_record(hand, self._meshes),
             objects=objects,

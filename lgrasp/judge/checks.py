@@ -13,6 +13,7 @@ from lgrasp.judge.hand import pose_transforms
 from lgrasp.judge.meshes import PROBES
 from lgrasp.judge.shard import JudgedShard
 from lgrasp.judge.solids import on_links
+from lgrasp.judge.steer import disobeys
 from lgrasp.judge.table import on_table
 from lgrasp.judge.wrench import ferrari_canny, force_errors, wrench_residual
 
@@ -35,6 +36,7 @@ CHECKS: dict[str, tuple[str, float]] = {
     "approach": ("approach_mm", 1e3 * bounds.PENETRATION),
     "touch": ("touch_missing", bounds.SHARE_TOLERANCE),
     "avoid": ("avoid_contacts", 0.0),
+    "steered": ("", 0.0),
     "frozen": ("", 0.0),
     "parent": ("", 0.0),
 }
@@ -85,6 +87,8 @@ class RowChecks:
             if shard.table:
                 self._table(T_links, T_objects[:, 0])
             self._regions()
+            if shard.asked:
+                self._steered(T_objects[:, 0])
             for row in good:
                 self._wrenches(int(row), epsilon)
         if shard.steps:
@@ -170,6 +174,8 @@ class RowChecks:
             m = np.flatnonzero(self.index[good, 0] == k)
             planes = self.shard.tables[k][pose[m]]
             found[:, m] = on_table(hand, obj, planes, T_objects[m], T_links[m], T_open[m], back[m])
+        if self.shard.asked and self.shard.asked.plane is not None:
+            found[1] = 0.0  # a plane that a user asks for need not touch the object
         for check, value in zip(("table", "resting", "approach"), found, strict=True):
             self._set(check, 1e3 * value)
 
@@ -188,6 +194,15 @@ class RowChecks:
                 own = self.values[CHECKS[check][0]][self.good]
                 own[rows] = np.fmax(own[rows], value)
                 self._set(check, np.nan_to_num(own))
+
+    def _steered(self, T_objects: np.ndarray) -> None:
+        """Rows that do not obey what was asked of them."""
+        shard, good, planes = self.shard, self.good, None
+        if shard.table:
+            pairs = zip(self.index[good, 0], self.table["pose"][good].astype(int), strict=True)
+            planes = np.array([shard.tables[k][pose] for k, pose in pairs])
+        links = np.where(self.used[good], np.asarray(self.g["contact_links"])[good], -1).reshape(len(good), -1)
+        self.failed["steered"][good] = disobeys(shard.asked, shard.link_names, links, T_objects, planes)
 
     def _self_penetration(self, T_links: np.ndarray) -> None:
         hand, depth = self.hand, np.zeros(len(self.good))

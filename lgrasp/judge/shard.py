@@ -18,6 +18,7 @@ from lgrasp.judge.bounds import LIMIT_EXCESS, JudgeError
 from lgrasp.judge.collision import POSTURES, JudgedHand, JudgedObject
 from lgrasp.judge.meshes import clean_mesh, load_mesh
 from lgrasp.judge.regions import JudgedRegions
+from lgrasp.judge.steer import Asked, read_asked
 
 MOST_BYTES = 4 << 30
 """Of one dataset."""
@@ -65,6 +66,7 @@ class JudgedShard:
     kept_invalid: np.ndarray  # (n,), rows that the file itself calls invalid
     claims: dict[str, str]
     notes: list[str]
+    asked: Asked | None
 
 
 _CACHE: dict[str, Any] = {}
@@ -241,6 +243,7 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
         metrics=metrics,
         kept_invalid=columns["valid"] == 0 if "valid" in columns else np.zeros(sizes["N"], bool),
         claims=claims,
+        asked=read_asked(told),
         notes=_notes(hand, joint_names, f["hand"], {k: obj for k, (obj, _) in objects.items()}),
     )
 

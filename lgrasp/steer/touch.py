@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from lgrasp.config import did_you_mean
 from lgrasp.errors import ConfigError
 from lgrasp.hand.fingers import finger_group, finger_label
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.palm import palm_axis
 from lgrasp.steer.params import Steering
 
 Fingers = Mapping[str, Sequence[str]]
@@ -60,6 +62,22 @@ def find_touching(steering: Steering, model: HandModel, fingers: Fingers) -> Tou
             f"steer: hand '{model.name}' would touch with {left}; a grasp needs a finger and something else"
         )
     return Touching(points, groups, bool(steering.fingers), steering.palm == "must" or able == 1)
+
+
+def describe_touching(steering: Steering, touching: Touching, model: HandModel) -> dict[str, Any]:
+    """What is asked in the words of this hand, for those who check rows: ``links`` that may touch, lists of links in
+    ``every`` of which one touches, the direction ``facing`` of the palm if one is asked for, and what is asked."""
+    group = np.repeat(np.arange(model.groups + 1), np.diff(model.contact_first))
+
+    def links(some: np.ndarray) -> list[str]:
+        return [model.tree.link_names[link] for link in np.unique(model.contact_link[some & touching.points])]
+
+    must = np.flatnonzero(touching.groups).tolist() if touching.exact else []
+    told: dict[str, Any] = {"links": links(group >= 0)}
+    told["every"] = [links(group == g) for g in (*must, *([model.groups] if touching.palm else []))]
+    if steering.approach:
+        told["facing"] = palm_axis(model)[1].tolist()
+    return told | steering.model_dump(mode="json", include={"approach", "above"}, exclude_none=True)
 
 
 def _links(names: Sequence[str], model: HandModel) -> list[int]:

@@ -2,6 +2,7 @@
 
 import json
 
+import h5py
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import device_matrix, pose_matrix
 from lgrasp.hand.find import find_hand
+from lgrasp.judge.run import judge
 
 FINGERS = find_hand("allegro").spec.fingers
 
@@ -99,6 +101,26 @@ def test_the_hand_stays_above_the_plane(steered, solids, link_poses):
             L = links[:, solid.link]
             points = np.einsum("nij,pj->npi", L[:, :3, :3], solid.samples) + L[:, None, :3, 3]
             assert (points @ [0, 0.6, 0.8]).min() > 0.0109
+
+
+def test_the_judge_agrees_and_finds_rows_that_do_not_obey(steered, tmp_path):
+    steered(rows=10, fingers="thumb,index,middle", palm="no", approach="1,0,0:40", above="0,0,1,0.001")
+    (path,) = (tmp_path / "steered").glob("*.h5")
+    assert judge(path).valid_share == 1.0
+    with h5py.File(path) as file:
+        config = json.loads(file.attrs["config"])
+    assert config["steered"]["every"] == [["link_3.0_tip"], ["link_7.0_tip"], ["link_15.0_tip"]]
+    for name, value in (
+        ("links", ["link_3.0_tip", "link_7.0_tip"]),
+        ("every", [["link_11.0_tip"]]),
+        ("approach", {"direction": [-1, 0, 0], "angle": 40}),
+        ("above", [0, 0, 1, 0.003]),
+    ):
+        with h5py.File(path, "r+") as file:
+            file.attrs["config"] = json.dumps(config | {"steered": config["steered"] | {name: value}})
+        report = judge(path)
+        assert report.failed["steered"].all(), name
+        assert not any(mask.any() for check, mask in report.failed.items() if check != "steered"), name
 
 
 @pytest.mark.parametrize("kind", [".npz", ".csv", ".h5"])

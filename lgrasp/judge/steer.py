@@ -1,0 +1,82 @@
+"""Whether rows obey what their shard says was asked of them: which links touch, and where the palm faces."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+COSINE_SLACK = 1e-4
+"""Of the palm's direction outside its cone."""
+PLANE_SLACK = 1e-4
+"""Of the numbers of the plane that the hand stays above."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the config of a shard says was asked, with the names that it has there."""
+
+    links: frozenset[str]  # that may touch
+    every: tuple[frozenset[str], ...]  # of each set one link touches
+    facing: np.ndarray | None  # (3,) unit vector that the palm faces along, base frame
+    approach: np.ndarray | None  # (3,) unit middle of its cone, object's frame
+    cosine: float
+    plane: np.ndarray | None  # (4,) unit normal and height [m], object's frame, that the hand stays above
+
+
+def read_asked(config: Any) -> Asked | None:
+    """What was asked, None if nothing was.
+
+    Raises:
+        KeyError, TypeError, ValueError: the config tells it in a form of its own.
+    """
+    told = config.get("steered") if isinstance(config, dict) else None
+    if not told:
+        return None
+    cone, facing = told.get("approach"), None
+    if cone:
+        facing = _unit(told["facing"])
+    plane = np.array(told["above"], float) if told.get("above") else None
+    return Asked(
+        links=frozenset(told["links"]),
+        every=tuple(frozenset(links) for links in told["every"]),
+        facing=facing,
+        approach=_unit(cone["direction"]) if cone else None,
+        cosine=float(np.cos(np.radians(cone["angle"]))) if cone else -1.0,
+        plane=None if plane is None else plane / np.linalg.norm(plane[:3]),
+    )
+
+
+def disobeys(
+    asked: Asked,
+    names: Sequence[str],
+    links: np.ndarray,
+    T_objects: np.ndarray,
+    planes: np.ndarray | None,
+) -> np.ndarray:
+    """Rows that do not obey, (n,) bool.
+
+    Args:
+        names: of the shard's links.
+        links: in contact, -1 none, indices of ``names``, (n, C).
+        T_objects: of the object, base frame, (n, 4, 4).
+        planes: that rows say the hand is above, object's frame, (n, 5); None: they say none.
+    """
+    touching = {name: (links == k).any(axis=1) for k, name in enumerate(names)}
+    none = np.zeros(len(links), bool)
+    bad = np.logical_or.reduce([none, *(found for name, found in touching.items() if name not in asked.links)])
+    for some in asked.every:
+        bad |= ~np.logical_or.reduce([none, *(found for name, found in touching.items() if name in some)])
+    if asked.approach is not None:
+        middle = np.einsum("nij,j->ni", T_objects[:, :3, :3], asked.approach)
+        bad |= ~(middle @ asked.facing >= asked.cosine - COSINE_SLACK)
+    if asked.plane is not None:
+        bad |= True if planes is None else (np.abs(planes[:, :4] - asked.plane) > PLANE_SLACK).any(axis=1)
+    return bad
+
+
+def _unit(vector: Sequence[float]) -> np.ndarray:
+    v = np.array(vector, float)
+    if v.shape != (3,) or not np.linalg.norm(v) > 0:
+        raise ValueError(f"{vector} is no direction")
+    return v / np.linalg.norm(v)
