@@ -182,7 +182,7 @@ def pair_requests(
     """
     found: dict[Path, GenerateRequest] = {}
     name = f"{pipeline.name}-table" if pipeline.params("place").table else pipeline.name
-    name = f"{name}-steered" if pipeline.steer.asks else name
+    name = f"{name}-steer-{pipeline.steer.tag}" if pipeline.steer.asks else name
     for hand, mesh in itertools.product(hands, objects):
         out = run_folder(top, *_names(hand, mesh), name, protocol)
         what = {"hand": hand, "object": mesh, "pipeline": pipeline, "out": out}

@@ -1,6 +1,7 @@
 """What a user steers grasps by; a pipeline carries it as its section ``steer``."""
 
 import hashlib
+import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -154,6 +155,11 @@ class Steering(Params):
     def asks(self) -> bool:
         """True if it asks for something."""
         return self != NOTHING
+
+    @property
+    def tag(self) -> str:
+        """What is asked in a few letters, for the names of folders."""
+        return hashlib.sha256(json.dumps(self.describe(), sort_keys=True).encode()).hexdigest()[:6]
 
     @property
     def plane(self) -> "np.ndarray | None":

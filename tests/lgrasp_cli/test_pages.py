@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 BLOCK = re.compile(r"^(<!-- not run.*?-->\n)?```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/guides/quickstart.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/guides/quickstart.md", "docs/guides/steer.md"])
 def test_a_page_runs_as_written(cli, page, tmp_path):
     pytest.importorskip("mujoco")
     text = (ROOT / page).read_text(encoding="utf-8")
@@ -30,4 +30,4 @@ def test_a_page_runs_as_written(cli, page, tmp_path):
             assert "warning" not in result.err, (line, result)
             ran += 1
     assert ran >= 5
-    assert list(tmp_path.glob("grasps/allegro-mug/robust/*.h5"))
+    assert list(tmp_path.glob("grasps/allegro-mug/robust*/*.h5"))
