@@ -13,7 +13,7 @@ from lgrasp.judge.hand import pose_transforms
 from lgrasp.judge.meshes import PROBES
 from lgrasp.judge.shard import JudgedShard
 from lgrasp.judge.solids import on_links
-from lgrasp.judge.steer import disobeys
+from lgrasp.judge.steer import Asked, disobeys
 from lgrasp.judge.table import on_table
 from lgrasp.judge.wrench import ferrari_canny, force_errors, wrench_residual
 
@@ -88,7 +88,7 @@ class RowChecks:
                 self._table(T_links, T_objects[:, 0])
             self._regions()
             if shard.asked:
-                self._steered(T_objects[:, 0])
+                self._steered(shard.asked, T_objects[:, 0])
             for row in good:
                 self._wrenches(int(row), epsilon)
         if shard.steps:
@@ -195,14 +195,14 @@ class RowChecks:
                 own[rows] = np.fmax(own[rows], value)
                 self._set(check, np.nan_to_num(own))
 
-    def _steered(self, T_objects: np.ndarray) -> None:
+    def _steered(self, asked: Asked, T_objects: np.ndarray) -> None:
         """Rows that do not obey what was asked of them."""
         shard, good, planes = self.shard, self.good, None
         if shard.table:
             pairs = zip(self.index[good, 0], self.table["pose"][good].astype(int), strict=True)
             planes = np.array([shard.tables[k][pose] for k, pose in pairs])
         links = np.where(self.used[good], np.asarray(self.g["contact_links"])[good], -1).reshape(len(good), -1)
-        self.failed["steered"][good] = disobeys(shard.asked, shard.link_names, links, T_objects, planes)
+        self.failed["steered"][good] = disobeys(asked, shard.link_names, links, T_objects, planes)
 
     def _self_penetration(self, T_links: np.ndarray) -> None:
         hand, depth = self.hand, np.zeros(len(self.good))

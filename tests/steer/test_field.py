@@ -26,7 +26,7 @@ def test_nothing_asked_changes_nothing(inputs):
 def test_only_what_may_touch_is_found(inputs):
     """Postures of the others stay: unused fingers take them."""
     field, hand = inputs.field.model, inputs.hand.model
-    touching = find_touching(Steering(fingers="link_3.0_tip,link_15.0_tip"), hand, {})
+    touching = find_touching(Steering(fingers=("link_3.0_tip", "link_15.0_tip")), hand, {})
     steered = steered_field(field, touching)
     rows, slots = found(steered)
     assert set(np.flatnonzero(touching.groups)) == set(slots)
