@@ -12,9 +12,11 @@ from typer.testing import CliRunner
 
 from lgrasp.dataset.metrics import mass_frame, row_metrics
 from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.report.write import read_dataset
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.events import Events
+from lgrasp.engine.report import job_report
 from lgrasp.engine.run import JobOutcome, run
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.jobs.metrics import MetricsJob
@@ -85,6 +87,20 @@ def test_stored_residuals(measured):
         assert metrics["fswo"][r] == pytest.approx(residual(arms, normals, 0.0, 1, 10.0), abs=2e-4)
         gswo = residual(arms, normals, 0.5, 8, 10.0)
         assert gswo - 1e-4 <= metrics["gswo"][r] <= max(gswo, 1e-4) + 1e-4
+
+
+def test_what_the_rows_show_together(run, tmp_path):
+    """The report has coverage and diversity of all shards of an object, as the report of the data set."""
+    run(rows=20, shard_rows=10)
+    outcome = add_metrics(tmp_path / "out", tmp_path / "more", ["volume"], workers=1)
+    (found,) = job_report(outcome)["sets"]
+    (hand,) = read_dataset(tmp_path / "more")[0]["hands"]
+    (group,) = hand["objects"]
+    assert (found["hand"], found["objects"], found["rows"]) == ("allegro", ["mug"], 20)
+    assert found["diversity"] == group["diversity"]
+    assert found["coverage"]["mug"]["surface"] == group["coverage"]["mug"]["surface"]
+    assert 0 < found["coverage"]["mug"]["surface"]["share"] < 1
+    assert hand["diversity"] == group["diversity"]["mug"]
 
 
 def test_all_else_stays(tmp_path, make_shard, same_rows):

@@ -58,7 +58,7 @@ class CompareRequest(Request):
 
     @property
     def title(self) -> str:
-        return f"{len(self.hands)} hands {len(self.objects)} objects"
+        return " ".join(Path(name).stem for name in (*self.hands, *self.objects))
 
     def check(self) -> None:
         self.variations()
