@@ -1,12 +1,10 @@
 """Kernels of the place stage (Lightning Grasp, 5.2): poses are proposed, the best is chosen, the rest is dropped."""
 
-from enum import IntEnum
-
 import numpy as np
 import warp as wp
 
 from lgrasp.field.arrays import Field, field_has, field_pair, field_seed
-from lgrasp.grasp.collision import body_clear, body_depth, body_height, plane_height, resting_plane
+from lgrasp.grasp.collision import body_clear, body_depth, body_height, resting_plane
 from lgrasp.grasp.structs import Poses
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_forward
@@ -14,14 +12,13 @@ from lgrasp.math.limits import MAX_GROUPS, MAX_JOINTS
 from lgrasp.math.transforms import random_rotation, rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.steer.arrays import Steer, may_touch, pick_group
+from lgrasp.stages.place.rating import rate_pose
+from lgrasp.stages.place.structs import PlaceCount, PlaceValues, ProposedPoses, Rating
+from lgrasp.steer.arrays import Steer, pick_group
 from lgrasp.steer.cone import in_cone, roll_in_cone, rotation_in_cone
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_MAX_GROUP_HITS = wp.constant(6)  # rated contacts per group
-_MAX_HITS = wp.constant(48)  # rated contacts of a pose
-_OPPOSED_COSINE = wp.constant(0.766)  # cos 40 deg, of an inward normal to the line between two contacts
 SEED_STRIDE = wp.constant(7919)
 """Between the seeds of a candidate's proposals."""
 _PINCH_DRAWS = wp.constant(32)  # of two opposite points and two opposed contact vectors
@@ -29,52 +26,7 @@ _PINCH_TOLERANCE = wp.constant(0.002)  # [m] difference of their distances
 _PINCH_ROLL_SIGMA = wp.constant(0.3)  # [rad] about the roll that brings the first normals together
 _PINCH_MIN_SINE = wp.constant(0.1)  # of a normal to the line; below that any roll is as good
 _CONE_DRAWS = wp.constant(32)  # of points of object and hand whose roll may bring the palm into its cone
-_LEAST_CONTACT_HEIGHT = wp.constant(0.005)  # [m] above the table, of contacts that rate a pose
 _PALM_COSINE = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched object's normal to the palm's
-
-
-class PlaceCount(IntEnum):
-    """Counts of the stage."""
-
-    TRIED = 0
-    BLOCKED = 1
-    KEPT = 2
-
-
-class Rating(IntEnum):
-    """Ratings that are no number of opposed contacts."""
-
-    HOPELESS = 0  # the hand can hold nothing there
-    CLEAR = 1  # of static links; not rated further, or one opposed pair
-    BLOCKED = -1  # by static links, or these by the table
-
-
-@wp.struct
-class PlaceValues:
-    """PlaceParams and GraspBounds as kernels read them."""
-
-    canonical: wp.float32  # share of all proposals, as the next two
-    pinch: wp.float32
-    palm: wp.float32
-    samples: wp.int32
-    max_com_distance: wp.float32  # [m]
-    allowed_penetration: wp.float32  # [m]
-    spins: wp.int32
-    min_object_distance: wp.float32  # [m]
-    min_table_distance: wp.float32  # [m]
-
-
-@wp.struct
-class ProposedPoses:
-    """B proposals for each of N candidates."""
-
-    pose: wp.array2d(dtype=wp.transform)  # (N, B) T_hand_object of the internal frame [m]
-    palm_point: wp.array2d(dtype=wp.int32)  # (N, B) hand contact point on ``surface``, -1 none
-    surface: wp.array2d(dtype=wp.int32)  # (N, B) object contact point that placed it
-    setting: wp.array2d(dtype=wp.int32)  # (N, B) setting of the hand's shared joints
-    resting: wp.array2d(dtype=wp.int32)  # (N, B) resting pose of the object, -1 none
-    anchor: wp.array3d(dtype=wp.int32)  # (N, B, G) object contact point that the group can touch, -1 unknown
-    rating: wp.array2d(dtype=wp.int32)  # (N, B) opposed pairs of contacts, or a Rating
 
 
 @wp.func
@@ -152,75 +104,6 @@ def _pinch(hand: Hand, field: Field, obj: Object, steer: Steer, anchor: wp.array
             anchor[slot[1] - setting * G] = j
         return T, setting, palm, j
     return T, int(-1), int(-1), int(-1)
-
-
-@wp.func
-def _rate(
-    hand: Hand,
-    field: Field,
-    obj: Object,
-    params: PlaceValues,
-    groups: wp.int32,
-    T: wp.transform,
-    plane: wp.vec4,
-    setting: wp.int32,
-    palm: wp.int32,
-    anchor: wp.array(dtype=wp.int32),
-    state: wp.uint32,
-):
-    """How many pairs of reachable contacts of different groups oppose each other about the centre of mass.
-
-    A pair counts when each contact's inward normal is within 40 degrees of the line to the other, and the line passes
-    the centre of mass within ``max_com_distance``; contacts near the table ``plane`` do not. ``anchor`` holds an object
-    contact point that each group can touch, or gets one. Bit g of ``groups``: group g may touch.
-    """
-    com = wp.transform_point(T, obj.com)
-    points = wp.zeros(shape=(_MAX_HITS,), dtype=wp.vec3)
-    normals = wp.zeros(shape=(_MAX_HITS,), dtype=wp.vec3)
-    owner = wp.zeros(shape=(_MAX_HITS,), dtype=wp.int32)
-    m = int(0)
-    R = wp.transform_get_rotation(T)
-    t = wp.transform_get_translation(T)
-    for g in range(hand.kin.groups):
-        hits = int(0)
-        if not may_touch(groups, g):
-            continue
-        for s in range(params.samples):
-            i = anchor[g]
-            if s > 0 or i < 0:
-                i = wp.min(int(wp.randf(state) * float(obj.contacts)), obj.contacts - 1)
-            p = wp.quat_rotate(R, obj.contact_points[i]) + t
-            n = -wp.quat_rotate(R, obj.contact_normals[i])
-            within = plane_height(plane, p) > _LEAST_CONTACT_HEIGHT
-            if within and field_has(field, setting * hand.kin.groups + g, p, n) >= 0:
-                points[m] = p
-                normals[m] = n
-                owner[m] = g
-                m += 1
-                hits += 1
-                if anchor[g] < 0:
-                    anchor[g] = i
-                if hits == _MAX_GROUP_HITS or m == _MAX_HITS - 1:
-                    break
-    if palm >= 0:
-        points[m] = hand.contacts.points[palm]
-        normals[m] = hand.contacts.normals[palm]
-        owner[m] = -1
-        m += 1
-    rating = int(0)
-    for i in range(m):
-        for j in range(i):
-            if owner[i] != owner[j]:
-                d = points[j] - points[i]
-                a = wp.dot(d, normals[i])
-                b = -wp.dot(d, normals[j])
-                # hand normals point into the object, so towards each other
-                limit = _OPPOSED_COSINE * wp.length(d)
-                if a > limit and b > limit:
-                    u = wp.clamp(wp.dot(com - points[i], d) / wp.dot(d, d), 0.0, 1.0)
-                    if wp.length(com - points[i] - d * u) < params.max_com_distance:
-                        rating += 1
-    return rating
 
 
 @wp.func
@@ -332,7 +215,7 @@ def propose_poses(
             rating = Rating.BLOCKED
         if rating == Rating.CLEAR and params.samples > 0:
             numbers = wp.rand_init(wp.randi(state))
-            rating = _rate(hand, field, obj, params, steer.groups, T, plane, setting, palm, anchor, numbers)
+            rating = rate_pose(hand, field, obj, params, steer.groups, T, plane, setting, palm, anchor, numbers)
     proposals_out.pose[row, b] = T
     proposals_out.palm_point[row, b] = palm
     proposals_out.surface[row, b] = i

@@ -11,7 +11,8 @@ from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.transforms import rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.stages.place.kernels import SEED_STRIDE, PlaceValues, ProposedPoses, Rating
+from lgrasp.stages.place.kernels import SEED_STRIDE
+from lgrasp.stages.place.structs import PlaceValues, ProposedPoses, Rating
 
 wp.set_module_options(KERNEL_OPTIONS)
 

@@ -9,9 +9,10 @@ from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.place.kernels import PlaceCount, PlaceValues, ProposedPoses, choose_poses, propose_poses, take_poses
+from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
 from lgrasp.stages.place.opposed_kernels import propose_opposed
 from lgrasp.stages.place.params import PlaceParams
+from lgrasp.stages.place.structs import PlaceCount, PlaceValues, ProposedPoses
 
 VERSION = 5
 
