@@ -1,7 +1,7 @@
 """The functions of ``import lgrasp as lg``: hand and object in, grasps in memory out; no file without ``out``."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -122,6 +122,7 @@ def generate(
     n: int = 1000,
     *,
     pipeline: Name | Pipeline = "robust",
+    steer: Mapping[str, Any] | None = None,
     seed: int | None = None,
     scale: float = 1.0,
     device: str = "auto",
@@ -134,6 +135,7 @@ def generate(
         hand: name, URDF, or folder with hand.yaml.
         object: name or mesh file.
         pipeline: name, YAML file, or what :func:`load_pipeline` gives.
+        steer: what is asked of grasps, as a pipeline's section ``steer`` has it: ``{"fingers": "thumb,index"}``.
         scale: from the mesh's unit to metres.
         workers: threads; 0: one per core.
         out: folder for shards; none: no file.
@@ -144,6 +146,7 @@ def generate(
     from lgrasp.jobs.generate import GenerateJob
 
     what = _asked(hand, n, pipeline, seed, device, workers, out)
+    what["pipeline"] = what["pipeline"].with_steering(**(steer or {}))
     return _done(GenerateJob, out, n, object=str(object), scale=scale, **what)
 
 

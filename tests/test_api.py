@@ -33,6 +33,13 @@ def test_rows_in_memory_are_those_on_disk(grasps, tmp_path):
     assert len(lg.open(file)) == len(lg.open(tmp_path / "mug")) == 12
 
 
+def test_steered_rows():
+    steered = lg.generate("allegro", "mug", 5, pipeline="swift", steer={"palm": "no"}, device="cpu")
+    assert not (steered.contact_links == steered.hand.link_names.index("base_link")).any()
+    with pytest.raises(lg.LgraspError, match="fingers: index, middle, ring, thumb"):
+        lg.generate("allegro", "mug", 5, steer={"fingers": "pinky"}, device="cpu")
+
+
 def test_some_of_the_rows(grasps, tmp_path):
     some = grasps[grasps.metrics["gap"] < np.median(grasps.metrics["gap"])]
     assert len(some) == 6

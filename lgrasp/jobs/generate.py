@@ -17,7 +17,7 @@ from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.run import JobOutcome, run
 from lgrasp.engine.shard import Execution, add_counts, make_shard, shard_effort
-from lgrasp.errors import LgraspError, StarvedError
+from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.records import ObjectRecord
@@ -158,7 +158,13 @@ class GenerateJob(GenerateRequest, SearchJob):
     def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
         if not outcome.starved:
             return None
-        stage, words = starving_stage(self.report(outcome)["counts"])
+        counts = self.report(outcome)["counts"]
+        if self.pipeline.steer.asks and not counts["place"].get("kept", 1):
+            return ConfigError(
+                f"steer leaves nothing: at none of {counts['place']['tried']:,} poses could {self.object_name} be held by "
+                f"hand '{self.keys.source.name}'"
+            )
+        stage, words = starving_stage(counts)
         if stage in ("search", "hold") and self.pipeline.bounds.max_unresisted_load < _LOOSE_LOAD:
             words += f"; grasps that resist less: --set bounds.max_unresisted_load={_LOOSE_LOAD}, or --pipeline swift"
         return StarvedError(f"{outcome.rows:,} of {self.rows:,} grasps found; stage {stage} is the bottleneck: {words}")

@@ -7,21 +7,21 @@ import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ConfigError
-from lgrasp.geometry.poses import pose_from_matrix
+from lgrasp.geometry.poses import inverse, pose_from_matrix
 
 _UNIT = 1e-3  # of the lengths of quaternions, and of the products of the axes of a matrix
 
 
 def read_poses(path: Path) -> np.ndarray:
     """T_hand_object, x y z [m] qw qx qy qz, shape [n, 7]: of a shard's rows, or of a NumPy file or a CSV file with
-    matrices (16 numbers a pose, row by row) or such poses (7).
+    matrices (16 numbers a pose, row by row) or such poses (7); an array T_object_hand of a NumPy file is turned round.
 
     Raises:
         ConfigError: the file cannot be read or holds no pose.
     """
     where = f"steer.pose: {path}"
     try:
-        poses = _read(path)
+        poses, of_hand = _read(path)
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"{where} cannot be read: {' '.join(str(error).split())[:200]}") from None
     if poses.ndim == 3 and poses.shape[1:] == (4, 4):
@@ -42,23 +42,24 @@ def read_poses(path: Path) -> np.ndarray:
     good &= np.isfinite(poses).all(1)
     if not good.all():
         raise ConfigError(f"{where}: pose {int(np.argmin(good))} is no rotation and translation")
-    return poses
+    return inverse(poses) if of_hand else poses
 
 
-def _read(path: Path) -> np.ndarray:
+def _read(path: Path) -> tuple[np.ndarray, bool]:
+    """Poses as they are in a file, and whether they are those of the hand."""
     if path.suffix in (".h5", ".hdf5"):
         with ShardReader(path) as reader:
-            return reader.column("object_pose")[:, 0]
+            return reader.column("object_pose")[:, 0], False
     data = path.read_bytes()
     if path.suffix in (".npy", ".npz"):
         found = np.load(io.BytesIO(data), allow_pickle=False)
         if isinstance(found, np.ndarray):
-            return found
-        names = [name for name in ("poses", "T_hand_object") if name in found.files] or found.files
+            return found, False
+        names = [name for name in ("T_hand_object", "T_object_hand") if name in found.files] or found.files
         if len(names) != 1:
-            raise ValueError(f"arrays {', '.join(found.files)}; name one of them poses")
-        return found[names[0]]
+            raise ValueError(f"it has {', '.join(found.files)}; an array T_hand_object or T_object_hand is needed")
+        return found[names[0]], names[0] == "T_object_hand"
     lines = [line for line in data.decode("utf-8").splitlines() if line.strip()]
     if lines and any(c.isalpha() and c not in "eE" for c in lines[0]):  # a header
         lines = lines[1:]
-    return np.atleast_2d(np.array([[float(x) for x in line.split(",")] for line in lines]))
+    return np.atleast_2d(np.array([[float(x) for x in line.split(",")] for line in lines])), False

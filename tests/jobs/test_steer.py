@@ -1,6 +1,7 @@
 """Grasps that obey what is asked of them, told from the rows alone."""
 
 import json
+import shutil
 
 import h5py
 import numpy as np
@@ -12,6 +13,8 @@ from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import device_matrix, pose_matrix
 from lgrasp.hand.find import find_hand
+from lgrasp.jobs.config import JobConfig, plan_requests
+from lgrasp.jobs.generate import generate
 from lgrasp.judge.run import judge
 
 FINGERS = find_hand("allegro").spec.fingers
@@ -136,6 +139,30 @@ def test_the_object_is_where_the_file_says(steered, run, swift, tmp_path, kind):
     found = steered(pose=path, rows=10).grasps.object_pose[:, 0]
     assert np.abs(found[:, None] - poses[None]).max(2).min(1).max() < 1e-5
     assert len(np.unique(found.round(4), axis=0)) > 1
+
+
+def test_poses_of_the_hand(steered, tmp_path):
+    T = pose_matrix(steered(rows=10).grasps.object_pose[:, 0].astype(float))
+    np.savez(tmp_path / "hand.npz", T_object_hand=np.linalg.inv(T))
+    shutil.rmtree(tmp_path / "steered")
+    found = pose_matrix(steered(pose=tmp_path / "hand.npz", rows=5).grasps.object_pose[:, 0].astype(float))
+    assert np.abs(found[:, None] - T[None]).max((2, 3)).min(1).max() < 1e-5
+
+
+def test_poses_out_of_reach_are_told(job, swift, tmp_path):
+    np.save(tmp_path / "far.npy", [[0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0]])
+    far = job(pipeline=swift.with_steering(pose=tmp_path / "far.npy"), rows=20)
+    error = far.shortfall(generate(far))
+    assert isinstance(error, ConfigError)
+    assert "at none of" in str(error)
+
+
+def test_a_config_steers_every_pipeline():
+    config = JobConfig(objects=("mug", "box"), pipelines=("swift", "robust"), steer={"fingers": "thumb,index"})
+    requests = plan_requests(config)
+    assert {request.pipeline.steer.fingers for request in requests} == {("thumb", "index")}
+    assert len({request.out for request in requests}) == 4
+    assert all("-steer-" in request.out.name for request in requests)
 
 
 @pytest.mark.parametrize("values", [np.zeros((0, 7)), np.zeros((3, 4, 4)), np.ones((2, 7)), np.ones((2, 5))])
