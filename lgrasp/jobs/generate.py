@@ -161,8 +161,8 @@ class GenerateJob(GenerateRequest, SearchJob):
         counts = self.report(outcome)["counts"]
         if self.pipeline.steer.asks and not counts["place"].get("kept", 1):
             return ConfigError(
-                f"steer leaves nothing: at none of {counts['place']['tried']:,} poses could {self.object_name} be held by "
-                f"hand '{self.keys.source.name}'"
+                f"steer leaves nothing: at none of {counts['place']['tried']:,} poses could hand "
+                f"'{self.keys.source.name}' hold {self.object_name}"
             )
         stage, words = starving_stage(counts)
         if stage in ("search", "hold") and self.pipeline.bounds.max_unresisted_load < _LOOSE_LOAD:
