@@ -2,11 +2,13 @@
 
 import json
 import shutil
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
+from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.shard import shard_context
@@ -158,8 +160,9 @@ def test_poses_out_of_reach_are_told(job, swift, tmp_path):
 
 
 def test_a_config_steers_every_pipeline():
-    config = JobConfig(objects=("mug", "box"), pipelines=("swift", "robust"), steer={"fingers": "thumb,index"})
-    requests = plan_requests(config)
+    names = {"objects": ["mug", "box"], "pipelines": ["swift", "robust"]}
+    config = parse_model(JobConfig, names | {"steer": {"fingers": "thumb,index"}}, "config")
+    requests: list[Any] = plan_requests(config)
     assert {request.pipeline.steer.fingers for request in requests} == {("thumb", "index")}
     assert len({request.out for request in requests}) == 4
     assert all("-steer-" in request.out.name for request in requests)
