@@ -4,6 +4,7 @@ from enum import IntEnum
 
 import warp as wp
 
+from lgrasp.grasp.collision import body_depth
 from lgrasp.grasp.structs import Candidates, Sets
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
@@ -19,6 +20,9 @@ from lgrasp.stages.search.sets import FoundSets, Hits, SearchValues, TriedSets, 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _INSCRIBED = wp.constant(INSCRIBED)
+
+
+_UNKNOWN = wp.constant(-1)  # whether a candidate sinks into the object
 
 
 class SearchCount(IntEnum):
@@ -135,6 +139,53 @@ def check_fingers(hits: Hits, hand: Hand, params: SearchValues, candidates: Cand
                     if not group_pairs_clear(hand, g + 1, h + 1, Xa, 0, Xb, 0, params.min_self_distance):
                         tried_out.score[row, lane] = -1.0
                         return
+
+
+@wp.kernel
+def check_depth(
+    hits: Hits,
+    hand: Hand,
+    obj: Object,
+    params: SearchValues,
+    candidates: Candidates,
+    usable_out: Usable,
+    tried_out: TriedSets,
+):
+    """One thread per (hit, group): scores go below 0 when the finger sinks into the object at any point, as the filter
+    would find, and its candidate is usable no more; each candidate is looked at once.
+    """
+    i, g = wp.tid()
+    row, lane = _hit(hits, tried_out, i)
+    if row < 0:
+        return
+    m = tried_out.chosen[row, lane, g]
+    if m < 0:
+        return
+    if usable_out.sunk[row, g, m] == _UNKNOWN:
+        X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+        j0 = group_forward(hand.kin, g, candidates.q[row, g, m], X, 0)
+        T_object = wp.transform_inverse(candidates.poses.pose[row])
+        sunk = int(0)
+        for j in range(hand.kin.joint_first[g + 1] - j0):
+            if sunk == 0:
+                depth = body_depth(hand, obj, 1 + j0 + j, T_object * X[j], params.max_penetration)
+                sunk = wp.where(depth > params.max_penetration, 1, 0)
+        usable_out.sunk[row, g, m] = sunk
+    if usable_out.sunk[row, g, m] == 1:
+        tried_out.score[row, lane] = -1.0
+
+
+@wp.kernel
+def drop_sunk(usable_out: Usable):
+    """Candidates that were found to sink into the object leave the lists of (pose, group)."""
+    row, g = wp.tid()
+    n = int(0)
+    for k in range(usable_out.size[row, g]):
+        m = usable_out.candidate[row, g, k]
+        if usable_out.sunk[row, g, m] != 1:
+            usable_out.candidate[row, g, n] = m
+            n += 1
+    usable_out.size[row, g] = n
 
 
 @wp.func

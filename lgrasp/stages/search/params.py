@@ -55,6 +55,11 @@ class SearchParams(Params):
         le=4,
         description="swap: rounds per start; each after the first adds a finger if that is needed and k allows.",
     )
+    check_depth: bool = Field(
+        default=False,
+        description="swap: fingers of a set must be clear of the object by every surface point; postures that are not "
+        "are left out of later starts.",
+    )
     per_pose: int = Field(default=3, ge=1, le=MAX_RESTARTS, description="Most sets per pose.")
     passes: int = Field(default=1, ge=1, le=64, description="Rounds over the same candidates (multi-pass generation).")
     separation: float = Field(

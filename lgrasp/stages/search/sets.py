@@ -30,6 +30,7 @@ class SearchValues:
     friction: wp.float32
     max_gswo: wp.float32
     max_unresisted_load: wp.float32
+    max_penetration: wp.float32  # [m]
     least_force: wp.float32
     torque_scale: wp.float32  # [1/m]
     moves: wp.int32
@@ -49,6 +50,7 @@ class Usable:
 
     size: wp.array2d(dtype=wp.int32)  # (P, G) how many
     candidate: wp.array3d(dtype=wp.int32)  # (P, G, M) which: the first ``size``
+    sunk: wp.array3d(dtype=wp.int32)  # (P, G, M) 1: in the object, 0: clear, -1: unknown; or (0, 0, 0)
     point: wp.array3d(dtype=wp.vec3)  # (P, G, M) where they are on the object [m]; (0, 0, 0) if nobody asks
 
 

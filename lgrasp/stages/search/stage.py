@@ -16,8 +16,10 @@ from lgrasp.stages.context import Context
 from lgrasp.stages.search.kernels import (
     SearchCount,
     check_balance,
+    check_depth,
     check_fingers,
     check_load,
+    drop_sunk,
     keep_sets,
     list_hits,
     list_usable,
@@ -32,6 +34,7 @@ VERSION = 8
 
 _CPU_STARTS = 2  # of a pose in one launch
 _GPU_STARTS = 10
+_EXACT_STARTS = 4  # on every device: what is left out of later starts depends on it
 
 
 def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple[ContactSets, Tally]:
@@ -50,14 +53,18 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     number = wp.zeros(n, dtype=wp.int32, device=d)
     found = empty_struct(FoundSets, d, n, params.per_pose, groups, number=number)
     swap = params.method == "swap"
-    points = {"point": wp.empty((0, 0, 0), dtype=wp.vec3, device=d)} if swap else {}
-    usable = empty_struct(Usable, d, n, groups, keep, **points)
+    exact = swap and params.check_depth and context.realised
+    shape = (n, groups, keep) if exact else (0, 0, 0)
+    given: dict[str, Any] = {"sunk": wp.full(shape, -1, dtype=wp.int32, device=d)}
+    given |= {"point": wp.empty((0, 0, 0), dtype=wp.vec3, device=d)} if swap else {}
+    usable = empty_struct(Usable, d, n, groups, keep, **given)
     hand, obj, values = context.hand.struct, context.object.struct, _values(params, context)
     state = State.REALISED if context.realised else State.DRAWN
     wp.launch(list_usable, (n, groups), [obj, int(state), inputs.struct], [usable], device=d)
     kernel = (swap_contacts if swap else mutate_contacts)[params.score]
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
     few = _CPU_STARTS if d == "cpu" else _GPU_STARTS
+    few = _EXACT_STARTS if exact else few
     lanes = min(params.restarts, few if params.per_pose < params.restarts else params.restarts)
     tried = empty_struct(TriedSets, d, n, lanes, groups)
     for first in range(0, params.restarts, lanes):
@@ -75,6 +82,10 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
                 wp.launch(check_load, (size, 6), [hits, obj, values, inputs.struct], [tried], device=d)
             if context.realised:
                 wp.launch(check_fingers, size, [hits, hand, values, inputs.struct], [tried], device=d)
+            if exact:
+                asked = [hits, hand, obj, values, inputs.struct]
+                wp.launch(check_depth, (size, groups), asked, [usable, tried], device=d)
+                wp.launch(drop_sunk, (n, groups), [], [usable], device=d)
         wp.launch(keep_sets, n, [values, inputs.struct, tried], [found], device=d)
     upto = wp.clone(found.number)
     running_sums(upto)

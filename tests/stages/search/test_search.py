@@ -8,8 +8,10 @@ import pytest
 from scipy.optimize import nnls
 from support.wrench import cone_forces, residual, wrenches
 
+from lgrasp.engine.batch import run_stages
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.stages.filter.stage import run as run_filter
 from lgrasp.stages.search.params import SearchParams
 from lgrasp.stages.search.stage import run
 
@@ -155,3 +157,21 @@ def test_too_many_candidates(tables, context, swift):
     table: Any = SimpleNamespace(surface=SimpleNamespace(shape=(3, 99, 16)))
     with pytest.raises(ConfigError, match="99 fingers"):
         run(table, swift.params("search"), context)
+
+
+def test_fingers_are_clear_by_every_point(context, swift):
+    """With check_depth the filter finds hardly any finger in the object, and batches change nothing."""
+    exact = swift.with_params("search", check_depth=True)
+    sunk, parts = {}, {}
+    for name, pipeline in (("quick", swift), ("exact", exact)):
+        table = run_stages(pipeline, context, 0, 300, "search")
+        parts[name] = table.arrays()
+        counts = run_filter(table, pipeline.params("filter"), context)[1]
+        sunk[name] = counts["object collision"] / sum(counts.values())
+        assert counts["kept"] > 20
+    assert sunk["exact"] < 0.3 * sunk["quick"]
+    assert sunk["quick"] > 0.1
+    first = run_stages(exact, context, 0, 100, "search").arrays()
+    rows = len(first["pose"])
+    for name in ("pose", "slot", "chosen", "score"):
+        np.testing.assert_array_equal(first[name], parts["exact"][name][:rows])
