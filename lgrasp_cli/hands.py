@@ -214,7 +214,7 @@ def compare_hands(
 
     what: dict[str, Any] = {"hands": hands, "objects": objects, "rows": rows, "vary": vary, "simulate": simulate}
     what |= {"pipeline": pipeline, "seed": seed, "out": out}
-    how.run(how.job(CompareRequest, "hands compare", **what), _show_comparison)
+    how.run(how.job(CompareRequest, "hands compare", **what), _show_comparison, _show_by_object)
 
 
 def _show_comparison(data: dict[str, Any]) -> list[Block]:
@@ -228,6 +228,20 @@ def _show_comparison(data: dict[str, Any]) -> list[Block]:
     missing = [("missing", f"{plural(data['missing'], 'hand')} with an object")] if data["missing"] else []
     table = TextTable(("hand", *heads), rows, right=heads)
     return [table, "", [*missing, ("time", f"{data['seconds']['total']:.1f} s"), ("page", str(data["page"]))]]
+
+
+def _show_by_object(data: dict[str, Any]) -> list[Block]:
+    from lgrasp.jobs.compare.page import cells, shown_columns
+
+    columns = shown_columns(data["hands"])
+    heads = [head for _, head, _, _ in columns]
+    rows = [
+        (name, hand["hand"], *cells(hand["objects"][name], columns))
+        for name in dict.fromkeys(name for hand in data["hands"] for name in hand["objects"])
+        for hand in data["hands"]
+        if name in hand["objects"]
+    ]
+    return ["", TextTable(("object", "hand", *heads), rows, right=heads), ""]
 
 
 def _show_spaces(found: "HandCheck") -> list[Block]:

@@ -115,4 +115,5 @@ def test_compare_prints_a_line_for_each_hand(cli, tmp_path):
     assert [hand["all"]["rows"] for hand in hands] == [3, 3]
     again = json.loads(cli(*given, "--json", "-").out)  # without the variant: its hand is there already
     assert (again["made"], again["present"]) == (0, 3)
+    assert ["sphere", "allegro", "3"] in [line.split()[:3] for line in cli(*given, "--verbose").out.splitlines()]
     assert "belongs to another run" in cli(*given, "-n", 4).error()
