@@ -11,9 +11,16 @@ from lgrasp_cli.names import one_of
 _PANEL = "Steer"
 
 Fingers = Annotated[
-    str | None, Option(help="Fingers that all touch, and no others, such as thumb,index.", rich_help_panel=_PANEL)
+    str | None,
+    Option(
+        metavar="NAMES",
+        help="Fingers that all touch, and no others, such as thumb,index.",
+        rich_help_panel=_PANEL,
+    ),
 ]
-Links = Annotated[str | None, Option(help="Links that may touch, and no others.", rich_help_panel=_PANEL)]
+Links = Annotated[
+    str | None, Option(metavar="NAMES", help="Links that may touch, and no others.", rich_help_panel=_PANEL)
+]
 Palm = Annotated[
     str | None, Option(rich_help_panel=_PANEL, **one_of(PalmUse, "PALM", "Whether the palm may or must touch."))
 ]
@@ -29,7 +36,7 @@ Above = Annotated[
     str | None,
     Option(
         metavar="X,Y,Z,D",
-        help="Keep the hand and its way where X x + Y y + Z z >= D, object's frame [m].",
+        help="Keep the hand and its way where X x + Y y + Z z >= D, object's frame, metres.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -37,6 +44,7 @@ PoseFile = Annotated[
     Path | None,
     Option(
         "--pose",
+        metavar="FILE",
         help="Object poses in the hand's frame (npz, csv or a shard); only fingers are searched.",
         rich_help_panel=_PANEL,
     ),

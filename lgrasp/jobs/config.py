@@ -29,7 +29,7 @@ from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest
 from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
 from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object
-from lgrasp.steer.params import NOTHING, Steering
+from lgrasp.steer.params import Steering
 
 
 class JobConfig(Params):
@@ -54,7 +54,7 @@ class JobConfig(Params):
     shard_rows: int = Field(10_000, ge=1)
     passes: int | None = Field(None, ge=1, le=64)
     table: bool = Field(False, description="Grasps leave room for the table that the object rests on.")
-    steer: Steering = Field(NOTHING, description="What is asked of the grasps, beside what the pipelines ask.")
+    steer: Steering | None = Field(None, description="What is asked of the grasps, beside what the pipelines ask.")
     sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn.")
 
     @model_validator(mode="before")
@@ -224,7 +224,8 @@ def _pipelines(config: JobConfig) -> Iterator[Pipeline]:
     """Each pipeline with the config's seed."""
     for name in config.pipelines:
         pipeline = load_pipeline(name).with_settings(config.settings)
-        pipeline = pipeline.with_steering(**config.steer.model_dump(exclude_unset=True))
+        if config.steer:
+            pipeline = pipeline.with_steering(**config.steer.model_dump(exclude_unset=True))
         if config.seed is not None:
             pipeline = pipeline.model_copy(update={"seed": config.seed})
         yield pipeline

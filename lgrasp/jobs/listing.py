@@ -68,7 +68,7 @@ def describe_pipeline(name: str) -> dict[str, Any]:
     """
     pipeline = load_pipeline(name)
     sections = ((part.name, params) for part, params in pipeline.sections)
-    parts = [("bounds", pipeline.bounds), ("object", pipeline.object), ("field", pipeline.field), *sections]
+    parts = [*((name, getattr(pipeline, name)) for name in ("bounds", "steer", "object", "field")), *sections]
     rows: list[tuple[str, str, Any, str]] = [
         ("", "seed", pipeline.seed, "Base seed of all stages."),
         ("", "effort", pipeline.effort, "Candidates tried per requested row before giving up."),
