@@ -29,6 +29,10 @@ def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
             continue
         whole = found.get(before, 0) if before else sum(found.values())
         share = found.get(after, 0) / whole if whole else 0.0
+        if 2 * found.get("touch", 0) > whole:
+            reason = (
+                "too little of the normal force is on the region to touch; a smaller share or larger region gives more"
+            )
         if share < least:
             worst, least = stage, share
             words = f"{found.get(after, 0):,} of {whole:,} survive: {reason}"

@@ -11,6 +11,7 @@ from lgrasp.errors import ConfigError
 from lgrasp.judge.run import judge
 
 ROWS = 40
+HANDLE = "box:0.026,-1,-1:1,1,1"
 TOP, LOW = "box:-1,-1,0.06:1,1,1", "box:-1,-1,-1:1,1,0.06"
 
 
@@ -19,7 +20,8 @@ def steered(run, swift, tmp_path):
     """steered(**asked): a shard of grasps of the mug that are steered so, and its file."""
 
     def steered(pipeline=swift, rows=ROWS, **asked):
-        outcome = run(pipeline=pipeline.with_steering(**asked), rows=rows, shard_rows=rows, out=tmp_path / "steered")
+        out = tmp_path / pipeline.with_steering(**asked).steer.tag
+        outcome = run(pipeline=pipeline.with_steering(**asked), rows=rows, shard_rows=rows, out=out)
         (path,) = outcome.paths
         shard = read_shard(path)
         assert len(shard.grasps) == rows
@@ -57,6 +59,19 @@ def test_no_contact_is_on_what_is_avoided(steered):
     shard, path = steered(avoid=[TOP, "box:-1,-1,-1:1,1,0.02"])
     z = contacts(shard)[1][:, 2]
     assert 0.02 < z.min() < z.max() < 0.06
+    passes(path)
+
+
+def test_a_handle_is_found(steered):
+    """Contacts are drawn on it, not filtered: a candidate gives at least 30 % of the handle's part in the grasps."""
+    handle, path = steered(touch=HANDLE)
+    whole, _ = steered()
+    mesh = trimesh.Trimesh(whole.objects[0].vertices, whole.objects[0].faces)
+    surface = mesh.area_faces[mesh.triangles_center[:, 0] >= 0.026].sum() / mesh.area
+    assert 0.05 < surface < 0.15
+    rate, unrestricted = (shard.statistics["filter_kept"] / shard.statistics["candidates"] for shard in (handle, whole))
+    assert rate >= 0.3 * unrestricted * surface
+    assert contacts(handle)[1][:, 0].min() >= 0.026
     passes(path)
 
 
