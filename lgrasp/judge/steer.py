@@ -16,7 +16,7 @@ PLANE_SLACK = 1e-4
 class Asked:
     """What the config of a shard says was asked, with the names that it has there."""
 
-    links: frozenset[str]  # that may touch
+    links: frozenset[str] | None  # that may touch, None: any
     every: tuple[frozenset[str], ...]  # of each set one link touches
     facing: np.ndarray | None  # (3,) unit vector that the palm faces along, base frame
     approach: np.ndarray | None  # (3,) unit middle of its cone, object's frame
@@ -38,8 +38,8 @@ def read_asked(config: Any) -> Asked | None:
         facing = _unit(told["facing"])
     plane = np.array(told["above"], float) if told.get("above") else None
     return Asked(
-        links=frozenset(told["links"]),
-        every=tuple(frozenset(links) for links in told["every"]),
+        links=frozenset(told["links"]) if "links" in told else None,
+        every=tuple(frozenset(links) for links in told.get("every", ())),
         facing=facing,
         approach=_unit(cone["direction"]) if cone else None,
         cosine=float(np.cos(np.radians(cone["angle"]))) if cone else -1.0,
@@ -64,7 +64,8 @@ def disobeys(
     """
     touching = {name: (links == k).any(axis=1) for k, name in enumerate(names)}
     none = np.zeros(len(links), bool)
-    bad = np.logical_or.reduce([none, *(found for name, found in touching.items() if name not in asked.links)])
+    others = [] if asked.links is None else [found for name, found in touching.items() if name not in asked.links]
+    bad = np.logical_or.reduce([none, *others])
     for some in asked.every:
         bad |= ~np.logical_or.reduce([none, *(found for name, found in touching.items() if name in some)])
     if asked.approach is not None:

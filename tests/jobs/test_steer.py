@@ -11,12 +11,15 @@ import pytest
 from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.batch import run_stages
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.run import run as run_job
 from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import device_matrix, pose_matrix
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.config import JobConfig, plan_requests
 from lgrasp.jobs.generate import generate
+from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.judge.run import judge
 
 FINGERS = find_hand("allegro").spec.fingers
@@ -126,6 +129,16 @@ def test_the_judge_agrees_and_finds_rows_that_do_not_obey(steered, tmp_path):
         report = judge(path)
         assert report.failed["steered"].all(), name
         assert not any(mask.any() for check, mask in report.failed.items() if check != "steered"), name
+
+
+def test_refined_rows_are_free_but_stay_above_the_plane(steered, cache_root, tmp_path):
+    steered(rows=6, fingers="thumb,index,middle", above="0,0,1,0.001")
+    cache = Cache(cache_root, pytest.fail)
+    job = RefineJob(shards=(tmp_path / "steered",), out=tmp_path / "refined", device="cpu", cache=cache)
+    (path,) = run_job(job).paths
+    assert read_shard(path).header.config["steered"] == {"above": [0, 0, 1, 0.001]}
+    failed = judge(path).failed
+    assert not any(failed[check].any() for check in ("steered", "table", "resting"))
 
 
 @pytest.mark.parametrize("kind", [".npz", ".csv", ".h5"])

@@ -30,6 +30,7 @@ from lgrasp.jobs.refine.moved import move_rows
 from lgrasp.jobs.requests.shards import RefineRequest
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
 from lgrasp.object.load import load_mesh
+from lgrasp.steer.touch import moved_rows
 
 VERSION = 3
 """Raised whenever refined shards change for the same parameters."""
@@ -130,6 +131,8 @@ class RefineJob(RefineRequest, ShardJob):
             "seconds_refine": time.perf_counter() - begin,
         }
         config = {**shard.header.config, "bounds": bounds.describe(), "refine": params.model_dump(mode="json")}
+        if told := config.pop("steered", None):
+            config |= moved_rows(told)
         header = replace(shard.header, config=config, created=now(), lgrasp_version=__version__)
         # contacts are found anew, wherever they are
         objects = [replace(record, regions=None, touch_share=1.0) for record in shard.objects]
