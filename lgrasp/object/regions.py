@@ -86,7 +86,7 @@ def _locate(
         mesh = wp.Mesh(corners, wp.array(faces.ravel(), dtype=wp.int32), support_winding_number=True)
         face, inside = (wp.empty(len(points), dtype=wp.int32) for _ in range(2))
         foot = wp.empty(len(points), dtype=wp.vec3)
-        reach = 10.0 * float(np.ptp(np.vstack([vertices, points]), axis=0).max())
+        reach = 10.0 * float(np.ptp(np.vstack([vertices[np.unique(faces)], points]), axis=0).max())
         wp.launch(locate_points, len(points), [mesh.id, wp.array(points, dtype=wp.vec3), reach], [face, foot, inside])
         return face.numpy(), foot.numpy().astype(float), inside.numpy() == 1
 

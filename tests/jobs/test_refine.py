@@ -208,13 +208,21 @@ def test_metrics_of_the_hold_test_are_left_out(source, refine, tmp_path):
     """Refined postures were not tried, and the bound is not asked of them."""
     shard = read_shard(source)
     tried = {name: np.ones(ROWS, "f4") for name in METRICS}
-    rows = replace(shard.grasps, metrics=shard.grasps.metrics | tried)
+    rows = replace(shard.grasps, metrics={**shard.grasps.metrics, **tried})
     config = {**shard.header.config, "bounds": GraspBounds(min_hold_probability=1.0).describe()}
     write_shard(tmp_path / "tried.h5", replace(shard, grasps=rows, header=replace(shard.header, config=config)))
     done = read_shard(refine(tmp_path / "tried.h5", tmp_path / "out", params=RefineParams(matching_rounds=0)))
     assert len(done.grasps) > 0
     assert not set(METRICS) & set(done.grasps.metrics)
     assert done.header.config["bounds"]["numbers"]["min_hold_probability"] == 0
+
+
+def test_regions_are_not_claimed_of_refined_rows(source, refine, tmp_path):
+    shard = read_shard(source)
+    asked = replace(shard.objects[0], regions=np.ones((9, 5), "f4"), touch_share=0.5)
+    write_shard(tmp_path / "steered.h5", replace(shard, objects=[asked]))
+    (object_,) = read_shard(refine(tmp_path / "steered.h5", tmp_path / "out")).objects
+    assert (object_.regions, object_.touch_share) == (None, 1.0)
 
 
 def test_the_same_job_gives_the_same_bytes(source, done, refine, tmp_path, raw_grasps):
