@@ -10,6 +10,8 @@ FieldIndex = Literal["voxel", "bvh"]
 """How a contact field is looked up."""
 PalmUse = Literal["yes", "no", "must"]
 """Whether the palm of a hand may touch."""
+Role = Literal["thumb", "index", "middle", "ring", "little"]
+"""Human finger that a finger acts as."""
 ProtocolName = Literal["fc", "gravity6", "gravity6_mu1", "seq6", "seq6_mu06", "fc_random", "lift", "dipgrasp"]
 """Protocols of the simulation (:mod:`lgrasp.simulate.protocol`)."""
 EngineName = Literal["mujoco", "physx"]

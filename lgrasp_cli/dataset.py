@@ -207,7 +207,7 @@ def _shard_table(shards: list[dict[str, Any]]) -> TextTable:
     rows = [
         (
             name,
-            *map(str, (s["hand"], ", ".join(s["objects"]), s["pipeline"], s["seed"], s["shard_index"])),
+            *map(str, (s["hand"], ", ".join(s["objects"]), _made_by(s), s["seed"], s["shard_index"])),
             f"{s['rows']:,}",
             str(len(s["joints"])),
             f"{s['bytes'] / 1e6:.1f}",
@@ -218,6 +218,11 @@ def _shard_table(shards: list[dict[str, Any]]) -> TextTable:
         total, size = sum(s["rows"] for s in shards), sum(s["bytes"] for s in shards)
         rows.append((plural(len(shards), "shard"), "", "", "", "", "", f"{total:,}", "", f"{size / 1e6:.1f}"))
     return TextTable(columns, rows, right=columns[6:])
+
+
+def _made_by(shard: dict[str, Any]) -> str:
+    """The pipeline, with the grasp type if one was asked for."""
+    return ", ".join(filter(None, (shard["pipeline"], shard["grasp_type"])))
 
 
 def _metric_table(shards: list[dict[str, Any]]) -> TextTable:

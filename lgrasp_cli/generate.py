@@ -9,7 +9,7 @@ from lgrasp.choices import ProtocolName
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import HANDS, OBJECTS, one_of
 from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, choose_pipeline, given
-from lgrasp_cli.steer import Above, Approach, Avoid, Fingers, Links, Palm, PoseFile, Touch
+from lgrasp_cli.steer import Above, Approach, Avoid, Fingers, GraspType, Links, Palm, PoseFile, Touch
 from lgrasp_cli.tables import Block, closed, counted, following, held, place, plural, took
 from lgrasp_cli.working import How, working
 
@@ -64,6 +64,7 @@ def generate(
             help="Searches per successful pose: faster, but fewer poses; default: the pipeline's.",
         ),
     ] = None,
+    grasp_type: GraspType = None,
     fingers: Fingers = None,
     links: Links = None,
     palm: Palm = None,
@@ -91,11 +92,13 @@ def generate(
     chosen = chosen.with_simulation(simulate) if simulate else chosen
     chosen = chosen.with_table() if table else chosen
     chosen = chosen.with_steering(
-        **given(fingers=fingers, links=links, palm=palm, approach=approach, above=above, pose=pose),
-        **given(touch=touch or None, avoid=avoid or None),
+        **given(grasp_type=grasp_type, fingers=fingers, links=links, palm=palm),
+        **given(approach=approach, above=above, pose=pose, touch=touch or None, avoid=avoid or None),
     )
-    if contacts is not None and chosen.steer.fingers:
-        raise ConfigError(f"--contacts {contacts}: --fingers says already how many touch; give one of them")
+    for name in ("fingers", "grasp_type") if contacts is not None else ():
+        if getattr(chosen.steer, name):
+            flag = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"--contacts {contacts}: {flag} says already how many touch; give one of them")
     pairs = all_hands(hands), all_objects(meshes)
     what = {"rows": rows, "scale": scale, "batch": batch, "shard_rows": shard_rows}
     requests = pair_requests(*pairs, chosen, out or Path("grasps"), simulate, **what, **how.shared)

@@ -65,7 +65,7 @@ def show_hand(name: HandArgument) -> Answer:
 
     hand = describe_hand(name)
     box = " to ".join(" ".join(f"{1000 * x:.0f}" for x in hand["canonical_box"][end]) for end in ("min", "max"))
-    spaces = hand["opposition_spaces"]
+    spaces, types = hand["opposition_spaces"], hand["grasp_types"]
     pairs = [
         ("hand", f"{hand['name']}: {hand['description']}" if hand["description"] else hand["name"]),
         ("file", hand["urdf"]),
@@ -77,6 +77,8 @@ def show_hand(name: HandArgument) -> Answer:
         *(("shared joint", f"{n}: {', '.join(f'{x:g}' for x in v)}") for n, v in hand["shared"].items()),
         ("canonical box", f"{box} mm"),
         ("opposition spaces", f"{len(spaces)}: {', '.join(spaces)}" if spaces else "none"),
+        ("grasp types", "; ".join(" = ".join((name, *others)) for name, others in types["makes"].items()) or "none"),
+        *(("not made", f"{', '.join(names)}: {why}") for why, names in _unmade(types["cannot"]).items()),
         ("licence", hand["licence"] or "not stated"),
         ("source", hand["source"] or "not stated"),
         *(("note", note) for note in hand["notes"]),
@@ -87,6 +89,14 @@ def show_hand(name: HandArgument) -> Answer:
     ]
     table = TextTable(("finger", "joint", "lower", "upper"), rows, right=("lower", "upper"))
     return Answer(hand, [[(what, " ".join(text.split())) for what, text in pairs], "", table])
+
+
+def _unmade(cannot: dict[str, str]) -> dict[str, list[str]]:
+    """Why grasp types cannot be made -> their names."""
+    found: dict[str, list[str]] = {}
+    for name, why in cannot.items():
+        found.setdefault(why, []).append(name)
+    return found
 
 
 @app.command("add")

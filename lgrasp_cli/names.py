@@ -90,6 +90,19 @@ def _configs() -> Iterable[str]:
     return config_files()
 
 
+def _grasp_types() -> Iterable[str]:
+    from lgrasp.steer.grasp_types import type_names
+
+    return type_names()
+
+
+def _grasp_type(name: str, flag: str) -> str:
+    from lgrasp.steer.grasp_types import find_type
+
+    find_type(name)
+    return name
+
+
 def _device(name: str, flag: str) -> str:
     from lgrasp.config import device_name
     from lgrasp.errors import DeviceError
@@ -106,6 +119,7 @@ def _as_given(name: str, flag: str) -> str:
 
 HAND = named("HAND", _hands, _hand)
 OBJECT = named("OBJECT", _objects, _object)
+GRASP_TYPE = named("NAME", _grasp_types, _grasp_type)
 DEVICE = named("[auto|cpu|cuda:N]", lambda: ("auto", "cpu", "cuda:0"), _device)
 # read by the command itself, before it imports anything heavy
 HAND_OR_SHARD, OBJECT_OR_SHARD = named("HAND", _hands, _as_given), named("OBJECT", _objects, _as_given)

@@ -6,10 +6,18 @@ from typing import Annotated
 from typer import Option
 
 from lgrasp.choices import PalmUse
-from lgrasp_cli.names import one_of
+from lgrasp_cli.names import GRASP_TYPE, one_of
 
 _PANEL = "Steer"
 
+GraspType = Annotated[
+    str | None,
+    Option(
+        help="Grasp type, such as tripod; lgrasp hands show lists a hand's.",
+        rich_help_panel=_PANEL,
+        **GRASP_TYPE,
+    ),
+]
 Fingers = Annotated[
     str | None,
     Option(

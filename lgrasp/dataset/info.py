@@ -17,8 +17,8 @@ def describe(paths: Paths) -> list[dict[str, Any]]:
     Returns:
         For each shard: ``file``, ``bytes``, ``rows``, ``rows_by_objects`` (rows by the number of objects held),
         ``rows_by_space`` (of sequences: rows by the opposition space of their last step; else None), ``hand``,
-        ``objects`` (ids), ``pipeline``, ``seed``, ``shard_index``, ``created``, ``lgrasp_version``, ``joints`` (names),
-        ``columns`` (shape of each row dataset), ``metrics`` (unit, min, mean, max of the finite values; None if there
+        ``objects`` (ids), ``pipeline``, ``grasp_type`` (asked for; else None), ``seed``, ``shard_index``, ``created``,
+        ``lgrasp_version``, ``joints`` (names), ``columns`` (shape of each row dataset), ``metrics`` (unit, min, mean, max of the finite values; None if there
         are none) and ``statistics``.
 
     Raises:
@@ -47,6 +47,7 @@ def _describe(reader: ShardReader) -> dict[str, Any]:
     if reader.space_names is not None:
         last = np.take_along_axis(reader.column("sequence/space"), held[:, None] - 1, 1)
         by_space = {name: int((last == number).sum()) for number, name in enumerate(reader.space_names)}
+    steered = header.config.get("steered")
     return {
         "file": str(reader.path),
         "bytes": reader.path.stat().st_size,
@@ -56,6 +57,7 @@ def _describe(reader: ShardReader) -> dict[str, Any]:
         "hand": str(reader.attributes["hand"]),
         "objects": reader.object_ids,
         "pipeline": header.pipeline,
+        "grasp_type": steered.get("grasp_type") if isinstance(steered, dict) else None,
         "seed": header.seed,
         "shard_index": header.shard_index,
         "created": header.created,

@@ -6,8 +6,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
+from lgrasp.choices import Role
 from lgrasp.config import load_yaml_file
 from lgrasp.errors import HandError
 
@@ -120,10 +130,23 @@ class HandSpec(_Strict):
     contacts: tuple[int, ...] = ()
     open_posture: dict[str, float] = Field(default_factory=dict)
     fingers: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    roles: dict[str, Role] = Field(default_factory=dict, exclude=True)
+    """Finger -> the human one that it acts as, for grasp types alone; a steering names fingers, so no key needs it."""
     opposition_spaces: dict[Name, OppositionSpace] = Field(default_factory=dict)
     licence: str = ""
     source: str = ""
     notes: str | tuple[str, ...] = ""
+
+    @field_validator("roles")
+    @classmethod
+    def _of_fingers(cls, roles: dict[str, Role], info: ValidationInfo) -> dict[str, Role]:
+        fingers = info.data.get("fingers", {})
+        for finger, role in roles.items():
+            if finger not in fingers:
+                raise ValueError(f"'{finger}' is none of fingers: {', '.join(fingers) or 'none'}")
+            if [*roles.values()].count(role) > 1:
+                raise ValueError(f"two fingers are '{role}'; give each role once")
+        return roles
 
 
 def spec_problem(error: ValidationError) -> str:

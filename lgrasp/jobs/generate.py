@@ -5,10 +5,10 @@ from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from pydantic import PrivateAttr
+from pydantic import PrivateAttr, model_validator
 
 from lgrasp.dataset.info import closure_share, stage_counts, survivors
 from lgrasp.dataset.reader import ShardReader
@@ -26,7 +26,7 @@ from lgrasp.grasp.schema import POSE_BITS
 from lgrasp.grasp.tables import take_grasps
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
-from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.hands import for_hand, hand_source
 from lgrasp.jobs.records import object_record
 from lgrasp.jobs.requests.search import GenerateRequest
 from lgrasp.jobs.search import SearchJob
@@ -50,6 +50,11 @@ class GenerateJob(GenerateRequest, SearchJob):
 
     _graphs: GraphCache | None = PrivateAttr(None)
     _rate: float = PrivateAttr(1.0)
+
+    @model_validator(mode="after")
+    def _for_hand(self) -> Self:
+        self.pipeline = for_hand(self.pipeline, self.hand)
+        return self
 
     @property
     def object_name(self) -> str:

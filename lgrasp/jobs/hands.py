@@ -3,10 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+from lgrasp.engine.pipeline import Pipeline
 from lgrasp.hand.find import HandSource, find_hand
 from lgrasp.hand.spec_check import check_spaces
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
+from lgrasp.steer.typed import made_types, typed
 
 
 def hand_source(name: str) -> HandSource:
@@ -16,6 +18,20 @@ def hand_source(name: str) -> HandSource:
         HandError: nothing of that name, or a URDF that no rules can be drafted for.
     """
     return find_hand(name, _draft)
+
+
+def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
+    """A pipeline whose grasp type, if one is asked for, is told in the words of a hand.
+
+    Raises:
+        HandError: no such hand.
+        ConfigError: see :func:`~lgrasp.steer.typed.typed`.
+    """
+    if pipeline.steer.grasp_type is None:
+        return pipeline
+    source = hand_source(hand)
+    steer = typed(pipeline.steer, source.spec, build_tree(read_urdf(source.urdf), source.spec))
+    return pipeline.model_copy(update={"steer": steer})
 
 
 def describe_hand(name: str) -> dict[str, Any]:
@@ -44,6 +60,7 @@ def describe_hand(name: str) -> dict[str, Any]:
         "palm_links": list(spec.palm.links),
         "canonical_box": spec.canonical_box.model_dump(),
         "opposition_spaces": {name: list(space.joints) for name, space in spec.opposition_spaces.items()},
+        "grasp_types": made_types(spec, tree)._asdict(),
         "licence": spec.licence,
         "source": spec.source,
         "notes": [spec.notes] if isinstance(spec.notes, str) and spec.notes else list(spec.notes),

@@ -18,7 +18,7 @@ from lgrasp.engine.run import Job
 from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import CandidateTable, ContactSets, DeviceTable, PoseTable, grasp_arrays
-from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.hands import for_hand, hand_source
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.runtime.tally import Meter
@@ -65,7 +65,7 @@ def run_up_to(
         raise ConfigError(f"--first {first} --candidates {count} --shard-index {shard}: need 0, 1 and 0 or more")
     if last not in pipeline.order:
         raise ConfigError(f"pipeline {pipeline.name} has no stage {last}; its stages: {', '.join(pipeline.order)}")
-    used = resolve_device(device)
+    pipeline, used = for_hand(pipeline, hand), resolve_device(device)
     keys = input_keys(hand_source(hand), mesh, scale, pipeline.object, pipeline.field)
     stages = pipeline.order[: pipeline.order.index(last) + 1]
     files = _stage_keys(pipeline, keys, stages, first, count, shard)

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from lgrasp.choices import PalmUse
 from lgrasp.config import Params
 from lgrasp.object.region_text import ACCEPTED, Region, describe_region, parse_regions
+from lgrasp.steer.grasp_types import find_type
 
 if TYPE_CHECKING:
     import numpy as np
@@ -61,6 +62,9 @@ class ApproachCone(Params):
 class Steering(Params):
     """Where and how a hand is to grasp; as it is by default it asks for nothing."""
 
+    grasp_type: str | None = Field(
+        default=None, description="Name of a grasp type, which says fingers, links and palm: tripod."
+    )
     fingers: tuple[str, ...] = Field(
         default=(),
         description="Fingers that all touch, and no others: names of hand.yaml, or one link of each; none: any.",
@@ -99,6 +103,13 @@ class Steering(Params):
     def _has_normal(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
         if value is not None and not (1e-6 < math.hypot(*value[:3]) < math.inf and math.isfinite(value[3])):
             raise ValueError("the normal must not be zero")
+        return value
+
+    @field_validator("grasp_type")
+    @classmethod
+    def _is_known(cls, value: str | None) -> str | None:
+        if value is not None:
+            find_type(value)
         return value
 
     @field_validator("pose")

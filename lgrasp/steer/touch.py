@@ -77,7 +77,7 @@ def describe_touching(steering: Steering, touching: Touching, model: HandModel) 
     told["every"] = [links(group == g) for g in (*must, *([model.groups] if touching.palm else []))]
     if steering.approach:
         told["facing"] = palm_axis(model)[1].tolist()
-    return told | steering.model_dump(mode="json", include={"approach", "above"}, exclude_none=True)
+    return told | steering.model_dump(mode="json", include={"grasp_type", "approach", "above"}, exclude_none=True)
 
 
 def moved_rows(told: Mapping[str, Any]) -> dict[str, Any]:

@@ -56,6 +56,18 @@ def test_exactly_these_fingers_touch(steered, asked):
     assert shard.header.config["pipeline"]["steer"]["fingers"] == list(named)
 
 
+def test_a_tripod_touches_with_three_tips_and_nothing_else(steered):
+    shard = steered(grasp_type="prismatic-2-finger", rows=20)
+    assert touching(shard) == 20 * [{"link_3.0_tip", "link_7.0_tip", "link_15.0_tip"}]
+    config = shard.header.config
+    assert config["pipeline"]["steer"]["grasp_type"] == config["steered"]["grasp_type"] == "prismatic-2-finger"
+
+
+def test_a_type_that_the_hand_cannot_make(job, swift):
+    with pytest.raises(ConfigError, match="grasp type precision-disk: hand 'allegro' has no little finger"):
+        job(pipeline=swift.with_steering(grasp_type="precision-disk"))
+
+
 def test_fingers_of_the_published_index(lightning, load):
     """Contacts of the boxes obey as those of the voxels do."""
     pipeline = lightning.with_steering(fingers="index,thumb")

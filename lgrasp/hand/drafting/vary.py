@@ -41,7 +41,8 @@ def write_variant(source: HandSource, kind: str, factor: float, name: str, folde
     with new_folder(folder) as made:
         _take_meshes(robot, urdf, made)
         write_file(made / "hand.urdf", etree.tostring(robot, xml_declaration=True, encoding="utf-8"))
-        write_file(made / "hand.yaml", yaml.safe_dump(spec.model_dump(mode="json"), sort_keys=False))
+        rules = spec.model_dump(mode="json") | {"roles": spec.roles}
+        write_file(made / "hand.yaml", yaml.safe_dump(rules, sort_keys=False))
         try:
             varied = read_urdf(made / "hand.urdf")
             check_spaces(spec, build_tree(varied, spec), dict(varied.links))
