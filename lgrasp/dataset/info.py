@@ -18,8 +18,8 @@ def describe(paths: Paths) -> list[dict[str, Any]]:
         For each shard: ``file``, ``bytes``, ``rows``, ``rows_by_objects`` (rows by the number of objects held),
         ``rows_by_space`` (of sequences: rows by the opposition space of their last step; else None), ``hand``,
         ``objects`` (ids), ``pipeline``, ``grasp_type`` (asked for; else None), ``seed``, ``shard_index``, ``created``,
-        ``lgrasp_version``, ``joints`` (names), ``columns`` (shape of each row dataset), ``metrics`` (unit, min, mean, max of the finite values; None if there
-        are none) and ``statistics``.
+        ``lgrasp_version``, ``joints`` (names), ``columns`` (shape of each row dataset), ``metrics`` (unit, min,
+        mean, max of the finite values; None if there are none) and ``statistics``.
 
     Raises:
         ShardError: No shard is found, or one cannot be read.
