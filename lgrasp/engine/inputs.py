@@ -28,7 +28,6 @@ from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.resting import RESTING_VERSION, resting_planes
-from lgrasp.object.steered import steer_object, surface_weights
 from lgrasp.runtime.device import Device
 from lgrasp.stages.context import Keeper
 from lgrasp.steer.arrays import SteerArrays, upload_steering
@@ -195,6 +194,8 @@ def load_inputs(
     planes = load.planes(object_model, keys.object) if table and not steer.above else steer.plane
     left = object_model
     if steer.touch or steer.avoid:
+        from lgrasp.object.steered import steer_object, surface_weights  # slow to load
+
         weights = surface_weights(object_model, steer.touch_regions, steer.avoid_regions, keys.mesh, device=alias)
         left = steer_object(object_model, weights, seed=objects.seed, device=alias)
     hand = upload_hand(hand_model, alias)

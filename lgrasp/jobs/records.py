@@ -13,8 +13,7 @@ from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.object.model import ObjectModel
-from lgrasp.object.steered import SteeredObject
+from lgrasp.object.model import ObjectModel, SteeredObject
 
 if TYPE_CHECKING:
     from lgrasp.simulate.scene import Scene

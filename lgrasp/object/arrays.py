@@ -6,8 +6,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.math.sdf import Sdf
-from lgrasp.object.model import ObjectModel
-from lgrasp.object.steered import SteeredObject
+from lgrasp.object.model import ObjectModel, SteeredObject
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
 

@@ -1,4 +1,4 @@
-"""The model of an object for all later stages, as plain arrays that can be cached."""
+"""The model of an object for all later stages, as plain arrays that can be cached, and what steering leaves of it."""
 
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -81,3 +81,49 @@ class ObjectModel:
         plain: dict[str, Any] = {k: v.item() if v.ndim == 0 else np.ascontiguousarray(v) for k, v in values.items()}
         plain["notes"] = plain["notes"].split("\n") if plain["notes"] else []
         return cls(**plain)
+
+
+@dataclass(frozen=True)
+class SurfaceWeights:
+    """How much each contact point of an object belongs to what grasps must touch and avoid.
+
+    Attributes:
+        points: Contact points of the whole object, its frame [m], shape (n, 3), f32.
+        touch: 0 to 1, shape (n,), f32; None: nothing must be touched.
+        avoid: The same; None: nothing must be avoided.
+        share: Least share of the normal force that contacts on ``touch`` carry; 1: every contact is there.
+    """
+
+    points: np.ndarray
+    touch: np.ndarray | None
+    avoid: np.ndarray | None
+    share: float
+
+    def table(self) -> np.ndarray:
+        """As shards store it: points, and their weights in what is to touch and to avoid, shape (n, 5), f32."""
+        n = len(self.points)
+        touch = np.ones(n) if self.touch is None else self.touch
+        avoid = np.zeros(n) if self.avoid is None else self.avoid
+        return np.column_stack([self.points, touch, avoid]).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SteeredObject:
+    """An object with contacts only where they may be.
+
+    Attributes:
+        model: Its contact points are those that may be touched, each as often as it is to be drawn, in their order.
+        weights: What that comes from.
+        touch: Contact points of the model that are in the region to touch, shape (c,), bool.
+    """
+
+    model: ObjectModel
+    weights: SurfaceWeights
+    touch: np.ndarray
+
+    @property
+    def off_centre(self) -> float:
+        """Distance of the middle of the contact points from the centre of mass [m]; 0 if only a share must be there."""
+        if self.weights.share < 1.0:
+            return 0.0
+        return float(np.linalg.norm(self.model.contact_points.mean(axis=0) - self.model.com))

@@ -1,64 +1,18 @@
 """An object whose contact points are drawn as regions ask."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from lgrasp.errors import ConfigError
-from lgrasp.object.model import ObjectModel
+from lgrasp.object.model import ObjectModel, SteeredObject, SurfaceWeights
 from lgrasp.object.region_text import Region
 from lgrasp.object.regions import MEMBER, region_weights
 from lgrasp.object.surface import opposite_points
 
 _DRAWS = 4096  # entries among which points of unequal weight are drawn
-
-
-@dataclass(frozen=True)
-class SurfaceWeights:
-    """How much each contact point of an object belongs to what grasps must touch and avoid.
-
-    Attributes:
-        points: Contact points of the whole object, its frame [m], shape (n, 3), f32.
-        touch: 0 to 1, shape (n,), f32; None: nothing must be touched.
-        avoid: The same; None: nothing must be avoided.
-        share: Least share of the normal force that contacts on ``touch`` carry; 1: every contact is there.
-    """
-
-    points: np.ndarray
-    touch: np.ndarray | None
-    avoid: np.ndarray | None
-    share: float
-
-    def table(self) -> np.ndarray:
-        """As shards store it: points, and their weights in what is to touch and to avoid, shape (n, 5), f32."""
-        n = len(self.points)
-        touch = np.ones(n) if self.touch is None else self.touch
-        avoid = np.zeros(n) if self.avoid is None else self.avoid
-        return np.column_stack([self.points, touch, avoid]).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class SteeredObject:
-    """An object with contacts only where they may be.
-
-    Attributes:
-        model: Its contact points are those that may be touched, each as often as it is to be drawn, in their order.
-        weights: What that comes from.
-        touch: Contact points of the model that are in the region to touch, shape (c,), bool.
-    """
-
-    model: ObjectModel
-    weights: SurfaceWeights
-    touch: np.ndarray
-
-    @property
-    def off_centre(self) -> float:
-        """Distance of the middle of the contact points from the centre of mass [m]; 0 if only a share must be there."""
-        if self.weights.share < 1.0:
-            return 0.0
-        return float(np.linalg.norm(self.model.contact_points.mean(axis=0) - self.model.com))
 
 
 def surface_weights(

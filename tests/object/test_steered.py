@@ -7,9 +7,10 @@ import pytest
 import trimesh
 
 from lgrasp.errors import ConfigError
+from lgrasp.object.model import SurfaceWeights
 from lgrasp.object.preprocess import preprocess_object
 from lgrasp.object.region_text import parse_regions
-from lgrasp.object.steered import SurfaceWeights, steer_object, surface_weights
+from lgrasp.object.steered import steer_object, surface_weights
 
 
 @pytest.fixture(scope="module")
