@@ -16,14 +16,10 @@ from lgrasp.bench.soak.trials import Soak
 
 TIMES = {
     "generate": 2,
-    "dataset merge": 2,
+    "dataset merge": 1,
     "export --to dexgraspnet": 1,
-    "export --to mjcf": 1,
-    "hands add": 1,
     "simulate": 1,
-    "plan": 1,
     "scenes make": 1,
-    "dataset metrics": 1,
     "dataset metrics --add hold": 1,
 }
 

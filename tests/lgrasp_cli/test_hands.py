@@ -103,12 +103,12 @@ def test_spaces_that_do_not_fit_are_refused(cli, jaws):
 
 def test_compare_prints_a_line_for_each_hand(cli, tmp_path):
     given = ("hands", "compare", "allegro", "--object", "sphere", "-n", 3, "-p", "swift", "--out", tmp_path / "out")
-    found = cli(*given, "--vary", "link_scale:0.9", "--json", tmp_path / "found.json")
+    found = cli(*given, "--vary", "link_scale:1.1", "--json", tmp_path / "found.json")
     lines = found.out.splitlines()
     assert [line.split()[:2] for line in lines[:3]] == [
         ["hand", "rows"],
         ["allegro", "3"],
-        ["allegro-link_scale-0.9", "3"],
+        ["allegro-link_scale-1.1", "3"],
     ]
     assert f"page  {tmp_path / 'out' / 'compare.html'}" in found.out
     hands = json.loads((tmp_path / "found.json").read_text())["hands"]

@@ -171,7 +171,7 @@ def test_hand_file_explains_every_key(tmp_path):
     made = import_urdf(gripper(tmp_path), out=tmp_path / "made")
     lines = (made.folder / "hand.yaml").read_text().splitlines()
     keys = {line.split(":")[0] for line in lines if line and not line.startswith((" ", "#"))}
-    assert keys >= set(type(made.spec).model_fields) - {"description", "approximation", "notes"}
+    assert keys >= set(type(made.spec).model_fields) - {"description", "approximation", "notes", "roles"}
     for above, line in pairwise(lines):
         if line.split(":")[0] in ("base_link", "locked", "contact", "palm", "canonical_box", "open_posture"):
             assert above.startswith("#"), line
