@@ -235,6 +235,17 @@ def _least_norm(arms: vec3s, normals: vec3s, k: wp.int32, p: Program, forces: ve
 
 
 @wp.func
+def _balancing(mu: wp.float32, torque_scale: wp.float32):
+    """What forces in round cones must do to balance each other, without a norm at which to stop."""
+    p = Program()
+    p.friction = mu
+    p.torque_scale = torque_scale
+    p.total = 1.0
+    p.exact = _EXACT
+    return p
+
+
+@wp.func
 def balance(
     arms: vec3s,
     normals: vec3s,
@@ -256,14 +267,10 @@ def balance(
     Returns:
         The least norm.
     """
-    p = Program()
-    p.friction = mu
+    p = _balancing(mu, torque_scale)
     p.edges = edges
-    p.torque_scale = torque_scale
-    p.total = 1.0
     p.stop = stop
     p.limit = _NO_LIMIT
-    p.exact = _EXACT
     return _least_norm(arms, normals, k, p, forces)
 
 
@@ -271,14 +278,18 @@ def balance(
 def balances(arms: vec3s, normals: vec3s, k: wp.int32, mu: wp.float32, torque_scale: wp.float32, limit: wp.float32):
     """True if :func:`balance` with round cones is ``limit`` at most, as soon as that is known."""
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    p = Program()
-    p.friction = mu
-    p.torque_scale = torque_scale
-    p.total = 1.0
+    p = _balancing(mu, torque_scale)
     p.stop = limit
     p.limit = limit
-    p.exact = _EXACT
     return _least_norm(arms, normals, k, p, forces) <= limit
+
+
+@wp.func
+def _pull(turn: wp.quat, direction: wp.int32):
+    """Unit force along one of x, y, z, -x, -y, -z of the hand's base frame, turned by ``turn``."""
+    e = wp.vec3(0.0)
+    e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
+    return wp.quat_rotate(turn, e)
 
 
 @wp.func
@@ -304,9 +315,7 @@ def unresisted(
         stop, limit: return as soon as the answer is known to be below, above this.
     """
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    e = wp.vec3(0.0)
-    e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
-    e = wp.quat_rotate(turn, e)
+    e = _pull(turn, direction)
     p = Program()
     p.friction = mu
     p.torque_scale = _LOAD_SCALE
@@ -327,9 +336,7 @@ def by_difficulty(normals: vec3s, k: wp.int32, mu: wp.float32, turn: wp.quat, ra
     """
     lack = vec6()
     for direction in range(6):
-        e = wp.vec3(0.0)
-        e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
-        e = wp.quat_rotate(turn, e)
+        e = _pull(turn, direction)
         least = float(0.0)
         for i in range(k):
             least = wp.min(least, wp.dot(e, _best_direction(e, normals[i], mu, 0)))

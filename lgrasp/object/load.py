@@ -187,9 +187,12 @@ def mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
     return meshes
 
 
-def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarray, int]:
-    """Vertices, faces and the number of geometries of a mesh file's bytes."""
-    meshes = mesh_parts(path, files)
+def join_parts(path: Path, meshes: Sequence[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (v, 3) and faces (f, 3) of all geometries of a file.
+
+    Raises:
+        ObjectError: a face of a vertex that is not there.
+    """
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
     faces = np.concatenate([np.asarray(m.faces, np.int64) + start for m, start in zip(meshes, starts, strict=False)])
     vertices = np.concatenate([np.asarray(m.vertices, np.float64) for m in meshes])
@@ -197,7 +200,13 @@ def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarr
         raise ObjectError(
             f"{path}: a face names vertex {faces.max()} of {len(vertices)}; existing vertices are accepted"
         )
-    return vertices, faces, len(meshes)
+    return vertices, faces
+
+
+def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Vertices, faces and the number of geometries of a mesh file's bytes."""
+    meshes = mesh_parts(path, files)
+    return *join_parts(path, meshes), len(meshes)
 
 
 def _check_size(label: str, vertices: np.ndarray, scale: float, params: ObjectParams) -> None:

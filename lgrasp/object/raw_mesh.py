@@ -11,7 +11,7 @@ import numpy as np
 from lgrasp.errors import ObjectError
 from lgrasp.geometry.mesh_files import mesh_bytes
 from lgrasp.object.find import MESH_SUFFIXES
-from lgrasp.object.load import mesh_parts, read_bytes
+from lgrasp.object.load import join_parts, mesh_parts, read_bytes
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,11 @@ def read_raw(path: Path) -> RawMesh:
     if path.suffix.lower() == ".obj":
         return _read_obj(path, data.decode("utf-8", "replace").splitlines())
     meshes = mesh_parts(path, mesh_bytes(path, data))
-    starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-    faces = np.concatenate([np.asarray(m.faces, int) + start for m, start in zip(meshes, starts, strict=False)])
+    vertices, faces = join_parts(path, meshes)
     painted: list[Any] = [m.visual for m in meshes]
     coloured = all(visual.kind == "vertex" for visual in painted)
     colours = np.concatenate([np.asarray(visual.vertex_colors)[:, :3] for visual in painted]) if coloured else None
-    return RawMesh(np.concatenate([np.asarray(m.vertices, float) for m in meshes]), faces, {}, colours)
+    return RawMesh(vertices, faces, {}, colours)
 
 
 def _read_obj(path: Path, lines: Iterable[str]) -> RawMesh:

@@ -10,11 +10,27 @@ from support.wrench import cone_forces, is_balanced, residual, unresisted
 
 from lgrasp.math import qp
 from lgrasp.math.qp import MAX_CONTACTS, balance, balances, by_difficulty, frictionless
+from lgrasp.math.transforms import vec3s
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 SCALE = 10.0
+
+
+@wp.func
+def take(
+    arm: wp.array2d(dtype=wp.vec3),
+    normal: wp.array2d(dtype=wp.vec3),
+    i: wp.int32,
+    k: wp.int32,
+    arms: vec3s,
+    normals: vec3s,
+):
+    """The first k contacts of problem i, in local arrays."""
+    for c in range(k):
+        arms[c] = arm[i, c]
+        normals[c] = normal[i, c]
 
 
 @wp.kernel
@@ -34,9 +50,7 @@ def _balance(
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     k = count[i]
-    for c in range(k):
-        arms[c] = arm[i, c]
-        normals[c] = normal[i, c]
+    take(arm, normal, i, k, arms, normals)
     norm_out[i] = balance(arms, normals, k, mu, edges, scale, stop, forces)
     for c in range(k):
         force_out[i, c] = forces[c]
@@ -53,9 +67,7 @@ def _frictionless(
     i = wp.tid()
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    for c in range(k):
-        arms[c] = arm[i, c]
-        normals[c] = normal[i, c]
+    take(arm, normal, i, k, arms, normals)
     score_out[i] = frictionless(arms, normals, k, scale)
 
 
@@ -89,9 +101,7 @@ def _disturbance(
     i = wp.tid()
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    for c in range(arm.shape[1]):
-        arms[c] = arm[i, c]
-        normals[c] = normal[i, c]
+    take(arm, normal, i, arm.shape[1], arms, normals)
     k = arm.shape[1]
     worst = float(0.0)
     for rank in range(6):
@@ -123,9 +133,7 @@ def _decide(
     i = wp.tid()
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    for c in range(arm.shape[1]):
-        arms[c] = arm[i, c]
-        normals[c] = normal[i, c]
+    take(arm, normal, i, arm.shape[1], arms, normals)
     balances_out[i] = balances(arms, normals, arm.shape[1], mu, SCALE, limit)
     for rank in range(6):
         order_out[i, rank] = by_difficulty(normals, arm.shape[1], mu, wp.quat_identity(), rank)

@@ -20,8 +20,6 @@ from lgrasp.stages.search.sets import FoundSets, Hits, SearchValues, TriedSets, 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _INSCRIBED = wp.constant(INSCRIBED)
-
-
 _UNKNOWN = wp.constant(-1)  # whether a candidate sinks into the object
 
 
@@ -142,37 +140,47 @@ def check_fingers(hits: Hits, hand: Hand, params: SearchValues, candidates: Cand
 
 
 @wp.kernel
-def check_depth(
+def find_sunk(
     hits: Hits,
     hand: Hand,
     obj: Object,
     params: SearchValues,
     candidates: Candidates,
+    tried: TriedSets,
     usable_out: Usable,
-    tried_out: TriedSets,
 ):
-    """One thread per (hit, group): scores go below 0 when the finger sinks into the object at any point, as the filter
-    would find, and its candidate is usable no more; each candidate is looked at once.
+    """One thread per (hit, group): whether the finger sinks into the object at any point, as the filter would find.
+
+    Scores stay as they are, so that which candidates are looked at does not depend on which thread comes first.
     """
     i, g = wp.tid()
-    row, lane = _hit(hits, tried_out, i)
+    row, lane = _hit(hits, tried, i)
     if row < 0:
         return
-    m = tried_out.chosen[row, lane, g]
-    if m < 0:
+    m = tried.chosen[row, lane, g]
+    if m < 0 or usable_out.sunk[row, g, m] != _UNKNOWN:
         return
-    if usable_out.sunk[row, g, m] == _UNKNOWN:
-        X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-        j0 = group_forward(hand.kin, g, candidates.q[row, g, m], X, 0)
-        T_object = wp.transform_inverse(candidates.poses.pose[row])
-        sunk = int(0)
-        for j in range(hand.kin.joint_first[g + 1] - j0):
-            if sunk == 0:
-                depth = body_depth(hand, obj, 1 + j0 + j, T_object * X[j], params.max_penetration)
-                sunk = wp.where(depth > params.max_penetration, 1, 0)
-        usable_out.sunk[row, g, m] = sunk
-    if usable_out.sunk[row, g, m] == 1:
-        tried_out.score[row, lane] = -1.0
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    j0 = group_forward(hand.kin, g, candidates.q[row, g, m], X, 0)
+    T_object = wp.transform_inverse(candidates.poses.pose[row])
+    sunk = int(0)
+    for j in range(hand.kin.joint_first[g + 1] - j0):
+        if sunk == 0:
+            depth = body_depth(hand, obj, 1 + j0 + j, T_object * X[j], params.max_penetration)
+            sunk = wp.where(depth > params.max_penetration, 1, 0)
+    usable_out.sunk[row, g, m] = sunk
+
+
+@wp.kernel
+def check_depth(hits: Hits, usable: Usable, tried_out: TriedSets):
+    """Scores of hits go below 0 when one of their fingers sinks into the object."""
+    row, lane = _hit(hits, tried_out, wp.tid())
+    if row < 0:
+        return
+    for g in range(tried_out.chosen.shape[2]):
+        m = tried_out.chosen[row, lane, g]
+        if m >= 0 and usable.sunk[row, g, wp.max(m, 0)] == 1:
+            tried_out.score[row, lane] = -1.0
 
 
 @wp.kernel

@@ -20,6 +20,7 @@ from lgrasp.stages.search.kernels import (
     check_fingers,
     check_load,
     drop_sunk,
+    find_sunk,
     keep_sets,
     list_hits,
     list_usable,
@@ -83,8 +84,9 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
             if context.realised:
                 wp.launch(check_fingers, size, [hits, hand, values, inputs.struct], [tried], device=d)
             if exact:
-                asked = [hits, hand, obj, values, inputs.struct]
-                wp.launch(check_depth, (size, groups), asked, [usable, tried], device=d)
+                asked = [hits, hand, obj, values, inputs.struct, tried]
+                wp.launch(find_sunk, (size, groups), asked, [usable], device=d)
+                wp.launch(check_depth, size, [hits, usable], [tried], device=d)
                 wp.launch(drop_sunk, (n, groups), [], [usable], device=d)
         wp.launch(keep_sets, n, [values, inputs.struct, tried], [found], device=d)
     upto = wp.clone(found.number)
