@@ -13,6 +13,7 @@ from lgrasp.errors import ConfigError
 from lgrasp.grasp.schema import PASS_SHIFT
 from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_rows, select_poses, take_rows
 from lgrasp.hand.model import HandModel
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
 from lgrasp.stages.search.params import SearchParams
@@ -139,7 +140,7 @@ def _run_through(stages: Sequence[str], table: Any, pipeline: Pipeline, context:
 def _yielding(table: CandidateTable, grasps: GraspTable, device: str) -> CandidateTable:
     """The poses that gave grasps: block by block, those that gave most first."""
     index, number = np.unique(grasps.index, return_counts=True)
-    row = np.searchsorted(table.poses.index.numpy()[: len(table.poses)], index)
+    row = np.searchsorted(to_numpy(table.poses.index)[: len(table.poses)], index)
     return select_poses(table, row[np.lexsort((-number, index // PASS_BLOCK))], device)
 
 

@@ -14,6 +14,7 @@ from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.model import HandModel
 from lgrasp.math.transforms import NORMAL_BINS
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.structs import empty_struct
 
 
@@ -162,7 +163,7 @@ def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, 
     seed = params.seed * 1009 + slot
     inputs = [hand.struct, group, setting, seed, _CLEARANCE]
     wp.launch(sample_postures, postures, inputs, [posture, clear], device=device)
-    good = np.flatnonzero(clear.numpy())
+    good = np.flatnonzero(to_numpy(clear))
     count = min(records, room) if len(good) else 0
     chosen = np.resize(np.repeat(good, _PER_POSTURE), count).astype(np.int32)
     vectors = empty_struct(Vectors, device, count)
@@ -170,7 +171,7 @@ def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, 
     inputs = [hand.struct, group, setting, seed + 500_009, posture, indices]
     wp.launch(contact_vectors, count, inputs, [vectors], device=device)
     return {
-        **{name: getattr(vectors, name).numpy() for name in Vectors.vars},
-        "posture": posture.numpy()[chosen],
+        **{name: to_numpy(getattr(vectors, name)) for name in Vectors.vars},
+        "posture": to_numpy(posture)[chosen],
         "clear": np.asarray(len(good) / postures if touches else np.nan, np.float32),
     }

@@ -31,6 +31,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.palm import palm_axis
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import ObjectArrays
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally, read_tallies
@@ -121,8 +122,8 @@ class Check:
         packed = self._pack(seed, row)
         if on_table:
             self._approach(row, packed, tally)
-        columns = {name: values.numpy() for name, values in _columns(packed, on_table).items()}
-        table, outcome = _table(columns, len(self)), self.found.outcome.numpy()
+        columns = {name: to_numpy(values) for name, values in _columns(packed, on_table).items()}
+        table, outcome = _table(columns, len(self)), to_numpy(self.found.outcome)
         if on_table:
             lost = np.isnan(table.table["approach"][:, 0]) & (outcome == Outcome.KEPT)
             outcome = np.where(lost, Outcome.APPROACH, outcome)
@@ -232,7 +233,7 @@ def check_grasps(
     """
     d, n, width, model = hand.device, len(q), contacts.link.shape[1], hand.model
     zeros, rows = wp.zeros(n, dtype=wp.int32, device=d), np.arange(n)
-    surface = np.where(contacts.link.numpy() >= 0, np.arange(n * width).reshape(n, width), -1)
+    surface = np.where(to_numpy(contacts.link) >= 0, np.arange(n * width).reshape(n, width), -1)
     at = empty_struct(
         CheckedPostures,
         d,

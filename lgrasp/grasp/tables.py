@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.grasp.structs import Candidates, Poses, Sets
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.structs import empty_arrays, make_struct
 
 _FAMILIES = ("metrics", "physics", "table")  # columns of a table in memory that come by name
@@ -32,7 +33,7 @@ class DeviceTable:
 
     def __len__(self) -> int:
         """Rows in use; waits for the device."""
-        return int(self.rows.numpy()[0])
+        return int(to_numpy(self.rows)[0])
 
     @classmethod
     def names(cls) -> list[str]:
@@ -61,7 +62,7 @@ class DeviceTable:
     def arrays(self) -> dict[str, np.ndarray]:
         """The rows in use as NumPy arrays, those of the table that they refer to as ``TABLE.NAME``."""
         n = len(self)
-        out = {name: getattr(self, name).numpy()[:n] for name in self.names()}
+        out = {name: to_numpy(getattr(self, name))[:n] for name in self.names()}
         for inner in self.INNER:
             out |= {f"{inner}.{name}": values for name, values in getattr(self, inner).arrays().items()}
         return out

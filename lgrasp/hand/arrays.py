@@ -13,6 +13,7 @@ from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
 from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import sdf_part
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.structs import upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -174,4 +175,4 @@ def body_poses(hand: HandArrays, q: np.ndarray) -> np.ndarray:
     out = wp.empty((len(q), bodies), dtype=wp.transform, device=hand.device)
     queries = wp.array(q, dtype=wp.float32, device=hand.device)
     wp.launch(place_bodies, dim=len(q), inputs=[hand.struct.kin, queries], outputs=[out], device=hand.device)
-    return out.numpy().reshape(len(q), bodies, 7)
+    return to_numpy(out).reshape(len(q), bodies, 7)

@@ -5,6 +5,7 @@ import trimesh
 import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
+from lgrasp.runtime.fetch import to_numpy
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -51,4 +52,4 @@ def signed_distance(
     out = wp.empty(len(points), dtype=wp.float32, device=device)
     queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
     wp.launch(mesh_distance, dim=len(points), inputs=[handle.id, queries, winding], outputs=[out], device=device)
-    return out.numpy()
+    return to_numpy(out)

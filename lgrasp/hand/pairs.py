@@ -14,6 +14,7 @@ from lgrasp.hand.overlap import OverlapSide, overlap_arrays, overlap_depth, over
 from lgrasp.hand.self_collision import OVERLAP
 from lgrasp.math.convex import Pieces, pieces_clear
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
+from lgrasp.runtime.fetch import to_numpy
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -63,7 +64,7 @@ def pieces_touch(
         float(margin),
     ]
     wp.launch(mark_touching, dim=(len(q), len(pairs)), inputs=inputs, outputs=[out], device=device)
-    return out.numpy().astype(bool)
+    return to_numpy(out).astype(bool)
 
 
 def with_pairs(

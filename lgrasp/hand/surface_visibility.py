@@ -13,6 +13,7 @@ from lgrasp.hand.postures import Postures, sample_bodies
 from lgrasp.hand.surface import ContactSurface, SurfaceSamples, joined_mesh
 from lgrasp.hand.urdf import Urdf, read_urdf
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
+from lgrasp.runtime.fetch import to_numpy
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -66,7 +67,7 @@ def surface_visibility(
         free = wp.empty(len(target), dtype=wp.int32, device=device)
         targets = wp.array(target.astype(np.float32), dtype=wp.vec3, device=device)
         wp.launch(first_hits, len(target), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device)
-        seen += facing & (free.numpy() == 1)
+        seen += facing & (to_numpy(free) == 1)
     parts = np.split(seen / len(chosen), np.cumsum([len(s.points) for s in surfaces])[:-1])
     return [replace(s, seen=part) for s, part in zip(surfaces, parts, strict=True)]
 

@@ -71,7 +71,7 @@ def palm_point(hand: HandModel) -> np.ndarray:
     """Mean of the contact surface of the open hand in its base frame [m], (3,): a point before the palm."""
     R, t = BodyKinematics(hand.tree, dtype=torch.float64)(torch.as_tensor(hand.tree.joint_open[None].astype(float)))
     body = hand.contact_body
-    points = np.einsum("nab,nb->na", R[0].numpy()[body], hand.contact_points) + t[0].numpy()[body]
+    points = np.einsum("nab,nb->na", R[0].cpu().numpy()[body], hand.contact_points) + t[0].cpu().numpy()[body]
     return points.mean(0)
 
 

@@ -12,6 +12,7 @@ from lgrasp.object.kernels import locate_points
 from lgrasp.object.load import load_mesh, read_bytes
 from lgrasp.object.raw_mesh import RawMesh, read_raw
 from lgrasp.object.region_text import Region
+from lgrasp.runtime.fetch import to_numpy
 
 MEMBER = 0.5
 """Least weight of a point that belongs to a region."""
@@ -88,7 +89,7 @@ def _locate(
         foot = wp.empty(len(points), dtype=wp.vec3)
         reach = 10.0 * float(np.ptp(np.vstack([vertices[np.unique(faces)], points]), axis=0).max())
         wp.launch(locate_points, len(points), [mesh.id, wp.array(points, dtype=wp.vec3), reach], [face, foot, inside])
-        return face.numpy(), foot.numpy().astype(float), inside.numpy() == 1
+        return to_numpy(face), to_numpy(foot).astype(float), to_numpy(inside) == 1
 
 
 def _corner_weights(region: Region, raw: RawMesh, path: Path) -> np.ndarray:

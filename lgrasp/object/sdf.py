@@ -6,6 +6,8 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
+from lgrasp.runtime.fetch import to_numpy
+
 from . import kernels
 
 _BAND_CELLS = 2.0  # half width of the exact band; sqrt(3) is the least that leaves no gap between its two sides
@@ -61,7 +63,7 @@ def build_sdf(
         key = wp.full(int(np.prod(dims)), np.iinfo(np.uint64).max, dtype=wp.uint64)
         args = [wp.vec3(*origin.tolist()), cell, shape]
         wp.launch(kernels.nearest_face_band, len(corners), [corners_d, *args, _BAND_CELLS * cell], [key])
-        face = key.numpy().view(np.uint32).reshape(-1, 2)[:, 0].view(np.int32)  # low word; -1 where no face came near
+        face = to_numpy(key).view(np.uint32).reshape(-1, 2)[:, 0].view(np.int32)  # low word; -1 where no face came near
         source = _nearest_band_cell(face.reshape(dims) < 0)  # (n,)
         distance = wp.empty(len(face), dtype=float)
         nearest = wp.array(face[source], dtype=wp.int32)
@@ -70,7 +72,7 @@ def build_sdf(
             inside = _closed_inside(vertices, faces, origin, cell, dims)
         else:
             inside = _open_inside(vertices, faces, np.flatnonzero(face >= 0), source, args, len(face))
-        values = distance.numpy().reshape(dims)
+        values = to_numpy(distance).reshape(dims)
     values = np.where(inside.reshape(dims), -values, values)
     return SdfGrid(np.ascontiguousarray(values, np.float32), origin, cell)
 
@@ -139,7 +141,7 @@ def _closed_inside(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, 
         wp.vec3i(*dims),
     ]
     wp.launch(kernels.lattice_crossings, len(faces), inputs, [step])
-    return np.cumsum(step.numpy(), axis=2, dtype=np.int32) > 0
+    return np.cumsum(to_numpy(step), axis=2, dtype=np.int32) > 0
 
 
 def _open_inside(
@@ -152,5 +154,5 @@ def _open_inside(
     inputs = [mesh.id, wp.array(band, dtype=wp.int32), *args, 2.0 * _BAND_CELLS * args[1]]
     wp.launch(kernels.winding_sign, len(band), inputs, [flag])
     inside = np.zeros(count, bool)
-    inside[band] = flag.numpy() == 1
+    inside[band] = to_numpy(flag) == 1
     return inside[source]

@@ -6,6 +6,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from lgrasp.object.sdf import SdfGrid, sample_sdf
+from lgrasp.runtime.fetch import to_numpy
 
 from . import kernels
 
@@ -153,7 +154,7 @@ def fold_cosine(
             wp.empty((len(points), min(_WALK_FACES, len(faces))), dtype=wp.int32),
         ]
         wp.launch(kernels.fold_spread, len(points), inputs, [out])
-        return out.numpy()
+        return to_numpy(out)
 
 
 def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int, device: str = "cpu") -> np.ndarray:
@@ -172,7 +173,7 @@ def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int, devic
         out = wp.empty(len(points), dtype=wp.int32)
         inputs = [wp.array(points, dtype=wp.vec3), wp.array(normals, dtype=wp.vec3), _OPPOSED, seed]
         wp.launch(kernels.draw_opposite, len(points), inputs, [out])
-        return out.numpy()
+        return to_numpy(out)
 
 
 def probe_fits(sdf: SdfGrid, points: np.ndarray, normals: np.ndarray, radius: float, tolerance: float) -> np.ndarray:

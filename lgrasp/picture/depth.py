@@ -11,6 +11,7 @@ from lgrasp.geometry.poses import device_from_stored
 from lgrasp.picture import depth_kernels as kernels
 from lgrasp.picture.camera import Intrinsics
 from lgrasp.runtime.device import start
+from lgrasp.runtime.fetch import to_numpy
 
 NOTHING = -1
 """Label of pixels that see nothing."""
@@ -68,4 +69,4 @@ def render(surface: LabelledMesh, intrinsics: Intrinsics, pose: np.ndarray, devi
             wp.array(device_from_stored(pose), dtype=wp.transform),
         ]
         wp.launch(kernels.cast_rays, shape, inputs, [depth, label])
-        return Images(intrinsics, np.asarray(pose, float), depth.numpy(), label.numpy())
+        return Images(intrinsics, np.asarray(pose, float), to_numpy(depth), to_numpy(label))

@@ -14,6 +14,7 @@ from lgrasp.picture.camera import Intrinsics, central_camera, look_at
 from lgrasp.picture.depth import LabelledMesh, join_surfaces, render
 from lgrasp.picture.scene import GraspScene, balls, split_edges
 from lgrasp.runtime.device import start
+from lgrasp.runtime.fetch import to_numpy
 
 HAND = ("#a9b6c6", "#8796a8")
 """Colours of links, in turns."""
@@ -125,7 +126,7 @@ def draw(painted: Sequence[Painted], dots: np.ndarray, view: Viewpoint, backgrou
         out = wp.empty((intrinsics.height, intrinsics.width), dtype=wp.vec3)
         ground = wp.vec3(*map(float, _linear([background])[0]))
         wp.launch(kernels.shade, out.shape, [solids, marks, camera, light, ground], [out])
-        colour = np.clip(out.numpy(), 0, 1)
+        colour = np.clip(to_numpy(out), 0, 1)
     del mesh, dot_mesh  # kept alive until here
     srgb = np.where(colour < 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
     return np.rint(255 * srgb).astype(np.uint8)

@@ -134,7 +134,7 @@ class Planner:
         order = np.lexsort(keys)
         place = np.arange(len(start)) - np.searchsorted(start[order], start[order])
         rows = np.sort(order[place < count])
-        pose, q = at.numpy()
+        pose, q = at.arrays()
         return start[rows], self._put(pose[rows], q[rows])
 
     def _starts(self, points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -157,7 +157,7 @@ class Planner:
         return Hands.put(pose, q, self.hand.device)
 
     def _checked(self, at: Hands, start: np.ndarray, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray]:
-        pose, q = at.numpy()
+        pose, q = at.arrays()
         back, obj = device_inverse(pose), self._scene.object
         contacts = find_contacts(self.hand, obj, back, q, bounds, self.palmar)
         return check_grasps(self.hand, obj, back, q, contacts, bounds, around=self._scene.around, index=start)

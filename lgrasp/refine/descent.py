@@ -27,6 +27,7 @@ from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
 from lgrasp.refine.resolve_penetration import resolve_penetration
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
 from lgrasp.refine.volume import TargetArrays
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.structs import empty_struct, make_struct, upload_struct
 
 _MAX_ADVANCES = 30
@@ -93,7 +94,7 @@ class Descent:
         m, body, moments = self._matches(rows), self._body(rows), self._moments(rows)
         self._match(at, m, body, self.params.reach)
         self._descend(at, m, 0, 0, 1, True, moments)
-        return moments.first.numpy()
+        return to_numpy(moments.first)
 
     def advanced(self, at: Hands, direction: np.ndarray, travel: np.ndarray, clearance: float) -> None:
         """Move hands straight until a point of theirs is ``clearance`` [m] from anything, or by ``travel`` (N,) [m].
@@ -117,7 +118,7 @@ class Descent:
         out = wp.empty(rows, dtype=wp.float32, device=self.device)
         inputs = [m, self._points, self._solids, body]
         wp.launch(penetration, dim=rows, inputs=inputs, outputs=[out], device=self.device)
-        return out.numpy()
+        return to_numpy(out)
 
     def _settings(self, surface: HandSurface) -> "Search":
         p, tree, t = self.params, self._hand.model.tree, self._target

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from lgrasp.runtime.fetch import to_numpy
+
 
 @dataclass(frozen=True)
 class Hands:
@@ -21,6 +23,6 @@ class Hands:
         poses = wp.array(pose, dtype=wp.transform, device=device)
         return cls(poses, wp.array(q, dtype=wp.float32, device=device))
 
-    def numpy(self) -> tuple[np.ndarray, np.ndarray]:
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """Base (N, 7) and joint positions (N, K)."""
-        return self.pose.numpy().reshape(-1, 7), self.q.numpy()
+        return to_numpy(self.pose).reshape(-1, 7), to_numpy(self.q)

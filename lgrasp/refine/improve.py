@@ -115,5 +115,5 @@ def _looks(search: Descent, at: Hands, number: int) -> Iterator[tuple[np.ndarray
     for first, stop in zip([0, *stops[:-1]], stops, strict=True):
         if stop > first:
             search.run(at, rounds=stop, first=first, whole=rounds)
-        base, q = at.numpy()
+        base, q = at.arrays()
         yield device_inverse(base), q.copy()

@@ -161,7 +161,7 @@ class Refiner(nn.Module):
         return Hands.put(base.cpu().numpy(), pose.q.cpu().numpy(), self.search.device)
 
     def _taken(self, at: Hands, dtype: torch.dtype) -> Pose:
-        base, q = (torch.as_tensor(x, dtype=dtype, device=self._device) for x in at.numpy())
+        base, q = (torch.as_tensor(x, dtype=dtype, device=self._device) for x in at.arrays())
         return Pose(*motion_from_pose(base), q)
 
     def unrolled(

@@ -38,7 +38,7 @@ def resolve_penetration(search: Depths, tree: Tree, back: np.ndarray, at: Hands,
     left = np.flatnonzero(least > _DEEP_PENETRATION)
     if len(left) == 0:
         return
-    pose, q = (x.copy() for x in at.numpy())
+    pose, q = (x.copy() for x in at.arrays())
     given, joints = pose.copy(), q.copy()
 
     def attempt(shifts: np.ndarray, opened: np.ndarray) -> None:

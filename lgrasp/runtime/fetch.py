@@ -1,4 +1,8 @@
-"""Several device arrays to the host with one wait, through page-locked memory that is kept."""
+"""Device arrays to the host with one wait, through page-locked memory that is kept.
+
+The only way there: Warp's own ``array.numpy()`` puts another stream in the place of the device's while it copies, for
+every thread, so that two at once may leave the device without its own.
+"""
 
 import threading
 from collections.abc import Sequence
@@ -36,3 +40,8 @@ def fetch(arrays: Sequence[wp.array]) -> list[np.ndarray]:
             out.append(host)
         wp.synchronize_stream(device.stream)
         return [host.numpy().copy() for host in out]
+
+
+def to_numpy(array: wp.array) -> np.ndarray:
+    """A copy of one array (:func:`fetch`)."""
+    return fetch([array])[0]

@@ -11,6 +11,7 @@ from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.picture.depth import LabelledMesh, join_surfaces, render
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.scenes import collision_kernels as kernels
 from lgrasp.scenes.camera import intrinsics_of, place_cameras
 from lgrasp.scenes.drop import drop
@@ -77,7 +78,7 @@ def find_collisions(
             limit,
         ]
         wp.launch(kernels.hand_depths, body.shape[:2], inputs, [table, obstacle])
-        return Collisions(*(depth.numpy().reshape(2, n).T.copy() for depth in (table, obstacle)))
+        return Collisions(*(to_numpy(depth).reshape(2, n).T.copy() for depth in (table, obstacle)))
 
 
 class Item(NamedTuple):

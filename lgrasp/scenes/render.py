@@ -8,6 +8,7 @@ import warp as wp
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.depth import Images, LabelledMesh
 from lgrasp.runtime.device import start
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.scenes import render_kernels as kernels
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.records import CloudRecord
@@ -36,7 +37,7 @@ def image_normals(images: Images, window: int, device: str = "cpu") -> np.ndarra
         step = _SLOPE / min(images.intrinsics.fx, images.intrinsics.fy)
         inputs = [wp.array(points, dtype=wp.vec3), window, step]
         wp.launch(kernels.fit_normals, images.depth.shape, inputs, [out])
-        normals = out.numpy()
+        normals = to_numpy(out)
     R = pose_matrix(images.pose)[:, :3, :3].astype(np.float32)
     return np.einsum("vab,vhwb->vhwa", R, normals)
 

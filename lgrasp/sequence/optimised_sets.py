@@ -6,6 +6,7 @@ import numpy as np
 
 from lgrasp.grasp.tables import ContactSets
 from lgrasp.math.limits import MAX_DOFS
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.stages.context import Context
 
 if TYPE_CHECKING:  # torch takes a second to import
@@ -47,7 +48,7 @@ def optimised_sets(grasps: "Optimised", free: np.ndarray, context: Context) -> C
             count[moves, g], chosen[moves, g] = 1, 0
             surface[moves, g, 0], record[moves, g, 0] = grasps.object_point[moves, side], found[moves]
     kept = np.flatnonzero(known)
-    setting = np.maximum(context.held.struct.setting.numpy(), 0)
+    setting = np.maximum(to_numpy(context.held.struct.setting), 0)
     arrays = {
         "pose": np.arange(len(kept), dtype=np.int32),
         "slot": np.zeros(len(kept), np.int32),

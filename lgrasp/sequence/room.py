@@ -11,6 +11,7 @@ from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.stages.context import Context
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -93,4 +94,4 @@ def room_left(free: np.ndarray, grasps: GraspTable, row: np.ndarray, context: Co
         outputs=[clear],
         device=d,
     )
-    return (clear.numpy() / np.maximum(counts[row].sum(1) * int(POSTURES), 1)).astype(np.float32)
+    return (to_numpy(clear) / np.maximum(counts[row].sum(1) * int(POSTURES), 1)).astype(np.float32)

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.verdict import CHUNK, WILD, links_touching, moved
@@ -107,7 +108,7 @@ class Worlds:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that decides what comes next, one row a world."""
-        return {name: a.numpy().copy() for name, a in self._state.items()}
+        return {name: to_numpy(a) for name, a in self._state.items()}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Inverse of :meth:`state`."""
@@ -129,15 +130,15 @@ class Worlds:
 
     def overflowed(self) -> np.ndarray:
         """(worlds,) bool: where a buffer was full since the last call, so that the state there is worth nothing."""
-        full = (self._d.overflow.numpy() & self._full) != 0
+        full = (to_numpy(self._d.overflow) & self._full) != 0
         self._d.overflow.zero_()
         return full
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray]:
         """Number of links that touch each object, (worlds, O), and deepest penetration of any object [m], (worlds,)."""
         d, m = self._d, self._model.mujoco
-        n = min(int(d.nacon.numpy()[0]), d.naconmax)
-        geoms, world, dist = (a[:n].numpy() for a in (d.contact.geom, d.contact.worldid, d.contact.dist))
+        n = min(int(to_numpy(d.nacon)[0]), d.naconmax)
+        geoms, world, dist = (to_numpy(a[:n]) for a in (d.contact.geom, d.contact.worldid, d.contact.dist))
         close = (dist < 0) & (geoms >= 0).all(1)
         bodies, world, dist = m.geom_bodyid[geoms[close]], world[close], dist[close]
         links = links_touching(bodies, self._model.object_body, m.nbody, world, self.worlds)

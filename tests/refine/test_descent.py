@@ -71,7 +71,7 @@ def test_a_step_is_as_large_as_adam_makes_it(inputs, valid, coarse):
     pose = pose._replace(q=pose.q.maximum(refiner.lower + 0.05).minimum(refiner.upper - 0.05))
     g, at = descent.gradient(put(pose)), put(pose)
     descent.run(at, rounds=1)
-    moved, q = at.numpy()
+    moved, q = at.arrays()
     # first step: the mean over its root is the sign, over one scale for the three axes
     expected = -SEARCH.max_joint_step * np.sign(g[:, 6:])
     np.testing.assert_allclose((q - pose.q.numpy())[g[:, 6:] != 0], expected[g[:, 6:] != 0], atol=2e-6)
@@ -109,7 +109,7 @@ def test_energy_falls_as_with_steps_in_torch(inputs, valid, coarse):
         adam.zero_grad()
         energy().sum().backward()
         adam.step()
-    base, joints = (torch.as_tensor(x) for x in at.numpy())
+    base, joints = (torch.as_tensor(x) for x in at.arrays())
     after = refiner.energy(matrix_from_quaternion(base[:, 3:]), base[:, :3], joints, matches=matches).total
     assert after.mean() < before.mean()
     assert float(after.median()) < 1.2 * float(energy().detach().median())

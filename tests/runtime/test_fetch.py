@@ -1,5 +1,8 @@
 """Copies of device arrays on the host."""
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 import warp as wp
@@ -24,3 +27,18 @@ def test_equals_numpy_and_stands_by_itself(device, n):
 
 def test_nothing():
     assert fetch([]) == []
+
+
+def test_device_arrays_come_to_the_host_in_one_place():
+    """Warp's own ``numpy()`` changes the stream of the device for all threads: only tensors on the CPU have it here."""
+    root, found = Path(__file__).parents[2], []
+    for path in (*root.glob("lgrasp/**/*.py"), *root.glob("lgrasp_cli/**/*.py")):
+        if path.name != "fetch.py":
+            calls = [x for x in ast.walk(ast.parse(path.read_text())) if isinstance(x, ast.Call)]
+            asked = [x.func.value for x in calls if isinstance(x.func, ast.Attribute) and x.func.attr == "numpy"]
+            found += [
+                f"{path.name}:{x.lineno}"
+                for x in asked
+                if not (isinstance(x, ast.Call) and isinstance(x.func, ast.Attribute) and x.func.attr == "cpu")
+            ]
+    assert not found

@@ -71,5 +71,5 @@ def _weights_digest(path: Path) -> str:
 
     h = hashlib.sha256()
     for name, values in load_predictor(path)[0].state_dict().items():
-        h.update(name.encode() + values.numpy().tobytes())
+        h.update(name.encode() + values.cpu().numpy().tobytes())
     return h.hexdigest()
