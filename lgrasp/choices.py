@@ -8,6 +8,8 @@ Policy = Literal["uniform", "lookahead"]
 """How a sequence chooses the opposition space of a step."""
 FieldIndex = Literal["voxel", "bvh"]
 """How a contact field is looked up."""
+ScoreName = Literal["fswo", "gswo"]
+"""Residual that the search lowers: frictionless, or with friction."""
 PalmUse = Literal["yes", "no", "must"]
 """Whether the palm of a hand may touch."""
 Role = Literal["thumb", "index", "middle", "ring", "little"]

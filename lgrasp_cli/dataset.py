@@ -182,6 +182,9 @@ def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
         ("near-duplicates", f"{near:,}"),
         ("distinct poses", f"{sum(group['distinct_poses'] for group in groups):,}"),
     ]
+    types = _sums(hand["grasp_types"] for hand in numbers["hands"])
+    if types:
+        pairs.append(("grasp types", ", ".join(f"{name or 'none asked'} {rows:,}" for name, rows in types.items())))
     if set(held) - {"1"}:
         pairs.append(("objects in the hand", ", ".join(f"{n}: {rows:,}" for n, rows in sorted(held.items()))))
     return [*pairs, ("where", str(out))]

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from typer import Option
 
-from lgrasp.choices import ProtocolName
+from lgrasp.choices import ProtocolName, ScoreName
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import HANDS, OBJECTS, one_of
 from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, choose_pipeline, given
@@ -64,6 +64,9 @@ def generate(
             help="Searches per successful pose: faster, but fewer poses; default: the pipeline's.",
         ),
     ] = None,
+    score: Annotated[
+        str | None, Option(**one_of(ScoreName, "SCORE", "Residual that the search lowers: without friction, or with."))
+    ] = None,
     grasp_type: GraspType = None,
     fingers: Fingers = None,
     links: Links = None,
@@ -89,6 +92,7 @@ def generate(
     from lgrasp.object.find import all_objects
 
     chosen = choose_pipeline(pipeline, seed, contacts, settings).with_passes(passes)
+    chosen = chosen.with_params("search", score=score) if score else chosen
     chosen = chosen.with_simulation(simulate) if simulate else chosen
     chosen = chosen.with_table() if table else chosen
     chosen = chosen.with_steering(

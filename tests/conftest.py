@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.kernels import compile_together
 
 from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
@@ -170,8 +171,10 @@ def raw_grasps() -> Callable[[Path], dict[str, dict[str, bytes]]]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _warp() -> None:
+def _warp(tmp_path_factory: pytest.TempPathFactory) -> None:
     start()
+    if worker := os.environ.get("PYTEST_XDIST_WORKER"):
+        compile_together(tmp_path_factory.getbasetemp().parent, backwards=worker.endswith("1"))
 
 
 @pytest.fixture(scope="session", params=["cpu", "cuda:0"])

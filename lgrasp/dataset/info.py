@@ -40,6 +40,12 @@ def closure_share(paths: Iterable[Path]) -> float | None:
     return closed / rows if rows else None
 
 
+def asked_type(config: Mapping[str, Any]) -> str | None:
+    """The grasp type that all rows of a shard were asked for, None if none was."""
+    steered = config.get("steered")
+    return steered.get("grasp_type") if isinstance(steered, dict) else None
+
+
 def _describe(reader: ShardReader) -> dict[str, Any]:
     header = reader.header
     units = reader.rows(0, 0).metric_units
@@ -47,7 +53,6 @@ def _describe(reader: ShardReader) -> dict[str, Any]:
     if reader.space_names is not None:
         last = np.take_along_axis(reader.column("sequence/space"), held[:, None] - 1, 1)
         by_space = {name: int((last == number).sum()) for number, name in enumerate(reader.space_names)}
-    steered = header.config.get("steered")
     return {
         "file": str(reader.path),
         "bytes": reader.path.stat().st_size,
@@ -57,7 +62,7 @@ def _describe(reader: ShardReader) -> dict[str, Any]:
         "hand": str(reader.attributes["hand"]),
         "objects": reader.object_ids,
         "pipeline": header.pipeline,
-        "grasp_type": steered.get("grasp_type") if isinstance(steered, dict) else None,
+        "grasp_type": asked_type(header.config),
         "seed": header.seed,
         "shard_index": header.shard_index,
         "created": header.created,

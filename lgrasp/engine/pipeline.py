@@ -97,11 +97,15 @@ class Pipeline(_Head):
         return self.model_copy(update={"bounds": self.bounds.changed(**changes)}).checked()
 
     def checked(self) -> "Pipeline":
-        """Itself, unless a bound asks for a stage that it lacks.
+        """Itself, unless a bound asks for a stage that it lacks, or rounds for contacts that come too late for them.
 
         Raises:
-            ConfigError: such a bound.
+            ConfigError: such a bound, or such rounds.
         """
+        if not self.realised and (rounds := self.params("domain").rounds) > 1:
+            raise ConfigError(
+                f"pipeline {self.name}: domain.rounds is {rounds}; with search before ik contacts are drawn once"
+            )
         if self.bounds.min_hold_probability > 0 and "hold" not in self.order:
             raise ConfigError(
                 f"pipeline {self.name}: bounds.min_hold_probability is {self.bounds.min_hold_probability:g}, which "

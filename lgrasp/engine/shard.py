@@ -24,6 +24,7 @@ from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_rows
 from lgrasp.stages.context import Context
 
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
+_LEAST_PLACED = 65_536  # candidates of which one must be placed where poses are steered, else a shard ends
 _EFFORT_STEP = 1024  # candidates: what a shard may try is a multiple of it
 _CPU_BATCH, _CPU_LARGEST = 256, 512  # candidates of a batch; the second with several passes
 _PHYSICS_BATCH = 64  # candidates, when their grasps are simulated on the CPU, which takes long
@@ -221,17 +222,23 @@ def make_shard(
     def run(first: int, count: int) -> BatchResult:
         return run_batch(pipeline, context, first, count, graphs.run if graphs else None)
 
+    def search(limit: int) -> None:
+        with closing(_batches(run, execution.workers, result.candidates, limit, size)) as batches:
+            for count, batch in batches:
+                result.candidates += count
+                add_counts(result.counts, batch.counts)
+                add_seconds(result.seconds, batch.seconds)
+                found.add(batch.grasps)
+                if progress:
+                    progress(found.count, result)
+                if found.count >= rows:
+                    break
+
     limit = shard_effort(pipeline, rows) if found.count < rows else 0
-    with closing(_batches(run, execution.workers, result.candidates, limit, size)) as batches:
-        for count, batch in batches:
-            result.candidates += count
-            add_counts(result.counts, batch.counts)
-            add_seconds(result.seconds, batch.seconds)
-            found.add(batch.grasps)
-            if progress:
-                progress(found.count, result)
-            if found.count >= rows:
-                break
+    some = min(limit, _LEAST_PLACED) if pipeline.steer.asks else limit  # the same whatever the batches are
+    search(some)
+    if some < limit and found.count < rows and result.counts["place"]["kept"]:
+        search(limit)
     result.grasps = found.shuffled()
     result.wall = earlier + time.perf_counter() - start
     result.exhausted = found.count < rows

@@ -114,7 +114,7 @@ class SearchJob(SearchRequest, Job):
         steer, inputs = self.pipeline.steer, self.inputs
         if not steer.asks:
             return {}
-        return {"steered": describe_touching(steer, inputs.steer.touching, inputs.hand.model)}
+        return {"steered": describe_touching(steer, inputs.steer.touching, inputs.hand.model, inputs.steer.poses)}
 
     def difference(self, path: Path) -> str:
         with ShardReader(path) as reader:

@@ -18,6 +18,7 @@ from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.folder import Found
 from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob, rows_digest
+from lgrasp.errors import PhysicsError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.jobs.difference import config_difference
@@ -26,7 +27,7 @@ from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.jobs.shard_inputs import mesh_hash
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
-from lgrasp.simulate.protocol import Protocol
+from lgrasp.simulate.protocol import NO_TABLE, Protocol
 from lgrasp.simulate.run import check_installed, on_cpu, protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
@@ -55,6 +56,9 @@ class SimulateJob(SimulateRequest, ShardJob):
 
     def check_source(self, reader: ShardReader) -> None:
         check_heaps(reader.path)
+        steered = reader.header.config.get("steered")
+        if self.protocol.table and isinstance(steered, dict) and "above" in steered:
+            raise PhysicsError(f"{reader.path}: {NO_TABLE}")
         for _ in reader.blocks():  # whose checksums are compared
             pass
 

@@ -1,15 +1,22 @@
-"""Whether rows obey what their shard says was asked of them: which links touch, and where the palm faces."""
+"""Whether rows obey what their shard says was asked of them: which links touch, where the palm faces, which poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 COSINE_SLACK = 1e-4
 """Of the palm's direction outside its cone."""
 PLANE_SLACK = 1e-4
 """Of the numbers of the plane that the hand stays above."""
+
+POSE_SLACK = 1e-4
+"""Between the object's pose and one that was asked for [m], turns at LEVER."""
+LEVER = 0.1
+"""[m]"""
 
 
 @dataclass(frozen=True)
@@ -22,6 +29,7 @@ class Asked:
     approach: np.ndarray | None  # (3,) unit middle of its cone, object's frame
     cosine: float
     plane: np.ndarray | None  # (4,) unit normal and height [m], object's frame, that the hand stays above
+    poses: np.ndarray | None  # (T, 12) of the object, base frame, as _comparable gives them
 
 
 def read_asked(config: Any) -> Asked | None:
@@ -44,6 +52,7 @@ def read_asked(config: Any) -> Asked | None:
         approach=_unit(cone["direction"]) if cone else None,
         cosine=float(np.cos(np.radians(cone["angle"]))) if cone else -1.0,
         plane=None if plane is None else plane / np.linalg.norm(plane[:3]),
+        poses=_comparable(_matrices(np.array(told["poses"], float))) if told.get("poses") else None,
     )
 
 
@@ -73,7 +82,24 @@ def disobeys(
         bad |= ~(middle @ asked.facing >= asked.cosine - COSINE_SLACK)
     if asked.plane is not None:
         bad |= True if planes is None else (np.abs(planes[:, :4] - asked.plane) > PLANE_SLACK).any(axis=1)
+    if asked.poses is not None:
+        bad |= ~(cKDTree(asked.poses).query(_comparable(T_objects))[0] <= POSE_SLACK)
     return bad
+
+
+def _matrices(poses: np.ndarray) -> np.ndarray:
+    """Poses x y z qw qx qy qz, (T, 7), as (T, 4, 4)."""
+    if poses.ndim != 2 or poses.shape[1] != 7 or not np.isfinite(poses).all():
+        raise ValueError(f"poses of shape {poses.shape} are none")
+    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    T[:, :3, :3] = Rotation.from_quat(poses[:, 3:], scalar_first=True).as_matrix()
+    T[:, :3, 3] = poses[:, :3]
+    return T
+
+
+def _comparable(T: np.ndarray) -> np.ndarray:
+    """Transforms (n, 4, 4) as points (n, 12) whose distances [m] are those of shifts, and of turns at LEVER."""
+    return np.concatenate([T[:, :3, 3], LEVER * T[:, :3, :3].reshape(len(T), 9)], axis=1)
 
 
 def _unit(vector: Sequence[float]) -> np.ndarray:

@@ -248,6 +248,10 @@ that sequences of objects were published with, ``seq6_mu06`` the same on smoothe
 random numbers, several times; ``lift`` takes the 0.1 kg of ``fc`` off a table; ``dipgrasp`` is that paper's lift."""
 
 
+NO_TABLE = "the plane of --above bounds the hand, the object need not rest on it: lift takes rows of generate --table"
+"""Why rows made with ``--above`` are not lifted off a table."""
+
+
 def find_protocol(name: str) -> Protocol:
     """A protocol by the name of its verdicts (:data:`lgrasp.choices.VERDICTS`): physx_fc is fc in PhysX.
 

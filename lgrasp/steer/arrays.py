@@ -35,6 +35,8 @@ class SteerArrays:
 
     touching: Touching
     struct: "Steer"
+    poses: np.ndarray | None = None
+    """T_hand_object that are asked for, x y z [m] qw qx qy qz, shape (T, 7)."""
 
     @property
     def fingers(self) -> int:
@@ -66,10 +68,10 @@ def upload_steering(
         direction = np.array(steering.approach.direction) / np.linalg.norm(steering.approach.direction)
         values |= {"facing": palm_axis(hand.model)[1], "approach": direction}
         values["cosine"] = float(np.cos(np.radians(steering.approach.angle)))
-    if steering.pose:
-        poses = read_poses(steering.pose)
+    poses = read_poses(steering.pose) if steering.pose else None
+    if poses is not None:
         values["poses"] = internal_poses(poses, np.zeros(3) if center is None else center)
-    return SteerArrays(touching, upload_struct(Steer, hand.device, values))
+    return SteerArrays(touching, upload_struct(Steer, hand.device, values), poses)
 
 
 def steer_nothing(hand: HandArrays) -> SteerArrays:

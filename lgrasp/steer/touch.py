@@ -13,6 +13,8 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.palm import palm_axis
 from lgrasp.steer.params import Steering
 
+MOST_POSES = 4096
+"""Poses that a shard tells: some 70 bytes each."""
 Fingers = Mapping[str, Sequence[str]]
 """Links of each finger by its name, as hand.yaml has them."""
 
@@ -64,9 +66,15 @@ def find_touching(steering: Steering, model: HandModel, fingers: Fingers) -> Tou
     return Touching(points, groups, bool(steering.fingers), steering.palm == "must" or able == 1)
 
 
-def describe_touching(steering: Steering, touching: Touching, model: HandModel) -> dict[str, Any]:
+def describe_touching(
+    steering: Steering, touching: Touching, model: HandModel, poses: np.ndarray | None = None
+) -> dict[str, Any]:
     """What is asked in the words of this hand, for those who check rows: ``links`` that may touch, lists of links in
-    ``every`` of which one touches, the direction ``facing`` of the palm if one is asked for, and what is asked."""
+    ``every`` of which one touches, the direction ``facing`` of the palm if one is asked for, and what is asked.
+
+    Args:
+        poses: T_hand_object that are asked for, (T, 7); told if there are at most MOST_POSES.
+    """
     group = np.repeat(np.arange(model.groups + 1), np.diff(model.contact_first))
 
     def links(some: np.ndarray) -> list[str]:
@@ -77,6 +85,8 @@ def describe_touching(steering: Steering, touching: Touching, model: HandModel) 
     told["every"] = [links(group == g) for g in (*must, *([model.groups] if touching.palm else []))]
     if steering.approach:
         told["facing"] = palm_axis(model)[1].tolist()
+    if poses is not None and len(poses) <= MOST_POSES:
+        told["poses"] = poses.round(6).tolist()
     return told | steering.model_dump(mode="json", include={"grasp_type", "approach", "above"}, exclude_none=True)
 
 

@@ -102,6 +102,12 @@ def test_with_params_checks(swift):
         swift.with_params("search", restart=3)
 
 
+def test_rounds_of_contacts_need_ik_before_search(swift, lightning):
+    assert swift.with_settings(["domain.rounds=2"]).params("domain").rounds == 2
+    with pytest.raises(ConfigError, match=r"lightning: domain\.rounds is 2; .* drawn once"):
+        lightning.with_settings(["domain.rounds=2"])
+
+
 def other(value: Any, kind: Any) -> list[Any]:
     """Values to try in place of a parameter's; at least one of them is within its bounds."""
     if isinstance(value, str):

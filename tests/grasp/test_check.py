@@ -31,10 +31,10 @@ PIPELINES = {"swift": 300, "robust": 1000, "lightning": 400, "swift-refine": 60}
 """Pipeline -> candidates."""
 SMALLER = {"lightning": ("domain.attempts=1000", "search.restarts=32", "search.per_pose=8")}
 """Settings with which a pipeline is faster; the checks stay."""
-MORE = {("shadow", "lightning"): 600, ("dclaw", "swift-refine"): 300}
+MORE = {("dclaw", "swift-refine"): 300}
 """Where these give no row: candidates with the pipeline's own settings."""
 
-FEW = {("leap", "robust"), ("schunk_svh", "lightning")}
+FEW = {("leap", "robust"), ("schunk_svh", "lightning"), ("shadow", "lightning")}
 """Where so few candidates give no row."""
 
 SAME = {"fswo", "penetration", "self_penetration", "gap", "normal_error"}

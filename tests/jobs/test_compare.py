@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from support.hands import ROOT
 
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.validate import validate_shard
@@ -14,6 +15,8 @@ from lgrasp.engine.run import run
 from lgrasp.errors import ConfigError, HandError
 from lgrasp.jobs.compare.job import CompareJob
 from lgrasp.jobs.requests.compare import CompareRequest, parse_variations
+
+QUICK = str(ROOT / "tests" / "lgrasp_cli" / "quick.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +28,7 @@ def compared(cache_root, tmp_path_factory):
         "objects": ("sphere",),
         "vary": ("link_scale:1.1",),
         "rows": 30,
-        "pipeline": "swift",
+        "pipeline": QUICK,
     }
     job = CompareJob(**given, out=out, device="cpu", workers=1, cache=Cache(cache_root))
     return job_report(run(job)), out
@@ -47,7 +50,7 @@ def test_numbers_are_those_of_the_shards(compared):
             assert cell["hold"] == pytest.approx(reader.column("metrics/hold_success").mean())
             assert cell["epsilon"] == pytest.approx(float(np.median(reader.column("metrics/epsilon"))))
             kept, tried = (float(reader.statistics[name]) for name in ("filter_kept", "candidates"))
-            assert cell["yield"] == pytest.approx(kept / tried)  # all rows of swift are strict
+            assert cell["yield"] == pytest.approx(kept / tried)  # all rows are strict
         assert 0 < cell["surface"] < 1
         assert 0 < cell["approach"] <= 30 / 288
         assert hand["all"]["yield"] == cell["yield"]  # the mean over one object
@@ -68,7 +71,7 @@ def test_page_stands_alone(compared):
 
 
 def test_a_task_reports_what_is_there(compared, cache_root, tmp_path):
-    given = {"hands": ("allegro",), "objects": ("sphere", "mug"), "rows": 2, "pipeline": "swift"}
+    given = {"hands": ("allegro",), "objects": ("sphere", "mug"), "rows": 2, "pipeline": QUICK}
     job = CompareJob(**given, out=tmp_path, device="cpu", workers=1, cache=Cache(cache_root))
     first = job_report(run(job, array=(0, 2)))
     assert (first["missing"], list(first["hands"][0]["objects"])) == (1, ["sphere"])

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
+from support.hands import ROOT
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.writer import write_shard
@@ -37,6 +38,7 @@ from lgrasp.simulate.protocol import find_protocol
 from lgrasp.stages.refine.params import RefineParams
 from lgrasp_cli.progress import Bar, JobProgress
 
+QUICK = str(ROOT / "tests" / "lgrasp_cli" / "quick.yaml")
 NAMES = ("generate", "sequence", "refine", "plan", "simulate", "scenes", "learn", "metrics", "export", "compare")
 
 
@@ -108,7 +110,7 @@ def jobs(swift, source: Path, shards, two_spaces: str, cache_root: Path) -> Call
         if name == "export":
             return ExportJob(**made, to="dexgraspnet")
         if name == "compare":
-            return CompareJob(**base, hands=("allegro",), objects=("sphere", "mug"), rows=3, pipeline="swift")
+            return CompareJob(**base, hands=("allegro",), objects=("sphere", "mug"), rows=3, pipeline=QUICK)
         if name == "refine":
             return RefineJob(**made, params=RefineParams(matching_rounds=1))
         return MetricsJob(**made, add=("volume",))

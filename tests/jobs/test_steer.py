@@ -14,12 +14,13 @@ from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.run import run as run_job
 from lgrasp.engine.shard import shard_context
-from lgrasp.errors import ConfigError
+from lgrasp.errors import ConfigError, PhysicsError
 from lgrasp.geometry.poses import device_matrix, pose_matrix
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.config import JobConfig, plan_requests
 from lgrasp.jobs.generate import generate
 from lgrasp.jobs.refine.shards import RefineJob
+from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.judge.run import judge
 
 FINGERS = find_hand("allegro").spec.fingers
@@ -166,6 +167,23 @@ def test_the_object_is_where_the_file_says(steered, run, swift, tmp_path, kind):
     found = steered(pose=path, rows=10).grasps.object_pose[:, 0]
     assert np.abs(found[:, None] - poses[None]).max(2).min(1).max() < 1e-5
     assert len(np.unique(found.round(4), axis=0)) > 1
+    if kind == ".csv":
+        (path,) = (tmp_path / "steered").glob("*.h5")
+        obeys_only_its_poses(path)
+
+
+def obeys_only_its_poses(path):
+    """The judge agrees, and finds the rows of a pose that was not asked for."""
+    assert judge(path).valid_share == 1.0
+    shard = read_shard(path)
+    config, found = dict(shard.header.config), shard.grasps.object_pose[:, 0].astype(float)
+    poses = np.array(config["steered"]["poses"])
+    mine = np.abs(found[:, None] - poses[None]).max(2).argmin(1) == (gone := np.abs(poses - found[0]).max(1).argmin())
+    others = np.delete(poses, gone, 0).tolist()
+    config["steered"] = config["steered"] | {"poses": others}
+    with h5py.File(path, "r+") as file:
+        file.attrs["config"] = json.dumps(config)
+    np.testing.assert_array_equal(judge(path).failed["steered"], mine)
 
 
 def test_poses_of_the_hand(steered, tmp_path):
@@ -174,6 +192,26 @@ def test_poses_of_the_hand(steered, tmp_path):
     shutil.rmtree(tmp_path / "steered")
     found = pose_matrix(steered(pose=tmp_path / "hand.npz", rows=5).grasps.object_pose[:, 0].astype(float))
     assert np.abs(found[:, None] - T[None]).max((2, 3)).min(1).max() < 1e-5
+
+
+def test_a_steering_without_poses_ends_early(job, swift, tmp_path, monkeypatch):
+    """At the same candidate with other batches, and with the line that says why; the plane is above all of it."""
+    monkeypatch.setattr("lgrasp.engine.shard._LEAST_PLACED", 1024)
+    for batch in (100, 512):
+        hopeless = job(pipeline=swift.with_steering(above="0,0,1,0.5"), rows=20, batch=batch, out=tmp_path / str(batch))
+        outcome = generate(hopeless)
+        assert outcome.results[0].candidates == 1024
+        assert "at none of 1,024 poses" in str(hopeless.shortfall(outcome))
+
+
+def test_a_plane_is_no_table_to_lift_from(steered, job, swift, tmp_path):
+    steered(rows=2, above="0,0,1,0.001")
+    given = {"shards": (tmp_path / "steered",), "protocol": "lift", "out": tmp_path / "lifted"}
+    with pytest.raises(PhysicsError, match=r"allegro-mug-00000\.h5: the plane of --above .* generate --table"):
+        run_job(parse_model(SimulateJob, given, "simulate"))
+    lifted = swift.with_simulation("lift")
+    with pytest.raises(ConfigError, match="stage simulate: the plane of --above"):
+        job(pipeline=lifted.with_steering(above="0,0,1,0.001")).check()
 
 
 def test_poses_out_of_reach_are_told(job, swift, tmp_path):

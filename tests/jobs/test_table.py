@@ -19,16 +19,19 @@ from lgrasp.errors import ConfigError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.records import Shard
 from lgrasp.jobs.config import JobConfig, plan_requests
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.requests.search import SearchRequest
 from lgrasp.judge.run import judge
 from lgrasp.stages.refine.params import RefineParams
 
 
-@pytest.fixture
-def on_table(run, swift):
+@pytest.fixture(scope="module")
+def on_table(swift, cache_root, tmp_path_factory):
     """A shard of grasps on a table, and what the job reports of it."""
-    outcome = run(pipeline=swift.with_table(), rows=80, shard_rows=80)
+    given = {"object": "mug", "rows": 60, "shard_rows": 60, "device": "cpu", "workers": 1, "batch": 128}
+    out, cache = tmp_path_factory.mktemp("table"), Cache(cache_root, pytest.fail)
+    outcome = generate(GenerateJob(**given, pipeline=swift.with_table(), out=out, cache=cache))
     (path,) = outcome.paths
     return path, outcome.job.report(outcome)
 

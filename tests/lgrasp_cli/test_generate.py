@@ -131,6 +131,13 @@ def test_another_run_in_the_folder(generate, tmp_path):
     assert generate("--seed", 1, "--no-resume").code == 0
 
 
+def test_score(generate, tmp_path):
+    assert generate("--score", "gswo", rows=2).code == 0
+    stages = read_shard(tmp_path / "out" / "allegro-tiny-00000.h5").header.config["pipeline"]["stages"]
+    assert next(stage["search"]["score"] for stage in stages if "search" in stage) == "gswo"
+    assert "--score 'gsw': did you mean 'gswo'? choose fswo, gswo" in generate("--score", "gsw").error()
+
+
 def test_contacts(generate, tmp_path):
     assert generate("--contacts", "2").code == 0
     shard = read_shard(tmp_path / "out" / "allegro-tiny-00000.h5")

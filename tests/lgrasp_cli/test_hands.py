@@ -62,13 +62,13 @@ def test_shipped_hands_say_that_they_are_approximations(cli, jaws, tmp_path):
     assert (real["name"], real["approximation"]) == ("allegro", "")
 
 
-def test_check_measures_the_spaces(cli, jaws, tmp_path):
+def test_check_measures_the_spaces(cli, jaws, quick, tmp_path):
     rules = yaml.safe_load((jaws / "hand.yaml").read_text())["opposition_spaces"]
     away = [part | {"axis": [-x for x in part["axis"]]} for part in rules[PINCH]["sides"]]
     thin = [part | {"box": {"min": [5, 5, 5], "max": [6, 6, 6]}} for part in rules[PINCH]["sides"]]
     change(jaws, rules | {"away": rules[PINCH] | {"sides": away}, "nothing": rules[PINCH] | {"sides": thin}})
     folder = tmp_path / "pictures"
-    shown = cli("hands", "check", jaws, "-n", 5, "--device", "cpu", "--workers", 1, "--out", folder, "--quiet")
+    shown = cli("hands", "check", jaws, "-n", 5, "-p", quick, "--device", "cpu", "--out", folder, "--quiet")
     assert shown.code == 0, shown
     lines = shown.out.splitlines()
     table = next(i for i, line in enumerate(lines) if line.startswith("space "))
@@ -101,8 +101,8 @@ def test_spaces_that_do_not_fit_are_refused(cli, jaws):
     assert "did you mean 'sides'" in cli("hands", "show", jaws).error()
 
 
-def test_compare_prints_a_line_for_each_hand(cli, tmp_path):
-    given = ("hands", "compare", "allegro", "--object", "sphere", "-n", 3, "-p", "swift", "--out", tmp_path / "out")
+def test_compare_prints_a_line_for_each_hand(cli, quick, tmp_path):
+    given = ("hands", "compare", "allegro", "--object", "sphere", "-n", 3, "-p", quick, "--out", tmp_path / "out")
     found = cli(*given, "--vary", "link_scale:1.1", "--json", tmp_path / "found.json")
     lines = found.out.splitlines()
     assert [line.split()[:2] for line in lines[:3]] == [

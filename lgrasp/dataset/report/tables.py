@@ -62,6 +62,8 @@ def run_tables(data: dict[str, Any]) -> list[Block]:
         ("rows", f"{number(data['rows'])} in {number(data['shards'])} shard{'s' if data['shards'] != 1 else ''}"),
         ("made", " to ".join(dict.fromkeys(data["created"])) + f", lgrasp {', '.join(data['lgrasp_versions'])}"),
     ]
+    if types := data["grasp_types"]:
+        about.append(("grasp types", ", ".join(f"{name or 'none asked'} {number(n)}" for name, n in types.items())))
     out = []
     for run in data["runs"]:
         seeds = ", ".join(map(str, run["seeds"][:8])) + ("…" if len(run["seeds"]) > 8 else "")

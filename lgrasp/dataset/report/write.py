@@ -1,12 +1,13 @@
 """Makes the report: shards in, one HTML file and the numbers out."""
 
 import base64
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lgrasp.dataset.files import Paths
-from lgrasp.dataset.info import SURVIVORS, stage_counts, survivors
+from lgrasp.dataset.info import SURVIVORS, asked_type, stage_counts, survivors
 from lgrasp.dataset.merge import sum_statistics
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.report.coverage import principal_postures
@@ -115,6 +116,7 @@ def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, 
         "created": [min(h.header.created for h in heads), max(h.header.created for h in heads)],
         "lgrasp_versions": sorted({h.header.lgrasp_version for h in heads}),
         "runs": [_run(name, [h for h in heads if h.header.pipeline == name]) for name in pipelines],
+        "grasp_types": _types(heads),
         "metrics": _metrics(hand.together()),
         "objects": [_objects(group) for group in hand.objects.values()],
         "diversity": hand.spread().numbers(),
@@ -123,6 +125,17 @@ def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, 
         "posture": principal_postures(hand.rows, hand.sum_q, hand.sum_qq).numbers(),
         "sample": {"rows": len(hand.sample.columns().get("group", ())), "every": hand.sample.step},
     }
+
+
+def _types(heads: Sequence[Head]) -> dict[str, int]:
+    """Rows by the grasp type that they were asked for; "" for those asked for none; empty if no row was asked for one.
+
+    All rows of a shard were asked for the same one.
+    """
+    counts: Counter[str] = Counter()
+    for head in heads:
+        counts[asked_type(head.header.config) or ""] += head.rows
+    return dict(sorted(counts.items())) if set(counts) - {""} else {}
 
 
 def _metrics(distributions: Mapping[str, Distribution]) -> dict[str, Any]:

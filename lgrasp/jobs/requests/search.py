@@ -16,7 +16,7 @@ from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.object.find import find_object
 from lgrasp.sequence.size import parse_size
-from lgrasp.simulate.protocol import PROTOCOLS
+from lgrasp.simulate.protocol import NO_TABLE, PROTOCOLS, find_protocol
 
 
 class SearchRequest(Request):
@@ -44,6 +44,9 @@ class SearchRequest(Request):
             )
         if self.pipeline.steer.above and self.pipeline.params("place").table:
             raise ConfigError(f"pipeline '{self.pipeline.name}': steer.above and place.table are one or the other")
+        simulated = "simulate" in self.pipeline.order and find_protocol(self.pipeline.params("simulate").protocol)
+        if self.pipeline.steer.above and simulated and simulated.table:
+            raise ConfigError(f"pipeline '{self.pipeline.name}', stage simulate: {NO_TABLE}")
         hand_path(self.hand)
         check_folder(self.out)
 

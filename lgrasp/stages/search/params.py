@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from lgrasp.choices import ScoreName
 from lgrasp.config import Params
 
 MAX_KINDS = 16
@@ -26,7 +27,7 @@ class SearchParams(Params):
         max_length=MAX_KINDS,
         description="Finger contacts k of the first round, drawn evenly; the largest bounds later rounds.",
     )
-    score: Literal["fswo", "gswo"] = Field(
+    score: ScoreName = Field(
         default="fswo", description="Residual that the search lowers: frictionless or with friction."
     )
     threshold: float = Field(default=0.1, gt=0, le=1, description="Squared residual at which a set is taken.")

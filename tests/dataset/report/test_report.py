@@ -125,6 +125,21 @@ def test_generated_grasps(run, make, tmp_path, grasps):
     assert "<h3>Physics</h3>" not in text
 
 
+def test_rows_are_counted_by_the_grasp_type_asked(make, make_shard, tmp_path):
+    """All rows of a shard were asked for one; merging keeps it."""
+    for i, steered in enumerate(
+        ({"grasp_type": "tripod"}, {}, {"grasp_type": "palmar-pinch"}, {"grasp_type": "tripod"})
+    ):
+        shard = make_shard(3 + i, shard_index=i)
+        config = {"steered": steered} if steered else {}
+        write_shard(tmp_path / "in" / f"{i}.h5", replace(shard, header=replace(shard.header, config=config)))
+    numbers, text = make(tmp_path / "in")
+    assert numbers["hands"][0]["grasp_types"] == {"": 4, "palmar-pinch": 5, "tripod": 9}
+    assert "none asked 4, palmar-pinch 5, tripod 9" in text
+    merge_shards([tmp_path / "in" / f"{i}.h5" for i in (0, 3)], tmp_path / "all.h5")
+    assert read_dataset(tmp_path / "all.h5")[0]["hands"][0]["grasp_types"] == {"tripod": 9}
+
+
 def test_merged_rows_give_the_same_numbers(make_shard, tmp_path):
     """However rows are cut into shards."""
     for i in range(3):

@@ -10,16 +10,17 @@ from typer.testing import CliRunner
 
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import read_shard
-from lgrasp.dataset.report.write import report_dataset
+from lgrasp.dataset.report.write import read_dataset, report_dataset
 from lgrasp.dataset.writer import write_shard
 from lgrasp_cli.dataset import app
 
 COUNTS = (30, 25, 12)
 
 
-@pytest.fixture
-def folder(tmp_path, make_sequence):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, make_sequence):
     """Two shards with verdicts of a protocol p, some of them not run."""
+    folder = tmp_path_factory.mktemp("sequences") / "in"
     for index in range(2):
         shard = make_sequence(COUNTS, shard_index=index, seed=index)
         rng = np.random.default_rng(index)
@@ -27,12 +28,19 @@ def folder(tmp_path, make_sequence):
         touching = np.where(shard.grasps.object_index >= 0, 1, -1).astype("i1")  # a number per object
         physics, protocols = {"p_holds": holds, "p_touching": touching}, {"p_holds": "p", "p_touching": "p"}
         grasps = replace(shard.grasps, physics=physics, physics_protocols=protocols)
-        write_shard(tmp_path / "in" / f"{index}.h5", replace(shard, grasps=grasps))
-    return tmp_path / "in"
+        write_shard(folder / f"{index}.h5", replace(shard, grasps=grasps))
+    return folder
 
 
-def test_numbers_are_those_of_the_rows(folder, tmp_path):
-    numbers = report_dataset(folder, tmp_path / "r.html")
+@pytest.fixture(scope="module")
+def reported(folder):
+    """The numbers of their report, and the page."""
+    page = folder.parent / "r.html"
+    return report_dataset(folder, page), page.read_text(encoding="utf-8")
+
+
+def test_numbers_are_those_of_the_rows(folder, reported, tmp_path):
+    numbers, _ = reported
     json.dumps(numbers, allow_nan=False)
     merge_shards(folder, tmp_path / "all.h5")
     grasps = read_shard(tmp_path / "all.h5").grasps
@@ -52,13 +60,12 @@ def test_numbers_are_those_of_the_rows(folder, tmp_path):
             found = group["spaces"][name]
             assert found["rows"] == ours.sum()
             assert found["physics"]["p"]["held"] == (holds[ours] == 1).sum()
-    whole = report_dataset(tmp_path / "all.h5", tmp_path / "all.html")["hands"][0]["held"]
-    assert whole == hand["held"]
+    whole, _ = read_dataset(tmp_path / "all.h5")
+    assert whole["hands"][0]["held"] == hand["held"]
 
 
-def test_page_has_the_tables(folder, tmp_path):
-    report_dataset(folder, tmp_path / "r.html")
-    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+def test_page_has_the_tables(reported):
+    _, text = reported
     section = text[text.index("<h3>Objects in the hand</h3>") : text.index("<h3>Physics</h3>")]
     assert re.findall(r"as object (\d)", section) == ["1", "2", "3"]
     for words in ("<td>60</td>", "<td>24</td>", "finger 3", "hold (p)"):
