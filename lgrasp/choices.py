@@ -2,8 +2,10 @@
 
 from typing import Literal, get_args
 
-Method = Literal["field", "anneal", "mala"]
+Method = Literal["field", "anneal", "mala", "diffuser"]
 """How a sequence continues with the next object."""
+NetworkName = Literal["coarse", "diffuser"]
+"""What ``lgrasp learn fit`` trains."""
 Policy = Literal["uniform", "lookahead"]
 """How a sequence chooses the opposition space of a step."""
 FieldIndex = Literal["voxel", "bvh"]

@@ -1,4 +1,4 @@
-"""``lgrasp learn``: a small network that guesses grasps from partial clouds, trained through the refiner."""
+"""``lgrasp learn``: networks that guess grasps, from partial clouds or for a hand that holds others."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,13 +6,13 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from lgrasp.choices import NetworkName
+from lgrasp_cli.names import one_of
 from lgrasp_cli.options import CacheDir, Device, Quiet, Shards, given, open_cache
 from lgrasp_cli.tables import Answer, Block, following, reporting, took
 from lgrasp_cli.working import How, working
 
-app = typer.Typer(
-    name="learn", help="Predict coarse grasps from partial point clouds with a small network.", no_args_is_help=True
-)
+app = typer.Typer(name="learn", help="Train and measure networks that predict grasps.", no_args_is_help=True)
 
 
 @app.command()
@@ -20,28 +20,44 @@ app = typer.Typer(
 def fit(
     shards: Shards,
     how: How,
-    out: Annotated[Path, Option("--out", "-o", help="File of the predictor.")] = Path("coarse.pt"),
-    steps: Annotated[int | None, Option(help="Training steps on poses alone; default: 1500.")] = None,
-    joint_steps: Annotated[
-        int | None, Option(help="Training steps through the refiner afterwards; default: 80.")
+    model: Annotated[str, Option(**one_of(NetworkName, "NETWORK", "What is trained."))] = "coarse",
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="File of the network; default: coarse.pt or diffuser.pt.")
     ] = None,
-    unrolled: Annotated[int | None, Option(help="Unrolled steps of the refiner; default: 5.")] = None,
-    batch: Annotated[int | None, Option(help="Seeds per training step; default: 64.")] = None,
-    seed: Annotated[int, Option(help="Seed of clouds, weights and batches.")] = 0,
+    steps: Annotated[
+        int | None, Option(help="Training steps; default: 1500 (coarse, on poses alone) or 20000 (diffuser).")
+    ] = None,
+    joint_steps: Annotated[
+        int | None, Option(help="Training steps through the refiner afterwards (coarse); default: 80.")
+    ] = None,
+    unrolled: Annotated[int | None, Option(help="Unrolled steps of the refiner (coarse); default: 5.")] = None,
+    batch: Annotated[int | None, Option(help="Examples per training step; default: 64 (coarse), 1024.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        Option("--set", metavar="NETWORK.KEY=VALUE", help="Set a parameter, such as diffuser.width=128; repeatable."),
+    ] = None,
+    seed: Annotated[int, Option(help="Seed of examples, weights and batches.")] = 0,
 ) -> None:
-    """Train a predictor on the grasps of shards, first on poses, then through unrolled steps of the refiner.
+    """Train a network on the grasps of shards.
 
-    The report compares energies on clouds outside the training data.
+    coarse predicts grasps from partial clouds: it is trained on poses, then through unrolled steps of the refiner; the
+    report compares energies on clouds outside the training data. diffuser draws the next step of sequences.
 
     Example: lgrasp learn fit grasps --out coarse.pt
+
+    Example: lgrasp learn fit --model diffuser sequences --device cuda:0
     """
-    from lgrasp.config import parse_model
-    from lgrasp.jobs.requests.shards import FitRequest
+    from lgrasp.config import apply_settings, parse_model
+    from lgrasp.jobs.requests.shards import DiffuserRequest, FitRequest
+    from lgrasp.learn.diffuser.params import DiffuserParams
     from lgrasp.learn.params import LearnParams
 
+    request, kind, show = FitRequest, LearnParams, _show_fit
+    if model == "diffuser":
+        request, kind, show = DiffuserRequest, DiffuserParams, _show_steps
     chosen = given(steps=steps, joint_steps=joint_steps, unrolled=unrolled, batch=batch, seed=seed)
-    params = parse_model(LearnParams, chosen, "learn fit")
-    how.run(how.job(FitRequest, "learn fit", shards=shards, out=out, params=params), _show_fit)
+    params = apply_settings({model: parse_model(kind, chosen, "learn fit")}, settings or (), "learn fit")[model]
+    how.run(how.job(request, "learn fit", shards=shards, out=out, params=params), show)
 
 
 @app.command(name="eval")
@@ -94,3 +110,12 @@ def _show_fit(data: dict[str, Any]) -> list[Block]:
         pairs.append(("lowered by", f"{lowered['coarse']:.1%}, after the unrolled steps {lowered['unrolled']:.1%}"))
     end = [*took(data, "steps"), ("where", data["out"]), following("learn eval", data["out"], " SHARDS")]
     return [[*pairs, *end]]
+
+
+def _show_steps(data: dict[str, Any]) -> list[Block]:
+    seen = "" if data["held_out"] is None else f", on steps held out {data['held_out']:.3f}"
+    pairs = [
+        ("hand, objects", f"{data['hand']}; {len(data['objects'])} objects, {data['examples']:,} steps of sequences"),
+        ("loss", f"{data['loss']:.3f}{seen}"),
+    ]
+    return [[*pairs, *took(data, "steps"), ("where", data["out"]), following("sample", data["out"], " OBJECT OBJECT")]]

@@ -19,12 +19,12 @@ from lgrasp_cli.plan import plan
 from lgrasp_cli.refine import refine
 from lgrasp_cli.renamed import renew
 from lgrasp_cli.run import run
-from lgrasp_cli.sequence import sequence
+from lgrasp_cli.sequence import sample, sequence
 from lgrasp_cli.simulate import simulate
 from lgrasp_cli.status import status
 
 _PANELS = {
-    "Generate": (generate, sequence, plan, refine, run),
+    "Generate": (generate, sequence, sample, plan, refine, run),
     "Check": (simulate, judge, status),
     "Look": (render, view, hands.app, catalog.objects, catalog.pipelines),
     "Data": (dataset.app, dataset.export, scenes.app),

@@ -1,43 +1,49 @@
-"""``lgrasp sequence``: several objects in one hand, one after another."""
+"""``lgrasp sequence`` and ``lgrasp sample``: several objects in one hand, one after another."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
 from lgrasp.choices import Method, Policy, ProtocolName
 from lgrasp_cli.names import OBJECT, PIPELINE, one_of
-from lgrasp_cli.options import Hand, Seed, Settings, choose_pipeline
+from lgrasp_cli.options import Hand, Seed, Settings, choose_pipeline, given
 from lgrasp_cli.tables import Block, TextTable, counted, following, held, place, share, took
 from lgrasp_cli.working import How, working
+
+if TYPE_CHECKING:
+    from lgrasp.engine.pipeline import Pipeline
+
+
+Objects = Annotated[list[str], Argument(help="Mesh files or names of objects, in the order of grasping.", **OBJECT)]
+Rows = Annotated[int, Option("-n", "--rows", help="Complete sequences requested.")]
+PolicyName = Annotated[str | None, Option(**one_of(Policy, "POLICY", "Default: the pipeline's."))]
+Size = Annotated[str, Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")]
+Simulate = Annotated[
+    str | None, Option(**one_of(ProtocolName, "PROTOCOL", "Continue only rows that hold in a simulation."))
+]
+PipelineName = Annotated[
+    str, Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.", **PIPELINE)
+]
+Out = Annotated[Path | None, Option(help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT.../PIPELINE")]
+ShardRows = Annotated[int, Option(help="Sequences per shard. Changing it changes which sequences are generated.")]
 
 
 @working
 def sequence(
-    objects: Annotated[list[str], Argument(help="Mesh files or names of objects, in the order of grasping.", **OBJECT)],
+    objects: Objects,
     how: How,
     hand: Hand = "allegro",
-    rows: Annotated[int, Option("-n", "--rows", help="Complete sequences requested.")] = 256,
+    rows: Rows = 256,
     method: Annotated[str | None, Option(**one_of(Method, "METHOD", "Default: the pipeline's."))] = None,
-    policy: Annotated[str | None, Option(**one_of(Policy, "POLICY", "Default: the pipeline's."))] = None,
-    scale: Annotated[
-        str, Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")
-    ] = "1",
-    simulate: Annotated[
-        str | None,
-        Option(**one_of(ProtocolName, "PROTOCOL", "Continue only rows that hold in a simulation.")),
-    ] = None,
-    pipeline: Annotated[
-        str, Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.", **PIPELINE)
-    ] = "sequence",
+    policy: PolicyName = None,
+    scale: Size = "1",
+    simulate: Simulate = None,
+    pipeline: PipelineName = "sequence",
     settings: Settings = None,
-    out: Annotated[
-        Path | None, Option(help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT.../PIPELINE")
-    ] = None,
+    out: Out = None,
     seed: Seed = None,
-    shard_rows: Annotated[
-        int, Option(help="Sequences per shard. Changing it changes which sequences are generated.")
-    ] = 1000,
+    shard_rows: ShardRows = 1000,
 ) -> None:
     """Grasp several objects one after another, each with joints that are still free, and write shards.
 
@@ -47,22 +53,59 @@ def sequence(
 
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10
     """
-    chosen = choose_pipeline(pipeline, seed, settings=settings)
-    if chosen.sequence is not None and (method or policy):
-        changes = {"method": method, "policy": policy}
-        chosen = chosen.with_params("sequence", **{name: value for name, value in changes.items() if value})
-    if out is None:
-        from lgrasp.engine.folder import run_folder
-        from lgrasp.jobs.config import hand_name
-        from lgrasp.jobs.sets import sequence_name
-
-        name = sequence_name(tuple(objects))
-        out = run_folder(Path("grasps"), hand_name(hand), name, chosen.name, simulate)
     from lgrasp.jobs.requests.search import SequenceRequest
 
-    what = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen, "out": out}
-    what |= {"scale": scale, "simulate": simulate, "shard_rows": shard_rows}
-    how.run(how.job(SequenceRequest, "sequence", **what), _show, _profile)
+    chosen = _chosen(pipeline, seed, settings, method=method, policy=policy)
+    what = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen}
+    what |= {"out": out or _folder(hand, objects, chosen, simulate), "scale": scale, "simulate": simulate}
+    how.run(how.job(SequenceRequest, "sequence", shard_rows=shard_rows, **what), _show, _profile)
+
+
+@working
+def sample(
+    model: Annotated[Path, Argument(help="File written by lgrasp learn fit --model diffuser.")],
+    objects: Objects,
+    how: How,
+    hand: Hand = "allegro",
+    rows: Rows = 256,
+    policy: PolicyName = None,
+    scale: Size = "1",
+    simulate: Simulate = None,
+    pipeline: PipelineName = "sample",
+    settings: Settings = None,
+    out: Out = None,
+    seed: Seed = None,
+    shard_rows: ShardRows = 1000,
+) -> None:
+    """Grasp several objects one after another as lgrasp sequence does, with poses and joints drawn by a network.
+
+    What is drawn is moved onto the surfaces and checked; only rows that are strictly valid are written.
+
+    Example: lgrasp sample diffuser.pt mug sphere -n 256 --scale 0.06:0.10
+    """
+    from lgrasp.jobs.requests.search import SampleRequest
+
+    chosen = _chosen(pipeline, seed, settings, policy=policy)
+    what = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen, "model": model}
+    what |= {"out": out or _folder(hand, objects, chosen, simulate), "scale": scale, "simulate": simulate}
+    how.run(how.job(SampleRequest, "sample", shard_rows=shard_rows, **what), _show, _profile)
+
+
+def _chosen(name: str, seed: int | None, settings: list[str] | None, **changes: str | None) -> "Pipeline":
+    """The pipeline with what the options change."""
+    chosen = choose_pipeline(name, seed, settings=settings)
+    if chosen.sequence is None:
+        return chosen
+    return chosen.with_params("sequence", **given(**changes))
+
+
+def _folder(hand: str, objects: list[str], pipeline: "Pipeline", simulate: str | None) -> Path:
+    """Where the shards go unless it is said."""
+    from lgrasp.engine.folder import run_folder
+    from lgrasp.jobs.config import hand_name
+    from lgrasp.jobs.sets import sequence_name
+
+    return run_folder(Path("grasps"), hand_name(hand), sequence_name(tuple(objects)), pipeline.name, simulate)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

@@ -8,7 +8,6 @@ import warp as wp
 from lgrasp.grasp.collision import body_apart, body_depth
 from lgrasp.hand.arrays import Hand, HandArrays
 from lgrasp.math.kinematics import vec_dof
-from lgrasp.math.limits import MAX_DOFS
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
@@ -66,11 +65,9 @@ def hold(
     """
     tree, d = hand.model.tree, hand.device
     rows, groups = len(q), tree.groups
-    posture = np.zeros((rows, groups, MAX_DOFS), np.float32)
-    bits = np.zeros((rows, groups), np.int32)
+    posture, bits = tree.by_group(q.astype(np.float32)), np.zeros((rows, groups), np.int32)
     for g in range(groups):
         columns = tree.dof_index[tree.dof_first[g] : tree.dof_first[g + 1]]
-        posture[:, g, : len(columns)] = q[:, columns]
         bits[:, g] = (frozen[:, columns] << np.arange(len(columns))).sum(1)
     setting = np.full(rows, -1) if any_setting else _settings(q, tree.settings)
     held = upload_struct(Held, d, {"tries": tries, "posture": posture, "frozen": bits, "setting": setting})

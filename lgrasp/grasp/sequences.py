@@ -1,7 +1,7 @@
 """Sequences of grasps: a table that grows by one object a step, as NumPy arrays."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,6 +50,17 @@ class SequenceTable:
         if self.steps:
             return self.q[:, -1]
         return np.broadcast_to(tree.joint_open.astype(np.float32), (len(self), len(tree.joint_open)))
+
+
+class HeldHands(NamedTuple):
+    """H hands that hold the same n objects."""
+
+    q: np.ndarray
+    """Joints now [rad or m], (H, K)."""
+    used: np.ndarray
+    """Joints that hold something, (H, K) bool."""
+    pose: np.ndarray
+    """T_hand_object of the objects' internal frames, device poses (H, n, 7)."""
 
 
 def empty_sequences(rows: int, joints: int, contacts: int) -> SequenceTable:

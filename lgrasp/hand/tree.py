@@ -10,6 +10,7 @@ import numpy as np
 from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.urdf import Joint, Urdf, check_mimic
+from lgrasp.math.limits import MAX_DOFS
 
 MAX_SETTINGS = 32
 """Most combinations of values of a hand's shared joints."""
@@ -70,6 +71,14 @@ class Tree:
         locked = np.broadcast_to(self.locked_values, (len(q), len(self.locked_values)))
         coupled = self.coupled_mult * q[:, self.coupled_column] + self.coupled_offset
         return np.hstack([q, locked, coupled]).astype(q.dtype)
+
+    def by_group(self, q: np.ndarray) -> np.ndarray:
+        """Actuated joints q, shape [n, K], by group as kernels take them, shape [n, G, MAX_DOFS]."""
+        out = np.zeros((len(q), self.groups, MAX_DOFS), q.dtype)
+        for g in range(self.groups):
+            columns = self.dof_index[self.dof_first[g] : self.dof_first[g + 1]]
+            out[:, g, : len(columns)] = q[:, columns]
+        return out
 
     @property
     def groups(self) -> int:

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lgrasp.grasp.predicted import record_of_points
 from lgrasp.grasp.tables import ContactSets
-from lgrasp.math.limits import MAX_DOFS
 from lgrasp.runtime.fetch import to_numpy
 from lgrasp.stages.context import Context
 
@@ -25,18 +25,13 @@ def optimised_sets(grasps: "Optimised", free: np.ndarray, context: Context) -> C
     assert context.space is not None
     tree = context.hand.model.tree
     groups, rows = tree.groups, len(grasps.q)
-    record_of = np.full(len(context.hand.model.contact_points), -1)
-    point, first = np.unique(context.field.model.point, return_index=True)
-    record_of[point] = first
+    record_of = record_of_points(context.hand.model, context.field.model)
     shape = (rows, groups, 1)
     count, surface, record = (np.zeros(s, np.int32) for s in (shape[:2], shape, shape))
     chosen = np.full((rows, groups), -1, np.int32)
     palm_point, palm_surface = (np.full(rows, -1, np.int32) for _ in range(2))
     known: np.ndarray = np.ones(rows, bool)
-    posture = np.zeros((*shape, MAX_DOFS), np.float32)
-    for g in range(groups):
-        columns = tree.dof_index[tree.dof_first[g] : tree.dof_first[g + 1]]
-        posture[:, g, 0, : len(columns)] = grasps.q[:, columns]
+    posture = tree.by_group(grasps.q.astype(np.float32))[:, :, None]
     for side, g in enumerate(context.space.groups):
         own = tree.dof_index[tree.dof_first[g] : tree.dof_first[g] + tree.dof_free[g]] if g >= 0 else []
         moves = free[:, own].any(1) if g >= 0 else np.zeros(rows, bool)

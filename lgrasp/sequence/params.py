@@ -11,7 +11,9 @@ class SequenceParams(Params):
     """How sequences of grasps grow, object by object."""
 
     method: Method = Field(
-        "field", description="field: the contact field proposes; anneal, mala: the published optimiser, true Langevin."
+        "field",
+        description="field: the contact field proposes; anneal, mala: the published optimiser, true Langevin; "
+        "diffuser: a trained network (lgrasp sample).",
     )
     policy: Policy = Field(
         "uniform",
@@ -19,9 +21,10 @@ class SequenceParams(Params):
     )
     width: int = Field(320, ge=1, le=65_536, description="Sequences started in a round.")
     wave: int = Field(
-        256, ge=1, le=65_536, description="Candidates tried with one space before the next is tried (field)."
+        256, ge=1, le=65_536, description="Candidates tried with one space before the next is tried (field, diffuser)."
     )
-    waves: int = Field(4, ge=1, le=256, description="Waves of a step before a sequence is given up (field).")
+    waves: int = Field(4, ge=1, le=256, description="Waves of a step before a sequence is given up.")
+    draws: int = Field(10, ge=1, le=1000, description="Steps in which a network takes the noise out (diffuser).")
     branch: int = Field(1, ge=1, le=1024, description="Largest number of continuations of one sequence.")
     optimiser: OptimiserParams = Field(
         default_factory=lambda: OptimiserParams.model_validate({}),

@@ -12,6 +12,7 @@ import warp as wp
 from lgrasp.field.arrays import FieldArrays
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.held import HeldArrays, hold_nothing
+from lgrasp.grasp.predicted import PredictedArrays
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.seeding import stage_seed
@@ -57,6 +58,8 @@ class Context:
     """Opposition space that grasps must use; hand and field are then those of the space."""
     holding: HeldArrays | None = None
     """What the hand holds already, and what of it may not move; None: nothing."""
+    predicted: PredictedArrays | None = None
+    """Poses and postures of the candidates in an opposition space; None: they are drawn."""
     steer: SteerArrays | None = None
     """What the user asks of grasps; None: nothing."""
     realised: bool = True

@@ -4,39 +4,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.sequences import OBJECTS, small_inputs, small_pipeline
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
-from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.run import run
 from lgrasp.errors import OutputError
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.jobs.sequence import round as round_module
-from lgrasp.jobs.sequence.inputs import load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.sequence.round import run_round
 from lgrasp.jobs.sequence.shard import make_sequences
-from lgrasp.runtime.device import resolve_device
-from lgrasp.sequence.size import Size
-
-OBJECTS = ("sphere", "mug")
-SIZE = Size(0.06, 0.08)
 
 
 @pytest.fixture(scope="module")
 def pipeline():
-    found = load_pipeline("sequence")
-    small = found.model_copy(update={"field": found.field.model_copy(update={"records": 20_000})})
-    return small.with_params("sequence", width=24, wave=64, waves=3)
+    return small_pipeline()
 
 
 @pytest.fixture(scope="module")
 def inputs(pipeline, cache_root):
-    keys = sequence_keys("allegro", OBJECTS, SIZE, pipeline.seed, pipeline.object, pipeline.field)
-    cache = Cache(cache_root, pytest.fail)
-    return load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, resolve_device("cpu"))
+    return small_inputs(pipeline, cache_root)
 
 
 @pytest.fixture(scope="module")

@@ -46,6 +46,7 @@ def sequence(cli, small, tmp_path):
         (["mug", "sphere", "--hand", "alegro"], "did you mean 'allegro'"),
         (["mug", "sphere", "--policy", "greedy"], "uniform"),
         (["mug", "sphere", "--method", "magic"], "anneal"),
+        (["mug", "sphere", "--method", "diffuser"], "lgrasp sample MODEL"),
         (["mug", "sphere", "--scale", "0.1:0.05"], "0.06:0.10"),
         (["mug", "sphere", "--scale", "big"], "0.06:0.10"),
         (["mug", "sphere", "-n", "0"], "at least 1"),
@@ -138,3 +139,11 @@ def test_sequences_are_drawn_with_a_seed():
     assert len(set(groups)) == 20
     assert all(len(g) == 4 for g in groups)
     assert (np.unique(list(map(str, map(sorted, groups))), return_counts=True)[1] == 3).all()
+
+
+def test_networks_that_cannot_be_used(cli, small):
+    assert "absent.pt: no such file" in cli("sample", "absent.pt", "mug", "sphere").error()
+    Path("bad.pt").write_bytes(b"nonsense")
+    assert "bad.pt: not a network" in cli("sample", "bad.pt", "mug", "sphere", "--device", "cpu").error()
+    assert "needs diffuser" in cli("sample", "bad.pt", "mug", "sphere", "-p", small).error()
+    assert "unknown key 'joint_steps'" in cli("learn", "fit", "--model", "diffuser", "out", "--joint-steps", 3).error()

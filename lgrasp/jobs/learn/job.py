@@ -10,18 +10,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import PrivateAttr
 
-from lgrasp.dataset.gather import gather
-from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Made, Part, PartProgress
-from lgrasp.engine.folder import Found
-from lgrasp.engine.run import Job, JobOutcome
-from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import ConfigError
-from lgrasp.files import write_file
 from lgrasp.hand.model import HandModel
-from lgrasp.jobs.requests.shards import FitRequest
+from lgrasp.jobs.learn.network import NetworkJob
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import object_of_shard
 from lgrasp.learn.examples import Examples, make_examples
@@ -37,7 +31,7 @@ _FORMAT, _VERSION = "lgrasp-coarse", 1
 _MIN_GRASPS = 16  # grasps to learn from
 
 
-class FitJob(FitRequest, Job):
+class FitJob(NetworkJob):
     """A predictor of coarse grasps, trained on the grasps of shards: one file.
 
     The report compares mean energies on clouds that were not trained on: of the predictor trained on poses alone
@@ -45,30 +39,14 @@ class FitJob(FitRequest, Job):
     (``joint``).
     """
 
-    command: ClassVar[str] = "learn fit"
-    part: ClassVar[str] = "file"
-    kernels: ClassVar[tuple[str, ...]] = ()
-    one_key: ClassVar[bool] = False
-    differs: ClassVar[str] = "other shards or parameters"
-
-    _key: str | None = PrivateAttr(None)
+    kind: ClassVar[tuple[str, int]] = ("predictor", 1)
 
     @property
-    def folder(self) -> Path:
-        return self.out.parent
+    def effort_steps(self) -> int:
+        return self.params.steps + self.params.joint_steps
 
-    def key(self) -> str:
-        if self._key is None:
-            rows = [shard.value for shard in gather(self.shards, rows_digest)]
-            described = self.params.model_dump(mode="json")
-            self._key = content_key("predictor", _VERSION, rows=rows, params=described, hand=self.hand)
-        return self._key
-
-    def parts(self) -> list[Part]:
-        return [Part(0, self.out, self.params.steps + self.params.joint_steps)]
-
-    def found(self, part: Part) -> Found:
-        return Found(load_predictor(part.file)[1].get("run_key"), part.rows)
+    def about_file(self, path: Path) -> dict[str, Any]:
+        return load_predictor(path)[1]
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, device = self.params, self.device_used.alias
@@ -98,14 +76,6 @@ class FitJob(FitRequest, Job):
             }
         report |= {"seconds": seconds, "params": p.model_dump(mode="json")}
         return Made(part.rows, _bytes(trainer, hand, self.key(), report))
-
-    def write(self, part: Part, contents: Any) -> None:
-        write_file(part.file, contents)
-
-    def report(self, outcome: JobOutcome) -> dict[str, Any]:
-        if not outcome.paths:
-            return {}
-        return load_predictor(self.out)[1]["report"] | {"out": str(self.out)}
 
 
 def evaluate(

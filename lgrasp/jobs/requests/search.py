@@ -98,11 +98,17 @@ class SequenceRequest(SearchRequest):
     def title(self) -> str:
         return " ".join(Path(name).stem for name in (self.hand, *self.objects))
 
+    def check_method(self) -> None:
+        """Raise ConfigError if the pipeline's method is none for this job."""
+        if self.pipeline.params("sequence").method == "diffuser":
+            raise ConfigError("method diffuser draws from a trained network: lgrasp sample MODEL OBJECT OBJECT ...")
+
     def check(self) -> None:
         if self.pipeline.sequence is None:
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}' has no sequence; use pipeline sequence, or add 'sequence: {{}}' to it"
             )
+        self.check_method()
         if len(self.objects) < 2:
             named = self.objects[0] if self.objects else "no object"
             raise ConfigError(
@@ -115,3 +121,20 @@ class SequenceRequest(SearchRequest):
         for name in self.objects:
             find_object(name)
         super().check()
+
+
+class SampleRequest(SequenceRequest):
+    """Sequences whose steps are drawn by a trained network."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.sequence.sample:SampleJob"
+
+    model: Path = Field(description="File of lgrasp learn fit --model diffuser.")
+
+    def check_method(self) -> None:
+        if (method := self.pipeline.params("sequence").method) != "diffuser":
+            raise ConfigError(
+                f"pipeline '{self.pipeline.name}' has sequence.method {method}; a network needs diffuser, as pipeline "
+                "sample has"
+            )
+        if not self.model.is_file():
+            raise ConfigError(f"{self.model}: no such file; lgrasp learn fit --model diffuser writes such files")

@@ -16,6 +16,7 @@ from lgrasp.files import check_folder
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.names import hand_path
 from lgrasp.hold.params import HoldTest
+from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.learn.params import LearnParams
 from lgrasp.refine.params import COARSE, LocalSearch
 from lgrasp.simulate.protocol import Protocol, find_protocol
@@ -144,11 +145,21 @@ class FitRequest(Request):
 
     def check(self) -> None:
         if self.out.is_dir():
-            raise OutputError(f"{self.out} is a folder; name a file with --out, such as coarse.pt")
+            usual = type(self).model_fields["out"].default
+            raise OutputError(f"{self.out} is a folder; name a file with --out, such as {usual}")
         shards_below(self.shards)
         if self.hand is not None:
             hand_path(self.hand)
         check_folder(self.out.parent)
+
+
+class DiffuserRequest(FitRequest):
+    """A network that draws steps of sequences, trained on shards of these: one file."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.learn.diffuser:DiffuserJob"
+
+    out: Path = Field(default=Path("diffuser.pt"), description="File of the network.")
+    params: DiffuserParams = Field(default_factory=lambda: DiffuserParams.model_validate({}))
 
 
 class ExportRequest(Request):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from dataclasses import field as with_default
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from lgrasp.runtime.device import Device
 from lgrasp.seeding import stage_seed
 from lgrasp.sequence.size import Size
 from lgrasp.simulate.scene import Scene
+
+if TYPE_CHECKING:  # torch takes a second to import
+    from lgrasp.learn.diffuser.sampler import StepSampler
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,7 @@ class SequenceInputs:
     seconds: dict[str, float] = with_default(default_factory=dict)
     hits: dict[str, bool] = with_default(default_factory=dict)
     scene: Scene | None = None  # for a physics simulation, if there is one
+    sampler: "StepSampler | None" = None  # of method diffuser
 
     @property
     def object_ids(self) -> tuple[str, ...]:

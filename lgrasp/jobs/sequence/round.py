@@ -11,7 +11,8 @@ from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.grasp.held import hold
-from lgrasp.grasp.sequences import SequenceTable, empty_sequences
+from lgrasp.grasp.predicted import PredictedArrays, upload_predicted
+from lgrasp.grasp.sequences import HeldHands, SequenceTable, empty_sequences
 from lgrasp.grasp.tables import GraspTable, join_rows, take_rows
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.runtime.tally import Meter
@@ -115,9 +116,10 @@ class _Step:
         rows, params = self._rows, self._params
         left = len(self._inputs.objects) - rows.steps - 1
         order = space_orders(rows, self._inputs.spaces, params.policy, left, self._seed)
-        if params.method != "field":
+        in_waves = params.method in ("field", "diffuser")
+        if not in_waves:
             self._optimise(order[:, 0])
-        for wave in range(params.waves if params.method == "field" else 0):
+        for wave in range(params.waves if in_waves else 0):
             self._tell((rows.steps + wave / params.waves) / len(self._inputs.objects))
             space = order[np.arange(len(rows)), wave % np.maximum((order >= 0).sum(1), 1)]
             for number in np.unique(space[space >= 0]):
@@ -140,8 +142,23 @@ class _Step:
         name, size = self._inputs.spaces[number].name, self._params.wave
         seed = stage_seed(self._seed, self._rows.steps, name, wave)
         context = self._context(chosen, number, size, seed)
-        grasps, meters = self._from_field(context, len(chosen) * size)
+        if self._params.method == "diffuser":
+            context = context.changed(predicted=self._predicted(chosen, number, size, seed))
+        grasps, meters = self._from_stages(context, len(chosen) * size)
         self._take(grasps, meters, chosen, number, size, wave * size)
+
+    def _predicted(self, chosen: np.ndarray, number: int, size: int, seed: int) -> PredictedArrays:
+        """Poses and postures of a wave of candidates, drawn by the network."""
+        inputs, before = self._inputs, take_rows(self._rows, chosen)
+        assert inputs.sampler is not None
+        start = time.perf_counter()
+        q, used = before.posture(inputs.hand.tree), before.used
+        free = inputs.spaces[number].joints & ~used
+        hands = HeldHands(q, used, before.pose)
+        drawn = inputs.sampler.draw(hands, number, free, each=size, seed=seed, steps=self._params.draws)
+        add_seconds(self._result.seconds, {"diffuser": time.perf_counter() - start})
+        view = inputs.views[number]
+        return upload_predicted(view.hand, view.field, drawn.pose, drawn.q)
 
     def _optimise(self, space: np.ndarray) -> None:
         """One grasp of each row with its space, by the optimiser."""
@@ -220,7 +237,7 @@ class _Step:
             realised=self._pipeline.realised,
         )
 
-    def _from_field(self, context: Context, candidates: int) -> tuple[GraspTable, list[Meter]]:
+    def _from_stages(self, context: Context, candidates: int) -> tuple[GraspTable, list[Meter]]:
         """Grasps of all candidates that continue the held rows; on a CPU several chunks of them at a time."""
         size = _CPU_CHUNK if context.device == "cpu" else candidates
         meters = [Meter(context.device) for _ in range(0, candidates, size)]

@@ -11,6 +11,7 @@ from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.domain.kernels import DomainCount, DomainValues, count_realised, draw_domains, drop_poor, keep_frozen
 from lgrasp.stages.domain.params import DomainParams
+from lgrasp.stages.domain.predicted_kernels import add_predicted
 
 VERSION = 3
 
@@ -48,6 +49,10 @@ def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Conte
     )
     if context.space:
         wp.launch(keep_frozen, table.count.shape, [hand, context.held.struct], [table.struct], device=d)
+    if context.space and context.predicted and context.round == 0:
+        asked = [context.object.struct, context.held.struct, context.predicted.struct]
+        sides = wp.vec2i(*context.space.groups)
+        wp.launch(add_predicted, table.count.shape, [hand, *asked, sides, params.keep], [table.struct], device=d)
     if context.round == 0:
         wp.launch(drop_poor, table.count.shape[0], [values], [table.struct, tally.device], device=d)
     return table, tally

@@ -20,7 +20,7 @@ _DRAWS = wp.constant(16)  # of two opposite object points and a contact vector o
 
 
 @wp.func
-def _fixed(hand: Hand, held: Held, h: wp.int32, side: wp.int32):
+def side_fixed(hand: Hand, held: Held, h: wp.int32, side: wp.int32):
     """True if a side is fixed: the static links (-1), or a finger that holds something."""
     return side < 0 or group_fixed(hand, held, h, wp.max(side, 0))
 
@@ -44,7 +44,7 @@ def _between(
     Returns:
         Pose, hand contact point, object point on it and the object point opposite (-1: nothing was found).
     """
-    fixed = _fixed(hand, held, h, side)
+    fixed = side_fixed(hand, held, h, side)
     c0 = hand.contacts.first[wp.where(side < 0, hand.kin.groups, side)]
     surface = hand.contacts.first[wp.where(side < 0, hand.kin.groups, side) + 1] - c0
     T = wp.transform_identity()
@@ -97,7 +97,7 @@ def _between(
 
 
 @wp.func
-def _clear(hand: Hand, obj: Object, held: Held, h: wp.int32, params: PlaceValues, T: wp.transform):
+def clear_of_hand(hand: Hand, obj: Object, held: Held, h: wp.int32, params: PlaceValues, T: wp.transform):
     """True if an object at T is clear of the static links, the fixed fingers and the held objects."""
     T_object = wp.transform_inverse(T)
     if not body_clear(hand, obj, 0, T_object, params.allowed_penetration):
@@ -151,8 +151,8 @@ def propose_opposed(
     if setting < 0:
         setting = wp.min(int(wp.randf(state) * float(hand.kin.settings)), hand.kin.settings - 1)
     proposals_out.setting[row, b] = setting
-    fixed_a = _fixed(hand, held, h, sides[0])
-    fixed_b = _fixed(hand, held, h, sides[1])
+    fixed_a = side_fixed(hand, held, h, sides[0])
+    fixed_b = side_fixed(hand, held, h, sides[1])
     if fixed_a and fixed_b:
         return
     side = sides[0]
@@ -170,7 +170,7 @@ def propose_opposed(
     else:
         proposals_out.anchor[row, b, side] = i
     proposals_out.anchor[row, b, other] = j
-    if _clear(hand, obj, held, h, params, T):
+    if clear_of_hand(hand, obj, held, h, params, T):
         proposals_out.rating[row, b] = Rating.CLEAR
     else:
         proposals_out.rating[row, b] = Rating.BLOCKED

@@ -12,6 +12,7 @@ from lgrasp.stages.context import Context
 from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
 from lgrasp.stages.place.opposed_kernels import propose_opposed
 from lgrasp.stages.place.params import PlaceParams
+from lgrasp.stages.place.predicted_kernels import propose_predicted
 from lgrasp.stages.place.structs import PlaceCount, PlaceValues, ProposedPoses
 
 VERSION = 5
@@ -20,7 +21,8 @@ VERSION = 5
 def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Context) -> tuple[PoseTable, Tally]:
     """Poses of candidates ``first .. first + count - 1`` of the shard's stream.
 
-    In an opposition space all of them are between its two sides, and the weights play no part.
+    In an opposition space all of them are between its two sides, and the weights play no part; where poses are
+    predicted (``context.predicted``), those are taken.
 
     Args:
         inputs: ``first`` (a number, or an array (1,) i32 on the device) and ``count``.
@@ -44,11 +46,15 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     reach = params.max_com_distance + (regions.off_centre if regions else 0.0)
     values = make_struct(PlaceValues, params, context.bounds, **shares, max_com_distance=reach)
     where = [context.seed("place"), first]
-    asked = [values, context.steered.struct, *where]
-    if context.space:
-        asked = [context.held.struct, values, wp.vec2i(*context.space.groups), *where]
-    kernel = propose_opposed if context.space else propose_poses
-    wp.launch(kernel, shape, [hand, field, obj, *asked], [proposals], device=d)
+    if context.space is None:
+        kernel, asked = propose_poses, [hand, field, obj, values, context.steered.struct, *where]
+    elif context.predicted is None:
+        kernel = propose_opposed
+        asked = [hand, field, obj, context.held.struct, values, wp.vec2i(*context.space.groups), *where]
+    else:
+        kernel, own = propose_predicted, context.predicted.struct
+        asked = [hand, field, obj, context.held.struct, own, values, wp.vec2i(*context.space.groups), *where]
+    wp.launch(kernel, shape, asked, [proposals], device=d)
     chosen, upto = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(2))
     tally = empty_tally(PlaceCount, d)
     wp.launch(choose_poses, count, [hand, obj, values, proposals], [chosen, upto, tally.device], device=d)

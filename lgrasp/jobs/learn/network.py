@@ -1,0 +1,66 @@
+"""What the jobs that train a network on shards and keep it in one file share."""
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import PrivateAttr
+
+from lgrasp.dataset.gather import gather
+from lgrasp.engine.cache import content_key
+from lgrasp.engine.events import Part
+from lgrasp.engine.folder import Found
+from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.shard_job import rows_digest
+from lgrasp.files import write_file
+from lgrasp.jobs.requests.shards import FitRequest
+
+
+class NetworkJob(FitRequest, Job):
+    """A network, trained on the grasps of shards: one file."""
+
+    command: ClassVar[str] = "learn fit"
+    part: ClassVar[str] = "file"
+    kernels: ClassVar[tuple[str, ...]] = ()
+    one_key: ClassVar[bool] = False
+    differs: ClassVar[str] = "other shards or parameters"
+    kind: ClassVar[tuple[str, int]]
+    """Name and version of what is trained."""
+
+    _key: str | None = PrivateAttr(None)
+
+    @property
+    def folder(self) -> Path:
+        return self.out.parent
+
+    def key(self) -> str:
+        if self._key is None:
+            rows = [shard.value for shard in gather(self.shards, rows_digest)]
+            described = self.params.model_dump(mode="json")
+            self._key = content_key(*self.kind, rows=rows, params=described, hand=self.hand)
+        return self._key
+
+    @property
+    @abstractmethod
+    def effort_steps(self) -> int:
+        """Steps of the training."""
+
+    def parts(self) -> list[Part]:
+        return [Part(0, self.out, self.effort_steps)]
+
+    @abstractmethod
+    def about_file(self, path: Path) -> dict[str, Any]:
+        """``run_key`` and ``report`` of a file.
+
+        Raises:
+            ConfigError: it is none of this kind.
+        """
+
+    def found(self, part: Part) -> Found:
+        return Found(self.about_file(part.file)["run_key"], part.rows)
+
+    def write(self, part: Part, contents: Any) -> None:
+        write_file(part.file, contents)
+
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
+        return self.about_file(self.out)["report"] | {"out": str(self.out)} if outcome.paths else {}

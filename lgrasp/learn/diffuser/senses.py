@@ -1,0 +1,106 @@
+"""What a hand feels in a pose: how far points of its surface are from the object to grasp and from those it holds."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from lgrasp.differentiable.distance import DistanceGrids
+from lgrasp.differentiable.kinematics import BodyKinematics
+from lgrasp.geometry.clusters import CLUSTER_SIZE
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.surface import contact_surface
+from lgrasp.hand.tree import Tree
+from lgrasp.learn.diffuser.features import mesh_centre
+from lgrasp.object.sdf import SdfGrid, build_sdf
+from lgrasp.refine.surface import farthest_points
+
+_NODES = 32**3  # of an object's grid
+_PAD = 0.03  # [m] of a grid about the object
+_NEAREST, _FARTHEST = -0.02, 0.04  # [m] distances that are told apart
+
+
+class HeldObjects(NamedTuple):
+    """Objects that N hands hold, up to S each."""
+
+    object: torch.Tensor
+    """Number of the grid, -1 none, (N, S) int64."""
+    R: torch.Tensor
+    """Rotation in the hand frame, (N, S, 3, 3)."""
+    t: torch.Tensor
+    """Position [m], (N, S, 3)."""
+
+
+def coarse_grid(vertices: np.ndarray, faces: np.ndarray, *, closed: bool, device: str = "cpu") -> SdfGrid:
+    """Signed distances of a mesh about :func:`~lgrasp.learn.diffuser.features.mesh_centre`."""
+    centred = np.asarray(vertices, float) - mesh_centre(vertices)
+    grid = build_sdf(centred, np.asarray(faces, np.int32), closed=closed, max_cells=_NODES, pad=_PAD, device=device)
+    return replace(grid, values=grid.values.astype(np.float32))
+
+
+def sense_points(model: HandModel, each: int) -> torch.Tensor:
+    """Points of a hand's surface: the body that each rides on, and its place in that body's frame [m], (P, 4).
+
+    ``each`` of every body, and as many of what may touch there.
+    """
+    side, found = contact_surface(model), []
+    for body in range(len(model.piece_first) - 1):
+        first, end = (model.cluster_first[body : body + 2] * CLUSTER_SIZE).tolist()
+        for points in (model.samples[first:end], side.points[side.body == body]):
+            if len(points):
+                chosen = points[farthest_points(points, each)]
+                found.append(np.column_stack([np.full(each, body), chosen]))
+    return torch.as_tensor(np.concatenate(found), dtype=torch.float32)
+
+
+class Senses:
+    """Distances in poses and postures that are still noisy: the network sees what its own estimate comes to.
+
+    Args:
+        points: of the hand (:func:`sense_points`), (P, 4).
+        basis: points in the hand frame [m], (H, 3).
+        grids: of all objects.
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        points: torch.Tensor,
+        basis: torch.Tensor,
+        grids: Sequence[SdfGrid],
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self._bodies = BodyKinematics(tree, device=device)
+        self._body, self._points = points[:, 0].to(device).long(), points[:, 1:].to(device)
+        self._basis, self._grids = basis.to(device), DistanceGrids(grids, device=device)
+
+    @torch.no_grad()
+    def __call__(
+        self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, object: torch.Tensor, held: HeldObjects
+    ) -> torch.Tensor:
+        """Distances in units of 2 cm, cut at -1 and 2: of the hand's points from the object and from what is held, and
+        of the basis points from the object, (N, 2 P + H).
+
+        Args:
+            R, t: pose of the object to grasp in the hand frame, (N, 3, 3) and (N, 3) [m].
+            q: joints [rad or m], (N, K).
+            object: number of its grid, (N,) int64.
+        """
+        R_body, t_body = self._bodies(q)
+        places = (R_body[:, self._body] @ self._points[..., None])[..., 0] + t_body[:, self._body]  # (N, P, 3)
+        every = torch.cat([places, self._basis.expand(len(q), -1, -1)], 1)
+        own = self._distance(every, R, t, object)
+        other = torch.full(places.shape[:2], _FARTHEST, device=q.device)
+        for slot in range(held.object.shape[1]):
+            rows = (held.object[:, slot] >= 0).nonzero()[:, 0]
+            if len(rows):
+                at = held.R[rows, slot], held.t[rows, slot], held.object[rows, slot]
+                other[rows] = other[rows].minimum(self._distance(places[rows], *at))
+        return torch.cat([own, other], 1).clamp(_NEAREST, _FARTHEST) / -_NEAREST
+
+    def _distance(self, x: torch.Tensor, R: torch.Tensor, t: torch.Tensor, object: torch.Tensor) -> torch.Tensor:
+        """Signed distance [m] of points (N, n, 3) of the hand frame from one object for each row."""
+        local = (x - t[:, None]) @ R
+        return self._grids.value_and_gradient((local[..., 0], local[..., 1], local[..., 2]), object[:, None])[0]

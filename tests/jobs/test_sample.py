@@ -1,0 +1,136 @@
+"""A network is trained on sequences and draws others: what it draws is checked like all grasps."""
+
+import numpy as np
+import pytest
+import torch
+from support.sequences import OBJECTS, small_inputs, small_pipeline
+
+from lgrasp.dataset.reader import ShardReader, read_shard
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.engine.batch import run_stages
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.run import run
+from lgrasp.errors import ConfigError
+from lgrasp.geometry.poses import pose_matrix
+from lgrasp.grasp.held import hold
+from lgrasp.grasp.predicted import upload_predicted
+from lgrasp.jobs.learn.diffuser import DiffuserJob
+from lgrasp.jobs.learn.sequences import read_steps
+from lgrasp.jobs.sequence.job import SequenceJob
+from lgrasp.jobs.sequence.round import run_round
+from lgrasp.jobs.sequence.sample import SampleJob
+from lgrasp.learn.diffuser.file import load_diffuser
+from lgrasp.learn.diffuser.params import DiffuserParams
+from lgrasp.runtime.device import resolve_device
+from lgrasp.stages.context import Context
+
+TINY = {"width": 32, "blocks": 2, "shape_points": 48, "held_points": 48, "cloud": 128, "turns": 4, "batch": 64}
+
+
+@pytest.fixture(scope="module")
+def cache(cache_root):
+    return Cache(cache_root, pytest.fail)
+
+
+@pytest.fixture(scope="module")
+def inputs(cache_root):
+    return small_inputs(small_pipeline(), cache_root)
+
+
+@pytest.fixture(scope="module")
+def asked(cache):
+    return {"objects": OBJECTS, "scale": "0.06:0.08", "device": "cpu", "cache": cache}
+
+
+@pytest.fixture(scope="module")
+def shards(asked, tmp_path_factory):
+    out = tmp_path_factory.mktemp("sequences")
+    run(SequenceJob(**asked, rows=40, pipeline=small_pipeline(), out=out))
+    return out
+
+
+@pytest.fixture(scope="module")
+def network(shards, cache, tmp_path_factory):
+    out = tmp_path_factory.mktemp("network") / "net.pt"
+    params = DiffuserParams.model_validate(TINY | {"steps": 150})
+    run(DiffuserJob(shards=(shards,), out=out, params=params, device="cpu", cache=cache))
+    return out
+
+
+def test_steps_are_those_of_the_rows(shards, cache, inputs):
+    found = read_steps([shards], cache, resolve_device("cpu"), 64)
+    (path,) = shards.glob("*.h5")
+    rows = read_shard(path).grasps
+    steps, there = found.steps, rows.object_index[:, 1] >= 0
+    two, one = np.flatnonzero(there), np.flatnonzero(~there)
+    assert rows.sequence is not None
+    np.testing.assert_array_equal(steps.q.numpy(), rows.q)
+    np.testing.assert_array_equal(steps.used.numpy()[two], rows.sequence.free_joints[two, 0])
+    np.testing.assert_array_equal(steps.used.numpy()[one], False)
+    before = rows.sequence.q[two, 0]
+    np.testing.assert_array_equal(steps.start.numpy()[two], before)  # frozen as before, the others as in the open hand
+    open_posture = np.broadcast_to(inputs.hand.tree.joint_open, steps.start[one].shape)
+    np.testing.assert_allclose(steps.start.numpy()[one], open_posture, atol=1e-6)
+    assert (steps.held.numpy()[one] == -1).all()
+    assert {found.object_names[i] for i in steps.object.numpy()[two]} == {"mug"}
+    assert {found.object_names[i] for i in steps.held.numpy()[two, 0]} == {"sphere"}
+    # a ball is about its own centre, which is where the contacts on it are a radius away
+    radius = found.clouds[found.object_names.index("sphere")].norm(dim=1)
+    torch.testing.assert_close(radius, radius.mean().expand_as(radius), atol=5e-4, rtol=0)
+    T = pose_matrix(rows.object_pose[one, 0].astype(float))
+    touched = np.einsum("nij,nj->ni", T[:, :3, :3], rows.contact_points[one, 0, 0]) + T[:, :3, 3]
+    away = np.linalg.norm(touched - steps.t.numpy()[one], axis=1)
+    np.testing.assert_allclose(away, float(radius.mean()), atol=2e-3)
+
+
+def test_training_learns_and_the_seed_decides(network, shards, cache, tmp_path):
+    net, about = load_diffuser(network)
+    assert about.report["loss"] < 0.99  # 1 of a network that knows nothing
+    assert about.report["objects"] == ["mug", "sphere"]
+    assert about.space_names[0] == "index-palm"
+    params = DiffuserParams.model_validate(TINY | {"steps": 150})
+    again = tmp_path / "again.pt"
+    run(DiffuserJob(shards=(shards,), out=again, params=params, device="cpu", cache=cache))
+    for name, values in load_diffuser(again)[0].state_dict().items():
+        torch.testing.assert_close(values, net.state_dict()[name], atol=2e-3, rtol=0)
+
+
+def test_valid_grasps_as_predictions_mostly_stay(inputs):
+    """Poses and joints of valid grasps: the stages find contacts there again, with the object hardly moved."""
+    table = run_round(small_pipeline(), inputs, 0, 0, 2).levels[0]
+    moved, pipeline = [], small_pipeline("sample")
+    for number, (space, view) in enumerate(zip(inputs.spaces, inputs.views, strict=True)):
+        own = table.space[:, 0] == number
+        rows = int(own.sum())
+        if not rows:
+            continue
+        posture = np.broadcast_to(inputs.hand.tree.joint_open.astype(np.float32), (rows, inputs.hand.dofs))
+        frozen = np.broadcast_to(~space.joints, posture.shape)
+        nothing = hold(view.hand, posture, frozen, (), np.zeros((rows, 0, 7), np.float32), tries=1)
+        predicted = upload_predicted(view.hand, view.field, table.pose[own, 0], table.q[own, 0])
+        given = {"bounds": pipeline.bounds, "space": space, "holding": nothing, "predicted": predicted}
+        grasps = run_stages(
+            pipeline, Context(view.hand, inputs.objects[0], view.field, "cpu", 0, 0, **given), 0, rows, "filter"
+        )
+        moved += np.linalg.norm(grasps.pose[:, :3] - table.pose[own, 0][grasps.index][:, :3], axis=1).tolist()
+    assert len(moved) > 0.35 * len(table)  # of candidates drawn by place one in fifty
+    assert np.median(moved) < 0.002
+
+
+def test_what_is_drawn_becomes_valid_shards(asked, network, tmp_path):
+    pipeline = small_pipeline("sample", width=12, wave=8, waves=6, draws=4)
+    job = SampleJob(**asked, rows=6, pipeline=pipeline, model=network, out=tmp_path / "out")
+    outcome = run(job)
+    (path,) = outcome.paths
+    assert validate_shard(path) == []  # joints of earlier steps are bit by bit the same, among others
+    with ShardReader(path) as reader:
+        assert (reader.column("object_index")[:, 1] >= 0).sum() == 6
+        assert job.pipeline.bounds.met_by({n: reader.column(f"metrics/{n}") for n in job.pipeline.bounds.limits}).all()
+        assert reader.header.config["model"] == "net.pt"
+    assert run(job.changed()).made == 0
+
+
+def test_networks_of_other_hands_are_refused(asked, network, tmp_path):
+    given = {"pipeline": small_pipeline("sample"), "model": network, "out": tmp_path / "out"}
+    with pytest.raises(ConfigError, match=r"net.pt is of hand 'allegro', not of 'leap'"):
+        run(SampleJob(**asked, **given, hand="leap"))
