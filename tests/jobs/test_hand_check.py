@@ -36,9 +36,9 @@ def spoil(jaws: Path, folder: Path, **changes: object) -> str:
 
 
 def test_drafted_gripper_holds_all_three(jaws, tmp_path, swift: Pipeline, cache_root):
-    found = check_hand(str(jaws), swift, out=tmp_path, rows=20, device="cpu", workers=1, cache=Cache(cache_root))
+    found = check_hand(str(jaws), swift, out=tmp_path, rows=10, device="cpu", workers=1, cache=Cache(cache_root))
     assert [o.name for o in found.objects] == ["sphere", "box", "cylinder"]
-    assert [o.rows for o in found.objects] == [20, 20, 20]
+    assert [o.rows for o in found.objects] == [10, 10, 10]
     assert all(o.reasons == [] for o in found.objects)
     assert found.hints == []
     assert [(s.name, s.problem) for s in found.spaces] == [("finger_1-finger_2", "")]

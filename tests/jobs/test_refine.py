@@ -261,7 +261,7 @@ def test_shards_without_rows_are_left_out(source, cache_root, tmp_path):
 def test_a_shard_of_which_no_row_passes_is_empty_and_stays(swift, cache_root, tmp_path):
     """It conforms to the format, and is not computed again."""
     cache = Cache(cache_root)
-    job = {"hand": "allegro", "object": "mug", "rows": 8, "shard_rows": 4, "pipeline": swift, "device": "cpu"}
+    job = {"hand": "allegro", "object": "sphere", "rows": 8, "shard_rows": 4, "pipeline": swift, "device": "cpu"}
     last = generate(GenerateJob(**job, out=tmp_path / "made", workers=1, batch=128, cache=cache)).paths[1]
     shard = read_shard(last)
     pose = shard.grasps.object_pose + np.array([0.1, 0, 0, 0, 0, 0, 0], np.float32)
