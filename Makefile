@@ -53,10 +53,10 @@ format: setup
 type: setup
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# WORKERS test files run side by side, each on one thread; a crash ends the run. Tests start hundreds
-# of processes: bytecode is kept.
+# WORKERS test files run side by side, each on one thread, in their order (few of the last are long);
+# a crash ends the run. Tests start hundreds of processes: bytecode is kept.
 pytest: setup
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 # Pages that are made from the code: docs/reference/cli.md.
 docs: setup

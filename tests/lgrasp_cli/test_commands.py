@@ -185,37 +185,12 @@ def table1(cli, quick, tmp_path_factory):
     slow.write_text(Path(quick).read_text().replace("name: quick", "name: slow"))
     pair = f"{quick},{slow}"
     base = ("bench", "table1", "--objects", "tiny,capsule", "--pipelines", pair, "-n", 10, "--baseline-n", 1)
-    return lambda *more: cli(*base, "--hands", "allegro", "--repeat", 1, "--device", "cpu", *more)
+    base = (*base, "--hands", "allegro", "--repeat", 1, "--set", "search.restarts=3", "--device", "cpu")
+    return lambda *more: cli(*base, *more)
 
 
-def test_bench_table1(table1, tmp_path):
-    result = table1("--json", "t.json", "--plot", "t.png")
-    assert result.code == 0, result.err
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["t.json", "t.png"]
-    assert (tmp_path / "t.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    table = json.loads((tmp_path / "t.json").read_text())
-    assert table["complete"]
-    assert [cell["object"] for cell in table["cells"]] == ["tiny", "capsule"]
-    for cell in table["cells"]:
-        runs = cell["pipelines"]
-        assert {name: run["grasps"] for name, run in runs.items()} == {"quick": 10, "slow": 1}
-        rates = {name: run["strict_valid_per_s"]["median"] for name, run in runs.items()}
-        assert cell["ratio"]["quick"] == rates["quick"] / rates["slow"]
-        wanted = {"survivors", "seconds", "build_seconds", "near_duplicates", "distinct_poses", "published_count_per_s"}
-        assert all(wanted <= set(run) for run in runs.values())
-    tiny, capsule = table["cells"]
-    assert tiny["published_per_s"] is None
-    assert capsule["published_ratio"]["quick"] == rates["quick"] / 1296
-    for text in ("trimmed mean", "quick/slow", "Table 1", "A100", "survivors", "near-dup", "field s"):
-        assert text in result.out
-    assert "[2/2] allegro capsule: quick" in result.err
-    again = table1("--json", "t.json", "--resume")
-    assert again.code == 0
-    assert "run 1/1" not in again.err
-    assert again.out == result.out
-
-
-def test_bench_table1_interrupted(table1, monkeypatch, tmp_path):
+def test_bench_table1(table1, monkeypatch, tmp_path):
+    """It is interrupted, goes on where it was, and has nothing left to do; --set reaches what is measured."""
     from lgrasp.bench.rate import Bench
 
     measure = Bench.measure
@@ -232,11 +207,33 @@ def test_bench_table1_interrupted(table1, monkeypatch, tmp_path):
     assert [cell["object"] for cell in kept["cells"]] == ["tiny"]
     assert not kept["complete"]
     assert [p.name for p in tmp_path.iterdir()] == ["t.json"]
-    result = table1("--json", "t.json", "--resume")
+    result = table1("--json", "t.json", "--resume", "--plot", "t.png")
+    assert result.code == 0, result.err
     assert "tiny, " not in result.err
-    whole = json.loads((tmp_path / "t.json").read_text())
-    assert whole["cells"][0] == kept["cells"][0]
-    assert whole["complete"]
+    assert "[2/2] allegro capsule: quick" in result.err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["t.json", "t.png"]
+    assert (tmp_path / "t.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    table = json.loads((tmp_path / "t.json").read_text())
+    assert table["complete"]
+    assert table["settings"]["set"] == ["search.restarts=3"]
+    assert table["cells"][0] == kept["cells"][0]
+    assert [cell["object"] for cell in table["cells"]] == ["tiny", "capsule"]
+    for cell in table["cells"]:
+        runs = cell["pipelines"]
+        assert {name: run["grasps"] for name, run in runs.items()} == {"quick": 10, "slow": 1}
+        rates = {name: run["strict_valid_per_s"]["median"] for name, run in runs.items()}
+        assert cell["ratio"]["quick"] == rates["quick"] / rates["slow"]
+        wanted = {"survivors", "seconds", "build_seconds", "near_duplicates", "distinct_poses", "published_count_per_s"}
+        assert all(wanted <= set(run) for run in runs.values())
+    tiny, capsule = table["cells"]
+    assert tiny["published_per_s"] is None
+    assert capsule["published_ratio"]["quick"] == rates["quick"] / 1296
+    for text in ("trimmed mean", "quick/slow", "Table 1", "A100", "survivors", "near-dup", "field s"):
+        assert text in result.out
+    again = table1("--json", "t.json", "--resume")
+    assert again.code == 0
+    assert "run 1/1" not in again.err
+    assert again.out == result.out
 
 
 def test_interrupted_bench_leaves_nothing(process, quick, tmp_path, monkeypatch):
@@ -253,11 +250,7 @@ def test_interrupted_bench_leaves_nothing(process, quick, tmp_path, monkeypatch)
     assert list(scratch.iterdir()) == []
 
 
-def test_bench_settings(cli, table1, tmp_path):
-    """--set reaches what is measured, and the table says so; a wrong one is refused before anything runs."""
-    result = table1("--objects", "tiny", "--set", "search.restarts=3", "--json", tmp_path / "t.json")
-    assert result.code == 0, result.err
-    assert json.loads((tmp_path / "t.json").read_text())["settings"]["set"] == ["search.restarts=3"]
+def test_wrong_settings_of_a_bench_are_refused(cli):
     for command in ("table1", "sequence", "refine"):
         refused = cli("bench", command, "--set", "bounds.frction=1", "--device", "cpu")
         assert refused.code == 2
