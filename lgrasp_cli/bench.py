@@ -176,6 +176,9 @@ def bench_sequence(
     pipeline: Annotated[
         str, Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.", **PIPELINE)
     ] = "sequence",
+    model: Annotated[
+        Path | None, Option(help="Also draw with this network of lgrasp learn fit --model diffuser (pipeline sample).")
+    ] = None,
     settings: Settings = None,
     seed: Annotated[int, Option(min=0, help="Seed of the sequences and the grasps.")] = 0,
     device: Device = "auto",
@@ -191,7 +194,7 @@ def bench_sequence(
     """
     check_report(json_path)
     from lgrasp.config import parse_model
-    from lgrasp.jobs.requests.search import SequenceRequest
+    from lgrasp.jobs.requests.search import SampleRequest, SequenceRequest
     from lgrasp.jobs.sets import SequenceSets, object_sequences
 
     pool = objects or ["mug", "sphere", "box", "capsule", "bottle", "bowl"]
@@ -203,18 +206,20 @@ def bench_sequence(
         chosen.with_params("sequence", method=method)
     how = {"scale": scale, "simulate": simulate, "device": device, "workers": workers}
     how |= {"hand": hand, "rows": 1, "pipeline": chosen, "out": gettempdir()}  # nothing is written there
-    asked = [
-        parse_model(SequenceRequest, how | {"objects": names}, "bench sequence")
-        for names in object_sequences(pool, sets, seed)
-    ]
+    drawn = object_sequences(pool, sets, seed)
+    asked = [parse_model(SequenceRequest, how | {"objects": names}, "bench sequence") for names in drawn]
+    if model is not None:
+        own = choose_pipeline("sample", seed).with_params("sequence", policy=policy, width=width)
+        how |= {"pipeline": own, "model": model}
+        asked += [parse_model(SampleRequest, how | {"objects": names}, "bench sequence") for names in drawn]
     for request in asked:
         request.check()
     cache = open_cache(cache_dir)
     from lgrasp.bench.sequence import bench_methods, sequence_page
 
     jobs = [request.job(cache) for request in asked]
-    result = bench_methods(jobs, split(methods), baseline_width, say) | {"set": settings or []}
-    _print(result, json_path, sequence_page(result))
+    result = bench_methods(jobs[: len(drawn)], split(methods), baseline_width, say, jobs[len(drawn) :])
+    _print(result | {"set": settings or []}, json_path, sequence_page(result))
 
 
 @app.command("refine")

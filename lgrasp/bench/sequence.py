@@ -26,9 +26,16 @@ _SHARE = ".1f", " %"
 
 
 def bench_methods(
-    jobs: list[SequenceJob], methods: Sequence[str], baseline_width: int, progress: Callable[[str], None]
+    jobs: list[SequenceJob],
+    methods: Sequence[str],
+    baseline_width: int,
+    progress: Callable[[str], None],
+    drawn: Sequence[SequenceJob] = (),
 ) -> dict[str, Any]:
     """Run each method on the same sequences of objects; methods after the first with ``baseline_width`` attempts.
+
+    Args:
+        drawn: the same sequences drawn by a network, measured as a method more with all their attempts.
 
     Returns:
         ``published``; ``device``, ``simulate`` and ``sequences`` as asked; ``methods``: name -> see
@@ -39,7 +46,9 @@ def bench_methods(
         changes: dict[str, Any] = {"method": method} | ({"width": baseline_width} if found else {})
         own = [job.changed(pipeline=job.pipeline.with_params("sequence", **changes)) for job in jobs]
         found[method] = measure_sequences(own, progress)
-    first = found[methods[0]]["objects"]
+    if drawn:
+        found["diffuser"] = measure_sequences(list(drawn), progress)
+    first = next(iter(found.values()))["objects"]
     for one in found.values():
         one["ratios"] = [
             {name: over(a[name], b[name]) for name in _RATES} for a, b in zip(first, one["objects"], strict=True)
@@ -74,7 +83,7 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
         pipeline, cache, keys = _as_published(job.pipeline), job.cache, job.keys
         inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device)
         scene = make_scene(cache, inputs.hand, object_records(inputs), mesh_blobs(keys.source.urdf), device.alias)
-        inputs = replace(inputs, scene=scene)
+        inputs = job.with_sampler(replace(inputs, scene=scene))
         load_kernels(device.alias, kernel_modules(*job.kernels))
         assert job.simulate
         params = pipeline.params("sequence")
@@ -101,7 +110,7 @@ def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] |
 
 def _as_published(pipeline: Pipeline) -> Pipeline:
     """The pipeline; for an optimiser with the published bounds in place of those of strict validity."""
-    if pipeline.params("sequence").method == "field":
+    if pipeline.params("sequence").method in ("field", "diffuser"):
         return pipeline
     return pipeline.with_bounds(
         max_penetration=0.01, min_self_distance=0.0, max_gap=0.01, max_normal_angle=60.0, max_gswo=1.0
@@ -176,7 +185,7 @@ def sequence_page(result: dict[str, Any]) -> Page:
     for method, found in result["methods"].items():
         title = f"{method}: {found['begun']} attempts started with each sequence"
         tables += [_space_table(title, found["spaces"], published["spaces"])]
-        tables += _object_tables(found["objects"], published)
+        tables += _object_tables(found["objects"], published | published.get(method, {}))
     tables.append(_rate_table(result))
     notes = [
         "hold/tried, hold/begun: of all attempts, as published; the other shares are of what was left of them",

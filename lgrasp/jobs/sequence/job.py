@@ -60,9 +60,14 @@ class SequenceJob(SequenceRequest, SearchJob):
 
     def load_inputs(self, events: Events) -> SequenceInputs:
         pipeline = self.pipeline
-        return load_sequence_inputs(
+        inputs = load_sequence_inputs(
             self.cache, self.keys, pipeline.object, pipeline.field, self.device_used, events.loading
         )
+        return self.with_sampler(inputs)
+
+    def with_sampler(self, inputs: SequenceInputs) -> SequenceInputs:
+        """Inputs with what method diffuser needs."""
+        return inputs
 
     def records(self, inputs: SequenceInputs) -> tuple[HandModel, list[ObjectRecord]]:
         return inputs.hand, object_records(inputs)

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from pydantic import PrivateAttr
 
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Events, Part
+from lgrasp.engine.events import Part
 from lgrasp.errors import ConfigError
 from lgrasp.hand.digest import hand_digest
 from lgrasp.jobs.requests.search import SampleRequest
@@ -53,11 +53,10 @@ class SampleJob(SampleRequest, SequenceJob):
         self.network()  # told at once if it cannot be used
         return super().parts()
 
-    def load_inputs(self, events: Events) -> SequenceInputs:
-        inputs, (net, about, _) = super().load_inputs(events), self.network()
-        models = [obj.model for obj in inputs.objects]
+    def with_sampler(self, inputs: SequenceInputs) -> SequenceInputs:
+        net, about, _ = self.network()
+        models, alias = [obj.model for obj in inputs.objects], inputs.device.alias
         clouds = [surface_cloud(model.vertices, model.faces, about.params.cloud) for model in models]
-        alias = self.device_used.alias
         grids = [coarse_grid(model.vertices, model.faces, closed=model.watertight, device=alias) for model in models]
         sampler = StepSampler(inputs.hand.tree, net, about.params.process, clouds, grids, alias)
         return replace(inputs, sampler=sampler)
