@@ -110,6 +110,14 @@ def test_ratios_of_methods_by_held_and_by_strict_rows(sequences):
     assert rates.rows[2][:3] == ("1", "published", "0.142")  # 256 attempts, 50.04 % of them hold, 900 s
 
 
+def test_a_network_stands_beside_the_published_one(sequences):
+    sequences["methods"]["diffuser"] = sequences["methods"]["field"]
+    tables = sequence_page(sequences).tables
+    assert tables[1].rows[0][6] == "78.1 % (50.0 %)"
+    assert tables[-3].rows[0][6] == "78.1 % (47.0 %)"
+    assert tables[-2].rows[0][1] == "0.50 (5.55)"
+
+
 def test_published_shares_stand_beside_shares_of_all_attempts(sequences):
     spaces, shares, measures, *_ = sequence_page(sequences).tables
     assert spaces.rows == [("thumb-palm", "50", "40", "30", "60.0 %", "17.7 %", "75.0 %")]
