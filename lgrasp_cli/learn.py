@@ -7,8 +7,8 @@ import typer
 from typer import Argument, Option
 
 from lgrasp.choices import NetworkName
-from lgrasp_cli.names import one_of
-from lgrasp_cli.options import CacheDir, Device, Quiet, Shards, given, open_cache
+from lgrasp_cli.names import HAND, OBJECT, PIPELINE, one_of
+from lgrasp_cli.options import CacheDir, Device, Quiet, Shards, choose_pipeline, given, open_cache
 from lgrasp_cli.tables import Answer, Block, following, reporting, took
 from lgrasp_cli.working import How, working
 
@@ -18,11 +18,11 @@ app = typer.Typer(name="learn", help="Train and measure networks that predict gr
 @app.command()
 @working
 def fit(
-    shards: Shards,
     how: How,
+    shards: Annotated[list[Path] | None, Argument(help="Shard files or folders; none for a pose policy.")] = None,
     model: Annotated[str, Option(**one_of(NetworkName, "NETWORK", "What is trained."))] = "coarse",
     out: Annotated[
-        Path | None, Option("--out", "-o", help="File of the network; default: coarse.pt or diffuser.pt.")
+        Path | None, Option("--out", "-o", help="File of the network; default: coarse.pt, diffuser.pt or policy.npz.")
     ] = None,
     steps: Annotated[
         int | None, Option(help="Training steps; default: 1500 (coarse, on poses alone) or 20000 (diffuser).")
@@ -31,33 +31,61 @@ def fit(
         int | None, Option(help="Training steps through the refiner afterwards (coarse); default: 80.")
     ] = None,
     unrolled: Annotated[int | None, Option(help="Unrolled steps of the refiner (coarse); default: 5.")] = None,
-    batch: Annotated[int | None, Option(help="Examples per training step; default: 64 (coarse), 1024.")] = None,
+    batch: Annotated[
+        int | None, Option(help="Examples per training step; default: 64 (coarse), 1024, 512 (pose).")
+    ] = None,
     settings: Annotated[
         list[str] | None,
         Option("--set", metavar="NETWORK.KEY=VALUE", help="Set a parameter, such as diffuser.width=128; repeatable."),
     ] = None,
+    hand: Annotated[str | None, Option(help="Hand of a pose policy; default: allegro.", **HAND)] = None,
+    objects: Annotated[
+        list[str] | None,
+        Option("--object", help="Objects of a pose policy; default: random shapes.", **OBJECT),
+    ] = None,
+    pipeline: Annotated[
+        str | None,
+        Option("--pipeline", "-p", help="Pipeline of a pose policy; default: robust.", **PIPELINE),
+    ] = None,
     seed: Annotated[int, Option(help="Seed of examples, weights and batches.")] = 0,
 ) -> None:
-    """Train a network on the grasps of shards.
+    """Train a network on grasps.
 
     coarse predicts grasps from partial clouds: it is trained on poses, then through unrolled steps of the refiner; the
     report compares energies on clouds outside the training data. diffuser draws the next step of sequences.
+    pose tells which poses to search.
 
     Example: lgrasp learn fit grasps --out coarse.pt
 
     Example: lgrasp learn fit --model diffuser sequences --device cuda:0
     """
     from lgrasp.config import apply_settings, parse_model
+    from lgrasp.errors import ConfigError
+    from lgrasp.jobs.requests.learn import PolicyRequest
     from lgrasp.jobs.requests.shards import DiffuserRequest, FitRequest
     from lgrasp.learn.diffuser.params import DiffuserParams
-    from lgrasp.learn.params import LearnParams
+    from lgrasp.learn.params import LearnParams, PosePolicyParams
 
-    request, kind, show = FitRequest, LearnParams, _show_fit
-    if model == "diffuser":
-        request, kind, show = DiffuserRequest, DiffuserParams, _show_steps
+    kinds: dict[str, Any] = {
+        "coarse": (FitRequest, LearnParams, _show_fit),
+        "diffuser": (DiffuserRequest, DiffuserParams, _show_steps),
+        "pose": (PolicyRequest, PosePolicyParams, _show_policy),
+    }
+    request, kind, show = kinds[model]
+    asked: dict[str, Any] = given(hand=hand, objects=objects or None, pipeline=pipeline)
+    if model == "pose" and shards:
+        raise ConfigError(f"learn fit: {shards[0]}: a pose policy takes no shards, but --hand and --object")
+    if model != "pose":
+        if asked:
+            raise ConfigError(f"learn fit: --{next(iter(asked)).removesuffix('s')} is for --model pose only")
+        if not shards:
+            raise ConfigError("learn fit: name shards to learn from, or give --model pose")
+        asked = {"shards": shards}
+    if pipeline:
+        asked["pipeline"] = choose_pipeline(pipeline)
     chosen = given(steps=steps, joint_steps=joint_steps, unrolled=unrolled, batch=batch, seed=seed)
     params = apply_settings({model: parse_model(kind, chosen, "learn fit")}, settings or (), "learn fit")[model]
-    how.run(how.job(request, "learn fit", shards=shards, out=out, params=params), show)
+    how.run(how.job(request, "learn fit", **asked, out=out, params=params), show)
 
 
 @app.command(name="eval")
@@ -119,3 +147,16 @@ def _show_steps(data: dict[str, Any]) -> list[Block]:
         ("loss", f"{data['loss']:.3f}{seen}"),
     ]
     return [[*pairs, *took(data, "steps"), ("where", data["out"]), following("sample", data["out"], " OBJECT OBJECT")]]
+
+
+def _show_policy(data: dict[str, Any]) -> list[Block]:
+    pairs = [
+        ("hand, objects", f"{data['hand']}; {data['objects']}, {data['held_out']} of them held out"),
+        ("poses", f"{data['poses']:,}; {data['yielding']:,} gave grasps"),
+    ]
+    words = (("reach", "rated in place"), ("contacts", "after the first contacts"))
+    for name, what in words:
+        if data[name] is not None:
+            pairs.append((what, f"{data[name]:.1%} of pairs of poses in the right order, on held-out objects"))
+    use = f"lgrasp generate --hand {data['hand']} --object OBJECT --set place.policy={data['out']}"
+    return [[*pairs, *took(data, "objects"), ("where", data["out"]), ("next", use)]]

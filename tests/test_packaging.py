@@ -22,7 +22,7 @@ ORDER = (
     ("grasp",),
     ("picture",),
     ("simulate", "dataset", "refine"),
-    ("planning", "scenes", "hold", "steer"),
+    ("planning", "scenes", "hold", "steer", "policy"),
     ("stages",),
     ("sequence", "learn"),
     ("engine",),

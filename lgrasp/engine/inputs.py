@@ -28,6 +28,9 @@ from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.resting import RESTING_VERSION, resting_planes
+from lgrasp.policy.arrays import PolicyArrays, upload_policy
+from lgrasp.policy.model import read_policy
+from lgrasp.policy.names import SHIPPED
 from lgrasp.runtime.device import Device
 from lgrasp.stages.context import Keeper
 from lgrasp.steer.arrays import SteerArrays, upload_steering
@@ -67,6 +70,22 @@ class Inputs:
     scene: Any = None  # for a physics simulation, if there is one
     steer: SteerArrays | None = None  # what is asked of grasps
     kept: Keeper = with_default(default_factory=Keeper)  # what stages keep from batch to batch
+
+    def policy(self, path: str | None) -> PolicyArrays | None:
+        """The policy of a file on the device, read once.
+
+        Raises:
+            ConfigError: no pose policy, or of another hand.
+        """
+        if path in (None, SHIPPED):
+            return None
+
+        def make() -> PolicyArrays:
+            policy, hand = read_policy(path), self.hand.model
+            policy.check_hand(hand.name, hand.tree.joint_names, path)
+            return upload_policy(policy, self.device.alias)
+
+        return self.kept.get("policy", path, make)
 
 
 def input_keys(

@@ -172,6 +172,7 @@ def shard_context(pipeline: Pipeline, inputs: Inputs, shard: int) -> Context:
         bounds=pipeline.bounds,
         scene=inputs.scene,
         steer=inputs.steer,
+        policy=inputs.policy(pipeline.params("place").policy),
         realised=pipeline.realised,
         kept=inputs.kept,
     )

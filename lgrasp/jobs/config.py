@@ -110,6 +110,7 @@ KINDS = {
     "simulate": "lgrasp.jobs.requests.shards:SimulateRequest",
     "scenes": "lgrasp.jobs.requests.scenes:SceneRequest",
     "learn": "lgrasp.jobs.requests.shards:FitRequest",
+    "policy": "lgrasp.jobs.requests.learn:PolicyRequest",
     "metrics": "lgrasp.jobs.requests.shards:MetricsRequest",
     "export": "lgrasp.jobs.requests.shards:ExportRequest",
     "compare": "lgrasp.jobs.requests.compare:CompareRequest",

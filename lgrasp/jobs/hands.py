@@ -8,6 +8,8 @@ from lgrasp.hand.find import HandSource, find_hand
 from lgrasp.hand.spec_check import check_spaces
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
+from lgrasp.policy.model import read_policy
+from lgrasp.policy.names import SHIPPED, shipped_policy
 from lgrasp.steer.typed import made_types, typed
 
 
@@ -21,17 +23,29 @@ def hand_source(name: str) -> HandSource:
 
 
 def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
-    """A pipeline whose grasp type, if one is asked for, is told in the words of a hand.
+    """A pipeline whose grasp type and pose policy, if they are asked for, are those of a hand.
 
     Raises:
         HandError: no such hand.
-        ConfigError: see :func:`~lgrasp.steer.typed.typed`.
+        ConfigError: see :func:`~lgrasp.steer.typed.typed`; a policy that is none, or of another hand.
     """
-    if pipeline.steer.grasp_type is None:
+    policy = pipeline.params("place").policy
+    if pipeline.steer.grasp_type is None and policy is None:
         return pipeline
     source = hand_source(hand)
-    steer = typed(pipeline.steer, source.spec, build_tree(read_urdf(source.urdf), source.spec))
-    return pipeline.model_copy(update={"steer": steer})
+    if policy == SHIPPED:
+        # trained where nothing is asked and nothing is in the way
+        free = not (pipeline.steer.asks or pipeline.on_table)
+        shipped = shipped_policy(source.name) if free else None
+        pipeline = pipeline.with_params("place", policy=str(shipped) if shipped else None)
+    if pipeline.steer.grasp_type is None and policy in (None, SHIPPED):
+        return pipeline
+    tree = build_tree(read_urdf(source.urdf), source.spec)
+    if policy not in (None, SHIPPED):
+        read_policy(policy).check_hand(source.name, tree.joint_names, policy)
+    if pipeline.steer.grasp_type is None:
+        return pipeline
+    return pipeline.model_copy(update={"steer": typed(pipeline.steer, source.spec, tree)})
 
 
 def describe_hand(name: str) -> dict[str, Any]:

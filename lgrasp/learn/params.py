@@ -23,3 +23,17 @@ class LearnParams(Params):
     unrolled: int = Field(5, ge=0, le=100, description="Steps K of the refiner that gradients go through.")
     pose_weight: float = Field(0.1, ge=0, le=1.0e6, description="Weight of the loss on poses in joint training.")
     seed: int = Field(0, ge=0, lt=2**31, description="Of the training and of the examples.")
+
+
+class PosePolicyParams(Params):
+    """Examples and training of a pose policy."""
+
+    shapes: int = Field(48, ge=2, le=10_000, description="Random shapes to learn from, where no objects are named.")
+    candidates: int = Field(2048, ge=64, le=10**6, description="Candidates of each object, searched to the end.")
+    draws: int = Field(2, ge=1, le=64, description="Times that the contacts in reach of a pose are drawn.")
+    held_out: float = Field(0.125, gt=0, lt=1, description="Share of the objects that is kept for the report.")
+    batch: int = Field(512, ge=1, le=65_536, description="Poses per training step.")
+    epochs: int = Field(20, ge=1, le=10_000, description="Times that all poses are seen.")
+    rate: float = Field(3.0e-3, gt=0, le=1.0, description="Highest learning rate of AdamW.")
+    decay: float = Field(2.0e-2, ge=0, le=1.0, description="Weight decay.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Of shapes, candidates and the training.")

@@ -15,6 +15,7 @@ from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.predicted import PredictedArrays
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
+from lgrasp.policy.arrays import PolicyArrays, upload_policy
 from lgrasp.seeding import stage_seed
 from lgrasp.steer.arrays import SteerArrays, steer_nothing
 
@@ -62,6 +63,8 @@ class Context:
     """Poses and postures of the candidates in an opposition space; None: they are drawn."""
     steer: SteerArrays | None = None
     """What the user asks of grasps; None: nothing."""
+    policy: PolicyArrays | None = None
+    """What rates poses; None: opposed contacts."""
     realised: bool = True
     """True if the candidates that search combines are already realised (ik comes before search)."""
     salt: int = 0
@@ -82,9 +85,16 @@ class Context:
         """What is asked, everything allowed if nothing is."""
         return self.steer or steer_nothing(self.hand)
 
+    @cached_property
+    def networks(self) -> PolicyArrays:
+        """The networks of the policy, without rows if there is none."""
+        return self.policy or upload_policy(None, self.device)
+
     def changed(self, **changes: Any) -> "Context":
         """A copy with some fields replaced, and what this one has on its device."""
-        return replace(self, **{"holding": self.held, "steer": self.steered} | changes)
+        copy = replace(self, **{"holding": self.held, "steer": self.steered} | changes)
+        copy.__dict__["networks"] = self.networks
+        return copy
 
     def with_salt(self, salt: int) -> "Context":
         """The same in another pass."""

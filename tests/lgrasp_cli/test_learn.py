@@ -89,3 +89,23 @@ def test_files_that_are_no_predictors(cli):
     assert "absent: no such file" in cli("learn", "eval", "net.pt", "absent").error()
     Path("net.pt").write_bytes(data[: len(data) // 2])
     assert "not a predictor" in cli("learn", "eval", "net.pt", "none.h5").error()
+
+
+def test_a_pose_policy_is_trained_and_used(cli, tmp_path):
+    pipeline = tmp_path / "small.yaml"
+    stages = "[place: {samples: 12}, domain: {rounds: 2}, ik: {}, search: {}, filter: {}]"
+    pipeline.write_text(f"name: small\nfield: {{records: 20000}}\nstages: {stages}\n")
+    options = ["--model", "pose", "--pipeline", pipeline, "--device", "cpu", "--object", "sphere", "--object", "tiny"]
+    options += ["--set", "pose.candidates=64", "--set", "pose.epochs=1"]
+    for name in ("a", "b"):
+        done = cli("learn", "fit", *options, "--out", f"{name}.npz", "--json", "fit.json")
+        assert done.code == 0, done
+    assert Path("a.npz").read_bytes() == Path("b.npz").read_bytes()
+    assert "--set place.policy=b.npz" in done.out
+    assert json.loads(Path("fit.json").read_text())["yielding"] > 16
+    use = ["generate", "--object", "tiny", "-n", 5, "--pipeline", pipeline, "--out", "rated", "--device", "cpu"]
+    assert cli(*use, "--set", "place.policy=a.npz").code == 0
+    assert "place.policy: absent.npz: No such file" in cli(*use, "--set", "place.policy=absent.npz").error()
+    assert "a pose policy takes no shards" in cli("learn", "fit", "rated", "--model", "pose").error()
+    assert "--hand is for --model pose only" in cli("learn", "fit", "rated", "--hand", "allegro").error()
+    assert "name shards to learn from" in cli("learn", "fit").error()

@@ -18,3 +18,10 @@ class DomainParams(Params):
         default=1, ge=1, le=16, description="Times that contacts are drawn, later ones where few could be realised."
     )
     enough: int = Field(default=6, ge=1, le=4096, description="Realised contacts of a finger that need no more.")
+    later_cost: float = Field(
+        default=1.5,
+        ge=0,
+        le=100,
+        description="Cost of a pose after the first contacts, over that before; with a policy those that are not worth "
+        "it are dropped. 0: none.",
+    )

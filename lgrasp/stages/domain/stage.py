@@ -9,11 +9,12 @@ from lgrasp.grasp.tables import CandidateTable, PoseTable
 from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
+from lgrasp.stages.domain.chance_kernels import drop_unlikely, rate_contacts
 from lgrasp.stages.domain.kernels import DomainCount, DomainValues, count_realised, draw_domains, drop_poor, keep_frozen
 from lgrasp.stages.domain.params import DomainParams
 from lgrasp.stages.domain.predicted_kernels import add_predicted
 
-VERSION = 3
+VERSION = 4
 
 
 def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Context) -> tuple[CandidateTable, Tally]:
@@ -32,6 +33,7 @@ def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Conte
     values = make_struct(DomainValues, params, context.bounds, **given)
     if isinstance(inputs, CandidateTable):
         table = inputs
+        _drop_unlikely(table, params, context)
         realised = wp.empty(table.count.shape, dtype=wp.int32, device=d)
         wp.launch(count_realised, realised.shape, [table.struct], [realised], device=d)
     else:
@@ -56,6 +58,17 @@ def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Conte
     if context.round == 0:
         wp.launch(drop_poor, table.count.shape[0], [values], [table.struct, tally.device], device=d)
     return table, tally
+
+
+def _drop_unlikely(table: CandidateTable, params: DomainParams, context: Context) -> None:
+    """Poses lose their contacts that a policy, if there is one, finds unlikely to give a grasp."""
+    if context.policy is None or context.space:
+        return
+    n, groups = table.count.shape
+    chance = wp.empty(n, dtype=wp.float32, device=context.device)
+    asked = [groups, context.object.struct, context.policy.contacts, table.struct]
+    wp.launch(rate_contacts, n, asked, [chance], device=context.device)
+    wp.launch(drop_unlikely, n, [chance, params.later_cost], [table.struct], device=context.device)
 
 
 def _stride(points: int) -> int:

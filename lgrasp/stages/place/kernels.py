@@ -11,6 +11,7 @@ from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_GROUPS, MAX_JOINTS
 from lgrasp.math.transforms import random_rotation, rotation_between
 from lgrasp.object.arrays import Object
+from lgrasp.policy.arrays import Network
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.place.rating import rate_pose
 from lgrasp.stages.place.structs import PlaceCount, PlaceValues, ProposedPoses, Rating
@@ -124,6 +125,7 @@ def propose_poses(
     obj: Object,
     params: PlaceValues,
     steer: Steer,
+    policy: Network,
     seed: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
     proposals_out: ProposedPoses,
@@ -215,7 +217,7 @@ def propose_poses(
             rating = Rating.BLOCKED
         if rating == Rating.CLEAR and params.samples > 0:
             numbers = wp.rand_init(wp.randi(state))
-            rating = rate_pose(hand, field, obj, params, steer.groups, T, plane, setting, palm, anchor, numbers)
+            rating = rate_pose(hand, field, obj, params, policy, steer.groups, T, plane, setting, palm, anchor, numbers)
     proposals_out.pose[row, b] = T
     proposals_out.palm_point[row, b] = palm
     proposals_out.surface[row, b] = i

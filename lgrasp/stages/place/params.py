@@ -2,9 +2,10 @@
 
 from typing import ClassVar
 
-from pydantic import Field
+from pydantic import Field, field_serializer
 
 from lgrasp.config import Params
+from lgrasp.policy.names import SHIPPED, policy_digest
 
 NO_BOUND = 10.0
 """[m] farther from the centre of mass than any line between two contacts."""
@@ -38,6 +39,14 @@ class PlaceParams(Params):
         description="Contacts rate a pose when the line between two passes this near the centre of mass [m]; "
         "10, farther than any object is large, bounds nothing.",
     )
+    policy: str | None = Field(
+        default=None,
+        description="What rates poses in place of opposed contacts: a file of 'learn fit --model pose', or hand: the "
+        "one that is shipped with the hand, if there is one.",
+    )
+    policy_proposals: int = Field(
+        default=32, ge=1, le=1024, description="Poses tried per candidate where a policy rates them."
+    )
     table: bool = Field(
         default=False, description="The object rests on a table that grasps leave room for, the way to them included."
     )
@@ -47,3 +56,7 @@ class PlaceParams(Params):
         le=360,
         description="Rolls about the contact normal tried for two points in an opposition space.",
     )
+
+    @field_serializer("policy", when_used="json")
+    def _by_content(self, value: str | None) -> str | None:
+        return value if value in (None, SHIPPED) else policy_digest(value)

@@ -15,7 +15,7 @@ from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.predicted_kernels import propose_predicted
 from lgrasp.stages.place.structs import PlaceCount, PlaceValues, ProposedPoses
 
-VERSION = 5
+VERSION = 7
 
 
 def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Context) -> tuple[PoseTable, Tally]:
@@ -39,7 +39,8 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     if not isinstance(first, wp.array):
         first = wp.full(1, first, dtype=wp.int32, device=d)
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
-    groups, shape = context.hand.model.groups, (count, params.proposals)
+    rated = context.policy is not None and not context.space
+    groups, shape = context.hand.model.groups, (count, params.policy_proposals if rated else params.proposals)
     proposals = empty_struct(ProposedPoses, d, *shape, groups)
     regions = context.object.steered
     # of contacts that must be far from the centre of mass, the line between two is far from it as well
@@ -47,7 +48,10 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     values = make_struct(PlaceValues, params, context.bounds, **shares, max_com_distance=reach)
     where = [context.seed("place"), first]
     if context.space is None:
-        kernel, asked = propose_poses, [hand, field, obj, values, context.steered.struct, *where]
+        kernel, asked = (
+            propose_poses,
+            [hand, field, obj, values, context.steered.struct, context.networks.reach, *where],
+        )
     elif context.predicted is None:
         kernel = propose_opposed
         asked = [hand, field, obj, context.held.struct, values, wp.vec2i(*context.space.groups), *where]

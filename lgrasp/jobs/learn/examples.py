@@ -1,0 +1,130 @@
+"""Examples for a pose policy: poses that the pipeline placed, what was seen there, and whether they gave a grasp."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lgrasp.engine.batch import run_stage
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.field.model import ContactField
+from lgrasp.grasp.structs import State
+from lgrasp.grasp.tables import CandidateTable, PoseTable
+from lgrasp.learn.policy import Seen, join_seen
+from lgrasp.policy.model import MOST_HITS, POINTS
+from lgrasp.policy.score import COUNT_SCALE
+from lgrasp.runtime.tally import Meter
+from lgrasp.stages.context import Context
+from lgrasp.stages.place.observe import Reach, observe_reach
+
+_BATCH = 256  # candidates
+_DRAW_STRIDE = 7919  # between the seeds of draws
+
+
+class PoseExamples(NamedTuple):
+    """Poses of one object, or of several."""
+
+    reach: Seen
+    """What place sees, ``draws`` times the poses."""
+    reach_yields: np.ndarray
+    contacts: Seen
+    """What is realised after the first contacts."""
+    contacts_yields: np.ndarray
+
+
+def join_examples(parts: list[PoseExamples]) -> PoseExamples:
+    """Those of several objects."""
+    reach, reach_yields, contacts, contacts_yields = zip(*parts, strict=True)
+    return PoseExamples(
+        join_seen(list(reach)), np.concatenate(reach_yields), join_seen(list(contacts)), np.concatenate(contacts_yields)
+    )
+
+
+def reach_points(field: ContactField, seed: int) -> np.ndarray:
+    """Points where fingers press towards each other, and between them: (POINTS, 3) base frame [m]."""
+    from scipy.cluster.vq import kmeans2  # slow to load
+
+    pairs = field.pair_point[:: max(1, len(field.pair_point) // 4000)].astype(float)
+    every = np.concatenate([pairs[:, 0], pairs[:, 1], pairs.mean(1)])
+    return kmeans2(every, POINTS, seed=seed, minit="++")[0].astype(np.float32)
+
+
+def make_pose_examples(
+    pipeline: Pipeline, context: Context, points: np.ndarray, candidates: int, draws: int
+) -> PoseExamples:
+    """Search ``candidates`` poses of the context's object to the end.
+
+    Args:
+        points: of the policy, (M, 3) base frame [m].
+        draws: times that the contacts in reach are drawn.
+    """
+    parts = [_batch(pipeline, context, points, first, draws) for first in range(0, candidates, _BATCH)]
+    return join_examples(parts)
+
+
+def _batch(pipeline: Pipeline, context: Context, points: np.ndarray, first: int, draws: int) -> PoseExamples:
+    meter = Meter(context.device)
+    poses = run_stage("place", (first, _BATCH), pipeline, context, meter)
+    index = poses.index.numpy()[: len(poses)]
+    _, com, palm = _placed(poses, context)
+    samples = pipeline.params("place").samples
+    seen = [
+        seen_reach(observe_reach(poses, points, samples, first + draw * _DRAW_STRIDE, context), com, palm)
+        for draw in range(draws)
+    ]
+    table: CandidateTable = poses
+    once = pipeline.with_params("domain", rounds=1)
+    for stage in ("domain", "ik"):
+        table = run_stage(stage, table, once, context, meter)
+    contacts = seen_contacts(table, context)
+    for number in range(1, pipeline.params("domain").rounds):
+        for stage in ("domain", "ik"):
+            table = run_stage(stage, table, once, context.changed(round=number), meter)
+    sets = run_stage("search", table, pipeline, context, meter)
+    grasps = run_stage("filter", sets, pipeline, context, meter)
+    yields = np.isin(index, grasps.index)
+    return PoseExamples(join_seen(seen), np.tile(yields, draws), contacts, yields)
+
+
+def _placed(poses: PoseTable, context: Context) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses (P, 7), the object's centre of mass at each (P, 3) [m], and whether the palm touches (P,)."""
+    pose = poses.pose.numpy()[: len(poses)]
+    com = _turned(pose, np.broadcast_to(context.object.model.com, (len(pose), 3))) + pose[:, :3]
+    return pose, com, poses.palm_point.numpy()[: len(poses)] >= 0
+
+
+def _turned(pose: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors (P, 3) of the object in the base frame, one for each pose (P, 7)."""
+    axis, w = pose[:, 3:6], pose[:, 6:]
+    return v + 2 * np.cross(axis, np.cross(axis, v) + w * v)
+
+
+def seen_reach(reach: Reach, com: np.ndarray, palm: np.ndarray) -> Seen:
+    """What the network of stage place is told, with the centre of mass (P, 3) [m] and whether the palm touches (P,)."""
+    n, groups = reach.share.shape
+    hits = np.zeros((n, groups, MOST_HITS, 6), np.float32)
+    count = np.zeros((n, groups), np.int32)
+    for g in range(groups):
+        mine = reach.owner == g
+        place = np.cumsum(mine, 1) - 1
+        row, k = np.nonzero(mine & (place < MOST_HITS))
+        hits[row, g, place[row, k]] = np.concatenate([reach.points[row, k], reach.normals[row, k]], 1)
+        count[:, g] = np.minimum(mine.sum(1), MOST_HITS)
+    return Seen(hits, count, reach.share, com, palm, reach.distances)
+
+
+def seen_contacts(table: CandidateTable, context: Context) -> Seen:
+    """What the network of stage domain is told of realised contacts."""
+    n = len(table)
+    pose, com, palm = _placed(table.poses, context)
+    used = np.arange(table.state.shape[2]) < table.count.numpy()[:n, :, None]
+    mine = used & (table.state.numpy()[:n] == State.REALISED)
+    place = np.cumsum(mine, 2) - 1
+    row, g, m = np.nonzero(mine & (place < MOST_HITS))
+    i = table.surface.numpy()[:n][row, g, m]
+    model = context.object.model
+    hits = np.zeros((n, mine.shape[1], MOST_HITS, 6), np.float32)
+    p = _turned(pose[row], model.contact_points[i]) + pose[row, :3]
+    hits[row, g, place[row, g, m]] = np.concatenate([p, -_turned(pose[row], model.contact_normals[i])], 1)
+    count = mine.sum(2)
+    none = np.zeros((n, 0), np.float32)
+    return Seen(hits, np.minimum(count, MOST_HITS), count / np.float32(COUNT_SCALE), com, palm, none)

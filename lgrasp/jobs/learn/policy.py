@@ -1,0 +1,159 @@
+"""Train a pose policy for a hand: examples by its pipeline, two networks, one file."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import PrivateAttr
+
+from lgrasp.engine.cache import content_key
+from lgrasp.engine.events import Events, Made, Part, PartProgress
+from lgrasp.engine.folder import Found
+from lgrasp.engine.inputs import InputKeys, Loader, input_keys, object_key
+from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.errors import ConfigError
+from lgrasp.field.arrays import FieldArrays, upload_field
+from lgrasp.files import write_file
+from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.learn.examples import PoseExamples, join_examples, make_pose_examples, reach_points
+from lgrasp.jobs.requests.learn import PolicyRequest
+from lgrasp.learn.policy import fit_network, ranking, rate
+from lgrasp.learn.shapes import random_shape
+from lgrasp.object.arrays import upload_object
+from lgrasp.object.model import ObjectModel
+from lgrasp.object.preprocess import preprocess_object
+from lgrasp.policy.model import PosePolicy, policy_bytes, read_policy
+from lgrasp.stages.context import Context
+
+_VERSION = 1
+_LEAST = 16  # poses that gave a grasp
+
+
+class PolicyJob(PolicyRequest, Job):
+    """A pose policy of one hand: one file.
+
+    The report tells, of objects that were not trained on, how well the networks rank poses: the share of pairs of a
+    pose that gave a grasp and one that did not in which the first is rated higher.
+    """
+
+    command: ClassVar[str] = "learn fit"
+    part: ClassVar[str] = "file"
+    one_key: ClassVar[bool] = False
+    differs: ClassVar[str] = "another hand, other objects or parameters"
+
+    _keys: InputKeys | None = PrivateAttr(None)
+    _field: FieldArrays | None = PrivateAttr(None)
+    _hand: HandArrays | None = PrivateAttr(None)
+
+    @property
+    def folder(self) -> Path:
+        return self.out.parent
+
+    @property
+    def learned(self) -> Pipeline:
+        """The pipeline whose grasps count, with several poses of each candidate."""
+        return self.pipeline.with_params("place", policy=None, proposals=3)
+
+    @property
+    def keys(self) -> InputKeys:
+        """Content keys of hand and field."""
+        if self._keys is None:
+            self._keys = input_keys(hand_source(self.hand), None, 1.0, self.pipeline.object, self.pipeline.field)
+        return self._keys
+
+    def key(self) -> str:
+        params = self.pipeline.object
+        objects = [object_key(name, self.scale, params)[1] for name in self.objects]
+        made = {"pipeline": self.learned.describe(), "params": self.params.model_dump(mode="json"), "objects": objects}
+        return content_key("policy", _VERSION, hand=self.keys.hand, field=self.keys.field, **made)
+
+    def parts(self) -> list[Part]:
+        return [Part(0, self.out, self.count)]
+
+    @property
+    def count(self) -> int:
+        """Objects to learn from."""
+        return len(self.objects) or self.params.shapes
+
+    def found(self, part: Part) -> Found:
+        return Found(read_policy(part.file).about.get("run_key"), part.rows)
+
+    def about(self) -> dict[str, Any]:
+        return {"hand": self.keys.source.name, "objects": list(self.objects), "pipeline": self.pipeline.name}
+
+    def load(self, events: Events, missing: bool) -> None:
+        if not missing:
+            return
+        for stage, _ in self.pipeline.sections:
+            assert stage.run  # imported now, so that its kernels are compiled before
+        load, alias = Loader(self.cache, self.device_used.alias, events.loading), self.device_used.alias
+        model = load.hand(self.keys.source, self.keys.hand)
+        self._hand = upload_hand(model, alias)
+        self._field = upload_field(load.field(self._hand, self.keys.field, self.pipeline.field), model, alias)
+
+    def make(self, part: Part, progress: PartProgress) -> Made:
+        assert self._hand is not None
+        assert self._field is not None
+        p, hand = self.params, self._hand.model
+        points = reach_points(self._field.model, p.seed)
+        start = time.perf_counter()
+        examples: list[PoseExamples] = []
+        with ThreadPoolExecutor(self.threads()) as pool:
+            for found in pool.map(lambda number: self._examples(number, points), range(self.count)):
+                examples.append(found)
+                progress(len(examples), f"{sum(int(e.contacts_yields.sum()) for e in examples):,} poses gave grasps")
+        seconds = {"examples": time.perf_counter() - start}
+        order = np.random.default_rng(p.seed).permutation(self.count)
+        held = max(1, round(p.held_out * self.count))
+        train, test = (join_examples([examples[k] for k in some]) for some in (order[held:], order[:held]))
+        if train.contacts_yields.sum() < _LEAST:
+            raise ConfigError(
+                f"{int(train.contacts_yields.sum())} poses gave grasps; at least {_LEAST} are needed to learn from: "
+                f"raise candidates or shapes"
+            )
+        start = time.perf_counter()
+        nets = [fit_network(train.reach, train.reach_yields, p), fit_network(train.contacts, train.contacts_yields, p)]
+        seconds["training"] = time.perf_counter() - start
+        report = {
+            "hand": hand.name,
+            "objects": ", ".join(self.objects) or f"{self.count} random shapes",
+            "held_out": held,
+            "poses": len(train.contacts_yields) + len(test.contacts_yields),
+            "yielding": int(train.contacts_yields.sum() + test.contacts_yields.sum()),
+            "reach": ranking(rate(nets[0], test.reach), test.reach_yields),
+            "contacts": ranking(rate(nets[1], test.contacts), test.contacts_yields),
+            "seconds": seconds,
+        }
+        about = {"run_key": self.key(), "report": {k: v for k, v in report.items() if k != "seconds"}}
+        reach, contacts = (net.weights() for net in nets)
+        made = PosePolicy(hand.name, hand.tree.joint_names, hand.groups, points, reach, contacts, about)
+        return Made(part.rows, policy_bytes(made), report)
+
+    def _examples(self, number: int, points: np.ndarray) -> PoseExamples:
+        assert self._hand is not None
+        assert self._field is not None
+        p, alias = self.params, self.device_used.alias
+        obj = upload_object(self._object(number), alias)
+        learned = self.learned
+        context = Context(self._hand, obj, self._field, alias, p.seed, number, bounds=learned.bounds)
+        return make_pose_examples(learned, context, points, p.candidates, p.draws)
+
+    def _object(self, number: int) -> ObjectModel:
+        params, alias = self.pipeline.object, self.device_used.alias
+        if self.objects:
+            path, key = object_key(self.objects[number], self.scale, params)
+            return Loader(self.cache, alias).object(path, key, self.scale, params)
+        return preprocess_object(random_shape(self.params.seed, number), params=params, device=alias)
+
+    def write(self, part: Part, contents: Any) -> None:
+        write_file(part.file, contents)
+
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
+        if not outcome.paths:
+            return {}
+        report = read_policy(self.out).about["report"] | {"out": str(self.out)}
+        return report | (outcome.results[0] if outcome.results else {})

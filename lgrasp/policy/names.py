@@ -1,0 +1,46 @@
+"""Where pose policies are: beside the rules of hands, or files of users; light to import."""
+
+import hashlib
+from pathlib import Path
+
+from lgrasp.errors import ConfigError
+from lgrasp.hand.names import known_hands
+
+SHIPPED = "hand"
+"""Stands for the policy that is shipped with a hand, if there is one."""
+
+_NAME = "pose_policy.npz"
+_MOST_BYTES = 2 << 20
+
+
+def shipped_policy(hand: str) -> Path | None:
+    """The policy beside the rules of a known hand."""
+    folder = known_hands().get(hand)
+    return folder / _NAME if folder and (folder / _NAME).is_file() else None
+
+
+def policy_file(path: str | Path) -> bytes:
+    """What the file of a policy holds.
+
+    Raises:
+        ConfigError: it cannot be read, or is too large to be one.
+    """
+    try:
+        with open(Path(path).expanduser(), "rb") as file:
+            data = file.read(_MOST_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(
+            f"place.policy: {path}: {error.strerror}; give a file of 'lgrasp learn fit --model pose', or {SHIPPED}"
+        ) from None
+    if len(data) > _MOST_BYTES:
+        raise ConfigError(f"place.policy: {path} is larger than {_MOST_BYTES:,} bytes, so it is no pose policy")
+    return data
+
+
+def policy_digest(path: str | Path) -> str:
+    """SHA-256 of the file of a policy.
+
+    Raises:
+        ConfigError: see :func:`policy_file`.
+    """
+    return hashlib.sha256(policy_file(path)).hexdigest()

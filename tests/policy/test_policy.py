@@ -1,0 +1,187 @@
+"""Pose policies: what they prefer is searched, what they find unlikely is dropped."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from lgrasp.engine.batch import run_batch, run_stages
+from lgrasp.engine.shard import shard_context
+from lgrasp.errors import ConfigError
+from lgrasp.field.arrays import Field
+from lgrasp.grasp.collision import resting_plane
+from lgrasp.grasp.structs import Poses
+from lgrasp.grasp.tables import CandidateTable, PoseTable
+from lgrasp.hand.arrays import Hand
+from lgrasp.jobs.hands import for_hand
+from lgrasp.jobs.learn.examples import seen_contacts, seen_reach
+from lgrasp.learn.params import PosePolicyParams
+from lgrasp.learn.policy import PoseNet, Seen, fit_network, ranking, rate
+from lgrasp.math.limits import MAX_GROUPS
+from lgrasp.object.arrays import Object
+from lgrasp.policy.arrays import Network, upload_policy
+from lgrasp.policy.model import MOST_HITS, POINTS, policy_bytes, read_policy
+from lgrasp.stages.domain.chance_kernels import BLOCK, drop_unlikely, rate_contacts
+from lgrasp.stages.place.observe import observe_reach
+from lgrasp.stages.place.rating import MAX_HITS, chance_of, find_reach
+
+CANDIDATES = 2 * BLOCK
+
+
+@pytest.fixture
+def searched(swift, inputs):
+    """searched(policy, **place): the grasps of the first candidates, contacts drawn twice."""
+
+    def searched(policy=None, cut=CANDIDATES, **place):
+        pipeline = swift.with_params("place", policy=policy and str(policy), **place).with_params("domain", rounds=2)
+        context = shard_context(pipeline, inputs, 0)
+        return [run_batch(pipeline, context, first, cut) for first in range(0, CANDIDATES, cut)]
+
+    return searched
+
+
+def test_objects_are_where_the_policy_wants_them(searched, policy):
+    def side(found):
+        (batch,) = found
+        return batch.counts["place"]["kept"], batch.grasps.pose[:, 0]
+
+    kept, ahead = side(searched(policy(x=50.0), policy_proposals=4))
+    also, behind = side(searched(policy(x=-50.0), policy_proposals=4))
+    assert min(kept, also) > CANDIDATES // 2
+    assert min(len(ahead), len(behind)) > 5
+    assert ahead.mean() > behind.mean() + 0.01
+    assert np.quantile(ahead, 0.3) > np.quantile(behind, 0.3)
+
+
+def test_a_policy_without_weights_changes_nothing(searched, policy):
+    (without,) = searched(proposals=5)
+    (rated,) = searched(policy(), policy_proposals=5)
+    assert len(without.grasps) > 20
+    np.testing.assert_array_equal(rated.grasps.q, without.grasps.q)
+    np.testing.assert_array_equal(rated.grasps.pose, without.grasps.pose)
+
+
+def test_cutting_the_stream_gives_the_same_rows(searched, policy):
+    path = policy(x=50.0)
+    (whole,), parts = searched(path), searched(path, cut=BLOCK)
+    assert len(parts) == 2
+    np.testing.assert_array_equal(whole.grasps.q, np.concatenate([part.grasps.q for part in parts]))
+
+
+@wp.kernel
+def _rate_again(
+    hand: Hand,
+    field: Field,
+    obj: Object,
+    samples: int,
+    poses: Poses,
+    net: Network,
+    seed: int,
+    chance_out: wp.array(dtype=float),
+):
+    """Log-odds of the contacts that are in reach with the same draws (P,)."""
+    row = wp.tid()
+    points = wp.zeros(shape=(MAX_HITS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_HITS,), dtype=wp.vec3)
+    owner = wp.zeros(shape=(MAX_HITS,), dtype=wp.int32)
+    share = wp.zeros(shape=(MAX_GROUPS,), dtype=wp.float32)
+    anchor = wp.zeros(shape=(MAX_GROUPS,), dtype=wp.int32)
+    for g in range(hand.kin.groups):
+        anchor[g] = poses.anchor[row, g]
+    T = poses.pose[row]
+    plane = resting_plane(obj, T, poses.resting[row])
+    state = wp.rand_init(seed, row)
+    m = find_reach(
+        hand, field, obj, samples, 63, T, plane, poses.setting[row], anchor, points, normals, owner, share, state
+    )
+    chance_out[row] = chance_of(net, obj, T, points, normals, share, owner, m, poses.palm_point[row])
+
+
+def test_kernels_and_torch_give_the_same_odds(swift, context, policy, inputs):
+    torch.manual_seed(1)
+    nets = [PoseNet(inputs.hand.model.groups, points).eval() for points in (POINTS, 0)]
+    points = np.random.default_rng(0).uniform(-0.1, 0.15, (POINTS, 3)).astype(np.float32)
+    made = read_policy(policy(reach=nets[0].weights(), contacts=nets[1].weights(), points=points))
+    networks = upload_policy(made, "cpu")
+    table: CandidateTable = run_stages(swift, context, 0, 200, "ik")
+    n = len(table)
+    chance = wp.zeros(table.count.shape[0], dtype=wp.float32, device="cpu")
+    asked = [inputs.hand.model.groups, context.object.struct, networks.contacts, table.struct]
+    wp.launch(rate_contacts, len(chance), asked, [chance], device="cpu")
+    contacts = seen_contacts(table, context)
+    some = contacts.count.sum(1) > 0
+    odds = rate(nets[1], contacts)
+    assert some.sum() > 50
+    assert np.ptp(odds) > 0.01
+    np.testing.assert_allclose(chance.numpy()[:n][some], 1 / (1 + np.exp(-odds[some])), atol=1e-4)
+    seen = seen_reach(observe_reach(table.poses, points, 24, 5, context), contacts.com, contacts.palm)
+    assert seen.count.sum() > 200
+    again = wp.zeros(n, dtype=wp.float32, device="cpu")
+    where = [context.hand.struct, context.field.struct, context.object.struct]
+    wp.launch(_rate_again, n, [*where, 24, table.poses.struct, networks.reach, 5], [again], device="cpu")
+    np.testing.assert_allclose(again.numpy(), rate(nets[0], seen), atol=1e-3)
+
+
+def test_poses_go_on_while_they_are_worth_it(context):
+    """Against every number of poses that may go on: the best by chances per cost."""
+    rng, cost = np.random.default_rng(3), 1.5
+    chance = np.concatenate([rng.beta(0.3, 4, BLOCK), rng.uniform(0.5, 0.9, BLOCK)]).astype(np.float32)
+    index = np.arange(2 * BLOCK, dtype=np.int32)
+    poses = PoseTable.empty("cpu", len(index), 1, index=wp.array(index, device="cpu"))
+    poses.rows.fill_(len(index))
+    count = wp.full((len(index), 1), 3, dtype=wp.int32, device="cpu")
+    table = CandidateTable.empty("cpu", len(index), 1, 3, poses=poses, count=count)
+    given = wp.array(chance, dtype=wp.float32, device="cpu")
+    wp.launch(drop_unlikely, len(index), [given, cost], [table.struct], device="cpu")
+    stay = count.numpy()[:, 0] > 0
+    for block in (slice(BLOCK), slice(BLOCK, None)):
+        best = np.sort(chance[block])[::-1]
+        gain = best.cumsum() / (BLOCK + cost * np.arange(1, BLOCK + 1))
+        np.testing.assert_array_equal(stay[block], chance[block] >= best[gain.argmax()])
+    assert 1 < stay[:BLOCK].sum() < BLOCK - 20
+    assert stay[BLOCK:].sum() > BLOCK - 20
+
+
+def test_a_network_learns_where_objects_are_held():
+    rng, n = np.random.default_rng(0), 4000
+    hits = rng.normal(0, 0.03, (n, 2, MOST_HITS, 6)).astype(np.float32)
+    count, com = rng.integers(0, MOST_HITS + 1, (n, 2)), rng.normal(0, 0.03, (n, 3)).astype(np.float32)
+    seen = Seen(hits, count, count / 48, com, np.zeros(n, bool), np.zeros((n, 0), np.float32))
+    yields = (count.min(1) >= 3) & (com[:, 0] > 0)
+    net = fit_network(seen, yields, PosePolicyParams.model_validate({"epochs": 40, "batch": 256}))
+    found = ranking(rate(net, seen), yields)
+    assert found is not None
+    assert found > 0.97
+    assert ranking(np.zeros(n), yields) == pytest.approx(0.5)
+    assert ranking(np.zeros(3), np.zeros(3, bool)) is None
+
+
+def test_keys_go_by_what_a_policy_holds(swift, policy):
+    a, b, c = policy(x=1.0), policy(x=1.0), policy(x=2.0)
+    keys = [swift.with_params("place", policy=str(path)).describe() for path in (a, b, c)]
+    assert keys[0] == keys[1] != keys[2]
+
+
+def test_refused_files(swift, policy, tmp_path, inputs):
+    def refused(path, hand="allegro"):
+        with pytest.raises(ConfigError) as error:
+            for_hand(swift.with_params("place", policy=str(path)), hand)
+        assert "\n" not in str(error.value)
+        return str(error.value)
+
+    good = policy()
+    assert for_hand(swift.with_params("place", policy=str(good)), "allegro").params("place").policy == str(good)
+    assert f"{good} is of hand 'allegro' with 16 joints, not of 'barrett'" in refused(good, "barrett")
+    assert "No such file" in refused(tmp_path / "absent.npz")
+    cut = tmp_path / "cut.npz"
+    cut.write_bytes(good.read_bytes()[:-100])
+    assert "is no pose policy" in refused(cut)
+    other = read_policy(good)
+    assert "weights of shape" in refused(policy(reach=other.contacts))
+    other.reach.rows[0, 0] = np.nan
+    (tmp_path / "nan.npz").write_bytes(policy_bytes(other))
+    assert "not finite" in refused(tmp_path / "nan.npz")
+    np.savez(tmp_path / "pickled.npz", about=np.array([{}], dtype=object))
+    assert "is no pose policy" in refused(tmp_path / "pickled.npz")
+    (tmp_path / "large.npz").write_bytes(bytes(3 << 20))
+    assert "larger than" in refused(tmp_path / "large.npz")
