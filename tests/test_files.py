@@ -102,6 +102,7 @@ WRITTEN_BY_HAND = {
     "lgrasp/hand/drafting/vary.py": "a folder that is whole or absent",
     "lgrasp/hand/drafting/write.py": "a folder that is whole or absent",
     "lgrasp/jobs/learn/job.py": "a predictor in memory",
+    "lgrasp/learn/diffuser/file.py": "a network in memory",
     "lgrasp/judge/files.py": "a file that is whole or absent; the judge stands alone",
     "lgrasp/judge/run.py": "a temporary folder",
     "lgrasp/object/load.py": "reads a scene",
