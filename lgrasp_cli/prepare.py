@@ -118,6 +118,7 @@ _STAGES = {
     "place": "Sample poses of the object in front of the palm, without collision.",
     "domain": "Find the contacts that each finger can make at each pose.",
     "ik": "Move fingers to their contacts and keep those that do not collide with the object.",
+    "wrap": "Lay further links of these fingers on the object.",
     "search": "Combine contacts into sets that balance.",
     "filter": "Complete the grasps and check them exactly.",
     "hold": "Try in a fast simulation how finished grasps hold.",
@@ -125,7 +126,7 @@ _STAGES = {
 
 
 def _up_to(stage: str):
-    usual = "robust-hold" if stage == "hold" else "robust"
+    usual = {"hold": "robust-hold", "wrap": "power"}.get(stage, "robust")
 
     def run(
         mesh: Mesh,

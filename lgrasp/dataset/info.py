@@ -87,6 +87,7 @@ SURVIVORS = {
     "place": "kept",
     "domain": "rich",
     "ik": "kept",
+    "wrap": "wrapped",
     "search": "sets",
     "filter": "kept",
     "refine": "tried",

@@ -22,6 +22,7 @@ from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
+from lgrasp.hand.params import LISTED, HandParams
 from lgrasp.notices import notice
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
@@ -54,6 +55,7 @@ class InputKeys:
     hand: str
     object: str
     field: str
+    hands: HandParams = LISTED
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,12 @@ class Inputs:
 
 
 def input_keys(
-    source: HandSource, mesh: str | None, scale: float, objects: ObjectParams, fields: FieldParams
+    source: HandSource,
+    mesh: str | None,
+    scale: float,
+    objects: ObjectParams,
+    fields: FieldParams,
+    hands: HandParams = LISTED,
 ) -> InputKeys:
     """Find the object of a hand and compute the content keys of their artifacts.
 
@@ -97,10 +104,16 @@ def input_keys(
         HandError, ObjectError: see :func:`hand_digest`, :func:`object_key`.
     """
     digest = hand_digest(source.urdf, source.spec)
-    hand_key = content_key("hand", HAND_VERSION, content=digest)
+    hand_key = hand_model_key(digest, hands)
     field_key = content_key("field", FIELD_VERSION, hand=hand_key, params=fields.model_dump(mode="json"))
     path, key = (None, "") if mesh is None else object_key(mesh, scale, objects)
-    return InputKeys(source, path, hand_key, key, field_key)
+    return InputKeys(source, path, hand_key, key, field_key, hands)
+
+
+def hand_model_key(digest: str, hands: HandParams = LISTED) -> str:
+    """Content key of the model of a hand, given the :func:`hand_digest` of it."""
+    described = {} if hands == LISTED else hands.model_dump(mode="json")
+    return content_key("hand", HAND_VERSION, content=digest, **described)
 
 
 def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str]:
@@ -137,11 +150,16 @@ class Loader:
         self.hits: dict[str, bool] = {}
         """By kind: True if all came from the cache."""
 
-    def hand(self, source: HandSource, key: str) -> HandModel:
+    def hand(self, source: HandSource, key: str, hands: HandParams = LISTED) -> HandModel:
         def make() -> HandModel:
             from lgrasp.geometry.decompose import decompose
             from lgrasp.hand.build import build_hand  # slow to load, as all that makes what is not cached
 
+            if hands.contact_links == "all":
+                from lgrasp.hand.whole_hand import whole_hand
+
+                listed = self.hand(source, hand_model_key(hand_digest(source.urdf, source.spec)))
+                return whole_hand(source, listed, self.device)
             return build_hand(source.urdf, source.spec, self.device, decompose=partial(decompose, store=self.cache))
 
         return self.get("hand", HandModel, key, make)
@@ -207,7 +225,7 @@ def load_inputs(
     """
     assert keys.mesh is not None
     load, alias = Loader(cache, device.alias, report), device.alias
-    hand_model = load.hand(keys.source, keys.hand)
+    hand_model = load.hand(keys.source, keys.hand, keys.hands)
     touching = find_touching(steer, hand_model, keys.source.spec.fingers)
     object_model = load.object(keys.mesh, keys.object, scale, objects)
     planes = load.planes(object_model, keys.object) if table and not steer.above else steer.plane

@@ -11,6 +11,7 @@ from lgrasp.engine.registry import SEQUENCE, STAGES, Stage, check_order
 from lgrasp.errors import ConfigError
 from lgrasp.field.params import FieldParams
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.hand.params import LISTED, HandParams
 from lgrasp.notices import notice
 from lgrasp.object.params import ObjectParams
 from lgrasp.stages.migration import ALIASES, move_to_bounds, stage_name
@@ -20,7 +21,7 @@ _ORDER_VERSION = 2
 """Raised whenever the same candidates give the rows of a shard in another order."""
 
 
-_PARTS = ("bounds", "steer", "object", "field")
+_PARTS = ("bounds", "steer", "hand", "object", "field")
 
 
 class _Head(Params):
@@ -37,6 +38,7 @@ class _Declared(_Head):
 
     bounds: dict[str, Any] = Field(default_factory=dict)
     steer: dict[str, Any] = Field(default_factory=dict)
+    hand: dict[str, Any] = Field(default_factory=dict)
     object: dict[str, Any] = Field(default_factory=dict)
     field: dict[str, Any] = Field(default_factory=dict)
     stages: list[dict[str, dict[str, Any] | None]]
@@ -48,6 +50,7 @@ class Pipeline(_Head):
 
     bounds: GraspBounds = GraspBounds()
     steer: Steering = NOTHING
+    hand: HandParams = LISTED
     object: ObjectParams
     field: FieldParams
     stages: tuple[tuple[str, SerializeAsAny[BaseModel]], ...]
@@ -117,7 +120,8 @@ class Pipeline(_Head):
         """A copy with parameters replaced and checked.
 
         Args:
-            settings: ``PART.KEY=VALUE`` each; a part is ``bounds``, ``steer``, ``object``, ``field`` or a stage.
+            settings: ``PART.KEY=VALUE`` each; a part is ``bounds``, ``steer``, ``hand``, ``object``, ``field`` or a
+                stage.
 
         Raises:
             ConfigError: an unknown part or key, or a value out of range.
@@ -165,6 +169,7 @@ class Pipeline(_Head):
             "order": _ORDER_VERSION,
             "bounds": self.bounds.describe(),
             **({"steer": self.steer.describe()} if self.steer.asks else {}),
+            **({"hand": self.hand.model_dump(mode="json")} if self.hand != LISTED else {}),
             "stages": [{s.name: {"version": s.version, **p.model_dump(mode="json")}} for s, p in self.sections],
         }
 
@@ -204,6 +209,7 @@ def load_pipeline(name: str) -> Pipeline:
         **{name: getattr(declared, name) for name in _Head.model_fields},
         bounds=parse_model(GraspBounds, declared.bounds, f"{where}, bounds"),
         steer=parse_model(Steering, declared.steer, f"{where}, steer"),
+        hand=parse_model(HandParams, declared.hand, f"{where}, hand"),
         object=parse_model(ObjectParams, declared.object, f"{where}, object"),
         field=parse_model(FieldParams, declared.field, f"{where}, field"),
         stages=tuple(stages),

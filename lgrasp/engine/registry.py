@@ -44,6 +44,7 @@ STAGES: dict[str, Stage] = {
     "place": Stage("place", "lgrasp.stages.place", "PlaceParams"),
     "domain": Stage("domain", "lgrasp.stages.domain", "DomainParams"),
     "ik": Stage("ik", "lgrasp.stages.ik", "IkParams"),
+    "wrap": Stage("wrap", "lgrasp.stages.wrap", "WrapParams"),
     "search": Stage("search", "lgrasp.stages.search", "SearchParams"),
     "filter": Stage("filter", "lgrasp.stages.filter", "FilterParams"),
     "refine": Stage("refine", "lgrasp.stages.refine", "RefineParams"),
@@ -54,8 +55,13 @@ STAGES: dict[str, Stage] = {
 SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
 """How a pipeline continues with the next object: not a stage of one object, but with its own parameters and version."""
 
-ORDERS = (("place", "domain", "ik", "search", "filter"), ("place", "domain", "search", "ik", "filter"))
-"""Accepted orders: contacts realised before they are combined, or (the published order) after."""
+ORDERS = (
+    ("place", "domain", "ik", "search", "filter"),
+    ("place", "domain", "ik", "wrap", "search", "filter"),
+    ("place", "domain", "search", "ik", "filter"),
+)
+"""Accepted orders: contacts realised before they are combined, fingers perhaps wrapped, or (the published order)
+realised after."""
 
 OPTIONAL = ("refine", "hold", "simulate")
 """Stages that may follow, in this order: grasps are refined, tried, simulated."""

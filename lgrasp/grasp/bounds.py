@@ -54,6 +54,7 @@ class GraspBounds(Params):
     min_object_distance: float = Field(
         default=0.0005, ge=0, le=0.05, description="Least distance of the object from objects held."
     )
+    min_contacts: int = Field(default=2, ge=2, le=7, description="Fewest contacts, each on a link of its own.")
     friction: float = Field(default=0.5, gt=0, le=2, description="Friction coefficient of every measure.")
     torque_scale: float = Field(
         default=10.0, gt=0, le=1000, description="Weight of torque against force in fswo, gswo [1/m]."

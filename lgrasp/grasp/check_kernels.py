@@ -100,9 +100,11 @@ def check_postures(
         at_out.chosen[i, g] = -1
         group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
     touching = int(0)
+    contacts = int(0)
     for k in range(at_out.contact.shape[1]):
         c = at_out.contact[i, k]
         if c >= 0:
+            contacts += 1
             g = hand.body_group[places.body[c]]
             if g >= 0:
                 at_out.chosen[i, g] = k
@@ -115,7 +117,8 @@ def check_postures(
     found_out.gap[i] = fit[0]
     found_out.facing[i] = fit[1]
     outcome = KEPT
-    if touching < 2 or fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
+    few = touching < 2 or contacts < limits.min_contacts
+    if few or fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
         outcome = CONTACT
     for b in range(G):
         for a in range(b + 2):

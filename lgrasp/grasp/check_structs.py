@@ -21,6 +21,7 @@ class Limits:
     allowed_penetration: wp.float32
     min_self_distance: wp.float32
     min_object_distance: wp.float32
+    min_contacts: wp.int32
     friction: wp.float32
     torque_scale: wp.float32
     max_gswo: wp.float32

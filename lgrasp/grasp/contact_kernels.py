@@ -29,6 +29,7 @@ class PalmarRuns:
     body: wp.array(dtype=wp.int32)  # (r,)
     link: wp.array(dtype=wp.int32)  # (r,) index in link_names
     grid: wp.array(dtype=wp.int32)  # (r,) mesh of the link, -1 none
+    place: wp.array(dtype=wp.int32)  # (r,) contact point of the hand that stands for the run
 
 
 @wp.struct
@@ -36,8 +37,7 @@ class RunContacts:
     """Findings on n hands, run by run."""
 
     gap: wp.array2d(dtype=wp.float32)  # (n, r) [m], -1 without contact
-    point: wp.array2d(dtype=wp.vec3)  # (n, r) on the object, its internal frame [m]
-    normal: wp.array2d(dtype=wp.vec3)  # (n, r) outward
+    surface: wp.array2d(dtype=wp.int32)  # (n, r) contact point of the object
 
 
 @wp.kernel
@@ -68,6 +68,9 @@ def link_contacts(
         first = group_forward(hand.kin, g, group_dofs(hand.kin, g, q, i), X, 0)
         B = X[runs.body[s] - 1 - first]
     T = T_object * B
+    ball = hand.pieces.body_sphere[runs.body[s]]
+    if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(ball[0], ball[1], ball[2]))) > ball[3] + limits.max_gap:
+        return
     best = limits.max_gap
     c = int(-1)
     for k in range(runs.first[s], runs.first[s + 1]):
@@ -102,8 +105,7 @@ def link_contacts(
         facing = wp.min(fit[1], fit[2])
     if wp.dot(m, n) > limits.min_spread_cosine and facing > limits.min_cosine and best < limits.max_gap:
         found_out.gap[i, s] = best
-        found_out.point[i, s] = obj.contact_points[beside]
-        found_out.normal[i, s] = m
+        found_out.surface[i, s] = beside
 
 
 @wp.kernel
@@ -111,22 +113,19 @@ def choose_contacts(
     hand: Hand,
     runs: PalmarRuns,
     found: RunContacts,
-    link_out: wp.array2d(dtype=wp.int32),
-    point_out: wp.array(dtype=wp.vec3),
-    normal_out: wp.array(dtype=wp.vec3),
+    run_out: wp.array2d(dtype=wp.int32),
+    surface_out: wp.array2d(dtype=wp.int32),
 ):
     """The contacts that are kept, C at most: the nearest of each group (palm included) first, then of the others.
 
     Args:
-        link_out: (n, C) index in link_names, -1 none.
-        point_out: (n * C,) on the object [m].
-        normal_out: (n * C,) outward.
+        run_out: (n, C) run that touches, -1 none.
+        surface_out: (n, C) contact point of the object, -1 none.
     """
     i = wp.tid()
     taken = wp.zeros(shape=(_MAX_RUNS,), dtype=wp.int32)
     has = wp.zeros(shape=(_MAX_GROUPS,), dtype=wp.int32)
-    width = link_out.shape[1]
-    for k in range(width):
+    for k in range(run_out.shape[1]):
         best = int(-1)
         least = float(1.0e30)
         for s in range(found.gap.shape[1]):
@@ -135,10 +134,36 @@ def choose_contacts(
                 if worth < least:
                     least = worth
                     best = s
-        link_out[i, k] = -1
+        run_out[i, k] = best
+        surface_out[i, k] = -1
         if best >= 0:
             taken[best] = 1
             has[hand.body_group[runs.body[best]] + 1] = 1
-            link_out[i, k] = runs.link[best]
-            point_out[i * width + k] = found.point[i, best]
-            normal_out[i * width + k] = found.normal[i, best]
+            surface_out[i, k] = found.surface[i, best]
+
+
+@wp.kernel
+def tell_contacts(
+    obj: Object,
+    runs: PalmarRuns,
+    run: wp.array2d(dtype=wp.int32),
+    surface: wp.array2d(dtype=wp.int32),
+    link_out: wp.array2d(dtype=wp.int32),
+    point_out: wp.array(dtype=wp.vec3),
+    normal_out: wp.array(dtype=wp.vec3),
+):
+    """Chosen contacts in words that hold without the runs.
+
+    Args:
+        run: (n, C) as of :func:`choose_contacts`, as the next.
+        surface: (n, C) contact point of the object.
+        link_out: (n, C) index in link_names, -1 none.
+        point_out: (n * C,) on the object [m].
+        normal_out: (n * C,) outward.
+    """
+    i, k = wp.tid()
+    link_out[i, k] = -1
+    if run[i, k] >= 0:
+        link_out[i, k] = runs.link[run[i, k]]
+        point_out[i * run.shape[1] + k] = obj.contact_points[surface[i, k]]
+        normal_out[i * run.shape[1] + k] = obj.contact_normals[surface[i, k]]

@@ -1,17 +1,28 @@
 """Where hands in a posture touch an object, for rows whose contacts are not known."""
 
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import ContactTable
-from lgrasp.grasp.check_structs import device_limits
-from lgrasp.grasp.contact_kernels import PalmarRuns, RunContacts, choose_contacts, link_contacts
+from lgrasp.grasp.check_structs import Limits, device_limits
+from lgrasp.grasp.contact_kernels import PalmarRuns, RunContacts, choose_contacts, link_contacts, tell_contacts
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.surface import ContactSurface, contact_surface
 from lgrasp.math.qp import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.runtime.structs import empty_struct, upload_struct
+
+
+class LinkTouches(NamedTuple):
+    """Contacts of n hands, C at most each, on a device."""
+
+    run: wp.array
+    """Run of palmar points that touches, -1 for none, (n, C) i32."""
+    surface: wp.array
+    """Contact point of the object, -1 for none, (n, C) i32."""
 
 
 def find_contacts(
@@ -29,24 +40,45 @@ def find_contacts(
         q: joint positions [rad or m], (n, K).
         palmar: where the hand may touch; default: where hand.yaml lets it.
     """
-    d, n, side = hand.device, len(q), palmar or contact_surface(hand.model)
-    first, width = _runs(side.link), contact_width(side.link)
-
-    link = side.link[first[:-1]]
-    known = {int(x): k for k, x in enumerate(hand.model.grid_link)}
-    grid = np.array([known.get(int(x), -1) for x in link])
-    points = {"points": side.points, "normals": side.normals}
-    runs = upload_struct(
-        PalmarRuns, d, points | {"first": first, "body": side.body[first[:-1]], "link": link, "grid": grid}
-    )
-    found = empty_struct(RunContacts, d, n, len(link))
+    d = hand.device
+    runs = palmar_runs(hand, palmar or contact_surface(hand.model))
     at = [wp.array(pose, dtype=wp.transform, device=d), wp.array(q, dtype=wp.float32, device=d)]
-    inputs = [hand.struct, obj.struct, device_limits(bounds), runs, *at]
-    wp.launch(link_contacts, (len(link), n), inputs, [found], device=d)
+    found = touching_links(hand, obj, device_limits(bounds), runs, *at)
     out = ContactTable(
-        wp.empty((n, width), dtype=wp.int32, device=d),
-        *(wp.zeros(n * width, dtype=wp.vec3, device=d) for _ in range(2)),
+        wp.empty(found.run.shape, dtype=wp.int32, device=d),
+        *(wp.zeros(found.run.size, dtype=wp.vec3, device=d) for _ in range(2)),
     )
+    wp.launch(tell_contacts, found.run.shape, [obj.struct, runs, *found], list(out), device=d)
+    return out
+
+
+def palmar_runs(hand: HandArrays, side: ContactSurface, place: np.ndarray | None = None) -> PalmarRuns:
+    """A palmar side on the device of its hand.
+
+    Args:
+        place: contact point of the hand that each point is, (n,); default: none is needed.
+    """
+    first, known = _runs(side.link), {int(x): k for k, x in enumerate(hand.model.grid_link)}
+    link = side.link[first[:-1]]
+    each = {"body": side.body[first[:-1]], "link": link, "grid": np.array([known.get(int(x), -1) for x in link])}
+    each["place"] = first[:-1] if place is None else place[first[:-1]]
+    points = {"points": side.points, "normals": side.normals}
+    return upload_struct(PalmarRuns, hand.device, points | {"first": first} | each)
+
+
+def touching_links(
+    hand: HandArrays, obj: ObjectArrays, limits: Limits, runs: PalmarRuns, pose: wp.array, q: wp.array
+) -> LinkTouches:
+    """:func:`find_contacts` on a device.
+
+    Args:
+        pose: (n,) transforms T_hand_object of the object's internal frame.
+        q: joint positions [rad or m], (n, K).
+    """
+    d, n, count = hand.device, pose.shape[0], runs.link.shape[0]
+    found = empty_struct(RunContacts, d, n, count)
+    wp.launch(link_contacts, (count, n), [hand.struct, obj.struct, limits, runs, pose, q], [found], device=d)
+    out = LinkTouches(*(wp.empty((n, min(MAX_CONTACTS, count)), dtype=wp.int32, device=d) for _ in range(2)))
     wp.launch(choose_contacts, n, [hand.struct, runs, found], list(out), device=d)
     return out
 

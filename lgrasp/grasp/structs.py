@@ -6,6 +6,9 @@ import warp as wp
 
 from lgrasp.math.kinematics import vec_dof
 
+FURTHER = wp.constant(2)
+"""Most further contacts of a candidate: those of other links of its finger."""
+
 
 class State(IntEnum):
     """What is known of a candidate."""
@@ -40,6 +43,18 @@ class Candidates:
     record: wp.array3d(dtype=wp.int32)  # (P, G, M) contact vector of the field
     state: wp.array3d(dtype=wp.int32)  # (P, G, M) State
     q: wp.array3d(dtype=vec_dof)  # (P, G, M) joint seed or realised posture [rad or m]
+    further: wp.array3d(dtype=wp.vec2i)  # (P, G, M) object contact points of other links, -1 none; or (0, 0, 0)
+
+
+@wp.func
+def further_contacts(candidates: Candidates, row: wp.int32, g: wp.int32, m: wp.int32):
+    """How many further contacts a candidate has."""
+    n = int(0)
+    if candidates.further.shape[2] > 0:
+        for k in range(FURTHER):
+            if candidates.further[row, g, m][k] >= 0:
+                n += 1
+    return n
 
 
 @wp.struct

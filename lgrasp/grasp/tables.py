@@ -95,6 +95,7 @@ class CandidateTable(DeviceTable):
     record: wp.array
     state: wp.array
     q: wp.array
+    further: wp.array
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -103,6 +104,8 @@ class CandidateTable(DeviceTable):
         """As of every table; 0 in places beyond ``count``, which are never written."""
         out = super().arrays()
         used = np.arange(out["surface"].shape[2]) < out["count"][..., None]  # (P, G, M)
+        if out["further"].size:
+            out["further"] = np.where(used[..., None], out["further"], -1).astype(np.int32)
         same = {name: np.where(used, out[name], 0).astype(out[name].dtype) for name in ("surface", "record", "state")}
         return out | same | {"q": np.where(used[..., None], out["q"], 0).astype(out["q"].dtype)}
 
@@ -159,7 +162,10 @@ def select_poses(table: CandidateTable, rows: np.ndarray, device: str) -> Candid
         columns = {name: getattr(part, name) for name in part.names()}
         if len(rows) == 0:
             return {n: wp.empty((0, *a.shape[1:]), dtype=a.dtype, device=device) for n, a in columns.items()}
-        return {n: wp.indexedarray(a, [chosen] + [None] * (a.ndim - 1)).contiguous() for n, a in columns.items()}
+        return {
+            n: wp.indexedarray(a, [chosen] + [None] * (a.ndim - 1)).contiguous() if a.shape[0] else a
+            for n, a in columns.items()
+        }
 
     poses = PoseTable(**take(table.poses), rows=wp.full(1, len(rows), dtype=wp.int32, device=device))
     return CandidateTable(poses, **take(table))

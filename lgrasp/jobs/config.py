@@ -111,7 +111,6 @@ KINDS = {
     "scenes": "lgrasp.jobs.requests.scenes:SceneRequest",
     "learn": "lgrasp.jobs.requests.shards:FitRequest",
     "policy": "lgrasp.jobs.requests.learn:PolicyRequest",
-    "diffuser": "lgrasp.jobs.requests.shards:DiffuserRequest",
     "metrics": "lgrasp.jobs.requests.shards:MetricsRequest",
     "export": "lgrasp.jobs.requests.shards:ExportRequest",
     "compare": "lgrasp.jobs.requests.compare:CompareRequest",

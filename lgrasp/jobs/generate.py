@@ -70,7 +70,7 @@ class GenerateJob(GenerateRequest, SearchJob):
         """Content keys of hand, object and field."""
         if self._keys is None:
             source, pipeline = hand_source(self.hand), self.pipeline
-            self._keys = input_keys(source, self.object, self.scale, pipeline.object, pipeline.field)
+            self._keys = input_keys(source, self.object, self.scale, pipeline.object, pipeline.field, pipeline.hand)
         return self._keys
 
     @property

@@ -8,9 +8,12 @@ from lgrasp.hand.find import HandSource, find_hand
 from lgrasp.hand.spec_check import check_spaces
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
+from lgrasp.notices import notice
 from lgrasp.policy.model import read_policy
 from lgrasp.policy.names import SHIPPED, shipped_policy
 from lgrasp.steer.typed import made_types, typed
+
+_TWO = 2  # contacts that any grasp has
 
 
 def hand_source(name: str) -> HandSource:
@@ -23,12 +26,14 @@ def hand_source(name: str) -> HandSource:
 
 
 def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
-    """A pipeline whose grasp type and pose policy, if they are asked for, are those of a hand.
+    """A pipeline whose grasp type and pose policy, if they are asked for, are those of a hand; one line tells where it
+    asks for more contacts than the hand has fingers and palm, and it then asks for so many.
 
     Raises:
         HandError: no such hand.
         ConfigError: see :func:`~lgrasp.steer.typed.typed`; a policy that is none, or of another hand.
     """
+    pipeline = _within_reach(pipeline, hand)
     policy = pipeline.params("place").policy
     if pipeline.steer.grasp_type is None and policy is None:
         return pipeline
@@ -46,6 +51,19 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
     if pipeline.steer.grasp_type is None:
         return pipeline
     return pipeline.model_copy(update={"steer": typed(pipeline.steer, source.spec, tree)})
+
+
+def _within_reach(pipeline: Pipeline, hand: str) -> Pipeline:
+    least = pipeline.bounds.min_contacts
+    if least <= _TWO:
+        return pipeline
+    source = hand_source(hand)
+    fingers = build_tree(read_urdf(source.urdf), source.spec).groups
+    most = max(_TWO, fingers + bool(source.spec.palm.links))
+    if least <= most:
+        return pipeline
+    notice(f"hand '{source.name}': bounds.min_contacts is {most}, not {least}: its fingers and palm")
+    return pipeline.with_bounds(min_contacts=most)
 
 
 def describe_hand(name: str) -> dict[str, Any]:

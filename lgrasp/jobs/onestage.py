@@ -66,7 +66,7 @@ def run_up_to(
     if last not in pipeline.order:
         raise ConfigError(f"pipeline {pipeline.name} has no stage {last}; its stages: {', '.join(pipeline.order)}")
     pipeline, used = for_hand(pipeline, hand), resolve_device(device)
-    keys = input_keys(hand_source(hand), mesh, scale, pipeline.object, pipeline.field)
+    keys = input_keys(hand_source(hand), mesh, scale, pipeline.object, pipeline.field, pipeline.hand)
     stages = pipeline.order[: pipeline.order.index(last) + 1]
     files = _stage_keys(pipeline, keys, stages, first, count, shard)
     found = {stage: arrays for stage in stages if (arrays := cache.load(stage, files[stage])) is not None}

@@ -12,14 +12,15 @@ from pydantic import ValidationError
 from lgrasp.cloud.model import cloud_object
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import Cache, content_key
-from lgrasp.engine.inputs import OBJECT_VERSION, Loader, object_key
+from lgrasp.engine.inputs import OBJECT_VERSION, Loader, hand_model_key, object_key
 from lgrasp.errors import HandError, ShardError
 from lgrasp.files import scratch_folder
 from lgrasp.grasp.hand_files import write_hand
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource, rules_of_known
-from lgrasp.hand.model import HAND_VERSION, HandModel
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.params import LISTED, HandParams
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
@@ -57,7 +58,7 @@ def hand_of_shard(
     source = _with_rules(_files(record), record, config)
     if source.note:
         cache.warn(f"the shard does not hold the rules of its hand '{record.name}'; taken are {source.note}")
-    return _built(cache, source, device)
+    return _built(cache, source, device, _surface(config))
 
 
 def object_of_shard(
@@ -115,9 +116,18 @@ def mesh_hash(record: ObjectRecord) -> str:
     return h.hexdigest()
 
 
-def _built(cache: Cache, source: HandSource, device: Device) -> tuple[HandSource, HandModel]:
-    key = content_key("hand", HAND_VERSION, content=hand_digest(source.urdf, source.spec))
-    return source, Loader(cache, device.alias).hand(source, key)
+def _built(
+    cache: Cache, source: HandSource, device: Device, hands: HandParams = LISTED
+) -> tuple[HandSource, HandModel]:
+    key = hand_model_key(hand_digest(source.urdf, source.spec), hands)
+    return source, Loader(cache, device.alias).hand(source, key, hands)
+
+
+def _surface(config: Mapping[str, Any]) -> HandParams:
+    """What of the hand the rows of a shard may touch, by its ``config``."""
+    pipeline = config.get("pipeline")
+    told = pipeline.get("hand", {}) if isinstance(pipeline, dict) else {}
+    return HandParams.model_validate(told) if isinstance(told, dict) else LISTED
 
 
 def _files(record: HandRecord) -> Path:

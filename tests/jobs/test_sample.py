@@ -14,10 +14,8 @@ from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.held import hold
 from lgrasp.grasp.predicted import upload_predicted
-from lgrasp.jobs.config import load_requests
 from lgrasp.jobs.learn.diffuser import DiffuserJob
 from lgrasp.jobs.learn.sequences import read_steps
-from lgrasp.jobs.requests.shards import DiffuserRequest
 from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.sequence.round import run_round
 from lgrasp.jobs.sequence.sample import SampleJob
@@ -83,14 +81,6 @@ def test_steps_are_those_of_the_rows(shards, cache, inputs):
     touched = np.einsum("nij,nj->ni", T[:, :3, :3], rows.contact_points[one, 0, 0]) + T[:, :3, 3]
     away = np.linalg.norm(touched - steps.t.numpy()[one], axis=1)
     np.testing.assert_allclose(away, float(radius.mean()), atol=2e-3)
-
-
-def test_a_config_asks_for_a_training(shards, tmp_path):
-    path = tmp_path / "job.yaml"
-    path.write_text(f"job: diffuser\nshards: [{shards}]\nparams: {{steps: 7, process: flow}}\n")
-    (asked,) = load_requests(str(path), {})
-    assert isinstance(asked, DiffuserRequest)
-    assert (asked.params.steps, asked.params.process, asked.out.name) == (7, "flow", "diffuser.pt")
 
 
 def test_training_learns_and_the_seed_decides(network, shards, cache, tmp_path):

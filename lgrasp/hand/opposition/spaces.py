@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lgrasp.errors import HandError
-from lgrasp.hand.contacts import LinkGrid, body_cones, side_points
+from lgrasp.hand.contacts import body_cones, side_points
 from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.spec import Cone, HandSpec, Surface
@@ -18,6 +18,7 @@ from lgrasp.hand.spec_check import side_links
 from lgrasp.hand.surface import ContactLink, contact_arrays, with_bare_links
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf, read_urdf
+from lgrasp.hand.whole_hand import link_grids
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,18 +138,11 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
     urdf, tree = read_urdf(urdf_path), model.tree
     links = [link for side in space_sides(urdf, spec, tree, name, device) for link in side]
     meshes = {link.link: link_meshes(urdf, tree, link.link) for link in links}
-    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=_grids(model))
+    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=link_grids(model))
     arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
     described = spec.opposition_spaces[name].model_dump(mode="json")
     digest = hashlib.sha256(json.dumps([model.sha256, name, described]).encode()).hexdigest()
     return replace(model, sha256=digest, contacts=(), **arrays)
-
-
-def _grids(model: HandModel) -> dict[str, LinkGrid]:
-    """Distance grids of the hand's own contact links."""
-    names, parts = model.tree.link_names, np.split(model.grid_values, model.grid_first[1:-1])
-    rows = zip(model.grid_link, parts, model.grid_shape, model.grid_origin, model.grid_cell, strict=True)
-    return {names[k]: LinkGrid(part.reshape(shape), origin, float(cell)) for k, part, shape, origin, cell in rows}
 
 
 def _outside(surface: Surface) -> tuple[Cone, ...]:

@@ -39,7 +39,8 @@ def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Conte
     else:
         n = inputs.index.shape[0]
         count, state = (wp.zeros((n, groups, params.keep)[:axes], dtype=wp.int32, device=d) for axes in (2, 3))
-        table = CandidateTable.empty(d, n, groups, params.keep, poses=inputs, count=count, state=state)
+        none = wp.empty((0, 0, 0), dtype=wp.vec2i, device=d)
+        table = CandidateTable.empty(d, n, groups, params.keep, poses=inputs, count=count, state=state, further=none)
         realised = wp.empty((0, 0), dtype=wp.int32, device=d)
     hand, field, boxes = context.hand.struct, context.field.struct, context.field.boxes
     wp.launch(

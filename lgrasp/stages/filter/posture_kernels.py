@@ -6,6 +6,7 @@ from lgrasp.field.arrays import Field, field_seed
 from lgrasp.grasp.check_kernels import fit_contacts, hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Places
 from lgrasp.grasp.collision import body_clear, body_height, resting_plane
+from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.grasp.outcomes import CONTACT, KEPT, OBJECT_COLLISION, SELF_COLLISION, UNUSED_FINGER
 from lgrasp.hand.arrays import Hand
@@ -53,9 +54,9 @@ def place_touching(
             at_out.posture[i, g] = held.posture[h, g]
             group_forward(hand.kin, g, held.posture[h, g], X, hand.kin.joint_first[g])
     k = int(0)
-    for g in range(G + 1):
-        at_out.contact[i, g] = -1
-        at_out.surface[i, g] = -1
+    for slot in range(at_out.contact.shape[1]):
+        at_out.contact[i, slot] = -1
+        at_out.surface[i, slot] = -1
     for g in range(G + 1):
         s = int(-1)
         c = int(-1)
@@ -170,3 +171,66 @@ def fill_unused(
             if found == 0:
                 found_out.outcome[i] = UNUSED_FINGER
                 return
+
+
+@wp.kernel
+def tell_postures(
+    hand: Hand, at: CheckedPostures, pose_out: wp.array(dtype=wp.transform), q_out: wp.array2d(dtype=wp.float32)
+):
+    """Hands as poses of the object and joint positions.
+
+    Args:
+        pose_out: (n,) T_hand_object.
+        q_out: (n, K) [rad or m].
+    """
+    i = wp.tid()
+    pose_out[i] = at.pose[at.of[i]]
+    for g in range(hand.kin.groups):
+        first = hand.kin.dof_first[g]
+        for d in range(hand.kin.dof_first[g + 1] - first):
+            q_out[i, hand.kin.dof_index[first + d]] = at.posture[i, g][d]
+
+
+@wp.kernel
+def take_contacts(
+    hand: Hand,
+    limits: Limits,
+    places: Places,
+    runs: PalmarRuns,
+    run: wp.array2d(dtype=wp.int32),
+    surface: wp.array2d(dtype=wp.int32),
+    at_out: CheckedPostures,
+    found_out: Findings,
+):
+    """Contacts that were found on the final postures join those that were chosen, one of each link.
+
+    Args:
+        run: (n, C) as of :func:`~lgrasp.grasp.contact_kernels.choose_contacts`, as the next.
+        surface: (n, C) contact point of the object.
+    """
+    i = wp.tid()
+    if found_out.outcome[i] != KEPT:
+        return
+    width = at_out.contact.shape[1]
+    n = int(0)
+    for k in range(width):
+        if at_out.contact[i, k] >= 0:
+            n += 1
+    for k in range(run.shape[1]):
+        r = run[i, k]
+        fresh = r >= 0 and n < width
+        for c in range(n):
+            if fresh and places.link[at_out.contact[i, c]] == runs.link[wp.max(r, 0)]:
+                fresh = False
+        if fresh:
+            at_out.contact[i, n] = runs.place[r]
+            at_out.surface[i, n] = surface[i, k]
+            g = hand.body_group[runs.body[r]]
+            if g >= 0 and at_out.chosen[i, wp.max(g, 0)] < 0:
+                at_out.chosen[i, g] = n
+            n += 1
+    fit = fit_contacts(hand, places, at_out, i)
+    found_out.gap[i] = fit[0]
+    found_out.facing[i] = fit[1]
+    if n < limits.min_contacts or fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
+        found_out.outcome[i] = CONTACT

@@ -5,12 +5,20 @@ import warp as wp
 from lgrasp.grasp.check import Check
 from lgrasp.grasp.check_kernels import OTHERS, TOUCHING
 from lgrasp.grasp.check_structs import CheckedPostures, Places, device_limits, new_findings
+from lgrasp.grasp.find_contacts import contact_width, touching_links
 from lgrasp.grasp.tables import ContactSets, GraspTable, trim_sets
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally
+from lgrasp.stages.allowed import allowed_runs
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.params import FilterParams
-from lgrasp.stages.filter.posture_kernels import SetCandidates, fill_unused, place_touching
+from lgrasp.stages.filter.posture_kernels import (
+    SetCandidates,
+    fill_unused,
+    place_touching,
+    take_contacts,
+    tell_postures,
+)
 
 VERSION = 8
 
@@ -28,7 +36,10 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     d, n = context.device, inputs.pose.shape[0]
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
     limits, held = device_limits(context.bounds), context.held.struct
-    at = _postures(inputs, context)
+    width = context.hand.model.groups + 1
+    if params.contacts == "all":
+        width = max(width, contact_width(context.hand.model.contact_link))
+    at = _postures(inputs, width, context)
     sets = make_struct(SetCandidates, inputs.candidates.poses, inputs.candidates)
     places = make_struct(Places, hand.contacts, points=obj.contact_points, normals=obj.contact_normals)
     found = new_findings(n, at.contact.shape[1], d)
@@ -42,12 +53,25 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     check.measure(OTHERS)
     if context.space:
         check.measure_held()
+    if params.contacts == "all":
+        _take_all(check, context)
     return check.kept(context.seed("filter", 1))
 
 
-def _postures(inputs: ContactSets, context: Context) -> CheckedPostures:
+def _take_all(check: Check, context: Context) -> None:
+    """Contacts of further links that touch join those that search combined."""
+    d, n, hand = context.device, len(check), context.hand.struct
+    pose, q = wp.empty(n, dtype=wp.transform, device=d), wp.empty((n, context.hand.model.dofs), dtype=float, device=d)
+    wp.launch(tell_postures, n, [hand, check.at], [pose, q], device=d)
+    runs = allowed_runs(context)
+    found = touching_links(context.hand, context.object, check.limits, runs, pose, q)
+    inputs = [hand, check.limits, check.places, runs, *found]
+    wp.launch(take_contacts, n, inputs, [check.at, check.found], device=d)
+
+
+def _postures(inputs: ContactSets, width: int, context: Context) -> CheckedPostures:
     d, n, model, poses = context.device, inputs.pose.shape[0], context.hand.model, inputs.candidates.poses
-    contact, surface = (wp.empty((n, model.groups + 1), dtype=wp.int32, device=d) for _ in range(2))
+    contact, surface = (wp.empty((n, width), dtype=wp.int32, device=d) for _ in range(2))
     body = wp.empty((n, len(model.piece_first) - 2), dtype=wp.transform, device=d)
     given = {
         "pose": poses.pose,

@@ -5,7 +5,7 @@ from enum import IntEnum
 import warp as wp
 
 from lgrasp.grasp.collision import body_depth
-from lgrasp.grasp.structs import Candidates, Sets
+from lgrasp.grasp.structs import FURTHER, Candidates, Sets, further_contacts
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.constants import INSCRIBED
@@ -33,15 +33,20 @@ class SearchCount(IntEnum):
 
 @wp.kernel
 def list_usable(obj: Object, state: wp.int32, candidates: Candidates, usable_out: Usable):
-    """Candidates of each (pose, group) in one State."""
+    """Candidates of each (pose, group) in one State, those whose finger touches with most links first."""
     row, g = wp.tid()
     n = int(0)
-    for m in range(candidates.count[row, g]):
-        if candidates.state[row, g, m] == state:
-            usable_out.candidate[row, g, n] = m
-            if usable_out.point.shape[2] > 0:
-                usable_out.point[row, g, n] = obj.contact_points[candidates.surface[row, g, m]]
-            n += 1
+    ranks = wp.where(usable_out.ranked == 1, FURTHER + 1, 1)
+    for r in range(ranks):
+        for m in range(candidates.count[row, g]):
+            wanted = candidates.state[row, g, m] == state
+            if wanted and usable_out.ranked == 1:
+                wanted = further_contacts(candidates, row, g, m) == FURTHER - r
+            if wanted:
+                usable_out.candidate[row, g, n] = m
+                if usable_out.point.shape[2] > 0:
+                    usable_out.point[row, g, n] = obj.contact_points[candidates.surface[row, g, m]]
+                n += 1
     usable_out.size[row, g] = n
 
 
@@ -75,19 +80,28 @@ def _contacts(
     points: vec3s,
     normals: vec3s,
 ):
-    """Number of contacts of a set, the palm's last, in ``points`` and ``normals``."""
+    """Number of contacts of a set, in ``points`` and ``normals``: one of each finger, the palm's, then those of their
+    other links."""
     n = int(0)
     for g in range(tried.chosen.shape[2]):
         if tried.chosen[row, lane, g] >= 0:
             n = put_contact(obj, candidates.surface[row, g, tried.chosen[row, lane, g]], n, points, normals)
     if candidates.poses.palm_surface[row] >= 0:
         n = put_contact(obj, candidates.poses.palm_surface[row], n, points, normals)
+    if candidates.further.shape[2] > 0:
+        for k in range(FURTHER):
+            for g in range(tried.chosen.shape[2]):
+                m = tried.chosen[row, lane, g]
+                if m >= 0 and n < MAX_CONTACTS:
+                    s = candidates.further[row, g, wp.max(m, 0)][k]
+                    if s >= 0:
+                        n = put_contact(obj, s, n, points, normals)
     return n
 
 
 @wp.kernel
 def check_balance(hits: Hits, obj: Object, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
-    """Scores of hits go below 0 when friction does not balance them."""
+    """Scores of hits go below 0 when they have too few contacts, or friction does not balance them."""
     row, lane = _hit(hits, tried_out, wp.tid())
     if row < 0:
         return
@@ -95,6 +109,9 @@ def check_balance(hits: Hits, obj: Object, params: SearchValues, candidates: Can
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     n = _contacts(obj, candidates, tried_out, row, lane, points, normals)
+    if n < params.min_contacts:
+        tried_out.score[row, lane] = -1.0
+        return
     centred(points, n, arms)
     if not balances(arms, normals, n, params.friction * _INSCRIBED, params.torque_scale, params.max_gswo):
         tried_out.score[row, lane] = -1.0

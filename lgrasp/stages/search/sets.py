@@ -26,6 +26,7 @@ class SearchValues:
     contacts: vec_kinds
     kinds: wp.int32  # entries of ``contacts``
     least: wp.int32  # fewest finger contacts
+    min_contacts: wp.int32  # of fingers' links and the palm
     threshold: wp.float32  # of the squared residual
     friction: wp.float32
     max_gswo: wp.float32
@@ -52,6 +53,7 @@ class Usable:
     candidate: wp.array3d(dtype=wp.int32)  # (P, G, M) which: the first ``size``
     sunk: wp.array3d(dtype=wp.int32)  # (P, G, M) 1: in the object, 0: clear, -1: unknown; or (0, 0, 0)
     point: wp.array3d(dtype=wp.vec3)  # (P, G, M) where they are on the object [m]; (0, 0, 0) if nobody asks
+    ranked: wp.int32  # 1: those of most contacts come first, and are drawn more often
 
 
 @wp.struct
@@ -117,7 +119,10 @@ MEASURES = {"fswo": _frictionless, "gswo": _with_friction}
 def any_usable(usable: Usable, row: wp.int32, g: wp.int32, u: wp.float32):
     """One of the usable candidates of a group, u in [0, 1)."""
     n = usable.size[row, g]
-    return usable.candidate[row, g, wp.min(int(u * float(n)), n - 1)]
+    at = u
+    if usable.ranked == 1:
+        at = u * u
+    return usable.candidate[row, g, wp.min(int(at * float(n)), n - 1)]
 
 
 @wp.func

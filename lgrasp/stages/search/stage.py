@@ -31,7 +31,7 @@ from lgrasp.stages.search.params import MAX_KINDS, SearchParams
 from lgrasp.stages.search.sets import FoundSets, Hits, SearchValues, TriedSets, Usable, vec_kinds
 from lgrasp.stages.search.swap_kernels import swap_contacts
 
-VERSION = 8
+VERSION = 9
 
 _CPU_STARTS = 2  # of a pose in one launch
 _GPU_STARTS = 10
@@ -58,6 +58,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     shape = (n, groups, keep) if exact else (0, 0, 0)
     given: dict[str, Any] = {"sunk": wp.full(shape, -1, dtype=wp.int32, device=d)}
     given |= {"point": wp.empty((0, 0, 0), dtype=wp.vec3, device=d)} if swap else {}
+    given["ranked"] = int(inputs.further.shape[2] > 0)
     usable = empty_struct(Usable, d, n, groups, keep, **given)
     hand, obj, values = context.hand.struct, context.object.struct, _values(params, context)
     state = State.REALISED if context.realised else State.DRAWN

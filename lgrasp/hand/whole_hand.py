@@ -1,0 +1,67 @@
+"""The hand as a whole-hand grasp sees it: the palmar side of every finger link may touch."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lgrasp.hand.contacts import LinkGrid
+from lgrasp.hand.find import HandSource
+from lgrasp.hand.geometry import link_meshes
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.surface import ContactLink, contact_arrays
+from lgrasp.hand.surface_visibility import visible_surface
+from lgrasp.hand.urdf import read_urdf
+
+_LEAST_POINTS = 12  # of a link's samples that the fingertips see
+_MOST_POINTS = 160  # of a finger link
+_PALMAR_COSINE = np.cos(np.radians(80.0))  # to the axis away from the palmar side, above which a normal is not palmar
+
+
+def whole_hand(source: HandSource, model: HandModel, device: str = "cpu") -> HandModel:
+    """The same hand, whose other finger links may touch too: with the side that the mean fingertip sees.
+
+    Links that hand.yaml lists keep their surface. Of the others a contact may slide wherever the normal is within 100
+    degrees of the mean of the side's.
+
+    Args:
+        source: what ``model`` was built from. device: answers the geometric queries.
+    """
+    tree, urdf, links = model.tree, read_urdf(source.urdf), listed_links(model)
+    side = visible_surface(source, model, device)
+    for link in np.setdiff1d(side.link, model.grid_link):
+        name, own = tree.link_names[link], side.link == link
+        if tree.group_of(name) >= 0 and own.sum() >= _LEAST_POINTS:
+            facing = side.normals[own].mean(0)
+            facing /= np.linalg.norm(facing)
+            palmar = own & (side.normals @ facing > 0.0)
+            rules = np.array([[*-facing, _PALMAR_COSINE]])
+            links.append(ContactLink(name, tree.group_of(name), side.points[palmar], side.normals[palmar], rules))
+    links = [_thinned(link) if link.group < tree.groups else link for link in links]
+    meshes = {link.link: link_meshes(urdf, tree, link.link) for link in links}
+    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=link_grids(model))
+    return replace(model, **arrays)
+
+
+def _thinned(link: ContactLink) -> ContactLink:
+    """The link with fewer points, so that the field draws about as many contacts of each link."""
+    return replace(link, points=link.points[:_MOST_POINTS], normals=link.normals[:_MOST_POINTS])
+
+
+def listed_links(model: HandModel) -> list[ContactLink]:
+    """Contact surface of the links that hand.yaml lists, in the order of their grids."""
+    found = []
+    for grid, link in enumerate(model.grid_link):
+        own = model.contact_grid == grid
+        name = model.tree.link_names[link]
+        group = model.tree.group_of(name)
+        rules = model.rules[model.rule_first[grid] : model.rule_first[grid + 1]]
+        group = group if group >= 0 else model.groups
+        found.append(ContactLink(name, group, model.contact_points[own], model.contact_normals[own], rules))
+    return found
+
+
+def link_grids(model: HandModel) -> dict[str, LinkGrid]:
+    """Distance grids of the hand's own contact links."""
+    names, parts = model.tree.link_names, np.split(model.grid_values, model.grid_first[1:-1])
+    rows = zip(model.grid_link, parts, model.grid_shape, model.grid_origin, model.grid_cell, strict=True)
+    return {names[k]: LinkGrid(part.reshape(shape), origin, float(cell)) for k, part, shape, origin, cell in rows}

@@ -1,0 +1,328 @@
+"""Kernels of the wrap stage: further links of a finger are laid on the object, its first contact slides."""
+
+from enum import IntEnum
+
+import warp as wp
+
+from lgrasp.field.arrays import Field
+from lgrasp.grasp.collision import body_clear, finger_above, resting_plane
+from lgrasp.grasp.contact_kernels import PalmarRuns
+from lgrasp.grasp.held import Held, body_clear_of_held
+from lgrasp.grasp.structs import FURTHER, Candidates, State
+from lgrasp.hand.arrays import Hand
+from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.math.limits import MAX_DOFS, MAX_JOINTS
+from lgrasp.math.qp import mat8, solve_spd
+from lgrasp.math.sdf import sdf_gradient, sdf_value
+from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.stages.wrap.touch import LinkTouch, WrapValues, contact_beside, fits, nearest_touch
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_LINKS = wp.constant(6)  # most links of a finger that are looked at
+_WAITING, _ASKED, _FAILED = wp.constant(0), wp.constant(1), wp.constant(2)  # what a link is to do
+_FACING = wp.constant(0.7)  # least cosine of normals of a link that may come to touch
+_SLIDES = wp.constant(3)  # of touches where a posture is new; afterwards they slide with every step
+_FARTHEST_STEP = wp.constant(0.006)  # [m] of a link towards the object
+_OFF = wp.constant(0.0005)  # [m] that links without contact keep off the object
+_LEVER = wp.constant(0.01)  # [m] from a contact along its normal to the point that turns it
+_AT_LIMIT = wp.constant(1.0e-4)  # [rad or m]
+
+
+class WrapCount(IntEnum):
+    """Counts of the stage."""
+
+    TRIED = 0
+    WRAPPED = 1
+
+
+@wp.struct
+class StepRows:
+    """StepRows equations of a least-squares step."""
+
+    A: mat8
+    b: vec_dof
+
+
+@wp.func
+def nearest_probe(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues, r: wp.int32, T: wp.transform):
+    """The point of a run that is nearest to the object and faces it, as a touch; its run is -1 if none is in reach.
+
+    T = T_object_body.
+    """
+    touch = LinkTouch()
+    touch.run = -1
+    ball = hand.pieces.body_sphere[runs.body[r]]
+    if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(ball[0], ball[1], ball[2]))) > ball[3] + params.reach:
+        return touch
+    touch.gap = params.reach
+    for k in range(runs.first[r], runs.first[r + 1]):
+        p = wp.transform_point(T, runs.points[k])
+        off = sdf_value(obj.sdf, p)
+        if off < touch.gap:
+            e = sdf_gradient(obj.sdf, p)
+            if wp.dot(wp.transform_vector(T, runs.normals[k]), wp.vec3(e[0], e[1], e[2])) < -_FACING:
+                touch.run = r
+                touch.gap = off
+                touch.local = runs.points[k]
+                touch.out = runs.normals[k]
+    return touch
+
+
+@wp.func
+def next_link(
+    runs: PalmarRuns, params: WrapValues, touch: wp.array(dtype=LinkTouch), task: wp.array(dtype=wp.int32), n: wp.int32
+):
+    """The nearest of the links that wait, on a body that no link asked to touch rides on; -1 if there is none."""
+    near = params.reach
+    added = int(-1)
+    for i in range(n):
+        if task[i] == _WAITING and touch[i].gap < near:
+            alone = int(1)
+            for o in range(n):
+                if task[o] == _ASKED and runs.body[touch[o].run] == runs.body[touch[i].run]:
+                    alone = 0
+            if alone == 1:
+                near = touch[i].gap
+                added = i
+    return added
+
+
+@wp.func
+def add_rows(
+    hand: Hand,
+    g: wp.int32,
+    params: WrapValues,
+    pose: wp.transform,
+    X: wp.array(dtype=wp.transform),
+    body: wp.int32,
+    touch: LinkTouch,
+    asked: wp.bool,
+    still: wp.int32,
+    to: StepRows,
+):
+    """The normal equations and the rows of one link: its distance, and its normal where it is asked to touch."""
+    aim = _OFF - touch.gap
+    weight = float(0.0)
+    if asked:
+        aim = -(touch.gap + params.contact_indentation)
+        weight = params.normal_weight * params.normal_weight
+    if not asked and aim < 0.0:
+        return to
+    aim = wp.clamp(aim, -_FARTHEST_STEP, _FARTHEST_STEP)
+    j0 = hand.kin.joint_first[g]
+    dofs = hand.kin.dof_free[g]
+    p = wp.transform_point(X[body], touch.local)
+    across = wp.transform_vector(pose, touch.normal)
+    f = wp.transform_vector(X[body], touch.out)
+    turn = -(f + across) * _LEVER
+    J = vec_dof()
+    R = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
+    j = body
+    while j >= 0:
+        d = hand.kin.joint_dof[j0 + j]
+        moved = point_column(hand.kin, j0 + j, X[j], p)
+        J[d] = J[d] + wp.dot(moved, across)
+        R[d] = R[d] + point_column(hand.kin, j0 + j, X[j], p + f * _LEVER) - moved
+        j = hand.kin.joint_parent[j0 + j]
+    for a in range(dofs):
+        if ((still >> a) & 1) == 1:
+            J[a] = 0.0
+            R[a] = wp.vec3(0.0)
+    for a in range(dofs):
+        to.b[a] = to.b[a] + J[a] * aim + weight * wp.dot(R[a], turn)
+        for k in range(a + 1):
+            to.A[a, k] = to.A[a, k] + J[a] * J[k] + weight * wp.dot(R[a], R[k])
+    return to
+
+
+@wp.func
+def bounded_step(hand: Hand, g: wp.int32, q: vec_dof, params: WrapValues, rows: StepRows):
+    """q after the damped least-squares step of the joints that it does not press against a limit."""
+    first = hand.kin.dof_first[g]
+    dofs = hand.kin.dof_free[g]
+    M = rows.A
+    r = rows.b
+    for a in range(dofs):
+        M[a, a] = M[a, a] + params.damping
+    step = solve_spd(M, r, dofs, 0.0, 1.0e-12)
+    stuck = int(0)
+    for a in range(dofs):
+        low = hand.kin.dof_lower[first + a]
+        high = hand.kin.dof_upper[first + a]
+        if (q[a] <= low + _AT_LIMIT and step[a] < 0.0) or (q[a] >= high - _AT_LIMIT and step[a] > 0.0):
+            stuck += 1
+            r[a] = 0.0
+            for k in range(dofs):
+                if k < a:
+                    M[a, k] = 0.0
+                if k > a:
+                    M[k, a] = 0.0
+    if stuck > 0:
+        step = solve_spd(M, r, dofs, 0.0, 1.0e-12)
+    moved = q
+    for a in range(dofs):
+        moved[a] = moved[a] + wp.clamp(step[a], -params.step, params.step)
+    return clamp_dofs(hand.kin, g, moved)
+
+
+@wp.func
+def clear_of_all(
+    hand: Hand,
+    obj: Object,
+    held: Held,
+    params: WrapValues,
+    h: wp.int32,
+    g: wp.int32,
+    pose: wp.transform,
+    resting: wp.int32,
+    X: wp.array(dtype=wp.transform),
+):
+    """True if a finger is off the object, what is held, and the table; X holds the poses of its bodies."""
+    j0 = hand.kin.joint_first[g]
+    T_object = wp.transform_inverse(pose)
+    for j in range(hand.kin.joint_first[g + 1] - j0):
+        if not body_clear(hand, obj, 1 + j0 + j, T_object * X[j], params.allowed_penetration):
+            return False
+        if not body_clear_of_held(hand, held, h, 1 + j0 + j, X[j], params.min_self_distance):
+            return False
+    if obj.resting.count > 0:
+        return finger_above(hand, g, X, resting_plane(obj, pose, resting), params.min_table_distance)
+    return True
+
+
+@wp.func
+def ask_link(
+    hand: Hand,
+    obj: Object,
+    runs: PalmarRuns,
+    params: WrapValues,
+    g: wp.int32,
+    pose: wp.transform,
+    still: wp.int32,
+    start: vec_dof,
+    touch: wp.array(dtype=LinkTouch),
+    task: wp.array(dtype=wp.int32),
+    n: wp.int32,
+):
+    """Whether the links that are asked to touch all do after a few steps from a posture, and that posture."""
+    q = start
+    j0 = hand.kin.joint_first[g]
+    T_object = wp.transform_inverse(pose)
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    for it in range(params.iterations + 1):
+        group_forward(hand.kin, g, q, X, 0)
+        missing = int(0)
+        rows = StepRows()
+        for i in range(n):
+            body = runs.body[touch[i].run] - 1 - j0
+            touch[i] = nearest_touch(hand, obj, runs, T_object * X[body], touch[i], 2)
+            if task[i] == _ASKED and not fits(hand, runs, params, T_object * X[body], touch[i]):
+                missing += 1
+            rows = add_rows(hand, g, params, pose, X, body, touch[i], task[i] == _ASKED, still, rows)
+        if missing == 0:
+            return True, q
+        if it < params.iterations:
+            q = bounded_step(hand, g, q, params, rows)
+    return False, q
+
+
+@wp.kernel
+def wrap_fingers(
+    hand: Hand,
+    field: Field,
+    obj: Object,
+    held: Held,
+    runs: PalmarRuns,
+    params: WrapValues,
+    candidates_out: Candidates,
+    counts_out: wp.array(dtype=wp.int32),
+):
+    """Postures of realised candidates in which further links of the finger touch; others stay as they are.
+
+    Link after link is asked to touch, the nearest first, with steps dq := argmin sum_l (n_l . J_l dq + g_l +
+    indentation)^2 + w^2 |normals|^2 + damping |dq|^2 over those asked; g_l is the distance of link and object, n_l the
+    object's normal there. Contacts, the first one too, are free to slide; other links are pushed off the object.
+    ``surface`` and ``q`` of a candidate follow its first contact, ``further`` are the others. Candidates whose finger
+    is not clear in either posture are blocked.
+
+    Args:
+        runs: points of links that may touch.
+        counts_out: WrapCount, (2,).
+    """
+    row, g, m = wp.tid()
+    if m >= candidates_out.count[row, g]:
+        return
+    candidates_out.further[row, g, m] = wp.vec2i(-1, -1)
+    if candidates_out.state[row, g, m] != State.REALISED:
+        return
+    wp.atomic_add(counts_out, WrapCount.TRIED, 1)
+    pose = candidates_out.poses.pose[row]
+    resting = candidates_out.poses.resting[row]
+    T_object = wp.transform_inverse(pose)
+    h = candidates_out.poses.index[row] // held.tries
+    own = hand.contacts.link[field.point[candidates_out.record[row, g, m]]]
+    j0 = hand.kin.joint_first[g]
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    touch = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
+    found = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
+    task = wp.zeros(shape=(_LINKS,), dtype=wp.int32)
+    posture = candidates_out.q[row, g, m]
+    group_forward(hand.kin, g, posture, X, 0)
+    n = int(0)
+    first = int(-1)
+    for r in range(runs.body.shape[0]):
+        body = runs.body[r]
+        if hand.body_group[body] == g and runs.grid[r] >= 0 and n < _LINKS:
+            near = nearest_probe(hand, obj, runs, params, r, T_object * X[body - 1 - j0])
+            if near.run >= 0:
+                touch[n] = near
+                task[n] = _WAITING
+                if runs.link[r] == own:
+                    first = n
+                    task[n] = _ASKED
+                n += 1
+    made = int(0)
+    for _round in range(wp.where(first < 0, 0, params.rounds)):
+        group_forward(hand.kin, g, posture, X, 0)
+        for i in range(n):
+            T = T_object * X[runs.body[touch[i].run] - 1 - j0]
+            touch[i] = nearest_touch(hand, obj, runs, T, touch[i], _SLIDES)
+        added = next_link(runs, params, touch, task, n)
+        if added < 0:
+            break
+        task[added] = _ASKED
+        done, q = ask_link(hand, obj, runs, params, g, pose, held.frozen[h, g], posture, touch, task, n)
+        if done:
+            posture = q
+            made += 1
+            for i in range(n):
+                found[i] = touch[i]
+        else:
+            task[added] = _FAILED
+    group_forward(hand.kin, g, posture, X, 0)
+    clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
+    if made > 0 and clear:
+        surface = int(-1)
+        further = wp.vec2i(-1, -1)
+        more = int(0)
+        for i in range(n):
+            if task[i] == _ASKED and (i == first or more < FURTHER):
+                at = contact_beside(hand, obj, runs, params, T_object * X[runs.body[found[i].run] - 1 - j0], found[i])
+                if i == first:
+                    surface = at
+                elif at >= 0:
+                    further[more] = at
+                    more += 1
+        if surface >= 0 and more > 0:
+            candidates_out.q[row, g, m] = posture
+            candidates_out.surface[row, g, m] = surface
+            candidates_out.further[row, g, m] = further
+            wp.atomic_add(counts_out, WrapCount.WRAPPED, 1)
+            return
+    if made > 0:
+        group_forward(hand.kin, g, candidates_out.q[row, g, m], X, 0)
+        clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
+    if not clear:
+        candidates_out.state[row, g, m] = State.BLOCKED

@@ -1,0 +1,113 @@
+"""Where links of a finger are nearest to the object, and whether they touch it there."""
+
+import warp as wp
+
+from lgrasp.grasp.check_kernels import contact_fit
+from lgrasp.grasp.contact_kernels import PalmarRuns
+from lgrasp.hand.arrays import Hand, hand_grid
+from lgrasp.math.sdf import sdf_gradient
+from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_DEPTH = wp.constant(0.004)  # [m] in the object, of points that links are nearest to
+_SAME_FACET = wp.constant(0.9)  # cosine of the turn of a normal that does not cross an edge
+_TOO_DEEP = wp.constant(0.0001)  # [m] more than a link aims to press in: the step after next is not as deep
+_REACH = wp.constant(0.005)  # [m] from a touch to the contact point of the object that stands for it
+_GAP_WEIGHT = wp.constant(30.0)  # [1/m] beside the cosine of the normals: 0.1 mm is worth 1 degree at 10 degrees
+
+
+@wp.struct
+class WrapValues:
+    """WrapParams and GraspBounds as kernels read them."""
+
+    iterations: wp.int32
+    rounds: wp.int32
+    reach: wp.float32  # [m]
+    damping: wp.float32
+    normal_weight: wp.float32
+    step: wp.float32  # [rad or m]
+    contact_indentation: wp.float32  # [m]
+    gap: wp.float32  # [m]
+    cosine: wp.float32  # least, of the normals
+    max_gap: wp.float32  # [m]
+    allowed_penetration: wp.float32  # [m] of inner spheres
+    min_self_distance: wp.float32  # [m]
+    min_table_distance: wp.float32  # [m]
+
+
+@wp.struct
+class LinkTouch:
+    """Where a link is nearest to the object."""
+
+    run: wp.int32
+    local: wp.vec3  # of the link's surface, body's frame [m]
+    out: wp.vec3  # outward normal of the facet there, body's frame
+    foot: wp.vec3  # of the object's surface, object's frame [m]
+    normal: wp.vec3  # its outward normal, object's frame
+    gap: wp.float32  # [m]
+
+
+@wp.func
+def nearest_touch(hand: Hand, obj: Object, runs: PalmarRuns, T: wp.transform, touch: LinkTouch, slides: wp.int32):
+    """The touch, slid along the link towards where it is nearest to the object, or deepest in it. T = T_object_body.
+
+    A slide ends at the link's nearest point to one inside the object, so that it is not stuck where surfaces cross.
+    """
+    at = wp.transform_point(T, touch.local)
+    e = sdf_gradient(obj.sdf, at)
+    for _s in range(slides):
+        inside = at - wp.vec3(e[0], e[1], e[2]) * (e[3] + _DEPTH)
+        local = wp.transform_point(wp.transform_inverse(T), inside)
+        s = sdf_gradient(hand_grid(hand.contacts, runs.grid[touch.run]), local)
+        out = wp.vec3(s[0], s[1], s[2])
+        touch.local = local - out * s[3]
+        # at an edge that of the facet before it
+        if wp.dot(out, touch.out) > _SAME_FACET:
+            touch.out = out
+        at = wp.transform_point(T, touch.local)
+        e = sdf_gradient(obj.sdf, at)
+    touch.normal = wp.vec3(e[0], e[1], e[2])
+    touch.gap = e[3]
+    touch.foot = at - touch.normal * e[3]
+    return touch
+
+
+@wp.func
+def fits(hand: Hand, runs: PalmarRuns, params: WrapValues, T: wp.transform, touch: LinkTouch):
+    """True if a touch is a contact: within gap and angle, on surface that may touch."""
+    off = touch.gap + params.contact_indentation
+    if off > params.gap or off < -_TOO_DEEP:
+        return False
+    if wp.dot(wp.transform_vector(T, touch.out), touch.normal) > -params.cosine:
+        return False
+    grid = runs.grid[touch.run]
+    for r in range(hand.contacts.rule_first[grid], hand.contacts.rule_first[grid + 1]):
+        f = hand.contacts.rules[r]
+        if f[0] * touch.out[0] + f[1] * touch.out[1] + f[2] * touch.out[2] > f[3]:
+            return False
+    return True
+
+
+@wp.func
+def contact_beside(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues, T: wp.transform, touch: LinkTouch):
+    """Contact point of the object that stands for a touch, -1 if none near by is a contact of the link's mesh."""
+    best = int(-1)
+    least = float(0.0)
+    sdf = hand_grid(hand.contacts, runs.grid[touch.run])
+    T_body = wp.transform_inverse(T)
+    for k in range(obj.contacts):
+        p = obj.contact_points[k]
+        if wp.length_sq(p - touch.foot) < _REACH * _REACH:
+            s = sdf_gradient(sdf, wp.transform_point(T_body, p))
+            facing = -wp.dot(wp.transform_vector(T, wp.vec3(s[0], s[1], s[2])), obj.contact_normals[k])
+            worth = facing - _GAP_WEIGHT * wp.abs(s[3])
+            if facing > params.cosine and wp.abs(s[3]) < params.max_gap and (best < 0 or worth > least):
+                least = worth
+                best = k
+    if best >= 0:
+        fit = contact_fit(hand, runs.grid[touch.run], T, obj.contact_points[best], -obj.contact_normals[best])
+        if fit[0] > params.max_gap or wp.min(fit[1], fit[2]) < params.cosine:
+            best = int(-1)
+    return best
