@@ -73,7 +73,7 @@ def test_needs_a_scene_and_a_known_protocol(grasps, context, swift):
 
 def test_generated_rows_hold(job, swift, tmp_path, raw_grasps):
     """The shard holds what simulating it again gives; batches and threads change nothing; its folder is its own."""
-    checked = swift.with_simulation("gravity6")
+    checked = swift.with_params("search", per_pose=1, restarts=2).with_simulation("gravity6")
     kwargs = {"object": "sphere", "rows": 4, "shard_rows": 4, "batch": 16}
     outcome = generate(job(**kwargs, pipeline=checked))
     shard = read_shard(outcome.paths[0])
