@@ -15,6 +15,7 @@ from lgrasp.engine.registry import ORDERS, STAGES
 from lgrasp.errors import ConfigError
 from lgrasp.hand.find import find_hand
 from lgrasp.object.find import find_object
+from lgrasp.policy.names import SHIPPED
 
 
 def declared(**changes: Any) -> dict[str, Any]:
@@ -110,6 +111,8 @@ def test_rounds_of_contacts_need_ik_before_search(swift, lightning):
 
 def other(value: Any, kind: Any) -> list[Any]:
     """Values to try in place of a parameter's; at least one of them is within its bounds."""
+    if value is None:
+        return [SHIPPED]  # a policy
     if isinstance(value, str):
         return [c for c in get_args(kind) if c != value]
     if isinstance(value, bool):
