@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,7 +59,9 @@ def test_keeps_what_holds(grasps, context):
 
 
 def test_no_grasps(grasps, context):
-    none = {name: values[:0] for name, values in grasp_arrays(grasps).items() if not name.startswith("metrics.")}
+    none: dict[str, Any] = {
+        name: values[:0] for name, values in grasp_arrays(grasps).items() if not name.startswith("metrics.")
+    }
     kept, counts = run(GraspTable(**none, metrics={}, physics={}), SimulateParams(), context)
     assert len(kept) == counts["tried"] == 0
     assert kept.physics["fc_holds"].dtype == bool
