@@ -185,3 +185,13 @@ def test_refused_files(swift, policy, tmp_path, inputs):
     assert "is no pose policy" in refused(tmp_path / "pickled.npz")
     (tmp_path / "large.npz").write_bytes(bytes(3 << 20))
     assert "larger than" in refused(tmp_path / "large.npz")
+
+
+def test_shipped_policies_are_of_their_hands(swift):
+    asked = swift.with_params("place", policy="hand")
+    for name in ("allegro", "leap"):
+        path = for_hand(asked, name).params("place").policy
+        assert path.endswith(f"{name}/pose_policy.npz")
+        assert for_hand(swift.with_params("place", policy=path), name).params("place").policy == path
+    assert for_hand(asked, "dclaw").params("place").policy is None
+    assert for_hand(asked.with_table(), "allegro").params("place").policy is None

@@ -45,7 +45,7 @@ class PlaceParams(Params):
         "one that is shipped with the hand, if there is one.",
     )
     policy_proposals: int = Field(
-        default=32, ge=1, le=1024, description="Poses tried per candidate where a policy rates them."
+        default=16, ge=1, le=1024, description="Poses tried per candidate where a policy rates them."
     )
     table: bool = Field(
         default=False, description="The object rests on a table that grasps leave room for, the way to them included."
