@@ -22,6 +22,7 @@ ALLOWED = {
     "source": "of a hand's model and of published figures",
     "links": "of the three rules in hand.yaml, each with links of its own kind",
     "pipeline": "what a job runs, and the name of it in a list of files",
+    "hand": "of jobs the name of a hand, of a pipeline a section",
     "params": "each job holds the parameters of what it runs",
 }
 """Fields without a description that several models have, and why they are not one declaration."""

@@ -5,6 +5,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from lgrasp.config import Params
+from lgrasp.stages.least_squares import Damping, Gap, JointStep
 
 
 class IkParams(Params):
@@ -15,12 +16,12 @@ class IkParams(Params):
     iterations: int = Field(default=3, ge=1, le=200, description="Damped least-squares steps.")
     lever: float = Field(default=0.01, gt=0, le=0.1, description="Distance of the second point along the normal.")
     normal_weight: float = Field(default=0.15, gt=0, le=10, description="Weight of the second point.")
-    damping: float = Field(default=2e-6, gt=0, le=1, description="Damping of the least squares.")
-    step: float = Field(default=0.3, gt=0, le=3, description="Largest joint change in one step [rad or m].")
+    damping: Damping = 2e-6
+    step: JointStep = 0.3
     contact_indentation: float = Field(
         default=0.0003, ge=0, le=0.002, description="How far the finger aims to press in at the contact."
     )
-    gap: float = Field(default=0.001, gt=0, le=0.01, description="Largest difference from that.")
+    gap: Gap = 0.001
     angle: float = Field(default=15.0, gt=0, le=60, description="Largest angle of the normals at the contact [deg].")
     min_held_distance: float = Field(
         default=0.0003, ge=0, le=0.05, description="Least distance of the finger from objects held."

@@ -3,6 +3,7 @@
 from pydantic import Field
 
 from lgrasp.config import Params
+from lgrasp.stages.least_squares import Damping, Gap, JointStep
 
 
 class WrapParams(Params):
@@ -12,9 +13,9 @@ class WrapParams(Params):
     rounds: int = Field(default=3, ge=1, le=8, description="Links of a finger that are tried, the nearest first.")
     reach: float = Field(default=0.02, gt=0, le=0.1, description="Links farther from the object are left alone.")
     normal_weight: float = Field(default=0.15, ge=0, le=10, description="Weight of the contacts' normals.")
-    damping: float = Field(default=1e-5, gt=0, le=1, description="Damping of the least squares.")
-    step: float = Field(default=0.3, gt=0, le=3, description="Largest joint change in one step [rad or m].")
+    damping: Damping = 1e-5
+    step: JointStep = 0.3
     contact_indentation: float = Field(
         default=0.0003, ge=0, le=0.002, description="How far links aim to press in at a contact."
     )
-    gap: float = Field(default=0.0007, gt=0, le=0.01, description="Largest difference from that.")
+    gap: Gap = 0.0007

@@ -1,0 +1,9 @@
+"""Numbers of the damped least squares that put links on an object."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+Damping = Annotated[float, Field(gt=0, le=1, description="Damping of the least squares.")]
+JointStep = Annotated[float, Field(gt=0, le=3, description="Largest joint change in one step [rad or m].")]
+Gap = Annotated[float, Field(gt=0, le=0.01, description="Largest difference from that.")]
