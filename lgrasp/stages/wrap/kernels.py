@@ -39,7 +39,7 @@ class WrapCount(IntEnum):
 
 @wp.struct
 class StepRows:
-    """StepRows equations of a least-squares step."""
+    """Normal equations of a least-squares step."""
 
     A: mat8
     b: vec_dof
