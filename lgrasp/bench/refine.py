@@ -20,8 +20,8 @@ from lgrasp.geometry.rotations import so3_exp
 from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
+from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.surface import ContactSurface
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
 from lgrasp.jobs.shard_inputs import named_hand

@@ -2,13 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
 from lgrasp.hand.contacts import LinkGrid, cover_patches, grid_arrays, link_grid
-from lgrasp.hand.model import HandModel, csr, stack_rows
+from lgrasp.hand.model import csr, stack_rows
 from lgrasp.hand.tree import Tree
 
 
@@ -131,21 +130,3 @@ def outer_mesh(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
         if whole.is_volume:
             return whole
     return joined_mesh(meshes)
-
-
-class ContactSurface(NamedTuple):
-    """Where a hand may touch: n points of its palmar side, those of one link together."""
-
-    link: np.ndarray
-    """Index in ``link_names``, (n,)."""
-    body: np.ndarray
-    """Body that the link rides on, (n,)."""
-    points: np.ndarray
-    """In the body's frame [m], (n, 3)."""
-    normals: np.ndarray
-    """Outward, (n, 3)."""
-
-
-def contact_surface(model: HandModel) -> ContactSurface:
-    """The palmar side where hand.yaml lets a hand touch."""
-    return ContactSurface(model.contact_link, model.contact_body, model.contact_points, model.contact_normals)

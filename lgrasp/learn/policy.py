@@ -65,7 +65,7 @@ class PoseNet(torch.nn.Module):
         rows = [part for layer in (self.hit, self.first, self.second) for part in (layer.weight.T, layer.bias[None])]
         end = torch.zeros(2, WIDTH)
         end[0], end[1, 0] = self.last.weight[0], self.last.bias[0]
-        return Weights(torch.cat([*rows, end]).detach().numpy().astype(np.float32))
+        return Weights(torch.cat([*rows, end]).detach().cpu().numpy().astype(np.float32))
 
 
 def inputs_of(seen: Seen) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -103,7 +103,7 @@ def fit_network(seen: Seen, yields: np.ndarray, params: PosePolicyParams) -> Pos
 @torch.no_grad()
 def rate(net: PoseNet, seen: Seen) -> np.ndarray:
     """Log-odds, (N,)."""
-    return net(*inputs_of(seen)).numpy()
+    return net(*inputs_of(seen)).cpu().numpy()
 
 
 def ranking(score: np.ndarray, yields: np.ndarray) -> float | None:

@@ -15,8 +15,8 @@ from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import REASONS, Outcome
 from lgrasp.grasp.tables import GraspTable, join_rows, take_grasps
 from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.palm import palm_axis
-from lgrasp.hand.surface import ContactSurface
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.params import PlanParams

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE
+from lgrasp.hand.contact_surface import ContactSurface, contact_surface
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.surface import ContactSurface, contact_surface
 from lgrasp.hand.surface_visibility import last_bodies
 from lgrasp.refine.params import DISTAL, OTHER
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.find_contacts import palmar_runs
-from lgrasp.hand.surface import ContactSurface, contact_surface
+from lgrasp.hand.contact_surface import ContactSurface, contact_surface
 from lgrasp.stages.context import Context
 
 

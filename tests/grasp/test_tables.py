@@ -45,8 +45,8 @@ def test_select_poses(tables):
     table = tables["ik"]
     order = np.array([5, 0, 3])
     chosen = select_poses(table, order, "cpu").arrays()
-    for name, values in table.arrays().items():
-        np.testing.assert_array_equal(chosen[name], values[order], err_msg=name)
+    for name, values in table.arrays().items():  # no contacts further to those: an empty column
+        np.testing.assert_array_equal(chosen[name], values[order] if len(values) else values, err_msg=name)
     assert len(select_poses(table, np.zeros(0, int), "cpu").poses) == 0
 
 

@@ -63,8 +63,9 @@ def test_geometry_is_primitive_and_visual_equals_collision(name):
             np.testing.assert_array_equal(origin, visual.origin)
 
 
-def test_no_file_but_text_is_shipped(name):
-    assert {p.name for p in (ROOT / "hands" / name).iterdir()} == {"hand.urdf", "hand.yaml", "LICENSE", "README.md"}
+def test_no_file_but_text_and_a_policy_is_shipped(name):
+    shipped = {p.name for p in (ROOT / "hands" / name).iterdir()}
+    assert shipped - {"pose_policy.npz"} == {"hand.urdf", "hand.yaml", "LICENSE", "README.md"}
 
 
 def test_rules_name_what_exists(name):

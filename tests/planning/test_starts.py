@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import upload_hand
+from lgrasp.hand.contact_surface import contact_surface
 from lgrasp.hand.palm import palm_axis
-from lgrasp.hand.surface import contact_surface
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.object.find import find_object
 from lgrasp.object.preprocess import preprocess_object

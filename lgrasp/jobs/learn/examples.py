@@ -12,6 +12,7 @@ from lgrasp.grasp.tables import CandidateTable, PoseTable
 from lgrasp.learn.policy import Seen, join_seen
 from lgrasp.policy.model import MOST_HITS, POINTS
 from lgrasp.policy.score import COUNT_SCALE
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.observe import Reach, observe_reach
@@ -64,7 +65,7 @@ def make_pose_examples(
 def _batch(pipeline: Pipeline, context: Context, points: np.ndarray, first: int, draws: int) -> PoseExamples:
     meter = Meter(context.device)
     poses = run_stage("place", (first, _BATCH), pipeline, context, meter)
-    index = poses.index.numpy()[: len(poses)]
+    index = to_numpy(poses.index)[: len(poses)]
     _, com, palm = _placed(poses, context)
     samples = pipeline.params("place").samples
     seen = [
@@ -87,9 +88,9 @@ def _batch(pipeline: Pipeline, context: Context, points: np.ndarray, first: int,
 
 def _placed(poses: PoseTable, context: Context) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses (P, 7), the object's centre of mass at each (P, 3) [m], and whether the palm touches (P,)."""
-    pose = poses.pose.numpy()[: len(poses)]
+    pose = to_numpy(poses.pose)[: len(poses)]
     com = _turned(pose, np.broadcast_to(context.object.model.com, (len(pose), 3))) + pose[:, :3]
-    return pose, com, poses.palm_point.numpy()[: len(poses)] >= 0
+    return pose, com, to_numpy(poses.palm_point)[: len(poses)] >= 0
 
 
 def _turned(pose: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -116,11 +117,11 @@ def seen_contacts(table: CandidateTable, context: Context) -> Seen:
     """What the network of stage domain is told of realised contacts."""
     n = len(table)
     pose, com, palm = _placed(table.poses, context)
-    used = np.arange(table.state.shape[2]) < table.count.numpy()[:n, :, None]
-    mine = used & (table.state.numpy()[:n] == State.REALISED)
+    used = np.arange(table.state.shape[2]) < to_numpy(table.count)[:n, :, None]
+    mine = used & (to_numpy(table.state)[:n] == State.REALISED)
     place = np.cumsum(mine, 2) - 1
     row, g, m = np.nonzero(mine & (place < MOST_HITS))
-    i = table.surface.numpy()[:n][row, g, m]
+    i = to_numpy(table.surface)[:n][row, g, m]
     model = context.object.model
     hits = np.zeros((n, mine.shape[1], MOST_HITS, 6), np.float32)
     p = _turned(pose[row], model.contact_points[i]) + pose[row, :3]

@@ -10,8 +10,8 @@ import torch
 from lgrasp.differentiable.distance import DistanceGrids
 from lgrasp.differentiable.kinematics import BodyKinematics
 from lgrasp.geometry.clusters import CLUSTER_SIZE
+from lgrasp.hand.contact_surface import contact_surface
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.surface import contact_surface
 from lgrasp.hand.tree import Tree
 from lgrasp.learn.diffuser.features import mesh_centre
 from lgrasp.object.sdf import SdfGrid, build_sdf

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.grasp.tables import PoseTable
+from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.structs import empty_struct
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.observe_kernels import ReachRows, find_all
@@ -41,4 +42,4 @@ def observe_reach(table: PoseTable, points: np.ndarray, samples: int, seed: int,
     at = wp.array(points, dtype=wp.vec3, device=d)
     asked = [hand, field, obj, samples, context.steered.touching.bits, table.struct, at, seed]
     wp.launch(find_all, n, asked, [found], device=d)
-    return Reach(*(getattr(found, name).numpy()[: len(table)] for name in Reach._fields))
+    return Reach(*(to_numpy(getattr(found, name))[: len(table)] for name in Reach._fields))

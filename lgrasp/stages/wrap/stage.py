@@ -9,7 +9,7 @@ import warp as wp
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.find_contacts import palmar_runs
 from lgrasp.grasp.tables import CandidateTable
-from lgrasp.hand.surface import ContactSurface, contact_surface
+from lgrasp.hand.contact_surface import ContactSurface, contact_surface
 from lgrasp.refine.surface import farthest_points
 from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
