@@ -31,7 +31,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.palm import palm_axis
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import ObjectArrays
-from lgrasp.runtime.fetch import to_numpy
+from lgrasp.runtime.fetch import fetch, to_numpy
 from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally, read_tallies
@@ -122,8 +122,9 @@ class Check:
         packed = self._pack(seed, row)
         if on_table:
             self._approach(row, packed, tally)
-        columns = {name: to_numpy(values) for name, values in _columns(packed, on_table).items()}
-        table, outcome = _table(columns, len(self)), to_numpy(self.found.outcome)
+        columns = _columns(packed, on_table)
+        *fetched, outcome = fetch([*columns.values(), self.found.outcome])
+        table = _table(dict(zip(columns, fetched, strict=True)), len(self))
         if on_table:
             lost = np.isnan(table.table["approach"][:, 0]) & (outcome == Outcome.KEPT)
             outcome = np.where(lost, Outcome.APPROACH, outcome)

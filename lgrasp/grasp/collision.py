@@ -16,12 +16,18 @@ _FAR_BELOW = wp.constant(1.0e6)  # [m]
 
 
 @wp.func
-def body_clear(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, slack: wp.float32):
-    """Fast test: no inner sphere of the body sinks into the object by more than ``slack`` [m]. T = T_object_body."""
+def body_far(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
+    """Fastest test: the ball around the body is farther than ``margin`` [m] from the object. T = T_object_body."""
     b = hand.pieces.body_sphere[body]
     if b[3] < 0.0:
         return True
-    if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))) > b[3]:
+    return sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))) > b[3] + margin
+
+
+@wp.func
+def body_clear(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, slack: wp.float32):
+    """Fast test: no inner sphere of the body sinks into the object by more than ``slack`` [m]. T = T_object_body."""
+    if body_far(hand, obj, body, T, 0.0):
         return True
     for k in range(hand.sphere_first[body], hand.sphere_first[body + 1]):
         s = hand.spheres[k]
@@ -33,10 +39,7 @@ def body_clear(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, slack: 
 @wp.func
 def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
     """True if all surface samples of the body are farther than ``margin`` [m] from the object. T = T_object_body."""
-    b = hand.pieces.body_sphere[body]
-    if b[3] < 0.0:
-        return True
-    if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))) > b[3] + margin:
+    if body_far(hand, obj, body, T, margin):
         return True
     for k in range(hand.cluster_first[body], hand.cluster_first[body + 1]):
         s = hand.cluster_sphere[k]

@@ -4,6 +4,7 @@ import warp as wp
 
 from lgrasp.grasp.check_kernels import contact_fit
 from lgrasp.grasp.check_structs import Limits
+from lgrasp.grasp.collision import body_far
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_dofs, group_forward
 from lgrasp.math.limits import MAX_JOINTS
@@ -68,8 +69,7 @@ def link_contacts(
         first = group_forward(hand.kin, g, group_dofs(hand.kin, g, q, i), X, 0)
         B = X[runs.body[s] - 1 - first]
     T = T_object * B
-    ball = hand.pieces.body_sphere[runs.body[s]]
-    if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(ball[0], ball[1], ball[2]))) > ball[3] + limits.max_gap:
+    if body_far(hand, obj, runs.body[s], T, limits.max_gap):
         return
     best = limits.max_gap
     c = int(-1)

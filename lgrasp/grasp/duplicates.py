@@ -5,7 +5,7 @@ import warp as wp
 
 from lgrasp.grasp.near_kernels import Near, list_near
 from lgrasp.runtime.device import start
-from lgrasp.runtime.fetch import to_numpy
+from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.structs import upload_struct
 
 NEAR_DISTANCE = 0.005  # [m]
@@ -95,7 +95,8 @@ class _NearRows:
             number, others = (wp.empty(n, dtype=wp.int32, device=d) for n in (len(asked), room))
             given = [wp.array(a, dtype=wp.int32, device=d) for a in (asked, places)]
             wp.launch(list_near, len(asked), [self._grid.id, x, *given], [number, others], device=d)
-            return to_numpy(number), to_numpy(others)
+            number, others = fetch([number, others])
+            return number, others
 
         rows = np.arange(first, len(pose))
         number, _ = listed(rows, rows[:0], 0)

@@ -141,6 +141,16 @@ def hand_grid(c: Contacts, i: wp.int32):
 
 
 @wp.func
+def contact_allowed(c: Contacts, i: wp.int32, normal: wp.vec3):
+    """True if the rules of contact link i let it touch where its outward normal is this."""
+    for r in range(c.rule_first[i], c.rule_first[i + 1]):
+        f = c.rules[r]
+        if f[0] * normal[0] + f[1] * normal[1] + f[2] * normal[2] > f[3]:
+            return False
+    return True
+
+
+@wp.func
 def overlap_grid(c: Overlaps, i: wp.int32):
     """Distance grid of side i."""
     return sdf_part(c.grid_values, c.grid_first[i], c.grid_shape[i], c.grid_origin[i], c.grid_inv_cell[i])

@@ -13,7 +13,7 @@ from lgrasp.hold.params import HoldTest
 from lgrasp.hold.solve import MAX_HAND_DOFS
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.object.mass import mass_properties
-from lgrasp.runtime.fetch import to_numpy
+from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.structs import empty_struct, make_struct, upload_struct
 from lgrasp.simulate.protocol import DIRECTIONS, PROTOCOLS
 
@@ -134,7 +134,8 @@ class HoldTester:
         wp.launch(close_hands, n, [*both, spread, grasps, trials], device=device, block_dim=_BLOCK)
         dim = (n, ways // each)
         wp.launch(pull_objects, dim, [*both, grasps, trials, each], [pulls], device=device, block_dim=_BLOCK)
-        return np.all(to_numpy(held), axis=1), np.max(to_numpy(displacement), axis=1)
+        stayed, moved = fetch([held, displacement])
+        return np.all(stayed, axis=1), np.max(moved, axis=1)
 
     def _make_course(self) -> Any:
         fc = PROTOCOLS["fc"]

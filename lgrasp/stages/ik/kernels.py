@@ -8,7 +8,7 @@ from lgrasp.field.arrays import Field
 from lgrasp.grasp.collision import body_clear, finger_above, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.grasp.structs import Candidates, Sets, State
-from lgrasp.hand.arrays import Hand, hand_grid
+from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
 from lgrasp.math.limits import MAX_DOFS, MAX_JOINTS
@@ -138,11 +138,8 @@ def realise_contacts(
     state = int(State.REALISED)
     if wp.abs(gap + params.contact_indentation) > params.gap or dot < params.cosine:
         state = State.MISSED
-    if state == State.REALISED:
-        for r in range(hand.contacts.rule_first[grid], hand.contacts.rule_first[grid + 1]):
-            f = hand.contacts.rules[r]
-            if f[0] * out[0] + f[1] * out[1] + f[2] * out[2] > f[3]:
-                state = State.MISSED
+    if state == State.REALISED and not contact_allowed(hand.contacts, grid, out):
+        state = State.MISSED
     if state == State.REALISED and params.check_collision == 1:
         T_object = wp.transform_inverse(T)
         # the touching body first: it fails most often

@@ -20,6 +20,17 @@ _DRAWS = wp.constant(16)  # of two opposite object points and a contact vector o
 
 
 @wp.func
+def no_proposal(proposals_out: ProposedPoses, row: wp.int32, b: wp.int32):
+    """A proposal of nothing, to be filled in; its pose and setting are not written."""
+    for g in range(proposals_out.anchor.shape[2]):
+        proposals_out.anchor[row, b, g] = -1
+    proposals_out.palm_point[row, b] = -1
+    proposals_out.resting[row, b] = -1
+    proposals_out.surface[row, b] = -1
+    proposals_out.rating[row, b] = Rating.HOPELESS
+
+
+@wp.func
 def side_fixed(hand: Hand, held: Held, h: wp.int32, side: wp.int32):
     """True if a side is fixed: the static links (-1), or a finger that holds something."""
     return side < 0 or group_fixed(hand, held, h, wp.max(side, 0))
@@ -141,12 +152,7 @@ def propose_opposed(
     row, b = wp.tid()
     state = wp.rand_init(seed[0] + b * SEED_STRIDE, first[0] + row)
     h = (first[0] + row) // held.tries
-    for g in range(hand.kin.groups):
-        proposals_out.anchor[row, b, g] = -1
-    proposals_out.palm_point[row, b] = -1
-    proposals_out.resting[row, b] = -1
-    proposals_out.surface[row, b] = -1
-    proposals_out.rating[row, b] = Rating.HOPELESS
+    no_proposal(proposals_out, row, b)
     setting = held.setting[h]
     if setting < 0:
         setting = wp.min(int(wp.randf(state) * float(hand.kin.settings)), hand.kin.settings - 1)

@@ -11,7 +11,7 @@ from lgrasp.math.transforms import rotation_between, tangent
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.place.kernels import SEED_STRIDE
-from lgrasp.stages.place.opposed_kernels import clear_of_hand, side_fixed
+from lgrasp.stages.place.opposed_kernels import clear_of_hand, no_proposal, side_fixed
 from lgrasp.stages.place.structs import PlaceValues, ProposedPoses, Rating
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -90,14 +90,9 @@ def propose_predicted(
     candidate = first[0] + row
     state = wp.rand_init(seed[0] + b * SEED_STRIDE, candidate)
     h = candidate // held.tries
-    for g in range(hand.kin.groups):
-        proposals_out.anchor[row, b, g] = -1
     setting = wp.max(held.setting[h], 0)
     T = predicted.pose[candidate]
-    proposals_out.palm_point[row, b] = -1
-    proposals_out.resting[row, b] = -1
-    proposals_out.surface[row, b] = -1
-    proposals_out.rating[row, b] = Rating.HOPELESS
+    no_proposal(proposals_out, row, b)
     proposals_out.setting[row, b] = setting
     proposals_out.pose[row, b] = T
     fixed_a = side_fixed(hand, held, h, sides[0])

@@ -5,7 +5,7 @@ from enum import IntEnum
 import warp as wp
 
 from lgrasp.field.arrays import Field
-from lgrasp.grasp.collision import body_clear, finger_above, resting_plane
+from lgrasp.grasp.collision import body_clear, body_far, finger_above, resting_plane
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.grasp.structs import FURTHER, Candidates, State
@@ -53,8 +53,7 @@ def nearest_probe(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues,
     """
     touch = LinkTouch()
     touch.run = -1
-    ball = hand.pieces.body_sphere[runs.body[r]]
-    if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(ball[0], ball[1], ball[2]))) > ball[3] + params.reach:
+    if body_far(hand, obj, runs.body[r], T, params.reach):
         return touch
     touch.gap = params.reach
     for k in range(runs.first[r], runs.first[r + 1]):

@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.grasp.check_kernels import contact_fit
 from lgrasp.grasp.contact_kernels import PalmarRuns
-from lgrasp.hand.arrays import Hand, hand_grid
+from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid
 from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -82,12 +82,7 @@ def fits(hand: Hand, runs: PalmarRuns, params: WrapValues, T: wp.transform, touc
         return False
     if wp.dot(wp.transform_vector(T, touch.out), touch.normal) > -params.cosine:
         return False
-    grid = runs.grid[touch.run]
-    for r in range(hand.contacts.rule_first[grid], hand.contacts.rule_first[grid + 1]):
-        f = hand.contacts.rules[r]
-        if f[0] * touch.out[0] + f[1] * touch.out[1] + f[2] * touch.out[2] > f[3]:
-            return False
-    return True
+    return contact_allowed(hand.contacts, runs.grid[touch.run], touch.out)
 
 
 @wp.func
