@@ -16,6 +16,11 @@ PalmUse = Literal["yes", "no", "must"]
 """Whether the palm of a hand may touch."""
 Role = Literal["thumb", "index", "middle", "ring", "little"]
 """Human finger that a finger acts as."""
+ShapeKind = Literal[
+    *("mug", "bottle", "bowl", "plate", "box", "can", "ball", "hammer", "screwdriver"),
+    *("single", "joined", "cup", "ring", "tool"),
+]
+"""Kinds of random solids (:mod:`lgrasp.object.shapes`); the last five are free forms."""
 ProtocolName = Literal["fc", "gravity6", "gravity6_mu1", "seq6", "seq6_mu06", "fc_random", "lift", "dipgrasp"]
 """Protocols of the simulation (:mod:`lgrasp.simulate.protocol`)."""
 EngineName = Literal["mujoco", "physx"]

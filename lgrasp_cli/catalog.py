@@ -1,15 +1,17 @@
 """``lgrasp objects`` and ``lgrasp pipelines``: what there is."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
-from typer import Argument
+from typer import Argument, Option
 
-from lgrasp_cli.names import PIPELINE
-from lgrasp_cli.options import MeshArgument, Scale
+from lgrasp.choices import ShapeKind
+from lgrasp_cli.names import PIPELINE, one_of
+from lgrasp_cli.options import MeshArgument, Quiet, Scale
 from lgrasp_cli.tables import Answer, TextTable, reporting
 
-objects = typer.Typer(name="objects", help="List and show objects.", no_args_is_help=True)
+objects = typer.Typer(name="objects", help="List, show and make objects.", no_args_is_help=True)
 pipelines = typer.Typer(name="pipelines", help="List and show pipelines.", no_args_is_help=True)
 
 
@@ -47,6 +49,35 @@ def show_object(mesh: MeshArgument, scale: Scale = 1.0) -> Answer:
         *(("repaired", note) for note in data["notes"]),
     ]
     return Answer(data, [pairs])
+
+
+@objects.command("make")
+@reporting
+def make_objects(
+    out: Annotated[Path, Option("--out", help="Folder of the meshes.")],
+    count: Annotated[int, Option("-n", min=1, max=100_000, help="Objects.")] = 40,
+    kinds: Annotated[
+        list[str] | None, Option("--kind", **one_of(ShapeKind, "KIND", "Repeatable; default all."))
+    ] = None,
+    size: Annotated[
+        str | None, Option(help="Range of the longest side [m], such as 0.04:0.12; default: that of the kind.")
+    ] = None,
+    seed: Annotated[int, Option(min=0, max=2**31 - 1, help="The same seed makes the same objects.")] = 0,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace files of other contents.")] = False,
+    quiet: Quiet = False,
+) -> Answer:
+    """Make meshes with drawn sizes: KIND-SEED-NUMBER.obj, watertight, in metres. Files that are there stay.
+
+    Example: lgrasp objects make -n 40 --kind mug --kind bottle --out meshes
+    """
+    from lgrasp.jobs.make_objects import make_objects as make
+    from lgrasp_cli.progress import Bar
+
+    with Bar(quiet=quiet) as bar:
+        shown = {"progress": lambda done: bar.show("objects", done, count)}
+        data = make(out, count, kinds or (), size=size, seed=seed, overwrite=overwrite, **shown)
+    pairs = [("objects", f"{data['objects']:,}, of which {data['written']:,} written now"), ("where", data["out"])]
+    return Answer(data, [] if quiet else [pairs])
 
 
 @pipelines.command("list")

@@ -81,8 +81,7 @@ def generate(
 ) -> None:
     """Generate grasps of an object and write them as shards.
 
-    The exit code is 3 if fewer grasps are found than requested; those found are kept. With several objects or hands,
-    every pair is a job; one that fails does not stop the others.
+    With several objects or hands, every pair is a job; one that fails does not stop the others.
 
     Example: lgrasp generate --object mug --object bowl --object "meshes/*.obj" -n 10000
     """

@@ -48,8 +48,7 @@ def sequence(
     """Grasp several objects one after another, each with joints that are still free, and write shards.
 
     Each grasp uses one opposition space of the hand (hand.yaml); joints and objects of earlier grasps stay in place.
-    The shards hold the whole sequences and the rows of fewer objects that these continue. The exit code is 3 if fewer
-    are found than requested; those found are kept.
+    The shards hold the whole sequences and the rows of fewer objects that these continue.
 
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10
     """

@@ -29,11 +29,10 @@ def simulate(
 ) -> None:
     """Simulate grasps and add the verdicts to the shards, as columns physics/PROTOCOL_...
 
-    The hand closes from q_pregrasp over q to q_squeeze on its free objects, then something pulls them in six
-    directions; a grasp holds if they stay in all of them. lift is for grasps of generate --table: the hand comes down,
-    closes, lifts the object by 15 cm and is shaken sideways; dipgrasp lifts a free object by 20 cm and turns gravity;
-    fc_random is fc in 8 random draws (these on the CPU only). seq6 and seq6_mu06 are made for sequences of objects. A
-    shard that has the verdicts already is left as it is.
+    The hand closes on its free objects, which are then pulled in six directions; a grasp holds if they stay. lift takes
+    the object of a generate --table off its table and is shaken; dipgrasp lifts a free object and turns gravity;
+    fc_random is fc in 8 random draws (these on the CPU only). seq6 and seq6_mu06 are for sequences of objects. A shard
+    that has the verdicts is left as it is.
 
     Contacts are hard in PhysX (pip install "lgrasp[physx]"), whose columns are physics/physx_PROTOCOL_....
 

@@ -81,6 +81,27 @@ def test_objects(cli):
     assert "did you mean" in cli("objects", "show", "tinny").error()
 
 
+def test_objects_are_made_once_for_a_seed(cli, tmp_path):
+    make = ("objects", "make", "-n", 4, "--kind", "mug", "--kind", "bottle", "--out")
+    assert cli(*make, "a", "--json", "-").code == 0
+    names = ["bottle-0-0.obj", "bottle-0-1.obj", "mug-0-0.obj", "mug-0-1.obj"]
+    made = {path.name: path.read_bytes() for path in sorted((tmp_path / "a").iterdir())}
+    assert list(made) == names
+    assert len(set(made.values())) == 4
+    (tmp_path / "a" / names[0]).unlink()
+    assert json.loads(cli(*make, "a", "--json", "-").out)["written"] == 1
+    assert (tmp_path / "a" / names[0]).read_bytes() == made[names[0]]
+    alone = cli("objects", "make", "-n", 2, "--kind", "mug", "--out", "b")
+    assert "2 written now" in "".join(alone.out.split("of which "))
+    assert (tmp_path / "b" / "mug-0-1.obj").read_bytes() == made["mug-0-1.obj"]  # whatever else is made
+    assert "another mesh" in cli(*make, "a", "--size", "0.04:0.12").error()
+    assert json.loads(cli(*make, "a", "--size", "0.04:0.12", "--overwrite", "--json", "-").out)["written"] == 4
+    for wrong in ("5:12", "0.05", "x", "0.1:0.05"):
+        assert "0.005 to 1 m" in cli(*make, "c", "--size", wrong).error()
+    assert "did you mean 'mug'" in cli("objects", "make", "--kind", "mag", "--out", "c").error()
+    assert not (tmp_path / "c").exists()
+
+
 def test_pipelines(cli):
     names = [entry["name"] for entry in json.loads(cli("pipelines", "list", "--json", "-").out)]
     assert "swift" in names

@@ -22,10 +22,10 @@ from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.learn.examples import PoseExamples, join_examples, make_pose_examples, reach_points
 from lgrasp.jobs.requests.learn import PolicyRequest
 from lgrasp.learn.policy import fit_network, ranking, rate
-from lgrasp.learn.shapes import random_shape
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.preprocess import preprocess_object
+from lgrasp.object.shapes import random_shape
 from lgrasp.policy.model import PosePolicy, policy_bytes, read_policy
 from lgrasp.stages.context import Context
 

@@ -1,0 +1,30 @@
+"""Random solids: watertight, one body, of the size asked for; things that hold something are hollow."""
+
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from lgrasp.choices import ShapeKind
+from lgrasp.object.shapes import random_shape
+
+
+@pytest.mark.parametrize("kind", [None, *get_args(ShapeKind)])
+def test_shapes(kind):
+    for number in range(2):
+        mesh = random_shape(3, number, kind, (0.04, 0.12))
+        assert mesh.is_watertight
+        assert mesh.body_count == 1
+        assert mesh.volume > 0
+        assert 0.04 <= mesh.extents.max() <= 0.12
+        assert np.array_equal(mesh.vertices, random_shape(3, number, kind, (0.04, 0.12)).vertices)
+        assert not np.array_equal(mesh.bounds, random_shape(4, number, kind, (0.04, 0.12)).bounds)
+        assert random_shape(3, number, kind).extents.max() <= 0.2201
+
+
+def test_mugs_and_bowls_are_hollow():
+    for kind in ("mug", "bowl", "plate"):
+        mesh = random_shape(0, 0, kind)
+        assert mesh.volume < 0.6 * mesh.convex_hull.volume, kind
+        middle = mesh.bounds.mean(0) * [0, 1, 0] + [0, 0, mesh.bounds[1, 2] - 1e-3]
+        assert not mesh.contains([middle])[0], kind
