@@ -16,7 +16,7 @@ def data_dirs(kind: str) -> list[Path]:
     """Existing folders searched for declarations of one kind, first match wins.
 
     Args:
-        kind: ``hands``, ``objects``, ``pipelines`` or ``configs``.
+        kind: ``hands``, ``objects``, ``pipelines``, ``configs`` or ``models``.
 
     Returns:
         The folders of ``LGRASP_PATH`` (separated as in ``PATH``), then the user's data folder, then the shipped one.

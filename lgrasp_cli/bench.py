@@ -8,7 +8,7 @@ import typer
 from typer import Argument, Option
 
 from lgrasp.choices import EngineName, Policy, ProtocolName
-from lgrasp_cli.names import OBJECT, PIPELINE, one_of
+from lgrasp_cli.names import NETWORK, OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import (
     CacheDir,
     Device,
@@ -177,7 +177,8 @@ def bench_sequence(
         str, Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.", **PIPELINE)
     ] = "sequence",
     model: Annotated[
-        Path | None, Option(help="Also draw with this network of lgrasp learn fit --model diffuser (pipeline sample).")
+        str | None,
+        Option(help="Also draw with this network, a file or a name of learn list (pipeline sample).", **NETWORK),
     ] = None,
     settings: Settings = None,
     seed: Annotated[int, Option(min=0, help="Seed of the sequences and the grasps.")] = 0,

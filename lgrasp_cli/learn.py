@@ -7,9 +7,9 @@ import typer
 from typer import Argument, Option
 
 from lgrasp.choices import NetworkName
-from lgrasp_cli.names import HAND, OBJECT, PIPELINE, one_of
+from lgrasp_cli.names import HAND, NETWORK, OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import CacheDir, Device, Quiet, Shards, choose_pipeline, given, open_cache
-from lgrasp_cli.tables import Answer, Block, following, reporting, took
+from lgrasp_cli.tables import Answer, Block, TextTable, following, plural, reporting, took
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(name="learn", help="Train and measure networks that predict grasps.", no_args_is_help=True)
@@ -91,7 +91,7 @@ def fit(
 @app.command(name="eval")
 @reporting
 def evaluate(
-    predictor: Annotated[Path, Argument(exists=True, dir_okay=False, help="File written by lgrasp learn fit.")],
+    predictor: Annotated[str, Argument(help="File written by lgrasp learn fit, or a name of learn list.", **NETWORK)],
     shards: Shards,
     clouds: Annotated[int, Option(min=1, help="New clouds per object.")] = 8,
     seed: Annotated[int, Option(min=0, help="Seed of the clouds.")] = 1,
@@ -108,8 +108,9 @@ def evaluate(
     shards_below(shards)
     cache = open_cache(cache_dir)
     from lgrasp.jobs.learn.job import evaluate as run
+    from lgrasp.learn.networks import find_network
 
-    data = run(predictor, shards, cache, clouds=clouds, seed=seed, device=device)
+    data = run(find_network(predictor), shards, cache, clouds=clouds, seed=seed, device=device)
     pairs = [
         ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
         ("poses", f"{data['poses']:,}"),
@@ -120,6 +121,43 @@ def evaluate(
         ),
     ]
     return Answer(data, [] if quiet else [pairs])
+
+
+@app.command("list")
+@reporting
+def list_networks() -> Answer:
+    """List networks that can be used by name, and pose policies of hands: what they learnt from, how good they are.
+
+    Example: lgrasp learn list
+    """
+    from lgrasp.jobs.listing import list_networks as listed
+
+    found = listed()
+    rows = []
+    for network in found:
+        figures = [f"{name} {value:.3g}" for name, value in network["report"].items() if isinstance(value, float)]
+        size = f"{network['bytes'] / 1e6:.1f} MB"
+        rows.append(
+            (
+                network["name"],
+                network["kind"],
+                network["hand"],
+                size,
+                _learnt_from(network["report"]),
+                ", ".join(figures),
+            )
+        )
+    return Answer(found, [TextTable(("name", "kind", "hand", "size", "learnt from", "figures"), rows, right=("size",))])
+
+
+def _learnt_from(report: dict[str, Any]) -> str:
+    objects, params = report.get("objects", []), report.get("params", {})
+    named = objects if isinstance(objects, str) else plural(len(objects), "object")
+    held_out = report.get("unseen", [])
+    more = [f"{plural(len(held_out), 'object')} held out"] if held_out else []
+    more += [f"{report['examples']:,} examples"] if "examples" in report else []
+    more += [f"seed {params['seed']}"] if "seed" in params else []
+    return ", ".join([named, *more])
 
 
 def _show_fit(data: dict[str, Any]) -> list[Block]:

@@ -84,6 +84,19 @@ def _pipelines() -> Iterable[str]:
     return pipeline_files()
 
 
+def _networks() -> Iterable[str]:
+    from lgrasp.learn.networks import known_networks
+
+    return known_networks()
+
+
+def _network(name: str, flag: str) -> str:
+    from lgrasp.learn.networks import find_network
+
+    find_network(name)
+    return name
+
+
 def _configs() -> Iterable[str]:
     from lgrasp.jobs.config import config_files
 
@@ -120,6 +133,7 @@ def _as_given(name: str, flag: str) -> str:
 HAND = named("HAND", _hands, _hand)
 OBJECT = named("OBJECT", _objects, _object)
 GRASP_TYPE = named("NAME", _grasp_types, _grasp_type)
+NETWORK = named("MODEL", _networks, _network)
 DEVICE = named("[auto|cpu|cuda:N]", lambda: ("auto", "cpu", "cuda:0"), _device)
 # read by the command itself, before it imports anything heavy
 HAND_OR_SHARD, OBJECT_OR_SHARD = named("HAND", _hands, _as_given), named("OBJECT", _objects, _as_given)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument, Option
 
 from lgrasp.choices import Method, Policy, ProtocolName
-from lgrasp_cli.names import OBJECT, PIPELINE, one_of
+from lgrasp_cli.names import NETWORK, OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import Hand, Seed, Settings, choose_pipeline, given
 from lgrasp_cli.tables import Block, TextTable, counted, following, held, place, share, took
 from lgrasp_cli.working import How, working
@@ -62,7 +62,9 @@ def sequence(
 
 @working
 def sample(
-    model: Annotated[Path, Argument(help="File written by lgrasp learn fit --model diffuser.")],
+    model: Annotated[
+        str, Argument(help="File of lgrasp learn fit --model diffuser, or a name of learn list.", **NETWORK)
+    ],
     objects: Objects,
     how: How,
     hand: Hand = "allegro",

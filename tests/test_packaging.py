@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("torch", "warp", "trimesh", "yourdfpy", "h5py", "scipy", "numpy", "coacd", "pytorch_kinematics")
-DATA = ("hands", "objects", "pipelines", "configs")
+DATA = ("hands", "objects", "pipelines", "configs", "models")
 
 ORDER = (
     ("errors", "files", "paths", "notices", "choices", "config", "seeding", "signals"),

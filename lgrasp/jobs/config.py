@@ -105,12 +105,14 @@ def load_config(name: str) -> JobConfig:
 
 KINDS = {
     "sequence": "lgrasp.jobs.requests.search:SequenceRequest",
+    "sample": "lgrasp.jobs.requests.search:SampleRequest",
     "refine": "lgrasp.jobs.requests.shards:RefineRequest",
     "plan": "lgrasp.jobs.requests.plan:PlanRequest",
     "simulate": "lgrasp.jobs.requests.shards:SimulateRequest",
     "scenes": "lgrasp.jobs.requests.scenes:SceneRequest",
     "learn": "lgrasp.jobs.requests.shards:FitRequest",
     "policy": "lgrasp.jobs.requests.learn:PolicyRequest",
+    "diffuser": "lgrasp.jobs.requests.shards:DiffuserRequest",
     "metrics": "lgrasp.jobs.requests.shards:MetricsRequest",
     "export": "lgrasp.jobs.requests.shards:ExportRequest",
     "compare": "lgrasp.jobs.requests.compare:CompareRequest",

@@ -1,5 +1,6 @@
-"""What can be used by name: hands, objects, pipelines; JSON-serialisable. Light to import: a list comes at once."""
+"""What can be used by name: hands, objects, pipelines, networks; JSON-serialisable. Light to import."""
 
+from pathlib import Path
 from typing import Any
 
 from lgrasp.config import read_yaml
@@ -7,8 +8,10 @@ from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.errors import ConfigError
 from lgrasp.hand.names import PACKAGE_HANDS, known_hands, pip_line
 from lgrasp.hand.spec import load_spec
+from lgrasp.learn.networks import known_networks, read_card
 from lgrasp.object.find import list_objects as named_objects
 from lgrasp.paths import data_dirs, is_installed
+from lgrasp.policy.names import SHIPPED, shipped_policy
 
 
 def list_hands() -> list[dict[str, Any]]:
@@ -58,6 +61,33 @@ def list_pipelines() -> list[dict[str, Any]]:
             entry = {"description": f"cannot be used: {error}", "stages": []}
         found.append({"name": name, **entry, "file": str(path)})
     return found
+
+
+def list_networks() -> list[dict[str, Any]]:
+    """Name, kind, hand, file, bytes and report of every network that can be used by name, then of the pose policies of
+    hands; for one that cannot be read, why.
+
+    The report is that of the training: what was learnt from, and, as its numbers, how good the network is.
+    """
+    found = []
+    for name, path in known_networks().items():
+        try:
+            card = read_card(path)
+        except ConfigError as error:
+            card = {"kind": f"cannot be used: {error}", "hand": "", "report": {}}
+        found.append({"name": name, "kind": card["kind"], "hand": card["hand"], **_told(path, card["report"])})
+    for hand in known_hands():
+        if (path := shipped_policy(hand)) is not None:
+            from lgrasp.policy.model import read_policy  # numpy
+
+            found.append(
+                {"name": SHIPPED, "kind": "pose", "hand": hand, **_told(path, read_policy(path).about["report"])}
+            )
+    return found
+
+
+def _told(path: Path, report: dict[str, Any]) -> dict[str, Any]:
+    return {"file": str(path), "bytes": path.stat().st_size, "report": report}
 
 
 def describe_pipeline(name: str) -> dict[str, Any]:

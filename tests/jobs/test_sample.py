@@ -14,8 +14,10 @@ from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.held import hold
 from lgrasp.grasp.predicted import upload_predicted
+from lgrasp.jobs.config import load_requests
 from lgrasp.jobs.learn.diffuser import DiffuserJob
 from lgrasp.jobs.learn.sequences import read_steps
+from lgrasp.jobs.requests.shards import DiffuserRequest
 from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.sequence.round import run_round
 from lgrasp.jobs.sequence.sample import SampleJob
@@ -83,6 +85,14 @@ def test_steps_are_those_of_the_rows(shards, cache, inputs):
     np.testing.assert_allclose(away, float(radius.mean()), atol=2e-3)
 
 
+def test_a_config_asks_for_a_training(shards, tmp_path):
+    path = tmp_path / "job.yaml"
+    path.write_text(f"job: diffuser\nshards: [{shards}]\nparams: {{steps: 7, process: flow}}\n")
+    (asked,) = load_requests(str(path), {})
+    assert isinstance(asked, DiffuserRequest)
+    assert (asked.params.steps, asked.params.process, asked.out.name) == (7, "flow", "diffuser.pt")
+
+
 def test_training_learns_and_the_seed_decides(network, shards, cache, tmp_path):
     net, about = load_diffuser(network)
     assert about.report["loss"] < 0.99  # 1 of a network that knows nothing
@@ -120,7 +130,7 @@ def test_valid_grasps_as_predictions_mostly_stay(inputs):
 
 def test_what_is_drawn_becomes_valid_shards(asked, network, tmp_path):
     pipeline = small_pipeline("sample", width=12, wave=8, waves=6, draws=4)
-    job = SampleJob(**asked, rows=6, pipeline=pipeline, model=network, out=tmp_path / "out")
+    job = SampleJob(**asked, rows=6, pipeline=pipeline, model=str(network), out=tmp_path / "out")
     outcome = run(job)
     (path,) = outcome.paths
     assert validate_shard(path) == []  # joints of earlier steps are bit by bit the same, among others
@@ -132,6 +142,6 @@ def test_what_is_drawn_becomes_valid_shards(asked, network, tmp_path):
 
 
 def test_networks_of_other_hands_are_refused(asked, network, tmp_path):
-    given = {"pipeline": small_pipeline("sample"), "model": network, "out": tmp_path / "out"}
+    given = {"pipeline": small_pipeline("sample"), "model": str(network), "out": tmp_path / "out"}
     with pytest.raises(ConfigError, match=r"net.pt is of hand 'allegro', not of 'leap'"):
         run(SampleJob(**asked, **given, hand="leap"))

@@ -20,6 +20,7 @@ from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.learn.diffuser.process import PROCESSES, Process
 from lgrasp.learn.diffuser.sampler import StepSampler
 from lgrasp.learn.diffuser.senses import HeldObjects, Senses, coarse_grid, sense_points
+from lgrasp.learn.networks import network_bytes, read_card
 
 SPACES = 3
 PARAMS = DiffuserParams.model_validate({"width": 16, "blocks": 2, "shape_points": 12, "held_points": 10, "cloud": 32})
@@ -191,23 +192,22 @@ def test_a_file_is_read_as_it_was_written(net, tmp_path):
 def test_files_that_lie_are_refused(net, tmp_path):
     path = tmp_path / "net.pt"
 
-    def refused(**changes):
+    def refused(weights=(), **changes):
         path.write_bytes(diffuser_bytes(net, about()))
-        saved = torch.load(path, weights_only=True)
-        saved["state"] |= changes.pop("state", {})
-        torch.save(saved | changes, path)
+        card, state = read_card(path), torch.load(path, weights_only=True)
+        path.write_bytes(network_bytes(card | changes, state | dict(weights)))
         with pytest.raises(ConfigError, match="not a network of lgrasp") as error:
             load_diffuser(path)
         return str(error.value)
 
-    huge = about(width=4096, blocks=64).params.model_dump_json()  # no memory is taken for it
+    huge = about(width=4096, blocks=64).params.model_dump(mode="json")  # no memory is taken for it
     assert "missing or of another shape" in refused(params=huge)
-    assert "missing or of another shape" in refused(state={"out.weight": torch.zeros(2, 2)})
-    assert "not finite" in refused(state={"mean": net.mean * torch.nan})
-    assert "not in order" in refused(state={"spread": net.spread * 0})
-    assert "version 2" in refused(version=2)
+    assert "missing or of another shape" in refused({"out.weight": torch.zeros(2, 2)})
+    assert "not finite" in refused({"mean": net.mean * torch.nan})
+    assert "not in order" in refused({"spread": net.spread * 0})
+    assert "version 3" in refused(version=3)
     assert "must be text" in refused(space_names=[1, 2, 3])
-    assert "width" in refused(params='{"width": -1}')
+    assert "width" in refused(params={"width": -1})
     path.write_bytes(b"nonsense")
     with pytest.raises(ConfigError, match="not a network"):
         load_diffuser(path)

@@ -1,6 +1,8 @@
 """``lgrasp learn``: a predictor is trained, kept, measured; one line for bad input."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -8,6 +10,7 @@ import numpy as np
 import torch
 
 from lgrasp.learn.network import CoarseNet
+from lgrasp.learn.networks import network_bytes
 from lgrasp.learn.params import LearnParams
 from lgrasp_cli.progress import JobProgress
 
@@ -27,8 +30,8 @@ def test_fit_and_eval(generate, cli):
     assert len(found["refined"]) == 4
     assert found["refined"][-1] < found["coarse"]
     Path("bad.pt").write_bytes(b"nonsense")
-    assert "not a predictor" in cli("learn", "eval", "bad.pt", "out").error()
-    assert "'absent.pt' does not exist" in cli("learn", "eval", "absent.pt", "out").error()
+    assert "not a network" in cli("learn", "eval", "bad.pt", "out").error()
+    assert "absent.pt: no such file, nor a network" in cli("learn", "eval", "absent.pt", "out").error()
 
 
 def test_interrupted_before_there_is_anything_to_report(generate, cli, monkeypatch):
@@ -70,25 +73,56 @@ def test_files_that_are_no_predictors(cli):
     params = LearnParams.model_validate({"width": 8})
     net = CoarseNet(torch.zeros(2), torch.ones(2), params)
     Path("none.h5").touch()  # the predictor is read first
-    good = {"format": "lgrasp-coarse", "version": 1, "hand": "h", "hand_sha256": "0" * 64}
-    good |= {"params": params.model_dump_json(), "state": net.state_dict()}
-    weights = {name: values * float("nan") for name, values in net.state_dict().items()}
-    for change, words in (
-        ({"version": 9}, "version 9"),
-        ({"params": "{}"}, "size mismatch"),
-        ({"params": "?"}, "net.pt"),
-        ({"state": {}}, "'lower'"),
-        ({"state": weights}, "weights that are not finite"),
+    card = {"kind": "coarse", "version": 2, "hand": "h", "hand_sha256": "0" * 64, "report": {}}
+    card |= {"params": params.model_dump(mode="json")}
+    good = net.state_dict()
+    for change, state, words in (
+        ({"version": 9}, good, "version 9"),
+        ({"kind": "diffuser"}, good, "kind 'diffuser'"),
+        ({"hand": 3}, good, "hand is 3"),
+        ({"params": {}}, good, "size mismatch"),
+        ({"params": "?"}, good, "net.pt"),
+        ({}, {}, "'lower'"),
+        ({}, {name: values * float("nan") for name, values in good.items()}, "not finite"),
     ):
-        torch.save(good | change, "net.pt")
+        Path("net.pt").write_bytes(network_bytes(card | change, state))
         line = cli("learn", "eval", "net.pt", "none.h5").error()
-        assert "net.pt: not a predictor of lgrasp" in line
+        assert "net.pt: not a network of lgrasp learn fit" in line
         assert words in line
     torch.save(good, "net.pt")
+    assert "no item named" in cli("learn", "eval", "net.pt", "none.h5").error()
+    Path("net.pt").write_bytes(network_bytes(card, good))
     data = Path("net.pt").read_bytes()
     assert "absent: no such file" in cli("learn", "eval", "net.pt", "absent").error()
     Path("net.pt").write_bytes(data[: len(data) // 2])
-    assert "not a predictor" in cli("learn", "eval", "net.pt", "none.h5").error()
+    assert "not a network" in cli("learn", "eval", "net.pt", "none.h5").error()
+
+
+def test_networks_are_known_by_name(generate, cli, monkeypatch, tmp_path):
+    """A file in a data folder is listed with its card, and read by its name."""
+    (tmp_path / "models").mkdir()
+    monkeypatch.setenv("LGRASP_PATH", str(tmp_path))
+    net = CoarseNet(torch.zeros(2), torch.ones(2), params := LearnParams.model_validate({"width": 8}))
+    card = {"kind": "coarse", "version": 2, "hand": "allegro", "hand_sha256": "0" * 64}
+    report = {"objects": ["a", "b"], "unseen": ["c"], "examples": 1200, "loss": 0.25, "params": {"seed": 3}}
+    data = network_bytes(card | {"params": params.model_dump(mode="json"), "report": report}, net.state_dict())
+    (tmp_path / "models" / "toy.pt").write_bytes(data)
+    (tmp_path / "models" / "bad.pt").write_bytes(b"nonsense")
+    found = {n["name"]: n for n in json.loads(cli("learn", "list", "--json", "-").out)}
+    assert found["toy"]["report"] == report
+    assert found["toy"]["bytes"] == len(data)
+    assert found["bad"]["kind"].startswith("cannot be used: ")
+    assert found["hand"]["kind"] == "pose"  # shipped with hands
+    (line,) = (line for line in cli("learn", "list").out.splitlines() if line.startswith("toy"))
+    assert line.split("  ")[-1] == "loss 0.25"
+    assert "2 objects, 1 object held out, 1,200 examples, seed 3" in line
+    assert generate(rows=3).code == 0
+    assert "toy.pt is of hand 'allegro', the shards" in cli("learn", "eval", "toy", "out", "--device", "cpu").error()
+    assert "did you mean 'toy'" in cli("learn", "eval", "toi", "out").error()
+    code = (
+        "import sys; from lgrasp.jobs.listing import list_networks; list_networks(); sys.exit('torch' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_a_pose_policy_is_trained_and_used(cli, tmp_path):

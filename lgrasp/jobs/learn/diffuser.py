@@ -14,7 +14,7 @@ from lgrasp.jobs.learn.network import NetworkJob
 from lgrasp.jobs.learn.sequences import ReadSteps, read_steps
 from lgrasp.jobs.requests.shards import DiffuserRequest
 from lgrasp.learn.diffuser.examples import StepExamples, make_net
-from lgrasp.learn.diffuser.file import FORMAT, VERSION, AboutDiffuser, diffuser_bytes, load_diffuser
+from lgrasp.learn.diffuser.file import KIND, VERSION, AboutDiffuser, diffuser_bytes, load_diffuser
 from lgrasp.learn.diffuser.training import StepTrainer
 
 _MIN_STEPS = 64  # of sequences, to learn from
@@ -23,7 +23,7 @@ _MIN_STEPS = 64  # of sequences, to learn from
 class DiffuserJob(DiffuserRequest, NetworkJob):
     """A network that draws steps of sequences; the report has its losses on steps that it saw and that it did not."""
 
-    kind: ClassVar[tuple[str, int]] = (FORMAT, VERSION)
+    kind: ClassVar[tuple[str, int]] = (KIND, VERSION)
 
     @property
     def effort_steps(self) -> int:

@@ -1,15 +1,12 @@
 """Train a coarse predictor on shards, keep it in a file, measure it."""
 
 import copy
-import io
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Made, Part, PartProgress
@@ -20,6 +17,7 @@ from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import object_of_shard
 from lgrasp.learn.examples import Examples, make_examples
 from lgrasp.learn.network import CoarseNet
+from lgrasp.learn.networks import network_bytes, open_network
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import Measured, Trainer, measure
 from lgrasp.runtime.device import resolve_device
@@ -27,7 +25,6 @@ from lgrasp.runtime.device import resolve_device
 ROUNDS = (3, 6, 10, 13)
 """Outer steps of the refiner that the published table has."""
 
-_FORMAT, _VERSION = "lgrasp-coarse", 1
 _MIN_GRASPS = 16  # grasps to learn from
 
 
@@ -39,7 +36,7 @@ class FitJob(NetworkJob):
     (``joint``).
     """
 
-    kind: ClassVar[tuple[str, int]] = ("predictor", 1)
+    kind: ClassVar[tuple[str, int]] = ("coarse", 2)
 
     @property
     def effort_steps(self) -> int:
@@ -104,27 +101,15 @@ def evaluate(
 
 
 def load_predictor(path: Path) -> tuple[CoarseNet, dict[str, Any]]:
-    """A predictor on the CPU, and what its file says: ``hand``, ``hand_sha256``, ``params``, ``report``, ``run_key``.
+    """A predictor on the CPU, and its card: ``hand``, ``hand_sha256``, ``params``, ``report``, ``run_key``.
 
     Raises:
         ConfigError: no such file, or no predictor.
     """
-    try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-        if saved["format"] != _FORMAT or saved["version"] != _VERSION:
-            raise ValueError(f"format {saved['format']!r}, version {saved['version']!r}")
-        about = {name: saved[name] for name in ("format", "version", "hand", "hand_sha256")}
-        about |= {"run_key": saved.get("run_key"), "report": json.loads(saved.get("report", "{}"))}
-        about["params"], state = json.loads(saved["params"]), saved["state"]
-        net = CoarseNet(state["lower"], state["upper"], LearnParams.model_validate(about["params"]))
+    with open_network(path, *FitJob.kind) as (card, state):
+        net = CoarseNet(state["lower"], state["upper"], LearnParams.model_validate(card["params"]))
         net.load_state_dict(state)
-        if not all(bool(values.isfinite().all()) for values in state.values()):
-            raise ValueError("weights that are not finite")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; lgrasp learn fit writes predictors") from None
-    except Exception as error:  # damaged files make the unpickler raise almost anything
-        raise ConfigError(f"{path}: not a predictor of lgrasp ({' '.join(str(error).split())[:120]})") from None
-    return net, about
+        return net, card
 
 
 def _numbers(found: Measured) -> dict[str, Any]:
@@ -155,9 +140,6 @@ def _examples(
 
 def _bytes(trainer: Trainer, hand: HandModel, key: str, report: dict[str, Any]) -> bytes:
     """The file of a predictor."""
-    data = io.BytesIO()
-    state = {name: values.cpu() for name, values in trainer.net.state_dict().items()}
-    about = {"format": _FORMAT, "version": _VERSION, "hand": hand.name, "hand_sha256": hand.sha256, "run_key": key}
-    about |= {"params": trainer.params.model_dump_json(), "report": json.dumps(report), "state": state}
-    torch.save(about, data)
-    return data.getvalue()
+    card = {"kind": FitJob.kind[0], "version": FitJob.kind[1], "hand": hand.name, "hand_sha256": hand.sha256}
+    card |= {"params": trainer.params.model_dump(mode="json"), "run_key": key, "report": report}
+    return network_bytes(card, {name: values.cpu() for name, values in trainer.net.state_dict().items()})

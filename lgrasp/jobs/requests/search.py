@@ -14,6 +14,7 @@ from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
+from lgrasp.learn.networks import find_network
 from lgrasp.object.find import find_object
 from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import NO_TABLE, PROTOCOLS, find_protocol
@@ -128,7 +129,7 @@ class SampleRequest(SequenceRequest):
 
     maker: ClassVar[str] = "lgrasp.jobs.sequence.sample:SampleJob"
 
-    model: Path = Field(description="File of lgrasp learn fit --model diffuser.")
+    model: str = Field(description="File of lgrasp learn fit --model diffuser, or a name of lgrasp learn list.")
 
     def check_method(self) -> None:
         if (method := self.pipeline.params("sequence").method) != "diffuser":
@@ -136,5 +137,4 @@ class SampleRequest(SequenceRequest):
                 f"pipeline '{self.pipeline.name}' has sequence.method {method}; a network needs diffuser, as pipeline "
                 "sample has"
             )
-        if not self.model.is_file():
-            raise ConfigError(f"{self.model}: no such file; lgrasp learn fit --model diffuser writes such files")
+        find_network(self.model)

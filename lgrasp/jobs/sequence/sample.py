@@ -17,6 +17,7 @@ from lgrasp.learn.diffuser.file import AboutDiffuser, load_diffuser
 from lgrasp.learn.diffuser.network import DiffuserNet
 from lgrasp.learn.diffuser.sampler import StepSampler
 from lgrasp.learn.diffuser.senses import coarse_grid
+from lgrasp.learn.networks import find_network
 
 
 class SampleJob(SampleRequest, SequenceJob):
@@ -33,21 +34,22 @@ class SampleJob(SampleRequest, SequenceJob):
             ConfigError: the file is none, or of another hand.
         """
         if self._network is None:
-            net, about, source = *load_diffuser(self.model), self.keys.source
+            path, source = find_network(self.model), self.keys.source
+            net, about = load_diffuser(path)
             if about.hand_sha256 != hand_digest(source.urdf, source.spec) or about.space_names != tuple(
                 source.spec.opposition_spaces
             ):
                 raise ConfigError(
                     f"{self.model} is of hand '{about.hand}', not of '{source.name}' (or of another model of it)"
                 )
-            self._network = net, about, content_key("network", 1, content=self.model.read_bytes().hex())
+            self._network = net, about, content_key("network", 1, content=path.read_bytes().hex())
         return self._network
 
     def key(self) -> str:
         return content_key("sample", 1, run=super().key(), network=self.network()[2])
 
     def own_config(self) -> dict[str, Any]:
-        return super().own_config() | {"model": self.model.name, "network": self.network()[2]}
+        return super().own_config() | {"model": find_network(self.model).name, "network": self.network()[2]}
 
     def parts(self) -> list[Part]:
         self.network()  # told at once if it cannot be used

@@ -17,7 +17,7 @@ from lgrasp.learn.diffuser.features import mesh_centre
 from lgrasp.object.sdf import SdfGrid, build_sdf
 from lgrasp.refine.surface import farthest_points
 
-_NODES = 32**3  # of an object's grid
+_NODES = 48**3  # of an object's grid
 _PAD = 0.03  # [m] of a grid about the object
 _NEAREST, _FARTHEST = -0.02, 0.04  # [m] distances that are told apart
 

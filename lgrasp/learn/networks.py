@@ -1,0 +1,118 @@
+"""Files of trained networks: weights, and a card that tells what they are. No code is in them, and nothing in them is
+trusted. Light to import; cards are read without torch."""
+
+import io
+import json
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lgrasp.config import did_you_mean
+from lgrasp.errors import ConfigError
+from lgrasp.paths import data_dirs
+
+if TYPE_CHECKING:
+    import torch
+
+_CARD = "archive/card.json"  # beside what torch writes there
+_MOST_BYTES, _MOST_CARD = 1 << 28, 1 << 22
+
+
+def known_networks() -> dict[str, Path]:
+    """Name -> file of the networks in the data folders ``models``; the user's own come before shipped ones."""
+    found: dict[str, Path] = {}
+    for path in (path for folder in data_dirs("models") for path in sorted(folder.glob("*.pt"))):
+        found.setdefault(path.stem, path)
+    return found
+
+
+def find_network(name: str) -> Path:
+    """The file of a network: a path, or a name of :func:`known_networks`.
+
+    Raises:
+        ConfigError: neither.
+    """
+    path, known = Path(name).expanduser(), known_networks()
+    if path.is_file():
+        return path
+    if name not in known:
+        hint = did_you_mean(name, known)
+        raise ConfigError(
+            f"{name}: no such file, nor a network of that name; {hint}known: {', '.join(known) or 'none'}; "
+            "lgrasp learn fit writes such files"
+        )
+    return known[name]
+
+
+def network_bytes(card: Mapping[str, Any], state: "Mapping[str, torch.Tensor]") -> bytes:
+    """The file of a network, which torch.load reads as its weights.
+
+    Args:
+        card: JSON-serialisable: ``kind`` (as ``learn fit --model`` names it), ``version``, ``hand``, ``hand_sha256``,
+            ``params``, ``run_key``, ``report`` (``objects``, ``examples``; its numbers are the network's figures), and
+            what else the kind needs.
+        state: on the CPU.
+    """
+    import torch
+
+    data = io.BytesIO()
+    torch.save(dict(state), data)
+    with zipfile.ZipFile(data, "a") as archive:
+        archive.writestr(zipfile.ZipInfo(_CARD), json.dumps(card))  # of no date
+    return data.getvalue()
+
+
+@contextmanager
+def open_network(path: Path, kind: str, version: int) -> "Iterator[tuple[dict[str, Any], dict[str, torch.Tensor]]]":
+    """The card and the weights, on the CPU, of a file; what is raised within means that the file is none.
+
+    Raises:
+        ConfigError: no such file, or not such a network.
+    """
+    with _as_told(path, kind):
+        import torch
+
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"{path.stat().st_size:,} bytes")
+        card = _card(path)
+        if card["kind"] != kind or card["version"] != version:
+            raise ValueError(f"kind '{card['kind']}', version {card['version']}")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        for name, values in state.items():
+            if not (values.dtype.is_floating_point and bool(values.isfinite().all())):
+                raise ValueError(f"{name}: weights that are not finite numbers")
+        yield card, state
+
+
+def read_card(path: Path) -> dict[str, Any]:
+    """The card of a network of any kind.
+
+    Raises:
+        ConfigError: no such file, or no network.
+    """
+    with _as_told(path, ""):
+        return _card(path)
+
+
+def _card(path: Path) -> dict[str, Any]:
+    with zipfile.ZipFile(path) as archive:
+        if (size := archive.getinfo(_CARD).file_size) > _MOST_CARD:
+            raise ValueError(f"a card of {size:,} bytes")
+        card = json.loads(archive.read(_CARD))
+    for name, kind in {"kind": str, "version": int, "hand": str, "hand_sha256": str, "report": dict}.items():
+        if not isinstance(card[name], kind):
+            raise ValueError(f"card: {name} is {card[name]!r}")
+    return card
+
+
+@contextmanager
+def _as_told(path: Path, kind: str) -> Iterator[None]:
+    by = f"lgrasp learn fit{kind and f' --model {kind}'}"
+    try:
+        yield
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; {by} writes such files") from None
+    except Exception as error:  # damaged files make the unpickler raise almost anything
+        raise ConfigError(f"{path}: not a network of {by} ({' '.join(str(error).split())[:160]})") from None
