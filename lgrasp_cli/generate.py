@@ -51,7 +51,7 @@ def generate(
     batch: Annotated[int, Option(min=0, help="Candidates per batch; 0: by device.")] = 0,
     simulate: Annotated[
         str | None,
-        Option(**one_of(ProtocolName, "PROTOCOL", "Keep only grasps that hold in a simulation.")),
+        Option(**one_of(ProtocolName, "PROTOCOL", "Keep only rows that hold in a simulation.")),
     ] = None,
     shard_rows: Annotated[
         int, Option(help="Grasps per shard. Changing it changes which grasps are generated.")

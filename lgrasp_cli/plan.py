@@ -42,8 +42,7 @@ def plan(
 ) -> None:
     """Plan grasps by closing an open hand onto a mesh or point cloud with a local search.
 
-    The palm faces each of the starts, the farthest from each other; the best hand of a start that passes all checks
-    becomes a row. The exit code is 3 if no start gives one.
+    The best hand of a start that passes all checks becomes a row. The exit code is 3 if no start gives one.
 
     Example: lgrasp plan --cloud scene.ply --mask labels.npy --label 3 --hand barrett --starts 80
     """

@@ -29,9 +29,9 @@ def cli_page() -> str:
             common[_flag(names)] = rows[0]
     lines = [
         _MARK,
-        "Commands name these options without repeating their meaning. Brackets hold defaults. Of commands for",
+        "Commands only name these options. Brackets hold defaults. `--help` tells more of commands for developers.",
+        "",
     ]
-    lines += ["developers there is only a summary: `--help` tells the rest.", ""]
     lines += [f"*Job options* are {_code(_JOB)}.", ""]
     lines += [*(f"- `{names}`: {what}{default}" for _, (names, what, default) in sorted(common.items())), ""]
     for command, context in commands:

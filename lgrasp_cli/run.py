@@ -6,7 +6,7 @@ from typing import Annotated
 from typer import Argument, Option
 
 from lgrasp_cli.many import run_all
-from lgrasp_cli.names import CONFIG
+from lgrasp_cli.names import CONFIG, OBJECTS
 from lgrasp_cli.options import DryRun, given
 from lgrasp_cli.working import How, working
 
@@ -18,6 +18,8 @@ def run(
     rows: Annotated[int | None, Option("-n", "--rows", help="Replaces rows.")] = None,
     out: Annotated[Path | None, Option(help="Replaces out.")] = None,
     object_dir: Annotated[Path | None, Option(help="Replaces object_dir.")] = None,
+    objects: Annotated[list[str] | None, Option("--object", help="Replaces objects; repeatable.", **OBJECTS)] = None,
+    held_out: Annotated[list[str] | None, Option(help="Replaces held_out; repeatable.", **OBJECTS)] = None,
     seed: Annotated[int | None, Option(help="Replaces seed.")] = None,
     dry_run: DryRun = False,
 ) -> None:
@@ -31,4 +33,5 @@ def run(
     from lgrasp.jobs.config import load_requests
 
     changes = given(rows=rows, out=out, object_dir=object_dir, seed=seed, device=how.device, workers=how.workers)
+    changes |= {key: value for key, value in (("objects", objects), ("held_out", held_out)) if value}
     run_all(load_requests(config, changes), how, dry_run=dry_run)

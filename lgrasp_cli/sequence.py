@@ -20,7 +20,7 @@ Rows = Annotated[int, Option("-n", "--rows", help="Complete sequences requested.
 PolicyName = Annotated[str | None, Option(**one_of(Policy, "POLICY", "Default: the pipeline's."))]
 Size = Annotated[str, Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")]
 Simulate = Annotated[
-    str | None, Option(**one_of(ProtocolName, "PROTOCOL", "Continue only rows that hold in a simulation."))
+    str | None, Option(**one_of(ProtocolName, "PROTOCOL", "Keep only rows that hold in a simulation."))
 ]
 PipelineName = Annotated[
     str, Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.", **PIPELINE)

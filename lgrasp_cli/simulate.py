@@ -30,8 +30,7 @@ def simulate(
     """Simulate grasps and add the verdicts to the shards, as columns physics/PROTOCOL_...
 
     The hand closes on its free objects, which are then pulled in six directions; a grasp holds if they stay. lift takes
-    the object of a generate --table off its table and is shaken; dipgrasp lifts a free object and turns gravity;
-    fc_random is fc in 8 random draws (these on the CPU only). seq6 and seq6_mu06 are for sequences of objects. A shard
+    rows of generate --table, seq6 and seq6_mu06 are for several objects; docs/guides/physics.md describes all. A shard
     that has the verdicts is left as it is.
 
     Contacts are hard in PhysX (pip install "lgrasp[physx]"), whose columns are physics/physx_PROTOCOL_....

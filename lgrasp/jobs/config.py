@@ -24,6 +24,7 @@ from lgrasp.engine.folder import run_folder
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.engine.request import Request, named
 from lgrasp.errors import ConfigError, LgraspError
+from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.hand.names import all_hands, hand_path
 from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest
 from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
@@ -42,6 +43,7 @@ class JobConfig(Params):
         (), description="Names, paths, folders of meshes, or globs; none: all meshes of object_dir."
     )
     object_dir: Path | None = Field(None, description="Folder where the names of objects are looked up first.")
+    held_out: tuple[str, ...] = Field((), description="Likewise: objects to leave out, by name and by contents.")
     pipelines: tuple[str, ...] = Field(("robust",), min_length=1, description="Names or paths.")
     rows: int = Field(1000, ge=1, description="Grasps per hand, object and pipeline.")
     settings: tuple[str, ...] = Field((), description="PART.KEY=VALUE of every pipeline, such as bounds.friction=0.8.")
@@ -235,15 +237,30 @@ def _pipelines(config: JobConfig) -> Iterator[Pipeline]:
 
 
 def _objects(config: JobConfig) -> tuple[str, ...]:
-    """The objects of a config, those of its folder if it names none."""
+    """The objects of a config, those of its folder if it names none, without those held out."""
     for key, folder in (("hand_dir", config.hand_dir), ("object_dir", config.object_dir)):
         if folder is not None and not folder.expanduser().is_dir():
             raise ConfigError(f"{key} {folder} is not a folder")
-    if config.objects:
-        return all_objects(config.objects)
-    if config.object_dir is None:
+    if not config.objects and config.object_dir is None:
         raise ConfigError("the config names no objects; give object_dir, a folder of meshes (--object-dir)")
-    return tuple(Path(mesh).name for mesh in all_objects([str(config.object_dir)]))
+    found = all_objects(config.objects or [str(config.object_dir)])
+    found = found if config.objects else tuple(Path(mesh).name for mesh in found)
+    if not config.held_out:
+        return found
+    named = {Path(mesh).stem: mesh for mesh in all_objects(config.held_out)}
+    own = {mesh for mesh in found if Path(mesh).stem in named}
+    others = named.keys() - {Path(mesh).stem for mesh in own}
+    contents = {_contents(config, mesh) for mesh in (*own, *(named[name] for name in others))}
+    return tuple(mesh for mesh in found if mesh not in own and _contents(config, mesh) not in contents)
+
+
+def _contents(config: JobConfig, mesh: str) -> str:
+    """Digest of an object's file.
+
+    Raises:
+        ObjectError: there is no such object.
+    """
+    return mesh_digest(mesh_bytes(find_object(in_folder(config.object_dir, mesh))))
 
 
 def _urdf_in_folder(folder: Path | None, hand: str) -> str:

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator
 from lgrasp.choices import Method, Policy, ProtocolName
 from lgrasp.config import Params
 from lgrasp.errors import ConfigError
+from lgrasp.notices import notice
 from lgrasp.seeding import stage_seed
 
 
@@ -37,12 +38,18 @@ def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list
     """Sequences of objects: ``permutations`` orders of each of ``sets`` different sets.
 
     Args:
-        pool: objects to draw from, in any order.
+        pool: objects to draw from, in any order; of two of one name the first counts.
 
     Raises:
         ConfigError: there are not so many sets or orders.
     """
-    pool = sorted(set(pool))
+    named: dict[str, str] = {}
+    for mesh in pool:
+        named.setdefault(Path(mesh).stem, mesh)
+    if len(named) < len(set(pool)):
+        twice = sorted({Path(mesh).stem for mesh in pool if named[Path(mesh).stem] != mesh})
+        notice(f"{', '.join(twice)}: several objects of one name, of which the first is in sets")
+    pool = [named[name] for name in sorted(named)]
     most, orders = math.comb(len(pool), sets.length), math.factorial(sets.length)
     if sets.sets > most:
         raise ConfigError(f"{sets.sets} sets of {sets.length} objects are requested; {len(pool)} objects make {most}")

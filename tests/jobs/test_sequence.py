@@ -14,9 +14,12 @@ from lgrasp.engine.run import run
 from lgrasp.errors import OutputError
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.jobs.sequence import round as round_module
+from lgrasp.jobs.sequence.inputs import load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.sequence.round import run_round
 from lgrasp.jobs.sequence.shard import make_sequences
+from lgrasp.runtime.device import resolve_device
+from lgrasp.sequence.size import Size
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +124,28 @@ def test_first_rows_of_a_longer_run(pipeline, inputs):
         first, second = result.levels
         assert second.parent.max() < len(first)
         np.testing.assert_array_equal(first.q[second.parent], second.q[:, :1])
+
+
+def test_an_object_has_one_size_in_all_sets(pipeline):
+    """So that it is prepared once, and rows of many sets are not all of the few sizes of a set's places."""
+
+    def scales(*names, seed=0):
+        made = sequence_keys("allegro", names, Size(0.06, 0.10), seed, pipeline.object, pipeline.field)
+        return dict(zip(names, made.scales, strict=True))
+
+    four = scales("mug", "sphere", "box", "bowl")
+    assert scales("bowl", "plate", "mug") | four == four | scales("plate", "sphere")
+    assert scales("mug", "sphere", seed=1)["mug"] != four["mug"]
+
+
+def test_sets_share_what_is_loaded_of_the_hand(pipeline, cache_root):
+    """On the device, as long as they share a cache."""
+    cache, device = Cache(cache_root, pytest.fail), resolve_device("cpu")
+    views = []
+    for names in (OBJECTS, OBJECTS[::-1]):
+        keys = sequence_keys("allegro", names, Size(0.06, 0.08), 0, pipeline.object, pipeline.field)
+        views.append(load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device).views)
+    assert views[0] is views[1]
 
 
 @pytest.fixture

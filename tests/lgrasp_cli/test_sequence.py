@@ -1,12 +1,14 @@
 """``lgrasp sequence``: what goes wrong says so on one line; reports; configs of sets."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from lgrasp.object.find import find_object
 from lgrasp.paths import data_dirs
 
 PIPELINE = {
@@ -115,6 +117,29 @@ def test_sets(cli, small, tmp_path):
     assert sorted(line for part in parts for line in part.splitlines()[1:]) == sorted(plan.out.splitlines()[1:])
     assert cli("run", config).code == 0
     assert len(list(Path(tmp_path / "sets").glob("*/*/*.h5"))) == 2
+
+
+def test_no_set_has_an_object_that_is_held_out(cli, small, tmp_path):
+    """Neither by name nor as a copy under another name, wherever it comes from."""
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for name, source in {"cup": "mug", "ball": "sphere", "box": "box"}.items():
+        shutil.copy(find_object(source), meshes / f"{name}.obj")
+    config = tmp_path / "sets.yaml"
+    sets = {"sets": 3, "length": 2, "permutations": 2}
+    config.write_text(yaml.safe_dump({"pipelines": [str(small)], "sequences": sets, "out": "sets", "objects": ["mug"]}))
+    pool = [f"--object={name}" for name in (meshes, "mug", "box", "bowl", "plate")]
+
+    def drawn(*options):
+        told = cli("run", config, *pool, *options, "--dry-run")
+        files = [line.split()[-1] for line in told.out.splitlines()[1:]]
+        return told, {name for file in files for name in Path(file).parts[1].split("-")[1:]}
+
+    told, names = drawn("--held-out", "mug")
+    assert "box: several objects of one name" in told.err
+    assert names <= {"ball", "box", "bowl", "plate"}
+    assert "2 objects make 1" in cli("run", config, *pool, "--held-out", meshes, "--dry-run").error()
+    assert "mugg" in cli("run", config, *pool, "--held-out", "mugg", "--dry-run").error()
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from dataclasses import field as with_default
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,7 +113,7 @@ def sequence_keys(
     described = fields.model_dump(mode="json")
     field_keys = {n: content_key("field", FIELD_VERSION, hand=key, params=described) for n, key in views.items()}
     paths = tuple(find_object(mesh) for mesh in meshes)
-    scales = _object_scales(paths, size, seed, objects)
+    scales = _object_scales(paths, size, seed)
     keys = tuple(object_key(str(p), s, objects)[1] for p, s in zip(paths, scales, strict=True))
     return SequenceKeys(source, hand_key, views, field_keys, paths, scales, keys)
 
@@ -131,44 +131,58 @@ def load_sequence_inputs(
     Raises:
         ConfigError: more objects than the hand's opposition spaces can take one after another.
     """
-    load, source, alias = Loader(cache, device.alias, report), keys.source, device.alias
-    model = load.hand(source, keys.hand)
-    spaces = hand_spaces(source.spec, model.tree)
+    load, alias = Loader(cache, device.alias, report), device.alias
+    key = alias, keys.hand, *keys.views.values(), *keys.fields.values()
+    model, spaces, views = cache.keep("spaces", key, lambda: _load_spaces(load, keys, fields))
     most = longest(spaces, (), np.zeros(model.dofs, bool))
     if len(keys.meshes) > most:
         raise ConfigError(
             f"{len(keys.meshes)} objects are requested, but the {len(spaces)} opposition spaces of hand "
-            f"'{source.name}' ({', '.join(s.name for s in spaces)}) take at most {most} one after another"
+            f"'{keys.source.name}' ({', '.join(s.name for s in spaces)}) take at most {most} one after another"
         )
-    views = []
-    for name in (space.name for space in spaces):
-        make = partial(space_view, source.urdf, source.spec, model, name, alias)
-        view = load.get("hand", HandModel, keys.views[name], make)
-        hand = upload_hand(view, alias)
-        views.append(SpaceView(hand, upload_field(load.field(hand, keys.fields[name], fields), view, alias)))
     made: dict[str, ObjectArrays] = {}
     for path, key, scale in zip(keys.meshes, keys.objects, keys.scales, strict=True):
         if key not in made:
             made[key] = upload_object(load.object(path, key, scale, objects), alias)
     steps = tuple(made[key] for key in keys.objects)
-    return SequenceInputs(model, spaces, tuple(views), steps, keys, device, load.seconds, load.hits)
+    return SequenceInputs(
+        model, spaces, views, steps, keys, device, load.seconds, {"hand": True, "field": True} | load.hits
+    )
 
 
-def _object_scales(meshes: Sequence[Path], size: Size, seed: int, params: ObjectParams) -> tuple[float, ...]:
-    """Factor from each mesh's unit to metres; the same mesh gets the same.
+def _load_spaces(
+    load: Loader, keys: SequenceKeys, fields: FieldParams
+) -> tuple[HandModel, tuple[Space, ...], tuple[SpaceView, ...]]:
+    """The hand, its opposition spaces and their views, on the device."""
+    source, alias = keys.source, load.device
+    model = load.hand(source, keys.hand)
+    spaces, views = hand_spaces(source.spec, model.tree), []
+    for name in (space.name for space in spaces):
+        make = partial(space_view, source.urdf, source.spec, model, name, alias)
+        view = load.get("hand", HandModel, keys.views[name], make)
+        hand = upload_hand(view, alias)
+        views.append(SpaceView(hand, upload_field(load.field(hand, keys.fields[name], fields), view, alias)))
+    return model, spaces, tuple(views)
+
+
+def _object_scales(meshes: Sequence[Path], size: Size, seed: int) -> tuple[float, ...]:
+    """Factor from each mesh's unit to metres, by its name and the seed: the same with whatever other objects, so that
+    it is prepared once for all sets that it is in.
 
     Raises:
         ObjectError: a mesh whose size is needed cannot be read.
     """
     if not size.high:
         return (size.low,) * len(meshes)
+    drawn = (np.random.default_rng(stage_seed(seed, 0, f"size/{path.stem}")).uniform(*size) for path in meshes)
+    sides = (_longest_side(path, path.stat().st_mtime_ns) for path in meshes)
+    return tuple(float(wanted) / side for wanted, side in zip(drawn, sides, strict=True))
+
+
+@lru_cache(1024)  # an object is in many sets
+def _longest_side(path: Path, changed: int) -> float:
+    """Of the bounding box of a mesh as of some time, in its own unit."""
     from lgrasp.object.load import load_mesh  # slow to load
 
-    rng = np.random.default_rng(stage_seed(seed, 0, "size"))
-    drawn: dict[Path, float] = {}
-    for path in meshes:
-        if path not in drawn:
-            any_size = params.model_copy(update={"min_extent": 0.0, "max_extent": math.inf})
-            side = float(np.ptp(load_mesh(path, params=any_size).vertices, axis=0).max())
-            drawn[path] = float(rng.uniform(*size)) / side
-    return tuple(drawn[path] for path in meshes)
+    any_size = ObjectParams().model_copy(update={"min_extent": 0.0, "max_extent": math.inf})
+    return float(np.ptp(load_mesh(path, params=any_size).vertices, axis=0).max())
