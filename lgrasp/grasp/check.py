@@ -29,6 +29,7 @@ from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.palm import palm_axis
+from lgrasp.math.constants import LOAD_DIRECTIONS
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.runtime.fetch import fetch, to_numpy
@@ -37,7 +38,6 @@ from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally, read_tallies
 
 _MAX_RANKED_PENETRATION = 0.03  # [m] penetrations above this are not distinguished
-_LOAD_DIRECTIONS = 6
 _ON_TABLE = {"resting": "pose", "approach": "approach"}  # columns of rows on a table, and their names in it
 
 
@@ -82,7 +82,7 @@ class Check:
         d, n = self.hand.device, len(self)
         wp.launch(balance_grasps, n, [self.limits, self.places, self.at], [self.found], device=d)
         inputs = [self.obj.struct, self.limits, self.places, self.at]
-        wp.launch(resist_loads, (_LOAD_DIRECTIONS, n), inputs, [self.found], device=d)
+        wp.launch(resist_loads, (LOAD_DIRECTIONS, n), inputs, [self.found], device=d)
         reasons = REASONS if self.obj.touch is None else SHARED
         tally, passed = empty_tally(reasons, d), wp.empty(n, dtype=wp.int32, device=d)
         wp.launch(count_outcomes, n, [self.limits], [self.found, passed, tally.device], device=d)

@@ -12,6 +12,8 @@ LOAD_ARM = 0.05
 """Torques of the unresisted load are divided by this length [m]."""
 LOAD_FORCE = 5.0
 """Normal forces of all contacts together that may resist a unit load."""
+LOAD_DIRECTIONS = 6
+"""Directions of the unit load, along and against the axes of the hand's base."""
 DRIVE_STIFFNESS = 5.0
 """Position control that squeezes are meant for and simulations begin with [N m/rad]."""
 SLIDING_ARM = 0.1

@@ -118,8 +118,14 @@ def check_balance(hits: Hits, obj: Object, params: SearchValues, candidates: Can
 
 
 @wp.kernel
-def check_load(hits: Hits, obj: Object, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
-    """One thread per (hit, direction), the hardest first: scores go below 0 when the set lets go of the object."""
+def check_load(
+    hits: Hits, obj: Object, params: SearchValues, first: wp.int32, candidates: Candidates, tried_out: TriedSets
+):
+    """One thread per (hit, direction): scores go below 0 when the set lets go of the object.
+
+    Args:
+        first: of the directions that are tried, from the hardest, 0.
+    """
     i, rank = wp.tid()
     row, lane = _hit(hits, tried_out, i)
     if row < 0:
@@ -131,7 +137,7 @@ def check_load(hits: Hits, obj: Object, params: SearchValues, candidates: Candid
         points[c] = points[c] - obj.com
     turn = wp.quat_inverse(wp.transform_get_rotation(candidates.poses.pose[row]))
     limit = params.max_unresisted_load
-    direction = by_difficulty(normals, n, params.friction, turn, rank)
+    direction = by_difficulty(normals, n, params.friction, turn, first + rank)
     if unresisted(points, normals, n, params.friction, turn, direction, limit, limit) > limit:
         tried_out.score[row, lane] = -1.0
 

@@ -8,6 +8,7 @@ import warp as wp
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable, ContactSets
+from lgrasp.math.constants import LOAD_DIRECTIONS
 from lgrasp.math.limits import MAX_GROUPS
 from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
@@ -81,7 +82,10 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
             wp.launch(list_hits, tried.score.shape, [tried], [hits], device=d)
             wp.launch(check_balance, size, [hits, obj, values, inputs.struct], [tried], device=d)
             if values.max_unresisted_load < 1.0:
-                wp.launch(check_load, (size, 6), [hits, obj, values, inputs.struct], [tried], device=d)
+                # most fail in the hardest direction: it comes alone
+                for some, directions in ((0, 1), (1, LOAD_DIRECTIONS - 1)):
+                    asked = [hits, obj, values, some, inputs.struct]
+                    wp.launch(check_load, (size, directions), asked, [tried], device=d)
             if context.realised:
                 wp.launch(check_fingers, size, [hits, hand, values, inputs.struct], [tried], device=d)
             if exact:
