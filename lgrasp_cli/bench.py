@@ -40,6 +40,7 @@ app = typer.Typer(
 
 _List = Annotated[str | None, Option(help="Names or files, separated by commas.", show_default="the published")]
 _ObjectDir = Annotated[Path | None, Option(help="Folder where the names of objects are looked up first.")]
+_Resume = Annotated[bool, Option("--resume", help="Keep what --json PATH holds.")]
 _Repeat = Annotated[int, Option(min=1, help="Runs of each pipeline and object.")]
 
 
@@ -107,7 +108,7 @@ def table1(
     workers: Workers = 0,
     json_path: JsonPath = None,
     plot: Annotated[Path | None, Option(metavar="FILE.png", help="Also draw the table as bars.")] = None,
-    resume: Annotated[bool, Option("--resume", help="Keep the cells that --json PATH holds.")] = False,
+    resume: _Resume = False,
 ) -> None:
     """Measure the table of Lightning Grasp: four hands, eight objects, our pipelines next to the published figures.
 
@@ -117,7 +118,6 @@ def table1(
     Example: lgrasp bench table1 --hand-dir hands --object-dir meshes --json table1.json --plot table1.png
     """
     from lgrasp.config import parse_model
-    from lgrasp.errors import ConfigError
     from lgrasp.jobs.config import JobConfig, load_config
 
     names = {"hands": hands, "objects": objects, "pipelines": pipelines}
@@ -125,9 +125,7 @@ def table1(
     what |= given(hand_dir=hand_dir, object_dir=object_dir, rows=rows, shard_rows=shard_rows)
     how = given(settings=settings, seed=seed, device=device, workers=workers)
     config = parse_model(JobConfig, load_config("table1").model_dump() | what | how, "bench table1")
-    file = None if json_path in (None, "-") else json_path
-    if resume and not file:
-        raise ConfigError("--resume needs the file to continue: --json PATH")
+    file = _written(json_path, resume)
     check_report(json_path)
     _check(config)
     cache = open_cache(None)
@@ -186,13 +184,16 @@ def bench_sequence(
     workers: Workers = 0,
     json_path: JsonPath = None,
     cache_dir: CacheDir = None,
+    resume: _Resume = False,
 ) -> None:
     """Measure the tables of SeqGrasp: success by opposition space and number of objects, for each method.
 
-    Every row is simulated, and only rows that hold are continued. Only the cache is written.
+    Every row is simulated, and only rows that hold are continued. All methods go through one sequence before the next;
+    --json PATH is written after each method.
 
     Example: lgrasp bench sequence --sequences 2 --methods field
     """
+    file = _written(json_path, resume)
     check_report(json_path)
     from lgrasp.config import parse_model
     from lgrasp.jobs.requests.search import SampleRequest, SequenceRequest
@@ -216,10 +217,14 @@ def bench_sequence(
     for request in asked:
         request.check()
     cache = open_cache(cache_dir)
-    from lgrasp.bench.sequence import bench_methods, sequence_page
+    from lgrasp.bench.sequence import bench_methods, read_parts, sequence_page
+    from lgrasp.engine.report import write_json
 
-    jobs = [request.job(cache) for request in asked]
-    result = bench_methods(jobs[: len(drawn)], split(methods), baseline_width, say, jobs[len(drawn) :])
+    jobs, result = [request.job(cache) for request in asked], {}
+    parts = read_parts(Path(file)) if resume and file else {}
+    for result in bench_methods(jobs[: len(drawn)], split(methods), baseline_width, say, jobs[len(drawn) :], parts):
+        if file:
+            write_json(file, result | {"set": settings or []})
     _print(result | {"set": settings or []}, json_path, sequence_page(result))
 
 
@@ -299,6 +304,19 @@ def bench_soak(
     _print(result, json_path, soak_page(result))
     if result["faults"]:
         raise typer.Exit(1)
+
+
+def _written(json_path: str | None, resume: bool) -> str | None:
+    """The file that is written as the benchmark goes on.
+
+    Raises:
+        ConfigError: there is none to resume from.
+    """
+    if resume and json_path in (None, "-"):
+        from lgrasp.errors import ConfigError
+
+        raise ConfigError("--resume needs the file to continue: --json PATH")
+    return None if json_path == "-" else json_path
 
 
 def _print(result: Any, json_path: str | None, page: "Page") -> None:

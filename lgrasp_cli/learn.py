@@ -99,7 +99,10 @@ def evaluate(
     cache_dir: CacheDir = None,
     quiet: Quiet = False,
 ) -> Answer:
-    """Measure the energy of predictions on new clouds, before and after 3, 6, 10 and 13 rounds of the refiner.
+    """Measure a network on shards.
+
+    coarse: the energy of predictions on new clouds, before and after 3, 6, 10 and 13 rounds of the refiner. diffuser:
+    the loss, and penetration of draws as they come.
 
     Example: lgrasp learn eval coarse.pt grasps
     """
@@ -107,10 +110,17 @@ def evaluate(
 
     shards_below(shards)
     cache = open_cache(cache_dir)
-    from lgrasp.jobs.learn.job import evaluate as run
-    from lgrasp.learn.networks import find_network
+    from lgrasp.learn.networks import find_network, read_card
 
-    data = run(find_network(predictor), shards, cache, clouds=clouds, seed=seed, device=device)
+    path = find_network(predictor)
+    if read_card(path)["kind"] == "diffuser":
+        from lgrasp.jobs.learn.diffuser import evaluate as measure
+
+        data = measure(path, shards, cache, seed=seed, device=device)
+        return Answer(data, [] if quiet else [_draws(data)])
+    from lgrasp.jobs.learn.job import evaluate as run
+
+    data = run(path, shards, cache, clouds=clouds, seed=seed, device=device)
     pairs = [
         ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
         ("poses", f"{data['poses']:,}"),
@@ -121,6 +131,21 @@ def evaluate(
         ),
     ]
     return Answer(data, [] if quiet else [pairs])
+
+
+def _draws(data: dict[str, Any]) -> Block:
+    def told(found: dict[str, Any]) -> str:
+        depth = f"penetration {found['penetration_median']:.2f} mm median, {found['penetration_mean']:.2f} mean"
+        return f"{depth}; {found['touching']:.1%} touch and are less than 2 mm deep"
+
+    unknown = f", {len(data['unknown'])} of them not learnt from"
+    return [
+        ("hand, objects", f"{data['hand']}; {plural(len(data['objects']), 'object')}{unknown}"),
+        ("steps", f"{data['examples']:,}, loss {data['loss']:.3f}"),
+        ("as drawn", f"{told(data)}, of {data['draws']:,}"),
+        ("of the shards", told(data["of_data"])),
+        ("time", f"{data['seconds_per_256']:.3f} s for 256 draws"),
+    ]
 
 
 @app.command("list")
@@ -179,7 +204,7 @@ def _show_fit(data: dict[str, Any]) -> list[Block]:
 
 
 def _show_steps(data: dict[str, Any]) -> list[Block]:
-    seen = "" if data["held_out"] is None else f", on steps held out {data['held_out']:.3f}"
+    seen = f", of {plural(len(data['unseen']), 'unseen object')} {data['unseen_loss']:.3f}" if data["unseen"] else ""
     pairs = [
         ("hand, objects", f"{data['hand']}; {len(data['objects'])} objects, {data['examples']:,} steps of sequences"),
         ("loss", f"{data['loss']:.3f}{seen}"),

@@ -1,8 +1,11 @@
 """The tables of SeqGrasp, measured: success by opposition space and by number of objects, for several methods."""
 
+import json
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import zip_longest
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +13,9 @@ import numpy as np
 from lgrasp.bench.page import Page, Table, caveats, load_published, number, over, times
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts
+from lgrasp.errors import ConfigError
+from lgrasp.geometry.poses import device_matrix
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.opposition.spaces import consumed
 from lgrasp.jobs.records import make_scene, mesh_blobs
@@ -31,86 +37,196 @@ def bench_methods(
     baseline_width: int,
     progress: Callable[[str], None],
     drawn: Sequence[SequenceJob] = (),
-) -> dict[str, Any]:
+    parts: dict[str, Any] | None = None,
+) -> Iterator[dict[str, Any]]:
     """Run each method on the same sequences of objects; methods after the first with ``baseline_width`` attempts.
 
     Args:
-        drawn: the same sequences drawn by a network, measured as a method more with all their attempts.
+        drawn: the same sequences drawn by a network, with all their attempts: method ``diffuser``, and ``diffuser
+            unrefined``, one draw of each attempt as it comes.
+        parts: measured before, by the keys of their jobs; those that are measured join them.
 
-    Returns:
-        ``published``; ``device``, ``simulate`` and ``sequences`` as asked; ``methods``: name -> see
-        :func:`measure_sequences`, with the ``ratios`` of the first method to it, by rows per second.
+    Yields:
+        After each method and sequence, all methods of one sequence before the next: ``published``; ``device``,
+        ``simulate`` and ``sequences`` as asked; ``parts``; ``methods``: name -> see :func:`summary`, of the sequences
+        so far, with the ``ratios`` of the first method to it, by rows per second.
     """
-    found: dict[str, dict[str, Any]] = {}
+    parts = {} if parts is None else parts
+    asked: dict[str, list[SequenceJob]] = {}
     for method in methods:
-        changes: dict[str, Any] = {"method": method} | ({"width": baseline_width} if found else {})
-        own = [job.changed(pipeline=job.pipeline.with_params("sequence", **changes)) for job in jobs]
-        found[method] = measure_sequences(own, progress)
-    if drawn:
-        found["diffuser"] = measure_sequences(list(drawn), progress)
-    first = next(iter(found.values()))["objects"]
-    for one in found.values():
-        one["ratios"] = [
-            {name: over(a[name], b[name]) for name in _RATES} for a, b in zip(first, one["objects"], strict=True)
-        ]
-    return {
+        changes: dict[str, Any] = {"method": method} | ({"width": baseline_width} if asked else {})
+        asked[method] = [job.changed(pipeline=job.pipeline.with_params("sequence", **changes)) for job in jobs]
+        if method == methods[0] and drawn:
+            asked["diffuser"] = list(drawn)
+            asked["diffuser unrefined"] = [
+                job.changed(pipeline=job.pipeline.with_params("sequence", refined=False)) for job in drawn
+            ]
+    result: dict[str, Any] = {
         "published": load_published("seqgrasp").model_dump(mode="json"),
         "device": resolve_device(jobs[0].device).name,
         "sequences": [list(job.objects) for job in jobs],
         "simulate": jobs[0].simulate,
-        "methods": found,
+        "parts": parts,
+        "methods": {},
+    }
+    done: dict[str, list[dict[str, Any]]] = {}
+    for place in range(len(jobs)):
+        for name, own in asked.items():
+            key = own[place].key()
+            if parts.get(key, {}).get("device") != result["device"]:
+                width = own[place].pipeline.params("sequence").width
+                progress(f"{place + 1}/{len(jobs)} {name}, {' '.join(own[place].objects)}: {width} attempts")
+                parts[key] = measure_sequence(own[place], result["device"])
+            done.setdefault(name, []).append(parts[key])
+            result["methods"] = {method: summary(some) for method, some in done.items()}
+            first = next(iter(result["methods"].values()))["objects"]
+            for one in result["methods"].values():
+                pairs = zip(first, one["objects"], strict=True)
+                one["ratios"] = [{rate: over(a[rate], b[rate]) for rate in _RATES} for a, b in pairs]
+            yield result
+
+
+def measure_sequence(job: SequenceJob, device: str = "") -> dict[str, Any]:
+    """Run a round of a job, simulate every row and continue those that hold; nothing is written.
+
+    Grasps of an optimiser, and of a network as they are drawn, are simulated as published: only a penetration of 1 cm,
+    contacts farther away than that, and links in links are left out before.
+
+    Args:
+        job: it names a protocol.
+        device: in words.
+
+    Returns:
+        ``begun`` (attempts), ``device``, ``spaces`` (name -> sequences tried with it, rows found, rows that held) and
+        ``steps``: for each object counts, ``seconds`` (simulation not counted), ``drawn`` candidates, ``outcomes`` of
+        the filter, ``depth`` (penetration of each row simulated [mm]), and sums of the numbers of held grasps and of
+        their squares.
+    """
+    used, bounds = resolve_device(job.device), job.pipeline.bounds
+    pipeline, cache, keys = _as_published(job.pipeline), job.cache, job.keys
+    inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, used)
+    scene = make_scene(cache, inputs.hand, object_records(inputs), mesh_blobs(keys.source.urdf), used.alias)
+    inputs = job.with_sampler(replace(inputs, scene=scene))
+    load_kernels(used.alias, kernel_modules(*job.kernels))
+    assert job.simulate
+    width, seen = pipeline.params("sequence").width, []
+    watched = _watched(simulated(inputs, job.simulate), seen)
+    found = run_round(pipeline, inputs, 0, 0, threads(job.workers), verdicts=watched)
+    spaces: dict[str, dict[str, int]] = {}
+    for name, counts in ((name, counts) for step in found.spaces for name, counts in step.items()):
+        grown, ran = counts.get("sequence", {}), counts.get("simulate", {})
+        more = {"tried": grown.get("sequences", 0), "found": ran.get("tried", 0), "held": ran.get("held", 0)}
+        add_counts(spaces, {name: more})
+    attempts, steps = [width, *map(len, found.levels)], []
+    for step in range(len(job.objects)):
+        counts = found.spaces[step].values() if step < len(found.spaces) else ()
+        outcomes: Counter[str] = Counter()
+        for one in counts:
+            outcomes.update(one.get("filter", {}))
+        entry = {
+            "attempts": attempts[step] if step < len(attempts) else 0,
+            "seconds": sum(found.walls[step : step + 1]),
+        }
+        entry |= {"drawn": sum(one.get("place", {}).get("tried", 0) for one in counts), "outcomes": dict(outcomes)}
+        tried, held = (some[step] if step < len(some) else None for some in (seen, found.levels))
+        steps.append(entry | _rows(tried, held, inputs, bounds))
+    return {"begun": width, "device": device, "spaces": spaces, "steps": steps}
+
+
+def _rows(
+    tried: SequenceTable | None, held: SequenceTable | None, inputs: SequenceInputs, bounds: GraspBounds
+) -> dict[str, Any]:
+    """Counts and numbers of the rows that were simulated, and of those of them that held."""
+    if tried is None or held is None:
+        return {"simulated": 0, "strict": 0, "held": 0, "consumed": 0, "depth": [], "sum": [], "squares": []}
+    pairs = zip(held.space, held.used, strict=True)
+    full = sum(consumed(inputs.spaces, frozenset(s.tolist()), used) for s, used in pairs)
+    R, t = device_matrix(held.pose[:, -1])[:, :3, :2], held.pose[:, -1, :3]
+    grasps = np.concatenate([t, R.reshape(-1, 6), held.q[:, -1]], 1).astype(float)
+    return {
+        "simulated": len(tried),
+        "strict": int(bounds.met_by(tried.metrics).sum()),
+        "held": len(held),
+        "consumed": full,
+        "depth": np.round(1e3 * tried.metrics["penetration"], 4).tolist(),
+        "sum": grasps.sum(0).tolist(),
+        "squares": (grasps**2).sum(0).tolist(),
     }
 
 
-def measure_sequences(jobs: list[SequenceJob], progress: Callable[[str], None] | None = None) -> dict[str, Any]:
-    """Run a round of each job, simulate every row and continue those that hold; nothing is written.
-
-    Grasps of an optimiser are simulated as published: only a penetration of 1 cm, contacts farther away than that, and
-    links in links are left out before.
-
-    Args:
-        jobs: the same method on several sequences of objects; each names a protocol.
-        progress: called with one line before each round.
+def summary(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """The numbers of one method over several sequences of objects.
 
     Returns:
-        ``begun`` (attempts of each sequence), ``spaces`` (name -> sequences tried with it, rows found, rows that held)
-        and ``objects`` (for each number of objects, see :class:`_Objects`).
+        ``begun`` (attempts of each sequence), ``spaces``, and ``objects``: for each number of objects counts; shares
+        that hold [%]: of all attempts begun (``success``), of those that reached this step, of the rows simulated; rows
+        per second of all steps so far; ``penetration_*`` [mm] of the rows simulated; ``diversity``: the standard
+        deviation of held grasps, mean over position [m], rotation in 6D and joints [rad]; ``drawn_per_attempt`` and
+        ``passed`` (share of the candidates drawn that pass the filter [%]); ``outcomes`` of the filter.
     """
-    device, bounds = resolve_device(jobs[0].device), jobs[0].pipeline.bounds
     spaces: dict[str, dict[str, int]] = {}
-    objects = [_Objects() for _ in range(max(len(job.objects) for job in jobs))]
-    for job in jobs:
-        pipeline, cache, keys = _as_published(job.pipeline), job.cache, job.keys
-        inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device)
-        scene = make_scene(cache, inputs.hand, object_records(inputs), mesh_blobs(keys.source.urdf), device.alias)
-        inputs = job.with_sampler(replace(inputs, scene=scene))
-        load_kernels(device.alias, kernel_modules(*job.kernels))
-        assert job.simulate
-        params = pipeline.params("sequence")
-        if progress:
-            progress(f"{params.method}, {' '.join(inputs.object_ids)}: {params.width} attempts")
-        seen: list[SequenceTable] = []
-        watched = _watched(simulated(inputs, job.simulate), seen)
-        found = run_round(pipeline, inputs, 0, 0, threads(job.workers), verdicts=watched)
-        for name, counts in ((name, counts) for step in found.spaces for name, counts in step.items()):
-            grown, ran = counts.get("sequence", {}), counts.get("simulate", {})
-            more = {"tried": grown.get("sequences", 0), "found": ran.get("tried", 0), "held": ran.get("held", 0)}
-            add_counts(spaces, {name: more})
-        attempts = [params.width, *map(len, found.levels)]
-        for step, entry in enumerate(objects):
-            entry.begun += params.width
-            entry.attempts += attempts[step] if step < len(attempts) else 0
-            entry.seconds += sum(found.walls[step : step + 1])
-            entry.total += sum(found.walls[: step + 1])
-        for step, table in enumerate(seen):
-            objects[step].add(table, found.levels[step], inputs, int(bounds.met_by(table.metrics).sum()))
-    begun = jobs[0].pipeline.params("sequence").width
-    return {"begun": begun, "spaces": spaces, "objects": [entry.summary() for entry in objects]}
+    objects, total = [], 0.0
+    for part in parts:
+        add_counts(spaces, part["spaces"])
+    begun = sum(part["begun"] for part in parts)
+    for entries in zip_longest(*(part["steps"] for part in parts)):
+        steps = [entry for entry in entries if entry]
+        names = ("attempts", "simulated", "strict", "held", "consumed", "drawn", "seconds")
+        n = {name: sum(step[name] for step in steps) for name in names}
+        outcomes: Counter[str] = Counter()
+        for step in steps:
+            outcomes.update(step["outcomes"])
+        depth, total = [x for step in steps for x in step["depth"]], total + n["seconds"]
+        mean, squares = (
+            np.sum([step[name] for step in steps if step[name]], 0) / max(n["held"], 1) for name in ("sum", "squares")
+        )
+        objects.append(
+            {
+                "begun": begun,
+                **{name: n[name] for name in ("attempts", "simulated", "strict", "held")},
+                "success": _percent(n["held"], begun),
+                "success_of_attempts": _percent(n["held"], n["attempts"]),
+                "success_of_simulated": _percent(n["held"], n["simulated"]),
+                "consumed": _percent(n["consumed"], n["held"]),
+                "penetration_mean": float(np.mean(depth)) if depth else None,
+                "penetration_median": float(np.median(depth)) if depth else None,
+                "penetration_max": max(depth) if depth else None,
+                "seconds": n["seconds"],
+                "seconds_per_256": over(256 * n["seconds"], n["attempts"]),
+                "held_per_s": over(n["held"], total),
+                "strict_per_s": over(n["strict"], total),
+                "diversity": float(np.sqrt(np.maximum(squares - mean**2, 0)).mean()) if n["held"] > 1 else None,
+                "drawn_per_attempt": over(n["drawn"], n["attempts"]),
+                "passed": _percent(outcomes["kept"], n["drawn"]),
+                "outcomes": dict(outcomes),
+            }
+        )
+    return {"begun": parts[0]["begun"], "spaces": spaces, "objects": objects}
+
+
+def read_parts(path: Path) -> dict[str, Any]:
+    """What an earlier run left in a file.
+
+    Raises:
+        ConfigError: the file is of no such run.
+    """
+    if not path.exists():
+        return {}
+    try:
+        parts = json.loads(path.read_text(encoding="utf-8"))["parts"]
+        for part in parts.values():
+            summary([part])
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        raise ConfigError(
+            f"--resume: {path} is of no run of lgrasp bench sequence; remove it or name another"
+        ) from None
+    return parts
 
 
 def _as_published(pipeline: Pipeline) -> Pipeline:
-    """The pipeline; for an optimiser with the published bounds in place of those of strict validity."""
-    if pipeline.params("sequence").method in ("field", "diffuser"):
+    """The pipeline; for an optimiser, or draws that are not refined, with the published bounds in place of its own."""
+    params = pipeline.params("sequence")
+    if params.method == "field" or (params.method == "diffuser" and params.refined):
         return pipeline
     return pipeline.with_bounds(
         max_penetration=0.01, min_self_distance=0.0, max_gap=0.01, max_normal_angle=60.0, max_gswo=1.0
@@ -127,52 +243,6 @@ def _watched(simulate: Verdicts, seen: list[SequenceTable]) -> Verdicts:
     return run
 
 
-class _Objects:
-    """Rows of one number of objects, over the sequences."""
-
-    def __init__(self) -> None:
-        self.begun = self.attempts = 0  # with the first object; with this one, after rows that held
-        self.seconds = self.total = 0.0  # of this step; of it and those before; simulation not counted
-        self._rows: Counter[str] = Counter()
-        self._depth: list[float] = []
-        self._q: list[np.ndarray] = []
-
-    def add(self, tried: SequenceTable, held: SequenceTable, inputs: SequenceInputs, strict: int) -> None:
-        """Count rows: those simulated, those of them that held, and how many were strict."""
-        pairs = zip(held.space, held.used, strict=True)
-        full = sum(consumed(inputs.spaces, frozenset(s.tolist()), used) for s, used in pairs)
-        self._rows.update(simulated=len(tried), strict=strict, held=len(held), consumed=full)
-        self._depth += (1e3 * tried.metrics["penetration"]).tolist()
-        self._q += [*held.q[:, -1]]
-
-    def summary(self) -> dict[str, Any]:
-        """The numbers.
-
-        Returns:
-            Counts; shares that hold [%]: of all attempts begun (``success``), of those that reached this step, of the
-            rows simulated; rows per second of all steps so far; ``penetration_*`` [mm] of the rows simulated;
-            ``diversity``, the standard deviation of the joints of held rows [rad].
-        """
-        depth, rows = self._depth, self._rows
-        return {
-            "begun": self.begun,
-            "attempts": self.attempts,
-            **{name: rows[name] for name in ("simulated", "strict", "held")},
-            "success": _percent(rows["held"], self.begun),
-            "success_of_attempts": _percent(rows["held"], self.attempts),
-            "success_of_simulated": _percent(rows["held"], rows["simulated"]),
-            "consumed": _percent(rows["consumed"], rows["held"]),
-            "penetration_mean": float(np.mean(depth)) if depth else None,
-            "penetration_median": float(np.median(depth)) if depth else None,
-            "penetration_max": max(depth) if depth else None,
-            "seconds": self.seconds,
-            "seconds_per_256": over(256 * self.seconds, self.attempts),
-            "held_per_s": over(rows["held"], self.total),
-            "strict_per_s": over(rows["strict"], self.total),
-            "diversity": float(np.std(self._q, axis=0).mean()) if len(self._q) > 1 else None,
-        }
-
-
 def _percent(part: int, whole: int) -> float | None:
     return over(100.0 * part, whole)
 
@@ -185,10 +255,11 @@ def sequence_page(result: dict[str, Any]) -> Page:
     for method, found in result["methods"].items():
         title = f"{method}: {found['begun']} attempts started with each sequence"
         tables += [_space_table(title, found["spaces"], published["spaces"])]
-        tables += _object_tables(found["objects"], published | published.get(method, {}))
+        tables += _object_tables(found["objects"], published | published.get(method.split()[0], {}))
     tables.append(_rate_table(result))
     notes = [
         "hold/tried, hold/begun: of all attempts, as published; the other shares are of what was left of them",
+        "drawn: candidates for each attempt at this step; pass: of these, through the filter",
         "(...): published; strict: rows within the bounds of the pipeline, whether they hold or not",
         *caveats(result["published"]),
     ]
@@ -229,10 +300,22 @@ def _object_tables(entries: list[dict[str, Any]], published: dict[str, list[floa
                 _beside(entry["consumed"], published["consumed"], n, *_SHARE),
                 _beside(entry["seconds_per_256"], published["seconds_per_256"], n, ".1f"),
                 _beside(entry["diversity"], published["diversity"], n, ".3f"),
+                number(entry["drawn_per_attempt"], ".0f"),
+                number(entry["passed"], *_SHARE),
             )
         )
     of = ("objects", "begun", "attempts", "simulated", "strict", "hold", "hold/begun", "hold/attempts", "hold/sim")
-    by = ("objects", "penetration: mean mm", "median", "largest", "consumed", "s per 256 attempts", "diversity")
+    by = (
+        "objects",
+        "penetration: mean mm",
+        "median",
+        "largest",
+        "consumed",
+        "s per 256 attempts",
+        "diversity",
+        "drawn",
+        "pass",
+    )
     return [Table("", of, shares), Table("", by, measures)]
 
 

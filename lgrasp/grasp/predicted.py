@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.field.arrays import FieldArrays
 from lgrasp.field.model import ContactField
 from lgrasp.hand.arrays import Hand, HandArrays
 from lgrasp.hand.model import HandModel
 from lgrasp.math.kinematics import group_forward, vec_dof
 from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import sdf_gradient
-from lgrasp.object.arrays import Object
+from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.structs import upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -79,6 +79,64 @@ def touching_points(hand: Hand, obj: Object, T: wp.transform, side: wp.int32, x:
     return best, place, normal, surface
 
 
+@wp.kernel
+def match_sides(
+    hand: Hand,
+    obj: Object,
+    sides: wp.vec2i,
+    pose: wp.array(dtype=wp.transform),
+    posture: wp.array2d(dtype=vec_dof),
+    hand_point_out: wp.array2d(dtype=wp.int32),
+    object_point_out: wp.array2d(dtype=wp.int32),
+):
+    """One thread per (hand, side): the contact points that touch best, see :func:`touching_points`.
+
+    Args:
+        sides: groups of the two sides, -1: static links.
+        pose: T_hand_object, (N,).
+        posture: by group, (N, G) [rad or m].
+        hand_point_out: of each side, (N, 2), -1 none.
+        object_point_out: the nearest, (N, 2), -1 none.
+    """
+    i, side = wp.tid()
+    x = vec_dof()
+    if sides[side] >= 0:
+        x = posture[i, sides[side]]
+    c, _p, _n, surface = touching_points(hand, obj, pose[i], sides[side], x)
+    hand_point_out[i, side] = c
+    object_point_out[i, side] = surface
+
+
+@dataclass(frozen=True)
+class TouchingGrasps:
+    """Grasps of H rows with an opposition space, whether good or not."""
+
+    pose: np.ndarray
+    """T_hand_object of the new object's internal frame, device poses (H, 7) f32."""
+    q: np.ndarray
+    """Joints, those that may not move bit by bit as given, (H, K) f32."""
+    hand_point: np.ndarray
+    """The point of each side that touches, index in ``contact_points`` of the view of the row's space, (H, 2)."""
+    object_point: np.ndarray
+    """The object's contact point nearest to each, index in ``contact_points`` of the object, (H, 2)."""
+
+
+def touching_grasps(
+    hand: HandArrays, obj: ObjectArrays, sides: tuple[int, int], pose: np.ndarray, q: np.ndarray
+) -> TouchingGrasps:
+    """Poses and joints with the points where they touch best.
+
+    Args:
+        sides: groups of the two sides, -1: static links.
+        pose: T_hand_object of the internal frame, device poses (H, 7). q: joints [rad or m], (H, K).
+    """
+    d, n = hand.device, len(q)
+    points = [wp.empty((n, 2), dtype=wp.int32, device=d) for _ in range(2)]
+    at = wp.array(pose, dtype=wp.transform, device=d), wp.array(hand.model.tree.by_group(q), dtype=vec_dof, device=d)
+    wp.launch(match_sides, (n, 2), [hand.struct, obj.struct, wp.vec2i(*sides), *at], points, device=d)
+    return TouchingGrasps(pose, q, *fetch(points))
+
+
 @dataclass(frozen=True)
 class PredictedArrays:
     """Predictions on a device."""
@@ -86,13 +144,13 @@ class PredictedArrays:
     struct: "Predicted"
 
 
-def upload_predicted(hand: HandArrays, field: FieldArrays, pose: np.ndarray, q: np.ndarray) -> PredictedArrays:
+def upload_predicted(hand: HandArrays, record: np.ndarray, pose: np.ndarray, q: np.ndarray) -> PredictedArrays:
     """Put predictions on the hand's device.
 
     Args:
+        record: see :func:`record_of_points`.
         pose: T_hand_object of the internal frame, device poses (N, 7). q: joints [rad or m], (N, K).
     """
-    record = record_of_points(hand.model, field.model)
     values = {"pose": pose, "posture": hand.model.tree.by_group(q), "record": record}
     return PredictedArrays(upload_struct(Predicted, hand.device, values))
 

@@ -25,6 +25,11 @@ class SequenceParams(Params):
     )
     waves: int = Field(4, ge=1, le=256, description="Waves of a step before a sequence is given up.")
     draws: int = Field(10, ge=1, le=1000, description="Steps in which a network takes the noise out (diffuser).")
+    refined: bool = Field(
+        True,
+        description="Draws of a network are moved onto the surfaces and searched on; false: one draw of each sequence, "
+        "as it comes (diffuser).",
+    )
     branch: int = Field(1, ge=1, le=1024, description="Largest number of continuations of one sequence.")
     optimiser: OptimiserParams = Field(
         default_factory=lambda: OptimiserParams.model_validate({}),

@@ -73,6 +73,8 @@ def entry(held, strict, seconds, begun=256):
         "held_per_s": held / seconds,
         "strict_per_s": strict / seconds,
         "diversity": None,
+        "drawn_per_attempt": None,
+        "passed": None,
     }
 
 
@@ -89,15 +91,16 @@ def sequences(monkeypatch):
     entries = {"field": entry(200, 200, 1.0), "anneal": entry(20, 2, 10.0, 32)}
     widths = {}
 
-    def measured(jobs, progress):
-        params = jobs[0].pipeline.params("sequence")
+    def measured(job, device):
+        params = job.pipeline.params("sequence")
         widths[params.method] = params.width
         return given[params.method] | {"objects": [entries[params.method]]}
 
-    monkeypatch.setattr(sequence, "measure_sequences", measured)
+    monkeypatch.setattr(sequence, "measure_sequence", measured)
+    monkeypatch.setattr(sequence, "summary", lambda parts: dict(parts[0]))
     pipeline = load_pipeline("sequence").with_params("sequence", width=256)
     job = SequenceJob(hand="allegro", objects=("mug", "box"), rows=1, pipeline=pipeline, out=Path("."), simulate="seq6")
-    result = bench_methods([job], ["field", "anneal"], 32, lambda line: None)
+    *_, result = bench_methods([job], ["field", "anneal"], 32, lambda line: None)
     assert widths == {"field": 256, "anneal": 32}
     return result
 

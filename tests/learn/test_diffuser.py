@@ -12,7 +12,7 @@ from lgrasp.geometry.poses import device_matrix
 from lgrasp.geometry.rotations import pose_from_motion, so3_exp
 from lgrasp.grasp.sequences import HeldHands
 from lgrasp.hand.arrays import body_poses
-from lgrasp.learn.diffuser.examples import make_net
+from lgrasp.learn.diffuser.examples import make_net, split_steps, unseen_objects
 from lgrasp.learn.diffuser.features import held_features, random_rotations, shape_features
 from lgrasp.learn.diffuser.file import AboutDiffuser, diffuser_bytes, load_diffuser
 from lgrasp.learn.diffuser.network import DiffuserNet
@@ -154,24 +154,38 @@ def hands(net: DiffuserNet, count: int, held: int) -> HeldHands:
     return HeldHands(q, used, pose_from_motion(so3_exp(torch.randn(count, held, 3)), at).numpy())
 
 
+def test_objects_are_held_out_whole():
+    """Of a mesh that is held out no size is learnt from, nor a step in which it is held."""
+    meshes = [f"{i % 10}" for i in range(20)]  # each in two sizes
+    unseen = unseen_objects(meshes, 0.2, 3)
+    assert unseen.sum() == 4
+    assert (unseen[:10] == unseen[10:]).all()
+    assert not unseen_objects(meshes, 0.0, 3).any()
+    a, b = unseen.nonzero()[0, 0].item(), (~unseen).nonzero()[0, 0].item()
+    held = torch.tensor([[-1, -1], [-1, -1], [a, -1], [b, -1], [b, a]])
+    learnt, evaluated = split_steps(torch.tensor([a, b, b, a, b]), held, unseen)
+    assert learnt.tolist() == [1]
+    assert evaluated.tolist() == [0, 3]
+
+
 def test_frozen_joints_are_bit_by_bit_as_before(net, sampler):
-    before = hands(net, 6, 2)
+    before, ones = hands(net, 6, 2), np.ones(6, int)
     free = ~before.used & (np.arange(len(net.lower)) < 12)
-    drawn = sampler.draw(before, 1, free, each=3, seed=5, steps=4)
+    drawn = sampler.draw(before, ones, free, each=3, seed=5, steps=4)
     start, moves = (np.repeat(x, 3, 0) for x in (before.q, free))
     assert (drawn.q[~moves] == start[~moves]).all()
     assert (drawn.q[moves] != start[moves]).all()
     assert ((drawn.q >= net.lower.numpy()) & (drawn.q <= net.upper.numpy())).all()
     np.testing.assert_allclose(np.linalg.norm(drawn.pose[:, 3:], axis=1), 1, atol=1e-5)
-    again = sampler.draw(before, 1, free, each=3, seed=5, steps=4)
+    again = sampler.draw(before, ones, free, each=3, seed=5, steps=4)
     np.testing.assert_array_equal(drawn.pose, again.pose)
-    assert (sampler.draw(before, 1, free, each=3, seed=6, steps=4).pose != drawn.pose).any(1).all()
+    assert (sampler.draw(before, ones, free, each=3, seed=6, steps=4).pose != drawn.pose).any(1).all()
 
 
 def test_what_is_held_changes_what_is_drawn(net, sampler):
     before = hands(net, 4, 1)
     moved = before._replace(pose=before.pose + np.array([0, 0, 1, 0, 0, 0, 0], np.float32))
-    one, other = (sampler.draw(h, 0, ~h.used, each=2, seed=0) for h in (before, moved))
+    one, other = (sampler.draw(h, np.zeros(4, int), ~h.used, each=2, seed=0) for h in (before, moved))
     assert (np.abs(one.pose - other.pose).max(1) > 1e-6).mean() > 0.6
 
 

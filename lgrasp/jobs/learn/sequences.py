@@ -31,6 +31,8 @@ class ReadSteps(NamedTuple):
     hand: HandModel
     space_names: tuple[str, ...]
     object_names: list[str]
+    meshes: list[str]
+    """SHA-256 of each object's mesh, whatever its size."""
     clouds: torch.Tensor
     """Of the objects, centred, (O, n, 3) [m]."""
     grids: list[SdfGrid]
@@ -64,7 +66,7 @@ def read_steps(paths: Paths, cache: Cache, device: Device, cloud: int) -> ReadSt
     with ShardReader(first.path) as reader:
         _, hand = hand_of_shard(cache, reader.hand(), reader.header.config, device)
     numbers: dict[tuple[str, float], int] = {}
-    clouds, grids, names, parts = [], [], [], []
+    clouds, grids, names, meshes, parts = [], [], [], [], []
     slots = max(part.value.columns["object_index"].shape[1] for part in shards)
     for _, _, part in shards:
         own = []
@@ -76,10 +78,11 @@ def read_steps(paths: Paths, cache: Cache, device: Device, cloud: int) -> ReadSt
                 closed = record.watertight
                 grids.append(coarse_grid(record.vertices, record.faces, closed=closed, device=device.alias))
                 names.append(record.name)
+                meshes.append(record.sha256)
             own.append((numbers[key], mesh_centre(record.vertices)))
         parts.append(_steps(part.columns, own, hand, slots))
     joined = SequenceSteps(*(torch.cat(x) for x in zip(*parts, strict=True)))
-    return ReadSteps(hand, first.value.spaces, names, torch.stack(clouds), grids, joined)
+    return ReadSteps(hand, first.value.spaces, names, meshes, torch.stack(clouds), grids, joined)
 
 
 def _read(reader: ShardReader) -> _Part:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from dataclasses import field as with_default
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays, upload_field
 from lgrasp.field.model import FIELD_VERSION
 from lgrasp.field.params import FieldParams
+from lgrasp.grasp.predicted import record_of_points
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
@@ -60,6 +61,11 @@ class SpaceView:
 
     hand: HandArrays
     field: FieldArrays
+
+    @cached_property
+    def records(self) -> np.ndarray:
+        """See :func:`~lgrasp.grasp.predicted.record_of_points`."""
+        return record_of_points(self.hand.model, self.field.model)
 
 
 @dataclass(frozen=True)

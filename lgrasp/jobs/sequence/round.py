@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,17 +12,21 @@ from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.grasp.held import hold
-from lgrasp.grasp.predicted import PredictedArrays, upload_predicted
+from lgrasp.grasp.predicted import touching_grasps, upload_predicted
 from lgrasp.grasp.sequences import HeldHands, SequenceTable, empty_sequences
 from lgrasp.grasp.tables import GraspTable, join_rows, take_rows
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.runtime.tally import Meter
 from lgrasp.seeding import stage_seed
-from lgrasp.sequence.optimised_sets import optimised_sets
 from lgrasp.sequence.policy import space_orders
 from lgrasp.sequence.stage import go_on
 from lgrasp.sequence.stage import run as grow
+from lgrasp.sequence.touching_sets import touching_sets
 from lgrasp.stages.context import Context
+
+if TYPE_CHECKING:  # torch takes a second to import
+    from lgrasp.learn.diffuser.sampler import DrawnSteps
+    from lgrasp.sequence.optimiser.optimise import Optimised
 
 _CPU_CHUNK = 1024  # candidates of a thread at a time
 _LOOKAHEAD_CHOICES = 4  # grasps among which policy lookahead chooses, for each that is continued
@@ -116,14 +121,19 @@ class _Step:
         rows, params = self._rows, self._params
         left = len(self._inputs.objects) - rows.steps - 1
         order = space_orders(rows, self._inputs.spaces, params.policy, left, self._seed)
-        in_waves = params.method in ("field", "diffuser")
+        in_waves = params.method == "field" or (params.method == "diffuser" and params.refined)
         if not in_waves:
-            self._optimise(order[:, 0])
+            self._one_each(order[:, 0])
         for wave in range(params.waves if in_waves else 0):
             self._tell((rows.steps + wave / params.waves) / len(self._inputs.objects))
             space = order[np.arange(len(rows)), wave % np.maximum((order >= 0).sum(1), 1)]
-            for number in np.unique(space[space >= 0]):
-                self._go_on(np.flatnonzero((space == number) & self._wanting), int(number), wave)
+            chosen = np.flatnonzero((space >= 0) & self._wanting)
+            if not len(chosen):
+                continue
+            drawn = self._drawn(chosen, space[chosen], params.wave, wave) if params.method == "diffuser" else None
+            for number in np.unique(space[chosen]):
+                own = space[chosen] == number
+                self._go_on(chosen[own], int(number), wave, drawn.of_hands(own) if drawn else None)
         if not self._tried:
             return take_rows(rows, np.zeros(0, int))
         table = join_rows([self._longer(number) for number in self._tried])
@@ -135,48 +145,66 @@ class _Step:
         """Rows that have not enough grasps yet, (N,) bool."""
         return self._have < self._params.branch * (_LOOKAHEAD_CHOICES if self._params.policy == "lookahead" else 1)
 
-    def _go_on(self, chosen: np.ndarray, number: int, wave: int) -> None:
-        """Give some rows a wave of candidates with a space."""
-        if not len(chosen):
-            return
+    def _go_on(self, chosen: np.ndarray, number: int, wave: int, drawn: "DrawnSteps | None") -> None:
+        """Give some rows a wave of candidates with a space, those that were drawn for them if any were."""
         name, size = self._inputs.spaces[number].name, self._params.wave
         seed = stage_seed(self._seed, self._rows.steps, name, wave)
         context = self._context(chosen, number, size, seed)
-        if self._params.method == "diffuser":
-            context = context.changed(predicted=self._predicted(chosen, number, size, seed))
+        if drawn is not None:
+            view = self._inputs.views[number]
+            context = context.changed(predicted=upload_predicted(view.hand, view.records, drawn.pose, drawn.q))
         grasps, meters = self._from_stages(context, len(chosen) * size)
         self._take(grasps, meters, chosen, number, size, wave * size)
 
-    def _predicted(self, chosen: np.ndarray, number: int, size: int, seed: int) -> PredictedArrays:
-        """Poses and postures of a wave of candidates, drawn by the network."""
+    def _drawn(self, chosen: np.ndarray, space: np.ndarray, each: int, wave: int) -> "DrawnSteps":
+        """Poses and postures of ``each`` candidates of some rows with their spaces, drawn at once by the network."""
         inputs, before = self._inputs, take_rows(self._rows, chosen)
         assert inputs.sampler is not None
         start = time.perf_counter()
         q, used = before.posture(inputs.hand.tree), before.used
-        free = inputs.spaces[number].joints & ~used
-        hands = HeldHands(q, used, before.pose)
-        drawn = inputs.sampler.draw(hands, number, free, each=size, seed=seed, steps=self._params.draws)
+        hands, free = HeldHands(q, used, before.pose), self._free(space) & ~used
+        seed = stage_seed(self._seed, before.steps, "diffuser", wave)
+        drawn = inputs.sampler.draw(hands, space, free, each=each, seed=seed, steps=self._params.draws)
         add_seconds(self._result.seconds, {"diffuser": time.perf_counter() - start})
-        view = inputs.views[number]
-        return upload_predicted(view.hand, view.field, drawn.pose, drawn.q)
+        return drawn
 
-    def _optimise(self, space: np.ndarray) -> None:
-        """One grasp of each row with its space, by the optimiser."""
-        from lgrasp.sequence.optimiser.optimise import optimise  # torch
+    def _free(self, space: np.ndarray) -> np.ndarray:
+        """Joints of spaces (N,), (N, K) bool."""
+        return np.array([own.joints for own in self._inputs.spaces])[space]
 
-        inputs, rows, params = self._inputs, self._rows, self._params
+    def _one_each(self, space: np.ndarray) -> None:
+        """One grasp of each row with its space, by the optimiser or as the network draws it."""
         able = np.flatnonzero(space >= 0)
         if not len(able):
             return
-        joints = np.array([own.joints for own in inputs.spaces])
-        free = joints[space[able]] & ~rows.used[able]
+        params, free = self._params, self._free(space[able]) & ~self._rows.used[able]
+        optimised = self._optimised(able, space[able], free) if params.method != "diffuser" else None
+        drawn = self._drawn(able, space[able], 1, 0) if params.method == "diffuser" else None
+        for number in np.unique(space[able]):
+            own, view = space[able] == number, self._inputs.views[number]
+            context = self._context(able[own], int(number), 1, self._seed)
+            if drawn:
+                sides = self._inputs.spaces[number].groups
+                part = touching_grasps(view.hand, context.object, sides, *drawn.of_hands(own))
+            else:
+                assert optimised
+                part = replace(optimised, **{f.name: getattr(optimised, f.name)[own] for f in fields(optimised)})
+            meter = Meter(context.device)
+            sets = touching_sets(part, free[own], context)
+            table = run_stage("filter", sets, self._pipeline, context, meter)
+            self._take(table, [meter], able[own], int(number), 1, 0)
+
+    def _optimised(self, able: np.ndarray, space: np.ndarray, free: np.ndarray) -> "Optimised":
+        from lgrasp.sequence.optimiser.optimise import optimise  # torch
+
+        inputs, rows, params = self._inputs, self._rows, self._params
         start = time.perf_counter()
         grasps = optimise(
             inputs.hand,
             [view.hand.model for view in inputs.views],
             inputs.spaces,
             [obj.model for obj in inputs.objects[: rows.steps + 1]],
-            space=space[able],
+            space=space,
             q=rows.posture(inputs.hand.tree)[able],
             free=free,
             held=rows.pose[able],
@@ -186,14 +214,7 @@ class _Step:
             device=inputs.device.alias,
         )
         add_seconds(self._result.seconds, {params.method: time.perf_counter() - start})
-        for number in np.unique(space[able]):
-            own = np.flatnonzero(space[able] == number)
-            part = replace(grasps, **{f.name: getattr(grasps, f.name)[own] for f in fields(grasps)})
-            context = self._context(able[own], int(number), 1, self._seed)
-            meter = Meter(context.device)
-            sets = optimised_sets(part, free[own], context)
-            table = run_stage("filter", sets, self._pipeline, context, meter)
-            self._take(table, [meter], able[own], int(number), 1, 0)
+        return grasps
 
     def _take(
         self, grasps: GraspTable, meters: list[Meter], chosen: np.ndarray, number: int, size: int, before: int

@@ -54,6 +54,25 @@ class SequenceSteps(NamedTuple):
         return SequenceSteps(*(x[index] for x in self))
 
 
+def unseen_objects(meshes: Sequence[str], share: float, seed: int) -> torch.Tensor:
+    """Which objects are held out, (O,) bool: those of a share of the different meshes, in all their sizes."""
+    different = sorted(set(meshes))
+    order = torch.randperm(len(different), generator=torch.Generator().manual_seed(seed)).tolist()
+    out = {different[i] for i in order[: round(share * len(different))]}
+    return torch.tensor([mesh in out for mesh in meshes])
+
+
+def split_steps(grasped: torch.Tensor, held: torch.Tensor, unseen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Indices of the steps that no unseen object has to do with, and of those that grasp one; those that only hold one
+    are neither.
+
+    Args:
+        grasped: (E,); held: (E, S), -1 none; unseen: (O,) bool.
+    """
+    holds = (unseen[held] & (held >= 0)).any(1)
+    return (~holds & ~unseen[grasped]).nonzero()[:, 0], unseen[grasped].nonzero()[:, 0]
+
+
 def make_net(hand: HandModel, spaces: int, params: DiffuserParams) -> DiffuserNet:
     """A network with random weights for a hand with some opposition spaces."""
     tree = hand.tree
@@ -94,7 +113,7 @@ class StepExamples:
         self.shapes = torch.stack([shape_features(basis, cloud, self.turns).half() for cloud in clouds])  # (O, V, B)
         self.held = held_features(held_basis, clouds, steps.held, steps.held_rotation, steps.held_position).half()
         self.steps = steps
-        self._senses = Senses(tree, net.senses, net.held_basis, grids, device)
+        self.senses = Senses(tree, net.senses, net.held_basis, grids, device)
 
     def __len__(self) -> int:
         return len(self.steps.t)
@@ -120,8 +139,12 @@ class StepExamples:
         )
         return (s.R[rows] @ self.turns[turn].mT, s.t[rows], s.q[rows]), situation
 
+    def held_objects(self, rows: torch.Tensor) -> HeldObjects:
+        """What the hands of steps hold before."""
+        s = self.steps
+        return HeldObjects(s.held[rows], s.held_rotation[rows], s.held_position[rows])
+
     def felt(self, rows: torch.Tensor, turn: torch.Tensor, step: tuple[torch.Tensor, ...]) -> torch.Tensor:
         """What the hands of steps feel in other poses and postures, R, t and q, with objects in turned frames."""
-        s, (R, t, q) = self.steps, step
-        held = HeldObjects(s.held[rows], s.held_rotation[rows], s.held_position[rows])
-        return self._senses(R @ self.turns[turn], t, q, s.object[rows], held)
+        R, t, q = step
+        return self.senses(R @ self.turns[turn], t, q, self.steps.object[rows], self.held_objects(rows))

@@ -32,7 +32,7 @@ class Situation(NamedTuple):
     space: torch.Tensor
     """Opposition space, (N,) int64."""
 
-    def rows(self, index: torch.Tensor) -> "Situation":
+    def rows(self, index: torch.Tensor | slice) -> "Situation":
         """Some of the steps, by index or mask."""
         return Situation(*(x[index] for x in self))
 
@@ -75,13 +75,12 @@ class DiffuserNet(nn.Module):
         buffers |= {"mean": torch.zeros(POSE + joints), "spread": torch.ones(POSE + joints)}
         for name, values in buffers.items():
             self.register_buffer(name, values)
-        self.shape = nn.Sequential(nn.Linear(len(basis), w), nn.SiLU(), nn.Linear(w, w))
-        self.hand = nn.Sequential(nn.Linear(len(held_basis) + 3 * joints + spaces, w), nn.SiLU(), nn.Linear(w, w))
-        self.time = nn.Sequential(nn.Linear(2 * _FREQUENCIES, w), nn.SiLU(), nn.Linear(w, w))
-        felt = 2 * len(senses) + len(held_basis)
-        self.feel = nn.Sequential(nn.Linear(felt, w), nn.SiLU(), nn.Linear(w, w))
+        self.shape = _perceptron(len(basis), w, params.dropout)
+        self.hand = _perceptron(len(held_basis) + 3 * joints + spaces, w, params.dropout)
+        self.time = _perceptron(2 * _FREQUENCIES, w, 0.0)
+        self.feel = _perceptron(2 * len(senses) + len(held_basis), w, params.dropout)
         self.into, self.out = nn.Linear(POSE + joints, w), nn.Linear(w, POSE + joints)
-        self.blocks = nn.ModuleList(_Block(w) for _ in range(params.blocks))
+        self.blocks = nn.ModuleList(_Block(w, params.dropout) for _ in range(params.blocks))
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
@@ -131,16 +130,21 @@ class DiffuserNet(nn.Module):
         return torch.cat([torch.ones(len(free), POSE, device=free.device), free.to(self.mean)], 1)
 
 
+def _perceptron(inputs: int, width: int, dropout: float) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, width), nn.SiLU(), nn.Dropout(dropout), nn.Linear(width, width))
+
+
 class _Block(nn.Module):
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, dropout: float) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
         self.change = nn.Linear(width, 2 * width)
         self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
+        self.drop = nn.Dropout(dropout)
 
     def forward(self, h: torch.Tensor, c: torch.Tensor) -> torch.Tensor:
         scale, shift = self.change(c).chunk(2, 1)
-        return h + self.second(nn.functional.silu(self.first(self.norm(h) * (1 + scale) + shift)))
+        return h + self.second(self.drop(nn.functional.silu(self.first(self.norm(h) * (1 + scale) + shift))))
 
 
 def joints_of(start: torch.Tensor, drawn: torch.Tensor, free: torch.Tensor) -> torch.Tensor:

@@ -11,12 +11,12 @@ from lgrasp.grasp.sequences import HeldHands
 from lgrasp.hand.tree import Tree
 from lgrasp.learn.diffuser.features import held_features, random_rotations, shape_features
 from lgrasp.learn.diffuser.network import DiffuserNet, Situation, joints_of
-from lgrasp.learn.diffuser.process import PROCESSES
+from lgrasp.learn.diffuser.process import PROCESSES, Process
 from lgrasp.learn.diffuser.senses import HeldObjects, Senses
 from lgrasp.object.sdf import SdfGrid
 
 _TURNS = 64  # rotations in which the network sees an object
-_ROWS = 8192  # at a time
+_CPU_ROWS, _GPU_ROWS = 1024, 16_384  # at a time
 
 
 class DrawnSteps(NamedTuple):
@@ -26,6 +26,39 @@ class DrawnSteps(NamedTuple):
     """T_hand_object of the next object's centred frame, device poses (N, 7) f32."""
     q: np.ndarray
     """Joints, those that may not move bit by bit as they are, (N, K) f32."""
+
+    def of_hands(self, which: np.ndarray) -> "DrawnSteps":
+        """What was drawn for some of the H hands, (H,) bool, as many for each."""
+        return DrawnSteps(*(x.reshape(len(which), -1, x.shape[1])[which].reshape(-1, x.shape[1]) for x in self))
+
+
+@torch.no_grad()
+def draw_steps(
+    net: DiffuserNet,
+    process: Process,
+    senses: Senses,
+    seen: Situation,
+    noise: torch.Tensor,
+    turn: torch.Tensor,
+    grasped: torch.Tensor,
+    held: HeldObjects,
+    steps: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """R (N, 3, 3), t (N, 3) [m] and joints (N, K) of N steps.
+
+    Args:
+        seen: situations, with objects in turned frames. noise: (N, 9 + K). turn: of the frames, (N, 3, 3).
+        grasped: number of the object to grasp, (N,) int64.
+        steps: in which the noise is taken out.
+    """
+    moving, known = net.moving(seen.free), net.situation(seen)
+
+    def velocity(x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        R, position, q = net.noisy_steps(x, process.coefficients(t)[0], seen)
+        return net(x, t, known, senses(R @ turn, position, q, grasped, held)) * moving
+
+    R, t, q = net.steps(process.sample(velocity, noise * moving, steps))
+    return R @ turn, t, joints_of(seen.start, q, seen.free)
 
 
 class StepSampler:
@@ -55,14 +88,14 @@ class StepSampler:
 
     @torch.no_grad()
     def draw(
-        self, hands: HeldHands, space: int, free: np.ndarray, *, each: int, seed: int, steps: int = 10
+        self, hands: HeldHands, space: np.ndarray, free: np.ndarray, *, each: int, seed: int, steps: int = 10
     ) -> DrawnSteps:
         """``each`` steps for each of H hands, those of one hand one after another: the object after those held.
 
         A function of its arguments; what is drawn for one hand does not depend on the others but by rounding.
 
         Args:
-            space: opposition space. free: joints that the steps may move, (H, K) bool.
+            space: opposition spaces, (H,). free: joints that the steps may move, (H, K) bool.
             steps: of the sampling.
         """
         rows, joints = hands.q.shape
@@ -77,36 +110,18 @@ class StepSampler:
             start,
             self._put(hands.used, torch.bool),
             self._put(free, torch.bool),
-            torch.full((rows,), space, dtype=torch.int64, device=self._device),
+            self._put(space, torch.int64),
         )
         parts = []
-        for picked in torch.arange(rows * each).split(_ROWS):
+        for picked in torch.arange(rows * each).split(_CPU_ROWS if self._device.type == "cpu" else _GPU_ROWS):
             row, own = (picked // each).to(self._device), turn[picked].to(self._device)
             seen = situation.rows(row)._replace(shape=self._shape(number)[own])
             objects = torch.full_like(row, number), HeldObjects(*(x[row] for x in held))
-            R, t, q = self._drawn(seen, noise[picked].to(self._device), self._turns[own], objects, steps)
-            parts.append((pose_from_motion(R, t), joints_of(start[row], q, seen.free)))
+            given = noise[picked].to(self._device), self._turns[own]
+            R, t, q = draw_steps(self._net, self._process, self._senses, seen, *given, *objects, steps)
+            parts.append((pose_from_motion(R, t), q))
         pose, q = (torch.cat(x).cpu().numpy() for x in zip(*parts, strict=True))
         return DrawnSteps(pose, q)
-
-    def _drawn(
-        self,
-        seen: Situation,
-        noise: torch.Tensor,
-        turn: torch.Tensor,
-        objects: tuple[torch.Tensor, HeldObjects],
-        steps: int,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """R, t and joints; objects are what is grasped and what is held, seen in turned frames."""
-        net, moving = self._net, self._net.moving(seen.free)
-        known = net.situation(seen)
-
-        def velocity(x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-            R, position, q = net.noisy_steps(x, self._process.coefficients(t)[0], seen)
-            return net(x, t, known, self._senses(R @ turn, position, q, *objects)) * moving
-
-        R, t, q = net.steps(self._process.sample(velocity, noise * moving, steps))
-        return R @ turn, t, q
 
     def _held(self, hands: HeldHands, number: int) -> HeldObjects:
         objects = torch.arange(number, device=self._device).expand(len(hands.q), number)

@@ -88,17 +88,31 @@ class Senses:
             q: joints [rad or m], (N, K).
             object: number of its grid, (N,) int64.
         """
-        R_body, t_body = self._bodies(q)
-        places = (R_body[:, self._body] @ self._points[..., None])[..., 0] + t_body[:, self._body]  # (N, P, 3)
-        every = torch.cat([places, self._basis.expand(len(q), -1, -1)], 1)
-        own = self._distance(every, R, t, object)
-        other = torch.full(places.shape[:2], _FARTHEST, device=q.device)
-        for slot in range(held.object.shape[1]):
-            rows = (held.object[:, slot] >= 0).nonzero()[:, 0]
-            if len(rows):
-                at = held.R[rows, slot], held.t[rows, slot], held.object[rows, slot]
-                other[rows] = other[rows].minimum(self._distance(places[rows], *at))
+        places = self._places(q)
+        own = self._distance(torch.cat([places, self._basis.expand(len(q), -1, -1)], 1), R, t, object)
+        other = self._from_held(places, held)
         return torch.cat([own, other], 1).clamp(_NEAREST, _FARTHEST) / -_NEAREST
+
+    @torch.no_grad()
+    def distances(
+        self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, object: torch.Tensor, held: HeldObjects
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distances [m] of the hand's points from the object, and from what is held, (N, P); see :meth:`__call__`."""
+        places = self._places(q)
+        return self._distance(places, R, t, object), self._from_held(places, held)
+
+    def _places(self, q: torch.Tensor) -> torch.Tensor:
+        """The hand's points in the hand frame, (N, P, 3) [m]."""
+        R_body, t_body = self._bodies(q)
+        return (R_body[:, self._body] @ self._points[..., None])[..., 0] + t_body[:, self._body]
+
+    def _from_held(self, places: torch.Tensor, held: HeldObjects) -> torch.Tensor:
+        other = torch.full(places.shape[:2], _FARTHEST, device=places.device)
+        for slot in range(held.object.shape[1]):
+            number = held.object[:, slot]
+            away = self._distance(places, held.R[:, slot], held.t[:, slot], number.clamp_min(0))
+            other = other.minimum(torch.where(number[:, None] >= 0, away, _FARTHEST))
+        return other
 
     def _distance(self, x: torch.Tensor, R: torch.Tensor, t: torch.Tensor, object: torch.Tensor) -> torch.Tensor:
         """Signed distance [m] of points (N, n, 3) of the hand frame from one object for each row."""

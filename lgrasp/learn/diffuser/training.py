@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import torch
 
-from lgrasp.learn.diffuser.examples import StepExamples
-from lgrasp.learn.diffuser.network import DiffuserNet
+from lgrasp.learn.diffuser.examples import StepExamples, split_steps
+from lgrasp.learn.diffuser.network import DiffuserNet, Situation
 from lgrasp.learn.diffuser.params import DiffuserParams
-from lgrasp.learn.diffuser.process import PROCESSES
+from lgrasp.learn.diffuser.process import PROCESSES, Process
 
 _TOLD = 50  # steps between two looks at the loss: each look waits for the device
 _WARM = 200  # steps in which the learning rate rises
@@ -17,30 +17,37 @@ _EVALUATED = 16_384  # steps of sequences at most
 
 
 class StepTrainer:
-    """A network, the mean of its weights that is kept, and the random numbers of one training."""
+    """A network, the mean of its weights that is kept, and the random numbers of one training.
+
+    Args:
+        unseen: objects that are only evaluated on, (O,) bool.
+    """
 
     def __init__(
-        self, net: DiffuserNet, examples: StepExamples, params: DiffuserParams, device: str | torch.device = "cpu"
+        self,
+        net: DiffuserNet,
+        examples: StepExamples,
+        unseen: torch.Tensor,
+        params: DiffuserParams,
+        device: str | torch.device = "cpu",
     ) -> None:
         self.params, self.device, self.examples = params, torch.device(device), examples
         self.net = net.to(self.device)
         self.net.mean, self.net.spread = examples.statistics()
-        self.kept = copy.deepcopy(self.net).requires_grad_(False)
+        self.kept = copy.deepcopy(self.net).requires_grad_(False).eval()
         self.process = PROCESSES[params.process]
-        order = torch.randperm(len(examples), generator=torch.Generator().manual_seed(params.seed))
-        out = int(params.held_out * len(examples))
-        self._held_out, self._rows = (part.to(self.device) for part in (order[:out], order[out:]))
+        self.rows, self.unseen_rows = split_steps(examples.steps.object, examples.steps.held, unseen.to(self.device))
         self._random = torch.Generator(self.device).manual_seed(params.seed)
 
     def fit(self, told: Callable[[int, float], None] | None = None) -> None:
         """All steps of the training; ``told`` is called with (step, mean loss since the last call) now and then."""
         p, weights = self.params, list(self.net.parameters())
-        optimiser = torch.optim.AdamW(weights, lr=p.rate, weight_decay=1e-4, fused=self.device.type == "cuda")
+        optimiser = torch.optim.AdamW(weights, lr=p.rate, weight_decay=p.decay, fused=self.device.type == "cuda")
         rate = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _share(step, p.steps))
         total, counted = torch.zeros((), device=self.device), 0
         for step in range(p.steps):
-            picked = torch.randint(len(self._rows), (p.batch,), generator=self._random, device=self.device)
-            loss = self._loss(self.net, self._rows[picked], self._random)
+            picked = torch.randint(len(self.rows), (p.batch,), generator=self._random, device=self.device)
+            loss = _loss(self.net, self.examples, self.rows[picked], self.process, self._random, self._blinded)
             optimiser.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(weights, 1.0)
@@ -56,31 +63,49 @@ class StepTrainer:
                 told(step + 1, float(total) / counted)
                 total, counted = torch.zeros((), device=self.device), 0
 
-    @torch.no_grad()
     def losses(self) -> tuple[float, float]:
-        """Loss of the kept weights on steps that it was trained on, and on those that were held out (NaN of none)."""
-        found = []
-        for rows in (self._rows, self._held_out):
-            rows = rows[:_EVALUATED]
-            draw = torch.Generator(self.device).manual_seed(1)
-            parts = [self._loss(self.kept, part, draw) * len(part) for part in rows.split(4096)]
-            found.append(float(sum(parts)) / len(rows) if len(rows) else float("nan"))
-        return found[0], found[1]
+        """Loss of the kept weights on steps that it was trained on, and on those of unseen objects (NaN of none)."""
+        seen, unseen = (
+            mean_loss(self.kept, self.examples, rows, self.process) for rows in (self.rows, self.unseen_rows)
+        )
+        return seen, unseen
 
-    def _loss(self, net: DiffuserNet, rows: torch.Tensor, draw: torch.Generator) -> torch.Tensor:
-        """Mean square of the error of dx/dt over entries that move."""
-        n = len(rows)
-        turn = torch.randint(len(self.examples.turns), (n,), generator=draw, device=self.device)
-        goal, situation = self.examples.batch(rows, turn)
-        x = net.standardised(*goal)
-        t = self.process.times(torch.rand(n, 1, generator=draw, device=self.device))
-        noise = torch.randn(x.shape, generator=draw, device=self.device)
-        mixed, velocity = self.process.mix(x, noise, t)
-        moving = net.moving(situation.free)
-        mixed = mixed * moving
-        felt = self.examples.felt(rows, turn, net.noisy_steps(mixed, self.process.coefficients(t)[0], situation))
-        error = (net(mixed, t, net.situation(situation), felt) - velocity) * moving
-        return (error**2).sum() / moving.sum()
+    def _blinded(self, s: Situation) -> Situation:
+        """Situations of which some do not see the object to grasp, which the hand only feels then."""
+        seen = torch.rand(len(s.shape), 1, generator=self._random, device=self.device) >= self.params.blind
+        return s._replace(shape=s.shape * seen)
+
+
+@torch.no_grad()
+def mean_loss(net: DiffuserNet, examples: StepExamples, rows: torch.Tensor, process: Process) -> float:
+    """Loss on some of the steps (16,384 at most), NaN of none."""
+    draw = torch.Generator(rows.device).manual_seed(1)
+    rows = rows[torch.randperm(len(rows), generator=draw, device=rows.device)[:_EVALUATED]]
+    parts = [_loss(net, examples, part, process, draw) * len(part) for part in rows.split(4096)]
+    return float(sum(parts)) / len(rows) if len(rows) else float("nan")
+
+
+def _loss(
+    net: DiffuserNet,
+    examples: StepExamples,
+    rows: torch.Tensor,
+    process: Process,
+    draw: torch.Generator,
+    change: Callable[[Situation], Situation] = lambda situation: situation,
+) -> torch.Tensor:
+    """Mean square of the error of dx/dt over entries that move."""
+    n, like = len(rows), {"generator": draw, "device": rows.device}
+    turn = torch.randint(len(examples.turns), (n,), **like)
+    goal, situation = examples.batch(rows, turn)
+    situation = change(situation)
+    x = net.standardised(*goal)
+    t = process.times(torch.rand(n, 1, **like))
+    mixed, velocity = process.mix(x, torch.randn(x.shape, **like), t)
+    moving = net.moving(situation.free)
+    mixed = mixed * moving
+    felt = examples.felt(rows, turn, net.noisy_steps(mixed, process.coefficients(t)[0], situation))
+    error = (net(mixed, t, net.situation(situation), felt) - velocity) * moving
+    return (error**2).sum() / moving.sum()
 
 
 def _share(step: int, steps: int) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from lgrasp.geometry.rotations import matrix_from_sixd, motion_from_pose, pose_from_motion, sixd_from_matrix
+from lgrasp.grasp.predicted import TouchingGrasps
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space
 from lgrasp.object.model import ObjectModel
@@ -23,17 +24,9 @@ _CPU_ROWS, _GPU_ROWS = 256, 512  # worked on at once; fewer leave a GPU half idl
 
 
 @dataclass(frozen=True)
-class Optimised:
+class Optimised(TouchingGrasps):
     """Grasps of H rows, whether good or not."""
 
-    pose: np.ndarray
-    """T_hand_object of the new object's internal frame, device poses (H, 7) f32."""
-    q: np.ndarray
-    """Joints, those that may not move bit by bit as given, (H, K) f32."""
-    hand_point: np.ndarray
-    """The point of each side that touches, index in ``contact_points`` of the view of the row's space, (H, 2)."""
-    object_point: np.ndarray
-    """The object's contact point nearest to each, index in ``contact_points`` of the object, (H, 2)."""
     energies: np.ndarray
     """In the order of TERMS, with these contact points, without weights, (H, 6)."""
 

@@ -1,19 +1,14 @@
-"""Grasps of an optimiser as contact sets, so that they pass the same filter as all others."""
-
-from typing import TYPE_CHECKING
+"""Finished grasps, of an optimiser or a network, as contact sets, so that they pass the same filter as all others."""
 
 import numpy as np
 
-from lgrasp.grasp.predicted import record_of_points
+from lgrasp.grasp.predicted import TouchingGrasps, record_of_points
 from lgrasp.grasp.tables import ContactSets
 from lgrasp.runtime.fetch import to_numpy
 from lgrasp.stages.context import Context
 
-if TYPE_CHECKING:  # torch takes a second to import
-    from lgrasp.sequence.optimiser.optimise import Optimised
 
-
-def optimised_sets(grasps: "Optimised", free: np.ndarray, context: Context) -> ContactSets:
+def touching_sets(grasps: TouchingGrasps, free: np.ndarray, context: Context) -> ContactSets:
     """Sets of the two contacts of each grasp; the candidate of row i is the first that continues held row i.
 
     Grasps whose contact point is in no record of the contact field are left out.
@@ -30,7 +25,7 @@ def optimised_sets(grasps: "Optimised", free: np.ndarray, context: Context) -> C
     count, surface, record = (np.zeros(s, np.int32) for s in (shape[:2], shape, shape))
     chosen = np.full((rows, groups), -1, np.int32)
     palm_point, palm_surface = (np.full(rows, -1, np.int32) for _ in range(2))
-    known: np.ndarray = np.ones(rows, bool)
+    known = ((grasps.hand_point >= 0) & (grasps.object_point >= 0)).all(1)
     posture = tree.by_group(grasps.q.astype(np.float32))[:, :, None]
     for side, g in enumerate(context.space.groups):
         own = tree.dof_index[tree.dof_first[g] : tree.dof_first[g] + tree.dof_free[g]] if g >= 0 else []
@@ -54,11 +49,13 @@ def optimised_sets(grasps: "Optimised", free: np.ndarray, context: Context) -> C
         "candidates.record": record[kept],
         "candidates.state": np.ones_like(surface[kept]),
         "candidates.q": posture[kept],
+        "candidates.further": np.zeros((len(kept), groups, 1, 0), np.int32),
         "candidates.poses.index": (kept * context.held.struct.tries).astype(np.int32),
         "candidates.poses.pose": grasps.pose[kept].astype(np.float32),
         "candidates.poses.palm_point": palm_point[kept],
         "candidates.poses.palm_surface": palm_surface[kept],
         "candidates.poses.setting": setting[kept].astype(np.int32),
+        "candidates.poses.resting": np.full(len(kept), -1, np.int32),
         "candidates.poses.anchor": np.full((len(kept), groups), -1, np.int32),
     }
     return ContactSets.of(arrays, context.device)
