@@ -4,7 +4,7 @@ from typing import Literal, get_args
 
 Method = Literal["field", "anneal", "mala", "diffuser"]
 """How a sequence continues with the next object."""
-NetworkName = Literal["coarse", "diffuser", "pose"]
+NetworkName = Literal["coarse", "diffuser", "grasp", "pose"]
 """What ``lgrasp learn fit`` trains."""
 Policy = Literal["uniform", "lookahead"]
 """How a sequence chooses the opposition space of a step."""

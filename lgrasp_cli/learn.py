@@ -22,17 +22,18 @@ def fit(
     shards: Annotated[list[Path] | None, Argument(help="Shard files or folders; none for a pose policy.")] = None,
     model: Annotated[str, Option(**one_of(NetworkName, "NETWORK", "What is trained."))] = "coarse",
     out: Annotated[
-        Path | None, Option("--out", "-o", help="File of the network; default: coarse.pt, diffuser.pt or policy.npz.")
+        Path | None,
+        Option("--out", "-o", help="File of the network; default: coarse.pt, diffuser.pt, grasp.pt or policy.npz."),
     ] = None,
     steps: Annotated[
-        int | None, Option(help="Training steps; default: 1500 (coarse, on poses alone) or 20000 (diffuser).")
+        int | None, Option(help="Training steps; default: 1500 (coarse, on poses alone) or 20000.")
     ] = None,
     joint_steps: Annotated[
         int | None, Option(help="Training steps through the refiner afterwards (coarse); default: 80.")
     ] = None,
     unrolled: Annotated[int | None, Option(help="Unrolled steps of the refiner (coarse); default: 5.")] = None,
     batch: Annotated[
-        int | None, Option(help="Examples per training step; default: 64 (coarse), 1024, 512 (pose).")
+        int | None, Option(help="Examples per training step; default: 64 (coarse), 512 (pose) or 1024.")
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -51,9 +52,8 @@ def fit(
 ) -> None:
     """Train a network on grasps.
 
-    coarse predicts grasps from partial clouds: it is trained on poses, then through unrolled steps of the refiner; the
-    report compares energies on clouds outside the training data. diffuser draws the next step of sequences.
-    pose tells which poses to search.
+    grasp draws grasps from a cloud, for lgrasp plan --model. coarse predicts them too, trained through unrolled steps
+    of the refiner. diffuser draws the next step of sequences. pose tells which poses to search.
 
     Example: lgrasp learn fit grasps --out coarse.pt
 
@@ -62,13 +62,15 @@ def fit(
     from lgrasp.config import apply_settings, parse_model
     from lgrasp.errors import ConfigError
     from lgrasp.jobs.requests.learn import PolicyRequest
-    from lgrasp.jobs.requests.shards import DiffuserRequest, FitRequest
+    from lgrasp.jobs.requests.shards import DiffuserRequest, FitRequest, GraspRequest
     from lgrasp.learn.diffuser.params import DiffuserParams
+    from lgrasp.learn.grasp.params import GraspParams
     from lgrasp.learn.params import LearnParams, PosePolicyParams
 
     kinds: dict[str, Any] = {
         "coarse": (FitRequest, LearnParams, _show_fit),
         "diffuser": (DiffuserRequest, DiffuserParams, _show_steps),
+        "grasp": (GraspRequest, GraspParams, _show_grasps),
         "pose": (PolicyRequest, PosePolicyParams, _show_policy),
     }
     request, kind, show = kinds[model]
@@ -93,27 +95,35 @@ def fit(
 def evaluate(
     predictor: Annotated[str, Argument(help="File written by lgrasp learn fit, or a name of learn list.", **NETWORK)],
     shards: Shards,
-    clouds: Annotated[int, Option(min=1, help="New clouds per object.")] = 8,
+    clouds: Annotated[int, Option(min=1, help="New clouds per object (grasp: of each kind).")] = 8,
+    starts: Annotated[int, Option("--starts", "-n", min=1, help="Plans of each cloud (grasp).")] = 8,
     seed: Annotated[int, Option(min=0, help="Seed of the clouds.")] = 1,
+    out: Annotated[Path | None, Option(help="Folder for the plans, as shards of the true meshes (grasp).")] = None,
     device: Device = "auto",
     cache_dir: CacheDir = None,
     quiet: Quiet = False,
 ) -> Answer:
     """Measure a network on shards.
 
-    coarse: the energy of predictions on new clouds, before and after 3, 6, 10 and 13 rounds of the refiner. diffuser:
-    the loss, and penetration of draws as they come.
+    coarse: energies on new clouds before and after 3, 6, 10 and 13 rounds of the refiner. grasp: plans from new clouds
+    of all sides and of one, checked on the true meshes. diffuser: the loss, and penetration of draws as they come.
 
-    Example: lgrasp learn eval coarse.pt grasps
+    Example: lgrasp learn eval grasp.pt grasps --out plans
     """
     from lgrasp.dataset.files import shards_below
-
-    shards_below(shards)
-    cache = open_cache(cache_dir)
+    from lgrasp.errors import ConfigError
     from lgrasp.learn.networks import find_network, read_card
 
-    path = find_network(predictor)
-    if read_card(path)["kind"] == "diffuser":
+    shards_below(shards)
+    path, cache = find_network(predictor), open_cache(cache_dir)
+    if (kind := read_card(path)["kind"]) == "grasp":
+        from lgrasp.jobs.learn.grasp_eval import evaluate as measure_plans
+
+        data = measure_plans(path, shards, cache, clouds=clouds, starts=starts, seed=seed, device=device, out=out)
+        return Answer(data, [] if quiet else [_plans(data)])
+    if out is not None:
+        raise ConfigError(f"learn eval: --out is for networks of kind grasp; {path} is of kind {kind}")
+    if kind == "diffuser":
         from lgrasp.jobs.learn.diffuser import evaluate as measure
 
         data = measure(path, shards, cache, seed=seed, device=device)
@@ -146,6 +156,18 @@ def _draws(data: dict[str, Any]) -> Block:
         ("of the shards", told(data["of_data"])),
         ("time", f"{data['seconds_per_256']:.3f} s for 256 draws"),
     ]
+
+
+def _plans(data: dict[str, Any]) -> TextTable:
+    rows = []
+    for kind, objects in data["kinds"].items():
+        for name, found in objects.items():
+            depths = found["penetration"] or [float("nan")] * 2
+            share = f"{found['valid'] / max(found['delivered'], 1):.1%}"
+            counts = str(found["asked"]), str(found["delivered"])
+            rows.append([kind, name, *counts, share, *(f"{1e3 * x:.1f}" for x in depths)])
+    numbers = ("asked", "plans", "valid", "depth [mm]", "90 %")
+    return TextTable(("cloud", "object", *numbers), rows, right=numbers)
 
 
 @app.command("list")
@@ -201,6 +223,17 @@ def _show_fit(data: dict[str, Any]) -> list[Block]:
         pairs.append(("lowered by", f"{lowered['coarse']:.1%}, after the unrolled steps {lowered['unrolled']:.1%}"))
     end = [*took(data, "steps"), ("where", data["out"]), following("learn eval", data["out"], " SHARDS")]
     return [[*pairs, *end]]
+
+
+def _show_grasps(data: dict[str, Any]) -> list[Block]:
+    seen = f", of {plural(len(data['unseen']), 'unseen object')} {data['unseen_loss']:.3f}" if data["unseen"] else ""
+    pairs = [
+        ("hand, objects", f"{data['hand']}; {len(data['objects'])} objects, {data['examples']:,} grasps"),
+        ("loss", f"completing {data['completion_loss']:.3f}; drawing {data['loss']:.3f}{seen}"),
+    ]
+    return [
+        [*pairs, *took(data, "steps"), ("where", data["out"]), following("plan --model", data["out"], " --cloud FILE")]
+    ]
 
 
 def _show_steps(data: dict[str, Any]) -> list[Block]:

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from typer import Option
 
-from lgrasp_cli.names import HAND_OR_SHARD, OBJECT_OR_SHARD
+from lgrasp_cli.names import HAND_OR_SHARD, NETWORK, OBJECT_OR_SHARD
 from lgrasp_cli.options import Scale, Settings
 from lgrasp_cli.tables import Block, closed, following, place, took
 from lgrasp_cli.working import How, working
@@ -28,6 +28,10 @@ def plan(
         str,
         Option(help="Name of a hand, a URDF file, a folder with hand.yaml, or a shard (its hand).", **HAND_OR_SHARD),
     ] = "allegro",
+    model: Annotated[
+        str | None,
+        Option(help="Draws hands to start from: file of learn fit --model grasp, or a name.", **NETWORK),
+    ] = None,
     starts: Annotated[int, Option("--starts", "-n", help="Points of the surface to start from.")] = 80,
     stand_off: Annotated[
         float | None, Option(help="Distance of the hand's base from a start [m]; default: the hand's.")
@@ -49,7 +53,13 @@ def plan(
     from lgrasp.jobs.requests.plan import PlanRequest, plan_params
 
     what = {"hand": hand, "object": mesh, "scale": scale, "cloud": cloud, "mask": mask, "label": label, "out": out}
-    what |= {"viewpoint": _numbers(viewpoint), "starts": starts, "stand_off": stand_off, "keep_invalid": keep_invalid}
+    what |= {
+        "viewpoint": _numbers(viewpoint),
+        "starts": starts,
+        "model": model,
+        "stand_off": stand_off,
+        "keep_invalid": keep_invalid,
+    }
     params = plan_params(settings or (), distal=distal, other=other)
     how.run(how.job(PlanRequest, "plan", **what, params=params), _show)
 

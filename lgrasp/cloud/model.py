@@ -1,6 +1,7 @@
 """Point clouds and distance grids as objects: models without faces that all else takes for an object."""
 
 import hashlib
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,6 +23,8 @@ _SAME_SIDE = 0.7  # cosine
 _PAD = 0.016
 _MOST_NODES, _LEAST_CELL = 250_000, 0.0015
 _CONTACTS = 4096
+_TRUSTED, _GUESSED = 0.003, 0.009  # [m] from what was seen: its distances hold; they are guessed
+_COARSE = 0.005  # [m]
 
 
 def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud", centred: bool = True) -> ObjectModel:
@@ -95,6 +98,41 @@ def sdf_object(values: np.ndarray, origin: np.ndarray, cell: float, *, name: str
     grid = v.astype(np.float32), (np.asarray(origin, float) - center).astype(np.float32), float(cell)
     digest = hashlib.sha256(grid[0].tobytes() + np.asarray([*np.ravel(origin), cell], float).tobytes()).hexdigest()
     return _model(name, digest, center, points[keep] - center, normals[keep], grid, com, "a grid of distances")
+
+
+def completed_object(seen: ObjectModel, distance: Callable[[np.ndarray], np.ndarray], reach: float) -> ObjectModel:
+    """The model of a cloud with the sides that nobody saw, as somebody guesses them; in the cloud's internal frame.
+
+    Distances near what was seen stay, farther off they are those guessed.
+
+    Args:
+        seen: what :func:`cloud_object` gave.
+        distance: signed distances [m] guessed at places (n, 3) of the internal frame, (n,).
+        reach: how far from the internal origin the object may reach along each axis [m].
+    """
+    points, normals = seen.obstacle_points.astype(float), seen.obstacle_normals.astype(float)
+    points, kept = np.unique(points, axis=0, return_index=True)
+    normals, tree = normals[kept], cKDTree(points)
+    coarse = np.stack(np.meshgrid(*[np.arange(-reach, reach, _COARSE)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    inside = coarse[distance(coarse) < 0]
+    whole = np.concatenate([points, inside])
+    nodes, shape, cell = _lattice(whole.min(0) - _PAD, whole.max(0) + _PAD)
+    value, away = _heights(nodes, points, normals, tree, cell)
+    share = np.clip((_GUESSED - away) / (_GUESSED - _TRUSTED), 0, 1)
+    value = share * value + (1 - share) * distance(nodes)
+    grid = value.reshape(shape)
+    hidden = (np.abs(value) < cell) & (away > _GUESSED)
+    slope = np.stack(np.gradient(grid, cell), -1).reshape(-1, 3)[hidden]
+    slope /= np.linalg.norm(slope, axis=1, keepdims=True).clip(1e-9)
+    points = np.concatenate([points, nodes[hidden] - value[hidden, None] * slope])
+    order = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
+    within = nodes[value < 0]
+    com = within.mean(0) if len(within) else seen.com
+    made = grid.astype(np.float32), nodes[0].astype(np.float32), cell
+    note = "a point cloud: what was not seen of the object is guessed"
+    digest = hashlib.sha256(made[0].tobytes()).hexdigest()
+    normals = np.concatenate([normals, slope])
+    return _model(seen.name, digest, seen.center.astype(float), points[order], normals[order], made, com, note)
 
 
 def _check_size(what: str, points: np.ndarray) -> None:
@@ -192,11 +230,23 @@ def _fit(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> tuple[np.
 
 def _distances(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Signed distance grid [m] of planes through points, its origin and its cell."""
-    low, high = points.min(0) - _PAD, points.max(0) + _PAD
+    nodes, shape, cell = _lattice(points.min(0) - _PAD, points.max(0) + _PAD)
+    value, away = _heights(nodes, points, normals, cKDTree(points), cell)
+    value = np.where((value < 0) & (away > TRUST), away, value)
+    return value.reshape(shape).astype(np.float32), nodes[0].astype(np.float32), cell
+
+
+def _lattice(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, tuple[int, ...], float]:
+    """Nodes of a grid over a box [m], (n, 3), their number along each axis, and the cell [m]."""
     cell = max(_LEAST_CELL, float(np.prod(high - low) / _MOST_NODES) ** (1 / 3))
-    shape = np.ceil((high - low) / cell).astype(int) + 1
-    nodes = low + cell * np.indices(shape).reshape(3, -1).T
-    tree = cKDTree(points)
+    shape = tuple((np.ceil((high - low) / cell).astype(int) + 1).tolist())
+    return low + cell * np.indices(shape).reshape(3, -1).T, shape, cell
+
+
+def _heights(
+    nodes: np.ndarray, points: np.ndarray, normals: np.ndarray, tree: cKDTree, cell: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distances of nodes from planes through points, however deep, and distances from the nearest point [m]."""
     gap, near = tree.query(nodes, min(_PLANES, len(points)), workers=-1)
     weight = np.exp(-0.5 * (gap / (gap[:, :1] + cell)) ** 2)
     height = ((nodes[:, None] - points[near]) * normals[near]).sum(-1)
@@ -207,6 +257,4 @@ def _distances(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.
     # close to the surface the planes tell the distance, farther off the nearest point does
     spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
     share = np.clip(gap[:, 0] / max(4 * spacing, 2 * cell) - 0.5, 0, 1)
-    value = (1 - share) * plane + share * np.sign(plane) * gap[:, 0]
-    value = np.where((plane < 0) & (gap[:, 0] > TRUST), gap[:, 0], value)
-    return value.reshape(shape).astype(np.float32), low.astype(np.float32), cell
+    return (1 - share) * plane + share * np.sign(plane) * gap[:, 0], gap[:, 0]

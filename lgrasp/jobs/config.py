@@ -115,6 +115,7 @@ KINDS = {
     "learn": "lgrasp.jobs.requests.shards:FitRequest",
     "policy": "lgrasp.jobs.requests.learn:PolicyRequest",
     "diffuser": "lgrasp.jobs.requests.shards:DiffuserRequest",
+    "grasp": "lgrasp.jobs.requests.shards:GraspRequest",
     "metrics": "lgrasp.jobs.requests.shards:MetricsRequest",
     "export": "lgrasp.jobs.requests.shards:ExportRequest",
     "compare": "lgrasp.jobs.requests.compare:CompareRequest",

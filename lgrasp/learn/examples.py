@@ -14,11 +14,13 @@ from lgrasp.picture.camera import look_at
 from lgrasp.picture.depth import LabelledMesh, render
 from lgrasp.scenes.camera import intrinsics_of
 from lgrasp.scenes.params import CameraParams
+from lgrasp.scenes.records import CloudRecord
 from lgrasp.scenes.render import add_noise, draw_offsets, merge_views
 
-_CAMERA = CameraParams.model_validate(
+CAMERA = CameraParams.model_validate(
     {"views": 2, "width": 96, "height": 96, "angle": 40.0, "calibration": 0.003, "voxel": 0.0, "window": 2}
 )
+"""Of clouds that networks see."""
 _CAMERA_DISTANCE = 4.0  # of a camera, in radii of the object
 
 
@@ -83,20 +85,26 @@ def partial_clouds(
     Returns:
         Points [m] in the internal frame and unit normals, (clouds, count, 3) each.
     """
-    vertices = model.vertices - model.center
-    radius = float(np.linalg.norm(vertices, axis=1).max())
-    surface = LabelledMesh(vertices, model.faces, np.zeros(len(model.faces)))
     points, normals = np.zeros((clouds, count, 3)), np.zeros((clouds, count, 3))
-    made = 0
-    while made < clouds:
-        way = rng.standard_normal((_CAMERA.views, 3))
+    for made in range(clouds):
+        seen = seen_cloud(model.vertices - model.center, model.faces, CAMERA, rng, device)
+        kept = np.resize(rng.permutation(len(seen.points)), count)
+        points[made], normals[made] = seen.points[kept], seen.normals[kept]
+    return points, normals
+
+
+def seen_cloud(
+    vertices: np.ndarray, faces: np.ndarray, camera: CameraParams, rng: np.random.Generator, device: str = "cpu"
+) -> CloudRecord:
+    """What the cameras see of a mesh alone in space, from random sides, about the origin of its vertices [m]."""
+    radius = float(np.linalg.norm(vertices, axis=1).max())
+    surface = LabelledMesh(vertices, faces, np.zeros(len(faces)))
+    while True:
+        way = rng.standard_normal((camera.views, 3))
         way /= np.linalg.norm(way, axis=1)[:, None]
         if np.abs(way[:, 2]).max() > 0.98:  # no upright image
             continue
-        images = render(surface, intrinsics_of(_CAMERA), look_at(_CAMERA_DISTANCE * radius * way, np.zeros(3)), device)
-        merged = merge_views(add_noise(images, _CAMERA, rng), draw_offsets(_CAMERA, rng), _CAMERA, device)
+        images = render(surface, intrinsics_of(camera), look_at(_CAMERA_DISTANCE * radius * way, np.zeros(3)), device)
+        merged = merge_views(add_noise(images, camera, rng), draw_offsets(camera, rng), camera, device)
         if len(merged.points):
-            kept = np.resize(rng.permutation(len(merged.points)), count)
-            points[made], normals[made] = merged.points[kept], merged.normals[kept]
-            made += 1
-    return points, normals
+            return merged

@@ -16,6 +16,14 @@ class PlanParams(Params):
     rolls: int = Field(
         default=30, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
     )
+    draws: int = Field(default=8, ge=1, le=64, description="Hands that a network draws for each start.")
+    thicker: float = Field(
+        default=0.005,
+        ge=0,
+        le=0.05,
+        description="How far the sides of a cloud that nobody saw are taken to reach beyond where a network puts them: "
+        "fingers that wait outside close until they touch.",
+    )
     tilts: tuple[float, ...] = Field(
         default=(0.0, 45.0, 90.0),
         min_length=1,

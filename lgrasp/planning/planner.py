@@ -37,6 +37,15 @@ def _loosened(bounds: GraspBounds) -> GraspBounds:
     return bounds.changed(**{name: max(least, getattr(bounds, name)) for name, least in _COARSE_BOUNDS.items()})
 
 
+class Guesses(NamedTuple):
+    """Hands of n starts, k of each, one start after another."""
+
+    pose: np.ndarray
+    """T_hand_object of the object's internal frame, device poses (n k, 7)."""
+    q: np.ndarray
+    """Joints within their limits [rad or m], (n k, K)."""
+
+
 class Planned(NamedTuple):
     """Plans of the starts."""
 
@@ -55,6 +64,7 @@ class Planner:
         stand_off: distance of the hand's base from the surface at the start [m].
         palmar: where the hand may touch; default: where hand.yaml lets it.
         around: what else the hand must not touch, in the object's internal frame.
+        guesses: hands to begin with in place of open ones before the surface, ``draws`` of each start.
     """
 
     hand: HandArrays
@@ -63,6 +73,7 @@ class Planner:
     params: PlanParams = field(default_factory=PlanParams)
     palmar: ContactSurface | None = None
     around: ObjectModel | None = None
+    guesses: Guesses | None = None
 
     def run(
         self, count: int, progress: Callable[[int, int], None] | None = None, *, keep_invalid: bool = False
@@ -77,7 +88,9 @@ class Planner:
             HandError: no side of the hand can face an object.
         """
         device = self.hand.device
-        points = farthest_points(self.model.contact_points.astype(float), count)
+        points = np.arange(count)
+        if self.guesses is None:
+            points = farthest_points(self.model.contact_points.astype(float), count)
         some, workers = (_CPU_STARTS, cores()) if device == "cpu" else (_GPU_STARTS, 1)
         counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *REASONS], 0)
         tables = []
@@ -112,19 +125,33 @@ class Planner:
 
     def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
-        p, hand = self.params, self.hand.model
-        start, pose, q, facing = self._starts(points, first)
-        free = search.max_penetration(self._put(pose, q)) <= _COLLIDES
-        start, at = start[free], self._put(pose[free], q[free])
+        p = self.params
+        start, at = self._opened(search, points, first) if self.guesses is None else self._guessed(points)
         if len(start):
-            centre, axis = palm_axis(hand)
-            travel = np.full(len(start), max(self.stand_off - float(centre @ axis) - p.clearance, 0.0))
-            search.advanced(at, facing[free], travel, p.clearance)
             search.run(at, rounds=p.opening)
             start, at = self._best(at, start, _loosened(p.bounds), p.finalists)
             search.run(at, first=p.opening)
             start, at = self._best(at, start, p.bounds, 1)
         return self._checked(at, start, p.bounds)
+
+    def _opened(self, search: Descent, points: np.ndarray, first: int) -> tuple[np.ndarray, Hands]:
+        """Starts, and open hands that advanced to the surface."""
+        hand, clearance = self.hand.model, self.params.clearance
+        start, pose, q, facing = self._starts(points, first)
+        free = search.max_penetration(self._put(pose, q)) <= _COLLIDES
+        start, at = start[free], self._put(pose[free], q[free])
+        if len(start):
+            centre, axis = palm_axis(hand)
+            travel = np.full(len(start), max(self.stand_off - float(centre @ axis) - clearance, 0.0))
+            search.advanced(at, facing[free], travel, clearance)
+        return start, at
+
+    def _guessed(self, starts: np.ndarray) -> tuple[np.ndarray, Hands]:
+        """Starts, and the hands that were guessed for them."""
+        assert self.guesses is not None
+        each = self.params.draws
+        rows = (starts[:, None] * each + np.arange(each)).reshape(-1)
+        return starts.repeat(each), self._put(device_inverse(self.guesses.pose[rows]), self.guesses.q[rows])
 
     def _best(self, at: Hands, start: np.ndarray, bounds: GraspBounds, count: int) -> tuple[np.ndarray, Hands]:
         """The ``count`` best hands of each start: those that pass the checks first, then those that resist most."""

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import torch
 
+import lgrasp as lg
 from lgrasp.learn.network import CoarseNet
 from lgrasp.learn.networks import network_bytes
 from lgrasp.learn.params import LearnParams
@@ -78,7 +79,7 @@ def test_files_that_are_no_predictors(cli):
     good = net.state_dict()
     for change, state, words in (
         ({"version": 9}, good, "version 9"),
-        ({"kind": "diffuser"}, good, "kind 'diffuser'"),
+        ({"kind": "other"}, good, "kind 'other'"),
         ({"hand": 3}, good, "hand is 3"),
         ({"params": {}}, good, "size mismatch"),
         ({"params": "?"}, good, "net.pt"),
@@ -123,6 +124,39 @@ def test_networks_are_known_by_name(generate, cli, monkeypatch, tmp_path):
         "import sys; from lgrasp.jobs.listing import list_networks; list_networks(); sys.exit('torch' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_grasps_are_planned_from_a_cloud_by_a_network(generate, cli):
+    assert generate(rows=64).code == 0
+    sizes = ["width=32", "blocks=1", "cloud=64", "shape_points=32", "held_points=32", "sense_points=1", "views=4"]
+    sizes += ["turns=2", "nodes=8", "channels=2", "completion_steps=20", "completion_batch=4", "held_out=0"]
+    options = [option for size in sizes for option in ("--set", f"grasp.{size}")]
+    fit = ["learn", "fit", "--model", "grasp", "out", "--steps", 60, "--batch", 64, "--device", "cpu", *options]
+    done = cli(*fit, "--out", "net.pt", "--json", "fit.json")
+    assert done.code == 0, done
+    assert json.loads(Path("fit.json").read_text())["examples"] == 64
+    assert cli(*fit, "--out", "again.pt").code == 0
+    one, two = (torch.load(name, weights_only=True) for name in ("net.pt", "again.pt"))
+    assert all(torch.equal(values, two[name]) for name, values in one.items())
+    told = cli(
+        "learn", "eval", "net.pt", "out", "--clouds", 1, "-n", 2, "--out", "plans", "--device", "cpu", "--json", "-"
+    )
+    assert told.code == 0, told
+    found = json.loads(told.out)["kinds"]["one view"]["tiny"]
+    assert found["asked"] == 2
+    assert found["delivered"] == sum(len(lg.open(path)) for path in Path("plans/one-view").glob("*.h5"))
+    points = lg.load_object("tiny")
+    seen = points.contact_normals[:, 2] > 0
+    cloud = np.column_stack([points.contact_points, points.contact_normals])[seen]
+    np.save("cloud.npy", cloud)
+    plan = ["plan", "--cloud", "cloud.npy", "-n", 3, "--device", "cpu", "--out", "planned", "--keep-invalid"]
+    assert cli(*plan, "--model", "net.pt").code == 0
+    (path,) = Path("planned").glob("*.h5")
+    grasps = lg.open(path)
+    assert len(grasps) == 3
+    assert grasps.header.config["network"]
+    assert "of hand 'allegro', not of 'barrett'" in cli(*plan, "--model", "net.pt", "--hand", "barrett").error()
+    assert "absent: no such file, nor a network" in cli(*plan, "--model", "absent").error()
 
 
 def test_a_pose_policy_is_trained_and_used(cli, tmp_path):

@@ -16,7 +16,7 @@ from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import Job, JobOutcome
-from lgrasp.errors import LgraspError, StarvedError
+from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader
 from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.hand.arrays import upload_hand
@@ -24,8 +24,11 @@ from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
+from lgrasp.jobs.refine.predicted import predicted_planner
 from lgrasp.jobs.requests.plan import PlanRequest
 from lgrasp.jobs.shard_inputs import mesh_hash, named_hand, named_object
+from lgrasp.learn.grasp.file import Networks, load_networks
+from lgrasp.learn.networks import find_network
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.params import PlanParams, cloud_params
 from lgrasp.planning.planner import Planner
@@ -51,6 +54,7 @@ class PlanJob(PlanRequest, Job):
     cloud: Path | InstanceOf[Cloud] | None = None
     _cloud: Cloud | None = PrivateAttr(None)
     _found: tuple[HandSource, HandModel, ObjectModel, ObjectModel | None] | None = PrivateAttr(None)
+    _networks: Networks | None = PrivateAttr(None)
 
     @property
     def name(self) -> str:
@@ -75,6 +79,7 @@ class PlanJob(PlanRequest, Job):
             stand_off=self._stand_off(),
             params=self._params().model_dump(mode="json"),
             keep_invalid=self.keep_invalid,
+            **self._model_key(),
         )
 
     def parts(self) -> list[Part]:
@@ -91,9 +96,12 @@ class PlanJob(PlanRequest, Job):
     def make(self, part: Part, progress: PartProgress) -> Made:
         source, hand, model, around = self._models()
         alias = self.device_used.alias
-        palmar = visible_surface(source, hand, alias)
-        planner = Planner(upload_hand(hand, alias), model, self._stand_off(), self._params(), palmar, around)
-        begin = time.perf_counter()
+        palmar, plan, arrays = visible_surface(source, hand, alias), self._params(), upload_hand(hand, alias)
+        begin, networks = time.perf_counter(), self.networks()
+        if networks is None:
+            planner = Planner(arrays, model, self._stand_off(), plan, palmar, around)
+        else:
+            planner = predicted_planner(networks, arrays, model, self.starts, plan, palmar, around)
         grasps, counts = planner.run(
             self.starts, lambda done, plans: progress(done, f"{plans:,} plans"), keep_invalid=self.keep_invalid
         )
@@ -109,6 +117,7 @@ class PlanJob(PlanRequest, Job):
                 "starts": self.starts,
                 "stand_off": self._stand_off(),
                 **hand_config(source),
+                **self._model_key(),
             },
         )
         statistics = {
@@ -122,6 +131,26 @@ class PlanJob(PlanRequest, Job):
         record = hand_record(hand, mesh_blobs(source.urdf))
         shard = Shard(header=header, hand=record, objects=[self._record()], grasps=rows, statistics=statistics)
         return Made(len(rows), shard, {"counts": counts, "seconds": seconds})
+
+    def networks(self) -> Networks | None:
+        """What draws the hands to start from, if something does.
+
+        Raises:
+            ConfigError: the file is none, or of another hand.
+        """
+        if self.model is not None and self._networks is None:
+            path, (source, hand, _, _) = find_network(self.model), self._models()
+            self._networks = load_networks(path)
+            if self._networks.hand_sha256 != hand.sha256:
+                raise ConfigError(
+                    f"{path} is of hand '{self._networks.hand}', not of '{source.name}' (or of another model of it)"
+                )
+        return self._networks
+
+    def _model_key(self) -> dict[str, Any]:
+        if self.networks() is None:
+            return {}
+        return {"network": content_key("network", 1, content=find_network(str(self.model)).read_bytes().hex())}
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``starts``, ``counts`` (what became of the starts), medians of ``epsilon`` and

@@ -13,6 +13,7 @@ from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.jobs.requests.shards import look_up
+from lgrasp.learn.networks import find_network
 from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
 from lgrasp.planning.params import PlanParams
@@ -35,6 +36,11 @@ class PlanRequest(Request):
     mask: Path | None = Field(default=None, description="Labels of the cloud's points (.npy, .npz).")
     label: int | None = Field(default=None, description="Label of the points to grasp.")
     viewpoint: tuple[float, float, float] | None = Field(default=None, description="Where the cloud was seen from [m].")
+    model: str | None = Field(
+        default=None,
+        description="File of lgrasp learn fit --model grasp, or a name of lgrasp learn list, that draws hands to start "
+        "from.",
+    )
     stand_off: float | None = Field(
         default=None, description="Of the hand's base from a start [m]; default: the hand's."
     )
@@ -75,6 +81,8 @@ class PlanRequest(Request):
             check_file(self.cloud, CLOUD_SUFFIXES, "a point cloud", CloudError)
         if self.mask is not None:
             check_file(self.mask, MASK_SUFFIXES, "a mask", CloudError)
+        if self.model is not None:
+            find_network(self.model)
         if self.out is not None:
             check_folder(self.out)
 

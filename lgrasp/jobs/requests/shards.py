@@ -17,6 +17,7 @@ from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.names import hand_path
 from lgrasp.hold.params import HoldTest
 from lgrasp.learn.diffuser.params import DiffuserParams
+from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.params import LearnParams
 from lgrasp.refine.params import COARSE, LocalSearch
 from lgrasp.simulate.protocol import Protocol, find_protocol
@@ -160,6 +161,15 @@ class DiffuserRequest(FitRequest):
 
     out: Path = Field(default=Path("diffuser.pt"), description="File of the network.")
     params: DiffuserParams = Field(default_factory=lambda: DiffuserParams.model_validate({}))
+
+
+class GraspRequest(FitRequest):
+    """A one-object predictor, trained on shards of grasps of single objects: one file."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.learn.grasp:GraspJob"
+
+    out: Path = Field(default=Path("grasp.pt"), description="File of the networks.")
+    params: GraspParams = Field(default_factory=lambda: GraspParams.model_validate({}))
 
 
 class ExportRequest(Request):

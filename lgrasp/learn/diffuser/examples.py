@@ -87,6 +87,15 @@ def make_net(hand: HandModel, spaces: int, params: DiffuserParams) -> DiffuserNe
     return net
 
 
+class Sights(NamedTuple):
+    """How objects are seen: O objects, V frames of each one after another."""
+
+    R: torch.Tensor
+    """Axes of a frame in that of the object as columns, (O V, 3, 3)."""
+    t: torch.Tensor
+    """Its origin there [m], (O V, 3)."""
+
+
 class StepExamples:
     """Steps as the network is given them, all on one device.
 
@@ -94,6 +103,8 @@ class StepExamples:
 
     Args:
         clouds: of all objects, centred, (O, n, 3) [m]. grids: their distances.
+        sights: where clouds and grids are those of ``each`` views of every object, in frames of their own; one is drawn
+            for each example.
     """
 
     def __init__(
@@ -105,6 +116,8 @@ class StepExamples:
         net: DiffuserNet,
         params: DiffuserParams,
         device: str | torch.device = "cpu",
+        sights: Sights | None = None,
+        each: int = 1,
     ) -> None:
         steps, clouds = SequenceSteps(*(x.to(device) for x in steps)), clouds.to(device)
         draw = torch.Generator().manual_seed(params.seed)
@@ -113,38 +126,61 @@ class StepExamples:
         self.shapes = torch.stack([shape_features(basis, cloud, self.turns).half() for cloud in clouds])  # (O, V, B)
         self.held = held_features(held_basis, clouds, steps.held, steps.held_rotation, steps.held_position).half()
         self.steps = steps
+        self.sights = None if sights is None else Sights(*(x.to(device) for x in sights))
+        self.each = each
         self.senses = Senses(tree, net.senses, net.held_basis, grids, device)
 
     def __len__(self) -> int:
         return len(self.steps.t)
 
+    @property
+    def ways(self) -> int:
+        """In how many ways an object is seen: views times rotations."""
+        return self.each * len(self.turns)
+
     def statistics(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and spread of rows, (9 + K,) each; of rotations those of all rotations."""
-        s = self.steps
-        there = torch.cat([torch.ones(len(self), POSE, dtype=torch.bool, device=s.t.device), s.free], 1)
-        mean, spread = spread_of(torch.cat([s.t, sixd_from_matrix(s.R), s.q], 1), there)
+        s, n = self.steps, len(self)
+        way = torch.randint(self.ways, (n,), generator=torch.Generator().manual_seed(0)).to(s.t.device)
+        R, t, q = self._goals(torch.arange(n, device=s.t.device), way)
+        there = torch.cat([torch.ones(n, POSE, dtype=torch.bool, device=s.t.device), s.free], 1)
+        mean, spread = spread_of(torch.cat([t, sixd_from_matrix(R), q], 1), there)
         mean[3:POSE], spread[3:POSE] = 0.0, 3**-0.5
         return mean, spread
 
-    def batch(self, rows: torch.Tensor, turn: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], Situation]:
-        """R, t and q of steps, (n, ...), and their situations, with objects in the frames of turns (n,)."""
+    def batch(self, rows: torch.Tensor, way: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], Situation]:
+        """R, t and q of steps, (n, ...), and their situations, with objects seen in ways (n,)."""
         s = self.steps
+        number, turn = self._seen(rows, way)
         situation = Situation(
-            self.shapes[s.object[rows], turn],
+            self.shapes[number, turn],
             self.held[rows],
             s.start[rows],
             s.used[rows],
             s.free[rows],
             s.space[rows],
         )
-        return (s.R[rows] @ self.turns[turn].mT, s.t[rows], s.q[rows]), situation
+        return self._goals(rows, way), situation
 
     def held_objects(self, rows: torch.Tensor) -> HeldObjects:
         """What the hands of steps hold before."""
         s = self.steps
         return HeldObjects(s.held[rows], s.held_rotation[rows], s.held_position[rows])
 
-    def felt(self, rows: torch.Tensor, turn: torch.Tensor, step: tuple[torch.Tensor, ...]) -> torch.Tensor:
-        """What the hands of steps feel in other poses and postures, R, t and q, with objects in turned frames."""
+    def felt(self, rows: torch.Tensor, way: torch.Tensor, step: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        """What the hands of steps feel in other poses and postures, R, t and q, with objects seen in ways (n,)."""
         R, t, q = step
-        return self.senses(R @ self.turns[turn], t, q, self.steps.object[rows], self.held_objects(rows))
+        number, turn = self._seen(rows, way)
+        return self.senses(R @ self.turns[turn], t, q, number, self.held_objects(rows))
+
+    def _goals(self, rows: torch.Tensor, way: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        s = self.steps
+        R, t, q = s.R[rows], s.t[rows], s.q[rows]
+        number, turn = self._seen(rows, way)
+        if self.sights:
+            R, t = R @ self.sights.R[number], t + (R @ self.sights.t[number, :, None])[..., 0]
+        return R @ self.turns[turn].mT, t, q
+
+    def _seen(self, rows: torch.Tensor, way: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Numbers of the cloud and the rotation."""
+        return self.steps.object[rows] * self.each + way // len(self.turns), way % len(self.turns)

@@ -25,11 +25,15 @@ class AboutDiffuser(NamedTuple):
 
 
 def diffuser_bytes(net: DiffuserNet, about: AboutDiffuser) -> bytes:
-    """The file: weights in half precision, numbers with a unit in single."""
-    buffers = {name for name, _ in net.named_buffers()}
-    state = {name: x.cpu().float() if name in buffers else x.cpu().half() for name, x in net.state_dict().items()}
+    """The file."""
     params = about.params.model_dump(mode="json")
-    return network_bytes({"kind": KIND, "version": VERSION, **about._asdict(), "params": params}, state)
+    return network_bytes({"kind": KIND, "version": VERSION, **about._asdict(), "params": params}, stored_state(net))
+
+
+def stored_state(net: torch.nn.Module) -> dict[str, torch.Tensor]:
+    """Weights in half precision, numbers with a unit in single, on the CPU."""
+    buffers = {name for name, _ in net.named_buffers()}
+    return {name: x.cpu().float() if name in buffers else x.cpu().half() for name, x in net.state_dict().items()}
 
 
 def load_diffuser(path: Path) -> tuple[DiffuserNet, AboutDiffuser]:
@@ -45,20 +49,34 @@ def load_diffuser(path: Path) -> tuple[DiffuserNet, AboutDiffuser]:
         params = DiffuserParams.model_validate(card["params"])
         told = card["hand"], card["hand_sha256"], tuple(spaces), params, card.get("run_key"), card["report"]
         about = AboutDiffuser(*told)
-        return _filled(state, about), about
+        return restored_net(state, len(about.space_names), about.params), about
 
 
-def _filled(state: dict[str, torch.Tensor], about: AboutDiffuser) -> DiffuserNet:
-    """A network with the weights; shapes are compared before any memory is taken for what the file asks for."""
-    p = about.params
+def restored_net(state: dict[str, torch.Tensor], spaces: int, params: DiffuserParams) -> DiffuserNet:
+    """A network with the weights of a file.
+
+    Raises:
+        ValueError: some are missing or of another shape, or numbers are not in order.
+    """
+    p = params
     with torch.device("meta"):
         ends = torch.zeros(2, len(state["lower"]))
         bases = torch.zeros(p.shape_points, 3), torch.zeros(p.held_points, 3), torch.zeros(len(state["senses"]), 4)
-        net = DiffuserNet(ends[0], ends[1], len(about.space_names), *bases, p)
+        net = DiffuserNet(ends[0], ends[1], spaces, *bases, p)
+    fill(net, state)
+    if bool((net.spread <= 0).any()) or bool((net.lower > net.upper).any()):
+        raise ValueError("spread or joint limits are not in order")
+    return net
+
+
+def fill(net: torch.nn.Module, state: dict[str, torch.Tensor]) -> None:
+    """Give weights to a network of device meta; shapes are compared before any memory is taken for it.
+
+    Raises:
+        ValueError: some are missing or of another shape.
+    """
     for name, values in net.state_dict().items():
         if name not in state or state[name].shape != values.shape:
             raise ValueError(f"{name} is missing or of another shape")
-    if bool((state["spread"] <= 0).any()) or bool((state["lower"] > state["upper"]).any()):
-        raise ValueError("spread or joint limits are not in order")
     net.load_state_dict({name: values.float() for name, values in state.items()}, assign=True)
-    return net.requires_grad_(False)
+    net.requires_grad_(False)

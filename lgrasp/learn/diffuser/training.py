@@ -41,6 +41,11 @@ class StepTrainer:
 
     def fit(self, told: Callable[[int, float], None] | None = None) -> None:
         """All steps of the training; ``told`` is called with (step, mean loss since the last call) now and then."""
+        with torch.random.fork_rng():
+            torch.manual_seed(self.params.seed)  # of dropout
+            self._fit(told)
+
+    def _fit(self, told: Callable[[int, float], None] | None) -> None:
         p, weights = self.params, list(self.net.parameters())
         optimiser = torch.optim.AdamW(weights, lr=p.rate, weight_decay=p.decay, fused=self.device.type == "cuda")
         rate = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _share(step, p.steps))
@@ -95,15 +100,15 @@ def _loss(
 ) -> torch.Tensor:
     """Mean square of the error of dx/dt over entries that move."""
     n, like = len(rows), {"generator": draw, "device": rows.device}
-    turn = torch.randint(len(examples.turns), (n,), **like)
-    goal, situation = examples.batch(rows, turn)
+    way = torch.randint(examples.ways, (n,), **like)
+    goal, situation = examples.batch(rows, way)
     situation = change(situation)
     x = net.standardised(*goal)
     t = process.times(torch.rand(n, 1, **like))
     mixed, velocity = process.mix(x, torch.randn(x.shape, **like), t)
     moving = net.moving(situation.free)
     mixed = mixed * moving
-    felt = examples.felt(rows, turn, net.noisy_steps(mixed, process.coefficients(t)[0], situation))
+    felt = examples.felt(rows, way, net.noisy_steps(mixed, process.coefficients(t)[0], situation))
     error = (net(mixed, t, net.situation(situation), felt) - velocity) * moving
     return (error**2).sum() / moving.sum()
 

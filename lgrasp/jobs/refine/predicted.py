@@ -1,0 +1,32 @@
+"""A planner whose hands start where networks draw them."""
+
+from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.contact_surface import ContactSurface
+from lgrasp.learn.grasp.file import Networks
+from lgrasp.learn.grasp.predictor import GraspPredictor
+from lgrasp.object.model import ObjectModel
+from lgrasp.planning.params import PlanParams
+from lgrasp.planning.planner import Guesses, Planner
+
+
+def predicted_planner(
+    networks: Networks,
+    hand: HandArrays,
+    model: ObjectModel,
+    starts: int,
+    params: PlanParams,
+    palmar: ContactSurface | None = None,
+    around: ObjectModel | None = None,
+    *,
+    seed: int = 0,
+) -> Planner:
+    """The planner of an object or of the model of a cloud, whose unseen sides are guessed.
+
+    Args:
+        starts: how many there will be at most.
+        palmar, around: as of :class:`Planner`.
+    """
+    predictor = GraspPredictor(hand.model.tree, networks, model.contact_points, model.contact_normals, hand.device)
+    guesses = Guesses(*predictor.draw(starts * params.draws, seed))
+    whole = model if len(model.faces) else predictor.completed(model, params.thicker)
+    return Planner(hand, whole, 0.0, params, palmar, around, guesses)

@@ -1,0 +1,129 @@
+"""The network that completes clouds: distances to what was seen -> signed distances of the whole object."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+from lgrasp.object.sdf import SdfGrid
+
+CHANNELS = 5
+_MARGIN, _PAD = 1.25, 0.015  # half side of the cube over the cloud's radius, and beyond that [m]
+_NEAR = 4.0  # cells within which signed distances are seen
+_ONE_SIDED = 0.35  # length of the mean normal above which a cloud shows one side
+_RIM = 0.02  # share of the points that lie beyond the rim
+_BLOCK = 1 << 25  # distances at a time
+_AT_ONCE = 16  # clouds
+
+
+class Cubes(NamedTuple):
+    """Cubes of nodes about N clouds, in the frames of these."""
+
+    half: torch.Tensor
+    """Half of the side [m], (N,)."""
+    values: torch.Tensor
+    """What the network is given, (N, CHANNELS, n, n, n)."""
+    base: torch.Tensor
+    """Signed distances in half sides of a first guess, (N, n, n, n): a cloud of one side is closed by its mirror image
+    behind the rim."""
+
+    def some(self, index: torch.Tensor) -> "Cubes":
+        """Some of them, by index."""
+        return Cubes(*(x[index] for x in self))
+
+
+def unit_nodes(count: int, device: torch.device) -> torch.Tensor:
+    """Nodes of a cube with corners at -1 and 1, (count^3, 3)."""
+    line = torch.linspace(-1, 1, count, device=device)
+    return torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
+
+
+def cubes_of(points: torch.Tensor, normals: torch.Tensor, count: int) -> Cubes:
+    """Cubes with ``count`` nodes along a side.
+
+    Args:
+        points: about their middle, z out of the side that was seen, (N, k, 3) [m]. normals: (N, k, 3).
+    """
+    half = _MARGIN * points.norm(dim=2).amax(1) + _PAD
+    nodes = unit_nodes(count, points.device)
+    values, bases = [], []
+    for cloud, normal, h in zip(points, normals, half, strict=True):
+        away, seen = _distances(nodes * h, cloud, normal)
+        base, one_sided = seen, normal.mean(0).norm()
+        if one_sided > _ONE_SIDED:
+            flip = torch.tensor([1.0, 1.0, -1.0], device=points.device)
+            rim = torch.zeros(3, device=points.device)
+            rim[2] = 2 * cloud[:, 2].quantile(_RIM)
+            base = seen.maximum(_distances(nodes * h, cloud * flip + rim, normal * flip)[1])
+        near = _NEAR * 2 * h / count
+        told = [(seen / near).clamp(-1, 1), (base / near).clamp(-1, 1), away / h, nodes[:, 2]]
+        values.append(torch.stack([*told, one_sided.expand(len(nodes))]))
+        bases.append(base / h)
+    shape = count, count, count
+    return Cubes(half, torch.stack(values).unflatten(2, shape), torch.stack(bases).unflatten(1, shape))
+
+
+def _distances(x: torch.Tensor, points: torch.Tensor, normals: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distance of places x (m, 3) from the nearest point [m], and the same with the sign of its side."""
+    found = [torch.cdist(part, points).min(1) for part in x.split(max(1, _BLOCK // len(points)))]
+    away, which = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return away, away * ((x - points[which]) * normals[which]).sum(1).sign()
+
+
+class CompletionNet(nn.Module):
+    """A U-Net on cubes; it corrects their first guess.
+
+    Args:
+        channels: at the finest of four levels.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        sizes = [channels << k for k in range(4)]
+        self.down = nn.ModuleList(
+            _Block(a, b, stride) for a, b, stride in zip([CHANNELS, *sizes[:-1]], sizes, (1, 2, 2, 2), strict=True)
+        )
+        self.up = nn.ModuleList(_Block(a + b, a, 1) for a, b in pairwise(sizes))
+        self.out = nn.Conv3d(channels, 1, 1, bias=False)
+        nn.init.zeros_(self.out.weight)
+
+    def forward(self, cubes: Cubes) -> torch.Tensor:
+        """Signed distances of the objects in half sides, (N, n, n, n)."""
+        seen, x = [], cubes.values
+        for block in self.down:
+            x = block(x)
+            seen.append(x)
+        for block, finer in zip(reversed(self.up), reversed(seen[:-1]), strict=True):
+            x = functional.interpolate(x, size=finer.shape[2:], mode="trilinear", align_corners=False)
+            x = block(torch.cat([finer, x], 1))
+        return self.out(x)[:, 0] + cubes.base
+
+
+class _Block(nn.Module):
+    def __init__(self, a: int, b: int, stride: int) -> None:
+        super().__init__()
+        self.first, self.second = nn.Conv3d(a, b, 3, stride, 1), nn.Conv3d(b, b, 3, 1, 1)
+        self.norms = nn.ModuleList(nn.GroupNorm(1, b) for _ in range(2))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = functional.silu(self.norms[0](self.first(x)))
+        return functional.silu(self.norms[1](self.second(x)))
+
+
+@torch.no_grad()
+def completed_grids(net: CompletionNet, points: torch.Tensor, normals: torch.Tensor, count: int) -> list[SdfGrid]:
+    """Signed distances of whole objects, guessed from clouds, in the frames of these.
+
+    Args:
+        points, normals: as of :func:`cubes_of`. count: nodes along a side.
+    """
+    grids = []
+    for some in torch.arange(len(points), device=points.device).split(_AT_ONCE):
+        cubes = cubes_of(points[some], normals[some], count)
+        values = (net(cubes) * cubes.half[:, None, None, None]).cpu().numpy()
+        for h, value in zip(cubes.half.tolist(), values, strict=True):
+            grids.append(SdfGrid(value.astype(np.float32), np.full(3, -h, np.float32), 2 * h / (count - 1)))
+    return grids

@@ -1,0 +1,79 @@
+"""Grasps of an object of which a cloud is known, as two trained networks guess them."""
+
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from lgrasp.cloud.model import completed_object
+from lgrasp.geometry.rotations import motion_from_pose, pose_from_motion
+from lgrasp.grasp.sequences import HeldHands
+from lgrasp.hand.tree import Tree
+from lgrasp.learn.diffuser.sampler import DrawnSteps, StepSampler
+from lgrasp.learn.grasp.completion import completed_grids
+from lgrasp.learn.grasp.file import Networks
+from lgrasp.learn.grasp.views import make_view
+from lgrasp.object.model import ObjectModel
+from lgrasp.object.sdf import SdfGrid, sample_sdf
+
+
+class GraspPredictor:
+    """Networks with one cloud before them. What they guess turns and moves with the cloud.
+
+    Args:
+        points: of the cloud [m], (n, 3). normals: outward, (n, 3).
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        networks: Networks,
+        points: np.ndarray,
+        normals: np.ndarray,
+        device: str = "cpu",
+    ) -> None:
+        self._tree, self._networks, self._device = tree, networks, device
+        self.view = make_view(points, normals, networks.params.cloud)
+
+    @cached_property
+    def grid(self) -> SdfGrid:
+        """Signed distances of the whole object, in the frame of the view."""
+        points, normals = (torch.as_tensor(x, device=self._device)[None] for x in (self.view.points, self.view.normals))
+        completes, nodes = self._networks.completes.to(self._device), self._networks.params.nodes
+        return completed_grids(completes, points, normals, nodes)[0]
+
+    def draw(self, count: int, seed: int = 0, *, steps: int = 10) -> DrawnSteps:
+        """``count`` grasps; poses are those of the cloud's frame in the hand's. A function of its arguments."""
+        tree = self._tree
+        hands = HeldHands(
+            tree.joint_open[None].astype(np.float32),
+            np.zeros((1, len(tree.joint_open)), bool),
+            np.zeros((1, 0, 7), np.float32),
+        )
+        drawn = self._sampler.draw(hands, np.zeros(1, int), ~hands.used, each=count, seed=seed, steps=steps)
+        R, t = motion_from_pose(torch.as_tensor(drawn.pose))
+        R = R @ torch.as_tensor(self.view.R, dtype=torch.float32).mT
+        t = t - R @ torch.as_tensor(self.view.t, dtype=torch.float32)
+        return DrawnSteps(pose_from_motion(R, t).cpu().numpy(), drawn.q)
+
+    def distance(self, places: np.ndarray) -> np.ndarray:
+        """Guessed signed distances [m] of places (n, 3) in the cloud's frame, (n,); positive beyond what is guessed."""
+        local = (places - self.view.t) @ self.view.R
+        reach = -float(self.grid.origin[0])
+        beyond = np.linalg.norm(np.maximum(np.abs(local) - reach, 0), axis=1)
+        found = sample_sdf(self.grid, local)
+        return np.where(beyond > 0, np.maximum(found, 0) + beyond, found)
+
+    def completed(self, model: ObjectModel, thicker: float = 0.0) -> ObjectModel:
+        """The model of the cloud, whose internal frame is the cloud's frame here, with the sides that nobody saw.
+
+        Args:
+            thicker: how far these are moved outward [m].
+        """
+        reach = float(np.abs(self.view.t).max() - np.sqrt(3) * self.grid.origin[0])
+        return completed_object(model, lambda x: self.distance(x) - thicker, reach)
+
+    @cached_property
+    def _sampler(self) -> StepSampler:
+        draws, process = self._networks.draws, self._networks.params.process
+        return StepSampler(self._tree, draws, process, [self.view.points], [self.grid], self._device)
