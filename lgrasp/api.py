@@ -245,8 +245,8 @@ def simulate(
 
     Args:
         grasps: grasps, a shard, or a folder of shards.
-        protocol: dipgrasp, fc, fc_random, gravity6, gravity6_mu1, lift, seq6 or seq6_mu06; or a protocol with other
-            numbers.
+        protocol: dipgrasp, fc, fc_random, gravity6, gravity6_mu1, lift, seq6, seq6_mu06 or seq_shake; or a protocol
+            with other numbers.
         all_directions: continue after a direction in which a grasp does not hold.
         out: folder for shards; none: no file.
 

@@ -21,7 +21,10 @@ ShapeKind = Literal[
     *("single", "joined", "cup", "ring", "tool"),
 ]
 """Kinds of random solids (:mod:`lgrasp.object.shapes`); the last five are free forms."""
-ProtocolName = Literal["fc", "gravity6", "gravity6_mu1", "seq6", "seq6_mu06", "fc_random", "lift", "dipgrasp"]
+ProtocolName = Literal[
+    *("fc", "gravity6", "gravity6_mu1", "seq6", "seq6_mu06", "seq_shake"),
+    *("fc_random", "lift", "dipgrasp"),
+]
 """Protocols of the simulation (:mod:`lgrasp.simulate.protocol`)."""
 EngineName = Literal["mujoco", "physx"]
 """Simulators."""

@@ -29,9 +29,8 @@ def simulate(
 ) -> None:
     """Simulate grasps and add the verdicts to the shards, as columns physics/PROTOCOL_...
 
-    The hand closes on its free objects, which are then pulled in six directions; a grasp holds if they stay. lift takes
-    rows of generate --table, seq6 and seq6_mu06 are for several objects; docs/guides/physics.md describes all. A shard
-    that has the verdicts is left as it is.
+    The hand closes on its free objects, which are then pulled in six directions; a grasp holds if they stay.
+    docs/guides/physics.md describes each protocol. A shard that has the verdicts is left as it is.
 
     Contacts are hard in PhysX (pip install "lgrasp[physx]"), whose columns are physics/physx_PROTOCOL_....
 

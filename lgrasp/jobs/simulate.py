@@ -189,7 +189,7 @@ def _told(text: str, settings: Mapping[str, Any]) -> dict[str, Any]:
         return {}
     device = "gpu" if simulator.startswith("mujoco_warp") else "cpu"
     # what shards do not tell that were written before there was a choice
-    older = {"engine": "mujoco", "draws": None, "lift": None}
+    older = {"engine": "mujoco", "draws": None, "lift": None, "shake": None}
     return older | {name: told[name] for name in settings if name in told} | {"device": device}
 
 

@@ -99,10 +99,10 @@ def course_of(
     come, push = np.zeros((1, 3)), np.zeros((steps(protocol.hold), 3))
     if isinstance(lift, Lift):
         assert approach is not None
-        come, push = -lift.way * (1.0 - _smooth(steps(lift.coming)))[:, None] * approach, _shaking(lift, push, dt, up)
+        come, push = -lift.way * (1.0 - smooth(steps(lift.coming)))[:, None] * approach, _shaking(lift, push, dt, up)
     closes = len(come) - 1
     closed = np.zeros(((len(stops) - 1) * closing + rest, 3))
-    rise = lift.height * _smooth(rising)[:, None] * up
+    rise = lift.height * smooth(rising)[:, None] * up
     held = rise[-1] + np.cumsum(np.cumsum(push, axis=0), axis=0) * dt**2
     even = np.arange(1, closing + 1)[:, None] / closing
     close = [a + (b - a) * even for a, b in pairwise(stops)]
@@ -124,7 +124,7 @@ def course_of(
     )
 
 
-def _smooth(steps: int) -> np.ndarray:
+def smooth(steps: int) -> np.ndarray:
     """Share of a way from rest to rest with a smooth acceleration, (steps + 1,)."""
     t = np.linspace(0.0, 1.0, steps + 1)
     return t**3 * (10.0 - 15.0 * t + 6.0 * t**2)

@@ -24,7 +24,8 @@ FRICTION = 0.6
 DENSITY = 500.0
 """Of objects that are weighed [kg/m^3]."""
 
-_GRAVITY = 9.8  # [m/s^2]
+GRAVITY = 9.8
+"""[m/s^2]"""
 
 
 class Load(Params):
@@ -127,6 +128,20 @@ class FreeLift(Rise):
     seed: Seed = 0
 
 
+class Shake(Params):
+    """The closed hand is shaken, then turned by 90 degrees again and again, until gravity has had all six directions of
+    its base frame: in place of six pulls, each from the closed hand.
+
+    ``hold`` of the protocol is spent in each direction. All rows are shaken alike.
+    """
+
+    shaking: float = Field(default=2.0, gt=0, description="[s]")
+    acceleration: float = Field(default=13.0, ge=0, description="Most of the hand while it is shaken [m/s^2].")
+    frequency: PositiveRange = Field(default=(1.5, 4.0), description="Of the sines along each axis [1/s].")
+    turning: float = Field(default=1.0, gt=0, description="Each turn [s].")
+    seed: Seed = 0
+
+
 class Protocol(Physics):
     """Close the hand on free objects, then pull them in six directions; they must stay in the hand."""
 
@@ -177,6 +192,8 @@ class Protocol(Physics):
     )
     lift: Lift | FreeLift | None = Field(default=None, description="The object is lifted in place of the pulls.")
 
+    shake: Shake | None = Field(default=None, description="The hand is shaken and turned in place of the pulls.")
+
     @model_validator(mode="after")
     def _drawable(self) -> Self:
         if self.draws and (self.kind != "force" or self.stiffness_range is not None):
@@ -185,12 +202,21 @@ class Protocol(Physics):
             raise ValueError("lift has no draws, starts at pregrasp, and its success is stays")
         if isinstance(self.lift, FreeLift) and self.lift.turning > self.hold:
             raise ValueError("lift.turning is part of hold")
+        if self.shake and (self.kind != "weight" or self.draws or self.lift):
+            raise ValueError("shake has kind weight, no draws and no lift")
         return self
 
     @property
     def table(self) -> Lift | None:
         """The lift, if it is off a table."""
         return self.lift if isinstance(self.lift, Lift) else None
+
+    @property
+    def unfit_for_gpu(self) -> str:
+        """What about it runs on the CPU alone; "": nothing."""
+        reasons = {"has random draws, which run": self.draws, "lifts the object, which runs": self.lift}
+        reasons |= {"shakes the hand, which runs": self.shake}
+        return next((words for words, found in reasons.items() if found), "")
 
     def by(self, engine: EngineName) -> "Protocol":
         """The same in a simulator; its columns are named physics/ENGINE_NAME_... unless that is MuJoCo."""
@@ -205,7 +231,7 @@ class Protocol(Physics):
             mass, force = self.mass, self.force
         else:
             mass = self.density * volume
-            force = _GRAVITY * mass
+            force = GRAVITY * mass
         stiffness = self.stiffness
         if self.stiffness_range is not None:
             low, high = self.stiffness_range
@@ -226,15 +252,16 @@ class Protocol(Physics):
 
 def _protocols() -> dict[str, Protocol]:
     gravity = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
-    # 100 steps of 1/60 s, each cut in four
-    sequence = {"start": "grasp", "success": "touches", "rest": 0.6, "hold": 100 / 60, "timestep": 1 / 240}
-    sequence |= {"most_rotation": 180.0}
+    sequence: dict[str, Any] = {"start": "grasp", "success": "touches", "rest": 0.6, "most_rotation": 180.0}
+    sequence |= {"timestep": 1 / 240, **gravity}  # of 1/60 s each step is cut in four
+    pulls = 100 / 60  # 100 steps
     made = (
         Protocol(name="fc"),
         Protocol(name="gravity6", friction=FRICTION, **gravity),
         Protocol(name="gravity6_mu1", friction=1.0, **gravity),
-        Protocol(name="seq6", friction=2.0, **gravity, **sequence),
-        Protocol(name="seq6_mu06", friction=FRICTION, **gravity, **sequence),
+        Protocol(name="seq6", friction=2.0, hold=pulls, **sequence),
+        Protocol(name="seq6_mu06", friction=FRICTION, hold=pulls, **sequence),
+        Protocol(name="seq_shake", friction=2.0, shake=Shake(), hold=0.5, **sequence),
         Protocol(name="fc_random", draws=Draws()),
         Protocol(name="lift", lift=Lift(), force=0.981, rest=0.2),
         Protocol(name="dipgrasp", lift=FreeLift(height=0.2), force=0.981, rest=0.2, hold=3.0, most_rotation=180.0),
@@ -244,8 +271,9 @@ def _protocols() -> dict[str, Protocol]:
 
 PROTOCOLS: dict[str, Protocol] = _protocols()
 """The named protocols: ``fc`` is DexGraspBench's, ``gravity6`` and ``gravity6_mu1`` ask for more; ``seq6`` is the one
-that sequences of objects were published with, ``seq6_mu06`` the same on smoother objects; ``fc_random`` is ``fc`` with
-random numbers, several times; ``lift`` takes the 0.1 kg of ``fc`` off a table; ``dipgrasp`` is that paper's lift."""
+that sequences of objects were published with, ``seq6_mu06`` the same on smoother objects, ``seq_shake`` after the test
+on their robot; ``fc_random`` is ``fc`` with random numbers, several times; ``lift`` takes the 0.1 kg of ``fc`` off a
+table; ``dipgrasp`` is that paper's lift."""
 
 
 NO_TABLE = "the plane of --above bounds the hand, the object need not rest on it: lift takes rows of generate --table"

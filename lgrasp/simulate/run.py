@@ -162,12 +162,10 @@ def check_installed(device: str, protocol: Protocol) -> None:
 
 
 def _check_device(device: str, protocol: Protocol) -> None:
-    if (protocol.draws or protocol.lift) and not on_cpu(device, protocol):
-        others = ", ".join(other.name for other in PROTOCOLS.values() if not (other.draws or other.lift))
-        why = "has random draws, which run" if protocol.draws else "lifts the object, which runs"
-        raise PhysicsError(
-            f"protocol {protocol.name} {why} on the CPU alone: give --device cpu, or one of the protocols {others}"
-        )
+    if protocol.unfit_for_gpu and not on_cpu(device, protocol):
+        others = ", ".join(other.name for other in PROTOCOLS.values() if not other.unfit_for_gpu)
+        why = f"{protocol.unfit_for_gpu} on the CPU alone: give --device cpu, or one of the protocols {others}"
+        raise PhysicsError(f"protocol {protocol.name} {why}")
 
 
 def _worlds(

@@ -9,6 +9,7 @@ from lgrasp.simulate.draws import draw_of, tune
 from lgrasp.simulate.lift import Lifted, conclude_lift, lift_row
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.mujoco_world import MujocoWorld
+from lgrasp.simulate.shake import shake_course
 from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude, moved, worst
 
 
@@ -130,11 +131,14 @@ class Trial:
     def _pull_all(self, closed: Closed, pulls: Pulls) -> bool:
         """Run directions into ``pulls`` until all is decided; True if one diverged."""
         diverged, holds, stays = False, True, True
-        squeezed = self._world.state()
-        base = self._world.frames()[1][self._model.base_body]
-        for k, direction in enumerate(AXES @ base.T):
-            self._world.restore(squeezed)
-            pulls.moved[k], pulls.depth[k] = self._pull(direction, closed)
+        squeezed, shaken = self._world.state(), self._protocol.shake
+        base = self._world.frames()[1][self._model.base_body].copy()
+        hold = np.ones((self._steps(self._protocol.hold), 1))
+        course = shake_course(self._protocol) if shaken else {k: hold * axis for k, axis in enumerate(AXES)}
+        for k, load in course.items():
+            if not shaken:
+                self._world.restore(squeezed)
+            pulls.moved[k], pulls.depth[k] = self._pull(load @ base.T, closed)
             if self._world.wild():
                 diverged, pulls.held[k], pulls.moved[k] = True, 0, np.nan
             else:
@@ -145,19 +149,18 @@ class Trial:
                 break
         return diverged
 
-    def _pull(self, direction: np.ndarray, closed: Closed) -> tuple[np.ndarray, float]:
-        """Load one direction (3,) [world frame].
+    def _pull(self, load: np.ndarray, closed: Closed) -> tuple[np.ndarray, float]:
+        """Load the objects in each of T steps, over their forces, (T, 3) [world frame].
 
         Returns:
             How far each object moved at worst, (O, 2) [m], [rad], and the deepest penetration of any [m].
         """
-        self._world.push(self._model.forces[:, None] * direction)
         worst, depth = closed.moved, closed.depth
-        total = self._steps(self._protocol.hold)
-        done, before = 0, self._moved()
+        may_stop = self._settled_stop and bool((load == load[0]).all())
+        done, before, total = 0, self._moved(), len(load)
         while done < total:
             steps = min(self._chunk, total - done)
-            self._step(steps)
+            self._go(load[done : done + steps])
             done += steps
             now = self._moved()
             worst = np.maximum(worst, now)
@@ -166,11 +169,17 @@ class Trial:
             depth = max(depth, self._world.deepest())
             if self._bounds.lost(worst):
                 break
-            near = self._settled_stop and self._bounds.near(before, now, (total - done) / steps)
+            near = may_stop and self._bounds.near(before, now, (total - done) / steps)
             if near and self._bounds.held(worst, self._world.links_touching() > 0, depth):
                 break
             before = now
         return worst, depth
+
+    def _go(self, load: np.ndarray) -> None:
+        """One step under each load (n, 3)."""
+        for some in [load] if (load == load[0]).all() else load[:, None]:
+            self._world.push(self._model.forces[:, None] * some[0])
+            self._step(len(some))
 
     def _step(self, steps: int) -> None:
         self._world.step(steps)

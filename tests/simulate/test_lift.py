@@ -24,14 +24,6 @@ ABOVE = 0.078  # of the cube over the hand's base [m]: the jaws' tips end 3 mm a
 DOWN, UP = np.array([0, 0, 1.0]), np.array([0, 0, -1.0])  # the jaws point along +z of the hand, to the table
 
 
-@pytest.fixture(params=["mujoco", "physx"])
-def engine(request):
-    """Each simulator."""
-    if request.param == "physx":
-        pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
-    return request.param
-
-
 @pytest.fixture
 def lift(engine):
     return LIFT.by(engine)
