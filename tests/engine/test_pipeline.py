@@ -121,7 +121,7 @@ def other(value: Any, kind: Any) -> list[Any]:
         return [(*value, 3)]
     if isinstance(value, int):
         return [value + 1, value * 2, value - 1]
-    return [value * 0.9, value * 0.5 + 0.01]
+    return [value * 0.9 or 0.01, value * 0.5 + 0.01]
 
 
 def changed(model: BaseModel) -> list[tuple[str, BaseModel]]:

@@ -1,6 +1,6 @@
 """Examples for a pose policy: poses that the pipeline placed, what was seen there, and whether they gave a grasp."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -72,7 +72,7 @@ def _batch(pipeline: Pipeline, context: Context, points: np.ndarray, first: int,
         seen_reach(observe_reach(poses, points, samples, first + draw * _DRAW_STRIDE, context), com, palm)
         for draw in range(draws)
     ]
-    table: CandidateTable = poses
+    table: Any = poses
     once = pipeline.with_params("domain", rounds=1)
     for stage in ("domain", "ik"):
         table = run_stage(stage, table, once, context, meter)
@@ -80,9 +80,10 @@ def _batch(pipeline: Pipeline, context: Context, points: np.ndarray, first: int,
     for number in range(1, pipeline.params("domain").rounds):
         for stage in ("domain", "ik"):
             table = run_stage(stage, table, once, context.changed(round=number), meter)
-    sets = run_stage("search", table, pipeline, context, meter)
-    grasps = run_stage("filter", sets, pipeline, context, meter)
-    yields = np.isin(index, grasps.index)
+    order, found = pipeline.order, table
+    for stage in order[order.index("ik") + 1 : order.index("filter") + 1]:
+        found = run_stage(stage, found, pipeline, context, meter)
+    yields = np.isin(index, found.index)
     return PoseExamples(join_seen(seen), np.tile(yields, draws), contacts, yields)
 
 

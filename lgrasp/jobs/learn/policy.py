@@ -18,7 +18,7 @@ from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays, upload_field
 from lgrasp.files import write_file
 from lgrasp.hand.arrays import HandArrays, upload_hand
-from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.hands import for_hand, hand_source
 from lgrasp.jobs.learn.examples import PoseExamples, join_examples, make_pose_examples, reach_points
 from lgrasp.jobs.requests.learn import PolicyRequest
 from lgrasp.learn.policy import fit_network, ranking, rate
@@ -56,13 +56,14 @@ class PolicyJob(PolicyRequest, Job):
     @property
     def learned(self) -> Pipeline:
         """The pipeline whose grasps count, with several poses of each candidate."""
-        return self.pipeline.with_params("place", policy=None, proposals=3)
+        return for_hand(self.pipeline.with_params("place", policy=None, proposals=3), self.hand)
 
     @property
     def keys(self) -> InputKeys:
         """Content keys of hand and field."""
         if self._keys is None:
-            self._keys = input_keys(hand_source(self.hand), None, 1.0, self.pipeline.object, self.pipeline.field)
+            source, pipeline = hand_source(self.hand), self.pipeline
+            self._keys = input_keys(source, None, 1.0, pipeline.object, pipeline.field, pipeline.hand)
         return self._keys
 
     def key(self) -> str:
@@ -91,7 +92,7 @@ class PolicyJob(PolicyRequest, Job):
         for stage, _ in self.pipeline.sections:
             assert stage.run  # imported now, so that its kernels are compiled before
         load, alias = Loader(self.cache, self.device_used.alias, events.loading), self.device_used.alias
-        model = load.hand(self.keys.source, self.keys.hand)
+        model = load.hand(self.keys.source, self.keys.hand, self.pipeline.hand)
         self._hand = upload_hand(model, alias)
         self._field = upload_field(load.field(self._hand, self.keys.field, self.pipeline.field), model, alias)
 

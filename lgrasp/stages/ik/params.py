@@ -27,3 +27,10 @@ class IkParams(Params):
         default=0.0003, ge=0, le=0.05, description="Least distance of the finger from objects held."
     )
     check_collision: bool = Field(default=True, description="Also require the whole finger to be clear of the object.")
+    resolved_penetration: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.01,
+        description="Penetration of a finger's inner spheres that stage wrap is left to resolve [m], where that is "
+        "more than bounds.allowed_penetration.",
+    )

@@ -59,7 +59,8 @@ def run(
 def _realise(table: CandidateTable, wanted: wp.array, params: IkParams, context: Context, tally: Tally) -> None:
     hand, field, obj, held = context.hand.struct, context.field.struct, context.object.struct, context.held.struct
     bounds, cosine = context.bounds, math.cos(math.radians(params.angle))
-    values = make_struct(IkValues, params, bounds, cosine=cosine)
+    allowed = max(bounds.allowed_penetration, params.resolved_penetration)
+    values = make_struct(IkValues, params, bounds, cosine=cosine, allowed_penetration=allowed)
     outputs = [table.struct, tally.device]
     asked = [hand, field, obj, held, values, wanted]
     wp.launch(realise_contacts, table.surface.shape, asked, outputs, device=context.device)

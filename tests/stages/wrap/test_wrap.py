@@ -155,3 +155,14 @@ def test_batches_change_nothing(source, power):
     parts = [run_stages(power, context, *cut, "wrap").arrays() for cut in ((0, 15), (15, 25))]
     for name, values in whole.items():
         np.testing.assert_array_equal(np.concatenate([part[name] for part in parts]), values, err_msg=name)
+
+
+def test_what_ik_leaves_in_the_object_is_wrapped_or_blocked(source, power):
+    once = power.with_params("domain", rounds=1)
+    context = shard_context(once, source, 0)
+    strict = run_stages(once.with_params("ik", resolved_penetration=0.0), context, 0, 60, "ik").arrays()["state"]
+    left = (run_stages(once, context, 0, 60, "ik").arrays()["state"] == State.REALISED) & (strict == State.BLOCKED)
+    arrays = run_stages(once, context, 0, 60, "wrap").arrays()
+    wrapped = arrays["further"].max(3) >= 0
+    assert (wrapped & left).sum() > 20
+    np.testing.assert_array_equal(arrays["state"][left], np.where(wrapped[left], State.REALISED, State.BLOCKED))
