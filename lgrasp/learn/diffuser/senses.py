@@ -18,7 +18,7 @@ from lgrasp.object.sdf import SdfGrid, build_sdf
 from lgrasp.refine.surface import farthest_points
 
 _NODES = 48**3  # of an object's grid
-_PAD = 0.03  # [m] of a grid about the object
+_PAD = 0.04  # [m] of a grid about the object: what is beyond is at least so far away
 _NEAREST, _FARTHEST = -0.02, 0.04  # [m] distances that are told apart
 
 
@@ -107,14 +107,14 @@ class Senses:
         return (R_body[:, self._body] @ self._points[..., None])[..., 0] + t_body[:, self._body]
 
     def _from_held(self, places: torch.Tensor, held: HeldObjects) -> torch.Tensor:
-        other = torch.full(places.shape[:2], _FARTHEST, device=places.device)
-        for slot in range(held.object.shape[1]):
-            number = held.object[:, slot]
-            away = self._distance(places, held.R[:, slot], held.t[:, slot], number.clamp_min(0))
-            other = other.minimum(torch.where(number[:, None] >= 0, away, _FARTHEST))
-        return other
+        if not held.object.shape[1]:
+            return torch.full(places.shape[:2], _FARTHEST, device=places.device)
+        every = (places[:, None] - held.t[:, :, None]) @ held.R  # (N, S, P, 3) in the objects' frames
+        x, y, z = every.unbind(-1)
+        away = self._grids.value_within((x, y, z), held.object.clamp_min(0)[..., None])
+        return torch.where(held.object[..., None] >= 0, away, _FARTHEST).amin(1)
 
     def _distance(self, x: torch.Tensor, R: torch.Tensor, t: torch.Tensor, object: torch.Tensor) -> torch.Tensor:
         """Signed distance [m] of points (N, n, 3) of the hand frame from one object for each row."""
-        local = (x - t[:, None]) @ R
-        return self._grids.value_and_gradient((local[..., 0], local[..., 1], local[..., 2]), object[:, None])[0]
+        u, v, w = ((x - t[:, None]) @ R).unbind(-1)
+        return self._grids.value_within((u, v, w), object[:, None])
