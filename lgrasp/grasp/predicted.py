@@ -13,7 +13,6 @@ from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.structs import upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -31,6 +30,19 @@ class Predicted:
     pose: wp.array(dtype=wp.transform)  # (N,) T_hand_object of the internal frame [m]
     posture: wp.array2d(dtype=vec_dof)  # (N, G) [rad or m]
     record: wp.array(dtype=wp.int32)  # (C,) a contact vector of the field by each contact point of the hand, -1 none
+    hand_point: wp.array2d(dtype=wp.int32)  # (N, 2) of each side, the one that touches best, -1 none
+    object_point: wp.array2d(dtype=wp.int32)  # (N, 2) the nearest, -1 none
+
+
+@wp.func
+def contact_place(hand: Hand, side: wp.int32, x: vec_dof, c: wp.int32):
+    """Place and normal of contact point c of a side in the hand frame, with the side's joints at x."""
+    if side < 0:
+        return hand.contacts.points[c], hand.contacts.normals[c]
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    j0 = group_forward(hand.kin, side, x, X, 0)
+    B = X[hand.contacts.body[c] - 1 - j0]
+    return wp.transform_point(B, hand.contacts.points[c]), wp.transform_vector(B, hand.contacts.normals[c])
 
 
 @wp.func
@@ -80,31 +92,19 @@ def touching_points(hand: Hand, obj: Object, T: wp.transform, side: wp.int32, x:
 
 
 @wp.kernel
-def match_sides(
-    hand: Hand,
-    obj: Object,
-    sides: wp.vec2i,
-    pose: wp.array(dtype=wp.transform),
-    posture: wp.array2d(dtype=vec_dof),
-    hand_point_out: wp.array2d(dtype=wp.int32),
-    object_point_out: wp.array2d(dtype=wp.int32),
-):
-    """One thread per (hand, side): the contact points that touch best, see :func:`touching_points`.
+def match_sides(hand: Hand, obj: Object, sides: wp.vec2i, predicted_out: Predicted):
+    """One thread per (candidate, side): the contact points that touch best, see :func:`touching_points`.
 
     Args:
         sides: groups of the two sides, -1: static links.
-        pose: T_hand_object, (N,).
-        posture: by group, (N, G) [rad or m].
-        hand_point_out: of each side, (N, 2), -1 none.
-        object_point_out: the nearest, (N, 2), -1 none.
     """
     i, side = wp.tid()
     x = vec_dof()
     if sides[side] >= 0:
-        x = posture[i, sides[side]]
-    c, _p, _n, surface = touching_points(hand, obj, pose[i], sides[side], x)
-    hand_point_out[i, side] = c
-    object_point_out[i, side] = surface
+        x = predicted_out.posture[i, sides[side]]
+    c, _p, _n, surface = touching_points(hand, obj, predicted_out.pose[i], sides[side], x)
+    predicted_out.hand_point[i, side] = c
+    predicted_out.object_point[i, side] = surface
 
 
 @dataclass(frozen=True)
@@ -121,22 +121,6 @@ class TouchingGrasps:
     """The object's contact point nearest to each, index in ``contact_points`` of the object, (H, 2)."""
 
 
-def touching_grasps(
-    hand: HandArrays, obj: ObjectArrays, sides: tuple[int, int], pose: np.ndarray, q: np.ndarray
-) -> TouchingGrasps:
-    """Poses and joints with the points where they touch best.
-
-    Args:
-        sides: groups of the two sides, -1: static links.
-        pose: T_hand_object of the internal frame, device poses (H, 7). q: joints [rad or m], (H, K).
-    """
-    d, n = hand.device, len(q)
-    points = [wp.empty((n, 2), dtype=wp.int32, device=d) for _ in range(2)]
-    at = wp.array(pose, dtype=wp.transform, device=d), wp.array(hand.model.tree.by_group(q), dtype=vec_dof, device=d)
-    wp.launch(match_sides, (n, 2), [hand.struct, obj.struct, wp.vec2i(*sides), *at], points, device=d)
-    return TouchingGrasps(pose, q, *fetch(points))
-
-
 @dataclass(frozen=True)
 class PredictedArrays:
     """Predictions on a device."""
@@ -144,15 +128,22 @@ class PredictedArrays:
     struct: "Predicted"
 
 
-def upload_predicted(hand: HandArrays, record: np.ndarray, pose: np.ndarray, q: np.ndarray) -> PredictedArrays:
-    """Put predictions on the hand's device.
+def upload_predicted(
+    hand: HandArrays, obj: ObjectArrays, sides: tuple[int, int], record: np.ndarray, pose: np.ndarray, q: np.ndarray
+) -> PredictedArrays:
+    """Put predictions on the hand's device, and find where they touch.
 
     Args:
+        sides: groups of the two sides, -1: static links.
         record: see :func:`record_of_points`.
-        pose: T_hand_object of the internal frame, device poses (N, 7). q: joints [rad or m], (N, K).
+        pose: T_hand_object of the internal frame, device poses (N, 7). q: joints [rad or m], (N, K), frozen as held.
     """
+    points = np.full((2, len(q), 2), -1, np.int32)
     values = {"pose": pose, "posture": hand.model.tree.by_group(q), "record": record}
-    return PredictedArrays(upload_struct(Predicted, hand.device, values))
+    values |= {"hand_point": points[0], "object_point": points[1]}
+    struct = upload_struct(Predicted, hand.device, values)
+    wp.launch(match_sides, (len(q), 2), [hand.struct, obj.struct, wp.vec2i(*sides)], [struct], device=hand.device)
+    return PredictedArrays(struct)
 
 
 def record_of_points(hand: HandModel, field: ContactField) -> np.ndarray:

@@ -13,7 +13,7 @@ from lgrasp.engine.run import run
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.held import hold
-from lgrasp.grasp.predicted import touching_grasps, upload_predicted
+from lgrasp.grasp.predicted import TouchingGrasps, upload_predicted
 from lgrasp.jobs.config import load_requests
 from lgrasp.jobs.learn.diffuser import DiffuserJob, evaluate
 from lgrasp.jobs.learn.sequences import read_steps
@@ -24,6 +24,7 @@ from lgrasp.jobs.sequence.sample import SampleJob
 from lgrasp.learn.diffuser.file import load_diffuser
 from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.runtime.device import resolve_device
+from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.tally import Meter
 from lgrasp.sequence.touching_sets import touching_sets
 from lgrasp.stages.context import Context
@@ -135,7 +136,8 @@ def test_valid_grasps_as_predictions_mostly_stay(inputs, table):
         posture = np.broadcast_to(inputs.hand.tree.joint_open.astype(np.float32), (rows, inputs.hand.dofs))
         frozen = np.broadcast_to(~space.joints, posture.shape)
         nothing = hold(view.hand, posture, frozen, (), np.zeros((rows, 0, 7), np.float32), tries=1)
-        predicted = upload_predicted(view.hand, view.records, table.pose[own, 0], table.q[own, 0])
+        given = inputs.objects[0], space.groups, view.records, table.pose[own, 0], table.q[own, 0]
+        predicted = upload_predicted(view.hand, *given)
         given = {"bounds": pipeline.bounds, "space": space, "holding": nothing, "predicted": predicted}
         grasps = run_stages(
             pipeline, Context(view.hand, inputs.objects[0], view.field, "cpu", 0, 0, **given), 0, rows, "filter"
@@ -151,7 +153,9 @@ def test_valid_grasps_are_valid_as_they_are(inputs, table):
     pipeline, kept = small_pipeline(), 0
     for number in np.unique(table.space):
         own, view, space = table.space[:, 0] == number, inputs.views[number], inputs.spaces[number]
-        grasps = touching_grasps(view.hand, inputs.objects[0], space.groups, table.pose[own, 0], table.q[own, 0])
+        given = view.hand, inputs.objects[0], space.groups, view.records, table.pose[own, 0], table.q[own, 0]
+        there = upload_predicted(*given).struct
+        grasps = TouchingGrasps(*given[-2:], *fetch([there.hand_point, there.object_point]))
         frozen = ~np.tile(space.joints, (own.sum(), 1))
         holding = hold(view.hand, table.q[own, 0], frozen, (), np.zeros((own.sum(), 0, 7)), tries=1)
         given = {"bounds": pipeline.bounds, "space": space, "holding": holding}

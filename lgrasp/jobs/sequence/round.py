@@ -12,10 +12,11 @@ from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.grasp.held import hold
-from lgrasp.grasp.predicted import touching_grasps, upload_predicted
+from lgrasp.grasp.predicted import TouchingGrasps, upload_predicted
 from lgrasp.grasp.sequences import HeldHands, SequenceTable, empty_sequences
 from lgrasp.grasp.tables import GraspTable, join_rows, take_rows
 from lgrasp.jobs.sequence.inputs import SequenceInputs
+from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.tally import Meter
 from lgrasp.seeding import stage_seed
 from lgrasp.sequence.policy import space_orders
@@ -152,7 +153,8 @@ class _Step:
         context = self._context(chosen, number, size, seed)
         if drawn is not None:
             view = self._inputs.views[number]
-            context = context.changed(predicted=upload_predicted(view.hand, view.records, drawn.pose, drawn.q))
+            given = context.object, self._inputs.spaces[number].groups, view.records, drawn.pose, drawn.q
+            context = context.changed(predicted=upload_predicted(view.hand, *given))
         grasps, meters = self._from_stages(context, len(chosen) * size)
         self._take(grasps, meters, chosen, number, size, wave * size)
 
@@ -184,8 +186,10 @@ class _Step:
             own, view = space[able] == number, self._inputs.views[number]
             context = self._context(able[own], int(number), 1, self._seed)
             if drawn:
+                some = drawn.of_hands(own)
                 sides = self._inputs.spaces[number].groups
-                part = touching_grasps(view.hand, context.object, sides, *drawn.of_hands(own))
+                found = upload_predicted(view.hand, context.object, sides, view.records, *some).struct
+                part = TouchingGrasps(*some, *fetch([found.hand_point, found.object_point]))
             else:
                 assert optimised
                 part = replace(optimised, **{f.name: getattr(optimised, f.name)[own] for f in fields(optimised)})

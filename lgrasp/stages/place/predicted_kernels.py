@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.field.arrays import Field, field_has
 from lgrasp.grasp.held import Held, with_frozen
-from lgrasp.grasp.predicted import Predicted, touching_points
+from lgrasp.grasp.predicted import Predicted, contact_place, touching_points
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.math.transforms import rotation_between, tangent
@@ -101,18 +101,22 @@ def propose_predicted(
         return
     side = sides[0]
     other = sides[1]
+    place = int(0)
     if fixed_b or (not fixed_a and b % 2 == 1):
         side = sides[1]
         other = sides[0]
+        place = int(1)
     moves = not fixed_a and not fixed_b
     x = vec_dof()
     if moves:
         x = with_frozen(hand, held, h, side, predicted.posture[candidate, side])
     elif side >= 0:
         x = held.posture[h, side]
-    c, p, n, nearest = touching_points(hand, obj, T, side, x)
+    c = predicted.hand_point[candidate, place]
+    nearest = predicted.object_point[candidate, place]
     if nearest < 0:
         return
+    p, n = contact_place(hand, side, x, c)
     if b == 0:
         P = T
         if not moves:
