@@ -29,7 +29,6 @@ _EFFORT_STEP = 1024  # candidates: what a shard may try is a multiple of it
 _CPU_BATCH, _CPU_LARGEST = 256, 512  # candidates of a batch; the second with several passes
 _PHYSICS_BATCH = 64  # candidates, when their grasps are simulated on the CPU, which takes long
 _GPU_SMALLEST, _GPU_LARGEST = 2_048, 65_536  # candidates of a batch
-_GPU_WHOLE = 16_384  # candidates: a batch of more is cut in two
 _GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
 _CONTACT_BYTES = 64  # the same for a contact of its domain
 _SET_BYTES = 32  # the same for a set of contacts
@@ -133,8 +132,7 @@ def _batch_size(
 ) -> int:
     """Candidates of a batch when ``running`` others are worked on; 0 when those should give the missing rows.
 
-    On a GPU as many as should give them, up to ``most``. Many are cut in two, so that the rows of one part are taken
-    over while the other is worked on.
+    On a GPU as many as should give them, up to ``most``: half as many take more than half the time.
 
     Args:
         rate: rows expected per candidate.
@@ -149,8 +147,6 @@ def _batch_size(
         needed = (missing / rate - running) / share if share else 0
         return int(min(max(needed, PASS_BLOCK), _CPU_LARGEST))
     needed = 1.05 * missing / rate + 256 - running
-    if not running and needed > _GPU_WHOLE:
-        needed /= 2
     return int(min(max(needed, _GPU_SMALLEST), most))
 
 

@@ -4,6 +4,8 @@ Both published scores are this problem: FSWO (eq. 1) over the k frictionless wre
 cones. So is the resistance to an outside force, of a hull moved by that force.
 """
 
+from typing import Any
+
 import warp as wp
 
 from lgrasp.math.constants import LOAD_ARM, LOAD_FORCE
@@ -84,6 +86,38 @@ def solve_spd(A: mat8, b: vec8, n: wp.int32, shift: wp.float32, floor: wp.float3
             s -= L[c, i] * x[c]
         x[i] = s / L[i, i]
     return x
+
+
+def solving(size: int) -> Any:
+    """x with A x = b for positive definite matrices of one size, by Cholesky."""
+
+    @wp.func
+    def solve(A: wp.types.matrix((size, size), wp.float32), b: wp.types.vector(size, wp.float32)):
+        L = A
+        x = b
+        for i in range(size):
+            for j in range(i + 1):
+                s = A[i, j]
+                for c in range(j):
+                    s -= L[i, c] * L[j, c]
+                if i == j:
+                    L[i, i] = wp.sqrt(wp.max(s, 1.0e-12))
+                else:
+                    L[i, j] = s / L[j, j]
+        for i in range(size):
+            s = x[i]
+            for c in range(i):
+                s -= L[i, c] * x[c]
+            x[i] = s / L[i, i]
+        for r in range(size):
+            i = size - 1 - r
+            s = x[i]
+            for c in range(i + 1, size):
+                s -= L[c, i] * x[c]
+            x[i] = s / L[i, i]
+        return x
+
+    return solve
 
 
 @wp.func

@@ -1,6 +1,7 @@
 """Kernels of the ik stage: contacts are realised finger by finger; of sets the whole ones are kept."""
 
 from enum import IntEnum
+from typing import Any
 
 import warp as wp
 
@@ -10,9 +11,9 @@ from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.grasp.structs import Candidates, Sets, State
 from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid
 from lgrasp.hand.self_collision import group_pairs_clear
-from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
+from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column
 from lgrasp.math.limits import MAX_DOFS, MAX_JOINTS
-from lgrasp.math.qp import mat8, solve_spd
+from lgrasp.math.qp import solving
 from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -50,116 +51,130 @@ class IkValues:
     min_table_distance: wp.float32  # [m]
 
 
-@wp.kernel
-def realise_contacts(
-    hand: Hand,
-    field: Field,
-    obj: Object,
-    held: Held,
-    params: IkValues,
-    wanted: wp.array3d(dtype=wp.int32),
-    candidates_out: Candidates,
-    counts_out: wp.array(dtype=wp.int32),
-):
-    """Joint positions that put a candidate's contact on the object, and whether they do (Lightning Grasp, eq. 7, 5.5).
+def _realising(size: int) -> Any:
+    """The kernel for groups of at most ``size`` dofs: what is known to the compiler stays in registers."""
+    square, column, solve = wp.types.matrix((size, size), wp.float32), wp.types.vector(size, wp.float32), solving(size)
 
-    Steps dq := argmin |J1 dq - e1|^2 + w^2 |J2 dq - e2|^2 + damping |dq|^2, where e1 = p_o - p and
-    e2 = e1 + lever (n_o - n), p and n are the hand's contact, n_o the inward normal of the object's, and p_o lies
-    ``contact_indentation`` in the object. After each, p slides to the point of the link nearest to the object's.
-    ``candidates_out.q`` holds the seed on entry; its frozen dofs (:class:`Held`) do not move.
+    @wp.kernel
+    def realise_contacts(
+        hand: Hand,
+        field: Field,
+        obj: Object,
+        held: Held,
+        params: IkValues,
+        wanted: wp.array3d(dtype=wp.int32),
+        candidates_out: Candidates,
+        counts_out: wp.array(dtype=wp.int32),
+    ):
+        """Joint positions that put a contact on the object, and whether they do (Lightning Grasp, eq. 7, 5.5).
 
-    Args:
-        wanted: 0 leaves a candidate alone, (P, G, M).
-        counts_out: IkCount, (3,) or (4,).
-    """
-    row, g, m = wp.tid()
-    if m >= candidates_out.count[row, g] or wanted[row, g, m] == 0 or candidates_out.state[row, g, m] != State.DRAWN:
-        return
-    T = candidates_out.poses.pose[row]
-    s = candidates_out.surface[row, g, m]
-    target = wp.transform_point(T, obj.contact_points[s])
-    normal = -wp.transform_vector(T, obj.contact_normals[s])
-    c = field.point[candidates_out.record[row, g, m]]
-    grid = hand.contacts.grid[c]
-    sdf = hand_grid(hand.contacts, grid)
-    j0 = hand.kin.joint_first[g]
-    body = hand.contacts.body[c] - 1 - j0
-    dofs = hand.kin.dof_free[g]
-    still = held.frozen[candidates_out.poses.index[row] // held.tries, g]
-    q = candidates_out.q[row, g, m]
-    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    point = hand.contacts.points[c]
-    out = hand.contacts.normals[c]
-    gap = float(1.0)
-    dot = float(0.0)
-    w2 = params.normal_weight * params.normal_weight
-    for it in range(params.iterations + 1):
-        group_forward(hand.kin, g, q, X, 0)
-        B = X[body]
-        if it > 0:
-            # the contact slides: nearest point of the link surface to the target
-            local = wp.transform_point(wp.transform_inverse(B), target)
-            e = sdf_gradient(sdf, local)
-            out = wp.vec3(e[0], e[1], e[2])
-            point = local - out * e[3]
-            gap = e[3]
-        n = wp.transform_vector(B, out)
-        dot = wp.dot(n, normal)
-        difference = wp.abs(gap + params.contact_indentation)
-        if it > 0 and difference < _EARLY_GAP * params.gap and dot > 0.5 * (1.0 + params.cosine):
-            break
-        if it == params.iterations:
-            break
-        p = wp.transform_point(B, point)
-        e1 = target + normal * params.contact_indentation - p
-        e2 = e1 + (normal - n) * params.lever
-        A = mat8()
-        b = vec_dof()
-        J1 = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
-        J2 = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
-        j = body
-        while j >= 0:
-            d = hand.kin.joint_dof[j0 + j]
-            J1[d] = J1[d] + point_column(hand.kin, j0 + j, X[j], p)
-            J2[d] = J2[d] + point_column(hand.kin, j0 + j, X[j], p + n * params.lever)
-            j = hand.kin.joint_parent[j0 + j]
-        for a in range(dofs):
-            if ((still >> a) & 1) == 1:
-                J1[a] = wp.vec3(0.0)
-                J2[a] = wp.vec3(0.0)
-            b[a] = wp.dot(J1[a], e1) + w2 * wp.dot(J2[a], e2)
-            for k in range(a + 1):
-                A[a, k] = wp.dot(J1[a], J1[k]) + w2 * wp.dot(J2[a], J2[k])
-            A[a, a] = A[a, a] + params.damping
-        step = solve_spd(A, b, dofs, 0.0, 1.0e-12)
-        for a in range(dofs):
-            q[a] = q[a] + wp.clamp(step[a], -params.step, params.step)
-        q = clamp_dofs(hand.kin, g, q)
-    state = int(State.REALISED)
-    if wp.abs(gap + params.contact_indentation) > params.gap or dot < params.cosine:
-        state = State.MISSED
-    if state == State.REALISED and not contact_allowed(hand.contacts, grid, out):
-        state = State.MISSED
-    if state == State.REALISED and params.check_collision == 1:
-        T_object = wp.transform_inverse(T)
-        # the touching body first: it fails most often
-        joints = hand.kin.joint_first[g + 1] - j0
-        for k in range(joints):
-            j = (body + joints - k) % joints
-            T = T_object * X[j]
-            if state == State.REALISED and not body_clear(hand, obj, 1 + j0 + j, T, params.allowed_penetration):
+        Steps dq := argmin |J1 dq - e1|^2 + w^2 |J2 dq - e2|^2 + damping |dq|^2, where e1 = p_o - p and
+        e2 = e1 + lever (n_o - n), p and n are the hand's contact, n_o the inward normal of the object's, and p_o lies
+        ``contact_indentation`` in the object. After each, p slides to the point of the link nearest to the object's.
+        ``candidates_out.q`` holds the seed on entry; its frozen dofs (:class:`Held`) do not move.
+
+        Args:
+            wanted: 0 leaves a candidate alone, (P, G, M).
+            counts_out: IkCount, (3,) or (4,).
+        """
+        row, g, m = wp.tid()
+        if (
+            m >= candidates_out.count[row, g]
+            or wanted[row, g, m] == 0
+            or candidates_out.state[row, g, m] != State.DRAWN
+        ):
+            return
+        T = candidates_out.poses.pose[row]
+        s = candidates_out.surface[row, g, m]
+        target = wp.transform_point(T, obj.contact_points[s])
+        normal = -wp.transform_vector(T, obj.contact_normals[s])
+        c = field.point[candidates_out.record[row, g, m]]
+        grid = hand.contacts.grid[c]
+        sdf = hand_grid(hand.contacts, grid)
+        j0 = hand.kin.joint_first[g]
+        body = hand.contacts.body[c] - 1 - j0
+        dofs = hand.kin.dof_free[g]
+        still = held.frozen[candidates_out.poses.index[row] // held.tries, g]
+        q = candidates_out.q[row, g, m]
+        X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+        point = hand.contacts.points[c]
+        out = hand.contacts.normals[c]
+        gap = float(1.0)
+        dot = float(0.0)
+        w2 = params.normal_weight * params.normal_weight
+        for it in range(params.iterations + 1):
+            group_forward(hand.kin, g, q, X, 0)
+            B = X[body]
+            if it > 0:
+                # the contact slides: nearest point of the link surface to the target
+                local = wp.transform_point(wp.transform_inverse(B), target)
+                e = sdf_gradient(sdf, local)
+                out = wp.vec3(e[0], e[1], e[2])
+                point = local - out * e[3]
+                gap = e[3]
+            n = wp.transform_vector(B, out)
+            dot = wp.dot(n, normal)
+            difference = wp.abs(gap + params.contact_indentation)
+            if it > 0 and difference < _EARLY_GAP * params.gap and dot > 0.5 * (1.0 + params.cosine):
+                break
+            if it == params.iterations:
+                break
+            p = wp.transform_point(B, point)
+            e1 = target + normal * params.contact_indentation - p
+            e2 = e1 + (normal - n) * params.lever
+            A = square()
+            b = column()
+            J1 = wp.zeros(shape=(size,), dtype=wp.vec3)
+            J2 = wp.zeros(shape=(size,), dtype=wp.vec3)
+            j = body
+            while j >= 0:
+                d = hand.kin.joint_dof[j0 + j]
+                J1[d] = J1[d] + point_column(hand.kin, j0 + j, X[j], p)
+                J2[d] = J2[d] + point_column(hand.kin, j0 + j, X[j], p + n * params.lever)
+                j = hand.kin.joint_parent[j0 + j]
+            for a in range(size):
+                if a >= dofs or ((still >> a) & 1) == 1:
+                    J1[a] = wp.vec3(0.0)
+                    J2[a] = wp.vec3(0.0)
+                b[a] = wp.dot(J1[a], e1) + w2 * wp.dot(J2[a], e2)
+                for k in range(a + 1):
+                    A[a, k] = wp.dot(J1[a], J1[k]) + w2 * wp.dot(J2[a], J2[k])
+                A[a, a] = A[a, a] + params.damping
+            step = solve(A, b)
+            for a in range(dofs):
+                q[a] = q[a] + wp.clamp(step[a], -params.step, params.step)
+            q = clamp_dofs(hand.kin, g, q)
+        state = int(State.REALISED)
+        if wp.abs(gap + params.contact_indentation) > params.gap or dot < params.cosine:
+            state = State.MISSED
+        if state == State.REALISED and not contact_allowed(hand.contacts, grid, out):
+            state = State.MISSED
+        if state == State.REALISED and params.check_collision == 1:
+            T_object = wp.transform_inverse(T)
+            # the touching body first: it fails most often
+            joints = hand.kin.joint_first[g + 1] - j0
+            for k in range(joints):
+                j = (body + joints - k) % joints
+                T = T_object * X[j]
+                if state == State.REALISED and not body_clear(hand, obj, 1 + j0 + j, T, params.allowed_penetration):
+                    state = State.BLOCKED
+        if state == State.REALISED and obj.resting.count > 0:
+            plane = resting_plane(obj, candidates_out.poses.pose[row], candidates_out.poses.resting[row])
+            if not finger_above(hand, g, X, plane, params.min_table_distance):
                 state = State.BLOCKED
-    if state == State.REALISED and obj.resting.count > 0:
-        plane = resting_plane(obj, candidates_out.poses.pose[row], candidates_out.poses.resting[row])
-        if not finger_above(hand, g, X, plane, params.min_table_distance):
-            state = State.BLOCKED
-    candidates_out.q[row, g, m] = q
-    candidates_out.state[row, g, m] = state
-    wp.atomic_add(counts_out, IkCount.TRIED, 1)
-    if state != State.MISSED:
-        wp.atomic_add(counts_out, IkCount.REACHED, 1)
-    if state == State.REALISED:
-        wp.atomic_add(counts_out, IkCount.KEPT, 1)
+        candidates_out.q[row, g, m] = q
+        candidates_out.state[row, g, m] = state
+        wp.atomic_add(counts_out, IkCount.TRIED, 1)
+        if state != State.MISSED:
+            wp.atomic_add(counts_out, IkCount.REACHED, 1)
+        if state == State.REALISED:
+            wp.atomic_add(counts_out, IkCount.KEPT, 1)
+
+    return realise_contacts
+
+
+realise_contacts = {size: _realising(size) for size in (4, MAX_DOFS)}
+"""Kernels by the most dofs of a group."""
 
 
 @wp.kernel

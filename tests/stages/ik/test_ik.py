@@ -6,6 +6,7 @@ import trimesh
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.shard import shard_context
+from lgrasp.stages.ik import stage
 from lgrasp.stages.ik.stage import run
 
 
@@ -37,6 +38,17 @@ def test_counts(context, swift):
     assert counts["tried"] == filled.sum()
     assert counts["kept"] == (arrays["state"] == 1).sum()
     assert counts["tried"] >= counts["reached"] >= counts["kept"] > 0
+
+
+def test_kernel_of_larger_groups_gives_the_same(context, swift, monkeypatch):
+    def realised():
+        return run(run_stages(swift, context, 0, 20, "domain"), swift.params("ik"), context)[0].arrays()
+
+    small = realised()
+    monkeypatch.setattr(stage, "realise_contacts", {8: stage.realise_contacts[8]})
+    large = realised()
+    np.testing.assert_array_equal(small["state"], large["state"])
+    np.testing.assert_allclose(small["q"], large["q"], atol=1e-5)
 
 
 def test_gap_and_normal(realised, swift, link_distance):
