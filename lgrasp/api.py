@@ -183,6 +183,7 @@ def plan(
     object: Name | Cloud,
     *,
     starts: int = 80,
+    model: Name | None = None,
     scale: float = 1.0,
     device: str = "auto",
     out: Name | None = None,
@@ -191,6 +192,7 @@ def plan(
 
     Args:
         object: name, mesh file, or a cloud of :func:`read_cloud`.
+        model: draws the hands to start from: file of ``lgrasp learn fit --model grasp``, or a name of ``learn list``.
         out: folder for the shard; none: no file.
 
     Raises:
@@ -199,6 +201,7 @@ def plan(
     from lgrasp.jobs.refine.plan import PlanJob
 
     what: dict[str, Any] = {"cloud": object} if isinstance(object, Cloud) else {"object": str(object), "scale": scale}
+    what["model"] = None if model is None else str(model)
     return _done(PlanJob, out, hand=str(hand), starts=starts, device=device, **what)
 
 
