@@ -41,7 +41,7 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
     if policy == SHIPPED:
         # trained where nothing is asked and nothing is in the way
         free = not (pipeline.steer.asks or pipeline.on_table)
-        shipped = shipped_policy(source.name) if free else None
+        shipped = shipped_policy(source.name, pipeline.hand.contact_links) if free else None
         pipeline = pipeline.with_params("place", policy=str(shipped) if shipped else None)
     if pipeline.steer.grasp_type is None and policy in (None, SHIPPED):
         return pipeline

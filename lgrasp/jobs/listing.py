@@ -77,7 +77,7 @@ def list_networks() -> list[dict[str, Any]]:
             card = {"kind": f"cannot be used: {error}", "hand": "", "report": {}}
         found.append({"name": name, "kind": card["kind"], "hand": card["hand"], **_told(path, card["report"])})
     for hand in known_hands():
-        if (path := shipped_policy(hand)) is not None:
+        for path in sorted({p for links in ("listed", "all") if (p := shipped_policy(hand, links))}):
             from lgrasp.policy.model import read_policy  # numpy
 
             found.append(

@@ -9,14 +9,16 @@ from lgrasp.hand.names import known_hands
 SHIPPED = "hand"
 """Stands for the policy that is shipped with a hand, if there is one."""
 
-_NAME = "pose_policy.npz"
+_NAMES = {"listed": ("pose_policy.npz",), "all": ("power_policy.npz", "pose_policy.npz")}
 _MOST_BYTES = 2 << 20
 
 
-def shipped_policy(hand: str) -> Path | None:
-    """The policy beside the rules of a known hand."""
+def shipped_policy(hand: str, links: str = "listed") -> Path | None:
+    """The policy beside the rules of a known hand; where all links may touch, that of whole-hand grasps if there is
+    one."""
     folder = known_hands().get(hand)
-    return folder / _NAME if folder and (folder / _NAME).is_file() else None
+    files = [folder / name for name in _NAMES[links]] if folder else []
+    return next((file for file in files if file.is_file()), None)
 
 
 def policy_file(path: str | Path) -> bytes:

@@ -65,7 +65,7 @@ def test_geometry_is_primitive_and_visual_equals_collision(name):
 
 def test_no_file_but_text_and_a_policy_is_shipped(name):
     shipped = {p.name for p in (ROOT / "hands" / name).iterdir()}
-    assert shipped - {"pose_policy.npz"} == {"hand.urdf", "hand.yaml", "LICENSE", "README.md"}
+    assert shipped - {"pose_policy.npz", "power_policy.npz"} == {"hand.urdf", "hand.yaml", "LICENSE", "README.md"}
 
 
 def test_rules_name_what_exists(name):

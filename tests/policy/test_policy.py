@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from lgrasp.engine.batch import run_batch, run_stages
+from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import Field
@@ -193,5 +194,9 @@ def test_shipped_policies_are_of_their_hands(swift):
         path = for_hand(asked, name).params("place").policy
         assert path.endswith(f"{name}/pose_policy.npz")
         assert for_hand(swift.with_params("place", policy=path), name).params("place").policy == path
+    power = load_pipeline("power")
+    for name in ("allegro", "leap", "shadow"):
+        assert for_hand(power, name).params("place").policy.endswith(f"{name}/power_policy.npz")
+    assert for_hand(asked, "shadow").params("place").policy is None
     assert for_hand(asked, "dclaw").params("place").policy is None
     assert for_hand(asked.with_table(), "allegro").params("place").policy is None
