@@ -86,6 +86,14 @@ class GraspBounds(Params):
         default=DRIVE_STIFFNESS, gt=0, le=1e6, description="Position control that q_squeeze is meant for [N m/rad]."
     )
 
+    max_squeeze_lead: float = Field(
+        default=1.0,
+        gt=0,
+        le=10,
+        description="How far the joint targets of q_squeeze may be ahead of q; where they would be further, the hand "
+        "presses with less [rad; sliding joints over 10 cm].",
+    )
+
     @model_validator(mode="before")
     @classmethod
     def _fill_in(cls, data: Any, info: ValidationInfo) -> Any:

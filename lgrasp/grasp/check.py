@@ -21,7 +21,14 @@ from lgrasp.grasp.check_kernels import (
     pack_rows,
 )
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
-from lgrasp.grasp.control_kernels import FINGER_TRIES, control_poses, open_fingers, open_poses, try_fingers
+from lgrasp.grasp.control_kernels import (
+    FINGER_TRIES,
+    control_poses,
+    limit_squeeze,
+    open_fingers,
+    open_poses,
+    try_fingers,
+)
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome
 from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, drop_light, grasp_epsilon, resist_loads
@@ -161,6 +168,7 @@ class Check:
         wp.launch(center_forces, m, [limits, places, at, row], [found], device=d)
         inputs = [hand, limits, places, at, found, row]
         wp.launch(control_poses, (m, model.groups), inputs, [packed, opened], device=d)
+        wp.launch(limit_squeeze, m, [hand, limits, row], [packed], device=d)
         stuck = wp.zeros(1 + m, dtype=wp.int32, device=d)
         inputs = [hand, obj, self.held.struct, limits, at, opened, row]
         wp.launch(open_poses, m, inputs, [packed, stuck], device=d)

@@ -31,6 +31,7 @@ class Limits:
     min_table_distance: wp.float32
     squeeze_force: wp.float32
     squeeze_stiffness: wp.float32
+    max_squeeze_lead: wp.float32
     deepest: wp.float32  # penetrations above this are not distinguished
     whole: wp.int32  # 1: rows that failed are measured to the end
 

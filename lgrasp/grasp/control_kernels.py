@@ -126,6 +126,29 @@ def control_poses(
     opened_out[i, g] = opened
 
 
+@wp.kernel
+def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), packed_out: Packed):
+    """Where a joint target would be further ahead than ``max_squeeze_lead``, all forces of the hand shrink alike.
+
+    Args:
+        row: (m,) hand of each row, -1 none.
+    """
+    i = wp.tid()
+    if row[i] < 0:
+        return
+    lead = float(0.0)
+    for g in range(hand.kin.groups):
+        for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
+            c = hand.kin.dof_index[hand.kin.dof_first[g] + hand.kin.joint_dof[k]]
+            ahead = wp.abs(packed_out.q_squeeze[i, c] - packed_out.q[i, c])
+            lead = wp.max(lead, wp.where(hand.kin.joint_prismatic[k] == 1, ahead / _ARM, ahead))
+    if lead > limits.max_squeeze_lead:
+        share = limits.max_squeeze_lead / lead
+        for c in range(packed_out.q.shape[1]):
+            q = packed_out.q[i, c]
+            packed_out.q_squeeze[i, c] = q + (packed_out.q_squeeze[i, c] - q) * share
+
+
 @wp.func
 def finger_clear(
     hand: Hand,

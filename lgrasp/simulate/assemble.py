@@ -49,7 +49,7 @@ def welded_joints(text: str, base_link: str) -> list[str]:
 
 
 def bare_urdf(text: str, held: Mapping[str, float]) -> str:
-    """A URDF text without visual and collision elements, for MuJoCo.
+    """A URDF text without visual and collision elements, and with one inertia a link, for MuJoCo.
 
     Args:
         held: joints that become fixed, and where [rad or m].
@@ -59,7 +59,7 @@ def bare_urdf(text: str, held: Mapping[str, float]) -> str:
     """
     tree, _ = parse_robot(Path("hand.urdf"), text.encode())
     for link in tree.iterfind("link"):
-        for element in [*link.iterfind("visual"), *link.iterfind("collision")]:
+        for element in [*link.iterfind("visual"), *link.iterfind("collision"), *link.findall("inertial")[1:]]:
             link.remove(element)
     set_compiler(tree)
     for joint in tree.iterfind("joint"):

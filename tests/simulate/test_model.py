@@ -11,6 +11,7 @@ from support.solids import YOU, no_cut, prism
 
 from lgrasp.engine.cache import Cache
 from lgrasp.geometry.decompose import decompose
+from lgrasp.simulate.assemble import bare_urdf
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
@@ -133,3 +134,11 @@ def test_neighbours_and_sockets_do_not_collide():
     mujoco.mj_forward(m.mujoco, data)
     assert data.ncon == 0
     assert (m.mujoco.body_weldid[m.mujoco.geom_bodyid] == 0).any()
+
+
+def test_a_second_inertia_of_a_link_is_left_out():
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    text = f'<robot name="r"><link name="a">{inertial}{inertial.replace("1", "2")}</link></robot>'
+    bare = bare_urdf(text, {})
+    assert bare.count("<mass") == 1
+    assert '<mass value="1"/>' in bare

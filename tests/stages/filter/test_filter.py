@@ -116,6 +116,21 @@ def test_control_poses(finished, inputs, link_poses):
     np.testing.assert_allclose(grasps.q_squeeze, inside, atol=2e-4)
 
 
+def test_soft_grasps_are_squeezed_less(finished, tables, context, swift):
+    """Targets far ahead are brought back, those of a hand all by the same share; nothing else changes."""
+    grasps, _, bounds = finished
+    most = 0.05
+    gentle, _ = run(
+        tables.search, swift.params("filter"), context.changed(bounds=bounds.changed(max_squeeze_lead=most))
+    )
+    ahead, less = grasps.q_squeeze - grasps.q, gentle.q_squeeze - gentle.q
+    lead = np.abs(ahead).max(1)
+    assert (lead > most).sum() > 10
+    np.testing.assert_allclose(less, ahead * np.minimum(1, most / lead)[:, None], atol=1e-5)
+    np.testing.assert_array_equal(gentle.q, grasps.q)
+    np.testing.assert_array_equal(gentle.contact_forces, grasps.contact_forces)
+
+
 def test_pregrasp_is_clear(finished, inputs, link_poses, link_distance):
     """Touching links are off the object by the margin, unless a finger cannot open."""
     grasps, _, bounds = finished
