@@ -77,12 +77,12 @@ def list_networks() -> list[dict[str, Any]]:
             card = {"kind": f"cannot be used: {error}", "hand": "", "report": {}}
         found.append({"name": name, "kind": card["kind"], "hand": card["hand"], **_told(path, card["report"])})
     for hand in known_hands():
-        for path in sorted({p for links in ("listed", "all") if (p := shipped_policy(hand, links))}):
+        kinds = {shipped_policy(hand, "all"): "pose, all links", shipped_policy(hand, "listed"): "pose"}
+        for path in sorted(path for path in kinds if path):
             from lgrasp.policy.model import read_policy  # numpy
 
-            found.append(
-                {"name": SHIPPED, "kind": "pose", "hand": hand, **_told(path, read_policy(path).about["report"])}
-            )
+            report = read_policy(path).about["report"]
+            found.append({"name": SHIPPED, "kind": kinds[path], "hand": hand, **_told(path, report)})
     return found
 
 

@@ -57,11 +57,13 @@ def network_bytes(card: Mapping[str, Any], state: "Mapping[str, torch.Tensor]") 
     """
     import torch
 
-    data = io.BytesIO()
-    torch.save(dict(state), data)
-    with zipfile.ZipFile(data, "a") as archive:
-        archive.writestr(zipfile.ZipInfo(_CARD), json.dumps(card))  # of no date
-    return data.getvalue()
+    plain, packed = io.BytesIO(), io.BytesIO()
+    torch.save(dict(state), plain)
+    with zipfile.ZipFile(plain) as made, zipfile.ZipFile(packed, "w") as archive:
+        contents = {name: made.read(name) for name in made.namelist()} | {_CARD: json.dumps(card).encode()}
+        for name, data in contents.items():
+            archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED, 9)  # of no date
+    return packed.getvalue()
 
 
 @contextmanager
@@ -74,8 +76,9 @@ def open_network(path: Path, kind: str, version: int) -> "Iterator[tuple[dict[st
     with _as_told(path, kind):
         import torch
 
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError(f"{path.stat().st_size:,} bytes")
+        with zipfile.ZipFile(path) as archive:
+            if (size := sum(info.file_size for info in archive.infolist())) > _MOST_BYTES:
+                raise ValueError(f"{size:,} bytes")
         card = _card(path)
         if card["kind"] != kind or card["version"] != version:
             raise ValueError(f"kind '{card['kind']}', version {card['version']}")

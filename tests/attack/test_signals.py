@@ -14,7 +14,7 @@ from support.forked import start_forked
 from lgrasp.bench.soak.processes import WAYS
 from lgrasp.bench.soak.trials import Soak
 
-TIMES = {"generate": 2, "dataset merge": 1, "simulate": 1}
+TIMES = {"generate": 1, "dataset merge": 1, "simulate": 1}
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks for processes in /proc")
@@ -23,5 +23,5 @@ def test_random_moments(tmp_path):
     place = Soak(tmp_path, Path(wp.config.kernel_cache_dir).parent, launch=start_forked)
     found = [place.end(name, next(ways), random.uniform()) for name, times in TIMES.items() for _ in range(times)]
     assert len(found) == sum(TIMES.values())
-    assert sum(attack.died for attack in found) > len(found) // 2
+    assert any(attack.died for attack in found)
     assert not [f"{a.command}, {a.way} at {a.moment:.3f}: {fault}" for a in found for fault in a.faults]

@@ -61,10 +61,8 @@ def test_expected_rows_per_candidate(swift, inputs, monkeypatch, rate):
 def test_batches_on_a_gpu_are_enough_and_not_more():
     size = shard_module._batch_size
     first = size("cuda:0", 50_000, 1.7, 0)
-    second = size("cuda:0", 50_000, 1.7, first)
-    assert first == pytest.approx(second, rel=0.01)
-    assert (first + second) * 1.7 > 50_000
-    assert size("cuda:0", 50_000, 1.7, first + second) == 0
+    assert 50_000 < first * 1.7 < 55_000
+    assert size("cuda:0", 50_000, 1.7, first) == 0
     assert size("cuda:0", 1000, 1e-3, 0) == 65_536
     assert size("cuda:0", 1000, 1e-3, 0, 5_000) == 5_000
 

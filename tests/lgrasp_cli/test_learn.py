@@ -113,9 +113,9 @@ def test_networks_are_known_by_name(generate, cli, monkeypatch, tmp_path):
     assert found["toy"]["report"] == report
     assert found["toy"]["bytes"] == len(data)
     assert found["bad"]["kind"].startswith("cannot be used: ")
-    assert found["hand"]["kind"] == "pose"  # shipped with hands
+    assert found["hand"]["kind"].startswith("pose")  # shipped with hands
     (line,) = (line for line in cli("learn", "list").out.splitlines() if line.startswith("toy"))
-    assert line.split("  ")[-1] == "loss 0.25"
+    assert line.split("  ")[-1].strip() == "loss 0.25"
     assert "2 objects, 1 object held out, 1,200 examples, seed 3" in line
     assert generate(rows=3).code == 0
     assert "toy.pt is of hand 'allegro', the shards" in cli("learn", "eval", "toy", "out", "--device", "cpu").error()
@@ -129,9 +129,9 @@ def test_networks_are_known_by_name(generate, cli, monkeypatch, tmp_path):
 def test_grasps_are_planned_from_a_cloud_by_a_network(generate, cli):
     assert generate(rows=64).code == 0
     sizes = ["width=32", "blocks=1", "cloud=64", "shape_points=32", "held_points=32", "sense_points=1", "views=4"]
-    sizes += ["turns=2", "nodes=8", "channels=2", "completion_steps=20", "completion_batch=4", "held_out=0"]
+    sizes += ["turns=2", "nodes=8", "channels=2", "completion_steps=4", "completion_batch=4", "held_out=0"]
     options = [option for size in sizes for option in ("--set", f"grasp.{size}")]
-    fit = ["learn", "fit", "--model", "grasp", "out", "--steps", 60, "--batch", 64, "--device", "cpu", *options]
+    fit = ["learn", "fit", "--model", "grasp", "out", "--steps", 12, "--batch", 64, "--device", "cpu", *options]
     done = cli(*fit, "--out", "net.pt", "--json", "fit.json")
     assert done.code == 0, done
     assert json.loads(Path("fit.json").read_text())["examples"] == 64

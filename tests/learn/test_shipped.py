@@ -1,0 +1,22 @@
+"""The networks that are shipped: small, whole, of the hand that is shipped, and honest about what they did not see."""
+
+import pytest
+
+from lgrasp.hand.digest import hand_digest
+from lgrasp.hand.find import find_hand
+from lgrasp.learn.diffuser.file import load_diffuser
+from lgrasp.learn.grasp.file import load_networks
+from lgrasp.learn.networks import find_network, read_card
+
+LOADERS = {"seq-allegro": load_diffuser, "grasp-allegro": load_networks}
+
+
+@pytest.mark.parametrize("name", LOADERS)
+def test_shipped_networks(name):
+    path = find_network(name)
+    LOADERS[name](path)
+    card, hand = read_card(path), find_hand("allegro")
+    assert path.stat().st_size <= 8e6
+    assert card["hand_sha256"] == hand_digest(hand.urdf, hand.spec)
+    assert card["report"]["unseen"]
+    assert not set(card["report"]["unseen"]) & set(card["report"]["objects"])
