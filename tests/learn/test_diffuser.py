@@ -106,19 +106,22 @@ def ball():
     """A ball's cloud and its distances."""
     mesh = trimesh.creation.icosphere(3, RADIUS)
     grid = coarse_grid(mesh.vertices + np.array([0.1, 0, 0]), mesh.faces, closed=True)  # seen about its own centre
-    return RADIUS * torch.nn.functional.normalize(torch.randn(32, 3), dim=1).numpy(), grid
+    directions = torch.randn(32, 3, generator=torch.Generator().manual_seed(0))
+    return RADIUS * torch.nn.functional.normalize(directions, dim=1).numpy(), grid
 
 
 def test_hands_feel_how_far_things_are(inputs, ball):
     """Distances of points of the posed hand from balls are known exactly."""
-    model, n = inputs.hand.model, 5
+    model, n = inputs.hand.model, 40
     points, basis = sense_points(model, 3), 0.1 * torch.randn(7, 3)
     senses = Senses(model.tree, points, basis, [ball[1]] * 2)
     low, high = (torch.as_tensor(x, dtype=torch.float32) for x in (model.tree.joint_lower, model.tree.joint_upper))
     q = low + (high - low) * torch.rand(n, len(low))
     R, t = so3_exp(torch.randn(n, 3)), torch.tensor([0.08, 0, 0]) + 0.02 * torch.randn(n, 3)
     held_t = torch.tensor([0.08, 0.05, 0]) + 0.01 * torch.randn(n, 2, 3)
-    held = HeldObjects(torch.tensor([[1, -1]] * 2 + [[0, 1]] * 2 + [[-1, -1]]), R[:, None].expand(-1, 2, 3, 3), held_t)
+    held = HeldObjects(
+        torch.tensor([[1, -1], [0, 1], [-1, -1], [1, 0]]).repeat(n // 4, 1), R[:, None].expand(-1, 2, 3, 3), held_t
+    )
     found = senses(R, t, q, torch.zeros(n, dtype=torch.int64), held)
     T = device_matrix(body_poses(inputs.hand, q.numpy()).reshape(-1, 7)).reshape(n, -1, 4, 4)[:, points[:, 0].long()]
     places = np.einsum("npij,pj->npi", T[..., :3, :3], points[:, 1:].numpy()) + T[..., :3, 3]
