@@ -42,6 +42,11 @@ class SequenceParams(Params):
         """Largest number of candidates that continue a sequence in a step."""
         return self.wave * self.waves
 
+    @property
+    def in_waves(self) -> bool:
+        """True if candidates are tried wave by wave, else each sequence gets one grasp a step."""
+        return self.method == "field" or (self.method == "diffuser" and self.refined)
+
     @model_validator(mode="after")
     def _numbers_fit(self) -> "SequenceParams":
         if self.width * self.tries > 2**24:

@@ -180,6 +180,18 @@ def test_what_is_drawn_becomes_valid_shards(asked, network, tmp_path):
     assert run(job.changed()).made == 0
 
 
+def test_few_are_the_first_of_many(asked, network, tmp_path):
+    """Bit by bit, though a network that multiplies other batches may round otherwise."""
+    pipeline = small_pipeline("sample", width=12, wave=8, waves=3, draws=4)
+    given = asked | {"pipeline": pipeline, "model": str(network)}
+    few, many = (run(SampleJob(**given, rows=rows, out=tmp_path / str(rows))).paths for rows in (2, 7))
+    few, many = (read_shard(path).grasps for (path,) in (few, many))
+    two, seven = (np.flatnonzero(rows.object_index[:, 1] >= 0) for rows in (few, many))
+    assert len(two) == 2
+    np.testing.assert_array_equal(few.q[two], many.q[seven[:2]])
+    np.testing.assert_array_equal(few.object_pose[two], many.object_pose[seven[:2]])
+
+
 def test_networks_of_other_hands_are_refused(asked, network, tmp_path):
     given = {"pipeline": small_pipeline("sample"), "model": str(network), "out": tmp_path / "out"}
     with pytest.raises(ConfigError, match=r"net.pt is of hand 'allegro', not of 'leap'"):

@@ -13,10 +13,11 @@ from lgrasp.engine.events import Events
 from lgrasp.engine.run import run
 from lgrasp.errors import OutputError
 from lgrasp.grasp.sequences import SequenceTable
+from lgrasp.grasp.tables import take_rows
 from lgrasp.jobs.sequence import round as round_module
 from lgrasp.jobs.sequence.inputs import load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.job import SequenceJob
-from lgrasp.jobs.sequence.round import run_round
+from lgrasp.jobs.sequence.round import Round, run_round
 from lgrasp.jobs.sequence.shard import make_sequences
 from lgrasp.runtime.device import resolve_device
 from lgrasp.sequence.size import Size
@@ -40,6 +41,16 @@ def found(pipeline, inputs):
 def assert_same(a: SequenceTable, b: SequenceTable) -> None:
     for name in ("parent", "candidate", "space", "free", "q", "q_pregrasp", "q_squeeze", "pose", "contact_points"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def assert_begins(whole: Round, part: Round, begun: int) -> None:
+    """A round has the rows of the first sequences of another."""
+    first = np.arange(begun)
+    for a, b in zip(whole.levels, part.levels, strict=True):
+        rows = np.flatnonzero(np.isin(a.parent, first))
+        assert 0 < len(rows) < len(a)
+        assert_same(take_rows(a, rows), b)
+        first = rows
 
 
 @pytest.mark.parametrize(("workers", "chunk"), [(1, 1024), (3, 100)])
@@ -124,6 +135,21 @@ def test_first_rows_of_a_longer_run(pipeline, inputs):
         first, second = result.levels
         assert second.parent.max() < len(first)
         np.testing.assert_array_equal(first.q[second.parent], second.q[:, :1])
+
+
+def test_a_round_of_fewer_sequences_has_the_first_rows(pipeline, inputs, found):
+    assert_begins(found, run_round(pipeline, inputs, 0, 0, 2, begun=7), 7)
+
+
+def test_few_rows_begin_few_sequences(pipeline, inputs):
+    """And more, up to a whole round, where these are too few: objects may be hard to hold."""
+    few = make_sequences(pipeline, inputs, 0, 2, 2)
+    assert len(few) == 2
+    assert few.reached[0] <= 3  # of 24
+    hard = pipeline.with_params("sequence", policy="uniform", waves=1, wave=4)
+    some, more = (make_sequences(hard, inputs, 0, rows, 2) for rows in (2, 6))
+    assert len(some) == 2
+    np.testing.assert_array_equal(some.levels[-1].q, more.levels[-1].q[:2])
 
 
 def test_an_object_has_one_size_in_all_sets(pipeline):

@@ -73,17 +73,22 @@ def run_round(
     workers: int,
     tell: Callable[[float], None] = lambda share: None,
     verdicts: Verdicts | None = None,
+    *,
+    begun: int | None = None,
 ) -> Round:
     """Sequences of round ``number`` of a shard: a pure function of its arguments but the number of threads.
+
+    What becomes of a sequence does not depend on those after it: begun with fewer, a round has the first of its rows.
 
     Args:
         workers: threads.
         tell: called with the share of the round that is done; what it raises ends the round.
         verdicts: simulates the rows of each step; only those that hold are continued.
+        begun: sequences that are started; None: the pipeline's width.
     """
     model, result = inputs.hand, Round()
     seed = stage_seed(pipeline.seed, shard, "sequence", number)
-    rows = empty_sequences(pipeline.params("sequence").width, model.dofs, model.groups + 1)
+    rows = empty_sequences(begun or pipeline.params("sequence").width, model.dofs, model.groups + 1)
     with ThreadPoolExecutor(workers) as pool:
         while rows.steps < len(inputs.objects) and len(rows):
             tell(rows.steps / len(inputs.objects))
@@ -122,10 +127,9 @@ class _Step:
         rows, params = self._rows, self._params
         left = len(self._inputs.objects) - rows.steps - 1
         order = space_orders(rows, self._inputs.spaces, params.policy, left, self._seed)
-        in_waves = params.method == "field" or (params.method == "diffuser" and params.refined)
-        if not in_waves:
+        if not params.in_waves:
             self._one_each(order[:, 0])
-        for wave in range(params.waves if in_waves else 0):
+        for wave in range(params.waves if params.in_waves else 0):
             self._tell((rows.steps + wave / params.waves) / len(self._inputs.objects))
             space = order[np.arange(len(rows)), wave % np.maximum((order >= 0).sum(1), 1)]
             chosen = np.flatnonzero((space >= 0) & self._wanting)
@@ -137,7 +141,7 @@ class _Step:
                 self._go_on(chosen[own], int(number), wave, drawn.of_hands(own) if drawn else None)
         if not self._tried:
             return take_rows(rows, np.zeros(0, int))
-        table = join_rows([self._longer(number) for number in self._tried])
+        table = join_rows([self._longer(number) for number in sorted(self._tried)])
         table = take_rows(table, np.argsort(table.parent, kind="stable"))
         return take_rows(table, go_on(table.parent, table.metrics["room"], params))
 

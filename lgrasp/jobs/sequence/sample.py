@@ -46,7 +46,7 @@ class SampleJob(SampleRequest, SequenceJob):
         return self._network
 
     def key(self) -> str:
-        return content_key("sample", 1, run=super().key(), network=self.network()[2])
+        return content_key("sample", 2, run=super().key(), network=self.network()[2])
 
     def own_config(self) -> dict[str, Any]:
         return super().own_config() | {"model": find_network(self.model).name, "network": self.network()[2]}

@@ -17,6 +17,7 @@ from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.jobs.sequence.round import Round, Verdicts, add_spaces, run_round
 
 _EMPTY_ROUNDS = 4  # without any row of some length, before nothing more is expected
+_SPARE = 1.5  # sequences begun for each that is needed, if all go well
 
 
 @dataclass
@@ -67,36 +68,55 @@ def make_sequences(
         verdicts: see :func:`run_round`.
     """
     result = SequenceResult()
-    objects = len(inputs.objects)
+    objects, width = len(inputs.objects), pipeline.params("sequence").width
     kept = KeptRows(inputs.hand.dofs, inputs.device.alias)
     parts: list[list[SequenceTable]] = []
     start = time.perf_counter()
     while kept.count < rows and not result.exhausted:
-        expected = min(rows - kept.count, pipeline.params("sequence").width)
-        found = run_round(
-            pipeline,
-            inputs,
-            shard,
-            result.rounds,
-            workers,
-            lambda share, rows=kept.count, expected=expected: progress(rows, share * expected),
-            verdicts,
-        )
+        found, begun, ended = Round(), 0, 0
+        while begun < width and kept.count < rows:
+            needed, spent = rows - kept.count, found.seconds
+            begun = _begun(needed, begun, ended, pipeline, inputs)
+            found = run_round(
+                pipeline,
+                inputs,
+                shard,
+                result.rounds,
+                workers,
+                lambda share, done=kept.count, most=begun: progress(done, share * min(rows - done, most)),
+                verdicts,
+                begun=begun,
+            )
+            add_seconds(found.seconds, spent)
+            if len(found.levels) == objects:
+                last = take_rows(found.levels[-1], np.arange(ended, len(found.levels[-1])))
+                # two sequences are near-duplicates at most where their first objects and their joints are
+                pose = user_poses(last.pose[:, 0], inputs.objects[0].model.center)
+                new, duplicates = kept.add(pose, last.q[:, -1], needed)
+                result.duplicates += duplicates
+                parts.append(_lineage(found.levels, ended + new))
+                ended += len(last)
+            progress(kept.count, 0.0)
         result.add(found)
-        if len(found.levels) == objects:
-            last = found.levels[-1]
-            # two sequences are near-duplicates at most where their first objects and their joints are
-            pose = user_poses(last.pose[:, 0], inputs.objects[0].model.center)
-            new, duplicates = kept.add(pose, last.q[:, -1], rows - kept.count)
-            result.duplicates += duplicates
-            parts.append(_lineage(found.levels, new))
-        progress(kept.count, 0.0)
         missing = len(result.reached) < objects or min(result.reached) == 0
         hopeless = result.rounds >= _EMPTY_ROUNDS and missing
         result.exhausted = kept.count < rows and (hopeless or result.rounds >= most_rounds(pipeline, rows))
     result.levels = _joined(parts)
     result.wall = time.perf_counter() - start
     return result
+
+
+def _begun(needed: int, begun: int, ended: int, pipeline: Pipeline, inputs: SequenceInputs) -> int:
+    """With how many sequences a round is begun, of which fewer were not enough: rows are the same, few take less time.
+
+    Args:
+        needed: whole sequences. begun, ended: sequences of the round so far, and those of them that became whole.
+    """
+    params = pipeline.params("sequence")
+    if inputs.device.alias != "cpu" or not params.in_waves:  # many take hardly longer
+        return params.width
+    more = begun + int(_SPARE * needed * (begun + 1) / (ended + 1))
+    return more if 2 * more <= params.width else params.width
 
 
 def _lineage(levels: list[SequenceTable], rows: np.ndarray) -> list[SequenceTable]:

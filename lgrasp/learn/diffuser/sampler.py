@@ -1,6 +1,6 @@
 """Steps drawn by a trained network for hands that hold objects already."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from lgrasp.learn.diffuser.senses import HeldObjects, Senses
 from lgrasp.object.sdf import SdfGrid
 
 _TURNS = 64  # rotations in which the network sees an object
-_CPU_ROWS, _GPU_ROWS = 1024, 16_384  # at a time
+_CPU_ROWS, _GPU_ROWS = 256, 16_384  # at a time
 
 
 class DrawnSteps(NamedTuple):
@@ -61,6 +61,16 @@ def draw_steps(
     return R @ turn, t, joints_of(seen.start, q, seen.free)
 
 
+def _batches(count: int, device: torch.device) -> Iterator[torch.Tensor]:
+    """Rows worked on at once. On a CPU always as many, the last one again and again: the size of what a library
+    multiplies decides how it rounds."""
+    if device.type != "cpu":
+        yield from torch.arange(count).split(_GPU_ROWS)
+        return
+    for first in range(0, count, _CPU_ROWS):
+        yield torch.arange(first, first + _CPU_ROWS).clamp_max(count - 1)
+
+
 class StepSampler:
     """A network with the objects of a sequence before it.
 
@@ -92,7 +102,8 @@ class StepSampler:
     ) -> DrawnSteps:
         """``each`` steps for each of H hands, those of one hand one after another: the object after those held.
 
-        A function of its arguments; what is drawn for one hand does not depend on the others but by rounding.
+        A function of its arguments; what is drawn for one hand does not depend on those after it, on a GPU but by
+        rounding.
 
         Args:
             space: opposition spaces, (H,). free: joints that the steps may move, (H, K) bool.
@@ -100,9 +111,9 @@ class StepSampler:
         """
         rows, joints = hands.q.shape
         number = hands.pose.shape[1]
-        draw = torch.Generator().manual_seed(seed)
-        noise = torch.randn(rows * each, 9 + joints, generator=draw)
-        turn = torch.randint(_TURNS, (rows * each,), generator=draw)
+        streams = [torch.Generator().manual_seed(seed + hand) for hand in range(rows)]
+        noise = torch.cat([torch.randn(each, 9 + joints, generator=draw) for draw in streams])
+        turn = torch.cat([torch.randint(_TURNS, (each,), generator=draw) for draw in streams])
         start, held = self._put(hands.q), self._held(hands, number)
         situation = Situation(
             self._shape(number)[:1].expand(rows, -1),
@@ -112,15 +123,15 @@ class StepSampler:
             self._put(free, torch.bool),
             self._put(space, torch.int64),
         )
-        parts = []
-        for picked in torch.arange(rows * each).split(_CPU_ROWS if self._device.type == "cpu" else _GPU_ROWS):
+        parts, count = [], rows * each
+        for picked in _batches(count, self._device):
             row, own = (picked // each).to(self._device), turn[picked].to(self._device)
             seen = situation.rows(row)._replace(shape=self._shape(number)[own])
             objects = torch.full_like(row, number), HeldObjects(*(x[row] for x in held))
             given = noise[picked].to(self._device), self._turns[own]
             R, t, q = draw_steps(self._net, self._process, self._senses, seen, *given, *objects, steps)
             parts.append((pose_from_motion(R, t), q))
-        pose, q = (torch.cat(x).cpu().numpy() for x in zip(*parts, strict=True))
+        pose, q = (torch.cat(x)[:count].cpu().numpy() for x in zip(*parts, strict=True))
         return DrawnSteps(pose, q)
 
     def _held(self, hands: HeldHands, number: int) -> HeldObjects:
