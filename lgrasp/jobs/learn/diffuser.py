@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 
 from lgrasp.engine.cache import Cache
@@ -13,7 +12,7 @@ from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.errors import ConfigError
 from lgrasp.hand.digest import hand_digest
 from lgrasp.jobs.hands import hand_source
-from lgrasp.jobs.learn.network import NetworkJob
+from lgrasp.jobs.learn.network import NetworkJob, training_report
 from lgrasp.jobs.learn.sequences import ReadSteps, read_steps
 from lgrasp.jobs.requests.shards import DiffuserRequest
 from lgrasp.learn.diffuser.examples import StepExamples, make_net, unseen_objects
@@ -52,17 +51,8 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
             raise ConfigError(f"diffuser.held_out {p.held_out}: every step has to do with a mesh that is held out")
         read = time.perf_counter() - start
         trainer.fit(lambda step, loss: progress(step, f"loss {loss:.3f}"))
-        loss, held_out = trainer.losses()
-        report = {
-            "hand": hand.name,
-            "objects": _names(found, ~unseen),
-            "unseen": _names(found, unseen),
-            "examples": len(examples),
-            "loss": loss,
-            "unseen_loss": None if np.isnan(held_out) else held_out,
-            "seconds": {"reading": read, "training": time.perf_counter() - start - read},
-            "params": p.model_dump(mode="json"),
-        }
+        seconds = {"reading": read, "training": time.perf_counter() - start - read}
+        report = training_report(hand.name, trainer, _names(found, ~unseen), _names(found, unseen), seconds)
         about = AboutDiffuser(hand.name, hand.sha256, found.space_names, p, self.key(), report)
         return Made(part.rows, diffuser_bytes(trainer.kept, about))
 

@@ -13,7 +13,7 @@ from lgrasp.geometry.poses import internal_poses
 from lgrasp.geometry.rotations import motion_from_pose
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.hand.model import HandModel
-from lgrasp.jobs.learn.network import NetworkJob
+from lgrasp.jobs.learn.network import NetworkJob, training_report
 from lgrasp.jobs.requests.shards import GraspRequest
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.learn.diffuser.examples import SequenceSteps, make_net, unseen_objects
@@ -60,18 +60,8 @@ class GraspJob(GraspRequest, NetworkJob):
         trainer = StepTrainer(draws, examples, unseen, p, alias)
         trainer.fit(lambda step, loss: progress(p.completion_steps + step, f"loss {loss:.3f}"))
         seconds["training"] = time.perf_counter() - start
-        loss, held_out = trainer.losses()
-        report = {
-            "hand": hand.name,
-            "objects": _names(records, ~unseen),
-            "unseen": _names(records, unseen),
-            "examples": len(examples),
-            "completion_loss": error,
-            "loss": loss,
-            "unseen_loss": None if np.isnan(held_out) else held_out,
-            "seconds": seconds,
-            "params": p.model_dump(mode="json"),
-        }
+        names = (_names(records, ~unseen), _names(records, unseen))
+        report = training_report(hand.name, trainer, *names, seconds) | {"completion_loss": error}
         made = Networks(trainer.kept, completes, p, hand.name, hand.sha256, self.key(), report)
         return Made(part.rows, predictor_bytes(made))
 

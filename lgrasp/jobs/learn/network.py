@@ -2,8 +2,9 @@
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 from pydantic import PrivateAttr
 
 from lgrasp.dataset.gather import gather
@@ -14,6 +15,9 @@ from lgrasp.engine.run import Job, JobOutcome
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.files import write_file
 from lgrasp.jobs.requests.shards import FitRequest
+
+if TYPE_CHECKING:  # torch takes a second to import
+    from lgrasp.learn.diffuser.training import StepTrainer
 
 
 class NetworkJob(FitRequest, Job):
@@ -64,3 +68,24 @@ class NetworkJob(FitRequest, Job):
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         return self.about_file(self.out)["report"] | {"out": str(self.out)} if outcome.paths else {}
+
+
+def training_report(
+    hand: str, trainer: "StepTrainer", objects: list[str], unseen: list[str], seconds: dict[str, float]
+) -> dict[str, Any]:
+    """What is said of a network that draws hands: what it learnt from, its losses, the time it took [s].
+
+    Args:
+        unseen: objects that were held out, of ``objects`` none.
+    """
+    loss, held_out = trainer.losses()
+    return {
+        "hand": hand,
+        "objects": objects,
+        "unseen": unseen,
+        "examples": len(trainer.examples),
+        "loss": loss,
+        "unseen_loss": None if np.isnan(held_out) else held_out,
+        "seconds": seconds,
+        "params": trainer.params.model_dump(mode="json"),
+    }
