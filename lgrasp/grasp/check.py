@@ -27,6 +27,7 @@ from lgrasp.grasp.control_kernels import (
     limit_squeeze,
     open_fingers,
     open_poses,
+    press_shared,
     try_fingers,
 )
 from lgrasp.grasp.held import HeldArrays, hold_nothing
@@ -168,6 +169,8 @@ class Check:
         wp.launch(center_forces, m, [limits, places, at, row], [found], device=d)
         inputs = [hand, limits, places, at, found, row]
         wp.launch(control_poses, (m, model.groups), inputs, [packed, opened], device=d)
+        if model.tree.shared_names:
+            wp.launch(press_shared, m, inputs, [packed], device=d)
         wp.launch(limit_squeeze, m, [hand, limits, row], [packed], device=d)
         stuck = wp.zeros(1 + m, dtype=wp.int32, device=d)
         inputs = [hand, obj, self.held.struct, limits, at, opened, row]

@@ -55,20 +55,25 @@ def shift_contact(hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, point: wp.v
 
 
 @wp.func
+def joint_lead(hand: Hand, k: wp.int32, T: wp.transform, p: wp.vec3, f: wp.vec3, stiffness: wp.float32):
+    """How far ahead position control of joint k's dof must aim to press with force f [N] on point p of a body that it
+    moves (body frame T of the joint) [rad or m]."""
+    lead = wp.dot(point_column(hand.kin, k, T, p), f) / stiffness
+    return wp.where(hand.kin.joint_prismatic[k] == 1, lead * _ARM * _ARM, lead)
+
+
+@wp.func
 def press_contact(
     hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, body: transforms, p: wp.vec3, f: wp.vec3, k: wp.float32
 ):
-    """q + J^T f / stiffness: targets at which position control presses with force f [N] on point p of body j."""
+    """q + J^T f / stiffness: targets of a group's own dofs that press with force f [N] on point p of body j."""
     j0 = hand.kin.joint_first[g]
     q = q0
     a = j
     while a >= 0:
-        stiffness = k
-        if hand.kin.joint_prismatic[j0 + a] == 1:
-            stiffness = k / (_ARM * _ARM)
         d = hand.kin.joint_dof[j0 + a]
         if d < hand.kin.dof_free[g]:
-            q[d] = q[d] + wp.dot(point_column(hand.kin, j0 + a, body[j0 + a], p), f) / stiffness
+            q[d] = q[d] + joint_lead(hand, j0 + a, body[j0 + a], p, f, k)
         a = hand.kin.joint_parent[j0 + a]
     return clamp_dofs(hand.kin, g, q)
 
@@ -124,6 +129,47 @@ def control_poses(
         packed_out.q[i, column] = x[d]
         packed_out.q_squeeze[i, column] = pressed[d]
     opened_out[i, g] = opened
+
+
+@wp.kernel
+def press_shared(
+    hand: Hand,
+    limits: Limits,
+    places: Places,
+    at: CheckedPostures,
+    found: Findings,
+    row: wp.array(dtype=wp.int32),
+    packed_out: Packed,
+):
+    """One thread per row kept: joints that groups share press as well, with what all contacts ask of them.
+
+    Args:
+        row: (m,) hand of each row, -1 none.
+    """
+    i = wp.tid()
+    s = row[i]
+    if s < 0:
+        return
+    T = at.pose[at.of[s]]
+    for c in range(at.contact.shape[1]):
+        if at.contact[s, c] >= 0:
+            b = places.body[at.contact[s, c]]
+            g = hand.body_group[b]
+            p = wp.transform_point(T, places.points[at.surface[s, c]])
+            f = wp.transform_vector(T, found.force[s, c]) * limits.squeeze_force
+            k = b - 1
+            while g >= 0 and k >= hand.kin.joint_first[wp.max(g, 0)]:
+                d = hand.kin.joint_dof[k]
+                if d >= hand.kin.dof_free[g]:
+                    column = hand.kin.dof_index[hand.kin.dof_first[g] + d]
+                    lead = joint_lead(hand, k, at.body[s, k], p, f, limits.squeeze_stiffness)
+                    packed_out.q_squeeze[i, column] = packed_out.q_squeeze[i, column] + lead
+                k = wp.where(hand.kin.joint_parent[k] < 0, -1, hand.kin.joint_parent[k] + hand.kin.joint_first[g])
+    for g in range(hand.kin.groups):
+        for d in range(hand.kin.dof_first[g] + hand.kin.dof_free[g], hand.kin.dof_first[g + 1]):
+            column = hand.kin.dof_index[d]
+            target = wp.clamp(packed_out.q_squeeze[i, column], hand.kin.dof_lower[d], hand.kin.dof_upper[d])
+            packed_out.q_squeeze[i, column] = target
 
 
 @wp.kernel

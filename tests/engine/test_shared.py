@@ -4,13 +4,19 @@ from itertools import product
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.grasp.records import GraspRows
+from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.find import find_hand
+from lgrasp.hand.model import HandModel
 from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.judge.run import judge
+from lgrasp.runtime.device import resolve_device
 
 
 @pytest.fixture
@@ -29,12 +35,40 @@ def test_rows_take_the_listed_values_and_are_valid(name, cache, tmp_path):
     shared = find_hand(name).spec.shared
     columns = [names.index(joint) for joint in shared]
     listed = {tuple(np.float32(v) for v in values) for values in product(*shared.values())}
-    for q in (shard.grasps.q, shard.grasps.q_pregrasp, shard.grasps.q_squeeze):
+    for q in (shard.grasps.q, shard.grasps.q_pregrasp):
         taken = {tuple(row) for row in q[:, columns]}
         assert taken <= listed
         assert len(taken) >= min(4, len(listed))
     # the judge poses every link from the one joint vector: fingers that disagreed would miss their contacts
     assert judge(outcome.paths).valid.all()
+    model = named_hand(cache, name, resolve_device("cpu"))[1]
+    wanted = pressed(model, shard.grasps, pipeline.bounds.squeeze_force / pipeline.bounds.squeeze_stiffness)
+    assert np.ptp(wanted[:, columns] - shard.grasps.q[:, columns], axis=0).min() > 0.01
+    np.testing.assert_allclose(shard.grasps.q_squeeze, wanted, atol=2e-4)
+
+
+def pressed(model: HandModel, rows: GraspRows, share: float) -> np.ndarray:
+    """q + J^T f: J by central differences, f the stored forces times ``share`` [N over N m/rad]; within limits."""
+    hand, body = upload_hand(model, "cpu"), model.tree.link_body[rows.contact_links[:, 0]]  # (N, C)
+    used, row = rows.contact_links[:, 0] >= 0, np.arange(len(rows))[:, None]
+    turn, at = Rotation.from_quat(rows.object_pose[:, 0, 3:], scalar_first=True).as_matrix(), rows.object_pose[:, 0, :3]
+    points = np.einsum("nij,ncj->nci", turn, rows.contact_points[:, 0]) + at[:, None]
+    forces = np.where(used[..., None], np.einsum("nij,ncj->nci", turn, rows.contact_forces[:, 0]), 0.0)
+
+    def frames(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        X = body_poses(hand, q).astype(float)[row, body]  # (N, C, 7)
+        return X[..., :3], Rotation.from_quat(X[..., 3:].reshape(-1, 4)).as_matrix().reshape(*body.shape, 3, 3)
+
+    origin, rotation = frames(rows.q)
+    local = np.nan_to_num(np.einsum("ncji,ncj->nci", rotation, points - origin))
+    q = rows.q.astype(float)
+    for k in range(q.shape[1]):
+        step = np.zeros_like(rows.q)
+        step[:, k] = 1e-2
+        (a, A), (b, B) = frames(rows.q - step), frames(rows.q + step)
+        motion = b - a + np.einsum("ncij,ncj->nci", B - A, local)
+        q[:, k] += share * (motion * forces).sum((1, 2)) / 2e-2
+    return np.clip(q, model.tree.joint_lower, model.tree.joint_upper)
 
 
 def test_couplings_of_the_known_hand_fill_gaps(tmp_path):

@@ -20,7 +20,7 @@ from lgrasp.stages.filter.posture_kernels import (
     tell_postures,
 )
 
-VERSION = 8
+VERSION = 9
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, Tally]:
