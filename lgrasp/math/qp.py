@@ -58,66 +58,45 @@ def _best_direction(a: wp.vec3, n: wp.vec3, mu: wp.float32, edges: wp.int32):
     return n + (t * wp.cos(angle) + b * wp.sin(angle)) * mu
 
 
-@wp.func
-def solve_spd(A: mat8, b: vec8, n: wp.int32, shift: wp.float32, floor: wp.float32):
-    """x with (A + shift I) x = b for the leading n x n block, by Cholesky; squared pivots are ``floor`` at least."""
-    L = mat8()
-    for i in range(n):
-        for j in range(i + 1):
-            s = A[i, j]
-            if i == j:
-                s += shift
-            for c in range(j):
-                s -= L[i, c] * L[j, c]
-            if i == j:
-                L[i, i] = wp.sqrt(wp.max(s, floor))
-            else:
-                L[i, j] = s / L[j, j]
-    x = vec8()
-    for i in range(n):
-        s = b[i]
-        for c in range(i):
-            s -= L[i, c] * x[c]
-        x[i] = s / L[i, i]
-    for r in range(n):
-        i = n - 1 - r
-        s = x[i]
-        for c in range(i + 1, n):
-            s -= L[c, i] * x[c]
-        x[i] = s / L[i, i]
-    return x
-
-
 def solving(size: int) -> Any:
-    """x with A x = b for positive definite matrices of one size, by Cholesky."""
+    """x with (A + shift I) x = b for the leading n x n block of symmetric A, by Cholesky, for matrices of one size.
+
+    Squared pivots are ``floor`` at least; x is 0 beyond n.
+    """
+    square, column = wp.types.matrix((size, size), wp.float32), wp.types.vector(size, wp.float32)
 
     @wp.func
-    def solve(A: wp.types.matrix((size, size), wp.float32), b: wp.types.vector(size, wp.float32)):
-        L = A
-        x = b
-        for i in range(size):
+    def solve(A: square, b: column, n: wp.int32, shift: wp.float32, floor: wp.float32):
+        L = square()
+        x = column()
+        for i in range(n):
             for j in range(i + 1):
                 s = A[i, j]
+                if i == j:
+                    s += shift
                 for c in range(j):
                     s -= L[i, c] * L[j, c]
                 if i == j:
-                    L[i, i] = wp.sqrt(wp.max(s, 1.0e-12))
+                    L[i, i] = wp.sqrt(wp.max(s, floor))
                 else:
                     L[i, j] = s / L[j, j]
-        for i in range(size):
-            s = x[i]
+        for i in range(n):
+            s = b[i]
             for c in range(i):
                 s -= L[i, c] * x[c]
             x[i] = s / L[i, i]
-        for r in range(size):
-            i = size - 1 - r
+        for r in range(n):
+            i = n - 1 - r
             s = x[i]
-            for c in range(i + 1, size):
+            for c in range(i + 1, n):
                 s -= L[c, i] * x[c]
             x[i] = s / L[i, i]
         return x
 
     return solve
+
+
+solve_spd = solving(_MAX_CORRAL)
 
 
 @wp.func

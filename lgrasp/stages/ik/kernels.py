@@ -140,7 +140,7 @@ def _realising(size: int) -> Any:
                 for k in range(a + 1):
                     A[a, k] = wp.dot(J1[a], J1[k]) + w2 * wp.dot(J2[a], J2[k])
                 A[a, a] = A[a, a] + params.damping
-            step = solve(A, b)
+            step = solve(A, b, size, 0.0, 1.0e-12)
             for a in range(dofs):
                 q[a] = q[a] + wp.clamp(step[a], -params.step, params.step)
             q = clamp_dofs(hand.kin, g, q)
