@@ -10,7 +10,7 @@ import numpy as np
 from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.urdf import Joint, Urdf, check_mimic
-from lgrasp.math.limits import MAX_DOFS
+from lgrasp.math.limits import DOF_SIZES, MAX_DOFS
 
 MAX_SETTINGS = 32
 """Most combinations of values of a hand's shared joints."""
@@ -54,6 +54,11 @@ class Tree:
     link_names: tuple[str, ...]
     link_body: np.ndarray  # (L,) i32
     T_body_link: np.ndarray  # (L, 4, 4)
+
+    @property
+    def dof_size(self) -> int:
+        """The size that its kernels are compiled for: one of DOF_SIZES, not less than the dofs of any group."""
+        return next(size for size in DOF_SIZES if size >= np.diff(self.dof_first).max())
 
     @property
     def listed_names(self) -> tuple[str, ...]:

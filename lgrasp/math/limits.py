@@ -8,3 +8,5 @@ MAX_DOFS = 8
 """Most actuated joints in one dependency group."""
 MAX_GROUPS = 6
 """Most dependency groups of a hand."""
+DOF_SIZES = (4, MAX_DOFS)
+"""Most actuated joints of a group that a kernel may be compiled for."""

@@ -12,7 +12,7 @@ from lgrasp.grasp.structs import Candidates, Sets, State
 from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column
-from lgrasp.math.limits import MAX_DOFS, MAX_JOINTS
+from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
 from lgrasp.math.qp import solving
 from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object
@@ -173,7 +173,7 @@ def _realising(size: int) -> Any:
     return realise_contacts
 
 
-realise_contacts = {size: _realising(size) for size in (4, MAX_DOFS)}
+realise_contacts = {size: _realising(size) for size in DOF_SIZES}
 """Kernels by the most dofs of a group."""
 
 

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import warp as wp
 
 from lgrasp.grasp.tables import CandidateTable, ContactSets
@@ -64,8 +63,7 @@ def _realise(table: CandidateTable, wanted: wp.array, params: IkParams, context:
     values = make_struct(IkValues, params, bounds, cosine=cosine, allowed_penetration=allowed)
     outputs = [table.struct, tally.device]
     asked = [hand, field, obj, held, values, wanted]
-    sizes = np.diff(context.hand.model.tree.dof_first)
-    kernel = realise_contacts[next(size for size in realise_contacts if size >= sizes.max())]
+    kernel = realise_contacts[context.hand.model.tree.dof_size]
     wp.launch(kernel, table.surface.shape, asked, outputs, device=context.device)
     if context.space:
         wp.launch(avoid_held, table.surface.shape, [hand, held, values], outputs, device=context.device)

@@ -1,6 +1,7 @@
 """Kernels of the wrap stage: further links of a finger are laid on the object, its first contact slides."""
 
 from enum import IntEnum
+from typing import Any
 
 import warp as wp
 
@@ -11,8 +12,8 @@ from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.grasp.structs import FURTHER, Candidates, State
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
-from lgrasp.math.limits import MAX_DOFS, MAX_JOINTS
-from lgrasp.math.qp import mat8, solve_spd
+from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
+from lgrasp.math.qp import solving
 from lgrasp.math.sdf import sdf_gradient, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -35,14 +36,6 @@ class WrapCount(IntEnum):
 
     TRIED = 0
     WRAPPED = 1
-
-
-@wp.struct
-class StepRows:
-    """Normal equations of a least-squares step."""
-
-    A: mat8
-    b: vec_dof
 
 
 @wp.func
@@ -89,84 +82,6 @@ def next_link(
 
 
 @wp.func
-def add_rows(
-    hand: Hand,
-    g: wp.int32,
-    params: WrapValues,
-    pose: wp.transform,
-    X: wp.array(dtype=wp.transform),
-    body: wp.int32,
-    touch: LinkTouch,
-    asked: wp.bool,
-    still: wp.int32,
-    to: StepRows,
-):
-    """The normal equations and the rows of one link: its distance, and its normal where it is asked to touch."""
-    aim = _OFF - touch.gap
-    weight = float(0.0)
-    if asked:
-        aim = -(touch.gap + params.contact_indentation)
-        weight = params.normal_weight * params.normal_weight
-    if not asked and aim < 0.0:
-        return to
-    aim = wp.clamp(aim, -_FARTHEST_STEP, _FARTHEST_STEP)
-    j0 = hand.kin.joint_first[g]
-    dofs = hand.kin.dof_free[g]
-    p = wp.transform_point(X[body], touch.local)
-    across = wp.transform_vector(pose, touch.normal)
-    f = wp.transform_vector(X[body], touch.out)
-    turn = -(f + across) * _LEVER
-    J = vec_dof()
-    R = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
-    j = body
-    while j >= 0:
-        d = hand.kin.joint_dof[j0 + j]
-        moved = point_column(hand.kin, j0 + j, X[j], p)
-        J[d] = J[d] + wp.dot(moved, across)
-        R[d] = R[d] + point_column(hand.kin, j0 + j, X[j], p + f * _LEVER) - moved
-        j = hand.kin.joint_parent[j0 + j]
-    for a in range(dofs):
-        if ((still >> a) & 1) == 1:
-            J[a] = 0.0
-            R[a] = wp.vec3(0.0)
-    for a in range(dofs):
-        to.b[a] = to.b[a] + J[a] * aim + weight * wp.dot(R[a], turn)
-        for k in range(a + 1):
-            to.A[a, k] = to.A[a, k] + J[a] * J[k] + weight * wp.dot(R[a], R[k])
-    return to
-
-
-@wp.func
-def bounded_step(hand: Hand, g: wp.int32, q: vec_dof, params: WrapValues, rows: StepRows):
-    """q after the damped least-squares step of the joints that it does not press against a limit."""
-    first = hand.kin.dof_first[g]
-    dofs = hand.kin.dof_free[g]
-    M = rows.A
-    r = rows.b
-    for a in range(dofs):
-        M[a, a] = M[a, a] + params.damping
-    step = solve_spd(M, r, dofs, 0.0, 1.0e-12)
-    stuck = int(0)
-    for a in range(dofs):
-        low = hand.kin.dof_lower[first + a]
-        high = hand.kin.dof_upper[first + a]
-        if (q[a] <= low + _AT_LIMIT and step[a] < 0.0) or (q[a] >= high - _AT_LIMIT and step[a] > 0.0):
-            stuck += 1
-            r[a] = 0.0
-            for k in range(dofs):
-                if k < a:
-                    M[a, k] = 0.0
-                if k > a:
-                    M[k, a] = 0.0
-    if stuck > 0:
-        step = solve_spd(M, r, dofs, 0.0, 1.0e-12)
-    moved = q
-    for a in range(dofs):
-        moved[a] = moved[a] + wp.clamp(step[a], -params.step, params.step)
-    return clamp_dofs(hand.kin, g, moved)
-
-
-@wp.func
 def clear_of_all(
     hand: Hand,
     obj: Object,
@@ -191,137 +106,225 @@ def clear_of_all(
     return True
 
 
-@wp.func
-def ask_link(
-    hand: Hand,
-    obj: Object,
-    runs: PalmarRuns,
-    params: WrapValues,
-    g: wp.int32,
-    pose: wp.transform,
-    still: wp.int32,
-    start: vec_dof,
-    touch: wp.array(dtype=LinkTouch),
-    task: wp.array(dtype=wp.int32),
-    n: wp.int32,
-):
-    """Whether the links that are asked to touch all do after a few steps from a posture, and that posture."""
-    q = start
-    j0 = hand.kin.joint_first[g]
-    T_object = wp.transform_inverse(pose)
-    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    for it in range(params.iterations + 1):
-        group_forward(hand.kin, g, q, X, 0)
-        missing = int(0)
-        rows = StepRows()
-        for i in range(n):
-            body = runs.body[touch[i].run] - 1 - j0
-            touch[i] = nearest_touch(hand, obj, runs, T_object * X[body], touch[i], 2)
-            if task[i] == _ASKED and not fits(hand, runs, params, T_object * X[body], touch[i]):
-                missing += 1
-            rows = add_rows(hand, g, params, pose, X, body, touch[i], task[i] == _ASKED, still, rows)
-        if missing == 0:
-            return True, q
-        if it < params.iterations:
-            q = bounded_step(hand, g, q, params, rows)
-    return False, q
+def _wrapping(size: int) -> Any:
+    """The kernel for groups of at most ``size`` dofs: what is known to the compiler stays in registers."""
+    square, column, solve = wp.types.matrix((size, size), wp.float32), wp.types.vector(size, wp.float32), solving(size)
 
+    @wp.func
+    def add_rows(
+        hand: Hand,
+        g: wp.int32,
+        params: WrapValues,
+        pose: wp.transform,
+        X: wp.array(dtype=wp.transform),
+        body: wp.int32,
+        touch: LinkTouch,
+        asked: wp.bool,
+        still: wp.int32,
+        A: square,
+        b: column,
+    ):
+        """The normal equations and the rows of one link: its distance, and its normal where it is asked to touch."""
+        aim = _OFF - touch.gap
+        weight = float(0.0)
+        if asked:
+            aim = -(touch.gap + params.contact_indentation)
+            weight = params.normal_weight * params.normal_weight
+        if not asked and aim < 0.0:
+            return A, b
+        aim = wp.clamp(aim, -_FARTHEST_STEP, _FARTHEST_STEP)
+        j0 = hand.kin.joint_first[g]
+        dofs = hand.kin.dof_free[g]
+        p = wp.transform_point(X[body], touch.local)
+        across = wp.transform_vector(pose, touch.normal)
+        f = wp.transform_vector(X[body], touch.out)
+        turn = -(f + across) * _LEVER
+        J = column()
+        R = wp.zeros(shape=(size,), dtype=wp.vec3)
+        j = body
+        while j >= 0:
+            d = hand.kin.joint_dof[j0 + j]
+            moved = point_column(hand.kin, j0 + j, X[j], p)
+            J[d] = J[d] + wp.dot(moved, across)
+            R[d] = R[d] + point_column(hand.kin, j0 + j, X[j], p + f * _LEVER) - moved
+            j = hand.kin.joint_parent[j0 + j]
+        for a in range(size):
+            if a >= dofs or ((still >> a) & 1) == 1:
+                J[a] = 0.0
+                R[a] = wp.vec3(0.0)
+            b[a] = b[a] + J[a] * aim + weight * wp.dot(R[a], turn)
+            for k in range(a + 1):
+                A[a, k] = A[a, k] + J[a] * J[k] + weight * wp.dot(R[a], R[k])
+        return A, b
 
-@wp.kernel
-def wrap_fingers(
-    hand: Hand,
-    field: Field,
-    obj: Object,
-    held: Held,
-    runs: PalmarRuns,
-    params: WrapValues,
-    candidates_out: Candidates,
-    counts_out: wp.array(dtype=wp.int32),
-):
-    """Postures of realised candidates in which further links of the finger touch; others stay as they are.
+    @wp.func
+    def bounded_step(hand: Hand, g: wp.int32, q: vec_dof, params: WrapValues, A: square, b: column):
+        """q after the damped least-squares step of the joints that it does not press against a limit."""
+        first = hand.kin.dof_first[g]
+        dofs = hand.kin.dof_free[g]
+        M = A
+        r = b
+        for a in range(size):
+            M[a, a] = M[a, a] + params.damping
+        step = solve(M, r, size, 0.0, 1.0e-12)
+        stuck = int(0)
+        for a in range(dofs):
+            low = hand.kin.dof_lower[first + a]
+            high = hand.kin.dof_upper[first + a]
+            if (q[a] <= low + _AT_LIMIT and step[a] < 0.0) or (q[a] >= high - _AT_LIMIT and step[a] > 0.0):
+                stuck += 1
+                r[a] = 0.0
+                for k in range(size):
+                    if k < a:
+                        M[a, k] = 0.0
+                    if k > a:
+                        M[k, a] = 0.0
+        if stuck > 0:
+            step = solve(M, r, size, 0.0, 1.0e-12)
+        moved = q
+        for a in range(dofs):
+            moved[a] = moved[a] + wp.clamp(step[a], -params.step, params.step)
+        return clamp_dofs(hand.kin, g, moved)
 
-    Link after link is asked to touch, the nearest first, with steps dq := argmin sum_l (n_l . J_l dq + g_l +
-    indentation)^2 + w^2 |normals|^2 + damping |dq|^2 over those asked; g_l is the distance of link and object, n_l the
-    object's normal there. Contacts, the first one too, are free to slide; other links are pushed off the object.
-    ``surface`` and ``q`` of a candidate follow its first contact, ``further`` are the others. Candidates whose finger
-    is not clear in either posture are blocked.
-
-    Args:
-        runs: points of links that may touch.
-        counts_out: WrapCount, (2,).
-    """
-    row, g, m = wp.tid()
-    if m >= candidates_out.count[row, g]:
-        return
-    candidates_out.further[row, g, m] = wp.vec2i(-1, -1)
-    if candidates_out.state[row, g, m] != State.REALISED:
-        return
-    wp.atomic_add(counts_out, WrapCount.TRIED, 1)
-    pose = candidates_out.poses.pose[row]
-    resting = candidates_out.poses.resting[row]
-    T_object = wp.transform_inverse(pose)
-    h = candidates_out.poses.index[row] // held.tries
-    own = hand.contacts.link[field.point[candidates_out.record[row, g, m]]]
-    j0 = hand.kin.joint_first[g]
-    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    touch = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
-    found = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
-    task = wp.zeros(shape=(_LINKS,), dtype=wp.int32)
-    posture = candidates_out.q[row, g, m]
-    group_forward(hand.kin, g, posture, X, 0)
-    n = int(0)
-    first = int(-1)
-    for r in range(runs.body.shape[0]):
-        body = runs.body[r]
-        if hand.body_group[body] == g and runs.grid[r] >= 0 and n < _LINKS:
-            near = nearest_probe(hand, obj, runs, params, r, T_object * X[body - 1 - j0])
-            if near.run >= 0:
-                touch[n] = near
-                task[n] = _WAITING
-                if runs.link[r] == own:
-                    first = n
-                    task[n] = _ASKED
-                n += 1
-    made = int(0)
-    for _round in range(wp.where(first < 0, 0, params.rounds)):
-        group_forward(hand.kin, g, posture, X, 0)
-        for i in range(n):
-            T = T_object * X[runs.body[touch[i].run] - 1 - j0]
-            touch[i] = nearest_touch(hand, obj, runs, T, touch[i], _SLIDES)
-        added = next_link(runs, params, touch, task, n)
-        if added < 0:
-            break
-        task[added] = _ASKED
-        done, q = ask_link(hand, obj, runs, params, g, pose, held.frozen[h, g], posture, touch, task, n)
-        if done:
-            posture = q
-            made += 1
+    @wp.func
+    def ask_link(
+        hand: Hand,
+        obj: Object,
+        runs: PalmarRuns,
+        params: WrapValues,
+        g: wp.int32,
+        pose: wp.transform,
+        still: wp.int32,
+        start: vec_dof,
+        touch: wp.array(dtype=LinkTouch),
+        task: wp.array(dtype=wp.int32),
+        n: wp.int32,
+    ):
+        """Whether the links that are asked to touch all do after a few steps from a posture, and that posture."""
+        q = start
+        j0 = hand.kin.joint_first[g]
+        T_object = wp.transform_inverse(pose)
+        X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+        for it in range(params.iterations + 1):
+            group_forward(hand.kin, g, q, X, 0)
+            missing = int(0)
+            A = square()
+            b = column()
             for i in range(n):
-                found[i] = touch[i]
-        else:
-            task[added] = _FAILED
-    group_forward(hand.kin, g, posture, X, 0)
-    clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
-    if made > 0 and clear:
-        surface = int(-1)
-        further = wp.vec2i(-1, -1)
-        more = int(0)
-        for i in range(n):
-            if task[i] == _ASKED and (i == first or more < FURTHER):
-                at = contact_beside(hand, obj, runs, params, T_object * X[runs.body[found[i].run] - 1 - j0], found[i])
-                if i == first:
-                    surface = at
-                elif at >= 0:
-                    further[more] = at
-                    more += 1
-        if surface >= 0 and more > 0:
-            candidates_out.q[row, g, m] = posture
-            candidates_out.surface[row, g, m] = surface
-            candidates_out.further[row, g, m] = further
-            wp.atomic_add(counts_out, WrapCount.WRAPPED, 1)
+                body = runs.body[touch[i].run] - 1 - j0
+                touch[i] = nearest_touch(hand, obj, runs, T_object * X[body], touch[i], 2)
+                if task[i] == _ASKED and not fits(hand, runs, params, T_object * X[body], touch[i]):
+                    missing += 1
+                A, b = add_rows(hand, g, params, pose, X, body, touch[i], task[i] == _ASKED, still, A, b)
+            if missing == 0:
+                return True, q
+            if it < params.iterations:
+                q = bounded_step(hand, g, q, params, A, b)
+        return False, q
+
+    @wp.kernel
+    def wrap_fingers(
+        hand: Hand,
+        field: Field,
+        obj: Object,
+        held: Held,
+        runs: PalmarRuns,
+        params: WrapValues,
+        candidates_out: Candidates,
+        counts_out: wp.array(dtype=wp.int32),
+    ):
+        """Postures of realised candidates in which further links of the finger touch; others stay as they are.
+
+        Link after link is asked to touch, the nearest first, with steps dq := argmin sum_l (n_l . J_l dq + g_l +
+        indentation)^2 + w^2 |normals|^2 + damping |dq|^2 over those asked; g_l is the distance of link and object, n_l
+        the object's normal there. Contacts, the first one too, are free to slide; other links are pushed off the
+        object. ``surface`` and ``q`` of a candidate follow its first contact, ``further`` are the others. Candidates
+        whose finger is not clear in either posture are blocked.
+
+        Args:
+            runs: points of links that may touch.
+            counts_out: WrapCount, (2,).
+        """
+        row, g, m = wp.tid()
+        if m >= candidates_out.count[row, g]:
             return
-    if made > 0:
-        group_forward(hand.kin, g, candidates_out.q[row, g, m], X, 0)
+        candidates_out.further[row, g, m] = wp.vec2i(-1, -1)
+        if candidates_out.state[row, g, m] != State.REALISED:
+            return
+        wp.atomic_add(counts_out, WrapCount.TRIED, 1)
+        pose = candidates_out.poses.pose[row]
+        resting = candidates_out.poses.resting[row]
+        T_object = wp.transform_inverse(pose)
+        h = candidates_out.poses.index[row] // held.tries
+        own = hand.contacts.link[field.point[candidates_out.record[row, g, m]]]
+        j0 = hand.kin.joint_first[g]
+        X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+        touch = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
+        found = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
+        task = wp.zeros(shape=(_LINKS,), dtype=wp.int32)
+        posture = candidates_out.q[row, g, m]
+        group_forward(hand.kin, g, posture, X, 0)
+        n = int(0)
+        first = int(-1)
+        for r in range(runs.body.shape[0]):
+            body = runs.body[r]
+            if hand.body_group[body] == g and runs.grid[r] >= 0 and n < _LINKS:
+                near = nearest_probe(hand, obj, runs, params, r, T_object * X[body - 1 - j0])
+                if near.run >= 0:
+                    touch[n] = near
+                    task[n] = _WAITING
+                    if runs.link[r] == own:
+                        first = n
+                        task[n] = _ASKED
+                    n += 1
+        made = int(0)
+        for _round in range(wp.where(first < 0, 0, params.rounds)):
+            group_forward(hand.kin, g, posture, X, 0)
+            for i in range(n):
+                T = T_object * X[runs.body[touch[i].run] - 1 - j0]
+                touch[i] = nearest_touch(hand, obj, runs, T, touch[i], _SLIDES)
+            added = next_link(runs, params, touch, task, n)
+            if added < 0:
+                break
+            task[added] = _ASKED
+            done, q = ask_link(hand, obj, runs, params, g, pose, held.frozen[h, g], posture, touch, task, n)
+            if done:
+                posture = q
+                made += 1
+                for i in range(n):
+                    found[i] = touch[i]
+            else:
+                task[added] = _FAILED
+        group_forward(hand.kin, g, posture, X, 0)
         clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
-    if not clear:
-        candidates_out.state[row, g, m] = State.BLOCKED
+        if made > 0 and clear:
+            surface = int(-1)
+            further = wp.vec2i(-1, -1)
+            more = int(0)
+            for i in range(n):
+                if task[i] == _ASKED and (i == first or more < FURTHER):
+                    at = contact_beside(
+                        hand, obj, runs, params, T_object * X[runs.body[found[i].run] - 1 - j0], found[i]
+                    )
+                    if i == first:
+                        surface = at
+                    elif at >= 0:
+                        further[more] = at
+                        more += 1
+            if surface >= 0 and more > 0:
+                candidates_out.q[row, g, m] = posture
+                candidates_out.surface[row, g, m] = surface
+                candidates_out.further[row, g, m] = further
+                wp.atomic_add(counts_out, WrapCount.WRAPPED, 1)
+                return
+        if made > 0:
+            group_forward(hand.kin, g, candidates_out.q[row, g, m], X, 0)
+            clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
+        if not clear:
+            candidates_out.state[row, g, m] = State.BLOCKED
+
+    return wrap_fingers
+
+
+wrap_fingers = {size: _wrapping(size) for size in DOF_SIZES}
+"""Kernels by the most dofs of a group."""

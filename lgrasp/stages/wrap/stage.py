@@ -36,7 +36,8 @@ def run(inputs: CandidateTable, params: WrapParams, context: Context) -> tuple[C
     cosine = math.cos(math.radians(context.bounds.max_normal_angle - _NORMAL_MARGIN))
     values = make_struct(WrapValues, params, context.bounds, cosine=cosine)
     asked = [context.hand.struct, context.field.struct, context.object.struct, context.held.struct, _probes(context)]
-    wp.launch(wrap_fingers, inputs.surface.shape, [*asked, values], [table.struct, tally.device], device=d)
+    kernel = wrap_fingers[context.hand.model.tree.dof_size]
+    wp.launch(kernel, inputs.surface.shape, [*asked, values], [table.struct, tally.device], device=d)
     return table, tally
 
 
