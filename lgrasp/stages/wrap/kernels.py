@@ -106,6 +106,26 @@ def clear_of_all(
     return True
 
 
+@wp.kernel
+def list_realised(
+    candidates_out: Candidates, listed_out: wp.array(dtype=wp.int32), counts_out: wp.array(dtype=wp.int32)
+):
+    """Realised candidates side by side, in any order; none of the candidates has further contacts yet.
+
+    Args:
+        listed_out: flat indices of (P, G, M), (P * G * M,).
+        counts_out: WrapCount, (2,).
+    """
+    row, g, m = wp.tid()
+    if m >= candidates_out.count[row, g]:
+        return
+    candidates_out.further[row, g, m] = wp.vec2i(-1, -1)
+    if candidates_out.state[row, g, m] == State.REALISED:
+        i = wp.atomic_add(counts_out, int(WrapCount.TRIED), 1)
+        shape = candidates_out.state.shape
+        listed_out[i] = (row * shape[1] + g) * shape[2] + m
+
+
 def _wrapping(size: int) -> Any:
     """The kernel for groups of at most ``size`` dofs: what is known to the compiler stays in registers."""
     square, column, solve = wp.types.matrix((size, size), wp.float32), wp.types.vector(size, wp.float32), solving(size)
@@ -230,6 +250,7 @@ def _wrapping(size: int) -> Any:
         held: Held,
         runs: PalmarRuns,
         params: WrapValues,
+        listed: wp.array(dtype=wp.int32),
         candidates_out: Candidates,
         counts_out: wp.array(dtype=wp.int32),
     ):
@@ -243,15 +264,16 @@ def _wrapping(size: int) -> Any:
 
         Args:
             runs: points of links that may touch.
+            listed: the realised candidates, (P * G * M,); WrapCount.TRIED of them are there.
             counts_out: WrapCount, (2,).
         """
-        row, g, m = wp.tid()
-        if m >= candidates_out.count[row, g]:
+        i = wp.tid()
+        if i >= counts_out[int(WrapCount.TRIED)]:
             return
-        candidates_out.further[row, g, m] = wp.vec2i(-1, -1)
-        if candidates_out.state[row, g, m] != State.REALISED:
-            return
-        wp.atomic_add(counts_out, WrapCount.TRIED, 1)
+        slots = candidates_out.state.shape[2]
+        row = listed[i] // (candidates_out.state.shape[1] * slots)
+        g = (listed[i] // slots) % candidates_out.state.shape[1]
+        m = listed[i] % slots
         pose = candidates_out.poses.pose[row]
         resting = candidates_out.poses.resting[row]
         T_object = wp.transform_inverse(pose)

@@ -14,7 +14,7 @@ from lgrasp.refine.surface import farthest_points
 from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.wrap.kernels import WrapCount, wrap_fingers
+from lgrasp.stages.wrap.kernels import WrapCount, list_realised, wrap_fingers
 from lgrasp.stages.wrap.params import WrapParams
 from lgrasp.stages.wrap.touch import WrapValues
 
@@ -36,8 +36,10 @@ def run(inputs: CandidateTable, params: WrapParams, context: Context) -> tuple[C
     cosine = math.cos(math.radians(context.bounds.max_normal_angle - _NORMAL_MARGIN))
     values = make_struct(WrapValues, params, context.bounds, cosine=cosine)
     asked = [context.hand.struct, context.field.struct, context.object.struct, context.held.struct, _probes(context)]
+    shape, listed = inputs.surface.shape, wp.empty(inputs.surface.size, dtype=wp.int32, device=d)
+    wp.launch(list_realised, shape, [table.struct], [listed, tally.device], device=d)
     kernel = wrap_fingers[context.hand.model.tree.dof_size]
-    wp.launch(kernel, inputs.surface.shape, [*asked, values], [table.struct, tally.device], device=d)
+    wp.launch(kernel, listed.shape, [*asked, values, listed], [table.struct, tally.device], device=d)
     return table, tally
 
 
