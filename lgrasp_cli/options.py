@@ -38,6 +38,9 @@ Settings = Annotated[
         help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.",
     ),
 ]
+Viewpoint = Annotated[
+    str | None, Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")
+]
 DryRun = Annotated[bool, Option("--dry-run", help="Show what would be computed without computing it.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print no progress and no report, only warnings and errors.")]
 
@@ -112,6 +115,23 @@ def old_name(command: Callable[..., None], old: str, new: str) -> Callable[..., 
         command(**options)
 
     return with_options(run, command)
+
+
+def position(text: str | None) -> list[float] | None:
+    """The numbers of a :data:`Viewpoint`.
+
+    Raises:
+        ConfigError: not three numbers.
+    """
+    from lgrasp.errors import ConfigError
+
+    try:
+        numbers = [float(part) for part in text.split(",")] if text is not None else None
+    except ValueError:
+        numbers = []
+    if numbers is not None and len(numbers) != 3:
+        raise ConfigError(f"--viewpoint '{text}': three numbers separated by commas, such as 0,0,0.7")
+    return numbers
 
 
 def choose_pipeline(

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from lgrasp_cli.names import HAND_OR_SHARD, NETWORK, OBJECT_OR_SHARD
-from lgrasp_cli.options import Scale, Settings
+from lgrasp_cli.options import Scale, Settings, Viewpoint, position
 from lgrasp_cli.tables import Block, closed, following, place, took
 from lgrasp_cli.working import How, working
 
@@ -20,9 +20,7 @@ def plan(
     cloud: Annotated[Path | None, Option(help="Point cloud or scene (.ply .xyz .npy .npz .h5).")] = None,
     mask: Annotated[Path | None, Option(help="Labels of the cloud's points (.npy, .npz).")] = None,
     label: Annotated[int | None, Option(help="Label of the points to grasp.")] = None,
-    viewpoint: Annotated[
-        str | None, Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")
-    ] = None,
+    viewpoint: Viewpoint = None,
     scale: Scale = 1.0,
     hand: Annotated[
         str,
@@ -54,7 +52,7 @@ def plan(
 
     what = {"hand": hand, "object": mesh, "scale": scale, "cloud": cloud, "mask": mask, "label": label, "out": out}
     what |= {
-        "viewpoint": _numbers(viewpoint),
+        "viewpoint": position(viewpoint),
         "starts": starts,
         "model": model,
         "stand_off": stand_off,
@@ -62,18 +60,6 @@ def plan(
     }
     params = plan_params(settings or (), distal=distal, other=other)
     how.run(how.job(PlanRequest, "plan", **what, params=params), _show)
-
-
-def _numbers(text: str | None) -> list[float] | None:
-    from lgrasp.errors import ConfigError
-
-    try:
-        numbers = [float(part) for part in text.split(",")] if text is not None else None
-    except ValueError:
-        numbers = []
-    if numbers is not None and len(numbers) != 3:
-        raise ConfigError(f"--viewpoint '{text}': three numbers separated by commas, such as 0,0,0.7")
-    return numbers
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

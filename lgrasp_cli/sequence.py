@@ -1,5 +1,6 @@
 """``lgrasp sequence`` and ``lgrasp sample``: several objects in one hand, one after another."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -7,7 +8,7 @@ from typer import Argument, Option
 
 from lgrasp.choices import Method, Policy, ProtocolName
 from lgrasp_cli.names import NETWORK, OBJECT, PIPELINE, one_of
-from lgrasp_cli.options import Hand, Seed, Settings, choose_pipeline, given
+from lgrasp_cli.options import Hand, Seed, Settings, Viewpoint, choose_pipeline, given, position
 from lgrasp_cli.tables import Block, TextTable, counted, following, held, place, share, took
 from lgrasp_cli.working import How, working
 
@@ -65,8 +66,16 @@ def sample(
     model: Annotated[
         str, Argument(help="File of lgrasp learn fit --model diffuser, or a name of learn list.", **NETWORK)
     ],
-    objects: Objects,
     how: How,
+    objects: Annotated[
+        list[str] | None, Argument(help="Mesh files or names of objects, in the order of grasping.", **OBJECT)
+    ] = None,
+    cloud: Annotated[
+        list[Path] | None, Option(help="Point cloud in place of an object, unseen sides guessed; repeatable.")
+    ] = None,
+    mask: Annotated[list[Path] | None, Option(help="Labels of each cloud's points.")] = None,
+    label: Annotated[list[int] | None, Option(help="Label to grasp of each cloud.")] = None,
+    viewpoint: Viewpoint = None,
     hand: Hand = "allegro",
     rows: Rows = 256,
     policy: PolicyName = None,
@@ -82,13 +91,16 @@ def sample(
 
     What is drawn is moved onto the surfaces and checked; only rows that are strictly valid are written.
 
-    Example: lgrasp sample diffuser.pt mug sphere -n 256 --scale 0.06:0.10
+    Example: lgrasp sample seq-allegro --cloud mug.npz --cloud ball.ply -n 16
     """
+    from lgrasp.cloud.suffixes import cloud_names
     from lgrasp.jobs.requests.search import SampleRequest
 
     chosen = _chosen(pipeline, seed, settings, policy=policy)
-    what = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen, "model": model}
-    what |= {"out": out or _folder(hand, objects, chosen, simulate), "scale": scale, "simulate": simulate}
+    names = objects or cloud_names(cloud or (), label or ())
+    what = {"hand": hand, "objects": objects, "rows": rows, "pipeline": chosen, "model": model, "scale": scale}
+    what |= {"clouds": cloud, "masks": mask, "labels": label, "viewpoint": position(viewpoint)}
+    what |= {"out": out or _folder(hand, names, chosen, simulate), "simulate": simulate}
     how.run(how.job(SampleRequest, "sample", shard_rows=shard_rows, **what), _show, _profile)
 
 
@@ -100,7 +112,7 @@ def _chosen(name: str, seed: int | None, settings: list[str] | None, **changes: 
     return chosen.with_params("sequence", **given(**changes))
 
 
-def _folder(hand: str, objects: list[str], pipeline: "Pipeline", simulate: str | None) -> Path:
+def _folder(hand: str, objects: Sequence[str], pipeline: "Pipeline", simulate: str | None) -> Path:
     """Where the shards go unless it is said."""
     from lgrasp.engine.folder import run_folder
     from lgrasp.jobs.config import hand_name

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,6 +10,9 @@ from scipy.spatial import cKDTree
 from lgrasp.errors import ObjectError
 from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.object.model import ObjectModel
+from lgrasp.object.params import ObjectParams
+from lgrasp.object.sdf import SdfGrid
+from lgrasp.object.surface import opposite_points, probe_fits
 
 TRUST = 0.02
 """Behind what was seen, the sign of distances is known to this depth [m]; what lies deeper counts as neither."""
@@ -25,6 +29,7 @@ _MOST_NODES, _LEAST_CELL = 250_000, 0.0015
 _CONTACTS = 4096
 _TRUSTED, _GUESSED = 0.003, 0.009  # [m] from what was seen: its distances hold; they are guessed
 _COARSE = 0.005  # [m]
+_FOLD_POINTS, _SMOOTH = 6, 0.85  # points whose normals tell a fold; their least cosine where there is none
 
 
 def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud", centred: bool = True) -> ObjectModel:
@@ -133,6 +138,38 @@ def completed_object(seen: ObjectModel, distance: Callable[[np.ndarray], np.ndar
     digest = hashlib.sha256(made[0].tobytes()).hexdigest()
     normals = np.concatenate([normals, slope])
     return _model(seen.name, digest, seen.center.astype(float), points[order], normals[order], made, com, note)
+
+
+def searched_object(whole: ObjectModel, params: ObjectParams, device: str = "cpu") -> ObjectModel:
+    """The model of a whole object as pipelines search it: about the middle of its box, contact points away from hollows
+    and folds, in order, and what is opposite to each.
+
+    Args:
+        whole: what :func:`completed_object` gave. params: of contact points.
+        device: answers the geometric queries.
+    """
+    points, kept = np.unique(whole.obstacle_points, axis=0, return_index=True)
+    points, normals = points.astype(float), whole.obstacle_normals[kept].astype(float)
+    sdf, middle = SdfGrid(whole.sdf, whole.sdf_origin, whole.sdf_cell), 0.5 * (points.min(0) + points.max(0))
+    fits = probe_fits(sdf, points, normals, params.probe_radius, params.probe_tolerance)
+    near = cKDTree(points).query(points, min(_FOLD_POINTS, len(points)), workers=-1)[1]
+    cosine = np.einsum("nki,ni->nk", normals[near], normals).min(1)
+    for chosen in (fits & (cosine > _SMOOTH), fits, np.ones_like(fits)):
+        if chosen.sum() >= params.min_contact_fraction * len(points):
+            break
+    touched = np.flatnonzero(chosen)
+    touched = np.random.default_rng(params.seed).permutation(touched)[: params.contact_count]
+    touched = touched[cluster_order(points[touched])]
+    contacts, outward = (x[touched].astype(np.float32) for x in (points - middle, normals))
+    moved = ("com", "sdf_origin", "obstacle_points", "cluster_center")
+    return replace(
+        whole,
+        **{name: (getattr(whole, name) - middle).astype(np.float32) for name in moved},
+        center=(whole.center + middle).astype(np.float32),
+        contact_points=contacts,
+        contact_normals=outward,
+        contact_opposite=opposite_points(contacts, outward, seed=params.seed, device=device),
+    )
 
 
 def _check_size(what: str, points: np.ndarray) -> None:

@@ -1,4 +1,14 @@
-"""Suffixes of the files that point clouds and masks are read from."""
+"""Files that point clouds and masks are read from: their suffixes, and what their contents are called."""
+
+from collections.abc import Sequence
+from pathlib import Path
 
 CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz", ".h5")
 MASK_SUFFIXES = (".npy", ".npz")
+
+
+def cloud_names(paths: Sequence[Path], labels: Sequence[int] = ()) -> tuple[str, ...]:
+    """What the points of clouds, or of a label of each, are called."""
+    return tuple(
+        path.stem if number >= len(labels) else f"{path.stem}-{labels[number]}" for number, path in enumerate(paths)
+    )

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from lgrasp.cloud.model import TRUST, cloud_object, sdf_object
+from lgrasp.cloud.model import TRUST, cloud_object, sdf_object, searched_object
 from lgrasp.errors import ObjectError
+from lgrasp.object.params import ObjectParams
 from lgrasp.object.sdf import SdfGrid, sample_sdf
 from lgrasp.planning.params import PlanParams
 from lgrasp.planning.planner import Planner
@@ -48,6 +49,24 @@ def test_noise_averages_out():
     off = np.linalg.norm(model.contact_points + model.center, axis=1) - RADIUS
     assert np.median(np.abs(off)) < 0.35 * noise
     assert (model.contact_normals * (model.contact_points + model.center)).sum(1).min() > 0
+
+
+def test_pipelines_search_whole_clouds_about_their_middle():
+    """A ball of which the internal frame was elsewhere: the same places, contacts all around, with their opposites."""
+    n = sphere()
+    points = RADIUS * n + 0.02
+    seen = cloud_object(points, n, centred=False)
+    model = searched_object(seen, ObjectParams())
+    np.testing.assert_allclose(model.center, 0.02, atol=2e-3)
+    np.testing.assert_allclose(distance(model, points[::50]), distance(seen, points[::50]), atol=1e-6)
+    contacts = model.contact_points
+    np.testing.assert_allclose(np.linalg.norm(contacts, axis=1), RADIUS, atol=2e-3)
+    assert (np.abs(contacts.mean(0)) < 0.1 * RADIUS).all()
+    there = model.contact_opposite >= 0
+    assert there.mean() > 0.95
+    facing = (model.contact_normals[there] * model.contact_normals[model.contact_opposite[there]]).sum(1)
+    assert facing.max() < -0.4
+    assert np.linalg.norm(model.cluster_center, axis=1).max() < 1.1 * RADIUS
 
 
 def test_the_same_points_give_the_same_object():

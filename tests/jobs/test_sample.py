@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.distance import cdist
 from support.sequences import OBJECTS, small_inputs, small_pipeline
 
 from lgrasp.dataset.reader import ShardReader, read_shard
@@ -23,6 +24,7 @@ from lgrasp.jobs.sequence.round import run_round
 from lgrasp.jobs.sequence.sample import SampleJob
 from lgrasp.learn.diffuser.file import load_diffuser
 from lgrasp.learn.diffuser.params import DiffuserParams
+from lgrasp.object.surface import face_normals, sample_surface
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.tally import Meter
@@ -190,6 +192,40 @@ def test_few_are_the_first_of_many(asked, network, tmp_path):
     assert len(two) == 2
     np.testing.assert_array_equal(few.q[two], many.q[seven[:2]])
     np.testing.assert_array_equal(few.object_pose[two], many.object_pose[seven[:2]])
+
+
+@pytest.fixture
+def clouds(inputs, tmp_path):
+    """Points all over the two objects, one cloud in the file's own frame."""
+    found = []
+    for obj, name, shift in zip(inputs.objects, OBJECTS, (0.0, 0.2), strict=True):
+        normals, _ = face_normals(obj.model.vertices, obj.model.faces)
+        points, face = sample_surface(obj.model.vertices, obj.model.faces, 3000, seed=0)
+        found.append(tmp_path / f"{name}.npz")
+        np.savez(found[-1], points=points + shift, normals=normals[face])
+    return tuple(found)
+
+
+def test_objects_may_be_known_as_clouds(asked, network, clouds, tmp_path):
+    """Shards have the points as they were given; contacts are on them."""
+    pipeline = small_pipeline("sample", width=12, wave=8, waves=6, draws=4)
+    given = {name: value for name, value in asked.items() if name not in ("objects", "scale")}
+    job = SampleJob(**given, clouds=clouds, rows=2, pipeline=pipeline, model=str(network), out=tmp_path / "out")
+    (path,) = run(job).paths
+    assert path.name == f"allegro-{'-'.join(OBJECTS)}-00000.h5"
+    assert validate_shard(path) == []
+    shard = read_shard(path)
+    rows = shard.grasps
+    assert (rows.object_index[:, 1] >= 0).sum() == 2
+    for number, record in enumerate(shard.objects):
+        with np.load(clouds[OBJECTS.index(record.id)]) as file:
+            np.testing.assert_allclose(record.vertices, file["points"], atol=1e-6)
+            np.testing.assert_allclose(np.asarray(record.normals), file["normals"], atol=1e-6)
+        assert not len(record.faces)
+        touched = rows.contact_points[rows.object_index == number].reshape(-1, 3)
+        touched = touched[np.isfinite(touched).all(1)]
+        assert cdist(touched, record.vertices).min(1).max() < 0.003
+    assert run(job.changed()).made == 0
 
 
 def test_networks_of_other_hands_are_refused(asked, network, tmp_path):

@@ -1,4 +1,4 @@
-"""``lgrasp plan --cloud`` on clouds that cannot be used, or only after a repair that is said."""
+"""Option ``--cloud`` on clouds that cannot be used, or only after a repair that is said."""
 
 from pathlib import Path
 
@@ -168,6 +168,30 @@ def test_a_mesh_gives_its_vertices_and_their_normals(plan, tmp_path):
     trimesh.creation.box((0.05,) * 3).export(tmp_path / "box.ply")
     assert "8 usable points" in (line := plan("--cloud", tmp_path / "box.ply", "--overwrite").error())
     assert "--object takes" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["mug", "--cloud", "a.npz"], "give objects (meshes or names) or --cloud"),
+        (["--cloud", "a.npz"], "at least two objects, got a;"),
+        (["--cloud", "a.npz", "--cloud", "no.npz"], "no.npz: does not exist"),
+        (["--cloud", "a.npz", "--cloud", "bad.npz"], "bad.npz: all 2,562 points are NaN"),
+        (["--cloud", "a.npz", "--cloud", "a.npz", "--label", 3], "1 --label for 2 --cloud: give one for each, or none"),
+        (["--cloud", "a.npz", "--cloud", "a.npz", "--label", 3, "--label", 4], "label 4 selects 0 points"),
+        (["--cloud", "a.npz", "--cloud", "a.npz", "--scale", "0.06:0.1"], "clouds have the size that they have"),
+        (["--cloud", "a.npz", "--cloud", "a.npz", "--simulate", "seq6"], "a simulator needs meshes"),
+        (["--cloud", "a.npz", "--cloud", "a.npz", "--viewpoint", "0,0"], "three numbers separated by commas"),
+        (["mug", "sphere", "--viewpoint", "0,0,0"], "--viewpoint belongs to --cloud"),
+    ],
+    ids=lambda value: " ".join(map(str, value)) if isinstance(value, list) else "",
+)
+def test_clouds_of_sequences(cli, tmp_path, arguments, words):
+    changed(tmp_path / "a.npz", labels=np.full(COUNT, 3))
+    changed(tmp_path / "bad.npz", np.full((COUNT, 3), np.nan))
+    line = cli("sample", "seq-allegro", *arguments, "--device", "cpu", "--out", tmp_path / "out").error()
+    assert words in line
+    assert not (tmp_path / "out").exists()
 
 
 def test_scale_turns_millimetres_into_metres(plan, tmp_path):

@@ -1,7 +1,6 @@
 """The job of ``lgrasp plan``: a hand before an object or a cloud -> one shard of grasps."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -9,7 +8,7 @@ import numpy as np
 from pydantic import InstanceOf, PrivateAttr
 
 from lgrasp.cloud.model import cloud_object
-from lgrasp.cloud.read import Cloud, read_cloud
+from lgrasp.cloud.read import Cloud
 from lgrasp.dataset.info import closure_share
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
@@ -23,6 +22,7 @@ from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.surface_visibility import visible_surface
+from lgrasp.jobs.clouds import cloud_record, cloud_to_grasp
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
 from lgrasp.jobs.refine.predicted import predicted_planner
 from lgrasp.jobs.requests.plan import PlanRequest
@@ -33,7 +33,6 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.planning.params import PlanParams, cloud_params
 from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import STAND_OFF
-from lgrasp.scenes.files import scene_cloud
 
 VERSION = 2
 """Raised whenever plans change for the same parameters."""
@@ -200,14 +199,12 @@ class PlanJob(PlanRequest, Job):
 
     def _read(self, cloud: Path | Cloud) -> Cloud:
         if isinstance(cloud, Path):
-            eye = None if self.viewpoint is None else list(self.viewpoint)
-            cloud = read_cloud(cloud, self.mask, self.label, self.scale, eye, scene=False, read_scene=scene_cloud)
-            for note in cloud.notes:
-                self.cache.warn(note)
+            cloud = cloud_to_grasp(self.cache, cloud, self.mask, self.label, self.scale, self.viewpoint)
         return cloud
 
     def _record(self) -> ObjectRecord:
-        return _record(self._models()[2], self._cloud)
+        record = object_record(self._models()[2])
+        return record if self._cloud is None else cloud_record(record, self._cloud)
 
 
 def lost_starts(counts: dict[str, int]) -> str:
@@ -217,15 +214,6 @@ def lost_starts(counts: dict[str, int]) -> str:
 
 def _statistic(name: str) -> str:
     return f"plan_{name.replace(' ', '_').replace('-', '_')}"
-
-
-def _record(model: ObjectModel, cloud: Cloud | None) -> ObjectRecord:
-    record = object_record(model)
-    if cloud is None:
-        return record
-    target = cloud.only(cloud.target)
-    normals = target.normals / np.linalg.norm(target.normals, axis=1, keepdims=True)
-    return replace(record, vertices=target.points, normals=normals)
 
 
 def _cloud_models(cloud: Cloud, name: str) -> tuple[ObjectModel, ObjectModel | None]:

@@ -6,8 +6,8 @@ from typing import Any, ClassVar, cast
 
 from pydantic import Field
 
-from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES
-from lgrasp.config import apply_settings, parse_model
+from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
+from lgrasp.config import Viewpoint, apply_settings, parse_model
 from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
@@ -35,7 +35,7 @@ class PlanRequest(Request):
     cloud: Path | None = Field(default=None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene.")
     mask: Path | None = Field(default=None, description="Labels of the cloud's points (.npy, .npz).")
     label: int | None = Field(default=None, description="Label of the points to grasp.")
-    viewpoint: tuple[float, float, float] | None = Field(default=None, description="Where the cloud was seen from [m].")
+    viewpoint: Viewpoint = None
     model: str | None = Field(
         default=None,
         description="File of lgrasp learn fit --model grasp, or a name of lgrasp learn list, that draws hands to start "
@@ -58,8 +58,8 @@ class PlanRequest(Request):
         """Of what is grasped."""
         if self.object is not None:
             return Path(self.object).stem
-        name = Path(str(self.cloud)).stem
-        return name if self.label is None else f"{name}-{self.label}"
+        (name,) = cloud_names([Path(str(self.cloud))], [] if self.label is None else [self.label])
+        return name
 
     def check(self) -> None:
         if (self.object is None) == (self.cloud is None):

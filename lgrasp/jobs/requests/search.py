@@ -1,21 +1,24 @@
 """What is asked of the jobs that search grasps by a pipeline."""
 
 import math
+from itertools import zip_longest
 from pathlib import Path
 from typing import ClassVar
 
 from pydantic import Field
 
 from lgrasp.choices import ProtocolName
-from lgrasp.config import HandName, ShardFolder
+from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
+from lgrasp.config import HandName, ShardFolder, Viewpoint
 from lgrasp.engine.folder import check_number
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.request import Request
-from lgrasp.errors import ConfigError
+from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.learn.networks import find_network
 from lgrasp.object.find import find_object
+from lgrasp.paths import check_file
 from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import NO_TABLE, PROTOCOLS, find_protocol
 
@@ -87,7 +90,9 @@ class SequenceRequest(SearchRequest):
     maker: ClassVar[str] = "lgrasp.jobs.sequence.job:SequenceJob"
     unit: ClassVar[str] = "sequences"
 
-    objects: tuple[str, ...] = Field(description="Names or mesh files, in the order in which they are grasped.")
+    objects: tuple[str, ...] = Field(
+        default=(), description="Names or mesh files, in the order in which they are grasped."
+    )
     rows: int = Field(default=256, description="Complete sequences requested.")
     scale: str = Field(default="1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")
     simulate: ProtocolName | None = Field(
@@ -97,7 +102,12 @@ class SequenceRequest(SearchRequest):
 
     @property
     def title(self) -> str:
-        return " ".join(Path(name).stem for name in (self.hand, *self.objects))
+        return " ".join(Path(name).stem for name in (self.hand, *self.names))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is grasped: names or files."""
+        return self.objects
 
     def check_method(self) -> None:
         """Raise ConfigError if the pipeline's method is none for this job."""
@@ -110,8 +120,8 @@ class SequenceRequest(SearchRequest):
                 f"pipeline '{self.pipeline.name}' has no sequence; use pipeline sequence, or add 'sequence: {{}}' to it"
             )
         self.check_method()
-        if len(self.objects) < 2:
-            named = self.objects[0] if self.objects else "no object"
+        if len(self.names) < 2:
+            named = self.names[0] if self.names else "no object"
             raise ConfigError(
                 f"a sequence needs at least two objects, got {named}; for one object: lgrasp generate --object MESH"
             )
@@ -130,6 +140,43 @@ class SampleRequest(SequenceRequest):
     maker: ClassVar[str] = "lgrasp.jobs.sequence.sample:SampleJob"
 
     model: str = Field(description="File of lgrasp learn fit --model diffuser, or a name of lgrasp learn list.")
+    clouds: tuple[Path, ...] = Field(
+        default=(), description="Point clouds (.ply .xyz .npy .npz .h5) in place of objects, in their order."
+    )
+    masks: tuple[Path, ...] = Field(default=(), description="Labels of each cloud's points (.npy, .npz).")
+    labels: tuple[int, ...] = Field(default=(), description="Label of the points to grasp in each cloud.")
+    viewpoint: Viewpoint = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.objects or cloud_names(self.clouds, self.labels)
+
+    @property
+    def targets(self) -> list[tuple[Path, Path | None, int | None]]:
+        """Cloud, mask and label of each object, without those that were not given."""
+        return list(zip_longest(self.clouds, self.masks, self.labels))
+
+    def check(self) -> None:
+        if self.objects and self.clouds:
+            raise ConfigError("give objects (meshes or names) or --cloud (files of points), one of the two")
+        for flag, values in {"--mask": self.masks, "--label": self.labels}.items():
+            if values and len(values) != len(self.clouds):
+                raise ConfigError(f"{len(values)} {flag} for {len(self.clouds)} --cloud: give one for each, or none")
+        if self.clouds:
+            self._check_clouds()
+        elif self.viewpoint is not None:
+            raise ConfigError("--viewpoint belongs to --cloud")
+        super().check()
+
+    def _check_clouds(self) -> None:
+        for path, mask, _ in self.targets:
+            check_file(path, CLOUD_SUFFIXES, "a point cloud", CloudError)
+            if mask is not None:
+                check_file(mask, MASK_SUFFIXES, "a mask", CloudError)
+        if self.simulate:
+            raise ConfigError(f"--simulate {self.simulate}: a simulator needs meshes, not --cloud")
+        if parse_size(self.scale).high:
+            raise ConfigError(f"--scale {self.scale}: clouds have the size that they have; give a factor to metres")
 
     def check_method(self) -> None:
         if (method := self.pipeline.params("sequence").method) != "diffuser":

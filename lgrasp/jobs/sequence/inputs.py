@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as with_default
 from functools import cached_property, lru_cache, partial
@@ -27,6 +27,7 @@ from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, space_vie
 from lgrasp.jobs.hands import hand_source
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
+from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import Device
 from lgrasp.seeding import stage_seed
@@ -45,7 +46,8 @@ class SequenceKeys:
     hand: str
     views: dict[str, str]
     fields: dict[str, str]
-    meshes: tuple[Path, ...]  # one per step
+    names: tuple[str, ...]  # one per step
+    meshes: tuple[Path, ...]  # files, perhaps of points
     scales: tuple[float, ...]
     objects: tuple[str, ...]
 
@@ -85,14 +87,14 @@ class SequenceInputs:
 
     @property
     def object_ids(self) -> tuple[str, ...]:
-        """Name of each step's object, unique per mesh and scale."""
+        """Name of each step's object, unique per mesh and scale, or cloud."""
         ids: dict[str, str] = {}
-        for path, key in zip(self.keys.meshes, self.keys.objects, strict=True):
+        for stem, key in zip(self.keys.names, self.keys.objects, strict=True):
             if key not in ids:
-                name, number = path.stem, 1
+                name, number = stem, 1
                 while name in ids.values():
                     number += 1
-                    name = f"{path.stem}-{number}"
+                    name = f"{stem}-{number}"
                 ids[key] = name
         return tuple(ids[key] for key in self.keys.objects)
 
@@ -121,7 +123,7 @@ def sequence_keys(
     paths = tuple(find_object(mesh) for mesh in meshes)
     scales = _object_scales(paths, size, seed)
     keys = tuple(object_key(str(p), s, objects)[1] for p, s in zip(paths, scales, strict=True))
-    return SequenceKeys(source, hand_key, views, field_keys, paths, scales, keys)
+    return SequenceKeys(source, hand_key, views, field_keys, tuple(p.stem for p in paths), paths, scales, keys)
 
 
 def load_sequence_inputs(
@@ -131,8 +133,12 @@ def load_sequence_inputs(
     fields: FieldParams,
     device: Device,
     report: Report | None = None,
+    clouds: Mapping[str, Callable[[], ObjectModel]] | None = None,
 ) -> SequenceInputs:
     """Load or make everything, and put it on the device.
+
+    Args:
+        clouds: what makes the objects that are no meshes, by key.
 
     Raises:
         ConfigError: more objects than the hand's opposition spaces can take one after another.
@@ -149,7 +155,11 @@ def load_sequence_inputs(
     made: dict[str, ObjectArrays] = {}
     for path, key, scale in zip(keys.meshes, keys.objects, keys.scales, strict=True):
         if key not in made:
-            made[key] = upload_object(load.object(path, key, scale, objects), alias)
+            if clouds and key in clouds:
+                own = load.get("object", ObjectModel, key, clouds[key])
+            else:
+                own = load.object(path, key, scale, objects)
+            made[key] = upload_object(own, alias)
     steps = tuple(made[key] for key in keys.objects)
     return SequenceInputs(
         model, spaces, views, steps, keys, device, load.seconds, {"hand": True, "field": True} | load.hits

@@ -1,6 +1,6 @@
 """The job: hand + objects in an order -> shards of sequences in a folder."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -21,6 +21,7 @@ from lgrasp.jobs.sequence.records import object_records, sequence_rows
 from lgrasp.jobs.sequence.round import Verdicts, add_spaces
 from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_rounds
 from lgrasp.jobs.sets import sequence_name
+from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.cores import cores
 from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import find_protocol
@@ -35,7 +36,7 @@ class SequenceJob(SequenceRequest, SearchJob):
 
     @property
     def object_name(self) -> str:
-        return sequence_name(self.objects)
+        return sequence_name(self.names)
 
     @property
     def protocol(self) -> str | None:
@@ -50,7 +51,7 @@ class SequenceJob(SequenceRequest, SearchJob):
         return self._keys
 
     def own_config(self) -> dict[str, Any]:
-        return {"objects": list(self.objects), "scales": list(self.keys.scales), "physics": self.simulate}
+        return {"objects": list(self.names), "scales": list(self.keys.scales), "physics": self.simulate}
 
     def key(self) -> str:
         return self.keys.run_key(self.pipeline.describe(), self.shard_rows, self.simulate)
@@ -61,9 +62,19 @@ class SequenceJob(SequenceRequest, SearchJob):
     def load_inputs(self, events: Events) -> SequenceInputs:
         pipeline = self.pipeline
         inputs = load_sequence_inputs(
-            self.cache, self.keys, pipeline.object, pipeline.field, self.device_used, events.loading
+            self.cache,
+            self.keys,
+            pipeline.object,
+            pipeline.field,
+            self.device_used,
+            events.loading,
+            self.clouds_by_key(),
         )
         return self.with_sampler(inputs)
+
+    def clouds_by_key(self) -> dict[str, Callable[[], ObjectModel]]:
+        """What makes the objects that are point clouds."""
+        return {}
 
     def with_sampler(self, inputs: SequenceInputs) -> SequenceInputs:
         """Inputs with what method diffuser needs."""

@@ -14,7 +14,8 @@ from lgrasp.hand.contact_surface import contact_surface
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.tree import Tree
 from lgrasp.learn.diffuser.features import mesh_centre
-from lgrasp.object.sdf import SdfGrid, build_sdf
+from lgrasp.object.model import ObjectModel
+from lgrasp.object.sdf import SdfGrid, build_sdf, sample_sdf
 from lgrasp.refine.surface import farthest_points
 
 _NODES = 48**3  # of an object's grid
@@ -38,6 +39,20 @@ def coarse_grid(vertices: np.ndarray, faces: np.ndarray, *, closed: bool, device
     centred = np.asarray(vertices, float) - mesh_centre(vertices)
     grid = build_sdf(centred, np.asarray(faces, np.int32), closed=closed, max_cells=_NODES, pad=_PAD, device=device)
     return replace(grid, values=grid.values.astype(np.float32))
+
+
+def coarse_grid_of_model(model: ObjectModel) -> SdfGrid:
+    """The same of an object without faces, about its internal origin: its own distances, and beyond their grid how far
+    off that is."""
+    own, origin = SdfGrid(model.sdf, model.sdf_origin, model.sdf_cell), model.sdf_origin.astype(float)
+    low, high = model.obstacle_points.min(0) - _PAD, model.obstacle_points.max(0) + _PAD
+    cell = float(np.prod(high - low) / _NODES) ** (1 / 3)
+    shape = np.ceil((high - low) / cell).astype(int) + 1
+    nodes = low + cell * np.indices(tuple(shape)).reshape(3, -1).T
+    beyond = np.linalg.norm(nodes - nodes.clip(origin, origin + (np.array(model.sdf.shape) - 1) * own.cell), axis=1)
+    found = sample_sdf(own, nodes)
+    values = np.where(beyond > 0, np.hypot(found.clip(0), beyond), found)
+    return SdfGrid(values.reshape(shape).astype(np.float32), nodes[0].astype(np.float32), cell)
 
 
 def sense_points(model: HandModel, each: int) -> torch.Tensor:

@@ -17,22 +17,15 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.object.sdf import SdfGrid, sample_sdf
 
 
-class GraspPredictor:
-    """Networks with one cloud before them. What they guess turns and moves with the cloud.
+class CloudCompletion:
+    """Networks with one cloud before them: the whole object. What they guess turns and moves with the cloud.
 
     Args:
         points: of the cloud [m], (n, 3). normals: outward, (n, 3).
     """
 
-    def __init__(
-        self,
-        tree: Tree,
-        networks: Networks,
-        points: np.ndarray,
-        normals: np.ndarray,
-        device: str = "cpu",
-    ) -> None:
-        self._tree, self._networks, self._device = tree, networks, device
+    def __init__(self, networks: Networks, points: np.ndarray, normals: np.ndarray, device: str = "cpu") -> None:
+        self._networks, self._device = networks, device
         self.view = make_view(points, normals, networks.params.cloud)
 
     @cached_property
@@ -41,20 +34,6 @@ class GraspPredictor:
         points, normals = (torch.as_tensor(x, device=self._device)[None] for x in (self.view.points, self.view.normals))
         completes, nodes = self._networks.completes.to(self._device), self._networks.params.nodes
         return completed_grids(completes, points, normals, nodes)[0]
-
-    def draw(self, count: int, seed: int = 0, *, steps: int = 10) -> DrawnSteps:
-        """``count`` grasps; poses are those of the cloud's frame in the hand's. A function of its arguments."""
-        tree = self._tree
-        hands = HeldHands(
-            tree.joint_open[None].astype(np.float32),
-            np.zeros((1, len(tree.joint_open)), bool),
-            np.zeros((1, 0, 7), np.float32),
-        )
-        drawn = self._sampler.draw(hands, np.zeros(1, int), ~hands.used, each=count, seed=seed, steps=steps)
-        R, t = motion_from_pose(torch.as_tensor(drawn.pose))
-        R = R @ torch.as_tensor(self.view.R, dtype=torch.float32).mT
-        t = t - R @ torch.as_tensor(self.view.t, dtype=torch.float32)
-        return DrawnSteps(pose_from_motion(R, t).cpu().numpy(), drawn.q)
 
     def distance(self, places: np.ndarray) -> np.ndarray:
         """Guessed signed distances [m] of places (n, 3) in the cloud's frame, (n,); positive beyond what is guessed."""
@@ -72,6 +51,34 @@ class GraspPredictor:
         """
         reach = float(np.abs(self.view.t).max() - np.sqrt(3) * self.grid.origin[0])
         return completed_object(model, lambda x: self.distance(x) - thicker, reach)
+
+
+class GraspPredictor(CloudCompletion):
+    """The same, and grasps of the object.
+
+    Args:
+        tree: of the hand. Others: as of :class:`CloudCompletion`.
+    """
+
+    def __init__(
+        self, tree: Tree, networks: Networks, points: np.ndarray, normals: np.ndarray, device: str = "cpu"
+    ) -> None:
+        super().__init__(networks, points, normals, device)
+        self._tree = tree
+
+    def draw(self, count: int, seed: int = 0, *, steps: int = 10) -> DrawnSteps:
+        """``count`` grasps; poses are those of the cloud's frame in the hand's. A function of its arguments."""
+        tree = self._tree
+        hands = HeldHands(
+            tree.joint_open[None].astype(np.float32),
+            np.zeros((1, len(tree.joint_open)), bool),
+            np.zeros((1, 0, 7), np.float32),
+        )
+        drawn = self._sampler.draw(hands, np.zeros(1, int), ~hands.used, each=count, seed=seed, steps=steps)
+        R, t = motion_from_pose(torch.as_tensor(drawn.pose))
+        R = R @ torch.as_tensor(self.view.R, dtype=torch.float32).mT
+        t = t - R @ torch.as_tensor(self.view.t, dtype=torch.float32)
+        return DrawnSteps(pose_from_motion(R, t).cpu().numpy(), drawn.q)
 
     @cached_property
     def _sampler(self) -> StepSampler:
