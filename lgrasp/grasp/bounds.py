@@ -93,6 +93,13 @@ class GraspBounds(Params):
         description="How far the joint targets of q_squeeze may be ahead of q; where they would be further, the hand "
         "presses with less [rad; sliding joints over 10 cm].",
     )
+    min_squeeze_travel: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.1,
+        description="How far q_squeeze would take the contacts if the object gave way, mean by force [m]; 0 asks for "
+        "nothing.",
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -24,6 +24,7 @@ from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed
 from lgrasp.grasp.control_kernels import (
     FINGER_TRIES,
     control_poses,
+    drop_limp,
     limit_squeeze,
     open_fingers,
     open_poses,
@@ -108,13 +109,16 @@ class Check:
         wp.launch(list_kept, len(self), [self.found, upto], [row], device=self.hand.device)
         packed, on_table = self._pack(seed, row), self.obj.planes is not None
         self._share(row, tally)
+        bounded = self.limits.min_squeeze_travel > 0.0
+        if bounded:
+            wp.launch(drop_limp, len(self), [self.limits, packed], [row, tally.device], device=self.hand.device)
         if on_table:
             self._approach(row, packed, tally)
-        columns = _columns(packed, on_table)
-        fetched = read_tallies([tally], [*columns.values(), *([] if self.obj.touch is None else [row])])
-        count = sum(tally[reason] for reason in tally.names if reason in ("kept", "approach", "touch"))
+        columns, dropped = _columns(packed, on_table), bounded or self.obj.touch is not None
+        fetched = read_tallies([tally], [*columns.values(), *([row] if dropped else [])])
+        count = sum(tally[reason] for reason in tally.names if reason in ("kept", "approach", "squeeze", "touch"))
         table = _table(dict(zip(columns, fetched, strict=False)), count)
-        kept = np.ones(count, bool) if self.obj.touch is None else fetched[-1][:count] >= 0
+        kept = fetched[-1][:count] >= 0 if dropped else np.ones(count, bool)
         if on_table:
             kept &= ~np.isnan(table.table["approach"][:, 0])
         return table if kept.all() else take_rows(table, kept), tally
@@ -133,6 +137,8 @@ class Check:
         columns = _columns(packed, on_table)
         *fetched, outcome = fetch([*columns.values(), self.found.outcome])
         table = _table(dict(zip(columns, fetched, strict=True)), len(self))
+        limp = table.metrics["squeeze_travel"] < self.limits.min_squeeze_travel
+        outcome = np.where(limp & (outcome == Outcome.KEPT), Outcome.SQUEEZE, outcome)
         if on_table:
             lost = np.isnan(table.table["approach"][:, 0]) & (outcome == Outcome.KEPT)
             outcome = np.where(lost, Outcome.APPROACH, outcome)
@@ -193,7 +199,7 @@ def _table(columns: dict[str, np.ndarray], count: int) -> GraspTable:
     """The first ``count`` rows of what :func:`_columns` gave."""
     x: dict[str, Any] = {name: values[:count] for name, values in columns.items() if name != "numbers"}
     numbers = dict(zip(MEASURED, columns["numbers"][:, :count], strict=True))
-    numbers |= {name: x.pop(name) for name in ("epsilon", "self_penetration", "pregrasp_opening")}
+    numbers |= {name: x.pop(name) for name in ("epsilon", "self_penetration", "pregrasp_opening", "squeeze_travel")}
     numbers["force_closure"] = (numbers["epsilon"] > 0).astype(np.float32)
     numbers["normal_error"] = np.arccos(np.clip(numbers["facing"], -1, 1))
     x["index"] = x["index"].astype(np.int64)

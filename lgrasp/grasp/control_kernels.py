@@ -6,6 +6,7 @@ from lgrasp.grasp.check_kernels import hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.grasp.collision import body_apart, body_height, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held
+from lgrasp.grasp.outcomes import KEPT, SQUEEZE
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.constants import SLIDING_ARM
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
@@ -17,6 +18,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 wp.set_module_options(KERNEL_OPTIONS)
 
 _ARM = wp.constant(SLIDING_ARM)
+_LEAST_FORCE = wp.constant(1.0e-6)  # [N]
 _OPENING_SHARES = wp.constant(5)  # of the way open that are tried
 FINGER_TRIES = wp.constant(2 * _OPENING_SHARES)
 """Postures of a finger that is opened by itself."""
@@ -66,7 +68,8 @@ def joint_lead(hand: Hand, k: wp.int32, T: wp.transform, p: wp.vec3, f: wp.vec3,
 def press_contact(
     hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, body: transforms, p: wp.vec3, f: wp.vec3, k: wp.float32
 ):
-    """q + J^T f / stiffness: targets of a group's own dofs that press with force f [N] on point p of body j."""
+    """q + J^T f / stiffness: targets of a group's own dofs that press with force f [N] on point p of body j, limits or
+    not."""
     j0 = hand.kin.joint_first[g]
     q = q0
     a = j
@@ -75,7 +78,7 @@ def press_contact(
         if d < hand.kin.dof_free[g]:
             q[d] = q[d] + joint_lead(hand, j0 + a, body[j0 + a], p, f, k)
         a = hand.kin.joint_parent[j0 + a]
-    return clamp_dofs(hand.kin, g, q)
+    return q
 
 
 @wp.kernel
@@ -121,7 +124,7 @@ def control_poses(
                     opened = shift_contact(hand, g, x, b - 1 - j0, local, n * limits.pregrasp_distance)
                     pressed = target
                 else:
-                    pressed = clamp_dofs(hand.kin, g, pressed + target - x)
+                    pressed = pressed + target - x
                 contacts += 1
     first = hand.kin.dof_first[g]
     for d in range(hand.kin.dof_first[g + 1] - first):
@@ -165,16 +168,12 @@ def press_shared(
                     lead = joint_lead(hand, k, at.body[s, k], p, f, limits.squeeze_stiffness)
                     packed_out.q_squeeze[i, column] = packed_out.q_squeeze[i, column] + lead
                 k = wp.where(hand.kin.joint_parent[k] < 0, -1, hand.kin.joint_parent[k] + hand.kin.joint_first[g])
-    for g in range(hand.kin.groups):
-        for d in range(hand.kin.dof_first[g] + hand.kin.dof_free[g], hand.kin.dof_first[g + 1]):
-            column = hand.kin.dof_index[d]
-            target = wp.clamp(packed_out.q_squeeze[i, column], hand.kin.dof_lower[d], hand.kin.dof_upper[d])
-            packed_out.q_squeeze[i, column] = target
 
 
 @wp.kernel
 def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), packed_out: Packed):
-    """Where a joint target would be further ahead than ``max_squeeze_lead``, all forces of the hand shrink alike.
+    """Targets of the squeeze within joint limits; where one is further ahead than ``max_squeeze_lead``, all forces of
+    the hand shrink alike. And how far that takes the contacts, mean by force, if the object gives way.
 
     Args:
         row: (m,) hand of each row, -1 none.
@@ -183,16 +182,37 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
     if row[i] < 0:
         return
     lead = float(0.0)
-    for g in range(hand.kin.groups):
-        for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-            c = hand.kin.dof_index[hand.kin.dof_first[g] + hand.kin.joint_dof[k]]
-            ahead = wp.abs(packed_out.q_squeeze[i, c] - packed_out.q[i, c])
-            lead = wp.max(lead, wp.where(hand.kin.joint_prismatic[k] == 1, ahead / _ARM, ahead))
+    work = float(0.0)
+    for c in range(packed_out.q.shape[1]):
+        q = packed_out.q[i, c]
+        wanted = packed_out.q_squeeze[i, c]
+        target = wp.clamp(wanted, hand.kin.column_lower[c], hand.kin.column_upper[c])
+        arm = wp.where(hand.kin.column_sliding[c] == 1, _ARM, 1.0)
+        work += limits.squeeze_stiffness * (wanted - q) * (target - q) / (arm * arm)
+        lead = wp.max(lead, wp.abs(target - q) / arm)
+        packed_out.q_squeeze[i, c] = target
+    share = float(1.0)
     if lead > limits.max_squeeze_lead:
         share = limits.max_squeeze_lead / lead
         for c in range(packed_out.q.shape[1]):
             q = packed_out.q[i, c]
             packed_out.q_squeeze[i, c] = q + (packed_out.q_squeeze[i, c] - q) * share
+    packed_out.squeeze_travel[i] = share * work / wp.max(limits.squeeze_force, _LEAST_FORCE)
+
+
+@wp.kernel
+def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32), counts_out: wp.array(dtype=wp.int32)):
+    """Rows that squeeze the object by less than ``min_squeeze_travel`` become none.
+
+    Args:
+        row_out: (m,) hand of each row, -1 none.
+        counts_out: (reasons,) these rows are moved from those that are kept.
+    """
+    i = wp.tid()
+    if row_out[i] >= 0 and packed.squeeze_travel[i] < limits.min_squeeze_travel:
+        row_out[i] = -1
+        wp.atomic_sub(counts_out, KEPT, 1)
+        wp.atomic_add(counts_out, SQUEEZE, 1)
 
 
 @wp.func

@@ -17,7 +17,8 @@ class Outcome(IntEnum):
     UNRESISTED_LOAD = 6
     TABLE = 7
     APPROACH = 8
-    TOUCH = 9
+    SQUEEZE = 9
+    TOUCH = 10
 
 
 KEPT = wp.constant(int(Outcome.KEPT))
@@ -29,11 +30,12 @@ BALANCE = wp.constant(int(Outcome.BALANCE))
 UNRESISTED_LOAD = wp.constant(int(Outcome.UNRESISTED_LOAD))
 TABLE = wp.constant(int(Outcome.TABLE))
 APPROACH = wp.constant(int(Outcome.APPROACH))
+SQUEEZE = wp.constant(int(Outcome.SQUEEZE))
 TOUCH = wp.constant(int(Outcome.TOUCH))
 
 REASONS = (
     *("kept", "unused finger", "self-collision", "object collision", "contact", "balance", "unresisted load"),
-    *("table", "approach"),
+    *("table", "approach", "squeeze"),
 )
 """Outcomes in words, by code; where a share of the force must be on a region there is one more, SHARED."""
 
@@ -44,6 +46,6 @@ MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
 
 METRICS = (
     *("fswo", "gswo", "unresisted_load", "epsilon", "force_closure"),
-    *("penetration", "self_penetration", "gap", "normal_error", "pregrasp_opening"),
+    *("penetration", "self_penetration", "gap", "normal_error", "pregrasp_opening", "squeeze_travel"),
 )
 """Columns of the metrics table."""

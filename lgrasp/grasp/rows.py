@@ -15,6 +15,7 @@ METRIC_UNITS = {
     **dict.fromkeys(("penetration", "self_penetration", "gap"), "m"),
     "normal_error": "rad",
     "pregrasp_opening": "rad or m",
+    "squeeze_travel": "m",
     "hold_drift": "m",
 }
 """Unit of each metric that has one."""

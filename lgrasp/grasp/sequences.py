@@ -9,7 +9,7 @@ from lgrasp.grasp.rows import CONTACTS
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.tree import Tree
 
-_WORST = {"epsilon": np.fmin, "force_closure": np.fmin, "pregrasp_opening": np.fmin}
+_WORST = {"epsilon": np.fmin, "force_closure": np.fmin, "pregrasp_opening": np.fmin, "squeeze_travel": np.fmin}
 """How a metric of several steps becomes one of the row; the largest unless stated otherwise."""
 
 

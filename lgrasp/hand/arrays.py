@@ -93,6 +93,8 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
         "joint_origin": device_from_matrix(t.T_parent_joint),
         "dof_lower": t.joint_lower[t.dof_index],
         "dof_upper": t.joint_upper[t.dof_index],
+        "column_lower": t.joint_lower,
+        "column_upper": t.joint_upper,
         "settings": len(t.settings),
         "dof_setting": t.settings[:, t.dof_index],
     }

@@ -105,6 +105,13 @@ class Tree:
         """(J,) i32: column of q that drives each joint."""
         return self.dof_index[self.dof_first[self.body_group[1:]] + self.joint_dof]
 
+    @cached_property
+    def column_sliding(self) -> np.ndarray:
+        """(K,) i32: 1 for actuated joints that slide, as those do that follow them."""
+        out = np.zeros(len(self.joint_names), np.int32)
+        out[self.joint_column] = self.joint_prismatic
+        return out
+
     def path(self, body: int) -> list[int]:
         """Bodies from the base (left out) to a body."""
         return [*self.path(int(self.body_parent[body])), body] if body > 0 else []

@@ -33,6 +33,8 @@ def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
             reason = (
                 "too little of the normal force is on the region to touch; a smaller share or larger region gives more"
             )
+        if 2 * found.get("squeeze", 0) > whole:
+            reason = "the joints hardly press on the object; bounds.min_squeeze_travel=0 asks for nothing"
         if share < least:
             worst, least = stage, share
             words = f"{found.get(after, 0):,} of {whole:,} survive: {reason}"

@@ -30,6 +30,9 @@ class Kinematics:
     dof_lower: wp.array(dtype=wp.float32)  # (D,) [rad or m]
     dof_upper: wp.array(dtype=wp.float32)  # (D,) [rad or m]
     dof_index: wp.array(dtype=wp.int32)  # (D,) column of q that a group's dof is
+    column_lower: wp.array(dtype=wp.float32)  # (K,) limits of the columns of q [rad or m]
+    column_upper: wp.array(dtype=wp.float32)  # (K,)
+    column_sliding: wp.array(dtype=wp.int32)  # (K,) 1: the joint slides
     dof_free: wp.array(dtype=wp.int32)  # (groups,) dofs that the group moves itself; shared ones come after
     settings: wp.int32  # number of combinations of values of the shared joints
     dof_setting: wp.array2d(dtype=wp.float32)  # (settings, D) open posture with the shared joints in place

@@ -114,6 +114,8 @@ def test_control_poses(finished, inputs, link_poses):
     wanted = grasps.q + torque / bounds.squeeze_stiffness
     inside = np.clip(wanted, tree.listed_limits[:, 0], tree.listed_limits[:, 1])
     np.testing.assert_allclose(grasps.q_squeeze, inside, atol=2e-4)
+    travel = (torque * (grasps.q_squeeze - grasps.q)).sum(1) / bounds.squeeze_force
+    np.testing.assert_allclose(grasps.metrics["squeeze_travel"], travel, atol=1e-5)
 
 
 def test_soft_grasps_are_squeezed_less(finished, tables, context, swift):
@@ -126,7 +128,9 @@ def test_soft_grasps_are_squeezed_less(finished, tables, context, swift):
     ahead, less = grasps.q_squeeze - grasps.q, gentle.q_squeeze - gentle.q
     lead = np.abs(ahead).max(1)
     assert (lead > most).sum() > 10
-    np.testing.assert_allclose(less, ahead * np.minimum(1, most / lead)[:, None], atol=1e-5)
+    share = np.minimum(1, most / lead)
+    np.testing.assert_allclose(less, ahead * share[:, None], atol=1e-5)
+    np.testing.assert_allclose(gentle.metrics["squeeze_travel"], grasps.metrics["squeeze_travel"] * share, rtol=1e-4)
     np.testing.assert_array_equal(gentle.q, grasps.q)
     np.testing.assert_array_equal(gentle.contact_forces, grasps.contact_forces)
 
@@ -162,6 +166,17 @@ def test_pregrasp_opening(finished, inputs):
     np.testing.assert_allclose(grasps.metrics["pregrasp_opening"], opening, atol=1e-6)
     assert (opening == 0).mean() < 0.01
     np.testing.assert_array_equal(grasps.metrics["force_closure"], grasps.metrics["epsilon"] > 0)
+
+
+def test_grasps_that_hardly_squeeze_are_dropped_where_asked(tables, context, swift):
+    params = swift.params("filter")
+    free = run(tables.search, params, context)
+    least = float(np.quantile(free[0].metrics["squeeze_travel"], 0.3))
+    bound = run(tables.search, params, replace(context, bounds=context.bounds.changed(min_squeeze_travel=least)))
+    kept = free[0].metrics["squeeze_travel"] >= least
+    assert bound[1]["squeeze"] == (~kept).sum() > 10
+    assert bound[1]["kept"] == len(bound[0]) == kept.sum()
+    np.testing.assert_array_equal(free[0].q[kept], bound[0].q)
 
 
 def test_unresisted_load_is_bounded_where_asked(tables, context, swift):
