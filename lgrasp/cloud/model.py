@@ -29,6 +29,7 @@ _MOST_NODES, _LEAST_CELL = 250_000, 0.0015
 _CONTACTS = 4096
 _TRUSTED, _GUESSED = 0.003, 0.009  # [m] from what was seen: its distances hold; they are guessed
 _COARSE = 0.005  # [m]
+_BOX = (0.01, 0.99)  # shares of the points along an axis
 _FOLD_POINTS, _SMOOTH = 6, 0.85  # points whose normals tell a fold; their least cosine where there is none
 
 
@@ -141,16 +142,19 @@ def completed_object(seen: ObjectModel, distance: Callable[[np.ndarray], np.ndar
 
 
 def searched_object(whole: ObjectModel, params: ObjectParams, device: str = "cpu") -> ObjectModel:
-    """The model of a whole object as pipelines search it: about the middle of its box, contact points away from hollows
-    and folds, in order, and what is opposite to each.
+    """The model of a whole object as pipelines search it: about the middle of its box (but for stray points), contact
+    points away from hollows and folds, in order, and what is opposite to each.
 
     Args:
         whole: what :func:`completed_object` gave. params: of contact points.
         device: answers the geometric queries.
+
+    Raises:
+        ObjectError: no two contact points are opposite to each other.
     """
     points, kept = np.unique(whole.obstacle_points, axis=0, return_index=True)
     points, normals = points.astype(float), whole.obstacle_normals[kept].astype(float)
-    sdf, middle = SdfGrid(whole.sdf, whole.sdf_origin, whole.sdf_cell), 0.5 * (points.min(0) + points.max(0))
+    sdf, middle = SdfGrid(whole.sdf, whole.sdf_origin, whole.sdf_cell), np.quantile(points, _BOX, axis=0).mean(0)
     fits = probe_fits(sdf, points, normals, params.probe_radius, params.probe_tolerance)
     near = cKDTree(points).query(points, min(_FOLD_POINTS, len(points)), workers=-1)[1]
     cosine = np.einsum("nki,ni->nk", normals[near], normals).min(1)
@@ -161,6 +165,9 @@ def searched_object(whole: ObjectModel, params: ObjectParams, device: str = "cpu
     touched = np.random.default_rng(params.seed).permutation(touched)[: params.contact_count]
     touched = touched[cluster_order(points[touched])]
     contacts, outward = (x[touched].astype(np.float32) for x in (points - middle, normals))
+    opposite = opposite_points(contacts, outward, seed=params.seed, device=device)
+    if (opposite < 0).all():
+        raise ObjectError(f"cloud '{whole.name}' shows no two sides to press on; add views of its other sides")
     moved = ("com", "sdf_origin", "obstacle_points", "cluster_center")
     return replace(
         whole,
@@ -168,7 +175,7 @@ def searched_object(whole: ObjectModel, params: ObjectParams, device: str = "cpu
         center=(whole.center + middle).astype(np.float32),
         contact_points=contacts,
         contact_normals=outward,
-        contact_opposite=opposite_points(contacts, outward, seed=params.seed, device=device),
+        contact_opposite=opposite,
     )
 
 

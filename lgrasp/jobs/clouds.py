@@ -16,7 +16,7 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.scenes.files import scene_cloud
 
-VERSION = 1
+VERSION = 2
 """Raised whenever :func:`whole_object` changes for the same arguments."""
 
 
@@ -56,7 +56,7 @@ def whole_object(cloud: Cloud, name: str, networks: Networks, params: ObjectPara
         networks: complete it.
 
     Raises:
-        ObjectError: see :func:`~lgrasp.cloud.model.cloud_object`.
+        ObjectError: see :func:`~lgrasp.cloud.model.cloud_object`, :func:`~lgrasp.cloud.model.searched_object`.
     """
     target = cloud.only(cloud.target)
     seen = cloud_object(target.points, target.normals, name=name)

@@ -69,6 +69,13 @@ def test_pipelines_search_whole_clouds_about_their_middle():
     assert np.linalg.norm(model.cluster_center, axis=1).max() < 1.1 * RADIUS
 
 
+def test_a_side_alone_cannot_be_pressed_on():
+    n = sphere()
+    n = n[n[:, 2] > 0.6]
+    with pytest.raises(ObjectError, match=r"cloud 'dish' shows no two sides to press on"):
+        searched_object(cloud_object(RADIUS * n, n, name="dish"), ObjectParams())
+
+
 def test_the_same_points_give_the_same_object():
     n = sphere(1000)
     a, b = (cloud_object(RADIUS * n, n) for _ in range(2))
