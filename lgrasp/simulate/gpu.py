@@ -2,36 +2,38 @@
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from lgrasp.geometry.poses import compose, pose_from_matrix
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.model import Model
+from lgrasp.simulate.slip import points_on_links, slips
 from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude
-from lgrasp.simulate.worlds import Worlds
+from lgrasp.simulate.worlds import Kept, Seen, Worlds
 
 
 @dataclass
 class _Closing:
-    """Hands of n grasps that close, and what has happened until now."""
+    """Hands of n grasps that close in W worlds, and what has happened until now."""
 
-    state: dict[str, np.ndarray]
     home: np.ndarray
-    """Poses of the objects at the start, (worlds, O, 7)."""
+    """Poses of the objects at the start, (W, O, 7)."""
     depth: np.ndarray
     """Deepest penetration of any object [m], (n,)."""
     worst: np.ndarray
     """Displacement [m] and rotation [rad] of each object at worst, (n, O, 2)."""
-    contacts: np.ndarray
-    """Links on the object that the fewest touch, before the squeeze, (n,)."""
     wild: np.ndarray
     """Diverged, (n,)."""
     full: np.ndarray
     """More contacts than there was room for, at any time, (n,)."""
+    contacts: np.ndarray
+    """Links on the object that the fewest touch, before the squeeze, (n,)."""
+    now: Seen
+    """(W,)"""
 
 
 class WorldTrials:
@@ -52,17 +54,18 @@ class WorldTrials:
         device: str,
         *,
         worlds: int = 4096,
-        threads: int = 2,
         all_directions: bool = False,
         settled_stop: bool = True,
     ) -> None:
         self._model, self._protocol = model, model.protocol
         self._sim = Worlds(model, worlds, device)
         self._few = Worlds(model, max(1, worlds // 8), device)
-        self._threads, self._all, self._settled_stop = threads, all_directions, settled_stop
+        self._every, self._settled_stop = all_directions, settled_stop
         self._spare = Trial(model, all_directions=all_directions, settled_stop=settled_stop)
         self._bounds, self._one = Bounds(model.protocol), threading.Lock()
-        self._base = self._spare.base_rotation()
+        at, turn = (a[0, model.base_body].astype(float) for a in self._sim.frames())
+        T = np.block([[turn, at[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+        self._base, self._base_rotation = pose_from_matrix(T[None])[0], turn
 
     @property
     def steps(self) -> int:
@@ -80,16 +83,18 @@ class WorldTrials:
         return found
 
     def _block(self, rows: GraspRows, index: np.ndarray) -> list[Verdict]:
-        n = len(index)
-        looks = self._looks(rows, index)
+        n, links, points = len(index), rows.contact_links[index], rows.contact_points[index]
+        looks, full = self._looks(rows, index)
         alive = np.array([look.depth for look in looks]) <= self._protocol.most_penetration
         hands = self._close(rows, index, looks)
-        slip = self._slip(rows, index, looks, hands.state["qpos"][:n])
-        rest = at_rest(hands.state["qvel"][:n, self._model.object_velocity])
+        hands.full |= full
+        kept, (at, turn) = self._sim.keep(), self._sim.frames()
+        slip = slips(self._model, (at[:n], turn[:n]), links, np.stack([look.points for look in looks]), points)
+        rest = at_rest(hands.now.velocity[:n, self._model.object_velocity])
         lost = hands.wild | self._bounds.lost(hands.worst)
         good = alive & ~lost
         hands.worst[hands.wild | ~alive] = np.nan
-        pulls, ran_away = self._pull(hands, good)
+        pulls, ran_away = self._pull(hands, kept, good)
         pulls.held[alive & lost] = 0
         pulls.moved[alive & lost] = hands.worst[alive & lost][:, None]
 
@@ -108,120 +113,127 @@ class WorldTrials:
 
         return [verdict(i) for i in range(n)]
 
-    def _looks(self, rows: GraspRows, index: np.ndarray) -> list[Look]:
-        """What needs no simulation, by MuJoCo itself on several threads."""
-        trials = [Trial(self._model) for _ in range(self._threads)]
+    def _looks(self, rows: GraspRows, index: np.ndarray) -> tuple[list[Look], np.ndarray]:
+        """What needs no simulation, and where there were more contacts than room, (n,)."""
+        n, sim, pose = len(index), self._sim, rows.object_pose[index]
+        sim.place(self._qpos(rows.q[index], pose), near=True)
+        links, _, full = sim.touching(np.inf)
+        at, turn = sim.frames()
+        points = points_on_links(self._model, (at[:n], turn[:n]), rows.contact_links[index], rows.contact_points[index])
+        start = self._qpos(self._protocol.stops(rows)[0][index], pose)
+        sim.place(start)
+        _, depth, too_full = sim.touching()
+        looks = [Look(points[i], links[i], depth[i, 1], depth[i, 0], start[i]) for i in range(n)]
+        return looks, (full | too_full)[:n]
 
-        def look(part: int) -> list[Look]:
-            return [trials[part].look(rows, int(i)) for i in index[part :: self._threads]]
+    def _qpos(self, q: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """State of all worlds, (W, nq), of hands at q (n, K), objects at poses (n, O, 7); the rest are as the first."""
+        model = self._model
+        qpos = np.tile(model.mujoco.qpos0, (self._sim.worlds, 1))
+        qpos[: len(q), model.joint_address] = q @ model.joint_matrix.T + model.joint_offset
+        qpos[: len(q), model.object_address] = compose(self._base, pose)
+        qpos[len(q) :] = qpos[0]
+        return qpos
 
-        with ThreadPoolExecutor(self._threads) as pool:
-            parts = list(pool.map(look, range(self._threads)))
-        return [parts[k % self._threads][k // self._threads] for k in range(len(index))]
+    def _filled(self, values: np.ndarray) -> np.ndarray:
+        """Values of n grasps (n, ...) for all worlds (W, ...)."""
+        return np.concatenate([values, np.repeat(values[:1], self._sim.worlds - len(values), 0)])
 
     def _close(self, rows: GraspRows, index: np.ndarray, looks: list[Look]) -> _Closing:
         """From the start to the squeeze, as of :class:`Trial`."""
-        n = len(index)
-        start = np.stack([look.qpos for look in looks])
-        stops = [self._model.controls(q[index].astype(float)) for q in self._protocol.stops(rows)]
-        state = self._sim.state()
-        for name in ("qvel", "warm", "force", "step"):
-            state[name][:] = 0
-        state["qpos"][:n], state["qpos"][n:] = start, start[0]
-        state["start"][n:] = state["end"][n:] = stops[0][0]
-        home = state["qpos"][:, self._model.object_address]
-        depth, no = np.array([look.object_depth for look in looks]), np.zeros(n, bool)
-        hands = _Closing(state, home, depth, np.zeros((n, home.shape[1], 2)), np.zeros(n, int), no, no.copy())
+        n, sim = len(index), self._sim
+        stops = [self._filled(self._model.controls(q[index].astype(float))) for q in self._protocol.stops(rows)]
+        start = self._filled(np.stack([look.qpos for look in looks]))
+        home = start[:, self._model.object_address]
+        depth, none = np.array([look.object_depth for look in looks]), np.zeros(n, int)
+        sim.begin(start)
+        hands = _Closing(home, depth, np.zeros((n, home.shape[1], 2)), none > 0, none > 0, none, sim.look())
         for a, b in pairwise(stops):
             if b is stops[-1]:  # the targets are q, the squeeze is next
                 hands.contacts = self._touching_at_rest(hands, a)
-            hands.state["start"][:n], hands.state["end"][:n], hands.state["step"][:] = a, b, 0
-            self._sim.restore(hands.state)
+            sim.drive(a, b)
             seconds = self._protocol.phase + (self._protocol.rest if b is stops[-1] else 0.0)
             for _ in range(max(1, round(seconds / CHUNK))):
-                self._sim.advance()
-                hands.state = self._sim.state()
-                hands.worst = np.maximum(hands.worst, self._sim.moved(hands.state, hands.home)[:n])
-                hands.wild |= self._sim.wild(hands.state)[:n]
-                deep = np.maximum(hands.depth, self._sim.contacts()[1][:n])
-                hands.depth = np.where(hands.wild, hands.depth, deep)
-                hands.full |= self._sim.overflowed()[:n]
+                sim.advance()
+                hands.now = now = sim.look()
+                hands.worst = np.maximum(hands.worst, sim.moved(now.qpos, home)[:n])
+                hands.wild |= now.wild[:n]
+                hands.depth = np.where(hands.wild, hands.depth, np.maximum(hands.depth, now.depth[:n]))
+                hands.full |= now.full[:n]
         return hands
 
     def _touching_at_rest(self, hands: _Closing, targets: np.ndarray) -> np.ndarray:
-        """Links on the object that the fewest touch, (n,), once hands have caught up with their targets (n, nu)."""
-        n = len(targets)
-        hands.state["start"][:n] = hands.state["end"][:n] = targets
-        self._sim.restore(hands.state)
+        """Links on the object that the fewest touch, (n,), once hands have caught up with their targets (W, nu); they
+        then continue from the previous state."""
+        n, sim = len(hands.full), self._sim
+        before = sim.keep()
+        sim.drive(targets, targets)
         for _ in range(max(1, round(self._protocol.settle / CHUNK))):
-            self._sim.advance()
-        hands.full |= self._sim.overflowed()[:n]
-        return self._sim.contacts()[0][:n].min(1)
+            sim.advance()
+        links, _, full = sim.touching()
+        hands.full |= full[:n]
+        sim.take(before, np.arange(sim.worlds))
+        return links[:n].min(1)
 
-    def _pull(self, hands: _Closing, good: np.ndarray) -> tuple[Pulls, np.ndarray]:
-        """Every direction of every good grasp, in whatever world is free, and which diverged; as of :class:`Trial`."""
-        n, sim, bodies, bounds = len(good), self._sim, self._model.object_body, self._bounds
-        pulls = Pulls.of(n, len(bodies))
+    def _pull(self, hands: _Closing, kept: Kept, good: np.ndarray) -> tuple[Pulls, np.ndarray]:
+        """Every direction of every good grasp, in whatever world is free, and which diverged; as of :class:`Trial`.
+
+        Args:
+            kept: state of the closed hands.
+        """
+        n, sim, bounds, objects = len(good), self._sim, self._bounds, len(self._model.object_body)
+        pulls = Pulls.of(n, objects)
         ran_away, undecided = np.zeros(n, bool), np.ones((n, 2), bool)  # holds, stays
         waiting = [(int(i), k) for k in reversed(range(6)) for i in reversed(np.flatnonzero(good))]
         total = max(1, round(self._protocol.hold / CHUNK))
         job = np.full((sim.worlds, 2), -1)  # grasp and direction of each world
         done, depth = np.zeros(sim.worlds, int), np.zeros(sim.worlds)
-        before, worst = np.zeros((2, sim.worlds, len(bodies), 2))
-        state = {name: values.copy() for name, values in hands.state.items()}
-        home = hands.home.copy()
-        axes = AXES @ self._base.T
+        before, worst = np.zeros((2, sim.worlds, objects, 2))
+        home, first = hands.home.copy(), sim.moved(hands.now.qpos, hands.home)
+        pull = self._model.forces[:, None] * (AXES @ self._base_rotation.T)[:, None]  # (6, O, 3)
         while True:
             free = np.flatnonzero(job[:, 0] < 0)
             taken = []
             while waiting and len(taken) < len(free):
                 i, k = waiting.pop()
-                if self._all or undecided[i].any():
+                if self._every or undecided[i].any():
                     taken.append((i, k))
-            fresh = free[: len(taken)]
             if taken:
+                fresh = free[: len(taken)]
                 job[fresh] = taken
                 i, k = job[fresh].T
                 done[fresh], worst[fresh], depth[fresh], home[fresh] = 0, hands.worst[i], hands.depth[i], hands.home[i]
-                for name, values in hands.state.items():
-                    state[name][fresh] = values[i]
-                state["start"][fresh], state["force"][fresh] = hands.state["end"][i], 0
-                state["force"][fresh[:, None], bodies, :3] = self._model.forces[:, None] * axes[k][:, None]
-                before[fresh] = sim.moved(state, home)[fresh]
+                before[fresh] = first[i]
+                source = np.full(sim.worlds, -1)
+                source[fresh] = i
+                sim.take(kept, source)
+                sim.hold(source, pull[job[:, 1]])
             busy = np.flatnonzero(job[:, 0] >= 0)
             if not len(busy):
                 return pulls, ran_away
             if not waiting and sim is self._sim and len(busy) <= self._few.worlds:  # stragglers
-                sim, rows = self._few, np.resize(busy, self._few.worlds)
-                state = {name: values[rows] for name, values in state.items()}
+                rows = np.resize(busy, self._few.worlds)
+                self._few.take(sim.state, rows)
+                sim = self._few
                 job, done, depth, before, worst, home = (a[rows] for a in (job, done, depth, before, worst, home))
                 job[len(busy) :] = -1
-                busy, taken = np.arange(len(busy)), [(-1, -1)]
-            if taken:
-                sim.restore(state)
+                busy = np.arange(len(busy))
             sim.advance()
-            state = sim.state()
-            here, wild = sim.moved(state, home), sim.wild(state)
-            links, deep = sim.contacts()
-            worst, depth = np.maximum(worst, here), np.where(wild, depth, np.maximum(depth, deep))
+            now = sim.look()
+            here, wild, touches = sim.moved(now.qpos, home), now.wild, now.links > 0
+            worst, depth = np.maximum(worst, here), np.where(wild, depth, np.maximum(depth, now.depth))
             done += 1
-            held = ~wild & bounds.held(worst, links > 0, depth)
+            held = ~wild & bounds.held(worst, touches, depth)
             over = wild | bounds.lost(worst) | (done >= total)
             if self._settled_stop:
                 over |= held & bounds.near(before, here, total - done)
             before = here
-            short = busy[sim.overflowed()[busy]]
-            hands.full[job[short, 0]] = True
+            hands.full[job[busy[now.full[busy]], 0]] = True
             ended = busy[over[busy]]
             i, k = job[ended].T
-            pulls.held[i, k], pulls.touches[i, k], pulls.depth[i, k] = held[ended], links[ended] > 0, depth[ended]
+            pulls.held[i, k], pulls.touches[i, k], pulls.depth[i, k] = held[ended], touches[ended], depth[ended]
             pulls.moved[i, k] = np.where(wild[ended, None, None], np.nan, worst[ended])
             undecided[i, 0] &= held[ended]
             undecided[i, 1] &= bounds.stays(pulls.moved[i, k])
             ran_away[i[wild[ended]]] = True
             job[ended] = -1
-
-    def _slip(self, rows: GraspRows, index: np.ndarray, looks: list[Look], qpos: np.ndarray) -> np.ndarray:
-        trial = Trial(self._model)
-        slips = (trial.slip_at(rows, int(i), look.points, q) for i, look, q in zip(index, looks, qpos, strict=True))
-        return np.fromiter(slips, float, len(index))

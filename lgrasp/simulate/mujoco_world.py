@@ -90,7 +90,7 @@ class MujocoWorld:
     def links_touching(self) -> np.ndarray:
         """Number of the hand's bodies in contact with each object (O,)."""
         bodies = self._m.geom_bodyid[self.data.contact.geom]
-        return links_touching(bodies, self._model.object_body, self._m.nbody)[0]
+        return links_touching(bodies, self._model.object_body, self._m.nbody)
 
     def on_table(self) -> bool:
         """Whether an object touches the table."""

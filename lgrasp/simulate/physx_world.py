@@ -171,7 +171,7 @@ class PhysxWorld:
         """Number of the hand's bodies in contact with each object (O,)."""
         bodies = [pair for pair, points in self._contacts() if min(p.separation for p in points) < 0.0]
         bodies = np.array(bodies, int).reshape(-1, 2)
-        return links_touching(bodies, self._model.object_body, self._m.nbody)[0]
+        return links_touching(bodies, self._model.object_body, self._m.nbody)
 
     def on_table(self) -> bool:
         """Whether an object touches the table."""

@@ -133,7 +133,7 @@ def verdicts(
         begin = time.perf_counter()
         model = build_model(scene, protocol, rows.q[0], group.objects)
         _check_held(model, group.rows)
-        worlds = None if on_cpu(device, protocol) else _worlds(model, device, len(group.rows), threads, options, keep)
+        worlds = None if on_cpu(device, protocol) else _worlds(model, device, len(group.rows), options, keep)
         if prepared:
             prepared(time.perf_counter() - begin)
         if worlds is None:
@@ -168,15 +168,13 @@ def _check_device(device: str, protocol: Protocol) -> None:
         raise PhysicsError(f"protocol {protocol.name} {why}")
 
 
-def _worlds(
-    model: Model, device: str, rows: int, threads: int, options: dict[str, bool], keep: Keep | None
-) -> "WorldTrials":
+def _worlds(model: Model, device: str, rows: int, options: dict[str, bool], keep: Keep | None) -> "WorldTrials":
     """As many worlds as there are rows, or those made before; their kernels are compiled."""
     from lgrasp.simulate.gpu import WorldTrials
 
     def make() -> WorldTrials:
         worlds = min(max(rows, _LEAST_WORLDS), _MOST_WORLDS)
-        return WorldTrials(model, device, worlds=worlds, threads=threads, **options)
+        return WorldTrials(model, device, worlds=worlds, **options)
 
     return keep("simulate", (model, device, *options.items()), make) if keep else make()
 

@@ -10,6 +10,7 @@ from lgrasp.simulate.lift import Lifted, conclude_lift, lift_row
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.mujoco_world import MujocoWorld
 from lgrasp.simulate.shake import shake_course
+from lgrasp.simulate.slip import Frames, points_on_links, slips
 from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude, moved, worst
 
 
@@ -55,11 +56,8 @@ class Trial:
             found.append(self._judge(rows, i, start, self._look(rows, i, start, at_q)))
         return worst(found)
 
-    def look(self, rows: GraspRows, i: int) -> Look:
-        """Row ``i`` before it is simulated, hand where the protocol starts; the geometry is MuJoCo's."""
-        return self._look(rows, i, rows.object_pose[i], self._look_at_q(rows, i))
-
     def _look(self, rows: GraspRows, i: int, pose: np.ndarray, at_q: tuple[np.ndarray, np.ndarray]) -> Look:
+        """Row ``i`` before it is simulated, hand where the protocol starts; the geometry is MuJoCo's."""
         still = self._still
         still.begin(self._protocol.stops(rows)[0][i], pose)
         return Look(*at_q, still.deepest(of_links=True), still.deepest(), still.data.qpos.copy())
@@ -88,15 +86,6 @@ class Trial:
             found = lift_row(self._world, self._model, rows, i)
             self.steps += found.steps
         return conclude_lift(self._bounds, look, found)
-
-    def base_rotation(self) -> np.ndarray:
-        """Of the hand's base in the world, (3, 3)."""
-        return self._still.frames()[1][self._model.base_body].copy()
-
-    def slip_at(self, rows: GraspRows, i: int, points: np.ndarray, qpos: np.ndarray) -> float:
-        """Slip of row ``i`` in a given state; ``points`` as of :meth:`look`."""
-        self._still.data.qpos[:] = qpos
-        return self._slip(rows, i, points)
 
     def _close(self, rows: GraspRows, i: int, look: Look) -> Closed:
         """From the start to the squeeze, each target approached evenly; ends early when all is lost."""
@@ -187,26 +176,22 @@ class Trial:
 
     def _look_at_q(self, rows: GraspRows, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Contact points on their links at q, (O, C, 3) in body frames [m], and links within 1 mm of each object."""
-        model = self._model
         self._near.begin(rows.q[i], rows.object_pose[i])
-        at, turn = self._near.frames()
-        body = model.link_body[rows.contact_links[i]]  # (O, C)
-        T = turn[model.object_body]
-        world = at[model.object_body][:, None] + rows.contact_points[i] @ T.transpose(0, 2, 1)
-        points = np.einsum("ocji,ocj->oci", turn[body], world - at[body])
-        return points, self._near.links_touching()
+        points = points_on_links(
+            self._model, _one(self._near.frames()), rows.contact_links[i : i + 1], rows.contact_points[i : i + 1]
+        )
+        return points[0], self._near.links_touching()
 
     def _slip(self, rows: GraspRows, i: int, points: np.ndarray) -> float:
         """How far the points of links are from the contact points that they made at q [m], largest; NaN: none."""
-        model, links = self._model, rows.contact_links[i]  # (O, C)
-        if not (links >= 0).any():
-            return np.nan
-        at, turn = self._world.frames()
-        body, own = model.link_body[links], model.object_body
-        world = at[body] + np.einsum("ocij,ocj->oci", turn[body], points)
-        seen = (world - at[own][:, None]) @ turn[own]
-        return float(np.linalg.norm(seen - rows.contact_points[i], axis=2)[links >= 0].max())
+        links, own = rows.contact_links[i : i + 1], rows.contact_points[i : i + 1]
+        return float(slips(self._model, _one(self._world.frames()), links, points[None], own)[0])
 
     def _moved(self) -> np.ndarray:
         """How far each object is from its start: displacement [m] and rotation [rad], (O, 2)."""
         return moved(self._world.objects(), self._start, self._model.centers)
+
+
+def _one(frames: Frames) -> Frames:
+    """The frames of one grasp, as those of n."""
+    return frames[0][None], frames[1][None]

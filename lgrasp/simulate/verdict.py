@@ -196,26 +196,20 @@ def at_rest(velocity: np.ndarray) -> np.ndarray:
     return (speed < _REST).all((-2, -1))
 
 
-def links_touching(
-    bodies: np.ndarray, objects: np.ndarray, count: int, world: np.ndarray | int = 0, worlds: int = 1
-) -> np.ndarray:
-    """Number of the hand's bodies in contact with each object, (worlds, O).
+def links_touching(bodies: np.ndarray, objects: np.ndarray, count: int) -> np.ndarray:
+    """Number of the hand's bodies in contact with each object (O,).
 
     Args:
         bodies: both bodies of each contact (n, 2).
         objects: bodies of the objects (O,); all others are the hand's.
         count: bodies in all.
-        world: of each contact (n,).
     """
     hand = np.ones(count, bool)
     hand[objects] = False
-    world = np.broadcast_to(world, len(bodies))
-    found = np.zeros((worlds, len(objects)), int)
-    for column, body in enumerate(objects):
-        of = (bodies == body).any(1)
-        table = np.zeros((worlds, count), bool)
-        table[world[of], bodies[of].sum(1) - body] = True
-        found[:, column] = table[:, hand].sum(1)
+    found = np.zeros(len(objects), int)
+    for number, body in enumerate(objects):
+        others = np.unique(bodies[(bodies == body).any(1)].sum(1) - body)
+        found[number] = hand[others].sum()
     return found
 
 

@@ -1,16 +1,16 @@
 """Many copies of one scene on one device, stepped together by MuJoCo Warp."""
 
 from copy import copy
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.runtime.fetch import to_numpy
+from lgrasp.runtime.fetch import fetch
 from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.model import Model
-from lgrasp.simulate.verdict import CHUNK, WILD, links_touching, moved
+from lgrasp.simulate.verdict import CHUNK, WILD, moved
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -25,8 +25,24 @@ class _Targets:
 
     start: wp.array2d(dtype=wp.float32)  # (W, nu)
     end: wp.array2d(dtype=wp.float32)  # (W, nu)
-    step: wp.array(dtype=wp.float32)  # (W,) steps since the start
+    step: wp.array2d(dtype=wp.float32)  # (W, 1) steps since the start
     ramp: wp.float32  # steps from start to end
+
+
+@wp.struct
+class _Owners:
+    """What the bodies and their geoms belong to."""
+
+    body: wp.array(dtype=wp.int32)  # (G,) of each geom
+    number: wp.array(dtype=wp.int32)  # (B,) which object each body is, -1: none
+
+
+@wp.struct
+class _Touching:
+    """What touches in W worlds; O objects, B bodies."""
+
+    links: wp.array3d(dtype=wp.uint8)  # (W, O, B) 1: this body, no object itself, touches the object
+    depth: wp.array2d(dtype=wp.float32)  # (W, 2) deepest penetration of any object, of anything [m]
 
 
 @wp.kernel
@@ -37,7 +53,7 @@ def _drive(targets: _Targets, ctrl_out: wp.array2d(dtype=wp.float32)):
         ctrl_out: (W, nu).
     """
     world, u = wp.tid()
-    share = wp.min((targets.step[world] + 1.0) / targets.ramp, 1.0)
+    share = wp.min((targets.step[world, 0] + 1.0) / targets.ramp, 1.0)
     ctrl_out[world, u] = targets.start[world, u] + (targets.end[world, u] - targets.start[world, u]) * share
 
 
@@ -45,34 +61,144 @@ def _drive(targets: _Targets, ctrl_out: wp.array2d(dtype=wp.float32)):
 def _count(targets_out: _Targets):
     """One step more."""
     world = wp.tid()
-    targets_out.step[world] = targets_out.step[world] + 1.0
+    targets_out.step[world, 0] = targets_out.step[world, 0] + 1.0
+
+
+@wp.kernel
+def _take(
+    rows: wp.array(dtype=wp.int32),
+    kept: wp.array2d(dtype=wp.float32),
+    now_out: wp.array2d(dtype=wp.float32),
+):
+    """Rows that were kept become those of worlds.
+
+    Args:
+        rows: (W,) which one each world takes, -1: none.
+        kept: (N, K).
+        now_out: (W, K).
+    """
+    world, k = wp.tid()
+    if rows[world] >= 0:
+        now_out[world, k] = kept[rows[world], k]
+
+
+@wp.kernel
+def _push(
+    rows: wp.array(dtype=wp.int32),
+    bodies: wp.array(dtype=wp.int32),
+    forces: wp.array3d(dtype=wp.float32),
+    applied_out: wp.array2d(dtype=wp.float32),
+):
+    """Forces on the centres of mass of bodies, in the worlds that take rows.
+
+    Args:
+        rows: (W,) -1: the world stays as it is.
+        bodies: (O,)
+        forces: (W, O, 3) [N], world frame.
+        applied_out: (W, 6 B) force and torque on each body.
+    """
+    world, o, k = wp.tid()
+    if rows[world] >= 0:
+        applied_out[world, 6 * bodies[o] + k] = forces[world, o, k]
+
+
+@wp.kernel
+def _touch(
+    geoms: wp.array(dtype=wp.vec2i),
+    worlds: wp.array(dtype=wp.int32),
+    distances: wp.array(dtype=wp.float32),
+    count: wp.array(dtype=wp.int32),
+    most: wp.float32,
+    owners: _Owners,
+    touching_out: _Touching,
+):
+    """Note each contact below a distance.
+
+    Args:
+        geoms: (C,) both, of each contact.
+        worlds: (C,)
+        distances: (C,) below 0 if they penetrate [m].
+        count: (1,) contacts in all.
+        most: [m]
+    """
+    contact = wp.tid()
+    if contact >= count[0] or distances[contact] >= most:
+        return
+    pair, world, depth = geoms[contact], worlds[contact], -distances[contact]
+    if pair[0] < 0 or pair[1] < 0:
+        return
+    a, b = owners.body[pair[0]], owners.body[pair[1]]
+    of_a, of_b = owners.number[a], owners.number[b]
+    wp.atomic_max(touching_out.depth, world, 1, depth)
+    if of_a >= 0 or of_b >= 0:
+        wp.atomic_max(touching_out.depth, world, 0, depth)
+    if of_a >= 0 and of_b < 0:
+        touching_out.links[world, of_a, b] = wp.uint8(1)
+    if of_b >= 0 and of_a < 0:
+        touching_out.links[world, of_b, a] = wp.uint8(1)
+
+
+Kept = tuple[wp.array, ...]
+"""Everything that decides what comes next, one row a world, on the device."""
+
+
+class Seen(NamedTuple):
+    """W worlds as they are now."""
+
+    qpos: np.ndarray
+    """(W, nq)"""
+    velocity: np.ndarray
+    """(W, nv)"""
+    links: np.ndarray
+    """Links that touch each object, (W, O)."""
+    depth: np.ndarray
+    """Deepest penetration of any object [m], (W,)."""
+    full: np.ndarray
+    """(W,) bool: a buffer was full since the last look, so that the state is worth nothing."""
+
+    @property
+    def wild(self) -> np.ndarray:
+        """(W,) bool: where the simulation has diverged."""
+        return ~(np.abs(self.velocity).max(1) < WILD) | ~np.isfinite(self.qpos).all(1)
 
 
 class Worlds:
-    """W copies of one scene; their state is set and read as NumPy arrays, and stepped a chunk at a time."""
+    """W copies of one scene, stepped a chunk at a time; states are kept and taken up again on the device."""
 
     def __init__(self, model: Model, worlds: int, device: str) -> None:
         mujoco, mujoco_warp = import_mujoco(), import_mujoco_warp()
         self._lib: Any = mujoco_warp
         self._model, self._device, self.worlds = model, wp.get_device(device), worlds
-        m = copy(model.mujoco)
-        if len(model.object_body) > 1:  # objects that press on each other: in single precision Newton's method fails
-            m.opt.solver = mujoco.mjtSolver.mjSOL_CG
-        m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
+        m, near = copy(model.mujoco), copy(model.mujoco_near)
+        for made in (m, near):
+            if len(model.object_body) > 1:  # which press on each other: in single precision Newton's method fails
+                made.opt.solver = mujoco.mjtSolver.mjSOL_CG
+            made.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
         with wp.ScopedDevice(self._device):
-            self._m = mujoco_warp.put_model(m)
-            self._m.opt.warn_overflow = 0  # reported by :meth:`overflowed`
+            self._m, self._near = mujoco_warp.put_model(m), mujoco_warp.put_model(near)
+            for placed in (self._m, self._near):
+                placed.opt.warn_overflow = 0  # :class:`Seen` tells
             room = {
                 "nconmax": _CONTACTS_PER_OBJECT * len(model.object_body),
                 "njmax": _CONSTRAINTS_PER_OBJECT * len(model.object_body),
             }
-            self._d = mujoco_warp.make_data(m, nworld=worlds, **room)
+            self._d = d = mujoco_warp.make_data(m, nworld=worlds, **room)
             self._targets = t = _Targets()
-            t.start, t.end, t.step = (wp.zeros((worlds, m.nu)[:n], dtype=wp.float32) for n in (2, 2, 1))
+            t.start, t.end, t.step = (wp.zeros((worlds, n), dtype=wp.float32) for n in (m.nu, m.nu, 1))
             t.ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
-        d = self._d
-        self._state = {"qpos": d.qpos, "qvel": d.qvel, "warm": d.qacc_warmstart, "force": d.xfrc_applied}
-        self._state |= {"start": t.start, "end": t.end, "step": t.step}
+            self._rows = wp.empty(worlds, dtype=wp.int32)
+            self._bodies = wp.array(model.object_body, dtype=wp.int32)
+            self._forces = wp.empty((worlds, len(model.object_body), 3), dtype=wp.float32)
+            self._owners, number = _Owners(), np.full(m.nbody, -1)
+            number[model.object_body] = np.arange(len(model.object_body))
+            self._owners.body = wp.array(m.geom_bodyid, dtype=wp.int32)
+            self._owners.number = wp.array(number, dtype=wp.int32)
+            self._touching = _Touching()
+            self._touching.links = wp.zeros((worlds, len(model.object_body), m.nbody), dtype=wp.uint8)
+            self._touching.depth = wp.zeros((worlds, 2), dtype=wp.float32)
+            force = d.xfrc_applied
+            self._applied = wp.array(ptr=force.ptr, dtype=wp.float32, shape=(worlds, 6 * m.nbody), copy=False)
+        self.state: Kept = (d.qpos, d.qvel, d.qacc_warmstart, self._applied, t.start, t.end, t.step)
         self.chunk = max(1, round(CHUNK / m.opt.timestep))
         self._graph: Any = None
         self._full = sum(int(mujoco_warp.OverflowType[name]) for name in _BUFFER_WARNINGS)
@@ -81,14 +207,14 @@ class Worlds:
 
     def _compile(self) -> None:
         """Compile what a step needs, and record it on a GPU; the state stays."""
-        saved = self.state()
+        before = self.keep()
         with wp.ScopedDevice(self._device):
             self._one_step()
             if self._device.is_cuda:
                 with wp.ScopedCapture() as capture:
                     self._one_step()
                 self._graph = capture.graph
-        self.restore(saved)
+        self.take(before, np.arange(self.worlds))
         self._d.overflow.zero_()
 
     def advance(self) -> None:
@@ -106,43 +232,80 @@ class Worlds:
         wp.launch(_count, self.worlds, [], [self._targets])
         self._lib.step(self._m, self._d)
 
-    def state(self) -> dict[str, np.ndarray]:
-        """Everything that decides what comes next, one row a world."""
-        return {name: to_numpy(a) for name, a in self._state.items()}
+    def begin(self, qpos: np.ndarray) -> None:
+        """Everything at rest at qpos (W, nq), the drives' targets 0."""
+        for a in self.state:
+            a.zero_()
+        self._d.qpos.assign(qpos)
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Inverse of :meth:`state`."""
-        for name, a in self._state.items():
-            a.assign(state[name])
+    def drive(self, start: np.ndarray, end: np.ndarray) -> None:
+        """Targets of the drives from now on, (W, nu) each [rad or m]: from one to the other."""
+        self._targets.start.assign(start)
+        self._targets.end.assign(end)
+        self._targets.step.zero_()
 
-    def moved(self, state: dict[str, np.ndarray], home: np.ndarray) -> np.ndarray:
-        """How far objects are from where they started: displacement [m] and rotation [rad], (worlds, O, 2).
+    def keep(self) -> Kept:
+        """A copy of everything that decides what comes next, one row a world."""
+        return tuple(wp.clone(a) for a in self.state)
+
+    def take(self, kept: Kept, rows: np.ndarray) -> None:
+        """Go on from rows (W,) of what these or other worlds have kept, where they are not -1."""
+        self._rows.assign(rows.astype(np.int32))
+        for a, now in zip(kept, self.state, strict=True):
+            wp.launch(_take, now.shape, [self._rows, a], [now], device=self._device)
+
+    def hold(self, rows: np.ndarray, forces: np.ndarray) -> None:
+        """In worlds whose row (W,) is not -1 the targets stay at their ends, and forces (W, O, 3) [N] pull from now on
+        at the centres of mass of the objects."""
+        self._rows.assign(rows.astype(np.int32))
+        self._forces.assign(forces)
+        t = self._targets
+        wp.launch(_push, forces.shape, [self._rows, self._bodies, self._forces], [self._applied], device=self._device)
+        own = wp.array(np.where(rows >= 0, np.arange(self.worlds), -1), dtype=wp.int32, device=self._device)
+        wp.launch(_take, t.start.shape, [own, t.end], [t.start], device=self._device)
+
+    def place(self, qpos: np.ndarray, *, near: bool = False) -> None:
+        """Everything at qpos (W, nq), with the contacts there; nothing moves.
 
         Args:
-            home: poses at the start, (worlds, O, 7).
+            near: hand and objects touch within 1 mm.
         """
-        return moved(state["qpos"][:, self._model.object_address], home, self._model.centers)
+        self._d.qpos.assign(qpos)
+        model = self._near if near else self._m
+        with wp.ScopedDevice(self._device):
+            self._lib.kinematics(model, self._d)
+            self._lib.collision(model, self._d)
 
-    @staticmethod
-    def wild(state: dict[str, np.ndarray]) -> np.ndarray:
-        """(worlds,) bool: where the simulation has diverged."""
-        return ~(np.abs(state["qvel"]).max(1) < WILD) | ~np.isfinite(state["qpos"]).all(1)
+    def frames(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (W, B, 3) [m] and rotations (W, B, 3, 3) of the bodies in the world."""
+        with wp.ScopedDevice(self._device):
+            self._lib.kinematics(self._m, self._d)
+        at, turn = fetch([self._d.xpos, self._d.xmat])
+        return at, turn
 
-    def overflowed(self) -> np.ndarray:
-        """(worlds,) bool: where a buffer was full since the last call, so that the state there is worth nothing."""
-        full = (to_numpy(self._d.overflow) & self._full) != 0
-        self._d.overflow.zero_()
-        return full
+    def touching(self, most: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Links that are nearer than ``most`` [m] to each object (W, O); deepest penetration of any object, and of
+        anything [m], (W, 2); where a buffer was full since the last call (W,)."""
+        d, seen = self._d, self._touching
+        seen.links.zero_()
+        seen.depth.zero_()
+        contact = d.contact
+        listed = [contact.geom, contact.worldid, contact.dist, d.nacon, most, self._owners]
+        wp.launch(_touch, d.naconmax, listed, [seen], device=self._device)
+        links, depth, full = fetch([seen.links, seen.depth, d.overflow])
+        d.overflow.zero_()
+        return links.sum(2, dtype=int), depth.astype(float), (full & self._full) != 0
 
-    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Number of links that touch each object, (worlds, O), and deepest penetration of any object [m], (worlds,)."""
-        d, m = self._d, self._model.mujoco
-        n = min(int(to_numpy(d.nacon)[0]), d.naconmax)
-        geoms, world, dist = (to_numpy(a[:n]) for a in (d.contact.geom, d.contact.worldid, d.contact.dist))
-        close = (dist < 0) & (geoms >= 0).all(1)
-        bodies, world, dist = m.geom_bodyid[geoms[close]], world[close], dist[close]
-        links = links_touching(bodies, self._model.object_body, m.nbody, world, self.worlds)
-        of_object = np.isin(bodies, self._model.object_body).any(1)
-        depth = np.zeros(self.worlds)
-        np.maximum.at(depth, world[of_object], -dist[of_object])
-        return links, depth
+    def look(self) -> Seen:
+        """The worlds after a chunk."""
+        links, depth, full = self.touching()
+        qpos, velocity = fetch([self._d.qpos, self._d.qvel])
+        return Seen(qpos, velocity, links, depth[:, 0], full)
+
+    def moved(self, qpos: np.ndarray, home: np.ndarray) -> np.ndarray:
+        """How far objects are from where they started: displacement [m] and rotation [rad], (W, O, 2).
+
+        Args:
+            home: poses at the start, (W, O, 7).
+        """
+        return moved(qpos[:, self._model.object_address], home, self._model.centers)
