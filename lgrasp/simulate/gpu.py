@@ -15,6 +15,9 @@ from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude
 from lgrasp.simulate.worlds import Kept, Seen, Worlds
 
+_SHARES = (4.0, 1.0, 0.25, 0.0625)
+"""Worlds in which closed hands are pulled, over those in which they close: fewer and fewer, as directions end."""
+
 
 @dataclass
 class _Closing:
@@ -44,7 +47,7 @@ class WorldTrials:
 
     Args:
         device: Warp device.
-        worlds: simulated at a time.
+        worlds: hands closed at a time.
         all_directions, settled_stop: as of :class:`Trial`.
     """
 
@@ -59,7 +62,7 @@ class WorldTrials:
     ) -> None:
         self._model, self._protocol = model, model.protocol
         self._sim = Worlds(model, worlds, device)
-        self._few = Worlds(model, max(1, worlds // 8), device)
+        self._pulled = [Worlds(model, max(1, int(worlds * share)), device) for share in _SHARES]
         self._every, self._settled_stop = all_directions, settled_stop
         self._spare = Trial(model, all_directions=all_directions, settled_stop=settled_stop)
         self._bounds, self._one = Bounds(model.protocol), threading.Lock()
@@ -70,7 +73,7 @@ class WorldTrials:
     @property
     def steps(self) -> int:
         """World-steps simulated so far."""
-        return self._sim.steps + self._few.steps
+        return self._sim.steps + sum(sim.steps for sim in self._pulled)
 
     def run(self, rows: GraspRows, progress: Callable[[int, int], None] | None = None) -> list[Verdict]:
         """The verdicts of all rows."""
@@ -84,12 +87,12 @@ class WorldTrials:
 
     def _block(self, rows: GraspRows, index: np.ndarray) -> list[Verdict]:
         n, links, points = len(index), rows.contact_links[index], rows.contact_points[index]
-        looks, full = self._looks(rows, index)
-        alive = np.array([look.depth for look in looks]) <= self._protocol.most_penetration
-        hands = self._close(rows, index, looks)
+        look, full = self._look(rows, index)
+        alive = look.depth <= self._protocol.most_penetration
+        hands = self._close(rows, index, look)
         hands.full |= full
         kept, (at, turn) = self._sim.keep(), self._sim.frames()
-        slip = slips(self._model, (at[:n], turn[:n]), links, np.stack([look.points for look in looks]), points)
+        slip = slips(self._model, (at[:n], turn[:n]), links, look.points, points)
         rest = at_rest(hands.now.velocity[:n, self._model.object_velocity])
         lost = hands.wild | self._bounds.lost(hands.worst)
         good = alive & ~lost
@@ -97,23 +100,21 @@ class WorldTrials:
         pulls, ran_away = self._pull(hands, kept, good)
         pulls.held[alive & lost] = 0
         pulls.moved[alive & lost] = hands.worst[alive & lost][:, None]
+        closed = Closed(
+            np.where(alive, hands.contacts, 0),
+            np.where(good, slip, np.nan),
+            good & rest,
+            hands.worst,
+            np.where(alive, hands.depth, look.object_depth),
+        )
+        found = conclude(self._bounds, look, closed, pulls, (hands.wild & alive) | ran_away)
+        own = [values for values in found if np.ndim(values)]
+        verdicts = [Verdict(*values) for values in zip(*own, strict=True)]
+        for i in np.flatnonzero(hands.full):
+            verdicts[i] = self._spare.run(rows, int(index[i]))
+        return verdicts
 
-        def verdict(i: int) -> Verdict:
-            if hands.full[i]:
-                return self._spare.run(rows, int(index[i]))
-            closed = Closed(
-                int(hands.contacts[i]) if alive[i] else 0,
-                float(slip[i]) if good[i] else np.nan,
-                bool(good[i] and rest[i]),
-                hands.worst[i],
-                float(hands.depth[i]) if alive[i] else looks[i].object_depth,
-            )
-            own = Pulls(*(values[i] for values in pulls))
-            return conclude(self._bounds, looks[i], closed, own, bool((hands.wild[i] and alive[i]) or ran_away[i]))
-
-        return [verdict(i) for i in range(n)]
-
-    def _looks(self, rows: GraspRows, index: np.ndarray) -> tuple[list[Look], np.ndarray]:
+    def _look(self, rows: GraspRows, index: np.ndarray) -> tuple[Look, np.ndarray]:
         """What needs no simulation, and where there were more contacts than room, (n,)."""
         n, sim, pose = len(index), self._sim, rows.object_pose[index]
         sim.place(self._qpos(rows.q[index], pose), near=True)
@@ -123,8 +124,7 @@ class WorldTrials:
         start = self._qpos(self._protocol.stops(rows)[0][index], pose)
         sim.place(start)
         _, depth, too_full = sim.touching()
-        looks = [Look(points[i], links[i], depth[i, 1], depth[i, 0], start[i]) for i in range(n)]
-        return looks, (full | too_full)[:n]
+        return Look(points, links[:n], depth[:n, 1], depth[:n, 0], start[:n]), (full | too_full)[:n]
 
     def _qpos(self, q: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """State of all worlds, (W, nq), of hands at q (n, K), objects at poses (n, O, 7); the rest are as the first."""
@@ -139,13 +139,13 @@ class WorldTrials:
         """Values of n grasps (n, ...) for all worlds (W, ...)."""
         return np.concatenate([values, np.repeat(values[:1], self._sim.worlds - len(values), 0)])
 
-    def _close(self, rows: GraspRows, index: np.ndarray, looks: list[Look]) -> _Closing:
+    def _close(self, rows: GraspRows, index: np.ndarray, look: Look) -> _Closing:
         """From the start to the squeeze, as of :class:`Trial`."""
         n, sim = len(index), self._sim
         stops = [self._filled(self._model.controls(q[index].astype(float))) for q in self._protocol.stops(rows)]
-        start = self._filled(np.stack([look.qpos for look in looks]))
+        start = self._filled(look.qpos)
         home = start[:, self._model.object_address]
-        depth, none = np.array([look.object_depth for look in looks]), np.zeros(n, int)
+        depth, none = look.object_depth, np.zeros(n, int)
         sim.begin(start)
         hands = _Closing(home, depth, np.zeros((n, home.shape[1], 2)), none > 0, none > 0, none, sim.look())
         for a, b in pairwise(stops):
@@ -181,15 +181,18 @@ class WorldTrials:
         Args:
             kept: state of the closed hands.
         """
-        n, sim, bounds, objects = len(good), self._sim, self._bounds, len(self._model.object_body)
-        pulls = Pulls.of(n, objects)
-        ran_away, undecided = np.zeros(n, bool), np.ones((n, 2), bool)  # holds, stays
+        n, bounds, objects = len(good), self._bounds, len(self._model.object_body)
+        pulls, wild_pulls = Pulls.of(n, objects), np.zeros((n, 6), bool)
+        undecided = np.ones((n, 2), bool)  # holds, stays
         waiting = [(int(i), k) for k in reversed(range(6)) for i in reversed(np.flatnonzero(good))]
+        enough = sum(sim.worlds >= len(waiting) for sim in self._pulled)
+        smaller = self._pulled[max(enough - 1, 0) :][::-1]
+        sim = smaller.pop()
         total = max(1, round(self._protocol.hold / CHUNK))
         job = np.full((sim.worlds, 2), -1)  # grasp and direction of each world
         done, depth = np.zeros(sim.worlds, int), np.zeros(sim.worlds)
         before, worst = np.zeros((2, sim.worlds, objects, 2))
-        home, first = hands.home.copy(), sim.moved(hands.now.qpos, hands.home)
+        home, first = np.zeros((sim.worlds, *hands.home.shape[1:])), sim.moved(hands.now.qpos, hands.home)
         pull = self._model.forces[:, None] * (AXES @ self._base_rotation.T)[:, None]  # (6, O, 3)
         while True:
             free = np.flatnonzero(job[:, 0] < 0)
@@ -210,11 +213,11 @@ class WorldTrials:
                 sim.hold(source, pull[job[:, 1]])
             busy = np.flatnonzero(job[:, 0] >= 0)
             if not len(busy):
-                return pulls, ran_away
-            if not waiting and sim is self._sim and len(busy) <= self._few.worlds:  # stragglers
-                rows = np.resize(busy, self._few.worlds)
-                self._few.take(sim.state, rows)
-                sim = self._few
+                return self._in_order(pulls, wild_pulls)
+            while not waiting and smaller and len(busy) <= smaller[-1].worlds:
+                rows = np.resize(busy, smaller[-1].worlds)
+                smaller[-1].take(sim.state, rows)
+                sim = smaller.pop()
                 job, done, depth, before, worst, home = (a[rows] for a in (job, done, depth, before, worst, home))
                 job[len(busy) :] = -1
                 busy = np.arange(len(busy))
@@ -235,5 +238,20 @@ class WorldTrials:
             pulls.moved[i, k] = np.where(wild[ended, None, None], np.nan, worst[ended])
             undecided[i, 0] &= held[ended]
             undecided[i, 1] &= bounds.stays(pulls.moved[i, k])
-            ran_away[i[wild[ended]]] = True
+            wild_pulls[i, k] = wild[ended]
             job[ended] = -1
+
+    def _in_order(self, pulls: Pulls, wild: np.ndarray) -> tuple[Pulls, np.ndarray]:
+        """The same without the directions that one after the other would not have been run, and which grasps diverged.
+
+        Args:
+            wild: directions that diverged (n, 6).
+        """
+        if not self._every:
+            lost = np.maximum.accumulate(pulls.held == 0, 1)
+            left = np.maximum.accumulate((pulls.held >= 0) & ~self._bounds.stays(pulls.moved), 1)
+            late = np.pad(lost & left, ((0, 0), (1, 0)))[:, :6]
+            for values, none in zip(pulls, Pulls.of(len(late), pulls.moved.shape[2]), strict=True):
+                values[late] = none[late]
+            wild = wild & ~late
+        return pulls, np.asarray(wild.any(1))

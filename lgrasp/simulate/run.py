@@ -76,7 +76,7 @@ if TYPE_CHECKING:
 Keep = Callable[[str, Hashable, Callable[[], Any]], Any]
 
 _HELD_TOLERANCE = 1.0e-4  # [rad or m]
-_LEAST_WORLDS, _MOST_WORLDS = 256, 8192  # on a GPU
+_LEAST_WORLDS, _MOST_WORLDS = 256, 4096  # that hands close in on a GPU
 
 
 def verdicts(

@@ -46,30 +46,30 @@ class Verdict(NamedTuple):
 
 
 class Look(NamedTuple):
-    """A row before it is simulated."""
+    """A row before it is simulated, or any number of rows at once (...)."""
 
     points: np.ndarray
     """Contact points at q in the frames of their links (O, C, 3) [m]."""
     contact_at_q: np.ndarray
     """Links within 1 mm of each object at q (O,)."""
-    depth: float
+    depth: Any
     """Deepest penetration at the start, links with links included [m]."""
-    object_depth: float
+    object_depth: Any
     """Deepest penetration of any object at the start [m]."""
     qpos: np.ndarray
     """MuJoCo's state at the start."""
 
 
 class Closed(NamedTuple):
-    """The closed hand."""
+    """The closed hand, or any number of them at once (...)."""
 
-    contacts: int
+    contacts: Any
     """Links on the object that the fewest touch, before the squeeze."""
-    slip: float
-    settled: bool
+    slip: Any
+    settled: Any
     moved: np.ndarray
     """Displacement [m] and rotation [rad] of each object at worst (O, 2); NaN: not run, or diverged."""
-    depth: float
+    depth: Any
     """Deepest penetration of any object until now [m]."""
 
 
@@ -134,28 +134,31 @@ class Bounds:
         return (ahead < 0.5 * self.most).all((-2, -1))
 
 
-def conclude(bounds: Bounds, look: Look, closed: Closed, pulls: Pulls, diverged: bool) -> Verdict:
-    """The verdict of one grasp."""
+def conclude(bounds: Bounds, look: Look, closed: Closed, pulls: Pulls, diverged: Any) -> Verdict:
+    """The verdict of one grasp, or of any number of grasps at once: then everything, ``diverged`` and the verdict
+    included, has leading axes."""
     run = pulls.held >= 0
-    far = pulls.moved.max(1)  # (6, 2)
-    worst = pulls.moved[run].max(0) if run.any() else closed.moved  # (O, 2)
-    touches = np.where(run.any(), pulls.touches[run].all(0), -1)
+    far = pulls.moved.max(-2)  # (..., 6, 2)
+    ever = np.any(run, axis=-1, keepdims=True)
+    of_runs = np.where(run[..., None, None], pulls.moved, -np.inf).max(-3)
+    worst = np.where(ever[..., None], of_runs, closed.moved)  # (..., O, 2)
+    touches = np.where(ever, (pulls.touches | ~run[..., None]).all(-2), -1)
     return Verdict(
-        holds=bool((pulls.held == 1).all()),
+        holds=(pulls.held == 1).all(-1),
         directions=pulls.held,
-        displacement=far[:, 0],
-        rotation=far[:, 1],
+        displacement=far[..., 0],
+        rotation=far[..., 1],
         slip=closed.slip,
-        contact_at_q=int(look.contact_at_q.min()),
+        contact_at_q=look.contact_at_q.min(-1),
         contact_at_grasp=closed.contacts,
         pregrasp_penetration=look.depth,
         settled=closed.settled,
         diverged=diverged,
-        stays=bool(run.all() and bounds.stays(pulls.moved).all()),
-        penetration=max(closed.depth, float(pulls.depth.max())),
-        object_touches=np.asarray(touches, np.int8),
-        object_displacement=worst[:, 0],
-        object_rotation=worst[:, 1],
+        stays=run.all(-1) & bounds.stays(pulls.moved).all(-1),
+        penetration=np.maximum(closed.depth, pulls.depth.max(-1)),
+        object_touches=touches.astype(np.int8),
+        object_displacement=worst[..., 0],
+        object_rotation=worst[..., 1],
     )
 
 

@@ -1,5 +1,7 @@
 """Many copies of one scene on one device, stepped together by MuJoCo Warp."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import copy
 from typing import Any, NamedTuple
 
@@ -14,9 +16,13 @@ from lgrasp.simulate.verdict import CHUNK, WILD, moved
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_CONTACTS_PER_OBJECT = 96  # per world and object, on average
+# room per world and object:
+_CONTACTS_PER_OBJECT = 64  # pairs of pieces that may touch, on average
+_DEEP_PER_OBJECT = 24  # pairs that penetrate, on average
+_CONSTRAINTS_PER_OBJECT = 256  # rows: four a contact, limits, couplings
 _BUFFER_WARNINGS = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # buffers that may be full
-_CONSTRAINTS_PER_OBJECT = 640  # rows per world and object: four a contact, limits, couplings
+_MOST_ITERATIONS = 20  # of Newton's method: all worlds wait for the slowest
+_BLOCK = 32  # threads of a block where each world has one thread: 4,096 worlds are too few for larger blocks
 
 
 @wp.struct
@@ -138,6 +144,22 @@ def _touch(
         touching_out.links[world, of_b, a] = wp.uint8(1)
 
 
+@contextmanager
+def _small_blocks(worlds: int) -> Iterator[None]:
+    """MuJoCo Warp launches kernels of one thread a world in blocks of 256, which leave most of a GPU idle."""
+    warp: Any = wp
+    launch = warp.launch
+
+    def spread(kernel: Any, dim: Any, *args: Any, block_dim: int | None = None, **more: Any) -> Any:
+        return launch(kernel, dim, *args, block_dim=_BLOCK if dim == worlds else block_dim, **more)
+
+    warp.launch = spread
+    try:
+        yield
+    finally:
+        warp.launch = launch
+
+
 Kept = tuple[wp.array, ...]
 """Everything that decides what comes next, one row a world, on the device."""
 
@@ -171,17 +193,18 @@ class Worlds:
         self._model, self._device, self.worlds = model, wp.get_device(device), worlds
         m, near = copy(model.mujoco), copy(model.mujoco_near)
         for made in (m, near):
+            made.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # a contact moves one finger
             if len(model.object_body) > 1:  # which press on each other: in single precision Newton's method fails
                 made.opt.solver = mujoco.mjtSolver.mjSOL_CG
+            else:
+                made.opt.iterations = min(made.opt.iterations, _MOST_ITERATIONS)
             made.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
         with wp.ScopedDevice(self._device):
             self._m, self._near = mujoco_warp.put_model(m), mujoco_warp.put_model(near)
             for placed in (self._m, self._near):
                 placed.opt.warn_overflow = 0  # :class:`Seen` tells
-            room = {
-                "nconmax": _CONTACTS_PER_OBJECT * len(model.object_body),
-                "njmax": _CONSTRAINTS_PER_OBJECT * len(model.object_body),
-            }
+            per = {"nconmax": _CONTACTS_PER_OBJECT, "nccdmax": _DEEP_PER_OBJECT, "njmax": _CONSTRAINTS_PER_OBJECT}
+            room = {name: number * len(model.object_body) for name, number in per.items()}
             self._d = d = mujoco_warp.make_data(m, nworld=worlds, **room)
             self._targets = t = _Targets()
             t.start, t.end, t.step = (wp.zeros((worlds, n), dtype=wp.float32) for n in (m.nu, m.nu, 1))
@@ -208,7 +231,7 @@ class Worlds:
     def _compile(self) -> None:
         """Compile what a step needs, and record it on a GPU; the state stays."""
         before = self.keep()
-        with wp.ScopedDevice(self._device):
+        with wp.ScopedDevice(self._device), _small_blocks(self.worlds):
             self._one_step()
             if self._device.is_cuda:
                 with wp.ScopedCapture() as capture:

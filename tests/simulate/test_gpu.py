@@ -35,12 +35,12 @@ def six(jaws: Jaws):
     return scene_of(shard.hand, shard.objects), Jaws.rows(shard, q_squeeze=shard.grasps.q - depth)
 
 
-def judge(scene, rows, worlds: int = 8, protocol=FC):
+def judge(scene, rows, worlds: int = 8, protocol=FC, all_directions: bool = True):
     from lgrasp.simulate.gpu import WorldTrials
 
     (group,) = group_rows(rows, len(scene.objects))
     model = build_model(scene, protocol, rows.q[0], group.objects)
-    trials = WorldTrials(model, "cuda:0" if GPU else "cpu", worlds=worlds, all_directions=True)
+    trials = WorldTrials(model, "cuda:0" if GPU else "cpu", worlds=worlds, all_directions=all_directions)
     return stack_verdicts(protocol, trials.run(group.rows), group.slots)
 
 
@@ -54,6 +54,15 @@ def test_same_verdicts(six):
             np.testing.assert_array_equal(here[f"fc_{name}"], there[f"fc_{name}"], err_msg=name)
         for name, bound in (("displacement", 2e-3), ("slip", 2e-4), ("pregrasp_penetration", 1e-6)):
             np.testing.assert_allclose(here[f"fc_{name}"], there[f"fc_{name}"], atol=bound, err_msg=name)
+
+
+def test_directions_end_with_the_first_that_is_lost(six):
+    """All of them are pulled at once, but the columns are those of one after the other."""
+    here, there = verdicts(*six, FC), judge(*six, all_directions=False)
+    assert (here["fc_directions"] == -1).any()
+    for name in ("directions", "holds", "diverged"):
+        np.testing.assert_array_equal(here[f"fc_{name}"], there[f"fc_{name}"], err_msg=name)
+    np.testing.assert_array_equal(np.isnan(here["fc_displacement"]), np.isnan(there["fc_displacement"]))
 
 
 def test_a_world_without_room_is_judged_by_mujoco(six, monkeypatch):
