@@ -183,28 +183,26 @@ class WorldTrials:
         """
         n, bounds, objects = len(good), self._bounds, len(self._model.object_body)
         pulls, wild_pulls = Pulls.of(n, objects), np.zeros((n, 6), bool)
-        undecided = np.ones((n, 2), bool)  # holds, stays
-        waiting = [(int(i), k) for k in reversed(range(6)) for i in reversed(np.flatnonzero(good))]
+        waiting = np.stack([np.tile(np.flatnonzero(good), 6), np.repeat(np.arange(6), good.sum())], 1)
         enough = sum(sim.worlds >= len(waiting) for sim in self._pulled)
         smaller = self._pulled[max(enough - 1, 0) :][::-1]
         sim = smaller.pop()
         total = max(1, round(self._protocol.hold / CHUNK))
-        job = np.full((sim.worlds, 2), -1)  # grasp and direction of each world
+        job: np.ndarray = np.full((sim.worlds, 2), -1)  # grasp and direction of each world
         done, depth = np.zeros(sim.worlds, int), np.zeros(sim.worlds)
         before, worst = np.zeros((2, sim.worlds, objects, 2))
         home, first = np.zeros((sim.worlds, *hands.home.shape[1:])), sim.moved(hands.now.qpos, hands.home)
         pull = self._model.forces[:, None] * (AXES @ self._base_rotation.T)[:, None]  # (6, O, 3)
         while True:
+            late = self._late(pulls)
+            waiting = waiting[~late[waiting[:, 0], waiting[:, 1]]]
+            job[(job[:, 0] >= 0) & late[job[:, 0], job[:, 1]]] = -1
             free = np.flatnonzero(job[:, 0] < 0)
-            taken = []
-            while waiting and len(taken) < len(free):
-                i, k = waiting.pop()
-                if self._every or undecided[i].any():
-                    taken.append((i, k))
-            if taken:
+            taken, waiting = waiting[: len(free)], waiting[len(free) :]
+            if len(taken):
                 fresh = free[: len(taken)]
                 job[fresh] = taken
-                i, k = job[fresh].T
+                i, k = taken.T
                 done[fresh], worst[fresh], depth[fresh], home[fresh] = 0, hands.worst[i], hands.depth[i], hands.home[i]
                 before[fresh] = first[i]
                 source = np.full(sim.worlds, -1)
@@ -213,8 +211,10 @@ class WorldTrials:
                 sim.hold(source, pull[job[:, 1]])
             busy = np.flatnonzero(job[:, 0] >= 0)
             if not len(busy):
-                return self._in_order(pulls, wild_pulls)
-            while not waiting and smaller and len(busy) <= smaller[-1].worlds:
+                for values, none in zip(pulls, Pulls.of(n, objects), strict=True):
+                    values[late] = none[late]
+                return pulls, np.asarray((wild_pulls & ~late).any(1))
+            while not len(waiting) and smaller and len(busy) <= smaller[-1].worlds:
                 rows = np.resize(busy, smaller[-1].worlds)
                 smaller[-1].take(sim.state, rows)
                 sim = smaller.pop()
@@ -236,22 +236,12 @@ class WorldTrials:
             i, k = job[ended].T
             pulls.held[i, k], pulls.touches[i, k], pulls.depth[i, k] = held[ended], touches[ended], depth[ended]
             pulls.moved[i, k] = np.where(wild[ended, None, None], np.nan, worst[ended])
-            undecided[i, 0] &= held[ended]
-            undecided[i, 1] &= bounds.stays(pulls.moved[i, k])
             wild_pulls[i, k] = wild[ended]
             job[ended] = -1
 
-    def _in_order(self, pulls: Pulls, wild: np.ndarray) -> tuple[Pulls, np.ndarray]:
-        """The same without the directions that one after the other would not have been run, and which grasps diverged.
-
-        Args:
-            wild: directions that diverged (n, 6).
-        """
-        if not self._every:
-            lost = np.maximum.accumulate(pulls.held == 0, 1)
-            left = np.maximum.accumulate((pulls.held >= 0) & ~self._bounds.stays(pulls.moved), 1)
-            late = np.pad(lost & left, ((0, 0), (1, 0)))[:, :6]
-            for values, none in zip(pulls, Pulls.of(len(late), pulls.moved.shape[2]), strict=True):
-                values[late] = none[late]
-            wild = wild & ~late
-        return pulls, np.asarray(wild.any(1))
+    def _late(self, pulls: Pulls) -> np.ndarray:
+        """Directions that one after the other would not be run, as all was decided before, (n, 6)."""
+        lost = np.logical_or.accumulate(pulls.held == 0, 1)
+        left = np.logical_or.accumulate((pulls.held >= 0) & ~self._bounds.stays(pulls.moved), 1)
+        late = np.pad(lost & left, ((0, 0), (1, 0)))[:, :6]
+        return late & (not self._every)
