@@ -15,8 +15,17 @@ from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude
 from lgrasp.simulate.worlds import Kept, Seen, Worlds
 
-_SHARES = (4.0, 1.0, 0.25, 0.0625)
+_SHARES = (4.0, 2.0, 1.0, 0.5, 0.25, 0.0625)
 """Worlds in which closed hands are pulled, over those in which they close: fewer and fewer, as directions end."""
+_WORLD_BYTES = 2.5e5
+"""Of a GPU's memory, that a world takes for each object."""
+_MOST_HANDS, _LEAST_HANDS = 8192, 256
+
+
+def hands_at_once(rows: int, objects: int, free: float) -> int:
+    """How many hands to close at a time, of so many rows with so many objects, in ``free`` bytes of memory."""
+    fit = 0.5 * free / (_WORLD_BYTES * objects * (1 + sum(_SHARES)))
+    return max(min(rows, _MOST_HANDS, int(fit)), _LEAST_HANDS)
 
 
 @dataclass

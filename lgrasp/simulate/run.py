@@ -76,7 +76,6 @@ if TYPE_CHECKING:
 Keep = Callable[[str, Hashable, Callable[[], Any]], Any]
 
 _HELD_TOLERANCE = 1.0e-4  # [rad or m]
-_LEAST_WORLDS, _MOST_WORLDS = 256, 4096  # that hands close in on a GPU
 
 
 def verdicts(
@@ -169,11 +168,13 @@ def _check_device(device: str, protocol: Protocol) -> None:
 
 
 def _worlds(model: Model, device: str, rows: int, options: dict[str, bool], keep: Keep | None) -> "WorldTrials":
-    """As many worlds as there are rows, or those made before; their kernels are compiled."""
-    from lgrasp.simulate.gpu import WorldTrials
+    """Worlds for the rows, or those made before; their kernels are compiled."""
+    import warp as wp
+
+    from lgrasp.simulate.gpu import WorldTrials, hands_at_once
 
     def make() -> WorldTrials:
-        worlds = min(max(rows, _LEAST_WORLDS), _MOST_WORLDS)
+        worlds = hands_at_once(rows, len(model.object_body), wp.get_device(device).free_memory)
         return WorldTrials(model, device, worlds=worlds, **options)
 
     return keep("simulate", (model, device, *options.items()), make) if keep else make()

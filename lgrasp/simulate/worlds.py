@@ -1,7 +1,5 @@
 """Many copies of one scene on one device, stepped together by MuJoCo Warp."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from copy import copy
 from typing import Any, NamedTuple
 
@@ -22,7 +20,6 @@ _DEEP_PER_OBJECT = 24  # pairs that penetrate, on average
 _CONSTRAINTS_PER_OBJECT = 256  # rows: four a contact, limits, couplings
 _BUFFER_WARNINGS = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # buffers that may be full
 _MOST_ITERATIONS = 20  # of Newton's method: all worlds wait for the slowest
-_BLOCK = 32  # threads of a block where each world has one thread: 4,096 worlds are too few for larger blocks
 
 
 @wp.struct
@@ -144,22 +141,6 @@ def _touch(
         touching_out.links[world, of_b, a] = wp.uint8(1)
 
 
-@contextmanager
-def _small_blocks(worlds: int) -> Iterator[None]:
-    """MuJoCo Warp launches kernels of one thread a world in blocks of 256, which leave most of a GPU idle."""
-    warp: Any = wp
-    launch = warp.launch
-
-    def spread(kernel: Any, dim: Any, *args: Any, block_dim: int | None = None, **more: Any) -> Any:
-        return launch(kernel, dim, *args, block_dim=_BLOCK if dim == worlds else block_dim, **more)
-
-    warp.launch = spread
-    try:
-        yield
-    finally:
-        warp.launch = launch
-
-
 Kept = tuple[wp.array, ...]
 """Everything that decides what comes next, one row a world, on the device."""
 
@@ -231,7 +212,7 @@ class Worlds:
     def _compile(self) -> None:
         """Compile what a step needs, and record it on a GPU; the state stays."""
         before = self.keep()
-        with wp.ScopedDevice(self._device), _small_blocks(self.worlds):
+        with wp.ScopedDevice(self._device):
             self._one_step()
             if self._device.is_cuda:
                 with wp.ScopedCapture() as capture:

@@ -65,6 +65,16 @@ def test_directions_end_with_the_first_that_is_lost(six):
     np.testing.assert_array_equal(np.isnan(here["fc_displacement"]), np.isnan(there["fc_displacement"]))
 
 
+def test_hands_at_once():
+    """As many as there are rows, within bounds and half the memory."""
+    from lgrasp.simulate.gpu import hands_at_once
+
+    assert hands_at_once(4000, 1, 1e12) == 4000
+    assert hands_at_once(10, 1, 1e12) == 256
+    assert hands_at_once(100_000, 1, 1e12) == 8192
+    assert hands_at_once(8192, 2, 16e9) < hands_at_once(8192, 1, 16e9) < 8192
+
+
 def test_a_world_without_room_is_judged_by_mujoco(six, monkeypatch):
     """Rows that need more constraints than there is room for get MuJoCo's own verdict."""
     from lgrasp.simulate import worlds
