@@ -46,7 +46,7 @@ def judge(scene, rows, worlds: int = 8, protocol=FC, all_directions: bool = True
 
 def test_same_verdicts(six):
     """In as many worlds as there are grasps, and in fewer."""
-    here = verdicts(*six, FC, all_directions=True)
+    here = verdicts(*six, protocol=FC, all_directions=True)
     assert 0 < here["fc_holds"].sum() < 6
     for worlds in (8, 4):
         there = judge(*six, worlds=worlds)
@@ -58,7 +58,7 @@ def test_same_verdicts(six):
 
 def test_directions_end_with_the_first_that_is_lost(six):
     """All of them are pulled at once, but the columns are those of one after the other."""
-    here, there = verdicts(*six, FC), judge(*six, all_directions=False)
+    here, there = verdicts(*six, protocol=FC), judge(*six, all_directions=False)
     assert (here["fc_directions"] == -1).any()
     for name in ("directions", "holds", "diverged"):
         np.testing.assert_array_equal(here[f"fc_{name}"], there[f"fc_{name}"], err_msg=name)
@@ -80,7 +80,7 @@ def test_a_world_without_room_is_judged_by_mujoco(six, monkeypatch):
     from lgrasp.simulate import worlds
 
     monkeypatch.setattr(worlds, "_CONSTRAINTS_PER_OBJECT", 8)
-    here, there = verdicts(*six, FC, all_directions=True), judge(*six)
+    here, there = verdicts(*six, protocol=FC, all_directions=True), judge(*six)
     for name, values in here.items():
         np.testing.assert_array_equal(values, there[name], err_msg=name)
 
