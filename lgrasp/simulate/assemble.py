@@ -97,6 +97,7 @@ OBJECT = "lgrasp object"
 TABLE = "lgrasp table"
 """Names the body of the table, where there is one."""
 
+_COUPLING = (0.99, 0.999)  # impedance of coupled joints: with MuJoCo's own they give way more than the drive
 _SAMPLED_POSTURES = 200
 _ALMOST_ALWAYS = 0.95  # of all postures; links that touch so often are left to touch
 
@@ -118,6 +119,8 @@ def assemble(
     spec = mujoco.MjSpec.from_string(bare_urdf(hand.urdf, held))
     set_options(mujoco, spec, protocol)
     _add_pieces(mujoco, spec, hand)
+    for equality in spec.equalities:
+        equality.solref, equality.solimp[:2] = [2.0 * protocol.timestep, 1.0], _COUPLING
     followers = {equality.name1 for equality in spec.equalities}
     for joint in spec.joints:
         set_joint(mujoco, joint, protocol)

@@ -22,8 +22,8 @@ SOLVER = {
 }
 """What decides a verdict besides the protocol, and the numbers of the protocol that mean nothing here."""
 
-_TENDON = 1.0e5  # stiffness of a tendon that couples joints
-_COUPLING = 5.0  # stiffness of a mimic joint's drive over that of its source
+_COUPLING = 5.0  # stiffness with which joints of one drive are held together, over that of the drive
+_AHEAD = 0.8  # of the motion in one step, that coupled joints are expected to go on with
 _AWAY = 10.0  # [m] where objects wait while the contacts of the grasp before are forgotten
 _ROTATE_X_TO_Z = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # w x y z: PhysX's capsules lie along x, MuJoCo's along z
 
@@ -46,22 +46,28 @@ def import_physx() -> Any:
     return sapien
 
 
-class _Follower(NamedTuple):
-    """A mimic joint: multiplier x source + offset."""
+class _Coupled(NamedTuple):
+    """J joints of one drive, at multiplier x (position of the drive) + offset."""
 
-    joint: int
-    source: int
-    multiplier: float
-    offset: float
-    stiffness: float
+    drive: int
+    joints: np.ndarray
+    """(J,) places in the articulation."""
+    multiplier: np.ndarray
+    """(J,)"""
+    offset: np.ndarray
+    """(J,) [rad or m]"""
+    tie: np.ndarray
+    """(2, J) stiffness and damping with which each is held to all of them."""
+    own: np.ndarray
+    """(2, J) likewise with which each takes its part in the drive."""
 
 
 class PhysxWorld:
     """A PhysX scene made of what MuJoCo compiled: its bodies, inertias, shapes, joints and drives, number by number.
 
     The interface is that of :class:`lgrasp.simulate.mujoco_world.MujocoWorld`. Contacts are hard; friction
-    acts at the points of a contact patch without torsional term, and a mimic joint is held to its source by a stiff
-    tendon if it is the next one, else driven after its source, which bears its torque.
+    acts at the points of a contact patch without torsional term, and joints that one drive moves share it and are held
+    to their mean.
 
     Args:
         model: O objects in the order of the rows.
@@ -100,8 +106,10 @@ class PhysxWorld:
     def drive(self, targets: np.ndarray) -> None:
         """Set the targets of the drives (nu,) [rad or m]."""
         self._targets = targets
-        for joint, target in zip(self._driven, targets, strict=True):
-            joint.set_drive_target(float(target))
+        shared = {coupled.drive for coupled in self._coupled}
+        for drive, (joint, target) in enumerate(zip(self._driven, targets, strict=True)):
+            if drive not in shared:
+                joint.set_drive_target(float(target))
 
     def push(self, forces: np.ndarray) -> None:
         """Pull on the objects' centres of mass from now on (O, 3) [N], world frame."""
@@ -122,20 +130,26 @@ class PhysxWorld:
         for _ in range(steps):
             for component, force in zip(self._objects, self._forces, strict=True):
                 component.add_force_torque(force, np.zeros(3))
-            if self._followers:
-                self._follow()
+            if self._coupled:
+                self._tie()
             self._system.step()
 
-    def _follow(self) -> None:
-        """Mimic joints go where their sources are, which bear their torques."""
-        q, speed = self._hand.get_qpos(), self._hand.get_qvel()
-        borne = np.zeros_like(q)
-        for f in self._followers:
-            target, velocity = f.multiplier * q[f.source] + f.offset, f.multiplier * speed[f.source]
-            self._joints[f.joint].set_drive_target(float(target))
-            self._joints[f.joint].set_drive_velocity_target(float(velocity))
-            borne[f.source] -= f.multiplier * f.stiffness * (target - q[f.joint])
-        self._hand.set_qf(borne)
+    def _tie(self) -> None:
+        """Aim the joints of each drive at where the drive wants them and, far more stiffly, at where they are on the
+        whole: such forces cancel in the drive, so that nothing but its own torque moves it."""
+        q = np.asarray(self._hand.get_qpos(), float)
+        # from positions: the velocities that PhysX tells are not those under load
+        speed = np.zeros_like(q) if self._before is None else (q - self._before) / self._m.opt.timestep
+        self._before = q
+        for c in self._coupled:
+            (k, d), (k_own, d_own), f = c.tie, c.own, c.multiplier
+            rate = _AHEAD * (f * d * speed[c.joints]).sum() / (f * f * d).sum()
+            mean = (f * k * (q[c.joints] - c.offset)).sum() / (f * f * k).sum()
+            ahead = mean + 0.5 * rate * self._m.opt.timestep
+            targets = f * (k * ahead + k_own * self._targets[c.drive]) / (k + k_own) + c.offset
+            for place, target, velocity in zip(c.joints, targets, f * rate * d / (d + d_own), strict=True):
+                self._joints[place].set_drive_target(float(target))
+                self._joints[place].set_drive_velocity_target(float(velocity))
 
     def state(self) -> Any:
         """Everything that decides what comes next, as far as PhysX gives it: not the contacts that it remembers."""
@@ -146,6 +160,7 @@ class PhysxWorld:
         packed, targets, forces = state
         self._forget()
         self._system.unpack(packed)
+        self._before = None
         self.drive(targets)
         self._forces[:] = forces
 
@@ -158,6 +173,10 @@ class PhysxWorld:
         """Linear [m/s] and angular [rad/s] velocities of the objects (O, 6)."""
         found = [[*c.get_linear_velocity(), *c.get_angular_velocity()] for c in self._objects]
         return np.array(found, float)
+
+    def hand_joints(self) -> np.ndarray:
+        """Positions of the hand's joints in the order of the model (J,) [rad or m]."""
+        return np.asarray(self._hand.get_qpos(), float)[self._column]
 
     def frames(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions (B, 3) [m] and rotations (B, 3, 3) of the bodies in the world."""
@@ -229,7 +248,8 @@ class PhysxWorld:
         self._column = np.array([order[self.links[int(m.jnt_bodyid[j])]] for j in hand_joints])
         row = {j: k for k, j in enumerate(hand_joints)}
         self._driven = [self._joints[self._column[row[int(m.actuator_trnid[a, 0])]]] for a in range(m.nu)]
-        self._followers: list[_Follower] = []
+        self._coupled: list[_Coupled] = []
+        self._before: np.ndarray | None = None  # positions of the joints a step ago
         self._couple(row)
         self._forces = np.zeros((len(self._objects), 3), np.float32)
 
@@ -297,10 +317,8 @@ class PhysxWorld:
         joint.set_armature(np.asarray(m.dof_armature[m.jnt_dofadr[j]], np.float32).reshape(1))
         joint.set_friction(0.0)
         driven = np.flatnonzero(m.actuator_trnid[:, 0] == j)
-        stiffness, damping = (
-            (m.actuator_gainprm[driven[0], 0], -m.actuator_biasprm[driven[0], 2]) if len(driven) else (0, 0)
-        )
-        joint.set_drive_property(float(stiffness), float(damping))
+        if len(driven):
+            joint.set_drive_property(*self._gains(int(driven[0])))
 
     def _add_shapes(self, body: int, component: Any) -> None:
         sapien, px, m = self._sapien, self._px, self._m
@@ -326,22 +344,34 @@ class PhysxWorld:
             component.attach(shape)
 
     def _couple(self, row: dict[int, int]) -> None:
-        """Hold mimic joints to their sources: by tendons where one link follows the other, else by :meth:`_follow`."""
-        m = self._m
-        for e in np.flatnonzero(m.eq_type == self._mujoco.mjtEq.mjEQ_JOINT):
-            follower, source = (int(self._column[row[int(j)]]) for j in (m.eq_obj1id[e], m.eq_obj2id[e]))
-            offset, multiplier = (float(x) for x in m.eq_data[e, :2])
-            joint, leader = self._joints[follower], self._joints[source]
-            if joint.parent_link == leader.child_link and multiplier:
-                self._hand.create_fixed_tendon(
-                    [leader.parent_link, leader.child_link, joint.child_link],
-                    [0, -multiplier, 1],
-                    [0, -multiplier, 1],  # forces, by virtual work
-                    rest_length=offset,
-                    stiffness=_TENDON,
-                )
+        """Share each drive of several joints out among them; :meth:`_tie` holds them together.
+
+        Tendons of PhysX pass on too little of a torque, and what drives a joint after another one must not press on it.
+        """
+        m, driven = self._m, {int(j): a for a, j in enumerate(self._m.actuator_trnid[:, 0])}
+        equal = m.eq_type == self._mujoco.mjtEq.mjEQ_JOINT
+        follows = zip(m.eq_obj1id[equal], m.eq_obj2id[equal], m.eq_data[equal, :2], strict=True)
+        source = {int(a): (int(b), float(shift), float(factor)) for a, b, (shift, factor) in follows}
+        members: dict[int, list[tuple[int, float, float]]] = {}
+        for joint in row:
+            at, factor, offset = joint, 1.0, 0.0
+            while at in source:
+                at, shift, multiplier = source[at]
+                offset, factor = offset + factor * shift, factor * multiplier
+            members.setdefault(at, []).append((joint, factor, offset))
+        arm = np.where(m.jnt_type == self._mujoco.mjtJoint.mjJNT_SLIDE, self._model.protocol.lever, 1.0)
+        for leader, some in members.items():
+            if len(some) == 1 or leader not in driven:
                 continue
-            stiffness = float(_COUPLING * m.actuator_gainprm[:, 0].max())
-            damping = 2.0 * np.sqrt(stiffness * m.dof_M0[m.jnt_dofadr[m.eq_obj1id[e]]])
-            joint.set_drive_property(stiffness, float(damping))
-            self._followers.append(_Follower(follower, source, multiplier, offset, stiffness))
+            joints, multiplier, offset = (np.array(column) for column in zip(*some, strict=True))
+            gain, damping = self._gains(driven[leader])
+            stiffness = _COUPLING * gain * (arm[leader] / arm[joints]) ** 2
+            tie = np.stack([stiffness, 2.0 * np.sqrt(stiffness * m.dof_M0[m.jnt_dofadr[joints]])])
+            own = np.array([[gain], [damping]]) * tie / (multiplier**2 * tie).sum(1, keepdims=True)
+            places = np.array([self._column[row[int(joint)]] for joint in joints])
+            for place, (k, d) in zip(places, (tie + own).T, strict=True):
+                self._joints[place].set_drive_property(float(k), float(d))
+            self._coupled.append(_Coupled(driven[leader], places, multiplier, offset, tie, own))
+
+    def _gains(self, drive: int) -> tuple[float, float]:
+        return float(self._m.actuator_gainprm[drive, 0]), float(-self._m.actuator_biasprm[drive, 2])

@@ -13,7 +13,7 @@ from lgrasp.simulate.run import verdicts
 from lgrasp.stages.context import Context
 from lgrasp.stages.simulate.params import SimulateParams
 
-VERSION = 2
+VERSION = 3
 """Raised also whenever a named protocol's numbers or the simulated scene change."""
 
 
