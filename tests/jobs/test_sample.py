@@ -183,10 +183,11 @@ def test_what_is_drawn_becomes_valid_shards(asked, network, tmp_path):
 
 
 def test_few_are_the_first_of_many(asked, network, tmp_path):
-    """Bit by bit, though a network that multiplies other batches may round otherwise."""
+    """Bit by bit, though a network that multiplies other batches may round otherwise; whatever the threads."""
     pipeline = small_pipeline("sample", width=12, wave=8, waves=3, draws=4)
     given = asked | {"pipeline": pipeline, "model": str(network)}
-    few, many = (run(SampleJob(**given, rows=rows, out=tmp_path / str(rows))).paths for rows in (2, 7))
+    jobs = [SampleJob(**given, rows=n, workers=threads, out=tmp_path / str(n)) for n, threads in ((2, 1), (7, 3))]
+    few, many = (run(job).paths for job in jobs)
     few, many = (read_shard(path).grasps for (path,) in (few, many))
     two, seven = (np.flatnonzero(rows.object_index[:, 1] >= 0) for rows in (few, many))
     assert len(two) == 2

@@ -170,7 +170,8 @@ class _Step:
         q, used = before.posture(inputs.hand.tree), before.used
         hands, free = HeldHands(q, used, before.pose), self._free(space) & ~used
         seed = stage_seed(self._seed, before.steps, "diffuser", wave)
-        drawn = inputs.sampler.draw(hands, space, free, each=each, seed=seed, steps=self._params.draws)
+        how = {"each": each, "seed": seed, "steps": self._params.draws, "pool": self._pool}
+        drawn = inputs.sampler.draw(hands, space, free, **how)
         add_seconds(self._result.seconds, {"diffuser": time.perf_counter() - start})
         return drawn
 

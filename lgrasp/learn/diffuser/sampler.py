@@ -1,7 +1,8 @@
 """Steps drawn by a trained network for hands that hold objects already."""
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -14,6 +15,8 @@ from lgrasp.learn.diffuser.network import DiffuserNet, Situation, joints_of
 from lgrasp.learn.diffuser.process import PROCESSES, Process
 from lgrasp.learn.diffuser.senses import HeldObjects, Senses
 from lgrasp.object.sdf import SdfGrid
+
+Result = TypeVar("Result")
 
 _TURNS = 64  # rotations in which the network sees an object
 _CPU_ROWS, _GPU_ROWS = 256, 16_384  # at a time
@@ -61,6 +64,24 @@ def draw_steps(
     return R @ turn, t, joints_of(seen.start, q, seen.free)
 
 
+def _in_threads(
+    work: Callable[[torch.Tensor], Result], batches: Iterable[torch.Tensor], pool: Executor | None
+) -> list[Result]:
+    """Results of batches; in a pool of one thread each, which takes less time than several threads for one batch."""
+    if pool is None:
+        return [work(picked) for picked in batches]
+    threads = torch.get_num_threads()
+
+    def alone(picked: torch.Tensor) -> Result:
+        torch.set_num_threads(1)
+        return work(picked)
+
+    try:
+        return list(pool.map(alone, batches))
+    finally:
+        torch.set_num_threads(threads)
+
+
 def _batches(count: int, device: torch.device) -> Iterator[torch.Tensor]:
     """Rows worked on at once. On a CPU always as many, the last one again and again: the size of what a library
     multiplies decides how it rounds."""
@@ -98,7 +119,15 @@ class StepSampler:
 
     @torch.no_grad()
     def draw(
-        self, hands: HeldHands, space: np.ndarray, free: np.ndarray, *, each: int, seed: int, steps: int = 10
+        self,
+        hands: HeldHands,
+        space: np.ndarray,
+        free: np.ndarray,
+        *,
+        each: int,
+        seed: int,
+        steps: int = 10,
+        pool: Executor | None = None,
     ) -> DrawnSteps:
         """``each`` steps for each of H hands, those of one hand one after another: the object after those held.
 
@@ -108,6 +137,7 @@ class StepSampler:
         Args:
             space: opposition spaces, (H,). free: joints that the steps may move, (H, K) bool.
             steps: of the sampling.
+            pool: threads that work on batches on a CPU.
         """
         rows, joints = hands.q.shape
         number = hands.pose.shape[1]
@@ -123,14 +153,17 @@ class StepSampler:
             self._put(free, torch.bool),
             self._put(space, torch.int64),
         )
-        parts, count = [], rows * each
-        for picked in _batches(count, self._device):
+        count = rows * each
+
+        def work(picked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             row, own = (picked // each).to(self._device), turn[picked].to(self._device)
             seen = situation.rows(row)._replace(shape=self._shape(number)[own])
             objects = torch.full_like(row, number), HeldObjects(*(x[row] for x in held))
             given = noise[picked].to(self._device), self._turns[own]
             R, t, q = draw_steps(self._net, self._process, self._senses, seen, *given, *objects, steps)
-            parts.append((pose_from_motion(R, t), q))
+            return pose_from_motion(R, t), q
+
+        parts = _in_threads(work, _batches(count, self._device), pool if self._device.type == "cpu" else None)
         pose, q = (torch.cat(x)[:count].cpu().numpy() for x in zip(*parts, strict=True))
         return DrawnSteps(pose, q)
 
