@@ -9,6 +9,7 @@ from scipy.spatial import QhullError
 from lgrasp.errors import ObjectError
 from lgrasp.object.load import open_edges
 
+_FLAT = 1e-6  # of the spreads of points along their main axes, the least over the largest
 _LEAST_VOLUME = 1e-12  # over the cubed largest side; a closed mesh of less bounds nothing
 
 
@@ -41,11 +42,7 @@ def mass_properties(vertices: np.ndarray, faces: np.ndarray) -> MassProperties:
     found = _solid(points, faces) if len(faces) and _closed(points, faces) else None
     closed = found is not None
     if found is None:
-        try:
-            hull = trimesh.convex.convex_hull(points[np.unique(faces)] if len(faces) else points)
-        except QhullError:
-            raise ObjectError("a flat mesh has no mass; a solid is accepted") from None
-        found = _solid(np.asarray(hull.vertices), np.asarray(hull.faces))
+        found = _solid_hull(points[np.unique(faces)] if len(faces) else points)
     if found is None:
         raise ObjectError("a flat mesh has no mass; a solid is accepted")
     volume, center, inertia = found
@@ -56,6 +53,18 @@ def _closed(points: np.ndarray, faces: np.ndarray) -> bool:
     """True if every directed edge is matched by its opposite."""
     joined = np.unique(points, axis=0, return_inverse=True)[1].ravel()[faces]
     return not len(open_edges(joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]))
+
+
+def _solid_hull(points: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
+    """:func:`_solid` of a convex hull; None if the points are in a plane."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if len(points) < 4 or spread[2] < _FLAT * spread[0]:
+        return None
+    try:
+        hull = trimesh.convex.convex_hull(points)
+    except QhullError:
+        return None
+    return _solid(np.asarray(hull.vertices), np.asarray(hull.faces))
 
 
 def _solid(points: np.ndarray, faces: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:

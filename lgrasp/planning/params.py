@@ -4,6 +4,7 @@ from pydantic import Field
 
 from lgrasp.config import Params
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.hold.params import HoldTest
 from lgrasp.refine.params import DISTAL, OTHER, LocalSearch
 
 _CLOUD_GAP = 6.0e-3  # [m]
@@ -56,6 +57,11 @@ class PlanParams(Params):
     )
     rank_friction: float = Field(
         default=0.3, gt=0, le=2, description="Friction coefficient at which the hands of a start are compared."
+    )
+    hold: HoldTest = Field(
+        default=HoldTest(),
+        description="How the finalists are tried: of those that pass the checks the one that holds most often is the "
+        "plan.",
     )
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 

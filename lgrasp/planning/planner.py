@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lgrasp.errors import ObjectError
 from lgrasp.geometry.poses import device_inverse
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps
@@ -17,6 +18,8 @@ from lgrasp.grasp.tables import GraspTable, join_rows, take_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.palm import palm_axis
+from lgrasp.hold.params import HoldTest
+from lgrasp.hold.run import ControlPoses, HoldTester
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.params import PlanParams
@@ -119,9 +122,8 @@ class Planner:
         device, surface = self.hand.device, hand_surface(self.hand.model, self.palmar, **self.params.weights())
         around = None if self.around is None else upload_object(self.around, device)
         target = upload_target(self.model, self.around, device)
-        return _Scene(
-            Descent(self.hand, target, self.params.search, surface), upload_object(self.model, device), around
-        )
+        obj, search = upload_object(self.model, device), Descent(self.hand, target, self.params.search, surface)
+        return _Scene(search, obj, around, _tester(self.hand, obj, self.params.hold))
 
     def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
@@ -131,7 +133,7 @@ class Planner:
             search.run(at, rounds=p.opening)
             start, at = self._best(at, start, _loosened(p.bounds), p.finalists)
             search.run(at, first=p.opening)
-            start, at = self._best(at, start, p.bounds, 1)
+            start, at = self._best(at, start, p.bounds, 1, tried=True)
         return self._checked(at, start, p.bounds)
 
     def _opened(self, search: Descent, points: np.ndarray, first: int) -> tuple[np.ndarray, Hands]:
@@ -153,16 +155,33 @@ class Planner:
         rows = (starts[:, None] * each + np.arange(each)).reshape(-1)
         return starts.repeat(each), self._put(device_inverse(self.guesses.pose[rows]), self.guesses.q[rows])
 
-    def _best(self, at: Hands, start: np.ndarray, bounds: GraspBounds, count: int) -> tuple[np.ndarray, Hands]:
-        """The ``count`` best hands of each start: those that pass the checks first, then those that resist most."""
+    def _best(
+        self, at: Hands, start: np.ndarray, bounds: GraspBounds, count: int, *, tried: bool = False
+    ) -> tuple[np.ndarray, Hands]:
+        """The ``count`` best hands of each start: those that pass the checks first, then, where hands are tried, those
+        that hold most often, then those that resist most."""
         bounds = bounds.changed(friction=self.params.rank_friction)
         table, outcome = self._checked(at, start, bounds)
-        keys = [np.arange(len(start)), -table.metrics["epsilon"], table.metrics["unresisted_load"], outcome != 0, start]
+        lost = 1 - self._held(table, outcome) if tried else np.zeros(len(start))
+        resist = [-table.metrics["epsilon"], table.metrics["unresisted_load"]]
+        keys = [np.arange(len(start)), *resist, lost, outcome != Outcome.KEPT, start]
         order = np.lexsort(keys)
         place = np.arange(len(start)) - np.searchsorted(start[order], start[order])
         rows = np.sort(order[place < count])
         pose, q = at.arrays()
         return start[rows], self._put(pose[rows], q[rows])
+
+    def _held(self, table: GraspTable, outcome: np.ndarray) -> np.ndarray:
+        """Share of the trials in which each of some hands holds, (M,); 0 of those that do not pass the checks."""
+        passed, held, tester = np.flatnonzero(outcome == Outcome.KEPT), np.zeros(len(outcome)), self._scene.tester
+        if tester is None or not len(passed):
+            return held
+        some = take_grasps(table, passed)
+        postures = ControlPoses(some.q_pregrasp, some.q, some.q_squeeze, some.pose, some.index)
+        found = tester.run(postures, 0)
+        draws = self.params.hold.draws
+        held[passed] = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
+        return held
 
     def _starts(self, points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Start of each hand (M,), the hands' bases (M, 7) and joints (M, K), and the directions they face (M, 3).
@@ -197,3 +216,12 @@ class _Scene:
     search: Descent
     object: ObjectArrays
     around: ObjectArrays | None
+    tester: HoldTester | None
+    """None: nothing is known of the object but a plane, which has no mass."""
+
+
+def _tester(hand: HandArrays, obj: ObjectArrays, test: HoldTest) -> HoldTester | None:
+    try:
+        return HoldTester(hand, obj, test)
+    except ObjectError:
+        return None

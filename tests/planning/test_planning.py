@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from lgrasp.cloud.model import cloud_object
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.outcomes import REASONS, Outcome
+from lgrasp.hold.run import ControlPoses, HoldTester
 from lgrasp.planning.params import PlanParams
 from lgrasp.planning.planner import Planner
 from lgrasp.refine.params import LocalSearch
@@ -53,6 +55,29 @@ def test_a_start_does_not_depend_on_the_others(planner, planned):
     np.testing.assert_array_equal(few.grasps.index, planned.grasps.index[same])
     np.testing.assert_array_equal(few.grasps.q, planned.grasps.q[same])
     np.testing.assert_array_equal(few.grasps.pose, planned.grasps.pose[same])
+
+
+def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, monkeypatch):
+    params = QUICK.model_copy(update={"rolls": 6, "finalists": 4})
+
+    def shares():
+        table = Planner(inputs.hand, inputs.object.model, 0.12, params).run(6).grasps
+        poses = ControlPoses(table.q_pregrasp, table.q, table.q_squeeze, table.pose, table.index)
+        found = HoldTester(inputs.hand, inputs.object, params.hold).run(poses, 0)
+        return dict(zip(table.index.tolist(), found["hold_probability"].tolist(), strict=True))
+
+    tried = shares()
+    monkeypatch.setattr(Planner, "_held", lambda self, table, outcome: np.zeros(len(outcome)))
+    untried = shares()
+    assert tried.keys() == untried.keys()
+    assert sum(tried.values()) > sum(untried.values())
+
+
+def test_of_a_plane_nothing_is_tried(inputs):
+    """A cloud of one flat face has no mass; its plans are ranked without."""
+    points = np.random.default_rng(0).uniform(-0.03, 0.03, (500, 3)) * [1, 1, 0]
+    face = cloud_object(points, np.tile([0.0, 0, 1], (500, 1)))
+    assert Planner(inputs.hand, face, 0.12, QUICK).run(2).counts["starts"] == 2
 
 
 def test_parameters_are_bounded():
