@@ -13,7 +13,7 @@ from lgrasp.simulate.model import Model
 from lgrasp.simulate.slip import points_on_links, slips
 from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude
-from lgrasp.simulate.worlds import Kept, Seen, Worlds
+from lgrasp.simulate.worlds import Kept, Sighting, Worlds
 
 _SHARES = (4.0, 2.0, 1.0, 0.5, 0.25, 0.0625)
 """Worlds in which closed hands are pulled, over those in which they close: fewer and fewer, as directions end."""
@@ -44,7 +44,7 @@ class _Closing:
     """More contacts than there was room for, at any time, (n,)."""
     contacts: np.ndarray
     """Links on the object that the fewest touch, before the squeeze, (n,)."""
-    now: Seen
+    now: Sighting
     """(W,)"""
 
 

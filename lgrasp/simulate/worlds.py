@@ -145,7 +145,7 @@ Kept = tuple[wp.array, ...]
 """Everything that decides what comes next, one row a world, on the device."""
 
 
-class Seen(NamedTuple):
+class Sighting(NamedTuple):
     """W worlds as they are now."""
 
     qpos: np.ndarray
@@ -183,7 +183,7 @@ class Worlds:
         with wp.ScopedDevice(self._device):
             self._m, self._near = mujoco_warp.put_model(m), mujoco_warp.put_model(near)
             for placed in (self._m, self._near):
-                placed.opt.warn_overflow = 0  # :class:`Seen` tells
+                placed.opt.warn_overflow = 0  # :class:`Sighting` tells
             per = {"nconmax": _CONTACTS_PER_OBJECT, "nccdmax": _DEEP_PER_OBJECT, "njmax": _CONSTRAINTS_PER_OBJECT}
             room = {name: number * len(model.object_body) for name, number in per.items()}
             self._d = d = mujoco_warp.make_data(m, nworld=worlds, **room)
@@ -300,11 +300,11 @@ class Worlds:
         d.overflow.zero_()
         return links.sum(2, dtype=int), depth.astype(float), (full & self._full) != 0
 
-    def look(self) -> Seen:
+    def look(self) -> Sighting:
         """The worlds after a chunk."""
         links, depth, full = self.touching()
         qpos, velocity = fetch([self._d.qpos, self._d.qvel])
-        return Seen(qpos, velocity, links, depth[:, 0], full)
+        return Sighting(qpos, velocity, links, depth[:, 0], full)
 
     def moved(self, qpos: np.ndarray, home: np.ndarray) -> np.ndarray:
         """How far objects are from where they started: displacement [m] and rotation [rad], (W, O, 2).
