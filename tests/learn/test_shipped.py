@@ -1,4 +1,4 @@
-"""The networks that are shipped: small, whole, of the hand that is shipped, and honest about what they did not see."""
+"""The networks that are shipped: small, whole, of hands that are shipped, and honest about what they did not see."""
 
 import pytest
 
@@ -8,14 +8,14 @@ from lgrasp.learn.diffuser.file import load_diffuser
 from lgrasp.learn.grasp.file import load_networks
 from lgrasp.learn.networks import find_network, read_card
 
-LOADERS = {"seq-allegro": load_diffuser, "grasp-allegro": load_networks}
+LOADERS = {"seq-allegro": load_diffuser, "grasp-allegro": load_networks, "grasp-shadow": load_networks}
 
 
 @pytest.mark.parametrize("name", LOADERS)
 def test_shipped_networks(name):
     path = find_network(name)
     LOADERS[name](path)
-    card, hand = read_card(path), find_hand("allegro")
+    card, hand = read_card(path), find_hand(name.split("-")[1])
     assert path.stat().st_size <= 8e6
     assert card["hand_sha256"] == hand_digest(hand.urdf, hand.spec)
     assert card["report"]["unseen"]
