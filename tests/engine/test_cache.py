@@ -3,6 +3,7 @@
 import os
 import shutil
 import threading
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -193,7 +194,9 @@ def test_damaged_artifact_is_made_again(job, inputs, cache_root, raw_grasps, lin
     path = next((cache.root / kind).iterdir()) if kind == "bank" else cache.path(kind, getattr(inputs.keys, kind))
     whole = path.read_bytes()
     broken = bytearray(whole)
-    broken[len(whole) // 2] ^= 1
+    with zipfile.ZipFile(path) as archive:
+        member = max(archive.infolist(), key=lambda one: one.file_size)
+    broken[member.header_offset + member.file_size // 2] ^= 1
     path.write_bytes(broken if damage == "flip" else whole[: len(whole) // 3])
     generate(job(rows=20, shard_rows=100, cache=cache, out=tmp_path / "second"))
     generate(job(rows=20, shard_rows=100, cache=Cache(cache_root), out=tmp_path / "first"))
