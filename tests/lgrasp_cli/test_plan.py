@@ -100,7 +100,7 @@ def test_interrupted(process, tmp_path):
     """Ctrl-C ends with 130 and leaves no half file."""
     out = tmp_path / "out"
     with process("plan", "--object", "sphere", "--starts", 2000, "--device", "cpu", "--out", out) as run:
-        time.sleep(5)
+        time.sleep(2)
         run.send_signal(signal.SIGINT)
         assert run.wait(20) == 130
     assert not list(out.glob("*"))

@@ -259,7 +259,7 @@ def test_interrupted(process, shards, tmp_path):
     with process(
         "refine", shards, "--matching-rounds", 1000, "--gradient-steps", 50, "--device", "cpu", "--out", out
     ) as run:
-        time.sleep(5)
+        time.sleep(2)
         run.send_signal(signal.SIGINT)
         assert run.wait(20) == 130
         assert run.stderr.read().splitlines()[-1].startswith("interrupted")
