@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hold.contacts import MAX_CONTACTS, Contact
 from lgrasp.hold.kernels import Course, Spread, TrialPulls, Trials, TriedGrasps, close_hands, pull_objects
@@ -40,6 +41,11 @@ class ControlPoses:
     """T_hand_object of the object's internal frame, device poses (N, 7)."""
     number: np.ndarray
     """(N,) integers from which random numbers come."""
+
+    @classmethod
+    def of(cls, table: GraspTable) -> "ControlPoses":
+        """Those of finished grasps; their numbers are those of their candidates."""
+        return cls(table.q_pregrasp, table.q, table.q_squeeze, table.pose, table.index)
 
     def __len__(self) -> int:
         return len(self.pose)

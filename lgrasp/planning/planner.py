@@ -176,9 +176,7 @@ class Planner:
         passed, held, tester = np.flatnonzero(outcome == Outcome.KEPT), np.zeros(len(outcome)), self._scene.tester
         if tester is None or not len(passed):
             return held
-        some = take_grasps(table, passed)
-        postures = ControlPoses(some.q_pregrasp, some.q, some.q_squeeze, some.pose, some.index)
-        found = tester.run(postures, 0)
+        found = tester.run(ControlPoses.of(take_grasps(table, passed)), 0)
         draws = self.params.hold.draws
         held[passed] = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
         return held

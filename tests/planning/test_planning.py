@@ -62,8 +62,7 @@ def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, monkeypa
 
     def shares():
         table = Planner(inputs.hand, inputs.object.model, 0.12, params).run(6).grasps
-        poses = ControlPoses(table.q_pregrasp, table.q, table.q_squeeze, table.pose, table.index)
-        found = HoldTester(inputs.hand, inputs.object, params.hold).run(poses, 0)
+        found = HoldTester(inputs.hand, inputs.object, params.hold).run(ControlPoses.of(table), 0)
         return dict(zip(table.index.tolist(), found["hold_probability"].tolist(), strict=True))
 
     tried = shares()

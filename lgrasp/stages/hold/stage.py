@@ -22,8 +22,7 @@ def run(inputs: GraspTable, params: HoldParams, context: Context) -> tuple[Grasp
     """
     least = context.bounds.min_hold_probability
     seed = stage_seed(context.base_seed, context.shard, "hold", context.salt)
-    postures = ControlPoses(inputs.q_pregrasp, inputs.q, inputs.q_squeeze, inputs.pose, inputs.index)
-    found = _tester(params, context).run(postures, seed, least=least)
+    found = _tester(params, context).run(ControlPoses.of(inputs), seed, least=least)
     keep = np.flatnonzero(context.bounds.held_by(found))
     table = take_grasps(replace(inputs, metrics={**inputs.metrics, **found}), keep)
     return table, {"tried": len(inputs), "held": len(keep)}
