@@ -19,7 +19,6 @@ APPROACH_LENGTH = 0.15
 RETREATS = wp.constant(7)
 """Directions in which the hand is tried to leave."""
 
-_LENGTH = wp.constant(APPROACH_LENGTH)
 _STEPS = wp.constant(15)
 _LEAST_SINE = wp.constant(1.0e-3)
 
@@ -112,7 +111,7 @@ def try_retreats(
     T_object = wp.transform_inverse(T)
     bodies = hand.body_group.shape[0]
     for step in range(_STEPS):
-        moved = wp.transform(way * (_LENGTH * float(step + 1) / float(_STEPS)), wp.quat_identity())
+        moved = wp.transform(way * (APPROACH_LENGTH * float(step + 1) / float(_STEPS)), wp.quat_identity())
         for b in range(bodies):
             B = moved
             if b > 0:

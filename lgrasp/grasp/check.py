@@ -21,18 +21,10 @@ from lgrasp.grasp.check_kernels import (
     pack_rows,
 )
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
-from lgrasp.grasp.control_kernels import (
-    FINGER_TRIES,
-    control_poses,
-    drop_limp,
-    limit_squeeze,
-    open_fingers,
-    open_poses,
-    press_shared,
-    try_fingers,
-)
+from lgrasp.grasp.control_kernels import control_poses, drop_limp, limit_squeeze, press_shared
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome
+from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, open_fingers, open_poses, try_fingers
 from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, drop_light, grasp_epsilon, resist_loads
 from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays

@@ -11,7 +11,6 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_CLUSTER = wp.constant(CLUSTER_SIZE)
 _FAR_BELOW = wp.constant(1.0e6)  # [m]
 
 
@@ -44,7 +43,7 @@ def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin:
     for k in range(hand.cluster_first[body], hand.cluster_first[body + 1]):
         s = hand.cluster_sphere[k]
         if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3] + margin:
-            for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+            for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                 if sdf_value(obj.sdf, wp.transform_point(T, hand.samples[i])) < margin:
                     return False
     return True
@@ -67,7 +66,7 @@ def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: 
     for k in range(hand.cluster_first[body], hand.cluster_first[body + 1]):
         s = hand.cluster_sphere[k]
         if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3]:
-            for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+            for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                 depth = wp.max(depth, -sdf_value(obj.sdf, wp.transform_point(T, hand.samples[i])))
             if depth > limit:
                 return depth
@@ -89,10 +88,10 @@ def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: 
                     # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
                     sdf = hand_grid(hand.contacts, grid)
                     if sdf_value(sdf, p) < s[3]:
-                        for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+                        for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                             depth = wp.max(depth, -sdf_value(sdf, wp.transform_point(T_body, obj.obstacles[i])))
                 elif point_depth(hand.pieces, piece, p) < s[3]:
-                    for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+                    for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                         q = wp.transform_point(T_body, obj.obstacles[i])
                         depth = wp.max(depth, -point_depth(hand.pieces, piece, q))
                 if depth > limit:
@@ -156,7 +155,7 @@ def _points_apart(a: Object, b: Object, T: wp.transform, margin: wp.float32):
     for k in range(a.clusters):
         s = a.cluster_sphere[k]
         if sdf_value(b.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3] + margin:
-            for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+            for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                 if sdf_value(b.sdf, wp.transform_point(T, a.obstacles[i])) < margin:
                     return False
     return True

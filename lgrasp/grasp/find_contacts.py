@@ -11,7 +11,7 @@ from lgrasp.grasp.check_structs import Limits, device_limits
 from lgrasp.grasp.contact_kernels import PalmarRuns, RunContacts, choose_contacts, link_contacts, tell_contacts
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.contact_surface import ContactSurface, contact_surface
-from lgrasp.math.qp import MAX_CONTACTS
+from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.runtime.structs import empty_struct, upload_struct
 

@@ -5,7 +5,8 @@ import warp as wp
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.grasp.outcomes import BALANCE, KEPT, OBJECT_COLLISION, TOUCH
 from lgrasp.math.constants import BALANCED, CONE_EDGES
-from lgrasp.math.qp import MAX_CONTACTS, balance, unresisted
+from lgrasp.math.limits import MAX_CONTACTS
+from lgrasp.math.qp import balance, unresisted
 from lgrasp.math.quality import epsilon_bound
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
@@ -13,8 +14,6 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_EDGES = wp.constant(CONE_EDGES)
-_BALANCED = wp.constant(BALANCED)
 _NARROWER_CONES = wp.constant(2)  # cones tried before the full one
 _RESIDUAL_TOLERANCE = wp.constant(1.0e-3)  # by which their residual may be larger
 
@@ -69,7 +68,7 @@ def balance_grasps(limits: Limits, places: Places, at: CheckedPostures, found_ou
         found_out.gswo[i] = 1.0
         return
     found_out.fswo[i] = _balanced(points, normals, k, 0.0, 0, limits.torque_scale, 0.0, forces)
-    gswo = _balanced(points, normals, k, limits.friction, _EDGES, limits.torque_scale, _BALANCED, forces)
+    gswo = _balanced(points, normals, k, limits.friction, CONE_EDGES, limits.torque_scale, BALANCED, forces)
     found_out.gswo[i] = gswo
     if gswo > limits.max_gswo:
         if found_out.outcome[i] == KEPT:

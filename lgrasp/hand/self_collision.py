@@ -5,13 +5,12 @@ import warp as wp
 from lgrasp.hand.arrays import Hand, overlap_grid
 from lgrasp.math.convex import pieces_clear
 from lgrasp.math.sdf import sdf_value
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+wp.set_module_options(KERNEL_OPTIONS)
 
 OVERLAP = 8.5e-4
 """Depth [m] to which such pairs may overlap; a grasp is strictly valid to 1 mm."""
-
-_OVERLAP = wp.constant(OVERLAP)
 
 
 @wp.func
@@ -82,7 +81,7 @@ def group_pairs_clear(
             Tg = Xb[side[1] - jb]
         elif a > 0:
             Tg = Xa[side[1] - ja]
-        if _side_depth(hand, k, wp.transform_inverse(Tg) * Tp, _OVERLAP) > _OVERLAP:
+        if _side_depth(hand, k, wp.transform_inverse(Tg) * Tp, OVERLAP) > OVERLAP:
             return False
     return True
 

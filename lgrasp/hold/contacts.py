@@ -11,10 +11,8 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-MAX_CONTACTS = 40
+MAX_TOUCHES = 40
 """Most contacts of a hand and an object."""
-_MOST = wp.constant(MAX_CONTACTS)
-_CLUSTER = wp.constant(CLUSTER_SIZE)
 _SPREAD = wp.constant(0.7e-3)  # [m] points so much farther than the deepest belong to the same patch
 _APART = wp.constant(1.5e-3)  # [m] least distance of two points of a patch
 _TURN = wp.constant(0.8660254)
@@ -73,7 +71,7 @@ def _on_both(hand: Hand, obj: Object, b: wp.int32, T: wp.transform, x: wp.vec3):
 @wp.func
 def _keep(found: wp.array(dtype=Contact), count: wp.int32, first: wp.int32, c: Contact):
     """Add a contact unless it is where another of its body is; the number of contacts."""
-    if count >= _MOST:
+    if count >= MAX_TOUCHES:
         return count
     for k in range(first, count):
         if wp.length(found[k].point - c.point) < _APART:
@@ -118,7 +116,7 @@ def find_contacts(
             for k in range(hand.cluster_first[b], hand.cluster_first[b + 1]):
                 s = hand.cluster_sphere[k]
                 if sdf_value(obj.sdf, wp.transform_point(T_b, wp.vec3(s[0], s[1], s[2]))) < s[3] + least:
-                    for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+                    for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                         d = sdf_value(obj.sdf, wp.transform_point(T_b, hand.samples[i]))
                         if d < least:
                             least = d
@@ -134,7 +132,7 @@ def find_contacts(
                 for k in range(hand.cluster_first[b], hand.cluster_first[b + 1]):
                     s = hand.cluster_sphere[k]
                     if sdf_value(obj.sdf, wp.transform_point(T_b, wp.vec3(s[0], s[1], s[2]))) < s[3] + least + _SPREAD:
-                        for i in range(k * _CLUSTER, (k + 1) * _CLUSTER):
+                        for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                             if sdf_value(obj.sdf, wp.transform_point(T_b, hand.samples[i])) < least + _SPREAD:
                                 e = hand.samples[i] - x0
                                 a = wp.dot(e, u)

@@ -20,8 +20,6 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-WIDTH = wp.constant(MAX_DOFS)
-"""Places of a contact's or a finger's dofs in flat arrays."""
 LIMIT = wp.constant(20.0)
 """Stiffness of joint limits over that of the drive."""
 _PATCH = wp.constant(0.005)  # [m] arm at which friction against twisting is as stiff as that against sliding
@@ -60,19 +58,19 @@ def make_columns(
 ):
     """Motion of each contact's point on its link [m], and its turn about the normal [rad], per unit of each dof."""
     for c in range(count):
-        for d in range(WIDTH):
-            column[c * WIDTH + d] = wp.vec3(0.0)
-            spin[c * WIDTH + d] = 0.0
+        for d in range(MAX_DOFS):
+            column[c * MAX_DOFS + d] = wp.vec3(0.0)
+            spin[c * MAX_DOFS + d] = 0.0
         b = contacts[c].body
         if b > 0:
             j0 = hand.kin.joint_first[hand.body_group[b]]
             a = b - 1 - j0
             while a >= 0:
                 d = hand.kin.joint_dof[j0 + a]
-                column[c * WIDTH + d] += point_column(hand.kin, j0 + a, X[j0 + a], contacts[c].point)
+                column[c * MAX_DOFS + d] += point_column(hand.kin, j0 + a, X[j0 + a], contacts[c].point)
                 if hand.kin.joint_prismatic[j0 + a] == 0:
                     axis = wp.transform_vector(X[j0 + a], hand.kin.joint_axis[j0 + a])
-                    spin[c * WIDTH + d] += hand.kin.joint_mult[j0 + a] * wp.dot(axis, contacts[c].normal)
+                    spin[c * MAX_DOFS + d] += hand.kin.joint_mult[j0 + a] * wp.dot(axis, contacts[c].normal)
                 a = hand.kin.joint_parent[j0 + a]
 
 
@@ -95,8 +93,8 @@ def relative_motion(
         g = hand.body_group[contact.body]
         first = hand.kin.dof_first[g]
         for d in range(hand.kin.dof_first[g + 1] - first):
-            y += column[c * WIDTH + d] * dq[first + d]
-            t += spin[c * WIDTH + d] * dq[first + d]
+            y += column[c * MAX_DOFS + d] * dq[first + d]
+            t += spin[c * MAX_DOFS + d] * dq[first + d]
     return wp.vec4(y[0], y[1], y[2], t)
 
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.hand.arrays import Hand
-from lgrasp.hold.contacts import MAX_CONTACTS, Contact, find_contacts, follow_contacts
+from lgrasp.hold.contacts import MAX_TOUCHES, Contact, find_contacts, follow_contacts
 from lgrasp.hold.energy import Body, Material, make_columns
 from lgrasp.hold.solve import MAX_HAND_DOFS, solve_step
 from lgrasp.math.constants import SLIDING_ARM
@@ -14,9 +14,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_DOFS = wp.constant(MAX_HAND_DOFS)
-_COLUMNS = MAX_CONTACTS * MAX_DOFS
-_ARM = wp.constant(SLIDING_ARM)
+_COLUMNS = MAX_TOUCHES * MAX_DOFS
 _REACH = wp.constant(2.0e-3)  # [m] contacts are looked for within
 _TRAVEL = wp.constant(1.0e-3)  # [m] of hand and object after which they are looked for afresh
 
@@ -84,7 +82,7 @@ class Trials:
     material: wp.array(dtype=Material)  # (T,) its ``drag`` is the damping [N m s/rad]
     mass: wp.array(dtype=wp.float32)  # (T,) [kg]
     motion: wp.array(dtype=Motion)  # (T,)
-    contacts: wp.array2d(dtype=Contact)  # (T, MAX_CONTACTS)
+    contacts: wp.array2d(dtype=Contact)  # (T, MAX_TOUCHES)
     q: wp.array2d(dtype=wp.float32)  # (T, MAX_HAND_DOFS) [rad or m]
 
 
@@ -193,7 +191,7 @@ def _scales(hand: Hand, scale: wp.array(dtype=wp.float32)):
             scale[first + d] = 1.0
         for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
             if hand.kin.joint_prismatic[j] == 1:
-                scale[first + hand.kin.joint_dof[j]] = 1.0 / (_ARM * _ARM)
+                scale[first + hand.kin.joint_dof[j]] = 1.0 / (SLIDING_ARM * SLIDING_ARM)
 
 
 @wp.func
@@ -205,10 +203,10 @@ def _advance(
     dx: wp.spatial_vector,
 ):
     """Move the joints; returns how far points of hand and object have come [m], roughly."""
-    far = wp.max(wp.length(wp.spatial_top(dx)), 0.5 * _ARM * wp.length(wp.spatial_bottom(dx)))
+    far = wp.max(wp.length(wp.spatial_top(dx)), 0.5 * SLIDING_ARM * wp.length(wp.spatial_bottom(dx)))
     for k in range(hand.kin.dof_first[hand.kin.groups]):
         q[k] = q[k] + dq[k]
-        far = wp.max(far, _ARM * wp.abs(dq[k]) * wp.sqrt(scale[k]))
+        far = wp.max(far, SLIDING_ARM * wp.abs(dq[k]) * wp.sqrt(scale[k]))
     return far
 
 
@@ -228,7 +226,7 @@ def _go(
 ):
     """Take trial i through a phase: 0 to the grasp, 1 to the squeeze, 2 ... 7 pulls; returns its motion at the end."""
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    before = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
+    before = wp.zeros(shape=(MAX_TOUCHES,), dtype=Contact)
     column = wp.zeros(shape=(_COLUMNS,), dtype=wp.vec3)
     spin = wp.zeros(shape=(_COLUMNS,), dtype=wp.float32)
     dq = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
@@ -285,7 +283,7 @@ def close_hands(
     """
     i = wp.tid()
     row = trials.row[i]
-    contacts = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
+    contacts = wp.zeros(shape=(MAX_TOUCHES,), dtype=Contact)
     scale = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
     q = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
     rng = wp.rand_init(trials.seed[i], grasps.number[row])
@@ -311,7 +309,7 @@ def close_hands(
     trials.motion[i] = s
     for c in range(s.contacts):
         trials.contacts[i, c] = contacts[c]
-    for k in range(_DOFS):
+    for k in range(MAX_HAND_DOFS):
         trials.q[i, k] = q[k]
 
 
@@ -327,7 +325,7 @@ def pull_objects(
 ):
     """One thread per trial and run of ``each`` directions, which ends at the first that is not held."""
     i, part = wp.tid()
-    contacts = wp.zeros(shape=(MAX_CONTACTS,), dtype=Contact)
+    contacts = wp.zeros(shape=(MAX_TOUCHES,), dtype=Contact)
     scale = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
     q = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
     _scales(hand, scale)
@@ -337,7 +335,7 @@ def pull_objects(
             s = trials.motion[i]
             for c in range(s.contacts):
                 contacts[c] = trials.contacts[i, c]
-            for k in range(_DOFS):
+            for k in range(MAX_HAND_DOFS):
                 q[k] = trials.q[i, k]
             s = _go(hand, obj, course, grasps, trials, i, 2 + pull, s, q, contacts, scale)
             pulls_out.held[i, pull] = 1 - s.lost

@@ -8,7 +8,7 @@ import warp as wp
 
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hold.contacts import MAX_CONTACTS, Contact
+from lgrasp.hold.contacts import MAX_TOUCHES, Contact
 from lgrasp.hold.kernels import Course, Spread, TrialPulls, Trials, TriedGrasps, close_hands, pull_objects
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.solve import MAX_HAND_DOFS
@@ -131,7 +131,7 @@ class HoldTester:
         given = {
             "row": wp.array(rows.astype(np.int32), dtype=wp.int32, device=device),
             "seed": wp.array(seeds.astype(np.int32), dtype=wp.int32, device=device),
-            "contacts": wp.empty((n, MAX_CONTACTS), dtype=Contact, device=device),
+            "contacts": wp.empty((n, MAX_TOUCHES), dtype=Contact, device=device),
             "q": wp.empty((n, MAX_HAND_DOFS), dtype=wp.float32, device=device),
         }
         trials = empty_struct(Trials, device, n, **given)

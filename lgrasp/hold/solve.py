@@ -3,10 +3,9 @@
 import warp as wp
 
 from lgrasp.hand.arrays import Hand
-from lgrasp.hold.contacts import MAX_CONTACTS, Contact
+from lgrasp.hold.contacts import MAX_TOUCHES, Contact
 from lgrasp.hold.energy import (
     LIMIT,
-    WIDTH,
     Body,
     Material,
     beyond_limits,
@@ -48,17 +47,17 @@ def _add_own(
         first = hand.kin.dof_first[group]
         for d in range(hand.kin.dof_first[group + 1] - first):
             k = first + d
-            for e in range(WIDTH):
-                A[k * WIDTH + e] = 0.0
+            for e in range(MAX_DOFS):
+                A[k * MAX_DOFS + e] = 0.0
             for e in range(6):
                 B[k * 7 + e] = 0.0
             stiff = m.drive * scale[k]
             drag = m.drag * scale[k]
             over = beyond_limits(hand, k, q[k] + dq[k])
             B[k * 7 + 6] = stiff * (q[k] + dq[k] - target[k] + LIMIT * over) + drag * dq[k]
-            A[k * WIDTH + d] = stiff + drag
+            A[k * MAX_DOFS + d] = stiff + drag
             if over != 0.0:
-                A[k * WIDTH + d] += LIMIT * stiff
+                A[k * MAX_DOFS + d] += LIMIT * stiff
     C = wp.spatial_matrix()
     g = wp.spatial_vector()
     r = dx - body.free
@@ -182,8 +181,8 @@ def solve_step(
     A = wp.zeros(shape=(_BLOCKS,), dtype=wp.float32)
     B = wp.zeros(shape=(_COUPLING,), dtype=wp.float32)
     step = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    Y = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec4)
-    Z = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec4)
+    Y = wp.zeros(shape=(MAX_TOUCHES,), dtype=wp.vec4)
+    Z = wp.zeros(shape=(MAX_TOUCHES,), dtype=wp.vec4)
     dofs = hand.kin.dof_first[hand.kin.groups]
     for k in range(dofs):
         dq[k] = 0.0

@@ -1,14 +1,15 @@
 """The linear system of a Newton step: fingers couple through the object only, so each is eliminated by itself.
 
-Flat arrays: A (dofs, WIDTH) lower triangles of the fingers' blocks, then their Cholesky factors; B (dofs, 7) the blocks
-between a finger and the object, and the gradient. C (6, 6) and g (6) are the object's.
+Flat arrays: A (dofs, MAX_DOFS) lower triangles of the fingers' blocks, then their Cholesky factors; B (dofs, 7) the
+blocks between a finger and the object, and the gradient. C (6, 6) and g (6) are the object's.
 """
 
 import warp as wp
 
 from lgrasp.hand.arrays import Hand
 from lgrasp.hold.contacts import Contact
-from lgrasp.hold.energy import WIDTH, Material, friction_stiffness, twist_stiffness
+from lgrasp.hold.energy import Material, friction_stiffness, twist_stiffness
+from lgrasp.math.limits import MAX_DOFS
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -76,8 +77,8 @@ def add_contact(
         group = hand.body_group[contact.body]
         first = hand.kin.dof_first[group]
         for d in range(hand.kin.dof_first[group + 1] - first):
-            j = column[c * WIDTH + d]
-            t = spin[c * WIDTH + d]
+            j = column[c * MAX_DOFS + d]
+            t = spin[c * MAX_DOFS + d]
             h = H * j
             rh = wp.cross(r, h)
             at = (first + d) * 7
@@ -86,7 +87,9 @@ def add_contact(
                 B[at + a] -= h[a]
                 B[at + 3 + a] -= rh[a] + turn_k * t * n[a]
             for e in range(d + 1):
-                A[(first + d) * WIDTH + e] += wp.dot(column[c * WIDTH + e], h) + turn_k * t * spin[c * WIDTH + e]
+                A[(first + d) * MAX_DOFS + e] += (
+                    wp.dot(column[c * MAX_DOFS + e], h) + turn_k * t * spin[c * MAX_DOFS + e]
+                )
     return C, g
 
 
@@ -103,18 +106,18 @@ def eliminate_finger(
     for d in range(dofs):
         k = first + d
         for e in range(d + 1):
-            s = A[k * WIDTH + e]
+            s = A[k * MAX_DOFS + e]
             for o in range(e):
-                s -= A[k * WIDTH + o] * A[(first + e) * WIDTH + o]
+                s -= A[k * MAX_DOFS + o] * A[(first + e) * MAX_DOFS + o]
             if e == d:
-                A[k * WIDTH + d] = wp.sqrt(wp.max(s, _LEAST))
+                A[k * MAX_DOFS + d] = wp.sqrt(wp.max(s, _LEAST))
             else:
-                A[k * WIDTH + e] = s / A[(first + e) * WIDTH + e]
+                A[k * MAX_DOFS + e] = s / A[(first + e) * MAX_DOFS + e]
         for col in range(7):
             s = B[k * 7 + col]
             for o in range(d):
-                s -= A[k * WIDTH + o] * B[(first + o) * 7 + col]
-            B[k * 7 + col] = s / A[k * WIDTH + d]
+                s -= A[k * MAX_DOFS + o] * B[(first + o) * 7 + col]
+            B[k * 7 + col] = s / A[k * MAX_DOFS + d]
         for a in range(6):
             g[a] = g[a] - B[k * 7 + a] * B[k * 7 + 6]
             for b in range(a + 1):
@@ -167,8 +170,8 @@ def solve_finger(
         for a in range(6):
             s -= B[k * 7 + a] * x[a]
         for o in range(d + 1, dofs):
-            s -= A[(first + o) * WIDTH + d] * step[first + o]
-        s = s / A[k * WIDTH + d]
+            s -= A[(first + o) * MAX_DOFS + d] * step[first + o]
+        s = s / A[k * MAX_DOFS + d]
         slope += step[k] * s
         step[k] = s
     return slope

@@ -3,8 +3,9 @@
 import warp as wp
 
 from lgrasp.math.triangles import closest_part
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+wp.set_module_options(KERNEL_OPTIONS)
 
 
 @wp.struct

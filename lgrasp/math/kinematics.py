@@ -3,8 +3,9 @@
 import warp as wp
 
 from lgrasp.math.limits import MAX_DOFS
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+wp.set_module_options(KERNEL_OPTIONS)
 
 vec_dof = wp.types.vector(MAX_DOFS, wp.float32)
 

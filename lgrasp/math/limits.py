@@ -10,3 +10,5 @@ MAX_GROUPS = 6
 """Most dependency groups of a hand."""
 DOF_SIZES = (4, MAX_DOFS)
 """Most actuated joints of a group that a kernel may be compiled for."""
+MAX_CONTACTS = MAX_GROUPS + 1
+"""Most contacts of a grasp: one of each finger, and the palm's."""

@@ -4,21 +4,18 @@ Both published scores are this problem: FSWO (eq. 1) over the k frictionless wre
 cones. So is the resistance to an outside force, of a hull moved by that force.
 """
 
-from typing import Any
-
 import warp as wp
 
+from lgrasp.math.cholesky import solving
 from lgrasp.math.constants import LOAD_ARM, LOAD_FORCE
+from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.math.transforms import tangent, vec3s
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+wp.set_module_options(KERNEL_OPTIONS)
 
-MAX_CONTACTS = 7
-"""Fingers plus palm in one grasp."""
 _MAX_CORRAL = 8
-_CORRAL_C = wp.constant(_MAX_CORRAL)
 _LOAD_SCALE = wp.constant(1.0 / LOAD_ARM)  # [1/m]
-_LOAD_FORCE = wp.constant(LOAD_FORCE)
 _EXACT, _LOAD_EXACT = wp.constant(1.0e-4), wp.constant(1.0e-3)  # relative errors of squared norms
 _NO_LIMIT = wp.constant(1.0e15)
 
@@ -56,44 +53,6 @@ def _best_direction(a: wp.vec3, n: wp.vec3, mu: wp.float32, edges: wp.int32):
     step = 6.2831853 / float(edges)
     angle = wp.round(wp.atan2(-v, -u) / step) * step
     return n + (t * wp.cos(angle) + b * wp.sin(angle)) * mu
-
-
-def solving(size: int) -> Any:
-    """x with (A + shift I) x = b for the leading n x n block of symmetric A, by Cholesky, for matrices of one size.
-
-    Squared pivots are ``floor`` at least; x is 0 beyond n.
-    """
-    square, column = wp.types.matrix((size, size), wp.float32), wp.types.vector(size, wp.float32)
-
-    @wp.func
-    def solve(A: square, b: column, n: wp.int32, shift: wp.float32, floor: wp.float32):
-        L = square()
-        x = column()
-        for i in range(n):
-            for j in range(i + 1):
-                s = A[i, j]
-                if i == j:
-                    s += shift
-                for c in range(j):
-                    s -= L[i, c] * L[j, c]
-                if i == j:
-                    L[i, i] = wp.sqrt(wp.max(s, floor))
-                else:
-                    L[i, j] = s / L[j, j]
-        for i in range(n):
-            s = b[i]
-            for c in range(i):
-                s -= L[i, c] * x[c]
-            x[i] = s / L[i, i]
-        for r in range(n):
-            i = n - 1 - r
-            s = x[i]
-            for c in range(i + 1, n):
-                s -= L[c, i] * x[c]
-            x[i] = s / L[i, i]
-        return x
-
-    return solve
 
 
 solve_spd = solving(_MAX_CORRAL)
@@ -172,7 +131,7 @@ def _least_norm(arms: vec3s, normals: vec3s, k: wp.int32, p: Program, forces: ve
                 bi = i
                 bf = f
         best = best * p.total + wp.dot(x, p.load)
-        if best > norm2 - 1.0e-6 - p.exact * norm2 or m >= _CORRAL_C:
+        if best > norm2 - 1.0e-6 - p.exact * norm2 or m >= _MAX_CORRAL:
             break
         if best > 0.0 and best * best > p.limit * p.limit * norm2:
             break
@@ -333,7 +292,7 @@ def unresisted(
     p.friction = mu
     p.torque_scale = _LOAD_SCALE
     p.load = vec6(e[0], e[1], e[2], 0.0, 0.0, 0.0)
-    p.total = _LOAD_FORCE
+    p.total = LOAD_FORCE
     p.less = 1
     p.stop = stop
     p.limit = limit

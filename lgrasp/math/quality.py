@@ -5,12 +5,13 @@ import math
 import warp as wp
 
 from lgrasp.math.constants import CONE_EDGES
-from lgrasp.math.qp import MAX_CONTACTS, vec6
+from lgrasp.math.limits import MAX_CONTACTS
+from lgrasp.math.qp import vec6
 from lgrasp.math.transforms import tangent, vec3s
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+wp.set_module_options(KERNEL_OPTIONS)
 
-_EDGES = wp.constant(CONE_EDGES)
 _CONES = wp.constant(CONE_EDGES * MAX_CONTACTS)
 _STEP = wp.constant(2.0 * math.pi / CONE_EDGES)  # [rad] between edges
 _STARTS = wp.constant(12)
@@ -37,7 +38,7 @@ def _pivot(B: mat66, r: wp.int32, d: vec6):
 @wp.func
 def _edge_wrench(arms: vec3s, cones: vec3s, e: wp.int32, scale: wp.float32):
     f = cones[e]
-    t = wp.cross(arms[e // _EDGES], f) * scale
+    t = wp.cross(arms[e // CONE_EDGES], f) * scale
     return vec6(f[0], f[1], f[2], t[0], t[1], t[2])
 
 
@@ -59,11 +60,11 @@ def _farthest(y: vec6, arms: vec3s, cones: vec3s, k: wp.int32, scale: wp.float32
     at = int(0)
     for i in range(k):
         a = yf + wp.cross(yt, arms[i])
-        for e in range(_EDGES):
-            z = wp.dot(a, cones[i * _EDGES + e])
+        for e in range(CONE_EDGES):
+            z = wp.dot(a, cones[i * CONE_EDGES + e])
             if z > top:
                 top = z
-                at = i * _EDGES + e
+                at = i * CONE_EDGES + e
     return top, at
 
 
@@ -81,9 +82,9 @@ def epsilon_bound(arms: vec3s, normals: vec3s, k: wp.int32, mu: wp.float32, radi
         n = normals[i]
         t = tangent(n)
         b = wp.cross(n, t)
-        for e in range(_EDGES):
+        for e in range(CONE_EDGES):
             angle = _STEP * float(e)
-            cones[i * _EDGES + e] = n + (t * wp.cos(angle) + b * wp.sin(angle)) * mu
+            cones[i * CONE_EDGES + e] = n + (t * wp.cos(angle) + b * wp.sin(angle)) * mu
     scale = 1.0 / radius
     least = float(1.0e30)
     for _s in range(_STARTS):
@@ -145,14 +146,14 @@ def epsilon_bound(arms: vec3s, normals: vec3s, k: wp.int32, mu: wp.float32, radi
             for i in range(k):
                 a = yf + wp.cross(yt, arms[i])
                 b = rf + wp.cross(rt, arms[i])
-                for e in range(_EDGES):
-                    f = cones[i * _EDGES + e]
+                for e in range(CONE_EDGES):
+                    f = cones[i * CONE_EDGES + e]
                     slope = -wp.dot(b, f)
                     if slope > 1.0e-4:
                         room = wp.max(1.0 - wp.dot(a, f), 0.0)
                         if room < theta * slope:
                             theta = room / slope
-                            at = i * _EDGES + e
+                            at = i * CONE_EDGES + e
             if at < 0:
                 break
             B = _pivot(B, r, B * _edge_wrench(arms, cones, at, scale))

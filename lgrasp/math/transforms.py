@@ -2,13 +2,14 @@
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+from lgrasp.runtime.device import KERNEL_OPTIONS
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 _RES = 8
 NORMAL_BINS = _RES * _RES
 """Octahedral bins of the unit sphere; a bin reaches 10 to 28 degrees from its middle."""
 
-_R = wp.constant(_RES)
 
 vec3s, transforms = wp.array(dtype=wp.vec3), wp.array(dtype=wp.transform)
 """Types of local arrays that functions are given."""
@@ -38,9 +39,9 @@ def octahedral(n: wp.vec3):
 def normal_bin(n: wp.vec3):
     """Index of the octahedral bin that holds unit vector n."""
     e = octahedral(n)
-    i = wp.clamp(int((e[0] + 1.0) * 0.5 * float(_R)), 0, _R - 1)
-    j = wp.clamp(int((e[1] + 1.0) * 0.5 * float(_R)), 0, _R - 1)
-    return i * _R + j
+    i = wp.clamp(int((e[0] + 1.0) * 0.5 * float(_RES)), 0, _RES - 1)
+    j = wp.clamp(int((e[1] + 1.0) * 0.5 * float(_RES)), 0, _RES - 1)
+    return i * _RES + j
 
 
 @wp.func

@@ -3,9 +3,10 @@
 import warp as wp
 
 from lgrasp.math.triangles import closest_on_triangle
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.config.log_level = wp.LOG_ERROR
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+wp.set_module_options(KERNEL_OPTIONS)
 
 
 @wp.kernel

@@ -20,8 +20,6 @@ wp.set_module_options(KERNEL_OPTIONS)
 MAX_COLUMNS = 32
 """Most joints that a hand's postures name."""
 
-_LENGTH = wp.constant(LENGTH)
-_STEEPEST = wp.constant(STEEPEST)
 _LOG_STEEPEST = math.log(STEEPEST)
 _PARABOLA_SLOPE = wp.constant(-2 * (STEEPEST - 1) * _LOG_STEEPEST - (STEEPEST - 1) ** 2 / STEEPEST)
 _PARABOLA_CONSTANT = wp.constant(-2 * _LOG_STEEPEST - 4 * (STEEPEST - 1) / STEEPEST + (STEEPEST - 1) ** 2 / STEEPEST**2)
@@ -61,8 +59,8 @@ def _repulsion(u: wp.float32):
     """Derivative of the barrier."""
     if u >= 1.0:
         return 0.0
-    if u < _STEEPEST:
-        return _PARABOLA_SLOPE + _PARABOLA_CONSTANT * (u - _STEEPEST)
+    if u < STEEPEST:
+        return _PARABOLA_SLOPE + _PARABOLA_CONSTANT * (u - STEEPEST)
     return -2.0 * (u - 1.0) * wp.log(u) - (u - 1.0) * (u - 1.0) / u
 
 
@@ -122,7 +120,7 @@ def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, X:
             if pull > 0.0:
                 plane = m.plane[row, i]
                 n = _normal(plane)
-                f += n * (2.0 * s.points * pull * beyond(plane, x) / (_LENGTH * _LENGTH))
+                f += n * (2.0 * s.points * pull * beyond(plane, x) / (LENGTH * LENGTH))
                 own = R * points.normals[i]
                 moment += wp.cross(own, n) * (2.0 * s.normals * pull * (wp.dot(own, n) + 1.0))
             total += f

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from lgrasp.grasp.wrench_space import WrenchSpace, primitive_wrenches, wrench_space, wrench_spaces
-from lgrasp.math.qp import MAX_CONTACTS
+from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.math.quality import epsilon_bound
 from lgrasp.runtime.device import KERNEL_OPTIONS
 

@@ -14,7 +14,7 @@ from support.urdfs import fingers
 
 from lgrasp.hand.arrays import Hand, HandArrays, body_poses, upload_hand
 from lgrasp.hand.build import build_hand
-from lgrasp.hold.contacts import MAX_CONTACTS, Contact
+from lgrasp.hold.contacts import MAX_TOUCHES, Contact
 from lgrasp.hold.energy import Body, Material, make_columns
 from lgrasp.hold.solve import MAX_HAND_DOFS, solve_step
 from lgrasp.math.kinematics import group_forward, vec_dof
@@ -25,7 +25,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 LIMIT, PATCH = 20.0, 0.005  # of joint limits over drives; arm of friction against twisting [m]
 DRIVE, DRAG, STIFF = 5.0, 1.0, 2e4
-WIDTH = MAX_CONTACTS * MAX_DOFS
+WIDTH = MAX_TOUCHES * MAX_DOFS
 
 
 @wp.kernel

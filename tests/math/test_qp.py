@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from support.wrench import cone_forces, is_balanced, residual, unresisted
 
 from lgrasp.math import qp
-from lgrasp.math.qp import MAX_CONTACTS, balance, balances, by_difficulty, frictionless
+from lgrasp.math.limits import MAX_CONTACTS
+from lgrasp.math.qp import balance, balances, by_difficulty, frictionless
 from lgrasp.math.transforms import vec3s
 from lgrasp.runtime.device import KERNEL_OPTIONS
 

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 from support.wrench import epsilon
 
-from lgrasp.math.qp import MAX_CONTACTS
+from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.math.quality import epsilon_bound
 from lgrasp.runtime.device import KERNEL_OPTIONS
 

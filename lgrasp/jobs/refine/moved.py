@@ -17,7 +17,7 @@ from lgrasp.grasp.rows import CONTACTS, POSTURES, grasp_rows, press
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.grasp.tables import GraspTable, choose_grasps, join_rows, widen_grasps
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.math.qp import MAX_CONTACTS
+from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.energy import Energies

@@ -14,9 +14,6 @@ wp.set_module_options(KERNEL_OPTIONS)
 BLOCK = 64
 """Candidates among which poses are compared; batches are whole blocks."""
 
-_BLOCK = wp.constant(BLOCK)
-_MOST_HITS = wp.constant(MOST_HITS)
-_COUNT = wp.constant(COUNT_SCALE)
 _ROUNDS = wp.constant(6)  # of the fixed point
 
 
@@ -49,7 +46,7 @@ def rate_contacts(
         for m in range(candidates.count[row, g]):
             if candidates.state[row, g, m] == State.REALISED:
                 realised += 1
-                if hits < _MOST_HITS:
+                if hits < MOST_HITS:
                     i = candidates.surface[row, g, m]
                     p = wp.transform_point(T, obj.contact_points[i])
                     x = hit_channels(net, p, -wp.transform_vector(T, obj.contact_normals[i]), com)
@@ -57,7 +54,7 @@ def rate_contacts(
                     top = wp.max(top, x)
                     hits += 1
         contacts += realised
-        h = add_count(net, h, g, float(realised) / _COUNT)
+        h = add_count(net, h, g, float(realised) / COUNT_SCALE)
         if hits > 0:
             h = add_group(net, h, g, total / float(hits), top)
     chance = float(0.0)
@@ -81,12 +78,12 @@ def drop_unlikely(chance: wp.array(dtype=wp.float32), later_cost: wp.float32, ca
     rows = candidates_out.poses.rows[0]
     if row >= rows:
         return
-    block = candidates_out.poses.index[row] // _BLOCK
+    block = candidates_out.poses.index[row] // BLOCK
     a = row
-    while a > 0 and candidates_out.poses.index[wp.max(a - 1, 0)] // _BLOCK == block:
+    while a > 0 and candidates_out.poses.index[wp.max(a - 1, 0)] // BLOCK == block:
         a -= 1
     b = row + 1
-    while b < rows and candidates_out.poses.index[wp.min(b, rows - 1)] // _BLOCK == block:
+    while b < rows and candidates_out.poses.index[wp.min(b, rows - 1)] // BLOCK == block:
         b += 1
     rate = float(0.0)
     for _r in range(_ROUNDS):

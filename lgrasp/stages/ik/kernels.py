@@ -11,9 +11,9 @@ from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.grasp.structs import Candidates, Sets, State
 from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid
 from lgrasp.hand.self_collision import group_pairs_clear
+from lgrasp.math.cholesky import solving
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column
 from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
-from lgrasp.math.qp import solving
 from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS

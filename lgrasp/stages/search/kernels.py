@@ -10,8 +10,8 @@ from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.constants import INSCRIBED
 from lgrasp.math.kinematics import group_forward
-from lgrasp.math.limits import MAX_JOINTS
-from lgrasp.math.qp import MAX_CONTACTS, balances, by_difficulty, unresisted
+from lgrasp.math.limits import MAX_CONTACTS, MAX_JOINTS
+from lgrasp.math.qp import balances, by_difficulty, unresisted
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -19,7 +19,6 @@ from lgrasp.stages.search.sets import FoundSets, Hits, SearchValues, TriedSets, 
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_INSCRIBED = wp.constant(INSCRIBED)
 _UNKNOWN = wp.constant(-1)  # whether a candidate sinks into the object
 
 
@@ -113,7 +112,7 @@ def check_balance(hits: Hits, obj: Object, params: SearchValues, candidates: Can
         tried_out.score[row, lane] = -1.0
         return
     centred(points, n, arms)
-    if not balances(arms, normals, n, params.friction * _INSCRIBED, params.torque_scale, params.max_gswo):
+    if not balances(arms, normals, n, params.friction * INSCRIBED, params.torque_scale, params.max_gswo):
         tried_out.score[row, lane] = -1.0
 
 

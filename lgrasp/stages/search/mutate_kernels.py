@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from lgrasp.grasp.structs import Candidates
-from lgrasp.math.qp import MAX_CONTACTS
+from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.math.transforms import tangent
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS

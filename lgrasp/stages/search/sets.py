@@ -4,8 +4,8 @@ import warp as wp
 
 from lgrasp.grasp.structs import Candidates
 from lgrasp.math.constants import INSCRIBED
-from lgrasp.math.limits import MAX_GROUPS
-from lgrasp.math.qp import MAX_CONTACTS, balance, frictionless
+from lgrasp.math.limits import MAX_CONTACTS, MAX_GROUPS
+from lgrasp.math.qp import balance, frictionless
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -13,8 +13,6 @@ from lgrasp.stages.search.params import MAX_KINDS, MAX_RESTARTS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_MAX_STARTS = wp.constant(MAX_RESTARTS)
-_INSCRIBED = wp.constant(INSCRIBED)
 vec_set = wp.types.vector(MAX_GROUPS, wp.int32)
 vec_kinds = wp.types.vector(MAX_KINDS, wp.int32)
 
@@ -104,7 +102,7 @@ def _with_friction(points: vec3s, normals: vec3s, k: wp.int32, friction: wp.floa
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     centred(points, k, arms)
-    r = balance(arms, normals, k, friction * _INSCRIBED, 0, torque_scale, 0.0, forces)
+    r = balance(arms, normals, k, friction * INSCRIBED, 0, torque_scale, 0.0, forces)
     low = float(1.0)
     for i in range(k):
         low = wp.min(low, wp.dot(forces[i], normals[i]))
@@ -187,4 +185,4 @@ def start_set(
 @wp.func
 def start_state(seed: wp.int32, index: wp.int32, start: wp.int32):
     """Random state of one start at the pose of candidate ``index``."""
-    return wp.rand_init(seed, index * _MAX_STARTS + start)
+    return wp.rand_init(seed, index * MAX_RESTARTS + start)

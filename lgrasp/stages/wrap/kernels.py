@@ -11,9 +11,9 @@ from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.grasp.structs import FURTHER, Candidates, State
 from lgrasp.hand.arrays import Hand
+from lgrasp.math.cholesky import solving
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
 from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
-from lgrasp.math.qp import solving
 from lgrasp.math.sdf import sdf_gradient, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
