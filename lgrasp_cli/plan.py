@@ -23,9 +23,13 @@ def plan(
     viewpoint: Viewpoint = None,
     scale: Scale = 1.0,
     hand: Annotated[
-        str,
-        Option(help="Name of a hand, a URDF file, a folder with hand.yaml, or a shard (its hand).", **HAND_OR_SHARD),
-    ] = "allegro",
+        str | None,
+        Option(
+            help="Name of a hand, a URDF file, a folder with hand.yaml, or a shard (its hand); default: the network's "
+            "hand, else allegro.",
+            **HAND_OR_SHARD,
+        ),
+    ] = None,
     model: Annotated[
         str | None,
         Option(help="Draws hands to start from: file of learn fit --model grasp, or a name.", **NETWORK),

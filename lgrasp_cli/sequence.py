@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument, Option
 
 from lgrasp.choices import Method, Policy, ProtocolName
-from lgrasp_cli.names import NETWORK, OBJECT, PIPELINE, one_of
+from lgrasp_cli.names import HAND, NETWORK, OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import Hand, Seed, Settings, Viewpoint, choose_pipeline, given, position
 from lgrasp_cli.tables import Block, TextTable, counted, following, held, place, share, took
 from lgrasp_cli.working import How, working
@@ -76,7 +76,10 @@ def sample(
     mask: Annotated[list[Path] | None, Option(help="Labels of each cloud's points.")] = None,
     label: Annotated[list[int] | None, Option(help="Label to grasp of each cloud.")] = None,
     viewpoint: Viewpoint = None,
-    hand: Hand = "allegro",
+    hand: Annotated[
+        str | None,
+        Option(help="Name of a hand, a URDF file, or a folder with hand.yaml; default: the network's hand.", **HAND),
+    ] = None,
     rows: Rows = 256,
     policy: PolicyName = None,
     scale: Size = "1",
@@ -95,12 +98,14 @@ def sample(
     """
     from lgrasp.cloud.suffixes import cloud_names
     from lgrasp.jobs.requests.search import SampleRequest
+    from lgrasp.learn.networks import with_network_hand
 
     chosen = _chosen(pipeline, seed, settings, policy=policy)
     names = objects or cloud_names(cloud or (), label or ())
-    what = {"hand": hand, "objects": objects, "rows": rows, "pipeline": chosen, "model": model, "scale": scale}
+    what = with_network_hand({"hand": hand, "model": model})
+    what |= {"objects": objects, "rows": rows, "pipeline": chosen, "scale": scale}
     what |= {"clouds": cloud, "masks": mask, "labels": label, "viewpoint": position(viewpoint)}
-    what |= {"out": out or _folder(hand, names, chosen, simulate), "simulate": simulate}
+    what |= {"out": out or _folder(what["hand"], names, chosen, simulate), "simulate": simulate}
     how.run(how.job(SampleRequest, "sample", shard_rows=shard_rows, **what), _show, _profile)
 
 

@@ -32,7 +32,7 @@ def simulate(
     The hand closes on its free objects, which are then pulled in six directions; a grasp holds if they stay.
     docs/guides/physics.md describes each protocol. A shard that has the verdicts is left as it is.
 
-    Contacts are hard in PhysX (pip install "lgrasp[physx]"), whose columns are physics/physx_PROTOCOL_....
+    Contacts are hard in PhysX (needs the extra physx), whose columns are physics/physx_PROTOCOL_....
 
     Example: lgrasp simulate grasps/allegro-mug/robust --protocol fc
     """

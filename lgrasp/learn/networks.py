@@ -89,14 +89,28 @@ def open_network(path: Path, kind: str, version: int) -> "Iterator[tuple[dict[st
         yield card, state
 
 
-def read_card(path: Path) -> dict[str, Any]:
-    """The card of a network of any kind.
+def read_card(path: Path, kind: str = "") -> dict[str, Any]:
+    """The card of a network of some kind, or of any.
 
     Raises:
-        ConfigError: no such file, or no network.
+        ConfigError: no such file, or not such a network.
     """
-    with _as_told(path, ""):
-        return _card(path)
+    with _as_told(path, kind):
+        card = _card(path)
+        if kind and card["kind"] != kind:
+            raise ValueError(f"kind '{card['kind']}'")
+        return card
+
+
+def with_network_hand(asked: Any) -> Any:
+    """Fields of a request whose ``model`` may be a network, with that network's hand where none is named.
+
+    Raises:
+        ConfigError: no such network.
+    """
+    if not isinstance(asked, dict) or asked.get("hand") is not None or asked.get("model") is None:
+        return asked
+    return asked | {"hand": read_card(find_network(str(asked["model"])))["hand"]}
 
 
 def _card(path: Path) -> dict[str, Any]:

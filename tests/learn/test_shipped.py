@@ -6,7 +6,7 @@ from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import find_hand
 from lgrasp.learn.diffuser.file import load_diffuser
 from lgrasp.learn.grasp.file import load_networks
-from lgrasp.learn.networks import find_network, read_card
+from lgrasp.learn.networks import find_network, read_card, with_network_hand
 
 LOADERS = {"seq-allegro": load_diffuser, "grasp-allegro": load_networks, "grasp-shadow": load_networks}
 
@@ -20,3 +20,5 @@ def test_shipped_networks(name):
     assert card["hand_sha256"] == hand_digest(hand.urdf, hand.spec)
     assert card["report"]["unseen"]
     assert not set(card["report"]["unseen"]) & set(card["report"]["objects"])
+    assert with_network_hand({"model": name})["hand"] == hand.name
+    assert with_network_hand({"model": name, "hand": "leap"})["hand"] == "leap"

@@ -157,6 +157,7 @@ def test_grasps_are_planned_from_a_cloud_by_a_network(generate, cli):
     assert grasps.header.config["network"]
     assert "of hand 'allegro', not of 'barrett'" in cli(*plan, "--model", "net.pt", "--hand", "barrett").error()
     assert "absent: no such file, nor a network" in cli(*plan, "--model", "absent").error()
+    assert "(kind 'diffuser')" in cli(*plan, "--model", "seq-allegro").error()
 
 
 def test_a_pose_policy_is_trained_and_used(cli, tmp_path):

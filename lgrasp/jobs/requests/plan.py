@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
 from lgrasp.config import Viewpoint, apply_settings, parse_model
@@ -13,7 +13,7 @@ from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.jobs.requests.shards import look_up
-from lgrasp.learn.networks import find_network
+from lgrasp.learn.networks import find_network, read_card, with_network_hand
 from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
 from lgrasp.planning.params import PlanParams
@@ -27,7 +27,9 @@ class PlanRequest(Request):
     maker: ClassVar[str] = "lgrasp.jobs.refine.plan:PlanJob"
     unit: ClassVar[str] = "starts"
 
-    hand: str = Field(default="allegro", description="Name, path, or a shard (its hand).")
+    hand: str = Field(
+        default="allegro", description="Name, path, or a shard (its hand); default: the model's hand, else allegro."
+    )
     out: Path | None = Field(default=None, description="Folder of the plans; default: plans/HAND-OBJECT.")
     starts: int = Field(default=80, description="Points of the surface to start from.")
     object: str | None = Field(default=None, description="Name, mesh file, or a shard of one object.")
@@ -48,6 +50,11 @@ class PlanRequest(Request):
         default=False, description="The best of a start is kept where it fails too, metric valid 0."
     )
     params: PlanParams = Field(default_factory=PlanParams)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _hand(cls, asked: Any) -> Any:
+        return with_network_hand(asked)
 
     @property
     def title(self) -> str:
@@ -82,7 +89,7 @@ class PlanRequest(Request):
         if self.mask is not None:
             check_file(self.mask, MASK_SUFFIXES, "a mask", CloudError)
         if self.model is not None:
-            find_network(self.model)
+            read_card(find_network(self.model), "grasp")
         if self.out is not None:
             check_folder(self.out)
 

@@ -3,9 +3,9 @@
 import math
 from itertools import zip_longest
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lgrasp.choices import ProtocolName
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
@@ -16,7 +16,7 @@ from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
-from lgrasp.learn.networks import find_network
+from lgrasp.learn.networks import find_network, read_card, with_network_hand
 from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
 from lgrasp.sequence.size import parse_size
@@ -147,6 +147,11 @@ class SampleRequest(SequenceRequest):
     labels: tuple[int, ...] = Field(default=(), description="Label of the points to grasp in each cloud.")
     viewpoint: Viewpoint = None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _hand(cls, asked: Any) -> Any:
+        return with_network_hand(asked)
+
     @property
     def names(self) -> tuple[str, ...]:
         return self.objects or cloud_names(self.clouds, self.labels)
@@ -184,4 +189,4 @@ class SampleRequest(SequenceRequest):
                 f"pipeline '{self.pipeline.name}' has sequence.method {method}; a network needs diffuser, as pipeline "
                 "sample has"
             )
-        find_network(self.model)
+        read_card(find_network(self.model), "diffuser")
