@@ -101,36 +101,37 @@ def _unmade(cannot: dict[str, str]) -> dict[str, list[str]]:
 
 @app.command("add")
 def add_hand(
-    urdf: Annotated[Path, Argument(metavar="URDF", exists=True, dir_okay=False, help="URDF file of the hand.")],
+    file: Annotated[Path, Argument(exists=True, dir_okay=False, help="URDF or MJCF file of the hand.")],
     name: Annotated[str | None, Option(help="Name of the hand; default: the file's, or LINK.")] = None,
     out: Annotated[Path | None, Option(help="Folder of the hand; default: hands/NAME in your data folder.")] = None,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace the hand of that name.")] = False,
     root: Annotated[
-        str | None, Option(metavar="LINK", help="Of a whole robot, take the hand that this link carries.")
+        str | None, Option(metavar="LINK", help="Of a whole robot, take the hand that this link (or body) carries.")
     ] = None,
     mesh_dir: Annotated[
         list[Path] | None,
-        Option(exists=True, file_okay=False, help="Folder of meshes that are not below the URDF's; repeatable."),
+        Option(exists=True, file_okay=False, help="Folder of meshes that are not below the file's; repeatable."),
     ] = None,
 ) -> None:
-    """Draft a hand from its URDF: fingers, palmar surface, canonical box, open posture.
+    """Draft a hand from its URDF or MJCF: fingers, palmar surface, canonical box, open posture.
 
     \b
     Example: lgrasp hands add my_hand.urdf
     lgrasp hands add robot.urdf --root left_palm --mesh-dir meshes
     """
     from lgrasp.hand.drafting.cut_hand import cut_hand
-    from lgrasp.hand.urdf import read_robot
+    from lgrasp.hand.urdf import is_mjcf, read_robot
 
-    robot, _ = read_robot(urdf)
-    if root is not None:
-        cut_hand(urdf, robot, root)
+    if not is_mjcf(file):
+        robot, _ = read_robot(file)
+        if root is not None:
+            cut_hand(file, robot, root)
     from lgrasp.hand.drafting.import_urdf import import_urdf
     from lgrasp_cli.progress import Bar
 
     with Bar() as bar:
         bar.show("drafting")
-        made = import_urdf(urdf, name=name, out=out, force=overwrite, root=root, mesh_dirs=mesh_dir or ())
+        made = import_urdf(file, name=name, out=out, force=overwrite, root=root, mesh_dirs=mesh_dir or ())
     for line in made.decisions:
         typer.echo(f"- {' '.join(line.split())}")
     typer.echo(f"\nwrote {made.folder}")

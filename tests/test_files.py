@@ -99,6 +99,7 @@ WRITTEN_BY_HAND = {
     "lgrasp/geometry/decompose.py": "a pipe",
     "lgrasp/grasp/hand_files.py": "a temporary folder, or that of an export",
     "lgrasp/hand/drafting/import_urdf.py": "a folder that is whole or absent",
+    "lgrasp/hand/drafting/mjcf.py": "a temporary folder",
     "lgrasp/hand/drafting/vary.py": "a folder that is whole or absent",
     "lgrasp/hand/drafting/write.py": "a folder that is whole or absent",
     "lgrasp/judge/files.py": "a file that is whole or absent; the judge stands alone",

@@ -86,15 +86,30 @@ def read_robot(path: Path) -> tuple[etree._Element, bytes]:
     Raises:
         HandError: a file that cannot be read or is too large, and as of :func:`parse_robot`.
     """
+    return parse_robot(path, _bytes(path))
+
+
+def is_mjcf(path: Path) -> bool:
+    """True if a file is MJCF, MuJoCo's own format.
+
+    Raises:
+        HandError: a file that cannot be read or is too large.
+    """
+    try:
+        return etree.fromstring(_bytes(path), _parser()).tag == "mujoco"
+    except (etree.XMLSyntaxError, ValueError):
+        return False
+
+
+def _bytes(path: Path) -> bytes:
     try:
         if not path.is_file() and path.exists():
             raise HandError(f"URDF {path} cannot be read: no regular file")
         if path.stat().st_size > _MOST_BYTES:
             raise HandError(f"URDF {path} has {path.stat().st_size:,} bytes; at most {_MOST_BYTES:,} are read")
-        raw = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise HandError(f"URDF {path} cannot be read: {error.strerror}") from None
-    return parse_robot(path, raw)
 
 
 def check_robot(path: Path, tree: etree._Element, raw: bytes, mesh_dirs: Sequence[Path] = ()) -> Urdf:
@@ -140,10 +155,9 @@ def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
     if tree.getroottree().docinfo.doctype:
         raise HandError(f"URDF {path} declares a DOCTYPE; entity declarations are not accepted, remove them")
     if tree.tag == "mujoco":
-        raise HandError(
-            f"URDF {path} is MJCF, and hands are read from URDF only: take the maker's URDF, or convert it with "
-            "mjcf_urdf_simple_converter.convert('hand.xml', 'hand.urdf') (pip install mjcf-urdf-simple-converter)"
-        )
+        raise HandError(f"URDF {path} is MJCF: make a hand of it with 'lgrasp hands add {path}', and use that")
+    if tree.tag == "mujocoinclude":
+        raise HandError(f"URDF {path} is a part that MJCF files include; name one of those")
     if tree.tag != "robot":
         raise HandError(f"URDF {path}: root element is <{tree.tag}>, expected <robot>")
     return tree, raw

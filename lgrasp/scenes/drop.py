@@ -7,8 +7,9 @@ import numpy as np
 
 from lgrasp.errors import PhysicsError
 from lgrasp.geometry.poses import canonical, pose_matrix
+from lgrasp.runtime.optional import import_mujoco
 from lgrasp.scenes.params import DropParams
-from lgrasp.simulate.builder import add_solid, import_mujoco, set_contact, set_options
+from lgrasp.simulate.builder import add_solid, set_contact, set_options
 from lgrasp.simulate.protocol import DENSITY, Physics
 from lgrasp.simulate.solid import Solid
 

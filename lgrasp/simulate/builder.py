@@ -6,7 +6,6 @@ import numpy as np
 from lxml import etree
 from scipy.spatial import ConvexHull, QhullError
 
-from lgrasp.errors import PhysicsError
 from lgrasp.math.constants import LEAST_INERTIA, LEAST_MASS
 from lgrasp.simulate.protocol import Physics, Protocol
 from lgrasp.simulate.solid import Solid
@@ -19,35 +18,6 @@ _TABLE_AWAY = 100.0  # [m]
 _TABLE_MASS = 100.0  # [kg], and [kg m^2]: what presses on it does not move it within one step
 
 _COMPILER = {"strippath": "false", "discardvisual": "true", "balanceinertia": "true", "fusestatic": "false"}
-
-
-def import_mujoco(what: str = "physics") -> Any:
-    """The module mujoco; ``what`` needs it.
-
-    Raises:
-        PhysicsError: it is not installed.
-    """
-    try:
-        import mujoco
-    except ImportError:
-        raise PhysicsError(f'{what} needs MuJoCo, which is not installed: pip install "lgrasp[sim]"') from None
-    return mujoco
-
-
-def import_mujoco_warp() -> Any:
-    """The module mujoco_warp.
-
-    Raises:
-        PhysicsError: it is not installed.
-    """
-    try:
-        import mujoco_warp
-    except ImportError:
-        raise PhysicsError(
-            'physics on a GPU needs MuJoCo Warp, which is not installed: pip install "lgrasp[sim,gpu-sim]" '
-            "(or run on the CPU: --device cpu)"
-        ) from None
-    return mujoco_warp
 
 
 def set_compiler(robot: etree._Element, **more: str) -> None:

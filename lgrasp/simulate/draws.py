@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lgrasp.simulate.builder import import_mujoco
+from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.protocol import Draws
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lgrasp.errors import PhysicsError
+from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.assemble import OBJECT, TABLE, assemble, welded_joints
-from lgrasp.simulate.builder import import_mujoco
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import Scene
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
-from lgrasp.simulate.builder import import_mujoco
+from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.verdict import WILD, links_touching
 

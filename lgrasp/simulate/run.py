@@ -12,7 +12,7 @@ import numpy as np
 
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
-from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
+from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.physx_world import SOLVER, import_physx

@@ -8,7 +8,7 @@ import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.fetch import fetch
-from lgrasp.simulate.builder import import_mujoco, import_mujoco_warp
+from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.verdict import CHUNK, WILD, moved
 

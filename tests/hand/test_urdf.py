@@ -100,7 +100,7 @@ BAD = {
     "empty geometry": (robot(link("a", "<collision><geometry/></collision>"), B, J), "unknown collision|malformed"),
     "flat box": (robot(link("a", SHAPE.replace("0.06", "0")), B, J), "sizes must be positive"),
     "negative box": (robot(link("a", SHAPE.replace("0.06", "-1")), B, J), "sizes must be positive"),
-    "MJCF": ('<mujoco model="a"><worldbody/></mujoco>', "is MJCF.*URDF only.*mjcf-urdf-simple-converter"),
+    "MJCF": ('<mujoco model="a"><worldbody/></mujoco>', "is MJCF.*lgrasp hands add"),
     "mesh missing": (robot(link("a", mesh("meshes/palm.stl")), B, J), "meshes/palm.stl.*does not exist"),
     "mesh above": (robot(link("a", mesh("../../../../../../../etc/passwd")), B, J), "outside the hand's folder"),
     "mesh absolute": (robot(link("a", mesh("/etc/passwd")), B, J), "outside the hand's folder"),

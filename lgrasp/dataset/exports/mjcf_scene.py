@@ -9,9 +9,9 @@ from lxml import etree
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.errors import PhysicsError
 from lgrasp.object.mass import MassProperties
+from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.builder import (
     add_drive,
-    import_mujoco,
     set_compiler,
     set_contact,
     set_joint,

@@ -1,11 +1,12 @@
-"""Any URDF -> a hand's folder: the URDF with its meshes beside it, and a drafted, commented hand.yaml."""
+"""Any URDF or MJCF -> a hand's folder: a URDF with its meshes beside it, and a drafted, commented hand.yaml."""
 
 import hashlib
 import itertools
 import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,18 +15,19 @@ import trimesh
 from lxml import etree
 
 from lgrasp.errors import HandError, LgraspError, OutputError
-from lgrasp.files import new_folder
+from lgrasp.files import new_folder, temporary_folder
 from lgrasp.geometry.mesh_files import mesh_bytes
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.drafting.couplings import left_out_couplings
 from lgrasp.hand.drafting.cut_hand import cut_hand, hand_roots
 from lgrasp.hand.drafting.draft import draft_spec
+from lgrasp.hand.drafting.mjcf import mjcf_to_urdf
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, thin_mesh
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
-from lgrasp.hand.urdf import check_robot, find_mesh, read_robot
+from lgrasp.hand.urdf import check_robot, find_mesh, is_mjcf, read_robot
 from lgrasp.paths import cache_dir, user_dir
 
 _UNINFORMATIVE_NAMES = {"hand", "robot", "model", "urdf", "gripper"}
@@ -44,7 +46,7 @@ class ImportedHand:
 
 
 def import_urdf(
-    urdf: Path,
+    file: Path,
     *,
     name: str | None = None,
     out: Path | None = None,
@@ -52,9 +54,10 @@ def import_urdf(
     root: str | None = None,
     mesh_dirs: Sequence[Path] = (),
 ) -> ImportedHand:
-    """Make a hand's folder from a URDF; the folder appears whole or not at all.
+    """Make a hand's folder from a URDF, or from an MJCF; the folder appears whole or not at all.
 
     Args:
+        file: URDF or MJCF.
         name: default: ``root``, else the file's name, or the robot's when the file is called hand.urdf or the like.
         out: default: the user's data folder, ``hands/NAME``.
         force: replace what is there.
@@ -62,39 +65,65 @@ def import_urdf(
         mesh_dirs: folders in which meshes are looked for as well, see :func:`lgrasp.hand.urdf.find_mesh`.
 
     Raises:
-        HandError: the URDF cannot be used, or the folder exists.
+        HandError: the file cannot be used, or the folder exists.
+        PhysicsError: an MJCF, and MuJoCo is not installed.
     """
-    robot, raw = read_robot(urdf)
-    hands = hand_roots(robot) if root is None else []
-    if root is not None:
-        cut_hand(urdf, robot, root)
-    source = check_robot(urdf, robot, raw, mesh_dirs)
-    name = name or _slug(root or (urdf.stem if urdf.stem.lower() not in _UNINFORMATIVE_NAMES else source.name))
-    if name != _slug(name):
-        raise HandError(f"hand name '{name}' may hold letters, digits, '.', '_' and '-' only, such as '{_slug(name)}'")
-    folder = Path(out).expanduser() if out is not None else user_dir("hands") / name
-    if os.path.lexists(folder) and not force:
-        raise HandError(f"hand folder {folder} exists; choose another --name or --out, or replace it with --overwrite")
-    if folder.exists() and not (folder / "hand.yaml").is_file() and any(folder.iterdir() if folder.is_dir() else [1]):
-        raise HandError(f"{folder} holds something that is no hand (it has no hand.yaml); choose another --out")
-    originals: dict[Path, Path] = {}
-    try:
-        with new_folder(folder) as made:
-            originals[made / "hand.urdf"] = urdf
-            meshes = partial(find_mesh, urdf, mesh_dirs=mesh_dirs)
-            spec, changes = _fill(robot, urdf, name, made, meshes, originals)
-    except OutputError as error:
-        raise HandError(f"hand folder {error}; choose another with --out") from None
-    except LgraspError as error:
-        # messages name the user's files, not copies that are gone
-        text = str(error)
-        for copy, original in originals.items():
-            text = text.replace(str(copy.resolve()), str(original)).replace(str(copy), str(original))
-        if hands:
-            text += f"; of a whole robot, take one hand: lgrasp hands add {urdf} --root {hands[0]}"
-            text += f" (links that carry hands: {', '.join(hands)})" if len(hands) > 1 else ""
-        raise type(error)(text) from None
-    return ImportedHand(folder, spec, changes)
+    with _as_urdf(file, root, mesh_dirs) as (urdf, notes):
+        robot, raw = read_robot(urdf)
+        hands = hand_roots(robot) if root is None else []
+        if root is not None:
+            cut_hand(urdf, robot, root)
+        source = check_robot(urdf, robot, raw, mesh_dirs)
+        name = name or _slug(root or (file.stem if file.stem.lower() not in _UNINFORMATIVE_NAMES else source.name))
+        if name != _slug(name):
+            raise HandError(
+                f"hand name '{name}' may hold letters, digits, '.', '_' and '-' only, such as '{_slug(name)}'"
+            )
+        folder = Path(out).expanduser() if out is not None else user_dir("hands") / name
+        if os.path.lexists(folder) and not force:
+            raise HandError(
+                f"hand folder {folder} exists; choose another --name or --out, or replace it with --overwrite"
+            )
+        if (
+            folder.exists()
+            and not (folder / "hand.yaml").is_file()
+            and any(folder.iterdir() if folder.is_dir() else [1])
+        ):
+            raise HandError(f"{folder} holds something that is no hand (it has no hand.yaml); choose another --out")
+        originals: dict[Path, Path] = {}
+        try:
+            with new_folder(folder) as made:
+                originals[made / "hand.urdf"] = urdf
+                meshes = partial(find_mesh, urdf, mesh_dirs=mesh_dirs)
+                spec, changes = _fill(robot, file, name, made, meshes, originals, notes)
+        except OutputError as error:
+            raise HandError(f"hand folder {error}; choose another with --out") from None
+        except LgraspError as error:
+            # messages name the user's files, not copies that are gone
+            text = str(error)
+            for copy, original in originals.items():
+                text = text.replace(str(copy.resolve()), str(original)).replace(str(copy), str(original))
+            if hands:
+                text += f"; of a whole robot, take one hand: lgrasp hands add {urdf} --root {hands[0]}"
+                text += f" (links that carry hands: {', '.join(hands)})" if len(hands) > 1 else ""
+            raise type(error)(text) from None
+        return ImportedHand(folder, spec, changes)
+
+
+@contextmanager
+def _as_urdf(file: Path, root: str | None, mesh_dirs: Sequence[Path]) -> Iterator[tuple[Path, list[str]]]:
+    """A URDF itself; for an MJCF one that is made of it and goes with the block, and what it cannot say. Errors of the
+    block name the file."""
+    if not is_mjcf(file):
+        yield file, []
+        return
+    with temporary_folder() as folder:
+        urdf, notes = mjcf_to_urdf(file, folder, root=root, mesh_dirs=mesh_dirs)
+        try:
+            yield urdf, notes
+        except LgraspError as error:
+            text = str(error).replace(f"URDF {urdf}", f"MJCF {file}").replace(str(urdf), str(file))
+            raise type(error)(text.replace(f"{folder}/", "")) from None
 
 
 def _slug(text: str) -> str:
@@ -102,13 +131,19 @@ def _slug(text: str) -> str:
 
 
 def _fill(
-    robot: etree._Element, urdf: Path, name: str, folder: Path, find: FindMesh, originals: dict[Path, Path]
+    robot: etree._Element,
+    file: Path,
+    name: str,
+    folder: Path,
+    find: FindMesh,
+    originals: dict[Path, Path],
+    notes: list[str],
 ) -> tuple[HandSpec, list[str]]:
-    """Write URDF, meshes and hand.yaml into a folder and build the hand once."""
+    """Write URDF, meshes and hand.yaml, with notes on the file, into a folder and build the hand once."""
     for note in [e for e in robot.iter() if not isinstance(e.tag, str)]:
         if note.getparent() is not None:
             note.getparent().remove(note)
-    changes = _take_visuals(robot)
+    changes = [*notes, *_take_visuals(robot)]
     changes += _take_meshes(robot, folder, find, originals)
     target = folder / "hand.urdf"
     _write(robot, target)
@@ -120,9 +155,9 @@ def _fill(
             f"one drive moves both jaws: '{jaws[0]}' is made the base (the copy of the URDF is turned round; joint "
             f"values mean the same), so that '{jaws[1]}' closes against it as against a palm"
         )
-    changes += left_out_couplings(urdf, robot)
+    changes += left_out_couplings(file, robot)
     spec, decided = draft_spec(target, name, jaws=jaws)
-    spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {urdf.name}"})
+    spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {file.name}"})
     changes += decided
     write_spec(spec, folder / "hand.yaml", changes)
     written = load_spec(folder / "hand.yaml")

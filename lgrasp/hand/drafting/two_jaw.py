@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 from lxml import etree
+from scipy.spatial.transform import Rotation
 
 from lgrasp.hand.drafting.contact_survey import survey_contacts
+from lgrasp.hand.drafting.elements import number_text, set_origin
 from lgrasp.hand.drafting.finger_structure import finger_structure
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import numbers, read_urdf
@@ -52,8 +54,6 @@ def reroot(robot: etree._Element, link: str) -> None:
     A movable joint keeps its name, limits and mimic relation; its axis is negated, and a link NAME_mount without
     geometry takes up the rest of its origin.
     """
-    from scipy.spatial.transform import Rotation
-
     into = {_end(j, "child"): j for j in robot.iter("joint") if j.find("child") is not None}
     chain = []
     at = link
@@ -64,37 +64,25 @@ def reroot(robot: etree._Element, link: str) -> None:
         parent, child = _end(joint, "parent"), _end(joint, "child")
         xyz, rpy = (numbers(joint.find("origin"), key, "0 0 0") for key in ("xyz", "rpy"))
         turn = Rotation.from_euler("xyz", rpy).inv()
-        back = -turn.apply(xyz), turn.as_euler("xyz")
+        back = -turn.apply(xyz), turn
         joint.find("parent").set("link", child)
         if joint.get("type") == "fixed":
             joint.find("child").set("link", parent)
-            _set_origin(joint, *back)
+            set_origin(joint, *back)
             continue
         mount = f"{child}_mount"
         robot.append(etree.Element("link", name=mount))
         joint.find("child").set("link", mount)
-        _set_origin(joint, np.zeros(3), np.zeros(3))
+        set_origin(joint, np.zeros(3), Rotation.identity())
         axis = joint.find("axis")
         if axis is None:
             axis = etree.SubElement(joint, "axis", xyz="1 0 0")
-        axis.set("xyz", _text(-numbers(axis, "xyz", "1 0 0")))
+        axis.set("xyz", number_text(-numbers(axis, "xyz", "1 0 0")))
         fixed = etree.SubElement(robot, "joint", name=f"{joint.get('name')}_mount", type="fixed")
         etree.SubElement(fixed, "parent", link=mount)
         etree.SubElement(fixed, "child", link=parent)
-        _set_origin(fixed, *back)
+        set_origin(fixed, *back)
 
 
 def _end(joint: etree._Element, which: str) -> str:
     return joint.find(which).get("link")
-
-
-def _set_origin(joint: etree._Element, xyz: np.ndarray, rpy: np.ndarray) -> None:
-    element = joint.find("origin")
-    if element is None:
-        element = etree.SubElement(joint, "origin")
-    for key, value in (("xyz", xyz), ("rpy", rpy)):
-        element.set(key, _text(value))
-
-
-def _text(values: np.ndarray) -> str:
-    return " ".join(f"{x + 0.0:.12g}" for x in values)

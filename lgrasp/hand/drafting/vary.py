@@ -10,6 +10,7 @@ from lxml import etree
 
 from lgrasp.errors import HandError
 from lgrasp.files import new_folder, write_file
+from lgrasp.hand.drafting.elements import number_text
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.spec import Box, HandSpec, OppositionSpace, Surface
 from lgrasp.hand.spec_check import check_spaces
@@ -129,7 +130,7 @@ def _finger_spacing(robot: etree._Element, urdf: Urdf, tree: Tree, spec: HandSpe
         origin = joint.find("origin")
         if origin is None:
             origin = etree.SubElement(joint, "origin")
-        origin.set("xyz", _text(numbers(origin, "xyz", "0 0 0") + shift))
+        origin.set("xyz", number_text(numbers(origin, "xyz", "0 0 0") + shift))
     return spec
 
 
@@ -173,11 +174,7 @@ def _ends(box: Box) -> tuple[tuple[float, ...], tuple[float, ...]]:
 def _scale(element: etree._Element | None, key: str, factor: float) -> None:
     """Multiply the numbers of an attribute, if it is there."""
     if element is not None and element.get(key) is not None:
-        element.set(key, _text(factor * numbers(element, key, "0")))
-
-
-def _text(values: np.ndarray) -> str:
-    return " ".join(repr(float(value)) for value in values)
+        element.set(key, number_text(factor * numbers(element, key, "0")))
 
 
 def _take_meshes(robot: etree._Element, urdf: Urdf, folder: Path) -> None:

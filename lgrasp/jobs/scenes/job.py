@@ -19,9 +19,9 @@ from lgrasp.errors import ShardError
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.requests.scenes import SceneRequest
 from lgrasp.jobs.scenes.stock import Stock, load_stock
+from lgrasp.runtime.optional import import_mujoco
 from lgrasp.scenes.files import SceneReader, check_scene, write_scene
 from lgrasp.scenes.make import make_scene
-from lgrasp.simulate.builder import import_mujoco
 
 
 class SceneJob(SceneRequest, Job):
