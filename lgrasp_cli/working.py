@@ -14,8 +14,9 @@ from lgrasp_cli.tables import Block, plural, print_report
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
+    from lgrasp.engine.events import JobOutcome
     from lgrasp.engine.request import Request
-    from lgrasp.engine.run import Job, JobOutcome
+    from lgrasp.engine.run import Job
     from lgrasp.runtime.array import Array
 
 

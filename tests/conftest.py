@@ -19,9 +19,9 @@ from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import JobOutcome
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
-from lgrasp.engine.run import JobOutcome
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.generate import GenerateJob, generate

@@ -6,8 +6,8 @@ from statistics import median
 from typing import Any
 
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import JobOutcome
 from lgrasp.engine.report import job_report
-from lgrasp.engine.run import JobOutcome
 from lgrasp.files import temporary_folder
 from lgrasp.jobs.generate import GenerateJob, generate
 

@@ -1,9 +1,12 @@
-"""Parts of a job, their results, and the events of a running job."""
+"""Parts of a job, their results and those of the job, and the events of a running job."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lgrasp.runtime.device import Device
 
 
 class CancelledError(Exception):
@@ -38,6 +41,58 @@ class Made:
     """What is to be written; forgotten when it is on disk. None: there is nothing to write."""
     result: Any = None
     """What the report needs of it; kept until the job ends."""
+
+
+@dataclass
+class JobOutcome:
+    """Result of a call of :func:`lgrasp.engine.run.run`."""
+
+    job: Any
+    """The job, with what it loaded."""
+    device: "Device"
+    parts: list[Part]
+    """Those of this task."""
+    on_disk: dict[int, int]
+    """Rows that were there already, by number of the part."""
+    made_parts: list[tuple[Part, Made]] = field(default_factory=list)
+    """Those that this call wrote."""
+    results: list[Any] = field(default_factory=list)
+    """Result of each part that this call made, those with nothing to write included."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Of loading kernels, making parts and the whole call [s]."""
+    starved: bool = False
+    cancelled: bool = False
+
+    @property
+    def written(self) -> list[Path]:
+        """Files that this call made."""
+        return [part.file for part, _ in self.made_parts]
+
+    @property
+    def paths(self) -> list[Path]:
+        """Files of this task that are on disk."""
+        made = {part.number for part, _ in self.made_parts}
+        return [part.file for part in self.parts if part.number in self.on_disk or part.number in made]
+
+    @property
+    def made(self) -> int:
+        """Rows made by this call."""
+        return sum(made.rows for _, made in self.made_parts)
+
+    @property
+    def present(self) -> int:
+        """Rows that were there already."""
+        return sum(self.on_disk.values())
+
+    @property
+    def rows(self) -> int:
+        """Rows on disk of this task's parts."""
+        return self.made + self.present
+
+    @property
+    def wall(self) -> float:
+        """Of the whole call [s]."""
+        return self.seconds["total"]
 
 
 class Events:

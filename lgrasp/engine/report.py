@@ -4,15 +4,13 @@ import json
 import os
 import resource
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from lgrasp.engine.events import JobOutcome
 from lgrasp.files import write_file
 
-if TYPE_CHECKING:
-    from lgrasp.engine.run import JobOutcome
 
-
-def job_report(outcome: "JobOutcome") -> dict[str, Any]:
+def job_report(outcome: JobOutcome) -> dict[str, Any]:
     """The report of a job, JSON-serialisable: its own numbers and those of all jobs.
 
     Returns:

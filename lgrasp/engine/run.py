@@ -3,11 +3,9 @@
 import os
 import time
 from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -18,7 +16,7 @@ from lgrasp.dataset.manifest import ListedRun
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.events import CancelledError, Events, Made, Part, PartProgress
+from lgrasp.engine.events import CancelledError, Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found, clean_folder, found_shard, neighbours
 from lgrasp.engine.listing import Listing, Renewing, begun_array, listing, renewing
 from lgrasp.engine.request import Request
@@ -29,6 +27,7 @@ from lgrasp.runtime.array import Array
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.runtime.kernels import first_time, kernel_modules, load_kernels
+from lgrasp.runtime.ordered import in_order
 
 
 class Job(Request, ABC):
@@ -169,10 +168,10 @@ class Job(Request, ABC):
         write_shard(part.file, contents)
 
     @abstractmethod
-    def report(self, outcome: "JobOutcome") -> dict[str, Any]:
+    def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """The results in numbers, JSON-serialisable; :func:`lgrasp.engine.report.job_report` adds the rest."""
 
-    def shortfall(self, outcome: "JobOutcome") -> LgraspError | None:
+    def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
         """The error for an outcome that falls short of the request, if any."""
         return None
 
@@ -205,58 +204,6 @@ class Job(Request, ABC):
     def threads(self) -> int:
         """Workers as asked, else one per core, or one on a GPU."""
         return threads(self.workers or int(self._device.is_cuda))
-
-
-@dataclass
-class JobOutcome:
-    """Result of a call of :func:`run`."""
-
-    job: Any
-    """The job, with what it loaded."""
-    device: Device
-    parts: list[Part]
-    """Those of this task."""
-    on_disk: dict[int, int]
-    """Rows that were there already, by number of the part."""
-    made_parts: list[tuple[Part, Made]] = field(default_factory=list)
-    """Those that this call wrote."""
-    results: list[Any] = field(default_factory=list)
-    """Result of each part that this call made, those with nothing to write included."""
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Of loading kernels, making parts and the whole call [s]."""
-    starved: bool = False
-    cancelled: bool = False
-
-    @property
-    def written(self) -> list[Path]:
-        """Files that this call made."""
-        return [part.file for part, _ in self.made_parts]
-
-    @property
-    def paths(self) -> list[Path]:
-        """Files of this task that are on disk."""
-        made = {part.number for part, _ in self.made_parts}
-        return [part.file for part in self.parts if part.number in self.on_disk or part.number in made]
-
-    @property
-    def made(self) -> int:
-        """Rows made by this call."""
-        return sum(made.rows for _, made in self.made_parts)
-
-    @property
-    def present(self) -> int:
-        """Rows that were there already."""
-        return sum(self.on_disk.values())
-
-    @property
-    def rows(self) -> int:
-        """Rows on disk of this task's parts."""
-        return self.made + self.present
-
-    @property
-    def wall(self) -> float:
-        """Of the whole call [s]."""
-        return self.seconds["total"]
 
 
 def run(
@@ -365,7 +312,9 @@ def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listin
         job.write(part, made.contents)
         manifests.record(part, made.rows, written=True)
 
-    def make(part: Part) -> Made:
+    def make(part: Part) -> Made | None:
+        if part.number in present:
+            return None
         progress = PartProgress(events, part)
         progress.check()
         return job.make(part, progress)
@@ -373,7 +322,7 @@ def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listin
     present = outcome.on_disk
     with ThreadPoolExecutor(1) as writer:
         try:
-            for part, made in _in_order(make, outcome.parts, present, job.at_once()):
+            for part, made in in_order(make, outcome.parts, job.at_once()):
                 rows = present[part.number] if made is None else made.rows
                 outcome.starved |= job.asks and rows < part.rows
                 if made is not None:
@@ -384,34 +333,11 @@ def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listin
                     else:
                         manifests.record(part, 0, written=False)
                 if job.asks and rows == 0:  # nor will the next parts give any
-                    for rest in outcome.parts[outcome.parts.index(part) + 1 :]:
-                        if rest.number not in present:
-                            manifests.record(rest, 0, written=False)
+                    for other in outcome.parts[outcome.parts.index(part) + 1 :]:
+                        if other.number not in present:
+                            manifests.record(other, 0, written=False)
                     break
         except CancelledError:
             settle()
             raise
         settle()
-
-
-def _in_order(make, parts: list[Part], present: Mapping[int, int], at_once: int) -> Iterator[tuple[Part, Made | None]]:
-    """Each part with what came of it, None for those that are there; ``at_once`` of them are made at a time."""
-    if at_once == 1:
-        for part in parts:
-            yield part, None if part.number in present else make(part)
-        return
-    rest = iter(parts)
-    waiting: deque[tuple[Part, Future[Made] | None]] = deque()
-    with ThreadPoolExecutor(at_once) as pool:
-        try:
-            while True:
-                while len(waiting) < at_once and (part := next(rest, None)) is not None:
-                    waiting.append((part, None if part.number in present else pool.submit(make, part)))
-                if not waiting:
-                    return
-                part, future = waiting.popleft()
-                yield part, future.result() if future else None
-        finally:
-            for _, future in waiting:
-                if future:
-                    future.cancel()

@@ -1,9 +1,7 @@
 """One shard: a pure function of (pipeline, hand, object, shard rows, shard index)."""
 
 import time
-from collections import deque
-from collections.abc import Callable, Generator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,6 +19,7 @@ from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.row_order import RowOrder
 from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_rows
+from lgrasp.runtime.ordered import in_order
 from lgrasp.stages.context import Context
 
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
@@ -78,39 +77,6 @@ def flat_statistics(counts: dict[str, dict[str, int]], seconds: Mapping[str, flo
     for stage, found in counts.items():
         flat |= {f"{stage}_{name.replace(' ', '_')}": value for name, value in found.items()}
     return flat | {f"seconds_{stage}": value for stage, value in seconds.items()}
-
-
-def _batches(
-    run: Callable[[int, int], BatchResult], workers: int, first: int, limit: int, size: Callable[[int], int]
-) -> Generator[tuple[int, BatchResult]]:
-    """Results of consecutive batches, in order; ``workers`` of them are worked on at a time.
-
-    Closing the generator (or an error in a batch) drops the batches not started and waits for the others.
-
-    Args:
-        run: makes the batch of candidates ``first .. first + count - 1`` from (first, count).
-        first: candidate that the first batch begins with.
-        limit: candidates there may be.
-        size: candidates of the next batch, given how many are being worked on; 0: those should do.
-    """
-    with ThreadPoolExecutor(workers) as pool:
-        waiting: deque[tuple[int, Future[BatchResult]]] = deque()
-        try:
-            while True:
-                # one more than there are workers: it begins at once when a worker is free
-                while len(waiting) <= workers and first < limit:
-                    count = min(size(sum(n for n, _ in waiting)), limit - first)
-                    if count == 0:
-                        break
-                    waiting.append((count, pool.submit(run, first, count)))
-                    first += count
-                if not waiting:
-                    return
-                count, future = waiting.popleft()
-                yield count, future.result()
-        finally:
-            for _, future in waiting:
-                future.cancel()
 
 
 def _most_candidates(device: str, groups: int, pipeline: Pipeline) -> int:
@@ -216,12 +182,20 @@ def make_shard(
             wanted = graphs.size(wanted)
         return -(-wanted // block) * block
 
-    def run(first: int, count: int) -> BatchResult:
-        return run_batch(pipeline, context, first, count, graphs.run if graphs else None)
+    def run(part: tuple[int, int]) -> BatchResult:
+        return run_batch(pipeline, context, *part, graphs.run if graphs else None)
 
     def search(limit: int) -> None:
-        with closing(_batches(run, execution.workers, result.candidates, limit, size)) as batches:
-            for count, batch in batches:
+        def parts() -> Iterator[tuple[int, int] | None]:
+            first = result.candidates
+            while first < limit:
+                count = min(size(first - result.candidates), limit - first)
+                yield (first, count) if count else None
+                first += count
+
+        # one waits that begins at once when a worker is free
+        with closing(in_order(run, parts(), execution.workers, ahead=1)) as batches:
+            for (_, count), batch in batches:
                 result.candidates += count
                 add_counts(result.counts, batch.counts)
                 add_seconds(result.seconds, batch.seconds)

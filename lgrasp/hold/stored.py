@@ -50,16 +50,12 @@ def try_rows(
 
     done = 0
     with ThreadPoolExecutor(workers if hand.device == "cpu" else 1) as pool:
-        try:
-            for (_, chosen), found in zip(blocks, pool.map(tried, blocks), strict=True):
-                for name, values in found.items():
-                    out[name][chosen] = values
-                done += len(chosen)
-                if progress:
-                    progress(done)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        for (_, chosen), found in zip(blocks, pool.map(tried, blocks), strict=True):
+            for name, values in found.items():
+                out[name][chosen] = values
+            done += len(chosen)
+            if progress:
+                progress(done)
     return out
 
 

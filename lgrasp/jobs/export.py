@@ -15,8 +15,8 @@ from lgrasp.dataset.exports.mjcf import Cut
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Made, Part, PartProgress
-from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
+from lgrasp.engine.run import Job
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import OutputError
 from lgrasp.grasp.records import ObjectRecord

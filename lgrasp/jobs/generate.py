@@ -12,10 +12,10 @@ from pydantic import PrivateAttr, model_validator
 
 from lgrasp.dataset.info import closure_share, stage_counts, survivors
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.engine.events import Events, Made, Part, PartProgress
+from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
-from lgrasp.engine.run import JobOutcome, run
+from lgrasp.engine.run import run
 from lgrasp.engine.shard import Execution, add_counts, make_shard, shard_effort
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds

@@ -13,8 +13,7 @@ from lgrasp.dataset.metrics import METRICS, TASK_ROWS, is_extended, measure_shar
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.dataset.report.write import read_dataset
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Events, Made, Part, PartProgress
-from lgrasp.engine.run import JobOutcome
+from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import ShardError
 from lgrasp.grasp.bounds import stored_bounds

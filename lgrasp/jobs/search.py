@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 from pydantic import PrivateAttr
 
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.engine.events import Events, Part
+from lgrasp.engine.events import Events, JobOutcome, Part
 from lgrasp.engine.folder import shard_path
-from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.run import Job
 from lgrasp.engine.shard import add_counts, add_seconds, flat_statistics
 from lgrasp.grasp.records import GraspRows, ObjectRecord, Shard, ShardHeader
 from lgrasp.hand.model import HandModel

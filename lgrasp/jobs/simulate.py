@@ -14,9 +14,8 @@ from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found
-from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob, rows_digest
 from lgrasp.errors import PhysicsError
 from lgrasp.geometry.decompose import decompose

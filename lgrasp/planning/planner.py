@@ -94,27 +94,26 @@ class Planner:
         points = np.arange(count)
         if self.guesses is None:
             points = farthest_points(self.model.contact_points.astype(float), count)
-        some, workers = (_CPU_STARTS, cores()) if device == "cpu" else (_GPU_STARTS, 1)
+        size, workers = (_CPU_STARTS, cores()) if device == "cpu" else (_GPU_STARTS, 1)
         counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *REASONS], 0)
         tables = []
+        search = self._scene.search
+
+        def plan(first: int) -> tuple[int, GraspTable, np.ndarray]:
+            some = points[first : first + size]
+            return len(some), *self._plan(search, some, first)
+
         with ThreadPoolExecutor(workers) as pool:
-            firsts, search = range(0, count, some), self._scene.search
-            parts = [pool.submit(self._plan, search, points[first : first + some], first) for first in firsts]
-            try:
-                for first, part in zip(firsts, parts, strict=True):
-                    table, outcome = part.result()
-                    tried = len(points[first : first + some])
-                    counts["starts"] += tried
-                    counts["colliding"] += tried - len(outcome)
-                    for code, name in enumerate(REASONS):
-                        counts[name] += int((outcome == code).sum())
-                    passed = outcome == Outcome.KEPT
-                    table.metrics["valid"] = passed.astype(np.float32)
-                    tables.append(take_grasps(table, np.flatnonzero(passed | keep_invalid)))
-                    if progress:
-                        progress(counts["starts"], counts["kept"])
-            finally:
-                pool.shutdown(cancel_futures=True)
+            for tried, table, outcome in pool.map(plan, range(0, count, size)):
+                counts["starts"] += tried
+                counts["colliding"] += tried - len(outcome)
+                for code, name in enumerate(REASONS):
+                    counts[name] += int((outcome == code).sum())
+                passed = outcome == Outcome.KEPT
+                table.metrics["valid"] = passed.astype(np.float32)
+                tables.append(take_grasps(table, np.flatnonzero(passed | keep_invalid)))
+                if progress:
+                    progress(counts["starts"], counts["kept"])
         return Planned(join_rows(tables), counts)
 
     @cached_property

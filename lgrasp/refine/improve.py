@@ -54,13 +54,13 @@ def improve(
     parts = [slice(first, first + _CPU_ROWS) for first in range(0, len(q), _CPU_ROWS)]
     if search.device != "cpu" or len(parts) < 2:
         return _improved(search, hand, obj, pose, q, bounds, tries, resting, index)
-    planes = [None if resting is None else resting[p] for p in parts]
+
+    def part(p: slice) -> tuple[GraspTable, np.ndarray]:
+        plane = None if resting is None else resting[p]
+        return _improved(search, hand, obj, pose[p], q[p], bounds, tries[p], plane, index[p])
+
     with ThreadPoolExecutor(cores()) as pool:
-        jobs = [
-            pool.submit(_improved, search, hand, obj, pose[p], q[p], bounds, tries[p], plane, index[p])
-            for p, plane in zip(parts, planes, strict=True)
-        ]
-        tables, outcomes = zip(*(job.result() for job in jobs), strict=True)
+        tables, outcomes = zip(*pool.map(part, parts), strict=True)
     return join_rows(list(tables)), np.concatenate(outcomes)
 
 

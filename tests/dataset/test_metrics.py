@@ -15,9 +15,9 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.report.write import read_dataset
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
-from lgrasp.engine.events import Events
+from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.report import job_report
-from lgrasp.engine.run import JobOutcome, run
+from lgrasp.engine.run import run
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.jobs.metrics import MetricsJob
 from lgrasp_cli.dataset import app

@@ -10,9 +10,8 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.events import Events
+from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.pipeline import load_pipeline
-from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.run import run as run_job
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.grasp.records import GraspRows

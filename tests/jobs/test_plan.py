@@ -14,8 +14,9 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import JobOutcome
 from lgrasp.engine.report import job_report
-from lgrasp.engine.run import JobOutcome, run
+from lgrasp.engine.run import run
 from lgrasp.errors import ConfigError, ObjectError, OutputError
 from lgrasp.grasp.records import Shard
 from lgrasp.jobs.refine.plan import PlanJob

@@ -11,8 +11,8 @@ import trimesh
 from lgrasp.cloud.read import read_cloud
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.events import Events
-from lgrasp.engine.run import JobOutcome, run
+from lgrasp.engine.events import Events, JobOutcome
+from lgrasp.engine.run import run
 from lgrasp.errors import CloudError, ConfigError, LgraspError, OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.jobs.config import read_scene_config, scene_configs

@@ -7,9 +7,9 @@ from typing import ClassVar
 from support.shards import sample_shard
 
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Events, Made, Part, PartProgress
+from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
-from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.run import Job
 
 
 class SampleJob(Job):

@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.inputs import Loader
 from lgrasp.engine.pipeline import load_pipeline
-from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.run import Job
 from lgrasp.hand.workspace import WORKSPACE_VERSION, Workspace, measure_workspace
 from lgrasp.hold.params import HoldTest
 from lgrasp.jobs.compare.cell import make_cell

@@ -9,9 +9,9 @@ from pydantic import PrivateAttr
 
 from lgrasp.dataset.gather import gather
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Part
+from lgrasp.engine.events import JobOutcome, Part
 from lgrasp.engine.folder import Found
-from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.run import Job
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.files import write_file
 from lgrasp.jobs.requests.shards import FitRequest

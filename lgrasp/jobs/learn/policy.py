@@ -9,11 +9,11 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Events, Made, Part, PartProgress
+from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found
 from lgrasp.engine.inputs import InputKeys, Loader, input_keys, object_key
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.run import Job
 from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays, upload_field
 from lgrasp.files import write_file

@@ -12,9 +12,9 @@ from lgrasp.cloud.read import Cloud
 from lgrasp.dataset.info import closure_share
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
-from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.run import Job
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader
 from lgrasp.grasp.rows import grasp_rows, press

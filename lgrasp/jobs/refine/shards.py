@@ -15,9 +15,8 @@ from lgrasp.dataset.exports.formats import read_grasps
 from lgrasp.dataset.info import closure_share
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import Made, Part, PartProgress
+from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
-from lgrasp.engine.run import JobOutcome
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import HandError, ShardError
 from lgrasp.grasp.bounds import stored_bounds

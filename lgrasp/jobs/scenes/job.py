@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 from pydantic import PrivateAttr
 
 from lgrasp.dataset.gather import gather
-from lgrasp.engine.events import Events, Made, Part, PartProgress
+from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found, shard_path
-from lgrasp.engine.run import Job, JobOutcome
+from lgrasp.engine.run import Job
 from lgrasp.errors import ShardError
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.requests.scenes import SceneRequest

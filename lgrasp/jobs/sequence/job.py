@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.engine.events import Events, Made, Part, PartProgress
-from lgrasp.engine.run import JobOutcome
+from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.errors import LgraspError, ObjectError, StarvedError
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.sequences import SequenceTable
