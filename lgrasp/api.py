@@ -125,6 +125,7 @@ def generate(
     steer: Mapping[str, Any] | None = None,
     seed: int | None = None,
     scale: float = 1.0,
+    negatives: float = 0.0,
     device: str = "auto",
     workers: int = 0,
     out: Name | None = None,
@@ -137,6 +138,7 @@ def generate(
         pipeline: name, YAML file, or what :func:`load_pipeline` gives.
         steer: what is asked of grasps, as a pipeline's section ``steer`` has it: ``{"fingers": "thumb,index"}``.
         scale: from the mesh's unit to metres.
+        negatives: failed rows that are kept for each grasp; they are not ``valid``.
         workers: threads; 0: one per core.
         out: folder for shards; none: no file.
 
@@ -147,7 +149,7 @@ def generate(
 
     what = _asked(hand, n, pipeline, seed, device, workers, out)
     what["pipeline"] = what["pipeline"].with_steering(**(steer or {}))
-    return _done(GenerateJob, out, n, object=str(object), scale=scale, **what)
+    return _done(GenerateJob, out, n, object=str(object), scale=scale, negatives=negatives, **what)
 
 
 def sequence(

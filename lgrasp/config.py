@@ -37,6 +37,9 @@ Workers = Annotated[int, Field(ge=0, description="Threads or processes; 0: by de
 HandName = Annotated[str, Field(description="Name or path.")]
 HandNames = Annotated[tuple[str, ...], Field(min_length=1, description="Names, paths, folders of hands, or globs.")]
 MeshScale = Annotated[float, Field(gt=0, description="Factor from the meshes' unit to metres.")]
+Negatives = Annotated[
+    float, Field(ge=0, le=100, description="Failed rows kept for each grasp, with metric valid 0 and failed_bound.")
+]
 Viewpoint = Annotated[tuple[float, float, float] | None, Field(description="Where clouds were seen from [m].")]
 ShardPaths = Annotated[tuple[Path, ...], Field(description="Shard files, or folders of them at any depth.")]
 ShardFolder = Annotated[Path, Field(description="Folder of the shards.")]

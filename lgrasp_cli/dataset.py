@@ -211,7 +211,7 @@ def _shard_table(shards: list[dict[str, Any]]) -> TextTable:
         (
             name,
             *map(str, (s["hand"], ", ".join(s["objects"]), _made_by(s), s["seed"], s["shard_index"])),
-            f"{s['rows']:,}",
+            f"{s['rows']:,}" + (f" ({s['invalid']:,} invalid)" if s["invalid"] else ""),
             str(len(s["joints"])),
             f"{s['bytes'] / 1e6:.1f}",
         )
@@ -234,7 +234,7 @@ def _metric_table(shards: list[dict[str, Any]]) -> TextTable:
         (
             "" if number else name,
             metric,
-            values["unit"],
+            values["unit"].partition(":")[0],
             *("-" if values[k] is None else f"{values[k]:.4g}" for k in ends),
         )
         for name, s in zip(_places(shards), shards, strict=True)

@@ -77,6 +77,10 @@ def generate(
     touch: Touch = None,
     avoid: Avoid = None,
     table: Annotated[bool, Option("--table", help="Leave room for the table that the object rests on.")] = False,
+    negatives: Annotated[
+        float,
+        Option(min=0, max=100, metavar="SHARE", help="Failed rows kept for each grasp, with metric 'valid' 0."),
+    ] = 0.0,
     dry_run: DryRun = False,
 ) -> None:
     """Generate grasps of an object and write them as shards.
@@ -103,7 +107,7 @@ def generate(
             flag = f"--{name.replace('_', '-')}"
             raise ConfigError(f"--contacts {contacts}: {flag} says already how many touch; give one of them")
     pairs = all_hands(hands), all_objects(meshes)
-    what = {"rows": rows, "scale": scale, "batch": batch, "shard_rows": shard_rows}
+    what = {"rows": rows, "scale": scale, "batch": batch, "shard_rows": shard_rows, "negatives": negatives}
     requests = pair_requests(*pairs, chosen, out or Path("grasps"), simulate, **what, **how.shared)
     if len(requests) > 1 or pairs != (tuple(hands), tuple(meshes)):
         run_all(requests, how, dry_run=dry_run)
@@ -122,6 +126,7 @@ def _show(data: dict[str, Any]) -> list[Block]:
     pairs = [
         ("grasps", counted(data, "grasps")),
         *held(data),
+        *([("negatives", f"{data['negatives']:,} rows that fail a bound")] if "negatives" in data else ()),
         ("diversity", f"{plural(data['distinct_poses'], 'object pose')}, {plural(near, 'near-duplicate')}"),
         closed(data),
         *_resting(data.get("resting", [])),

@@ -1,6 +1,7 @@
 """Conditions on the columns of shards, as users write them."""
 
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from lgrasp.errors import ConfigError, ShardError
 OBJECTS_HELD = "objects"
 """The number of objects in the hand, as if it were a column."""
 
+_VALID = "metrics/valid"
 _OPERATORS = {">=": np.greater_equal, "<=": np.less_equal, "==": np.equal, "!=": np.not_equal}
 _OPERATORS |= {">": np.greater, "<": np.less}
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -41,6 +43,20 @@ class Condition(NamedTuple):
         held = self.column == OBJECTS_HELD
         values = (reader.column("object_index") >= 0).sum(1) if held else reader.column(self.column)
         return _OPERATORS[self.operator](values, self.value) & ~np.isnan(values.astype(np.float64))
+
+
+def satisfied(reader: ShardReader, where: Sequence[Condition]) -> np.ndarray:
+    """Rows of which all conditions hold, bool, shape [N]; rows with metric ``valid`` 0 only if a condition names it.
+
+    Raises:
+        ShardError: As of :meth:`Condition.holds`.
+    """
+    good = np.ones(len(reader), bool)
+    if _VALID in reader.columns and all(condition.column != _VALID for condition in where):
+        good = reader.column(_VALID) != 0
+    for condition in where:
+        good &= condition.holds(reader)
+    return good
 
 
 def parse_condition(text: str) -> Condition:

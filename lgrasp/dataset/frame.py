@@ -24,8 +24,8 @@ def grasp_frame(rows: GraspRows, joints: Sequence[str], objects: Sequence[Object
     Returns:
         For each of N grasps: ``objects`` (names, joined by +), ``object_pose/x`` ... ``object_pose/qz`` (x y z [m] and
         quaternion in the hand base frame; of several objects ``object_pose/1/x`` ...), ``q/JOINT`` [rad or m],
-        ``table/pose`` and ``table/approach/x`` ... (of objects on a table), ``metrics/NAME``, ``physics/NAME``
-        (verdicts with one value a grasp) and ``candidate``.
+        ``table/pose`` and ``table/approach/x`` ... (of objects on a table), ``metrics/NAME`` (``failed_bound`` as a
+        name), ``physics/NAME`` (verdicts with one value a grasp) and ``candidate``.
 
     Raises:
         ConfigError: pandas is not installed.
@@ -45,5 +45,6 @@ def grasp_frame(rows: GraspRows, joints: Sequence[str], objects: Sequence[Object
         columns["table/pose"] = rows.table["pose"]
         columns |= {f"table/approach/{axis}": rows.table["approach"][:, k] for k, axis in enumerate("xyz")}
     columns |= {f"metrics/{name}": values for name, values in rows.metrics.items()}
+    columns |= {"metrics/failed_bound": rows.failed_bound} if rows.failed_bounds else {}
     columns |= {f"physics/{name}": values for name, values in rows.physics.items() if np.ndim(values) == 1}
     return pd.DataFrame(columns | {"candidate": rows.candidate})

@@ -24,7 +24,11 @@ class Gathered(NamedTuple, Generic[T]):
 
 
 def gather(
-    paths: Paths, look: Callable[[ShardReader], T] = lambda _: None, *, leave_out: Path | None = None
+    paths: Paths,
+    look: Callable[[ShardReader], T] = lambda _: None,
+    *,
+    leave_out: Path | None = None,
+    invalid: bool = True,
 ) -> list[Gathered[T]]:
     """The shards among files and folders of any depth, in the order of their names.
 
@@ -34,6 +38,7 @@ def gather(
     Args:
         look: What is needed of a shard; it raises ShardError where the shard cannot be used.
         leave_out: Folder that is not looked into.
+        invalid: as of :class:`~lgrasp.dataset.reader.ShardReader`.
 
     Raises:
         ShardError: A path does not exist, a file that was named cannot be used, or no shard is left.
@@ -44,7 +49,7 @@ def gather(
     by_name = set(named_files(paths))
 
     def read(path: Path) -> tuple[T, Any]:
-        with ShardReader(path) as reader:
+        with ShardReader(path, invalid=invalid) as reader:
             return look(reader), _rows_of(reader)
 
     for number, (path, folder, (value, rows)) in enumerate(sound_files(paths, read, leave_out=leave_out)):

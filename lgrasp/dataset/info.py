@@ -15,7 +15,8 @@ def describe(paths: Paths) -> list[dict[str, Any]]:
     """Summaries of shard files, or folders of them at any depth, JSON-serialisable, one per file.
 
     Returns:
-        For each shard: ``file``, ``bytes``, ``rows``, ``rows_by_objects`` (rows by the number of objects held),
+        For each shard: ``file``, ``bytes``, ``rows``, ``invalid`` (rows of these with metric ``valid`` 0),
+        ``rows_by_objects`` (rows by the number of objects held),
         ``rows_by_space`` (of sequences: rows by the opposition space of their last step; else None), ``hand``,
         ``objects`` (ids), ``pipeline``, ``grasp_type`` (asked for; else None), ``seed``, ``shard_index``, ``created``,
         ``lgrasp_version``, ``joints`` (names), ``columns`` (shape of each row dataset), ``metrics`` (unit, min,
@@ -35,7 +36,7 @@ def closure_share(paths: Iterable[Path]) -> float | None:
     """
     closed = rows = 0
     for path in paths:
-        with ShardReader(path) as reader:
+        with ShardReader(path, invalid=False) as reader:
             closed, rows = closed + int((reader.column("metrics/epsilon") > 0).sum()), rows + len(reader)
     return closed / rows if rows else None
 
@@ -57,6 +58,7 @@ def _describe(reader: ShardReader) -> dict[str, Any]:
         "file": str(reader.path),
         "bytes": reader.path.stat().st_size,
         "rows": len(reader),
+        "invalid": int((reader.column("metrics/valid") == 0).sum()) if "metrics/valid" in reader.columns else 0,
         "rows_by_objects": {str(n): int(rows) for n, rows in enumerate(np.bincount(held)) if rows},
         "rows_by_space": by_space,
         "hand": str(reader.attributes["hand"]),

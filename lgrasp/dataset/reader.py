@@ -136,13 +136,27 @@ class FileReader:
 
 
 class ShardReader(FileReader):
-    """One open shard; rows are read on demand."""
+    """One open shard; rows are read on demand.
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    Args:
+        invalid: False: as if rows with metric ``valid`` 0 (kept though they fail a bound) were not in the file.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, invalid: bool = True) -> None:
         super().__init__(path, shard_problems)
+        self._all = invalid
 
     def __len__(self) -> int:
-        return self._dataset("q").shape[0]
+        return self._dataset("q").shape[0] if self.taken is None else len(self.taken)
+
+    @cached_property
+    def taken(self) -> np.ndarray | None:
+        """Rows of the file that are read, rising; None if all are."""
+        if self._all or "metrics/valid" not in self.columns:
+            return None
+        with reading(self.path):
+            valid = self._dataset("metrics/valid")[()] != 0
+        return None if valid.all() else np.flatnonzero(valid)
 
     @cached_property
     def space_names(self) -> tuple[str, ...] | None:
@@ -176,7 +190,16 @@ class ShardReader(FileReader):
         if name not in self.columns:
             raise ShardError(f"{self.path}: no dataset {name!r}; it has {', '.join(self.columns)}")
         with reading(self.path):
-            return self._dataset(name)[start:stop]
+            if self.taken is None:
+                return self._dataset(name)[start:stop]
+            rows = self.taken[start:stop]
+            first, end = (rows[0], rows[-1] + 1) if len(rows) else (0, 0)
+            values = self._dataset(name)[first:end][rows - first]
+            if name == "sequence/parent":
+                place = np.append(np.full(self._dataset("q").shape[0], -1), -1)  # the last of rows without parent
+                place[self.taken] = np.arange(len(self.taken))
+                values = place[values]
+            return values
 
     def rows(self, start: int = 0, stop: int | None = None) -> GraspRows:
         """Rows ``start`` to ``stop`` of everything under ``/grasps``."""

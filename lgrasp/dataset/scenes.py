@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from lgrasp.dataset.conditions import Condition
+from lgrasp.dataset.conditions import Condition, satisfied
 from lgrasp.dataset.files import Paths, check_heaps
 from lgrasp.dataset.gather import sound_files
 from lgrasp.dataset.reader import ShardReader, count_rows
@@ -72,8 +72,7 @@ class SceneRows:
 
     def spread(self, count: int) -> list[int]:
         """So many rows evenly over all of them, or all if there are fewer."""
-        count = min(count, len(self))
-        return [(2 * k + 1) * len(self) // (2 * count) for k in range(count)]
+        return spread(len(self), count)
 
     def sound(self, rows: Iterable[int], most: int | None = None) -> list[int]:
         """The first of some rows that can be read; a shard with one that cannot is left out from there on.
@@ -147,7 +146,7 @@ class SceneRows:
         good = []
         for path in self.files:
             with ShardReader(path) as reader:
-                good.append(np.all([condition.holds(reader) for condition in where], axis=0))
+                good.append(satisfied(reader, where))
         return np.flatnonzero(np.concatenate(good))
 
     def numbers(self, row: int) -> dict[str, float | list[float]]:
@@ -171,6 +170,12 @@ class SceneRows:
         path, _ = self.place(row)
         hand, objects, _ = self._contents(path)
         return hand.name, " + ".join(o.id for o in objects)
+
+
+def spread(rows: int, count: int) -> list[int]:
+    """So many numbers evenly over 0 to ``rows - 1``, or all if there are fewer."""
+    count = min(count, rows)
+    return [(2 * k + 1) * rows // (2 * count) for k in range(count)]
 
 
 def draw_rows(

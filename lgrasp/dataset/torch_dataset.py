@@ -28,6 +28,7 @@ class _Source(NamedTuple):
     objects: list[tuple[str, str, float]]
     """Id, hash and scale."""
     space_names: tuple[str, ...] | None
+    failed_bounds: tuple[str, ...]
     columns: dict[str, tuple[tuple[int, ...], np.dtype]]
 
 
@@ -48,13 +49,18 @@ class GraspDataset(torch.utils.data.Dataset):
         paths: Shard files, or folders of any depth; what cannot be used in these is left out, with a notice.
         columns: Names to return; by default all that every shard has.
         cache_bytes: Memory for decoded blocks, per worker process.
+        negatives: Rows with metric ``valid`` 0 too, which fail a bound; :attr:`failed_bounds` names it by the code in
+            column ``metrics/failed_bound``.
 
     Raises:
         ShardError: A shard cannot be read, hands differ, or a shard lacks a column.
     """
 
-    def __init__(self, paths: Paths, *, columns: Sequence[str] | None = None, cache_bytes: int = 1 << 29) -> None:
-        self._sources = [shard.value for shard in gather(paths, _survey)]
+    def __init__(
+        self, paths: Paths, *, columns: Sequence[str] | None = None, cache_bytes: int = 1 << 29, negatives: bool = False
+    ) -> None:
+        self._negatives = negatives
+        self._sources = [shard.value for shard in gather(paths, _survey, invalid=negatives)]
         tell_differences(paths)
         first = self._sources[0]
         for source in self._sources:
@@ -65,6 +71,8 @@ class GraspDataset(torch.utils.data.Dataset):
         """Id, SHA-256 of the source mesh and scale of every object."""
         self.space_names: tuple[str, ...] | None = first.space_names
         """Opposition spaces of the hand, if the first shard is of sequences."""
+        self.failed_bounds: tuple[str, ...] = first.failed_bounds
+        """Names of the numbers in ``metrics/failed_bound``, if the first shard has it."""
         self.columns: list[str] = self._choose(columns)
         self._tails = {n: widest(source.columns[n][0][1:] for source in self._sources) for n in self.columns}
         self._cache_bytes = cache_bytes
@@ -152,7 +160,7 @@ class GraspDataset(torch.utils.data.Dataset):
         sets: list[list[str]] = []
         rows = []
         for source in self._sources:
-            with ShardReader(source.path) as reader:
+            with self._open(source) as reader:
                 kinds, which = np.unique(reader.column("object_index"), axis=0, return_inverse=True)
             rows.append(which.ravel() + len(sets))
             for kind in kinds:
@@ -167,12 +175,15 @@ class GraspDataset(torch.utils.data.Dataset):
         """Of each row, the object that was placed first and the number of its pose."""
         parts = []
         for source in self._sources:
-            with ShardReader(source.path) as reader:
+            with self._open(source) as reader:
                 pose = reader.column("candidate") & POSE_BITS
                 first = reader.column("object_index")[:, 0]
             names = np.array([sha256[:16] for _, sha256, _ in source.objects] + [""])[first]
             parts.append(np.char.add(np.char.add(names, "/"), pose.astype(str)))
         return np.concatenate(parts)
+
+    def _open(self, source: _Source) -> ShardReader:
+        return ShardReader(source.path, invalid=self._negatives)
 
     def _choose(self, columns: Sequence[str] | None) -> list[str]:
         kinds = [  # what must agree for a column to be stacked
@@ -208,7 +219,7 @@ class GraspDataset(torch.utils.data.Dataset):
     def _read_block(self, shard: int, number: int) -> dict[str, torch.Tensor]:
         source = self._sources[shard]
         block: dict[str, torch.Tensor] = {}
-        with ShardReader(source.path) as reader:
+        with self._open(source) as reader:
             for name in self.columns:
                 values = reader.column(name, number * CHUNK_ROWS, (number + 1) * CHUNK_ROWS)
                 if name == "object_index":
@@ -224,4 +235,5 @@ class GraspDataset(torch.utils.data.Dataset):
 
 def _survey(reader: ShardReader) -> _Source:
     hand = str(reader.attributes["hand_sha256"])
-    return _Source(reader.path, len(reader), hand, reader.object_keys, reader.space_names, reader.columns)
+    names = tuple(reader.rows(0, 0).failed_bounds)
+    return _Source(reader.path, len(reader), hand, reader.object_keys, reader.space_names, names, reader.columns)

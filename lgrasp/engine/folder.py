@@ -79,6 +79,7 @@ def found_shard(path: Path) -> Found:
         config, statistics = reader.header.config, reader.statistics
         if MADE_FROM in statistics:
             return Found(str(statistics[MADE_FROM]), len(reader))
+    with ShardReader(path, invalid=False) as reader:
         # of a file with sequences only the whole ones count, and rounds are tried
         rows = int(statistics.get("sequences", len(reader)))
         tried = statistics.get("rounds" if "sequences" in statistics else "candidates", 0)

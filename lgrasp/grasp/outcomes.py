@@ -2,7 +2,11 @@
 
 from enum import IntEnum
 
+import numpy as np
 import warp as wp
+
+from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.tables import GraspTable
 
 
 class Outcome(IntEnum):
@@ -41,6 +45,23 @@ REASONS = (
 
 SHARED = (*REASONS, "touch")
 
+FAILED_BOUNDS = (
+    *("none", "min_contacts", "max_gap", "max_normal_angle", "min_self_distance", "max_penetration", "max_gswo"),
+    *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel"),
+)
+"""By code, the first bound that a row fails, of :class:`~lgrasp.grasp.bounds.GraspBounds`; ``approach``: no straight
+way of the open hand to the object clears the table."""
+
+_FAILED = {
+    Outcome.SELF_COLLISION: "min_self_distance",
+    Outcome.OBJECT_COLLISION: "max_penetration",
+    Outcome.BALANCE: "max_gswo",
+    Outcome.UNRESISTED_LOAD: "max_unresisted_load",
+    Outcome.TABLE: "min_table_distance",
+    Outcome.APPROACH: "approach",
+    Outcome.SQUEEZE: "min_squeeze_travel",
+}
+
 MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
 """Rows of the numbers that the checks leave on the device; ``facing`` is the least cosine of opposed normals."""
 
@@ -49,3 +70,15 @@ METRICS = (
     *("penetration", "self_penetration", "gap", "normal_error", "pregrasp_opening", "squeeze_travel"),
 )
 """Columns of the metrics table."""
+
+
+def failed_bounds(table: GraspTable, outcome: np.ndarray, bounds: GraspBounds) -> np.ndarray:
+    """Codes of FAILED_BOUNDS of checked rows with their outcomes, (n,) float32; 0 of rows that pass."""
+    few = (table.contact_links >= 0).sum(1) < bounds.min_contacts
+    wide = table.metrics["gap"] > bounds.max_gap
+    at = {name: code for code, name in enumerate(FAILED_BOUNDS)}
+    contact = np.select([few, wide], [at["min_contacts"], at["max_gap"]], at["max_normal_angle"])
+    codes = np.zeros(max(Outcome) + 1, np.float32)
+    for failed, name in _FAILED.items():
+        codes[failed] = at[name]
+    return np.where(outcome == Outcome.CONTACT, contact, codes[outcome]).astype(np.float32)

@@ -91,6 +91,10 @@ class SequenceRows:
     """Position targets that press in each step [rad or m], shape [N, O, K], float32, NaN where absent."""
 
 
+CODE = "code: "
+"""What the unit of a metric begins with whose numbers stand for names, which follow: ``0 none, 1 max_gap, ...``."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class GraspRows:
     """``N`` grasps; ``K`` actuated joints, ``O`` objects in a row, ``C`` most contacts per object."""
@@ -131,6 +135,26 @@ class GraspRows:
 
     def __len__(self) -> int:
         return int(np.shape(self.q)[0])
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Rows that are grasps, shape [N], bool: all but those that were kept though they fail a bound."""
+        valid = self.metrics.get("valid")
+        return np.ones(len(self), bool) if valid is None else valid != 0
+
+    @property
+    def failed_bound(self) -> np.ndarray:
+        """Name of the first bound that each row fails, as in ``GraspBounds``, shape [N], str; "none" of grasps."""
+        codes = self.metrics.get("failed_bound")
+        if codes is None:
+            return np.where(self.valid, "none", "unknown")
+        return np.array(self.failed_bounds)[codes.astype(int)]
+
+    @property
+    def failed_bounds(self) -> list[str]:
+        """Names of the numbers in metric ``failed_bound``; none if the rows do not have it."""
+        unit = self.metric_units.get("failed_bound", "") if "failed_bound" in self.metrics else ""
+        return [entry.split(" ", 1)[1] for entry in unit.removeprefix(CODE).split(", ") if entry]
 
     def columns(self) -> dict[str, np.ndarray]:
         """Row arrays by flat name: fields, ``sequence/NAME``, ``table/NAME``, ``metrics/NAME``, ``physics/NAME``."""

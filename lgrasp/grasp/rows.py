@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from lgrasp.geometry.poses import user_poses
-from lgrasp.grasp.records import GraspRows
+from lgrasp.grasp.outcomes import FAILED_BOUNDS
+from lgrasp.grasp.records import CODE, GraspRows
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.tree import Tree
 
@@ -17,6 +18,7 @@ METRIC_UNITS = {
     "pregrasp_opening": "rad or m",
     "squeeze_travel": "m",
     "hold_drift": "m",
+    "failed_bound": CODE + ", ".join(f"{code} {name}" for code, name in enumerate(FAILED_BOUNDS)),
 }
 """Unit of each metric that has one."""
 

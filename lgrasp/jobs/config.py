@@ -12,6 +12,7 @@ from lgrasp.config import (
     DeviceName,
     HandNames,
     MeshScale,
+    Negatives,
     Params,
     Workers,
     did_you_mean,
@@ -55,6 +56,7 @@ class JobConfig(Params):
     batch: int = Field(0, ge=0)
     shard_rows: int = Field(10_000, ge=1)
     passes: int | None = Field(None, ge=1, le=64)
+    negatives: Negatives = 0.0
     table: bool = Field(False, description="Grasps leave room for the table that the object rests on.")
     steer: Steering | None = Field(None, description="What is asked of the grasps, beside what the pipelines ask.")
     sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn.")
@@ -158,7 +160,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
             meshes = [in_folder(config.object_dir, mesh) for mesh in objects]
             own = pipeline.with_passes(config.passes)
             own = own.with_table() if config.table else own
-            more = config.model_dump(include={"scale", "batch"})
+            more = config.model_dump(include={"scale", "batch", "negatives"})
             found += pair_requests(hands, meshes, own, config.out, **shared, **more)
             continue
         changes = {name: value for name in ("method", "policy") if (value := getattr(sets, name))}

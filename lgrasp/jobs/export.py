@@ -39,7 +39,7 @@ class ExportJob(ExportRequest, Job):
         return self.out
 
     def key(self) -> str:
-        columns = {parse_condition(text).column for text in self.where} | {HOLDS, *TABLE_FIELDS}
+        columns = {parse_condition(text).column for text in self.where} | {HOLDS, "metrics/valid", *TABLE_FIELDS}
 
         def digest(reader: ShardReader) -> str:
             return rows_digest(reader, sorted(columns & reader.columns.keys()))

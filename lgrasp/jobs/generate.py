@@ -79,10 +79,12 @@ class GenerateJob(GenerateRequest, SearchJob):
         return self._rate if self._inputs else self.rate
 
     def own_config(self) -> dict[str, Any]:
-        return {"object": self.object, "scale": self.scale}
+        own = {"object": self.object, "scale": self.scale}
+        return own | ({"negatives": self.negatives} if self.negatives else {})
 
     def key(self) -> str:
-        return run_key(self.pipeline.describe(), self.keys, self.shard_rows)
+        described = self.pipeline.describe() | ({"negatives": self.negatives} if self.negatives else {})
+        return run_key(described, self.keys, self.shard_rows)
 
     def effort(self, rows: int) -> int:
         return shard_effort(self.pipeline, rows)
@@ -114,10 +116,16 @@ class GenerateJob(GenerateRequest, SearchJob):
         self._rate = max(kept / result.candidates, 1e-3)
         # poses and contacts go from the internal to the user's frame of the object
         tree, center = self.inputs.hand.model.tree, self.inputs.object.model.center
-        rows = grasp_rows(result.grasps, tree, center, shard=part.number, protocol=self.protocol_text())
-        contents = self.shard(part, result, rows, {"candidates": result.candidates})
+        grasps, told = result.grasps, {"candidates": result.candidates}
+        if self.negatives and len(grasps):
+            from lgrasp.jobs.negatives import with_negatives
+
+            grasps = with_negatives(grasps, self.pipeline, self.inputs, part.number, self.negatives)
+            told["negatives"] = len(grasps) - len(result.grasps)
+        rows = grasp_rows(grasps, tree, center, shard=part.number, protocol=self.protocol_text())
+        contents = self.shard(part, result, rows, told)
         # a copy: memory must not grow with the shards
-        return Made(len(rows), contents, replace(result, grasps=take_grasps(result.grasps, np.zeros(0, int))))
+        return Made(len(result.grasps), contents, replace(result, grasps=take_grasps(result.grasps, np.zeros(0, int))))
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """The results in numbers; rates are those of the shards that this call made.
@@ -127,8 +135,8 @@ class GenerateJob(GenerateRequest, SearchJob):
             ``grasps_per_s``, ``strict_valid_per_s``, ``published_count_per_s`` (over the wall time of placement through
             filter), ``seconds`` (thread-seconds per stage; ``wall`` of placement through filter; hand, object, field),
             ``survivors`` and ``counts`` per stage, ``near_duplicates`` (across shards), ``distinct_poses``,
-            ``force_closure`` (share), what was asked, and of objects on a table ``resting``: ``probability`` and
-            ``rows`` of each resting pose.
+            ``force_closure`` (share), what was asked, ``negatives`` if they were, and of objects on a table
+            ``resting``: ``probability`` and ``rows`` of each resting pose.
         """
         inputs, tree = self.inputs, self.inputs.hand.model.tree
         moving = tree.body_group[tree.link_body] >= 0
@@ -149,6 +157,7 @@ class GenerateJob(GenerateRequest, SearchJob):
         return {
             "grasps": outcome.rows,
             **{name: both[name] for name in counts},
+            **({"negatives": both["negatives"]} if self.negatives else {}),
             "force_closure": closure_share(outcome.paths),
             "near_duplicates": _near_duplicates(outcome.paths, inputs.device.alias),
             "profile": self.pipeline.bounds.profile,
@@ -186,13 +195,14 @@ def _tally(paths: Collection[Path], moving: np.ndarray) -> tuple[Counter[str], d
     """
 
     def one(path: Path) -> tuple[Counter[str], dict[str, dict[str, int]]]:
-        with ShardReader(path) as reader:
+        with ShardReader(path, invalid=False) as reader:
             links, fswo = reader.column("contact_links"), reader.column("metrics/fswo")
             fingers = (moving[np.maximum(links, 0)] & (links >= 0)).sum((1, 2))
             found = Counter(
                 rows=len(reader),
                 strict=strict_rows(reader),
                 published_count=int(((fingers >= 3) & (fswo**2 < PUBLISHED_FSWO)).sum()),
+                negatives=int(reader.statistics.get("negatives", 0)),
                 distinct_poses=len(np.unique(reader.column("candidate") & POSE_BITS)),
             )
             if "table/pose" in reader.columns:
@@ -212,7 +222,7 @@ def _near_duplicates(paths: Collection[Path], device: str) -> int:
     """Rows of all shards together that are near-duplicates of a row before them; of the first _MOST_COMPARED rows."""
     poses, postures, rows = [], [], 0
     for path in paths:
-        with ShardReader(path) as reader:
+        with ShardReader(path, invalid=False) as reader:
             poses.append(reader.column("object_pose")[:, 0])
             postures.append(reader.column("q"))
             rows += len(reader)

@@ -147,7 +147,7 @@ class SimulateJob(SimulateRequest, ShardJob):
 
     def _simulated(self, path: Path, seconds: float) -> "Simulated":
         prefix = f"physics/{self.protocol.name}_"
-        with ShardReader(path) as reader:
+        with ShardReader(path, invalid=False) as reader:
             hand = reader.hand()
             return Simulated(
                 path=path,

@@ -13,7 +13,7 @@ from lgrasp.geometry.poses import device_inverse
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps
 from lgrasp.grasp.find_contacts import find_contacts
-from lgrasp.grasp.outcomes import REASONS, Outcome
+from lgrasp.grasp.outcomes import REASONS, Outcome, failed_bounds
 from lgrasp.grasp.tables import GraspTable, join_rows, take_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.contact_surface import ContactSurface
@@ -111,6 +111,8 @@ class Planner:
                     counts[name] += int((outcome == code).sum())
                 passed = outcome == Outcome.KEPT
                 table.metrics["valid"] = passed.astype(np.float32)
+                if keep_invalid:
+                    table.metrics["failed_bound"] = failed_bounds(table, outcome, self.params.bounds)
                 tables.append(take_grasps(table, np.flatnonzero(passed | keep_invalid)))
                 if progress:
                     progress(counts["starts"], counts["kept"])

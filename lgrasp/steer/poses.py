@@ -48,7 +48,7 @@ def read_poses(path: Path) -> np.ndarray:
 def _read(path: Path) -> tuple[np.ndarray, bool]:
     """Poses as they are in a file, and whether they are those of the hand."""
     if path.suffix in (".h5", ".hdf5"):
-        with ShardReader(path) as reader:
+        with ShardReader(path, invalid=False) as reader:
             return reader.column("object_pose")[:, 0], False
     data = path.read_bytes()
     if path.suffix in (".npy", ".npz"):

@@ -45,6 +45,23 @@ def test_rows_of_all_shards(folder):
         data[4105]
 
 
+def test_rows_that_fail_a_bound_are_left_out(tmp_path, make_sequence):
+    """Parents are counted among those that are left."""
+    shard = make_sequence((4, 5, 3))
+    rows = shard.grasps
+    childless = ~np.isin(np.arange(12), rows.sequence.parent)
+    valid = (~childless | (np.arange(12) % 2 == 0)).astype("f4")
+    metrics = {**rows.metrics, "valid": valid}
+    write_shard(tmp_path / "a.h5", replace(shard, grasps=replace(rows, metrics=metrics)))
+    data, every = GraspDataset(tmp_path), GraspDataset(tmp_path, negatives=True)
+    taken = np.flatnonzero(valid)
+    assert (len(data), len(every)) == (len(taken), 12)
+    for place, row in enumerate(taken):
+        assert torch.equal(data[place]["q"], every[int(row)]["q"])
+        old, new = int(rows.sequence.parent[row]), int(data[place]["sequence/parent"])
+        assert new == -1 if old == -1 else taken[new] == old
+
+
 def test_default_collate_with_two_workers(folder):
     data = GraspDataset(folder, columns=["q", "candidate", "contact_points", "metrics/gap"])
     data[0]  # the parent has read before the workers start

@@ -12,9 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lgrasp.dataset.conditions import Condition
+from lgrasp.dataset.exports.selection import select_rows
 from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.report.write import read_dataset
+from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.errors import HandError
+from lgrasp.grasp.bounds import GraspBounds
 
 KEYS = {
     "grasps",
@@ -65,6 +70,34 @@ def test_table(generate, tmp_path):
     assert sum(pose["rows"] for pose in poses) == 20
     (path,) = (tmp_path / "out").glob("*.h5")
     assert sorted(set(read_shard(path).grasps.table["pose"].tolist())) == [k for k, p in enumerate(poses) if p["rows"]]
+
+
+def test_negatives(cli, generate, tmp_path):
+    """The same grasps, and after them rows that fail the bound that they name; only the first count as grasps."""
+    assert generate().code == 0
+    both, plain = tmp_path / "both", read_shard(next((tmp_path / "out").glob("*.h5"))).grasps
+    data = json.loads(generate("--negatives", 1.5, "--json", "-", out=both).out)
+    assert (data["grasps"], data["negatives"], data["strict"]) == (20, 30, 20)
+    path = next(both.glob("*.h5"))
+    rows, bounds = read_shard(path).grasps, GraspBounds()
+    assert (len(rows), validate_shard(path)) == (50, [])
+    np.testing.assert_array_equal(rows.valid, np.arange(50) < 20)
+    for name in ("q", "q_pregrasp", "q_squeeze", "object_pose", "candidate"):
+        np.testing.assert_array_equal(getattr(rows, name)[:20], getattr(plain, name))
+    named, limits = rows.failed_bound, {"max_gap": "gap", "max_penetration": "penetration", "max_gswo": "gswo"}
+    assert set(named[:20]) == {"none"}
+    assert len(set(named[20:])) > 1
+    assert all(name in GraspBounds.model_fields for name in named[20:])
+    for name, metric in limits.items():
+        assert (rows.metrics[metric][named == name] > getattr(bounds, name)).all()
+    assert len(GraspDataset(both, columns=["q"])) == 20
+    told = GraspDataset(both, negatives=True)
+    assert [told.failed_bounds[int(told[k]["metrics/failed_bound"])] for k in (0, 20, 49)] == [*named[[0, 20, 49]]]
+    assert read_dataset([both], near=False)[0]["rows"] == 20
+    assert json.loads(cli("dataset", "info", both, "--json", "-").out)[0]["invalid"] == 30
+    assert [select_rows([both], where=where).rows for where in ((), [Condition("metrics/valid", "==")])] == [20, 30]
+    assert json.loads(generate("--negatives", 1.5, "--json", "-", out=both).out)["made"] == 0
+    assert "--simulate" in generate("--negatives", 1, "--simulate", "fc", out=tmp_path / "fc").error()
 
 
 def test_rows_of_looser_bounds_are_not_strict(generate):

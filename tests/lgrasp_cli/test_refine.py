@@ -55,6 +55,8 @@ def test_bounds_and_rows_that_fail_them(cli, shards, tmp_path):
     valid = after.grasps.metrics["valid"] == 1
     assert (~valid).sum() > 0
     assert after.grasps.metrics["gap"][valid].max(initial=0) <= 2.1e-4
+    assert (after.grasps.metrics["gap"][after.grasps.failed_bound == "max_gap"] > 2e-4).all()
+    assert ((after.grasps.failed_bound == "none") == valid).all()
     assert after.header.config["bounds"]["numbers"]["max_gap"] == 2e-4
     assert (
         "did you mean 'bounds.max_gap'"

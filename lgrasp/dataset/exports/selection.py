@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset.conditions import OBJECTS_HELD, Condition
+from lgrasp.dataset.conditions import OBJECTS_HELD, Condition, satisfied
 from lgrasp.dataset.exports.hand import free_name
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.gather import gather
@@ -162,10 +162,7 @@ def select_rows(
 
     def look(reader: ShardReader) -> tuple[np.ndarray, np.ndarray, int]:
         """The rows that conditions leave, their ``object_index``, and the number of all rows."""
-        good = np.ones(len(reader), bool)
-        for condition in where:
-            good &= condition.holds(reader)
-        rows = np.flatnonzero(good)
+        rows = np.flatnonzero(satisfied(reader, where))
         index = reader.column("object_index")[rows]
         several = np.flatnonzero((index >= 0).sum(1) != 1)
         if single and len(several):

@@ -38,7 +38,7 @@ def survey(paths: Paths) -> tuple[list[Head], list[str]]:
     Raises:
         ShardError: No shard is found, or one cannot be read.
     """
-    heads = [shard.value for shard in gather(paths, _head)]
+    heads = [shard.value for shard in gather(paths, _head, invalid=False)]
     meanings: dict[str, set[tuple[str, str, float]]] = defaultdict(set)
     for head in heads:
         for key in head.objects:

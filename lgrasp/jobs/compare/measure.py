@@ -37,7 +37,7 @@ def measure_cell(path: Path, protocol: ProtocolName | None = None) -> dict[str, 
     Raises:
         ShardError: the shard is damaged.
     """
-    with ShardReader(path) as reader:
+    with ShardReader(path, invalid=False) as reader:
         rows, statistics = len(reader), reader.statistics
         strict = strict_rows(reader)
         counts = survivors(stage_counts(statistics))

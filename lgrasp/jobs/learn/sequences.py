@@ -58,7 +58,7 @@ def read_steps(paths: Paths, cache: Cache, device: Device, cloud: int) -> ReadSt
             is left out, with a notice); shards are of different hands or opposition spaces.
         HandError: see :func:`hand_of_shard`.
     """
-    shards = gather(paths, _read)
+    shards = gather(paths, _read, invalid=False)
     first = shards[0]
     for shard in shards:
         if shard.value[:2] != first.value[:2]:

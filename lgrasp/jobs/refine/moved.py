@@ -11,7 +11,7 @@ from lgrasp.geometry.poses import internal_poses
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.find_contacts import find_contacts
-from lgrasp.grasp.outcomes import Outcome
+from lgrasp.grasp.outcomes import Outcome, failed_bounds
 from lgrasp.grasp.records import GraspRows
 from lgrasp.grasp.rows import CONTACTS, POSTURES, grasp_rows, press
 from lgrasp.grasp.schema import GRASP_FIELDS
@@ -29,6 +29,7 @@ _BATCH_ROWS = 256  # at a time
 _MAX_OBJECT_DISTANCE = 0.5  # [m] from the object: nothing pulls there
 _MIN_GAIN = 1e-3  # of a unit pull that must be resisted more to replace a valid row
 _POSE_ROUNDING = 1e-6  # [m] of a pose in a file
+_TOLD = {"valid", "failed_bound"}  # metrics that are of the last check
 _JOINT_TOLERANCE = 1e-4  # [rad or m] that a joint may be outside its limits
 
 
@@ -70,7 +71,7 @@ def move_rows(
 
     Args:
         planes: those that the object rests on, (T, 5), where rows are of objects on a table: they must stay above it.
-        keep_invalid: those rows are kept too, refined, with their own metrics and ``valid`` 0.
+        keep_invalid: those rows are kept too, refined, with their own metrics, ``valid`` 0 and ``failed_bound``.
         stored: contacts of the rows are known, and rows that are not replaced stay as they are.
         measured: metrics of the rows are of these bounds.
         progress: called with rows done.
@@ -86,10 +87,11 @@ def move_rows(
             progress(min(first + _BATCH_ROWS, len(rows)))
     table = join_rows([p.table for p in parts])
     first_energy, last_energy = (np.concatenate(x, 1) for x in zip(*(p.energy for p in parts), strict=True))
-    was, known, taken, good = (np.concatenate([p.marks[k] for p in parts]) for k in range(4))
+    was, known, taken, good, failed = (np.concatenate([p.marks[k] for p in parts]) for k in range(5))
     terms = {f"energy_{name}": values for name, values in zip(Energies._fields, last_energy, strict=True)}
     valid = was | good
     extra = {"energy": last_energy.sum(0), **terms, "valid": valid, "refined": taken}
+    extra |= {"failed_bound": np.where(valid, 0, failed)} if keep_invalid else {}
     extra = {name: np.asarray(values, np.float32) for name, values in extra.items()}
     made = grasp_rows(press(table), hand.model.tree, obj.center, extra=extra)
     made = replace(made, candidate=rows.candidate, table=_ways(rows.table, made.table))
@@ -98,14 +100,14 @@ def move_rows(
     if not keep_invalid:
         made = _some(made, valid)
     means = float(first_energy.sum(0).mean()), float(last_energy.sum(0).mean())
-    failed, far = int((~valid).sum()), sum(p.far for p in parts)
-    return Moved(made, means, (int(was.sum()), int(valid.sum())), failed, int(outside.sum()), far)
+    far, lost = sum(p.far for p in parts), int((~valid).sum())
+    return Moved(made, means, (int(was.sum()), int(valid.sum())), lost, int(outside.sum()), far)
 
 
 class _Part(NamedTuple):
     table: GraspTable
     energy: tuple[np.ndarray, np.ndarray]  # terms before and after, (6, n)
-    marks: tuple[np.ndarray, ...]  # rows valid before, with the contacts that they name, replaced, valid when refined
+    marks: tuple[np.ndarray, ...]  # valid before, with the contacts named, replaced, valid when refined, failed bound
     far: int
 
 
@@ -147,7 +149,7 @@ def _moved_part(
     table = choose_grasps(widen_grasps(old, new.contact_links.shape[1]), new, at, at)
     energy = tuple(_numbers(refiner.energy(*pose)) for pose in (given, table_pose(table, hand.device)))
     far = int((_distance(given, refiner) > _MAX_OBJECT_DISTANCE).sum())
-    return _Part(table, (energy[0], energy[1]), (was, known, taken, good), far)
+    return _Part(table, (energy[0], energy[1]), (was, known, taken, good, failed_bounds(new, outcome, bounds)), far)
 
 
 def _rounded(bounds: GraspBounds) -> GraspBounds:
@@ -215,7 +217,7 @@ def _kept(old: GraspRows, new: GraspRows, take: np.ndarray, measured: bool) -> G
             x, y = _padded(x, width), _padded(y, width)
         changes[name] = _chosen(take, y, x)
     metrics = {
-        name: np.where(take, values, old.metrics[name]) if measured and name in old.metrics else values
+        name: np.where(take, values, old.metrics[name]) if measured and name in {*old.metrics} - _TOLD else values
         for name, values in new.metrics.items()
     }
     table = {name: _chosen(take, values, np.asarray(old.table[name])) for name, values in new.table.items()}

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from lgrasp.choices import ProtocolName
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
-from lgrasp.config import HandName, ShardFolder, Viewpoint
+from lgrasp.config import HandName, Negatives, ShardFolder, Viewpoint
 from lgrasp.engine.folder import check_number
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.request import Request
@@ -63,6 +63,7 @@ class GenerateRequest(SearchRequest):
     object: str = Field(description="Name or mesh file.")
     scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
     batch: int = Field(default=0, description="Candidates per batch; 0: by device.")
+    negatives: Negatives = 0.0
     rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
 
     @property
@@ -77,6 +78,10 @@ class GenerateRequest(SearchRequest):
         if self.pipeline.sequence is not None:
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}' is for several objects: lgrasp sequence OBJECT OBJECT ..."
+            )
+        if self.negatives and "simulate" in self.pipeline.order:
+            raise ConfigError(
+                "--negatives: failed rows would have no verdict; leave --simulate out, then lgrasp simulate"
             )
         find_object(self.object)
         super().check()

@@ -46,7 +46,7 @@ def read_parts(paths: Paths) -> dict[tuple[str, str], Grasped]:
     """
     found: dict[tuple[str, str], Grasped] = {}
     first: tuple[Grasped, Path] | None = None
-    for path, _, (record, columns) in gather(paths, _single):
+    for path, _, (record, columns) in gather(paths, _single, invalid=False):
         with ShardReader(path) as reader:
             attributes, config = reader.attributes, reader.header.config
             hand = first[0].hand if first else reader.hand()

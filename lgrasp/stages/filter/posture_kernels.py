@@ -30,6 +30,18 @@ class SetCandidates:
 
 
 @wp.kernel
+def open_hands(hand: Hand, sets: SetCandidates, at_out: CheckedPostures):
+    """Every finger open, as the setting of the set's pose has it."""
+    i = wp.tid()
+    for g in range(hand.kin.groups):
+        first = hand.kin.dof_first[g]
+        x = vec_dof()
+        for d in range(hand.kin.dof_first[g + 1] - first):
+            x[d] = hand.kin.dof_setting[sets.setting[at_out.of[i]], first + d]
+        at_out.posture[i, g] = x
+
+
+@wp.kernel
 def place_touching(
     hand: Hand,
     field: Field,

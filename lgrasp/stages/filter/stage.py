@@ -15,6 +15,7 @@ from lgrasp.stages.filter.params import FilterParams
 from lgrasp.stages.filter.posture_kernels import (
     SetCandidates,
     fill_unused,
+    open_hands,
     place_touching,
     take_contacts,
     tell_postures,
@@ -32,7 +33,22 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
         The grasps in (candidate, slot) order, and the number of sets per outcome
         (:data:`~lgrasp.grasp.outcomes.REASONS`).
     """
-    inputs = trim_sets(inputs)
+    check = placed_hands(trim_sets(inputs), params, context)
+    check.clear_table(OTHERS)
+    check.measure(OTHERS)
+    if context.space:
+        check.measure_held()
+    if params.contacts == "all":
+        _take_all(check, context)
+    return check.kept(context.seed("filter", 1))
+
+
+def placed_hands(inputs: ContactSets, params: FilterParams, context: Context, *, opened: bool = False) -> Check:
+    """The hands of sets (:func:`trim_sets`): touching fingers, then the others, checked as far as that took.
+
+    Args:
+        opened: fingers that find no place are open; else those of hands that failed are anywhere.
+    """
     d, n = context.device, inputs.pose.shape[0]
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
     limits, held = device_limits(context.bounds), context.held.struct
@@ -44,25 +60,28 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     places = make_struct(Places, hand.contacts, points=obj.contact_points, normals=obj.contact_normals)
     found = new_findings(n, at.contact.shape[1], d)
     check = Check(context.hand, context.object, context.held, limits, places, at, found)
+    if opened:
+        wp.launch(open_hands, n, [hand, sets], [at], device=d)
     wp.launch(place_touching, n, [hand, field, held, limits, places, sets], [at, found], device=d)
     check.clear_table(TOUCHING)
     check.measure(TOUCHING)
     seed = context.seed("filter")
     wp.launch(fill_unused, n, [hand, field, obj, held, limits, seed, params.draws, sets], [at, found], device=d)
-    check.clear_table(OTHERS)
-    check.measure(OTHERS)
-    if context.space:
-        check.measure_held()
-    if params.contacts == "all":
-        _take_all(check, context)
-    return check.kept(context.seed("filter", 1))
+    return check
+
+
+def placed_postures(check: Check) -> tuple[wp.array, wp.array]:
+    """T_hand_object (n,) and joint positions (n, K) [rad or m] of hands."""
+    d, n, hand = check.hand.device, len(check), check.hand
+    pose, q = wp.empty(n, dtype=wp.transform, device=d), wp.empty((n, hand.model.dofs), dtype=float, device=d)
+    wp.launch(tell_postures, n, [hand.struct, check.at], [pose, q], device=d)
+    return pose, q
 
 
 def _take_all(check: Check, context: Context) -> None:
     """Contacts of further links that touch join those that search combined."""
     d, n, hand = context.device, len(check), context.hand.struct
-    pose, q = wp.empty(n, dtype=wp.transform, device=d), wp.empty((n, context.hand.model.dofs), dtype=float, device=d)
-    wp.launch(tell_postures, n, [hand, check.at], [pose, q], device=d)
+    pose, q = placed_postures(check)
     runs = allowed_runs(context)
     found = touching_links(context.hand, context.object, check.limits, runs, pose, q)
     inputs = [hand, check.limits, check.places, runs, *found]
