@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from lgrasp.engine.run import Job
 
 
-def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool = False) -> None:
+def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
     """Run jobs, report them, and leave with the worst exit code; one that fails does not stop the others.
 
     Args:

@@ -78,11 +78,11 @@ def bench_hands(
     starts: int,
     protocol: str = "dipgrasp",
     *,
-    engine: EngineName = "mujoco",
+    engine: EngineName,
     params: PlanParams | None = None,
-    noises: Sequence[float] = NOISES,
-    device: str = "auto",
-    cache: Cache | None = None,
+    noises: Sequence[float],
+    device: str,
+    cache: Cache | None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Plan and refine with some hands.

@@ -86,7 +86,7 @@ def bench_methods(
             yield result
 
 
-def measure_sequence(job: SequenceJob, device: str = "") -> dict[str, Any]:
+def measure_sequence(job: SequenceJob, device: str) -> dict[str, Any]:
     """Run a round of a job, simulate every row and continue those that hold; nothing is written.
 
     Grasps of an optimiser, and of a network as they are drawn, are simulated as published: only a penetration of 1 cm,

@@ -17,7 +17,7 @@ SceneCloud = Callable[[Path], dict[str, np.ndarray]]
 _LABELS = ("label", "labels")  # names that a file may give to the label of a point
 
 
-def read_arrays(path: Path, read_scene: SceneCloud | None = None) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, read_scene: SceneCloud | None) -> dict[str, np.ndarray]:
     """What a cloud's file says of n points: ``points`` (n, 3), and perhaps ``normals`` (n, 3) and ``labels`` (n,).
 
     An image of points, (h, w, 3), is read row by row. A scene (.h5) gives its merged cloud. Of a mesh (.ply) the

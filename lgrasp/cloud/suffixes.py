@@ -7,7 +7,7 @@ CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz", ".h5")
 MASK_SUFFIXES = (".npy", ".npz")
 
 
-def cloud_names(paths: Sequence[Path], labels: Sequence[int] = ()) -> tuple[str, ...]:
+def cloud_names(paths: Sequence[Path], labels: Sequence[int]) -> tuple[str, ...]:
     """What the points of clouds, or of a label of each, are called."""
     return tuple(
         path.stem if number >= len(labels) else f"{path.stem}-{labels[number]}" for number, path in enumerate(paths)

@@ -183,7 +183,7 @@ def draw_rows(
     chosen: Sequence[int],
     *,
     stage: str = "grasp",
-    size: int = 256,
+    size: int,
     columns: int = 0,
     progress: Callable[[int, int], None] | None = None,
     loading: Callable[[str, float], None] | None = None,

@@ -131,7 +131,7 @@ def _write_object(group: h5py.Group, record: ObjectRecord) -> None:
         group.attrs["touch_share"] = float(record.touch_share)
 
 
-def create_rows(file: h5py.File, name: str, shape: Sequence[int], dtype: np.dtype, text: str = "") -> h5py.Dataset:
+def create_rows(file: h5py.File, name: str, shape: Sequence[int], dtype: np.dtype, text: str) -> h5py.Dataset:
     """Make one empty row dataset by its flat name, chunked along its rows; the text is the unit of a metric, the
     protocol of a verdict."""
     path = GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"

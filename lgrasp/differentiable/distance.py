@@ -126,7 +126,7 @@ class DistanceGrids:
         assert isinstance(out, torch.Tensor)
         return out
 
-    def value_within(self, p: _Three, grid: torch.Tensor | int = 0) -> torch.Tensor:
+    def value_within(self, p: _Three, grid: torch.Tensor | int) -> torch.Tensor:
         """Signed distance [m] at the points of the grids nearest to points given by components (fast, no graph).
 
         With the margin that grids have, it is negative where :meth:`value` is, and the same there.
@@ -138,7 +138,7 @@ class DistanceGrids:
             v0, v1 = v00 + (v01 - v00) * fy, v10 + (v11 - v10) * fy
             return v0 + (v1 - v0) * fx
 
-    def value_and_gradient(self, p: _Three, grid: torch.Tensor | int = 0) -> tuple[torch.Tensor, _Three]:
+    def value_and_gradient(self, p: _Three, grid: torch.Tensor | int) -> tuple[torch.Tensor, _Three]:
         """As :meth:`value`, with the gradient, both of points given by components (faster; keeps no graph)."""
         with torch.no_grad():
             return _interpolate(self.values, self.cells(grid), p)

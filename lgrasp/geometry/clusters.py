@@ -3,6 +3,7 @@
 import numpy as np
 
 CLUSTER_SIZE = 32
+_BALL_STEPS = 64  # towards the farthest point; a radius is within 1/64 of the smallest
 
 
 def cluster_order(points: np.ndarray, *, size: int = CLUSTER_SIZE) -> np.ndarray:
@@ -34,15 +35,12 @@ def one_per_cell(points: np.ndarray, size: float) -> np.ndarray:
     return np.sort(np.unique(np.floor(points / size).astype(np.int64), axis=0, return_index=True)[1])
 
 
-def bounding_spheres(
-    points: np.ndarray, *, size: int = CLUSTER_SIZE, iterations: int = 64
-) -> tuple[np.ndarray, np.ndarray]:
+def bounding_spheres(points: np.ndarray, *, size: int = CLUSTER_SIZE) -> tuple[np.ndarray, np.ndarray]:
     """Nearly smallest balls around runs of ``size`` points (Bădoiu–Clarkson core-set iteration).
 
     Args:
         points: Points [m], shape (n, 3), n a multiple of ``size``.
         size: Points of a run.
-        iterations: Steps toward the farthest point; the radius is within 1/iterations of the smallest.
 
     Returns:
         Centres [m], shape (n / size, 3), and radii [m], shape (n / size,), f32, rounded up.
@@ -50,7 +48,7 @@ def bounding_spheres(
     group = np.asarray(points, np.float64).reshape(-1, size, 3)  # (k, c, 3)
     center = group.mean(axis=1)
     row = np.arange(len(group))
-    for step in range(1, iterations + 1):
+    for step in range(1, _BALL_STEPS + 1):
         far = np.argmax(((group - center[:, None]) ** 2).sum(-1), axis=1)
         center += (group[row, far] - center) / (step + 1)
     center = center.astype(np.float32)

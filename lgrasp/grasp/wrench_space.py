@@ -23,7 +23,7 @@ class WrenchSpace(NamedTuple):
     """6-D volume of the hull; 0 when the origin is not inside."""
 
 
-def cone_edges(normals: np.ndarray, *, friction: float = FRICTION, edges: int = CONE_EDGES) -> np.ndarray:
+def cone_edges(normals: np.ndarray, *, friction: float, edges: int) -> np.ndarray:
     """Forces of unit normal part along the edges of friction pyramids.
 
     Args:
@@ -50,7 +50,7 @@ def primitive_wrenches(
     *,
     center: np.ndarray,
     radius: float,
-    friction: float = FRICTION,
+    friction: float,
     edges: int = CONE_EDGES,
 ) -> np.ndarray:
     """Wrenches (f, (p - center) x f / radius) of the forces f of :func:`cone_edges`, shape [k * edges, 6].

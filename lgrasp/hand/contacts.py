@@ -44,7 +44,7 @@ def grid_arrays(grids: Sequence[LinkGrid], prefix: str = "") -> dict[str, np.nda
     return {f"{prefix}grid_{name}": array for name, array in arrays.items()}
 
 
-def link_grid(meshes: Sequence[trimesh.Trimesh], device: str = "cpu") -> LinkGrid:
+def link_grid(meshes: Sequence[trimesh.Trimesh], device: str) -> LinkGrid:
     """Distance grid of the union of a link's solids (already in the body frame)."""
     low = np.min([m.bounds[0] for m in meshes], 0) - _GRID_PAD
     high = np.max([m.bounds[1] for m in meshes], 0) + _GRID_PAD
@@ -52,7 +52,7 @@ def link_grid(meshes: Sequence[trimesh.Trimesh], device: str = "cpu") -> LinkGri
 
 
 def box_grid(
-    meshes: Sequence[trimesh.Trimesh], low: np.ndarray, high: np.ndarray, cell: float, device: str = "cpu", **sign: bool
+    meshes: Sequence[trimesh.Trimesh], low: np.ndarray, high: np.ndarray, cell: float, device: str, **sign: bool
 ) -> LinkGrid:
     """Distance grid of the union of solids in a box with corners (3,) [m]; ``sign`` as of :func:`signed_distance`."""
     shape = np.ceil((high - low) / cell).astype(int) + 1
@@ -106,7 +106,7 @@ def side_points(
     T_body_link: np.ndarray,
     surface: Surface,
     rng: np.random.Generator,
-    device: str = "cpu",
+    device: str,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Points and normals (n, 3) of a link's part of one side of an opposition space, body frame, and its area [m^2].
 

@@ -72,7 +72,7 @@ def with_pairs(
     adjacent: set[tuple[str, str]],
     meshes: Mapping[str, Sequence[trimesh.Trimesh]],
     dented: set[str],
-    device: str = "cpu",
+    device: str,
 ) -> HandModel:
     """The model with its self-collision pairs, grouped by (group a, group b).
 

@@ -17,7 +17,7 @@ _MOST_POINTS = 160  # of a finger link
 _PALMAR_COSINE = np.cos(np.radians(80.0))  # to the axis away from the palmar side, above which a normal is not palmar
 
 
-def whole_hand(source: HandSource, model: HandModel, device: str = "cpu") -> HandModel:
+def whole_hand(source: HandSource, model: HandModel, device: str) -> HandModel:
     """The same hand, whose other finger links may touch too: with the side that the mean fingertip sees.
 
     Links that hand.yaml lists keep their surface. Of the others a contact may slide wherever the normal is within 100

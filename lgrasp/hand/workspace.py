@@ -34,9 +34,9 @@ class Workspace:
     fingers [m^3/rad^3]; 0 of fingers that move it in a plane."""
 
 
-def measure_workspace(model: HandModel, device: str = "cpu") -> Workspace:
+def measure_workspace(model: HandModel) -> Workspace:
     """The workspace of a hand, from 4096 random postures."""
-    postures = sample_bodies(model, model.random_postures(_POSTURES), device)
+    postures = sample_bodies(model, model.random_postures(_POSTURES), "cpu")
     reached = []
     for group in range(model.groups):
         first, end = model.contact_first[group : group + 2]
@@ -45,10 +45,10 @@ def measure_workspace(model: HandModel, device: str = "cpu") -> Workspace:
         points = postures.place(clear[:, None], model.contact_body[None, rows], model.contact_points[None, rows])
         reached.append(np.unique(np.floor(points.reshape(-1, 3) / _CELL).astype(int), axis=0))
     times = np.unique(np.concatenate(reached), axis=0, return_counts=True)[1]
-    return Workspace(len(times) * _CELL**3, int((times > 1).sum()) * _CELL**3, _manipulability(model, device))
+    return Workspace(len(times) * _CELL**3, int((times > 1).sum()) * _CELL**3, _manipulability(model))
 
 
-def _manipulability(model: HandModel, device: str) -> float:
+def _manipulability(model: HandModel) -> float:
     """Mean over the last bodies of fingers that may touch."""
     tips = {}
     for body in sorted(last_bodies(model)):
@@ -59,7 +59,7 @@ def _manipulability(model: HandModel, device: str) -> float:
         return 0.0
     q, k = model.random_postures(_JACOBIANS, seed=1), model.dofs
     steps = _STEP * np.concatenate([np.eye(k), -np.eye(k)])
-    poses = body_poses(upload_hand(model, device), (q[:, None] + steps).reshape(-1, k))
+    poses = body_poses(upload_hand(model, "cpu"), (q[:, None] + steps).reshape(-1, k))
     poses = poses.reshape(len(q), 2 * k, -1, 7).astype(float)
     found = []
     for body, point in tips.items():

@@ -26,8 +26,8 @@ def try_rows(
     rows: GraspRows,
     seed: int,
     *,
-    workers: int = 1,
-    progress: Callable[[int], None] | None = None,
+    workers: int,
+    progress: Callable[[int], None] | None,
 ) -> dict[str, np.ndarray]:
     """The metrics of rows of one object (:data:`~lgrasp.hold.run.METRICS`), each (N,) float32.
 

@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,9 +44,8 @@ def run_up_to(
     shard: int,
     cache: Cache,
     *,
-    scale: float = 1.0,
-    device: str = "auto",
-    report: Callable[[str, float], None] | None = None,
+    scale: float,
+    device: str,
 ) -> list[StageRun]:
     """Tables of the stages up to ``last`` for candidates ``first .. first + count - 1`` of a shard's stream.
 
@@ -56,7 +54,6 @@ def run_up_to(
     Args:
         hand, mesh: name or path.
         scale: factor from the mesh's unit to metres.
-        report: called with (what, share) while inputs are loaded.
 
     Raises:
         LgraspError: bad input.
@@ -78,11 +75,12 @@ def run_up_to(
     done = max((i for i, stage in enumerate(stages) if stage in found), default=-1) + 1
     if done == len(stages):
         return runs
-    what = keys, scale, pipeline.object, pipeline.field, used, report
-    inputs = load_inputs(cache, *what, table=pipeline.on_table, steer=pipeline.steer)
+    inputs = load_inputs(
+        *(cache, keys, scale, pipeline.object, pipeline.field, used), table=pipeline.on_table, steer=pipeline.steer
+    )
     context = shard_context(pipeline, inputs, shard)
     table: Any = _table(found[stages[done - 1]], used.alias) if done else (first, count)
-    load_kernels(used.alias, kernel_modules(*Job.kernels), report)
+    load_kernels(used.alias, kernel_modules(*Job.kernels))
     runs = [run for run in runs if run.stage in stages[:done]]
     for stage in stages[done:]:
         start = time.perf_counter()

@@ -24,9 +24,9 @@ def prepare_field(
     hand: str,
     params: FieldParams,
     *,
-    index: str | None = None,
-    device: str = "auto",
-    report: Callable[[str, float], None] | None = None,
+    index: str | None,
+    device: str,
+    report: Callable[[str, float], None] | None,
 ) -> dict[str, Any]:
     """Build the contact field of a hand (or find it in the cache) and describe it.
 
@@ -67,7 +67,7 @@ def prepare_field(
     }
 
 
-def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: float = 1.0) -> dict[str, Any]:
+def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: float) -> dict[str, Any]:
     """Preprocess an object (or find it in the cache) and describe it.
 
     Raises:
@@ -95,7 +95,7 @@ def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: floa
     }
 
 
-def describe_object(mesh: str, scale: float = 1.0) -> dict[str, Any]:
+def describe_object(mesh: str, scale: float) -> dict[str, Any]:
     """A mesh as it would be used: size, repairs.
 
     Raises:

@@ -21,7 +21,7 @@ class PlanLine(NamedTuple):
     file: str
 
 
-def preview(job: Job, *, array: Array | tuple[int, int] = (0, 1), resume: bool = True) -> list[PlanLine]:
+def preview(job: Job, *, array: Array | tuple[int, int], resume: bool) -> list[PlanLine]:
     """The artifacts of a job in the order in which it would make them.
 
     Raises:

@@ -61,10 +61,8 @@ def hand_of_shard(
     return _built(cache, source, device, _surface(config))
 
 
-def object_of_shard(
-    cache: Cache, record: ObjectRecord, device: Device, params: ObjectParams | None = None
-) -> ObjectModel:
-    """The object of a shard, preprocessed, in its user frame; cached by its content and the parameters.
+def object_of_shard(cache: Cache, record: ObjectRecord, device: Device) -> ObjectModel:
+    """The object of a shard, preprocessed, in its user frame; cached by its content.
 
     Raises:
         ObjectError: it cannot be used.
@@ -76,7 +74,7 @@ def object_of_shard(
                 f"object '{record.id}' is a point cloud without normals; meshes and clouds with normals can be used"
             )
         return cloud_object(np.asarray(record.vertices, float), record.normals, name=record.name)
-    params = params or ObjectParams()
+    params = ObjectParams()
     described = {"content": mesh_hash(record), "params": params.model_dump(mode="json"), "name": record.id}
 
     def make() -> ObjectModel:

@@ -50,7 +50,7 @@ def make_examples(
     params: LearnParams,
     rng: np.random.Generator,
     clouds: int,
-    device: str = "cpu",
+    device: str,
 ) -> Examples:
     """Clouds and labels of one object.
 
@@ -94,7 +94,7 @@ def partial_clouds(
 
 
 def seen_cloud(
-    vertices: np.ndarray, faces: np.ndarray, camera: CameraParams, rng: np.random.Generator, device: str = "cpu"
+    vertices: np.ndarray, faces: np.ndarray, camera: CameraParams, rng: np.random.Generator, device: str
 ) -> CloudRecord:
     """What the cameras see of a mesh alone in space, from random sides, about the origin of its vertices [m]."""
     radius = float(np.linalg.norm(vertices, axis=1).max())

@@ -114,7 +114,7 @@ class Trainer:
         return self._refiners[key]
 
     @torch.no_grad()
-    def predict(self, examples: Examples, seeds: int = 4) -> Coarse:
+    def predict(self, examples: Examples, seeds: int) -> Coarse:
         """Answers on the first ``seeds`` points of every cloud: fixed ones, for comparisons."""
         examples = _moved(examples, self.device)
         clouds, n = examples.points.shape[:2]

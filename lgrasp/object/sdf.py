@@ -35,7 +35,7 @@ def build_sdf(
     faces: np.ndarray,
     *,
     closed: bool,
-    max_cells: int = 128**3,
+    max_cells: int,
     min_cell: float = 0.0005,
     pad: float = 0.008,
     device: str = "cpu",

@@ -157,7 +157,7 @@ def fold_cosine(
         return to_numpy(out)
 
 
-def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int, device: str = "cpu") -> np.ndarray:
+def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int, device: str) -> np.ndarray:
     """For each point a random one that a finger and an opposed finger could press together with it.
 
     Both normals are within 30 degrees of the line between the two; cavities in between do not matter.

@@ -50,7 +50,7 @@ class Viewpoint(NamedTuple):
     """T_scene_camera, x y z [m] qw qx qy qz, shape (7,)."""
 
 
-def draw_scene(scene: GraspScene, size: int, stage: str = "grasp", colour: int = 0) -> np.ndarray:
+def draw_scene(scene: GraspScene, size: int, stage: str, colour: int) -> np.ndarray:
     """The last step of a row, with its contacts as dots; sRGB, shape (size, size, 3), uint8.
 
     Args:

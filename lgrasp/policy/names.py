@@ -13,7 +13,7 @@ _NAMES = {"listed": ("pose_policy.npz",), "all": ("power_policy.npz", "pose_poli
 _MOST_BYTES = 2 << 20
 
 
-def shipped_policy(hand: str, links: str = "listed") -> Path | None:
+def shipped_policy(hand: str, links: str) -> Path | None:
     """The policy beside the rules of a known hand; where all links may touch, that of whole-hand grasps if there is
     one."""
     folder = known_hands().get(hand)

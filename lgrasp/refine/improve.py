@@ -32,7 +32,7 @@ def improve(
     *,
     tries: np.ndarray,
     resting: np.ndarray | None = None,
-    index: np.ndarray | None = None,
+    index: np.ndarray,
 ) -> tuple[GraspTable, np.ndarray]:
     """Hands at their best: of the postures that pass the checks the one that resists loads best.
 
@@ -45,12 +45,11 @@ def improve(
         q: joint positions within their limits [rad or m], (n, K).
         tries: most searches of each hand, (n,).
         resting: as of :func:`~lgrasp.grasp.check.check_grasps`.
-        index: candidate of each row; default: the row.
+        index: candidate of each row.
 
     Returns:
         Rows in the order given, and their outcomes (:class:`~lgrasp.grasp.outcomes.Outcome`), (n,).
     """
-    index = np.arange(len(q)) if index is None else index
     parts = [slice(first, first + _CPU_ROWS) for first in range(0, len(q), _CPU_ROWS)]
     if search.device != "cpu" or len(parts) < 2:
         return _improved(search, hand, obj, pose, q, bounds, tries, resting, index)

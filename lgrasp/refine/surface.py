@@ -36,13 +36,13 @@ class HandSurface:
     """How strongly each point is drawn to the object, 0 for points that are only kept out, (L, BLOCK)."""
 
 
-def farthest_points(points: np.ndarray, count: int, *, first: int = 0) -> np.ndarray:
+def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     """Indices of ``count`` points, each the farthest from those before (all and repeats when there are fewer).
 
     Args:
-        points: (n, 3), n >= 1. first: where to begin.
+        points: (n, 3), n >= 1.
     """
-    chosen, gap = [first], np.full(len(points), np.inf)
+    chosen, gap = [0], np.full(len(points), np.inf)
     while len(chosen) < min(count, len(points)):
         away = points - points[chosen[-1]]
         np.minimum(gap, np.einsum("ij,ij->i", away, away), out=gap)

@@ -27,7 +27,7 @@ def table_surface(side: float) -> LabelledMesh:
     return LabelledMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.full(2, TABLE))
 
 
-def image_normals(images: Images, window: int, device: str = "cpu") -> np.ndarray:
+def image_normals(images: Images, window: int, device: str) -> np.ndarray:
     """Unit normals in the scene frame from the depths alone, towards the camera, shape (v, h, w, 3), f32: of the plane
     through ``window`` pixels to each side; zero where too few of them lie on the same surface."""
     start()

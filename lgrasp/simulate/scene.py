@@ -61,7 +61,7 @@ def scene_of(
     return Scene(hand_of_record(hand, decompose, device), tuple(solids))
 
 
-def hand_of_record(record: HandRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> HandSolids:
+def hand_of_record(record: HandRecord, decompose: Decompose, device: str = "cpu") -> HandSolids:
     """The hand of a shard, cut into the convex pieces that the generator uses.
 
     Raises:

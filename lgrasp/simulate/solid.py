@@ -39,7 +39,7 @@ class Solid:
     """What a user should know: the hull stands for the mesh, the mesh is not closed."""
 
 
-def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device: str = "cpu") -> Solid:
+def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device: str) -> Solid:
     """A mesh as a rigid body. Where cutting it fails its hull collides, and a note says so.
 
     Args:

@@ -67,7 +67,7 @@ def find_touching(steering: Steering, model: HandModel, fingers: Fingers) -> Tou
 
 
 def describe_touching(
-    steering: Steering, touching: Touching, model: HandModel, poses: np.ndarray | None = None
+    steering: Steering, touching: Touching, model: HandModel, poses: np.ndarray | None
 ) -> dict[str, Any]:
     """What is asked in the words of this hand, for those who check rows: ``links`` that may touch, lists of links in
     ``every`` of which one touches, the direction ``facing`` of the palm if one is asked for, and what is asked.

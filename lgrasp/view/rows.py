@@ -118,7 +118,7 @@ class RowsView:
     def _go(self, step: int) -> None:
         self._at.value = int(np.clip(self._at.value + step, 0, len(self.order) - 1))
 
-    def choose(self, where: str = "", sort: str = _AS_STORED, *, falling: bool = True, side: int = 1) -> None:
+    def choose(self, where: str, sort: str = _AS_STORED, *, falling: bool = True, side: int = 1) -> None:
         """Show the first of the rows that satisfy conditions.
 
         Args:

@@ -21,7 +21,6 @@ from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, named_object, object_of_shard
-from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import resolve_device
 
 CPU = resolve_device("cpu")
@@ -136,15 +135,13 @@ def test_plans_take_hand_and_object_from_a_shard(made: Path, cache_root: Path, t
     np.testing.assert_allclose(plan.objects[0].vertices, shard.objects[0].vertices, atol=1e-7)
 
 
-def test_an_object_is_cached_by_content_and_parameters(made: Path, tmp_path: Path):
+def test_an_object_is_cached_by_content(made: Path, tmp_path: Path):
     cache, (record,) = Cache(tmp_path / "cache", pytest.fail), read_shard(made).objects
-    few = ObjectParams(obstacle_count=1024)
-    whole, thin = object_of_shard(cache, record, CPU), object_of_shard(cache, record, CPU, few)
-    assert len(thin.obstacle_points) < len(whole.obstacle_points)
+    whole = object_of_shard(cache, record, CPU)
     same(object_of_shard(cache, record, CPU), whole)
     moved = replace(record, vertices=record.vertices * np.float32(1.1))
     assert object_of_shard(cache, moved, CPU).extents[0] > whole.extents[0]
-    assert len(cache.entries()) == 3
+    assert len(cache.entries()) == 2
 
 
 def test_a_shard_of_no_single_object_is_no_object(made: Path, cache_root: Path, tmp_path: Path):

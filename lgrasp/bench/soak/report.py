@@ -16,13 +16,13 @@ from lgrasp.paths import cache_dir
 
 
 def run_soak(
-    commands: Sequence[str] = (),
-    ways: Sequence[str] = (),
+    commands: Sequence[str],
+    ways: Sequence[str],
     *,
-    rounds: int = 1,
-    hours: float = 0.0,
-    seed: int = 0,
-    say: Callable[[str], None] = lambda line: None,
+    rounds: int,
+    hours: float,
+    seed: int,
+    say: Callable[[str], None],
 ) -> Iterator[dict[str, Any]]:
     """:func:`soak` in a temporary folder; all commands and all ways by default.
 

@@ -83,10 +83,10 @@ class Distribution:
         ends = np.concatenate([[0], np.cumsum(self.counts)])
         return float(np.clip(np.interp(share * self.rows, ends, self.edges()), self.least, self.most))
 
-    def bars(self, number: int = 40) -> tuple[np.ndarray, np.ndarray]:
-        """Edges [number + 1] and counts [number] of even bins that show nearly all values above 0, and the bound."""
+    def bars(self) -> tuple[np.ndarray, np.ndarray]:
+        """Edges [41] and counts [40] of even bins that show nearly all values above 0, and the bound."""
         high = max(self.quantile(0.999), self.most if self.rows < 5000 else 0.0, self.quantity.bound or 0.0) or 1.0
-        edges = np.linspace(0, 1.02 * high, number + 1)
+        edges = np.linspace(0, 1.02 * high, 41)
         middle = (self.edges()[1:] + self.edges()[:-1]) / 2
         counts = self.counts.copy()
         counts[0] -= self.zeros

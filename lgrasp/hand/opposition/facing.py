@@ -39,7 +39,7 @@ class Opening:
 
 
 def opposed(
-    p: np.ndarray, n: np.ndarray, q: np.ndarray, m: np.ndarray, *, still: bool = False
+    p: np.ndarray, n: np.ndarray, q: np.ndarray, m: np.ndarray, *, still: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which pairs of contacts press towards each other, (N,) bool, and their distances (N,) [m].
 

@@ -27,7 +27,7 @@ MEANS = {
 """Numbers of a hand with an object, of which a hand has the means over its objects."""
 
 
-def measure_cell(path: Path, protocol: ProtocolName | None = None) -> dict[str, Any]:
+def measure_cell(path: Path, protocol: ProtocolName | None) -> dict[str, Any]:
     """Numbers of the shard of a hand and an object.
 
     Returns:

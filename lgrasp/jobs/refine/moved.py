@@ -58,11 +58,11 @@ def move_rows(
     params: RefineParams,
     bounds: GraspBounds,
     *,
-    planes: np.ndarray | None = None,
-    keep_invalid: bool = False,
-    stored: bool = True,
-    measured: bool = True,
-    progress: Callable[[int], None] | None = None,
+    planes: np.ndarray | None,
+    keep_invalid: bool,
+    stored: bool,
+    measured: bool,
+    progress: Callable[[int], None] | None,
 ) -> Moved:
     """Refine rows of one object.
 

@@ -15,7 +15,7 @@ def predicted_planner(
     model: ObjectModel,
     starts: int,
     params: PlanParams,
-    palmar: ContactSurface | None = None,
+    palmar: ContactSurface | None,
     around: ObjectModel | None = None,
     *,
     seed: int = 0,

@@ -94,7 +94,7 @@ class PlanRequest(Request):
             check_folder(self.out)
 
 
-def plan_params(settings: Sequence[str] = (), **options: float) -> PlanParams:
+def plan_params(settings: Sequence[str], **options: float) -> PlanParams:
     """Parameters of plans.
 
     Args:

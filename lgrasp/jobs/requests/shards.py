@@ -202,7 +202,7 @@ def look_up(name: str, find: Callable[[str], object]) -> None:
         find(name)
 
 
-def refine_params(*, coarse: bool = False, **options: int | None) -> RefineParams:
+def refine_params(*, coarse: bool, **options: int | None) -> RefineParams:
     """The stage's parameters, or those for coarse poses, with the options that are given (not None) in their place.
 
     Raises:

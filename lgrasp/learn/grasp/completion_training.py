@@ -53,7 +53,7 @@ def fit_completion(
     views: ViewSet,
     unseen: torch.Tensor,
     p: GraspParams,
-    told: Callable[[int, float], None] | None = None,
+    told: Callable[[int, float], None] | None,
 ) -> float:
     """Train a network in place on all but unseen objects (O,); the mean loss of the last tenth of the steps.
 
