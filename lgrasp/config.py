@@ -159,6 +159,16 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return data
 
 
+def first_problem(error: ValidationError) -> tuple[Any, str]:
+    """The problem to tell of a pydantic error, and the path of its key.
+
+    A mistyped key is missing under its right name as well; the typing error says more.
+    """
+    found = error.errors()
+    first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
+    return first, ".".join(str(part) for part in first["loc"]) or "(whole)"
+
+
 def parse_model(model: type[Model], data: Any, where: str) -> Model:
     """Validate ``data`` against a model.
 
@@ -168,10 +178,7 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
     try:
         return model.model_validate(data, context={"where": where})
     except ValidationError as error:
-        errors = error.errors()
-        # a mistyped key is missing under its right name as well; the typing error says more
-        first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
-        key = ".".join(str(part) for part in first["loc"]) or "(whole)"
+        first, key = first_problem(error)
         if first["type"] == "extra_forbidden":
             name, valid = str(first["loc"][-1]), _keys_at(model, first["loc"][:-1])
             hint = did_you_mean(name, valid)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lgrasp.errors import CacheError, OutputError
 from lgrasp.files import new_file, remove_leftovers
 from lgrasp.paths import cache_dir
+from lgrasp.runtime.kept import Keeper
 from lgrasp.runtime.kernel_cache import remove_unfinished
 
 if TYPE_CHECKING:
@@ -59,7 +60,8 @@ class Cache:
         self.root = cache_dir(root)
         self._fresh = fresh
         self._stored: set[Path] = set()
-        self._kept: dict[str, tuple[Any, Any]] = {}
+        self.kept = Keeper()
+        """What jobs of this process share in memory."""
         self.warn = warn or (lambda line: None)
         self._writable = True
         if os.path.exists(self.root) and not os.path.isdir(self.root):
@@ -118,13 +120,6 @@ class Cache:
             self._writable = False
             reason = getattr(error.__cause__, "strerror", error)
             self.warn(f"cache folder {self.root} cannot be written ({reason}); going on without it")
-
-    def keep(self, kind: str, key: Any, make: Callable[[], Any]) -> Any:
-        """What jobs of this process share in memory: the latest of a kind, made once for a key."""
-        if self._kept.get(kind, (None,))[0] != key:
-            self._kept.pop(kind, None)  # not both at a time
-            self._kept[kind] = key, make()
-        return self._kept[kind][1]
 
     def discard(self, kind: str, key: str) -> None:
         """Remove an artifact that is needed no more, if it is there."""

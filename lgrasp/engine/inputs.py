@@ -33,7 +33,7 @@ from lgrasp.policy.arrays import PolicyArrays, upload_policy
 from lgrasp.policy.model import read_policy
 from lgrasp.policy.names import SHIPPED
 from lgrasp.runtime.device import Device
-from lgrasp.stages.context import Keeper
+from lgrasp.runtime.kept import Keeper
 from lgrasp.steer.arrays import SteerArrays, upload_steering
 from lgrasp.steer.field import steered_field
 from lgrasp.steer.params import NOTHING, Steering

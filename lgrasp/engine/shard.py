@@ -20,6 +20,7 @@ from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.row_order import RowOrder
 from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_rows
 from lgrasp.runtime.ordered import in_order
+from lgrasp.runtime.tally import add_counts, add_seconds
 from lgrasp.stages.context import Context
 
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
@@ -55,20 +56,6 @@ class ShardResult:
     candidates: int = 0
     duplicates: int = 0
     exhausted: bool = False  # the effort bound was reached before the rows were
-
-
-def add_counts(total: dict[str, dict[str, int]], more: dict[str, dict[str, int]]) -> None:
-    """Add survivors per stage to a running total."""
-    for stage, counts in more.items():
-        into = total.setdefault(stage, {})
-        for name, value in counts.items():
-            into[name] = into.get(name, 0) + value
-
-
-def add_seconds(total: dict[str, float], more: Mapping[str, float]) -> None:
-    """Add seconds per stage to a running total."""
-    for stage, value in more.items():
-        total[stage] = total.get(stage, 0.0) + value
 
 
 def flat_statistics(counts: dict[str, dict[str, int]], seconds: Mapping[str, float]) -> dict[str, int | float]:

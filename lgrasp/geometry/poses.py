@@ -25,14 +25,14 @@ def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     q, p = canonical(a[..., 3:]), canonical(b[..., 3:])
     w = q[..., :1] * p[..., :1] - (q[..., 1:] * p[..., 1:]).sum(-1, keepdims=True)
     v = q[..., :1] * p[..., 1:] + p[..., :1] * q[..., 1:] + np.cross(q[..., 1:], p[..., 1:])
-    position = np.asarray(a[..., :3], np.float64) + _rotate(q, np.asarray(b[..., :3], np.float64))
+    position = np.asarray(a[..., :3], np.float64) + rotated(q, np.asarray(b[..., :3], np.float64))
     return np.concatenate([position, canonical(np.concatenate([w, v], -1))], -1)
 
 
 def inverse(pose: np.ndarray) -> np.ndarray:
     """``T^-1``, shape [..., 7]."""
     q = canonical(pose[..., 3:]) * [1, -1, -1, -1]
-    return np.concatenate([-_rotate(q, np.asarray(pose[..., :3], np.float64)), q], -1)
+    return np.concatenate([-rotated(q, np.asarray(pose[..., :3], np.float64)), q], -1)
 
 
 def pose_matrix(pose: np.ndarray) -> np.ndarray:
@@ -182,6 +182,7 @@ def shortest_rotation(z: np.ndarray) -> "Rotation":
     return Rotation.from_quat(q)
 
 
-def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+def rotated(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) turned by unit quaternions w x y z, (..., 4)."""
     t = 2 * np.cross(q[..., 1:], v)
     return v + q[..., :1] * t + np.cross(q[..., 1:], t)

@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from lgrasp.choices import Role
-from lgrasp.config import load_yaml_file
+from lgrasp.config import first_problem, load_yaml_file
 from lgrasp.errors import HandError
 
 Vec3 = tuple[float, float, float]
@@ -151,10 +151,7 @@ class HandSpec(_Strict):
 
 def spec_problem(error: ValidationError) -> str:
     """First problem of a pydantic error as one phrase: key, value, problem, the nearest valid key."""
-    found = error.errors()
-    # a misspelt key is the cause of one that is missing
-    first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
-    key = ".".join(str(part) for part in first["loc"]) or "file"
+    first, key = first_problem(error)
     if first["type"] == "extra_forbidden":
         kinds = (HandSpec, ContactRule, PalmRule, Surface, Box, Coupling, OppositionSpace)
         known = list(dict.fromkeys(name for kind in kinds for name in kind.model_fields))

@@ -16,7 +16,7 @@ from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.run import run
-from lgrasp.engine.shard import Execution, add_counts, make_shard, shard_effort
+from lgrasp.engine.shard import Execution, make_shard, shard_effort
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.duplicates import near_pairs
@@ -31,6 +31,7 @@ from lgrasp.jobs.records import object_record
 from lgrasp.jobs.requests.search import GenerateRequest
 from lgrasp.jobs.search import SearchJob
 from lgrasp.runtime.array import Array
+from lgrasp.runtime.tally import add_counts
 
 PUBLISHED_FSWO = 0.15
 """Squared frictionless residual below which the published system counts a grasp."""

@@ -12,13 +12,14 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, JobOutcome, Part
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import Job
-from lgrasp.engine.shard import add_counts, add_seconds, flat_statistics
+from lgrasp.engine.shard import flat_statistics
 from lgrasp.grasp.records import GraspRows, ObjectRecord, Shard, ShardHeader
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.difference import config_difference
 from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs
 from lgrasp.jobs.requests.search import SearchRequest
 from lgrasp.runtime.device import resolve_device
+from lgrasp.runtime.tally import add_counts, add_seconds
 from lgrasp.steer.touch import describe_touching
 
 

@@ -26,12 +26,12 @@ from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.jobs.shard_inputs import mesh_hash
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
+from lgrasp.runtime.kept import Keeper
 from lgrasp.simulate.protocol import NO_TABLE, Protocol
 from lgrasp.simulate.run import check_installed, on_cpu, protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, LIFT_COLUMNS, OBJECT_COLUMNS
-from lgrasp.stages.context import Keeper
 
 _MIN_HOLDING_LINKS = 2  # links that it takes to hold anything
 

@@ -85,9 +85,7 @@ class Meter:
         read_tallies([counts for _, counts, _, _ in self._parts if isinstance(counts, Tally)])
         total: dict[str, dict[str, int]] = {}
         for stage, counts, _, _ in self._parts:
-            into = total.setdefault(stage, {})
-            for name, value in counts.items():
-                into[name] = into.get(name, 0) + value
+            add_counts(total, {stage: counts})
         return total
 
     @property
@@ -103,3 +101,17 @@ class Meter:
                 elapsed = wp.get_event_elapsed_time(start, end) / 1000.0
             total[stage] = total.get(stage, 0.0) + elapsed
         return total
+
+
+def add_counts(total: dict[str, dict[str, int]], more: Mapping[str, Mapping[str, int]]) -> None:
+    """Add survivors per stage to a running total."""
+    for stage, counts in more.items():
+        into = total.setdefault(stage, {})
+        for name, value in counts.items():
+            into[name] = into.get(name, 0) + value
+
+
+def add_seconds(total: dict[str, float], more: Mapping[str, float]) -> None:
+    """Add seconds per stage to a running total."""
+    for stage, value in more.items():
+        total[stage] = total.get(stage, 0.0) + value

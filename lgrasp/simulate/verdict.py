@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from lgrasp.geometry.poses import rotated
 from lgrasp.simulate.protocol import Protocol
 
 CHUNK = 0.1
@@ -183,14 +184,8 @@ def moved(pose: np.ndarray, home: np.ndarray, centers: np.ndarray) -> np.ndarray
     now, start = np.asarray(pose, float), np.asarray(home, float)
     norm = np.linalg.norm(now[..., 3:], axis=-1) * np.linalg.norm(start[..., 3:], axis=-1)
     cosine = np.abs((now[..., 3:] * start[..., 3:]).sum(-1)) / np.maximum(norm, 1e-12)
-    shift = now[..., :3] - start[..., :3] + _turned(now[..., 3:], centers) - _turned(start[..., 3:], centers)
+    shift = now[..., :3] - start[..., :3] + rotated(now[..., 3:], centers) - rotated(start[..., 3:], centers)
     return np.stack([np.linalg.norm(shift, axis=-1), 2 * np.arccos(np.minimum(cosine, 1.0))], axis=-1)
-
-
-def _turned(quaternion: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Points (O, 3) turned by quaternions (..., O, 4) whose length a simulator keeps at 1."""
-    t = 2 * np.cross(quaternion[..., 1:], point)
-    return point + quaternion[..., :1] * t + np.cross(quaternion[..., 1:], t)
 
 
 def at_rest(velocity: np.ndarray) -> np.ndarray:

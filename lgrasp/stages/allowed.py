@@ -16,5 +16,4 @@ def allowed_runs(context: Context) -> PalmarRuns:
         side = contact_surface(context.hand.model)
         return palmar_runs(context.hand, ContactSurface(*(values[at] for values in side)), at)
 
-    key = (context.hand.model.sha256, len(context.hand.model.contact_points), id(context.steered), context.device)
-    return context.kept.get("allowed", key, make)
+    return context.once("allowed", make, context.steered)

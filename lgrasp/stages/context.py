@@ -1,7 +1,6 @@
 """The context that every stage gets in addition to its inputs and parameters."""
 
-import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from dataclasses import field as with_default
 from functools import cached_property
@@ -16,28 +15,13 @@ from lgrasp.grasp.predicted import PredictedArrays
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.policy.arrays import PolicyArrays, upload_policy
+from lgrasp.runtime.kept import Keeper
 from lgrasp.seeding import stage_seed
 from lgrasp.steer.arrays import SteerArrays, steer_nothing
 
 if TYPE_CHECKING:
     from lgrasp.hand.opposition.spaces import Space
     from lgrasp.simulate.scene import Scene
-
-
-class Keeper:
-    """What stages keep from batch to batch: the latest of each kind, made once by whichever thread comes first."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._made: dict[str, tuple[Hashable, Any]] = {}
-
-    def get(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The object of a kind that was made for a key."""
-        with self._lock:
-            if self._made.get(kind, (None,))[0] != key:
-                self._made.pop(kind, None)
-                self._made[kind] = key, make()
-            return self._made[kind][1]
 
 
 @dataclass(frozen=True)
@@ -95,6 +79,12 @@ class Context:
         copy = replace(self, **{"holding": self.held, "steer": self.steered} | changes)
         copy.__dict__["networks"] = self.networks
         return copy
+
+    def once(self, kind: str, make: Callable[[], Any], *settings: Any) -> Any:
+        """What a stage makes of hand, object and settings, and keeps from batch to batch of a job."""
+        hand, obj = self.hand.model, self.object.model
+        key = hand.sha256, len(hand.contact_points), obj.sha256, obj.scale, self.device, *settings
+        return self.kept.get(kind, key, make)
 
     def with_salt(self, salt: int) -> "Context":
         """The same in another pass."""

@@ -67,11 +67,7 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
             source = hand_source(self.hand)
             if hand_digest(source.urdf, source.spec) != found.hand.sha256:
                 raise ConfigError(f"the shards are of hand '{found.hand.name}', not of '{source.name}'")
-        if len(found.steps.t) < _MIN_STEPS:
-            raise ConfigError(
-                f"{', '.join(map(str, self.shards))}: {len(found.steps.t)} steps; at least {_MIN_STEPS} are needed to "
-                "learn from"
-            )
+        self.enough(len(found.steps.t), "steps", _MIN_STEPS)
         return found
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from lgrasp.engine.events import Made, Part, PartProgress
-from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import internal_poses
 from lgrasp.geometry.rotations import motion_from_pose
 from lgrasp.grasp.records import ObjectRecord
@@ -87,11 +86,7 @@ class GraspJob(GraspRequest, NetworkJob):
             centred = np.asarray(record.vertices, float) - centre
             views += draw_views(centred, record.faces, p.views, p.cloud, rng, device.alias)
             records.append(record)
-        count = sum(len(q) for _, q, _ in rows)
-        if count < _LEAST:
-            raise ConfigError(
-                f"{', '.join(map(str, self.shards))}: {count} grasps; at least {_LEAST} are needed to learn from"
-            )
+        self.enough(sum(len(q) for _, q, _ in rows), "grasps", _LEAST)
         pose, q, number = (torch.as_tensor(np.concatenate(x)) for x in zip(*rows, strict=True))
         return (
             hand,

@@ -48,11 +48,7 @@ class FitJob(NetworkJob):
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, device = self.params, self.device_used.alias
         hand, train, held_out = _examples(self.shards, self.hand, p, self.cache, device)
-        grasps = sum(len(e.q) for e in train)
-        if grasps < _MIN_GRASPS:
-            raise ConfigError(
-                f"{', '.join(map(str, self.shards))}: {grasps} grasps; at least {_MIN_GRASPS} are needed to learn from"
-            )
+        self.enough(sum(len(e.q) for e in train), "grasps", _MIN_GRASPS)
         trainer = Trainer(hand, train, p, device=device)
         start = time.perf_counter()
         trainer.fit_poses(p.steps, p.rate, lambda step, loss: progress(step, f"loss {loss:.3f}"))

@@ -13,6 +13,7 @@ from lgrasp.engine.events import JobOutcome, Part
 from lgrasp.engine.folder import Found
 from lgrasp.engine.run import Job
 from lgrasp.engine.shard_job import rows_digest
+from lgrasp.errors import ConfigError
 from lgrasp.files import write_file
 from lgrasp.jobs.requests.shards import FitRequest
 
@@ -59,6 +60,12 @@ class NetworkJob(FitRequest, Job):
         Raises:
             ConfigError: it is none of this kind.
         """
+
+    def enough(self, count: int, what: str, least: int) -> None:
+        """Raises ConfigError if there are too few grasps, or what else is learnt from."""
+        if count < least:
+            shards = ", ".join(map(str, self.shards))
+            raise ConfigError(f"{shards}: {count} {what}; at least {least} are needed to learn from")
 
     def found(self, part: Part) -> Found:
         return Found(self.about_file(part.file)["run_key"], part.rows)

@@ -145,7 +145,7 @@ def load_sequence_inputs(
     """
     load, alias = Loader(cache, device.alias, report), device.alias
     key = alias, keys.hand, *keys.views.values(), *keys.fields.values()
-    model, spaces, views = cache.keep("spaces", key, lambda: _load_spaces(load, keys, fields))
+    model, spaces, views = cache.kept.get("spaces", key, lambda: _load_spaces(load, keys, fields))
     most = longest(spaces, (), np.zeros(model.dofs, bool))
     if len(keys.meshes) > most:
         raise ConfigError(

@@ -22,10 +22,10 @@ from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_roun
 from lgrasp.jobs.sets import sequence_name
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.cores import cores
+from lgrasp.runtime.kept import Keeper
 from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts
-from lgrasp.stages.context import Keeper
 
 
 class SequenceJob(SequenceRequest, SearchJob):

@@ -10,14 +10,13 @@ import numpy as np
 
 from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.grasp.held import hold
 from lgrasp.grasp.predicted import TouchingGrasps, upload_predicted
 from lgrasp.grasp.sequences import HeldHands, SequenceTable, empty_sequences
 from lgrasp.grasp.tables import GraspTable, join_rows, take_rows
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.runtime.fetch import fetch
-from lgrasp.runtime.tally import Meter
+from lgrasp.runtime.tally import Meter, add_counts, add_seconds
 from lgrasp.seeding import stage_seed
 from lgrasp.sequence.policy import space_orders
 from lgrasp.sequence.stage import go_on

@@ -8,13 +8,13 @@ from itertools import zip_longest
 import numpy as np
 
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.shard import add_counts, add_seconds
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.grasp.tables import join_rows, take_rows
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.jobs.sequence.round import Round, Verdicts, add_spaces, run_round
+from lgrasp.runtime.tally import add_counts, add_seconds
 
 _EMPTY_ROUNDS = 4  # without any row of some length, before nothing more is expected
 _SPARE = 1.5  # sequences begun for each that is needed, if all go well

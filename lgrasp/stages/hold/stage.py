@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from lgrasp.grasp.tables import GraspTable, take_grasps
-from lgrasp.hold.params import HoldTest
 from lgrasp.hold.run import ControlPoses, HoldTester
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
@@ -22,14 +21,8 @@ def run(inputs: GraspTable, params: HoldParams, context: Context) -> tuple[Grasp
     """
     least = context.bounds.min_hold_probability
     seed = stage_seed(context.base_seed, context.shard, "hold", context.salt)
-    found = _tester(params, context).run(ControlPoses.of(inputs), seed, least=least)
+    tester = context.once("hold", lambda: HoldTester(context.hand, context.object, params), params)
+    found = tester.run(ControlPoses.of(inputs), seed, least=least)
     keep = np.flatnonzero(context.bounds.held_by(found))
     table = take_grasps(replace(inputs, metrics={**inputs.metrics, **found}), keep)
     return table, {"tried": len(inputs), "held": len(keep)}
-
-
-def _tester(test: HoldTest, context: Context) -> HoldTester:
-    """That of a job: made by the first batch, used by all."""
-    model = context.object.model
-    key = (context.hand.model.sha256, model.sha256, model.scale, test, context.device)
-    return context.kept.get("hold", key, lambda: HoldTester(context.hand, context.object, test))

@@ -42,10 +42,9 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
 
 def _descent(search: LocalSearch, context: Context) -> Descent:
     """The local search of a job: made by the first batch, used by all."""
-    key = (context.hand.model.sha256, context.object.model.sha256, context.object.model.scale, search, context.device)
 
     def make() -> Descent:
         target = upload_target(context.object.model, None, context.device)
         return Descent(context.hand, target, search, hand_surface(context.hand.model))
 
-    return context.kept.get("refine", key, make)
+    return context.once("refine", make, search)

@@ -55,5 +55,4 @@ def _probes(context: Context) -> PalmarRuns:
         at = np.concatenate(chosen)
         return palmar_runs(context.hand, ContactSurface(*(values[at] for values in side)), at)
 
-    key = (context.hand.model.sha256, len(context.hand.model.contact_points), id(context.steered), context.device)
-    return context.kept.get("wrap", key, make)
+    return context.once("wrap", make, context.steered)
