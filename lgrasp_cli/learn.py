@@ -226,23 +226,23 @@ def _show_fit(data: dict[str, Any]) -> list[Block]:
 
 
 def _show_grasps(data: dict[str, Any]) -> list[Block]:
-    seen = f", of {plural(len(data['unseen']), 'unseen object')} {data['unseen_loss']:.3f}" if data["unseen"] else ""
-    pairs = [
-        ("hand, objects", f"{data['hand']}; {len(data['objects'])} objects, {data['examples']:,} grasps"),
-        ("loss", f"completing {data['completion_loss']:.3f}; drawing {data['loss']:.3f}{seen}"),
-    ]
-    return [
-        [*pairs, *took(data, "steps"), ("where", data["out"]), following("plan --model", data["out"], " --cloud FILE")]
-    ]
+    losses = f"completing {data['completion_loss']:.3f}; drawing {data['loss']:.3f}"
+    return _drawing(data, "grasps", losses, following("plan --model", data["out"], " --cloud FILE"))
 
 
 def _show_steps(data: dict[str, Any]) -> list[Block]:
+    after = following("sample", data["out"], " OBJECT OBJECT")
+    return _drawing(data, "steps of sequences", f"{data['loss']:.3f}", after)
+
+
+def _drawing(data: dict[str, Any], examples: str, losses: str, after: tuple[str, str]) -> list[Block]:
+    """Of a network that draws hands."""
     seen = f", of {plural(len(data['unseen']), 'unseen object')} {data['unseen_loss']:.3f}" if data["unseen"] else ""
     pairs = [
-        ("hand, objects", f"{data['hand']}; {len(data['objects'])} objects, {data['examples']:,} steps of sequences"),
-        ("loss", f"{data['loss']:.3f}{seen}"),
+        ("hand, objects", f"{data['hand']}; {len(data['objects'])} objects, {data['examples']:,} {examples}"),
+        ("loss", f"{losses}{seen}"),
     ]
-    return [[*pairs, *took(data, "steps"), ("where", data["out"]), following("sample", data["out"], " OBJECT OBJECT")]]
+    return [[*pairs, *took(data, "steps"), ("where", data["out"]), after]]
 
 
 def _show_policy(data: dict[str, Any]) -> list[Block]:

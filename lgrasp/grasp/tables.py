@@ -40,6 +40,17 @@ class DeviceTable:
         """Columns, one row each."""
         return [name for name in cls.KIND.vars if name not in (*cls.INNER, "rows")]
 
+    def taken(self, rows: np.ndarray) -> dict[str, wp.array]:
+        """Columns of some rows, in the order given; copied on the device."""
+        columns = {name: getattr(self, name) for name in self.names()}
+        if len(rows) == 0:
+            return {n: wp.empty((0, *a.shape[1:]), dtype=a.dtype, device=a.device) for n, a in columns.items()}
+        chosen = wp.array(rows, dtype=wp.int32, device=next(iter(columns.values())).device)
+        return {
+            n: wp.indexedarray(a, [chosen] + [None] * (a.ndim - 1)).contiguous() if a.shape[0] else a
+            for n, a in columns.items()
+        }
+
     @classmethod
     def empty(cls, device: str, *shape: int, **given: Any) -> Self:
         """As many rows as there may be, none in use; columns have the first sizes of ``shape`` or are given."""
@@ -156,19 +167,8 @@ def trim_sets(table: ContactSets) -> ContactSets:
 
 def select_poses(table: CandidateTable, rows: np.ndarray, device: str) -> CandidateTable:
     """The candidates of some poses, in the order given; copied on the device."""
-    chosen = wp.array(rows, dtype=wp.int32, device=device)
-
-    def take(part: DeviceTable) -> dict[str, wp.array]:
-        columns = {name: getattr(part, name) for name in part.names()}
-        if len(rows) == 0:
-            return {n: wp.empty((0, *a.shape[1:]), dtype=a.dtype, device=device) for n, a in columns.items()}
-        return {
-            n: wp.indexedarray(a, [chosen] + [None] * (a.ndim - 1)).contiguous() if a.shape[0] else a
-            for n, a in columns.items()
-        }
-
-    poses = PoseTable(**take(table.poses), rows=wp.full(1, len(rows), dtype=wp.int32, device=device))
-    return CandidateTable(poses, **take(table))
+    poses = PoseTable(**table.poses.taken(rows), rows=wp.full(1, len(rows), dtype=wp.int32, device=device))
+    return CandidateTable(poses, **table.taken(rows))
 
 
 Rows = TypeVar("Rows")

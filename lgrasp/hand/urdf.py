@@ -193,6 +193,12 @@ def numbers(element: etree._Element | None, key: str, default: str) -> np.ndarra
     return np.array((default if element is None else element.get(key, default)).split(), float)
 
 
+def joint_end(joint: etree._Element, end: str) -> str:
+    """Name of a joint's link, its ``parent`` or its ``child``; "" if it names none."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
 def _numbers(path: Path, where: str, element: etree._Element, key: str, default: str | None = None) -> np.ndarray:
     """As :func:`numbers`; without a default the attribute must be there."""
     text = element.get(key, default)
@@ -301,7 +307,7 @@ def find_mesh(path: Path, link: str, name: str, mesh_dirs: Sequence[Path] = ()) 
 def _joint(path: Path, element: etree._Element, links: dict[str, tuple[Geometry, ...]]) -> Joint:
     name, kind = element.get("name", ""), element.get("type")
     where = f"joint '{name}'"
-    parent, child = (e.get("link", "") if (e := element.find(end)) is not None else "" for end in ("parent", "child"))
+    parent, child = (joint_end(element, end) for end in ("parent", "child"))
     for end in (parent, child):
         if end not in links:
             raise HandError(f"URDF {path}: {where} connects link '{end}', which is not declared")

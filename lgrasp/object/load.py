@@ -18,6 +18,7 @@ from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import LgraspError, ObjectError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
+from lgrasp.object.edges import open_edges
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.params import ObjectParams
 from lgrasp.paths import check_file
@@ -97,16 +98,6 @@ def load_mesh(
     if loose:
         notes.append(f"not watertight ({loose} open edges): inside is decided by winding number")
     return LoadedMesh(name, sha, vertices, faces.astype(np.int32), loose == 0, tuple(notes))
-
-
-def open_edges(faces: np.ndarray) -> np.ndarray:
-    """Directed edges, shape (n, 2), that no opposite edge matches; empty for a closed, consistently wound mesh."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    forward = edges[:, 0] < edges[:, 1]
-    key = edges.min(axis=1) * (int(faces.max()) + 1) + edges.max(axis=1)
-    unique, group = np.unique(key, return_inverse=True)
-    balance = np.bincount(group, weights=np.where(forward, 1.0, -1.0), minlength=len(unique))
-    return edges[(balance[group] != 0.0) & ((balance[group] > 0.0) == forward)]
 
 
 def read_bytes(path: Path, suffixes: Sequence[str], what: str, error: type[LgraspError]) -> bytes:

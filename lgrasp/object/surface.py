@@ -5,6 +5,7 @@ import warp as wp
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from lgrasp.object.edges import face_neighbours
 from lgrasp.object.sdf import SdfGrid, sample_sdf
 from lgrasp.runtime.fetch import to_numpy
 
@@ -21,24 +22,6 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
     cross = np.cross(b - a, c - a)
     double = np.linalg.norm(cross, axis=1)
     return cross / np.where(double > 0.0, double, 1.0)[:, None], 0.5 * double
-
-
-def face_neighbours(faces: np.ndarray) -> np.ndarray:
-    """Face across the edge from corner e to e + 1, shape (f, 3), int32; -1 across an open edge.
-
-    Edges shared by more than two faces are paired in the order of the faces.
-    """
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    key = edges.min(axis=1) * (int(faces.max()) + 1) + edges.max(axis=1)
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    new = np.r_[True, key[1:] != key[:-1]]
-    rank = np.arange(len(key)) - np.flatnonzero(new)[np.cumsum(new) - 1]
-    first = np.flatnonzero((rank[:-1] % 2 == 0) & (key[1:] == key[:-1]))
-    out = np.full(len(key), -1, np.int32)
-    out[order[first]] = order[first + 1] // 3
-    out[order[first + 1]] = order[first] // 3
-    return out.reshape(-1, 3)
 
 
 def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int) -> tuple[np.ndarray, np.ndarray]:

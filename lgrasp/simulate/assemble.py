@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
 from lgrasp.hand.piece import Piece
-from lgrasp.hand.urdf import numbers, parse_robot
+from lgrasp.hand.urdf import joint_end, numbers, parse_robot
 from lgrasp.simulate.builder import (
     add_drive,
     add_hull,
@@ -35,7 +35,7 @@ def joint_ends(text: str) -> dict[str, tuple[str, str]]:
         HandError: not XML, or no <robot>.
     """
     tree, _ = parse_robot(Path("hand.urdf"), text.encode())
-    return {j.get("name", ""): (_link(j, "parent"), _link(j, "child")) for j in tree.iterfind("joint")}
+    return {j.get("name", ""): (joint_end(j, "parent"), joint_end(j, "child")) for j in tree.iterfind("joint")}
 
 
 def welded_joints(text: str, base_link: str) -> list[str]:
@@ -66,11 +66,6 @@ def bare_urdf(text: str, held: Mapping[str, float]) -> str:
         if joint.get("name") in held and joint.get("type") != "fixed":
             _weld(joint, held[joint.get("name", "")])
     return etree.tostring(tree, encoding="unicode")
-
-
-def _link(joint: etree._Element, end: str) -> str:
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
 
 
 def _weld(joint: etree._Element, value: float) -> None:

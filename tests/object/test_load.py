@@ -1,14 +1,16 @@
 """Mesh files: what is repaired and what is refused, and how."""
 
 import os
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
 from lgrasp.errors import ObjectError
+from lgrasp.object.edges import open_edges
 from lgrasp.object.find import find_object, list_objects
-from lgrasp.object.load import load_mesh, open_edges
+from lgrasp.object.load import load_mesh
 from lgrasp.object.params import ObjectParams
 
 BOX = trimesh.creation.box(extents=(0.05, 0.07, 0.1))
@@ -19,8 +21,8 @@ def write(path, mesh):
     return path
 
 
-def _bytes(mesh, path):
-    data = mesh.export(file_type=path.suffix[1:])
+def _bytes(mesh, path) -> bytes:
+    data: Any = mesh.export(file_type=path.suffix[1:])
     return data.encode() if isinstance(data, str) else data
 
 
@@ -141,11 +143,11 @@ def test_inside_out_is_flipped_and_cavities_are_not():
     assert any("inside out" in n for n in loaded.notes)
     inner = trimesh.creation.box(extents=(0.02, 0.02, 0.02))
     inner.invert()
-    hollow = load_mesh(trimesh.util.concatenate([BOX, inner]))
+    hollow = load_mesh(BOX + inner)
     assert hollow.notes == ()
     assert trimesh.Trimesh(hollow.vertices, hollow.faces, process=False).volume == pytest.approx(BOX.volume - 8e-6)
     inner.apply_translation([0.2, 0, 0])
-    beside = load_mesh(trimesh.util.concatenate([BOX, inner]))
+    beside = load_mesh(BOX + inner)
     assert trimesh.Trimesh(beside.vertices, beside.faces, process=False).volume == pytest.approx(BOX.volume + 8e-6)
 
 
@@ -175,14 +177,14 @@ def test_repeated_and_two_sided_faces_count_once():
     back = BOX.copy()
     back.invert()
     for other, said in ((BOX, "dropped 12 repeated faces"), (back, "dropped 12 back faces of a two-sided mesh")):
-        loaded = load_mesh(trimesh.util.concatenate([BOX, other]))
+        loaded = load_mesh(BOX + other)
         assert loaded.closed
         assert said in loaded.notes
         assert trimesh.Trimesh(loaded.vertices, loaded.faces, process=False).volume == pytest.approx(BOX.volume)
 
 
 def test_glued_bodies_keep_their_common_wall():
-    stacked = load_mesh(trimesh.util.concatenate([BOX, BOX.copy().apply_translation([0, 0, 0.1])]))
+    stacked = load_mesh(BOX + BOX.copy().apply_translation([0, 0, 0.1]))
     assert stacked.closed
     assert len(stacked.faces) == 24
 

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
+from lgrasp.object.edges import face_neighbours
 from lgrasp.object.sdf import build_sdf
-from lgrasp.object.surface import face_neighbours, fold_cosine, probe_fits, sample_creases, sample_surface, thin
+from lgrasp.object.surface import fold_cosine, probe_fits, sample_creases, sample_surface, thin
 
 
 def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
@@ -122,7 +123,7 @@ def test_probe_removes_holes_and_closed_cavities_but_keeps_wide_walls():
     shell = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
     inner = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
     inner.invert()
-    mesh = trimesh.util.concatenate([shell, inner])
+    mesh = shell + inner
     sdf = build_sdf(*arrays(mesh), closed=True, max_cells=64**3)
     points, face = sample_surface(*arrays(mesh), 200, seed=0)
     fits = probe_fits(sdf, points, mesh.face_normals[face], 0.008, 0.0015)

@@ -7,7 +7,7 @@ from lxml import etree
 from lgrasp.config import did_you_mean
 from lgrasp.errors import HandError
 from lgrasp.hand.drafting.finger_structure import MAX_FINGERS
-from lgrasp.hand.urdf import MOVABLE
+from lgrasp.hand.urdf import MOVABLE, joint_end
 
 _WRIST = 2  # most joints between two places where a hand divides
 _FINGER = 5  # most joints of one; an arm has more
@@ -23,7 +23,7 @@ class _Links:
         self.into: dict[str, tuple[str, bool]] = {}  # child -> parent, movable
         self.below: dict[str, list[str]] = {}
         for joint in self.joints:
-            parent, child = _end(joint, "parent"), _end(joint, "child")
+            parent, child = joint_end(joint, "parent"), joint_end(joint, "child")
             if child not in self.into:  # a second parent is reported when the cut is read
                 self.into[child] = parent, joint.get("type") in MOVABLE
                 self.below.setdefault(parent, []).append(child)
@@ -96,7 +96,7 @@ def cut_hand(path: Path, robot: etree._Element, root: str) -> None:
     if root not in links.names:
         raise HandError(f"URDF {path} has no link '{root}'; {did_you_mean(root, links.names)}{choices}")
     kept = set(links.subtree(root))
-    inside = [joint for joint in links.joints if _end(joint, "parent") in kept]
+    inside = [joint for joint in links.joints if joint_end(joint, "parent") in kept]
     if not any(joint.get("type") in MOVABLE for joint in inside):
         raise HandError(f"URDF {path}: no joint moves what is below link '{root}'; {choices}")
     own, every = ({joint.get("name"): joint for joint in some} for some in (inside, links.joints))
@@ -104,7 +104,7 @@ def cut_hand(path: Path, robot: etree._Element, root: str) -> None:
         mimic = joint.find("mimic")
         source = None if mimic is None else mimic.get("joint")
         if source in every and source not in own:
-            ways = links.above(_end(every[source], "parent"))
+            ways = links.above(joint_end(every[source], "parent"))
             both = next((link for link in links.above(root) if link in ways), None)
             raise HandError(
                 f"URDF {path}: joint '{joint.get('name')}' below link '{root}' mimics '{source}', which is not below "
@@ -112,11 +112,6 @@ def cut_hand(path: Path, robot: etree._Element, root: str) -> None:
             )
     for element in list(robot):
         is_link, is_joint = element.tag == "link", element.tag == "joint"
-        inner = (is_link and element.get("name") in kept) or (is_joint and _end(element, "parent") in kept)
+        inner = (is_link and element.get("name") in kept) or (is_joint and joint_end(element, "parent") in kept)
         if not inner and element.tag != "material":
             robot.remove(element)
-
-
-def _end(joint: etree._Element, which: str) -> str:
-    end = joint.find(which)
-    return "" if end is None else end.get("link", "")

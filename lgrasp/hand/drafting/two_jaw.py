@@ -11,7 +11,7 @@ from lgrasp.hand.drafting.contact_survey import survey_contacts
 from lgrasp.hand.drafting.elements import number_text, set_origin
 from lgrasp.hand.drafting.finger_structure import finger_structure
 from lgrasp.hand.tree import Tree
-from lgrasp.hand.urdf import numbers, read_urdf
+from lgrasp.hand.urdf import joint_end, numbers, read_urdf
 
 
 def find_jaws(urdf_path: Path) -> tuple[str, str] | None:
@@ -54,14 +54,14 @@ def reroot(robot: etree._Element, link: str) -> None:
     A movable joint keeps its name, limits and mimic relation; its axis is negated, and a link NAME_mount without
     geometry takes up the rest of its origin.
     """
-    into = {_end(j, "child"): j for j in robot.iter("joint") if j.find("child") is not None}
+    into = {joint_end(j, "child"): j for j in robot.iter("joint") if j.find("child") is not None}
     chain = []
     at = link
     while at in into:
         chain.append(into[at])
-        at = _end(into[at], "parent")
+        at = joint_end(into[at], "parent")
     for joint in chain:
-        parent, child = _end(joint, "parent"), _end(joint, "child")
+        parent, child = joint_end(joint, "parent"), joint_end(joint, "child")
         xyz, rpy = (numbers(joint.find("origin"), key, "0 0 0") for key in ("xyz", "rpy"))
         turn = Rotation.from_euler("xyz", rpy).inv()
         back = -turn.apply(xyz), turn
@@ -82,7 +82,3 @@ def reroot(robot: etree._Element, link: str) -> None:
         etree.SubElement(fixed, "parent", link=mount)
         etree.SubElement(fixed, "child", link=parent)
         set_origin(fixed, *back)
-
-
-def _end(joint: etree._Element, which: str) -> str:
-    return joint.find(which).get("link")

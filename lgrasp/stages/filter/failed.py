@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import warp as wp
 
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.bounds import GraspBounds
@@ -55,12 +54,7 @@ def _few(sets: ContactSets, per_pose: int) -> ContactSets:
     """The first sets of each pose; they come pose by pose."""
     (pose,) = fetch([sets.pose])
     first = np.searchsorted(pose, pose)  # of the same pose
-    rows = wp.array(np.flatnonzero(np.arange(len(pose)) - first < per_pose), dtype=wp.int32, device=sets.pose.device)
-
-    def taken(a: wp.array) -> wp.array:
-        return wp.indexedarray(a, [rows] + [None] * (a.ndim - 1)).contiguous() if a.shape[0] else a
-
-    return replace(sets, **{name: taken(getattr(sets, name)) for name in sets.names()})
+    return replace(sets, **sets.taken(np.flatnonzero(np.arange(len(pose)) - first < per_pose)))
 
 
 def _from_above(table: GraspTable, planes: np.ndarray) -> np.ndarray:
