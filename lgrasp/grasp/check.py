@@ -228,6 +228,7 @@ def check_grasps(
     around: ObjectArrays | None = None,
     resting: np.ndarray | None = None,
     index: np.ndarray | None = None,
+    seed: wp.array | None = None,
 ) -> tuple[GraspTable, np.ndarray]:
     """All hands as rows in the order given, measured to the end, and their outcomes, (n,).
 
@@ -238,6 +239,7 @@ def check_grasps(
         around: what else the hand must not penetrate, in the object's internal frame.
         resting: plane of ``obj`` that is each row's table, which the hand and its way there must clear, (n,) int.
         index: candidate of each row; default: the row.
+        seed: of the random rays of epsilon; default: 0.
     """
     d, n, width, model = hand.device, len(q), contacts.link.shape[1], hand.model
     zeros, rows = wp.zeros(n, dtype=wp.int32, device=d), np.arange(n)
@@ -265,7 +267,8 @@ def check_grasps(
             check.measure(ALL, solid)
     if resting is not None:
         check.clear_table(ALL)
-    table, outcome = check.every(wp.zeros(1, dtype=wp.int32, device=d), on_table=resting is not None)
+    seed = wp.zeros(1, dtype=wp.int32, device=d) if seed is None else seed
+    table, outcome = check.every(seed, on_table=resting is not None)
     table.index[:] = rows if index is None else index
     return table, outcome
 
