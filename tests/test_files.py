@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from support.sources import parse
 
 from lgrasp.errors import OutputError
 from lgrasp.files import discard_temporaries, new_file, new_folder, remove_leftovers, scratch_folder, write_file
@@ -119,7 +120,7 @@ def test_files_are_written_in_one_place():
     root = Path(__file__).parents[1]
     found = set()
     for path in (*root.glob("lgrasp/**/*.py"), *root.glob("lgrasp_cli/**/*.py")):
-        for call in ast.walk(ast.parse(path.read_text())):
+        for call in ast.walk(parse(path)):
             if isinstance(call, ast.Call) and _writes(call):
                 found.add(path.relative_to(root).as_posix())
     assert found == set(WRITTEN_BY_HAND)

@@ -5,10 +5,12 @@ import subprocess
 import sys
 import zipfile
 from collections import Counter
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from support.sources import parse
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("torch", "warp", "trimesh", "yourdfpy", "h5py", "scipy", "numpy", "coacd", "pytorch_kinematics")
@@ -47,7 +49,6 @@ MODULES = {
     for path in sorted((ROOT / package).rglob("*.py"))
     if "_data" not in path.parts
 }
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 PACKAGES = {name for name, path in MODULES.items() if path.name == "__init__.py"}
 LEAVES = sorted(set(MODULES) - PACKAGES)
 
@@ -56,16 +57,17 @@ def exported(name: str) -> list[str]:
     """``__all__`` of a package; of a module every definition whose name does not begin with an underscore."""
     if name not in PACKAGES:
         return [x for x in defined(name) if not x.startswith("_")]
-    for node in TREES[name].body:
+    for node in parse(MODULES[name]).body:
         if isinstance(node, ast.Assign) and any(isinstance(t, ast.Name) and t.id == "__all__" for t in node.targets):
             return list(ast.literal_eval(node.value))
     return []
 
 
+@cache
 def defined(name: str) -> dict[str, ast.stmt]:
     """Top-level names that a module defines itself, imports left out."""
     found = {}
-    for node in TREES[name].body:
+    for node in parse(MODULES[name]).body:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             found[node.name] = node
         elif isinstance(node, ast.Assign):
@@ -76,11 +78,12 @@ def defined(name: str) -> dict[str, ast.stmt]:
     return found
 
 
+@cache
 def imports(name: str) -> list[tuple[str, str, int]]:
     """Every import of this project in a module, at any depth: (module, imported name or "", line)."""
     found = []
     package = name if name in PACKAGES else name.rpartition(".")[0]
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(parse(MODULES[name])):
         if isinstance(node, ast.Import):
             found += [(alias.name, "", node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
+from support.sources import parse
 
 from lgrasp.runtime.fetch import fetch
 
@@ -34,7 +35,7 @@ def test_device_arrays_come_to_the_host_in_one_place():
     root, found = Path(__file__).parents[2], []
     for path in (*root.glob("lgrasp/**/*.py"), *root.glob("lgrasp_cli/**/*.py")):
         if path.name != "fetch.py":
-            calls = [x for x in ast.walk(ast.parse(path.read_text())) if isinstance(x, ast.Call)]
+            calls = [x for x in ast.walk(parse(path)) if isinstance(x, ast.Call)]
             asked = [x.func.value for x in calls if isinstance(x.func, ast.Attribute) and x.func.attr == "numpy"]
             found += [
                 f"{path.name}:{x.lineno}"
