@@ -19,17 +19,17 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
     Args:
         dry_run: show what would be done instead.
     """
-    tasks = list(zip(requests, how.of_each(requests), strict=True))
     if dry_run:
-        show_plans([(request.job(how.cache), own) for request, own in tasks], how)
+        show_plans([(r.job(how.cache), own) for r, own in zip(requests, how.of_each(requests), strict=True)], how)
         return
     results = []
-    for number, (request, own) in enumerate(tasks, 1):
-        if not how.quiet:
-            typer.echo(f"[{number}/{len(tasks)}] {request.title}", err=True)
-        results.append(_run_one(request, own))
-        if results[-1]["exit_code"] == 130:
-            break
+    with how.spread(requests) as each:
+        for number, (request, own) in enumerate(zip(requests, each, strict=True), 1):
+            if not how.quiet:
+                typer.echo(f"[{number}/{len(each)}] {request.title}", err=True)
+            results.append(_run_one(request, own))
+            if results[-1]["exit_code"] == 130:
+                break
     code = max(result["exit_code"] for result in results)
     columns = ("job", "what", "requested", "present", "wall s", "strict/s", "status")
     table = TextTable(columns, map(_row, results), right=columns[2:6])

@@ -126,6 +126,10 @@ def _device(name: str, flag: str) -> str:
         raise DeviceError(str(error)) from None
 
 
+def _devices(names: str, flag: str) -> str:
+    return names if names == "all" else ",".join(_device(name, flag) for name in names.split(","))
+
+
 def _as_given(name: str, flag: str) -> str:
     return name
 
@@ -135,6 +139,7 @@ OBJECT = named("OBJECT", _objects, _object)
 GRASP_TYPE = named("NAME", _grasp_types, _grasp_type)
 NETWORK = named("MODEL", _networks, _network)
 DEVICE = named("[auto|cpu|cuda:N]", lambda: ("auto", "cpu", "cuda:0"), _device)
+DEVICES = named("[auto|cpu|cuda:N|all]", lambda: ("auto", "cpu", "cuda:0", "all"), _devices)
 # read by the command itself, before it imports anything heavy
 HAND_OR_SHARD, OBJECT_OR_SHARD = named("HAND", _hands, _as_given), named("OBJECT", _objects, _as_given)
 HANDS, OBJECTS = named("HAND", _hands, _as_given), named("OBJECT", _objects, _as_given)

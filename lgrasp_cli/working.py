@@ -1,6 +1,7 @@
 """Common parts of all commands that make files: their options, and how a job is run, reported and concluded."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
-from lgrasp_cli.names import DEVICE
+from lgrasp_cli.names import DEVICES
 from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, given, open_cache, with_options
 from lgrasp_cli.tables import Block, plural, print_report
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from lgrasp.engine.events import JobOutcome
     from lgrasp.engine.request import Request
     from lgrasp.engine.run import Job
+    from lgrasp.jobs.lanes import Lanes
     from lgrasp.runtime.array import Array
 
 
@@ -36,10 +38,36 @@ class How:
     json_path: str | None
     quiet: bool
     verbose: bool
+    devices: str | None = None
+    """Several devices, as the option names them."""
+    lanes: "Lanes | None" = None
+    """Those devices at work, on the job of :attr:`number` among others."""
+    number: int = 0
+
+    @contextmanager
+    def spread(self, jobs: "Sequence[Request]") -> "Iterator[list[How]]":
+        """The same for each of several jobs, on all devices while the block runs.
+
+        Raises:
+            DeviceError: a device that does not exist.
+        """
+        each = self.of_each(jobs)
+        if self.devices is None:
+            yield each
+            return
+        from lgrasp.jobs.lanes import Lanes
+        from lgrasp.runtime.device import resolve_devices
+
+        devices, arrays = resolve_devices(self.devices), [how.array for how in each]
+        if len(devices) == 1:
+            yield each
+            return
+        with Lanes(devices, jobs, arrays, self.cache, resume=not self.overwrite) as lanes:
+            yield [replace(how, lanes=lanes, number=number) for number, how in enumerate(each)]
 
     def of_each(self, jobs: "Sequence[Request]") -> "list[How]":
         """The same for each of several jobs, whose parts the tasks of an array share like those of one."""
-        if len(jobs) == 1 or not (self.array.slurm or self.array.tasks > 1):
+        if len(jobs) == 1 or not (self.array.slurm or self.array.tasks > 1 or self.devices):
             return [self] * len(jobs)
         *before, total = accumulate((_parts(job, self.cache) for job in jobs), initial=0)
         return [replace(self, array=self.array._replace(before=number, total=total)) for number in before]
@@ -68,7 +96,8 @@ class How:
             show: what a user decides by, of its report.
             profile: what --verbose adds.
         """
-        data, outcome = run_job(job, self)
+        with self.spread([job]) as (how,):
+            data, outcome = run_job(job, how)
         nothing = self.quiet or self.json_path == "-" or (outcome.cancelled and not outcome.paths)
         blocks = () if nothing else [*show(data), *((*profile(data), _used(data)) if self.verbose else ())]
         print_report(data, self.json_path, blocks)
@@ -82,7 +111,11 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
         *,
         device: Annotated[
             str | None,
-            Option(help="auto: the first GPU, else the CPU.", show_default="auto", **DEVICE),
+            Option(
+                help="auto: the first GPU, else the CPU; all: every GPU at once, or several, such as cuda:0,cuda:1.",
+                show_default="auto",
+                **DEVICES,
+            ),
         ] = None,
         workers: Annotated[int | None, Option(min=0, help="Threads or processes; 0: by device.")] = None,
         array: Annotated[
@@ -117,7 +150,11 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
             notice(f"--shard-index and --num-shards are now --array {array}; the old names work in this release only")
         shares = parse_array(array)
         cache = open_cache(cache_dir, fresh=rebuild)
-        command(**options, how=How(cache, device, workers, shares, overwrite, json_path, quiet, verbose))
+        several = device if device is not None and (device == "all" or "," in device) else None
+        first = device if several is None else {"all": "auto"}.get(several, several.split(",")[0])
+        command(
+            **options, how=How(cache, first, workers, shares, overwrite, json_path, quiet, verbose, devices=several)
+        )
 
     return with_options(run, command)
 
@@ -152,7 +189,10 @@ def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "JobOutcome"]:
     from lgrasp_cli.progress import Bar, JobProgress, interruptible
 
     with Bar(quiet=how.quiet) as bar, interruptible(JobProgress(bar, job.unit)) as progress, before_end(job.abandon):
-        outcome = run(job, progress, array=how.array, resume=not how.overwrite)
+        if how.lanes:
+            outcome = how.lanes.outcome(how.number, job, progress)
+        else:
+            outcome = run(job, progress, array=how.array, resume=not how.overwrite)
     return job_report(outcome), outcome
 
 

@@ -2,11 +2,9 @@
 
 import multiprocessing
 import os
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 from lgrasp.object.mass import mass_properties
+from lgrasp.runtime.processes import follow_parent, start_tracker
 from lgrasp.signals import spared
 
 METRICS = {"epsilon_exact": "", "volume": ""}
@@ -113,8 +112,8 @@ def process_map(workers: int) -> Iterator[_Map]:
         yield map
         return
     context = multiprocessing.get_context("spawn")
-    _start_tracker()
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_follow_parent) as pool:
+    start_tracker()
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=follow_parent) as pool:
 
         def each(*task: Any) -> Iterable[np.ndarray]:
             with spared():  # it starts processes
@@ -125,21 +124,3 @@ def process_map(workers: int) -> Iterator[_Map]:
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-
-
-def _start_tracker() -> None:
-    """Start the process that removes the semaphores of a pool that was killed; it would print a warning then."""
-    before = os.environ.get("PYTHONWARNINGS", "")
-    os.environ["PYTHONWARNINGS"] = f"{before},ignore:resource_tracker".lstrip(",")
-    try:
-        with spared():
-            resource_tracker.ensure_running()
-    finally:
-        os.environ["PYTHONWARNINGS"] = before
-
-
-def _follow_parent() -> None:
-    """In a worker: end when the parent has ended in any way."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()

@@ -62,6 +62,8 @@ class JobOutcome:
     """Of loading kernels, making parts and the whole call [s]."""
     starved: bool = False
     cancelled: bool = False
+    lanes: int = 1
+    """Devices that made parts side by side."""
 
     @property
     def written(self) -> list[Path]:

@@ -220,17 +220,9 @@ def run(
     """
     job._events = events = events or Events()
     start = time.perf_counter()
-    array, device, every, parts, present = look(job, array=array, resume=resume)
+    array, device, every, parts, present = todo = look(job, array=array, resume=resume)
     job.clean(parts)
-    missing = [part for part in parts if part.number not in present]
-    if missing and job.kernels and (words := first_time(device.alias)):
-        events.said(words)
-    job.load(events, bool(missing))
-    outcome = JobOutcome(job, device, parts, present)
-    begin = time.perf_counter()
-    if missing and job.kernels:
-        load_kernels(device.alias, kernel_modules(*job.kernels), events.loading)
-    outcome.seconds["kernels"] = time.perf_counter() - begin
+    outcome = JobOutcome(job, device, parts, present, seconds={"kernels": prepare(job, todo)})
     events.started(parts, present)
     begin = time.perf_counter()
     try:
@@ -243,6 +235,18 @@ def run(
     outcome.seconds["parts"] = time.perf_counter() - begin
     outcome.seconds["total"] = time.perf_counter() - start
     return outcome
+
+
+def prepare(job: Job, todo: "Todo") -> float:
+    """Load the inputs and kernels of a job that :func:`look` saw; seconds that the kernels took."""
+    missing = [part for part in todo.parts if part.number not in todo.present]
+    if missing and job.kernels and (words := first_time(todo.device.alias)):
+        job.events.said(words)
+    job.load(job.events, bool(missing))
+    begin = time.perf_counter()
+    if missing and job.kernels:
+        load_kernels(todo.device.alias, kernel_modules(*job.kernels), job.events.loading)
+    return time.perf_counter() - begin
 
 
 def _manifests(

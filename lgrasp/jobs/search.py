@@ -163,7 +163,7 @@ class SearchJob(SearchRequest, Job):
         loading = {name: self.inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field")}
         return {
             "counts": counts,
-            "seconds": seconds | loading | {"wall": sum(result.wall for result in outcome.results)},
+            "seconds": seconds | loading | {"wall": sum(result.wall for result in outcome.results) / outcome.lanes},
             "hits": self.inputs.hits,
             "hand": self.records(self.inputs)[0].name,
             "pipeline": self.pipeline.name,

@@ -138,7 +138,8 @@ class SimulateJob(SimulateRequest, ShardJob):
         """``protocol``; ``results``: see :func:`summary`; ``seconds_compile``: of models and, on a GPU, kernels, in no
         rate."""
         seconds = {part.file: made.result for part, made in outcome.made_parts}
-        done = [self._simulated(path, seconds[path][0] if path in seconds else 0.0) for path in outcome.paths]
+        wall = {path: simulating / outcome.lanes for path, (simulating, _) in seconds.items()}
+        done = [self._simulated(path, wall.get(path, 0.0)) for path in outcome.paths]
         return {
             "protocol": self.protocol.model_dump(mode="json"),
             "results": summary(done, self.protocol),

@@ -63,6 +63,9 @@ class Array(NamedTuple):
     """Parts of all the jobs, if there are several."""
     begun: str = ""
     """The array of which these tasks are submitted again."""
+    lane: int = 0
+    """Number of the device, of :attr:`lanes` that share the parts of the task."""
+    lanes: int = 1
 
     def resolved(self, begun: str = "") -> "Array":
         """With the numbers of the task and of the tasks.
@@ -89,7 +92,7 @@ class Array(NamedTuple):
         return self._replace(task=task, tasks=found.count, begun=begun if again else "")
 
     def share(self, parts: Sequence[Part], what: str = "part") -> list[Part]:
-        """Those of a job's parts that the task makes.
+        """Those of a job's parts that the task makes, in its lane.
 
         Raises:
             ConfigError: SLURM started more tasks than there are parts.
@@ -101,7 +104,8 @@ class Array(NamedTuple):
                 f"{'' if number == 1 else 's'} to share; give --array off if every task has a job of its own, or "
                 f"--array {self.task}/{self.tasks} if tasks may have nothing to do"
             )
-        return list(parts[(self.task - self.before) % self.tasks :: self.tasks])
+        own = range((self.task - self.before) % self.tasks, len(parts), self.tasks)
+        return [parts[i] for i in own if (self.before + i) // self.tasks % self.lanes == self.lane]
 
     @property
     def text(self) -> str:

@@ -108,6 +108,17 @@ def resolve_device(name: str = "auto") -> Device:
     return Device(alias=alias, name=wp.get_device(alias).name if alias != "cpu" else _cpu_name())
 
 
+def resolve_devices(names: str) -> list[Device]:
+    """Turn ``all`` (every GPU, else the CPU) or several names, separated by commas, into devices that exist.
+
+    Raises:
+        DeviceError: see :func:`resolve_device`.
+    """
+    start()
+    gpus = [f"cuda:{i}" for i in range(wp.get_cuda_device_count())]
+    return [resolve_device(name) for name in ((gpus or ["cpu"]) if names == "all" else names.split(","))]
+
+
 def _cpu_name() -> str:
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:

@@ -36,6 +36,7 @@ generate --object mug --hand alegro
 generate --object mug --pipeline robsut
 generate --object mug --device gpu
 generate --object mug --device cuda:x
+generate --object mug --device cpu,gpu
 generate --object mug --set bounds.frition=1
 generate --object mug --set bounds.friction=-1
 generate --object mug --contacts 9

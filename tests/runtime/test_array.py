@@ -53,6 +53,15 @@ def test_ranges(array, numbers):
     assert array.resolved()[:2] == numbers
 
 
+def test_lanes_share_what_a_task_has():
+    """Of several jobs too, each of one part: no device waits for the others."""
+    tasks = [Array(task, 3, lane=lane, lanes=2) for task in range(3) for lane in range(2)]
+    assert sorted(n for array in tasks for n in array.share(range(20))) == list(range(20))
+    assert tasks[2].share(range(20)) == [1, 7, 13, 19]
+    lanes = [[Array(lane=lane, lanes=2, before=job, total=4).share(["x"]) for job in range(4)] for lane in range(2)]
+    assert lanes == [[["x"], [], ["x"], []], [[], ["x"], [], ["x"]]]
+
+
 @pytest.mark.parametrize("array", [slurm(17, 17, 23, 2), slurm(7, 3, 9, 3), slurm(2, 0, 6, 4)])
 def test_a_list_alone_does_not_say_how_many_tasks_there_are(array):
     with pytest.raises(ConfigError, match=rf"--array {array.slurm.task}/N, or --array off"):

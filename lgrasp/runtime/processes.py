@@ -1,0 +1,136 @@
+"""Processes that work side by side for the one that started them, and end with it."""
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from types import TracebackType
+from typing import Any, Self
+
+from lgrasp.errors import DeviceError
+from lgrasp.files import discard_temporaries
+from lgrasp.signals import spared
+
+_PATIENCE = 4.0  # [s] that a process may take to end when it is asked to
+
+
+class Link:
+    """To the process that started this one; may be used by several threads."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self._lock = connection, threading.Lock()
+
+    def send(self, message: Any) -> None:
+        """Send anything that can be pickled."""
+        with self._lock:
+            self._connection.send(message)
+
+    def stopped(self) -> bool:
+        """True once this process is to end."""
+        return self._connection.poll()
+
+
+class Crew:
+    """A process for each of several tasks, while the block runs: ``work(link, *task)``.
+
+    They are spared the signals that ask to stop: this process gets them, and calls :meth:`stop`.
+
+    Args:
+        work: a function of a module.
+        tasks: its further arguments, which can be pickled.
+        names: of the tasks, for messages.
+    """
+
+    def __init__(self, work: Callable[..., None], tasks: Sequence[tuple[Any, ...]], names: Sequence[str]) -> None:
+        self._names, self._ended = names, set()
+        self._links: list[Connection] = []
+        self._waiting: list[Connection] = []  # not asked to end yet
+        self._processes: list[Any] = []
+        context = multiprocessing.get_context("spawn")
+        start_tracker()
+        with spared():
+            for task in tasks:
+                own, theirs = context.Pipe()
+                process = context.Process(target=_work, args=(theirs, work, task), daemon=False)
+                process.start()
+                theirs.close()
+                self._links.append(own)
+                self._processes.append(process)
+        self._waiting = list(self._links)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.stop()
+        for process in self._processes:
+            process.join(_PATIENCE)
+            if process.is_alive():
+                process.kill()
+                process.join()
+
+    @property
+    def working(self) -> bool:
+        """True until all processes have returned."""
+        return len(self._ended) < len(self._links)
+
+    def stop(self) -> None:
+        """Ask all processes to end."""
+        links, self._waiting = self._waiting, []
+        for link in links:
+            with suppress(OSError):  # it has ended
+                link.send(None)
+
+    def heard(self, seconds: float) -> list[tuple[int, Any]]:
+        """What processes sent, with their numbers, once there is something or the time is over.
+
+        Raises:
+            DeviceError: one ended otherwise than by returning.
+        """
+        links = {link: number for number, link in enumerate(self._links) if number not in self._ended}
+        found = []
+        for link in wait(list(links), seconds) if links else ():
+            number = links[link]  # type: ignore[index]
+            try:
+                found.append((number, link.recv()))  # type: ignore[union-attr]
+            except (EOFError, OSError):
+                self._ended.add(number)
+                self._processes[number].join()
+                if code := self._processes[number].exitcode:
+                    how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+                    raise DeviceError(f"the process on {self._names[number]} ended {how}") from None
+        return found
+
+
+def _work(connection: Connection, work: Callable[..., None], task: tuple[Any, ...]) -> None:
+    follow_parent()
+    work(Link(connection), *task)
+
+
+def follow_parent() -> None:
+    """In a process that was started: end when the one that started it has ended in any way."""
+    parent = multiprocessing.parent_process()
+
+    def follow() -> None:
+        assert parent is not None
+        parent.join()
+        discard_temporaries()
+        os._exit(1)
+
+    if parent is not None:
+        threading.Thread(target=follow, daemon=True).start()
+
+
+def start_tracker() -> None:
+    """Start the process that removes the semaphores of others that were killed, before these: it would print a warning
+    then, and while it starts signals come through."""
+    before = os.environ.get("PYTHONWARNINGS", "")
+    os.environ["PYTHONWARNINGS"] = f"{before},ignore:resource_tracker".lstrip(",")
+    try:
+        with spared():
+            resource_tracker.ensure_running()
+    finally:
+        os.environ["PYTHONWARNINGS"] = before

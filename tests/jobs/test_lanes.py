@@ -1,0 +1,73 @@
+"""One command on several devices: lanes make the files of a single process; they fail, stop and end as one job does."""
+
+import time
+
+import numpy as np
+import pytest
+from support.jobs import SampleJob, StopAfter
+
+from lgrasp.dataset.reader import read_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import Events
+from lgrasp.engine.run import run
+from lgrasp.errors import ObjectError
+from lgrasp.jobs.lanes import Lanes
+from lgrasp.runtime.array import Array
+from lgrasp.runtime.device import resolve_devices
+
+
+class FailingJob(SampleJob):
+    """Cannot make its third part."""
+
+    def make(self, part, progress):
+        if part.number == 2:
+            raise ObjectError("cup: broken")
+        return super().make(part, progress)
+
+
+class SlowJob(SampleJob):
+    def make(self, part, progress):
+        time.sleep(0.05)
+        return super().make(part, progress)
+
+
+class Heard(Events):
+    def __init__(self) -> None:
+        self.parts, self.rows, self.asked = set(), 0, 0
+
+    def started(self, parts, present):
+        self.asked = sum(part.rows for part in parts)
+
+    def wrote(self, part, made):
+        self.parts.add(part.number)
+        self.rows += made.rows
+
+
+def test_lanes_share_the_files_of_jobs(tmp_path):
+    devices, cache = resolve_devices("cpu,cpu"), Cache(tmp_path / "cache")
+    single = SampleJob(out=tmp_path / "single", rows=10, device="cpu")
+    run(single)
+    jobs = [
+        SampleJob(out=tmp_path / "a", rows=10, device="cpu"),
+        FailingJob(out=tmp_path / "b", rows=10, device="cpu"),
+        SampleJob(out=tmp_path / "c", rows=2, device="cpu"),
+        SlowJob(out=tmp_path / "d", rows=80, device="cpu"),
+    ]
+    run(jobs[0].changed(rows=2))
+    with Lanes(devices, jobs, [Array()] * len(jobs), cache, resume=True) as lanes:
+        events = Heard()
+        made = lanes.outcome(0, jobs[0], events)
+        assert (made.present, made.made, made.lanes) == (2, 8, 2)
+        assert [part.number for part, _ in made.made_parts] == [1, 2, 3, 4]
+        assert (events.parts, events.rows, events.asked) == ({0, 1, 2, 3, 4}, 10, 10)
+        for one, other in zip(sorted(single.out.glob("*.h5")), sorted(jobs[0].out.glob("*.h5")), strict=True):
+            mine, theirs = read_shard(one), read_shard(other)
+            np.testing.assert_array_equal(mine.grasps.q, theirs.grasps.q)
+            assert mine.header == theirs.header
+        with pytest.raises(ObjectError, match="cup: broken"):
+            lanes.outcome(1, jobs[1], Events())
+        assert lanes.outcome(2, jobs[2], Events()).rows == 2  # one that fails does not stop the others
+        cut = lanes.outcome(3, jobs[3], StopAfter(1))
+        assert cut.cancelled
+    assert len(list(jobs[3].out.glob("*.h5"))) == len(cut.written) < 40
+    assert not list(tmp_path.rglob("*.tmp"))
