@@ -26,8 +26,10 @@ if TYPE_CHECKING:
     )
     from lgrasp.dataset.exports.formats import export_shards, read_grasps
     from lgrasp.dataset.merge import merge_shards
+    from lgrasp.dataset.normalisation import Normalisation
     from lgrasp.dataset.reader import ShardReader, read_shard
     from lgrasp.dataset.torch_dataset import GraspDataset
+    from lgrasp.dataset.torch_stream import GraspIterableDataset
     from lgrasp.dataset.validate import validate_shard
     from lgrasp.dataset.writer import write_shard
     from lgrasp.engine.pipeline import load_pipeline
@@ -46,10 +48,12 @@ __version__ = "0.2.0"
 __all__ = [
     "GraspBounds",
     "GraspDataset",
+    "GraspIterableDataset",
     "Grasps",
     "Hand",
     "LgraspError",
     "LocalSearch",
+    "Normalisation",
     "Object",
     "Refiner",
     "SceneReader",
@@ -88,8 +92,10 @@ _HOMES = {
     "refine sequence simulate",
     "lgrasp.dataset.exports.formats": "export_shards read_grasps",
     "lgrasp.dataset.merge": "merge_shards",
+    "lgrasp.dataset.normalisation": "Normalisation",
     "lgrasp.dataset.reader": "ShardReader read_shard",
     "lgrasp.dataset.torch_dataset": "GraspDataset",
+    "lgrasp.dataset.torch_stream": "GraspIterableDataset",
     "lgrasp.dataset.validate": "validate_shard",
     "lgrasp.dataset.writer": "write_shard",
     "lgrasp.engine.pipeline": "load_pipeline",

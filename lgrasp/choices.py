@@ -36,6 +36,8 @@ VERDICTS: dict[str, tuple[ProtocolName, EngineName]] = {
 """How the verdicts of a protocol by a simulator are named."""
 FormatName = Literal["dexgraspnet", "dexgraspbench", "isaac-grasp", "mjcf"]
 """Formats of other programs (:mod:`lgrasp.dataset.exports.formats`)."""
+GroupName = Literal["object", "hand", "pose"]
+"""What a split of a data set keeps in one part: source meshes, hands, or rows made from one object pose."""
 MetricName = Literal["volume", "epsilon_exact", "hold"]
 """Metrics that can be added to shards (:mod:`lgrasp.dataset.metrics`); ``hold``: those of the hold test."""
 VariationName = Literal["joint_limit", "link_scale", "finger_spacing"]

@@ -13,6 +13,7 @@ from lgrasp.choices import FormatName, MetricName
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Quiet, Shards, old_name, split, warn
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, following, place, plural, reporting, took
+from lgrasp_cli.training import normalisation, split_rows
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(name="dataset", help="Inspect, check and merge grasp files (shards).", no_args_is_help=True)
@@ -80,6 +81,10 @@ def merge(
 
     rows = merge_shards(paths[0] if len(paths) == 1 else paths, out, manifest=manifest, partial=partial)
     typer.echo(f"{out}: {rows} rows")
+
+
+app.command("split")(split_rows)
+app.command()(normalisation)
 
 
 @app.command()

@@ -158,6 +158,11 @@ class ShardReader(FileReader):
             valid = self._dataset("metrics/valid")[()] != 0
         return None if valid.all() else np.flatnonzero(valid)
 
+    def take(self, rows: np.ndarray) -> None:
+        """From now on as if only some of the rows, bool, shape [N], were in the file."""
+        taken = np.arange(len(self)) if self.taken is None else self.taken
+        self.taken = taken[rows]
+
     @cached_property
     def space_names(self) -> tuple[str, ...] | None:
         """Opposition spaces of the hand that ``sequence/space`` counts in; None if the rows are no sequences."""

@@ -1,38 +1,22 @@
 """Grasps of many shards as a map-style PyTorch Dataset."""
 
-import hashlib
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Sequence
-from itertools import accumulate
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
+from lgrasp.choices import GroupName
 from lgrasp.dataset.files import Paths
-from lgrasp.dataset.gather import gather
-from lgrasp.dataset.manifest import tell_differences
-from lgrasp.dataset.merge import pad_column, widest
-from lgrasp.dataset.reader import ShardReader
-from lgrasp.errors import ShardError
-from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.grasp.schema import CHUNK_ROWS, POSE_BITS, SEQUENCE_FIELDS
+from lgrasp.dataset.split import Split, draw_split, read_groups
+from lgrasp.dataset.torch_rows import TorchRows
+from lgrasp.grasp.schema import CHUNK_ROWS
 
 
-class _Source(NamedTuple):
-    path: Path
-    rows: int
-    hand_sha256: str
-    objects: list[tuple[str, str, float]]
-    """Id, hash and scale."""
-    space_names: tuple[str, ...] | None
-    failed_bounds: tuple[str, ...]
-    columns: dict[str, tuple[tuple[int, ...], np.dtype]]
-
-
-class GraspDataset(torch.utils.data.Dataset):
+class GraspDataset(TorchRows, torch.utils.data.Dataset):
     """All rows of shards of one hand, each a dictionary of tensors that the default collate function can stack.
 
     Keys are the flat names of the row datasets: ``q``, ``object_pose``, ..., ``metrics/NAME``, ``physics/NAME``, with
@@ -46,35 +30,25 @@ class GraspDataset(torch.utils.data.Dataset):
     ``manifest.json`` are reported.
 
     Args:
-        paths: Shard files, or folders of any depth; what cannot be used in these is left out, with a notice.
-        columns: Names to return; by default all that every shard has.
+        paths, columns, negatives, split, part: as of :class:`~lgrasp.dataset.torch_rows.TorchRows`.
         cache_bytes: Memory for decoded blocks, per worker process.
-        negatives: Rows with metric ``valid`` 0 too, which fail a bound; :attr:`failed_bounds` names it by the code in
-            column ``metrics/failed_bound``.
 
     Raises:
         ShardError: A shard cannot be read, hands differ, or a shard lacks a column.
+        ConfigError: The split cannot be read, or has no such part.
     """
 
     def __init__(
-        self, paths: Paths, *, columns: Sequence[str] | None = None, cache_bytes: int = 1 << 29, negatives: bool = False
+        self,
+        paths: Paths,
+        *,
+        columns: Sequence[str] | None = None,
+        cache_bytes: int = 1 << 29,
+        negatives: bool = False,
+        split: Split | str | Path | None = None,
+        part: str = "train",
     ) -> None:
-        self._negatives = negatives
-        self._sources = [shard.value for shard in gather(paths, _survey, invalid=negatives)]
-        tell_differences(paths)
-        first = self._sources[0]
-        for source in self._sources:
-            if source.hand_sha256 != first.hand_sha256:
-                raise ShardError(f"{source.path}: another hand than {first.path}; make one GraspDataset per hand")
-        self._ends = list(accumulate(source.rows for source in self._sources))
-        self.objects: list[tuple[str, str, float]] = sorted({o for source in self._sources for o in source.objects})
-        """Id, SHA-256 of the source mesh and scale of every object."""
-        self.space_names: tuple[str, ...] | None = first.space_names
-        """Opposition spaces of the hand, if the first shard is of sequences."""
-        self.failed_bounds: tuple[str, ...] = first.failed_bounds
-        """Names of the numbers in ``metrics/failed_bound``, if the first shard has it."""
-        self.columns: list[str] = self._choose(columns)
-        self._tails = {n: widest(source.columns[n][0][1:] for source in self._sources) for n in self.columns}
+        super().__init__(paths, columns, negatives, split, part)
         self._cache_bytes = cache_bytes
         self._cache: OrderedDict[tuple[int, int], dict[str, torch.Tensor]] = OrderedDict()
 
@@ -102,29 +76,13 @@ class GraspDataset(torch.utils.data.Dataset):
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_cache": OrderedDict()}
 
-    def hand(self) -> HandRecord:
-        """The hand of all rows."""
-        with ShardReader(self._sources[0].path) as reader:
-            return reader.hand()
-
-    def object(self, index: int) -> ObjectRecord:
-        """The object that ``object_index`` names by ``index``."""
-        key = self.objects[index]
-        source = next(source for source in self._sources if key in source.objects)
-        with ShardReader(source.path) as reader:
-            return reader.object(key[0])
-
     def split(
-        self, *, by: Literal["object", "pose"], shares: Sequence[float] = (0.8, 0.1, 0.1), seed: int = 0
+        self, *, by: GroupName, shares: Sequence[float] = (0.8, 0.1, 0.1), seed: int = 0
     ) -> list[torch.utils.data.Subset]:
-        """Parts of about some shares of the rows, such that no object (or pose) is in two of them.
-
-        Grasps of one object pose are much alike: a split row by row has siblings on both sides. Which groups a part
-        gets depends on the seed and the groups alone.
+        """Parts of about some shares of the rows, as :func:`~lgrasp.dataset.split.draw_split` draws them.
 
         Args:
-            by: ``object``: source meshes, whatever their scale; objects held at once stay together. ``pose``: rows
-                made from one object pose, so all objects are in every part.
+            by: ``object`` or ``pose`` (all rows are of one hand).
             shares: of the rows, positive; they are divided by their sum.
 
         Raises:
@@ -135,66 +93,17 @@ class GraspDataset(torch.utils.data.Dataset):
             raise ValueError(
                 f"by={by!r}, shares={tuple(shares)}: by is object or pose (it has one hand), shares are positive"
             )
-        names = self._object_groups() if by == "object" else self._pose_groups()
-        groups, group_of, sizes = np.unique(names, return_inverse=True, return_counts=True)
-        if len(groups) < len(shares):
-            raise ShardError(f"rows of {len(groups)} {by}(s) cannot be split into {len(shares)} parts by {by}")
-        order = np.argsort([hashlib.sha256(f"{seed}/{group}".encode()).digest() for group in groups])
-        middle = np.cumsum(sizes[order]) - sizes[order] / 2  # the row that says where its group goes
-        number = np.arange(1, len(shares))
-        cuts = np.searchsorted(middle, np.cumsum(shares)[:-1] / sum(shares) * len(self))
-        cuts = np.maximum.accumulate(np.maximum(cuts - number, 0)) + number  # every part gets a group
-        cuts = np.minimum(cuts, len(groups) - len(shares) + number)
-        rows_of = (np.flatnonzero(np.isin(group_of, part)).tolist() for part in np.split(order, cuts))
-        return [torch.utils.data.Subset(self, rows) for rows in rows_of]
-
-    def _object_groups(self) -> np.ndarray:
-        """Of each row, the hash of a source mesh; the same for all that are held at once in some row."""
-        joined = {sha256: sha256 for _, sha256, _ in self.objects}
-
-        def root(name: str) -> str:
-            while joined[name] != name:
-                name = joined[name]
-            return name
-
-        sets: list[list[str]] = []
-        rows = []
+        groups = []
         for source in self._sources:
             with self._open(source) as reader:
-                kinds, which = np.unique(reader.column("object_index"), axis=0, return_inverse=True)
-            rows.append(which.ravel() + len(sets))
-            for kind in kinds:
-                held = [source.objects[i][1] for i in kind if i >= 0]
-                sets.append(held)
-                for name in held[1:]:
-                    joined[root(name)] = root(held[0])
-        names = np.array([root(held[0]) if held else "" for held in sets])
-        return names[np.concatenate(rows)]
-
-    def _pose_groups(self) -> np.ndarray:
-        """Of each row, the object that was placed first and the number of its pose."""
-        parts = []
-        for source in self._sources:
+                groups.append(read_groups(reader, by, seed))
+        drawn = draw_split(groups, by=by, shares={str(k): share for k, share in enumerate(shares)}, seed=seed)
+        rows: list[list[int]] = [[] for _ in shares]
+        for source, end in zip(self._sources, self._ends, strict=True):
             with self._open(source) as reader:
-                pose = reader.column("candidate") & POSE_BITS
-                first = reader.column("object_index")[:, 0]
-            names = np.array([sha256[:16] for _, sha256, _ in source.objects] + [""])[first]
-            parts.append(np.char.add(np.char.add(names, "/"), pose.astype(str)))
-        return np.concatenate(parts)
-
-    def _open(self, source: _Source) -> ShardReader:
-        return ShardReader(source.path, invalid=self._negatives)
-
-    def _choose(self, columns: Sequence[str] | None) -> list[str]:
-        kinds = [  # what must agree for a column to be stacked
-            {n: (t, len(shape), n in SEQUENCE_FIELDS and s.space_names) for n, (shape, t) in s.columns.items()}
-            for s in self._sources
-        ]
-        common = [name for name, kind in kinds[0].items() if all(other.get(name) == kind for other in kinds)]
-        for name in columns or ():
-            if name not in common:
-                raise ShardError(f"no column {name!r} that all {len(self._sources)} shards have: {', '.join(common)}")
-        return common if columns is None else list(columns)
+                for k, own in enumerate(rows):
+                    own += (np.flatnonzero(drawn.holds(str(k), reader)) + end - source.rows).tolist()
+        return [torch.utils.data.Subset(self, own) for own in rows]
 
     def _locate(self, index: int) -> tuple[int, int]:
         size = len(self)
@@ -207,7 +116,7 @@ class GraspDataset(torch.utils.data.Dataset):
     def _block(self, shard: int, number: int) -> dict[str, torch.Tensor]:
         key = (shard, number)
         if key not in self._cache:
-            self._cache[key] = self._read_block(shard, number)
+            self._cache[key] = self._read(shard, number * CHUNK_ROWS, (number + 1) * CHUNK_ROWS)
             while len(self._cache) > 1 and self._held_bytes() > self._cache_bytes:
                 self._cache.popitem(last=False)
         self._cache.move_to_end(key)
@@ -215,25 +124,3 @@ class GraspDataset(torch.utils.data.Dataset):
 
     def _held_bytes(self) -> int:
         return sum(values.nbytes for block in self._cache.values() for values in block.values())
-
-    def _read_block(self, shard: int, number: int) -> dict[str, torch.Tensor]:
-        source = self._sources[shard]
-        block: dict[str, torch.Tensor] = {}
-        with self._open(source) as reader:
-            for name in self.columns:
-                values = reader.column(name, number * CHUNK_ROWS, (number + 1) * CHUNK_ROWS)
-                if name == "object_index":
-                    known = np.array([*(self.objects.index(o) for o in source.objects), -1], dtype=values.dtype)
-                    values = known[values]  # -1, absent, takes the last
-                elif name == "sequence/parent":
-                    values = np.where(values < 0, values, values + self._ends[shard] - source.rows)
-                elif name == "candidate":
-                    values = values.astype(np.int64)
-                block[name] = torch.from_numpy(pad_column(name, values, self._tails[name]))
-        return block
-
-
-def _survey(reader: ShardReader) -> _Source:
-    hand = str(reader.attributes["hand_sha256"])
-    names = tuple(reader.rows(0, 0).failed_bounds)
-    return _Source(reader.path, len(reader), hand, reader.object_keys, reader.space_names, names, reader.columns)

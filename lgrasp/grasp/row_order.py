@@ -4,10 +4,10 @@ import numpy as np
 
 from lgrasp.grasp.schema import POSE_BITS
 from lgrasp.grasp.tables import GraspTable
-from lgrasp.seeding import stage_seed
+from lgrasp.seeding import mixed, stage_seed
 
 _BLOCK_BITS, _KEY_BITS = np.uint64(26), np.uint64(38)  # the number of a block fits in 26 bits
-_GAMMA, _A, _B = np.array([[0x9E3779B97F4A7C15], [0xBF58476D1CE4E5B9], [0x94D049BB133111EB]], np.uint64)
+_GAMMA = np.array([0x9E3779B97F4A7C15], np.uint64)
 
 
 class RowOrder:
@@ -33,11 +33,4 @@ class RowOrder:
 
     def _keys(self, index: np.ndarray, slot: np.ndarray) -> np.ndarray:
         """Random numbers (N,) that belong to the rows: of the seed, the candidate and the search that found it."""
-        return _mixed(_mixed(index.astype(np.uint64) + self._seed) + slot.astype(np.uint64) * _GAMMA)
-
-
-def _mixed(values: np.ndarray) -> np.ndarray:
-    """The finaliser of splitmix64."""
-    values = (values ^ (values >> np.uint64(30))) * _A
-    values = (values ^ (values >> np.uint64(27))) * _B
-    return values ^ (values >> np.uint64(31))
+        return mixed(mixed(index.astype(np.uint64) + self._seed) + slot.astype(np.uint64) * _GAMMA)

@@ -1,0 +1,96 @@
+"""``lgrasp dataset split`` and ``normalisation``: what training needs beside the shards."""
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Option
+
+from lgrasp.choices import GroupName
+from lgrasp_cli.names import one_of
+from lgrasp_cli.options import Shards, split
+from lgrasp_cli.tables import Answer, TextTable, reporting
+
+Negatives = Annotated[bool, Option("--negatives", help="Count rows with metric 'valid' 0 too.")]
+
+
+@reporting
+def split_rows(
+    paths: Shards,
+    by: Annotated[str, Option(**one_of(GroupName, "GROUP", "What is in one part only."))],
+    out: Annotated[Path, Option("--out", "-o", help="JSON file to write.")] = Path("split.json"),
+    shares: Annotated[
+        str, Option(metavar="PART=SHARE,...", help="Parts, and their shares of the rows.")
+    ] = "train=0.8,val=0.1,test=0.1",
+    seed: Annotated[int, Option(help="Decides which groups a part gets.")] = 0,
+    negatives: Negatives = False,
+) -> Answer:
+    """Write which objects (or hands, or object poses) are for training, validation and test.
+
+    GraspDataset, GraspIterableDataset and dataset normalisation read the file.
+
+    Example: lgrasp dataset split grasps --by object -o split.json
+    """
+    from lgrasp.dataset.files import shards_below
+    from lgrasp.files import check_file
+
+    parts = _shares(shares)
+    shards_below(paths)
+    check_file(out)
+    from lgrasp.dataset.split import make_split
+
+    made = make_split(paths, by=by, shares=parts, seed=seed, negatives=negatives)  # pyright: ignore[reportArgumentType]
+    made.write(out)
+    rows = [(name, f"{part.rows:,}", _listed(part.names)) for name, part in made.parts.items()]
+    return Answer(
+        made.model_dump(mode="json"), [TextTable(("part", "rows", by), rows, right=("rows",)), [("where", str(out))]]
+    )
+
+
+@reporting
+def normalisation(
+    paths: Shards,
+    out: Annotated[Path, Option("--out", "-o", help="JSON file to write.")] = Path("normalisation.json"),
+    split_file: Annotated[
+        Path | None, Option("--split", help="File of dataset split; only rows of --part are measured.")
+    ] = None,
+    part: Annotated[str, Option(help="Part of the split.")] = "train",
+    negatives: Negatives = False,
+) -> Answer:
+    """Write mean and deviation of hand position, 6D rotation (in the object's frame) and joints over all rows.
+
+    Example: lgrasp dataset normalisation grasps --split split.json -o normalisation.json
+    """
+    from lgrasp.dataset.files import shards_below
+    from lgrasp.files import check_file
+
+    shards_below(paths)
+    check_file(out)
+    from lgrasp.dataset.normalisation import Normalisation
+
+    made = Normalisation.of(paths, split=split_file, part=part, negatives=negatives)
+    made.write(out)
+    numbers = zip(made.names, made.mean, made.std, strict=True)
+    rows = [(name, f"{mean:.4f}", f"{std:.4f}") for name, mean, std in numbers]
+    table = TextTable(("number", "mean", "std"), rows, right=("mean", "std"))
+    return Answer(made.model_dump(mode="json"), [table, "", [("rows", f"{made.rows:,}"), ("where", str(out))]])
+
+
+def _shares(text: str) -> dict[str, float]:
+    """Shares by the names of parts."""
+    from lgrasp.errors import ConfigError
+
+    found: dict[str, float] = {}
+    for entry in split(text):
+        name, _, share = entry.partition("=")
+        try:
+            found[name.strip()] = float(share)
+        except ValueError:
+            found[name.strip()] = -1.0
+    if not all(name and 0 < share < float("inf") for name, share in found.items()):
+        raise ConfigError(f"--shares {text}: expected PART=SHARE,... with positive shares, such as train=0.9,test=0.1")
+    return found
+
+
+def _listed(names: tuple[str, ...], most: int = 4) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(dict.fromkeys(names[:most])) + more
