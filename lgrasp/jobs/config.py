@@ -178,7 +178,7 @@ def pair_requests(
     objects: Sequence[str],
     pipeline: Pipeline,
     top: Path,
-    protocol: str | None,
+    protocol: str | None = None,
     **shared: Any,
 ) -> list[GenerateRequest]:
     """A request for each hand and object, with a folder of its own below ``top``.

@@ -22,7 +22,7 @@ def run_soak(
     rounds: int,
     hours: float,
     seed: int,
-    say: Callable[[str], None],
+    say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[dict[str, Any]]:
     """:func:`soak` in a temporary folder; all commands and all ways by default.
 
