@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.jaws import EDGE, Jaws
+from support.judging import judge
 from support.twins import twin_rows, twin_shard
 
 from lgrasp.config import parse_model
 from lgrasp.errors import ConfigError, PhysicsError
 from lgrasp.simulate.lift import course_of
 from lgrasp.simulate.protocol import PROTOCOLS, FreeLift, Lift, Protocol
-from lgrasp.simulate.run import protocol_text, verdicts
+from lgrasp.simulate.run import protocol_text
 from lgrasp.simulate.scene import scene_of
-from lgrasp.simulate.verdict import FREE_LIFT_COLUMNS, LIFT_COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -51,13 +51,6 @@ def below(jaws: Jaws, press: float, count: int = 1):
     pose = shard.grasps.object_pose.copy()
     pose[..., 3:] = [0, 1, 0, 0]
     return replace(shard, grasps=replace(shard.grasps, object_pose=pose))
-
-
-def judge(shard, protocol, rows=None, **more):
-    found = verdicts(scene_of(shard.hand, shard.objects), rows or shard.grasps, protocol, **more)
-    columns = LIFT_COLUMNS if protocol.table else FREE_LIFT_COLUMNS
-    assert set(found) == {f"{protocol.name}_{name}" for name in columns}
-    return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
 
 
 def test_lifts_what_friction_bears(jaws: Jaws, lift):

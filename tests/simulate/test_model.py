@@ -1,6 +1,7 @@
 """What MuJoCo is given: the kinematics of the URDF, the generator's solids, the inertia of the mesh."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from support.solids import YOU, no_cut, prism
 from lgrasp.engine.cache import Cache
 from lgrasp.geometry.decompose import decompose
 from lgrasp.simulate.assemble import bare_urdf
-from lgrasp.simulate.model import build_model
+from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
 from lgrasp.simulate.scene import Scene, hand_of_record, object_of_record, scene_of
@@ -21,6 +22,18 @@ mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra si
 
 FC = PROTOCOLS["fc"]
 HANDS = ("allegro", "barrett", "dclaw", "leap", "schunk_svh", "shadow")
+
+
+def open_allegro() -> tuple[Model, Any, np.ndarray]:
+    """The model of the open Allegro, its state with the object far away, and its joints."""
+    record, _, tree = shipped_hand("allegro")
+    cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
+    q = tree.listed_values(tree.joint_open[None])[0]
+    m = build_model(Scene(hand_of_record(record, no_cut), (cube,)), FC, q)
+    data = mujoco.MjData(m.mujoco)
+    data.qpos[m.object_address[0, 0]] = 10.0
+    data.qpos[m.joint_address] = m.joint_matrix @ q + m.joint_offset
+    return m, data, q
 
 
 @pytest.mark.parametrize("name", HANDS)
@@ -46,13 +59,7 @@ def test_links_are_where_the_urdf_puts_them(name: str):
 
 def test_drives_are_near_critically_damped(jaws: Jaws):
     """A drive that is let go returns within a tenth of a second and overshoots by no more than 5 %."""
-    record, _, tree = shipped_hand("allegro")
-    cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
-    q = tree.listed_values(tree.joint_open[None])[0]
-    m = build_model(Scene(hand_of_record(record, no_cut), (cube,)), FC, q)
-    data = mujoco.MjData(m.mujoco)
-    data.qpos[m.object_address[0, 0]] = 10.0
-    data.qpos[m.joint_address] = m.joint_matrix @ q + m.joint_offset
+    m, data, q = open_allegro()
     data.ctrl[:] = q[m.columns]
     data.ctrl[2] += 0.2
     trace = []
@@ -124,13 +131,7 @@ def test_what_carries_the_base_does_not_matter(jaws: Jaws, kind: str):
 
 def test_neighbours_and_sockets_do_not_collide():
     """At random postures of the Allegro no pair of joined links is in contact, nor one with the welded base."""
-    record, _, tree = shipped_hand("allegro")
-    cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
-    q = tree.listed_values(tree.joint_open[None])[0]
-    m = build_model(Scene(hand_of_record(record, no_cut), (cube,)), FC, q)
-    data = mujoco.MjData(m.mujoco)
-    data.qpos[m.object_address[0, 0]] = 10.0
-    data.qpos[m.joint_address] = m.joint_matrix @ q + m.joint_offset
+    m, data, _ = open_allegro()
     mujoco.mj_forward(m.mujoco, data)
     assert data.ncon == 0
     assert (m.mujoco.body_weldid[m.mujoco.geom_bodyid] == 0).any()

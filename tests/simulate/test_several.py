@@ -5,26 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.jaws import EDGE
+from support.judging import judge
 from support.twins import SIDE, in_one_gripper, twin_rows, twin_shard
 
-from lgrasp.grasp.records import GraspRows, Shard
+from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.protocol import PROTOCOLS
-from lgrasp.simulate.run import verdicts
 from lgrasp.simulate.scene import scene_of
-from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, OBJECT_COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
 SEQ, SMOOTH = PROTOCOLS["seq6"], PROTOCOLS["seq6_mu06"]
 WEIGHT = 500 * EDGE**3 * 9.8  # [N] of a cube
 SLIDING = 500.0  # [N/m] of a jaw
-
-
-def judge(shard: Shard, protocol=SEQ, rows: GraspRows | None = None, **more) -> dict[str, np.ndarray]:
-    found = verdicts(scene_of(shard.hand, shard.objects), rows or shard.grasps, protocol, **more)
-    columns = COLUMNS | OBJECT_COLUMNS | (DRAWN_COLUMNS if protocol.draws else {})
-    assert set(found) == {f"{protocol.name}_{name}" for name in columns}
-    return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
 
 
 def moved(rows: GraspRows, slot: int, *shift: float) -> GraspRows:
@@ -44,7 +36,7 @@ def alone(rows: GraspRows, slot: int) -> GraspRows:
 
 
 def test_both_are_held():
-    found = judge(twin_shard(twin_rows()))
+    found = judge(twin_shard(twin_rows()), SEQ)
     assert found["holds"].all()
     assert found["stays"].all()
     assert found["object_touches"].tolist() == [[1, 1]]
@@ -76,7 +68,7 @@ def test_cubes_inside_each_other_fail():
     """By 12 mm: too deep for a simulation. By 8 mm, which is allowed: it runs."""
     free = moved(in_one_gripper(0.0), 0, 0, 0, 0.2)
     for depth, run in ((0.012, False), (0.008, True)):
-        found = judge(twin_shard(free), rows=moved(moved(free, 1, 0, 0, 0.2), 0, -depth, 0, 0))
+        found = judge(twin_shard(free), SEQ, rows=moved(moved(free, 1, 0, 0, 0.2), 0, -depth, 0, 0))
         assert found["penetration"] == pytest.approx(depth, abs=2e-4)
         assert (found["directions"] >= 0).any() == run
         assert not found["holds"].any()
@@ -107,10 +99,10 @@ def test_a_row_sees_its_own_objects_only():
     cube = twin_shard(both).objects[0]
     parent = alone(both, 1)
     mixed = replace(both, **{n: np.concatenate([v, parent.columns()[n]]) for n, v in both.columns().items()})
-    in_file = judge(twin_shard(mixed))
+    in_file = judge(twin_shard(mixed), SEQ)
     slots = ("object_pose", "object_index", "contact_points", "contact_normals", "contact_links", "contact_forces")
     lone = replace(both, **{name: getattr(both, name)[:, :1] for name in slots})
-    by_itself = judge(replace(twin_shard(lone), objects=[cube]))
+    by_itself = judge(replace(twin_shard(lone), objects=[cube]), SEQ)
     assert in_file["object_touches"].tolist() == [[1, 1], [1, -1]]
     assert np.isnan(in_file["object_displacement"][1, 1])
     for name, values in by_itself.items():
@@ -123,7 +115,7 @@ def test_order_of_slots_does_not_matter():
     rows = moved(twin_rows(0.0004, count=1), 1, 0, 0, 0.01)
     shard = twin_shard(rows, heights=(EDGE, EDGE / 2))
     turned = replace(rows, **{n: getattr(rows, n)[:, ::-1] for n in rows.columns() if "object" in n or "contact" in n})
-    a, b = judge(shard), judge(shard, rows=turned)
+    a, b = judge(shard, SEQ), judge(shard, SEQ, rows=turned)
     assert a["object_displacement"][0, 0] > 1.2 * a["object_displacement"][0, 1]
     for name, values in a.items():
         np.testing.assert_array_equal(values, b[name][:, ::-1] if name.startswith("object_") else b[name], err_msg=name)
@@ -132,7 +124,7 @@ def test_order_of_slots_does_not_matter():
 def test_the_same_object_twice():
     rows = twin_rows()
     once = twin_shard(replace(rows, object_index=np.zeros((1, 2), "i4")))
-    a, b = judge(twin_shard(rows)), judge(replace(once, objects=once.objects[:1]))
+    a, b = judge(twin_shard(rows), SEQ), judge(replace(once, objects=once.objects[:1]), SEQ)
     for name, values in a.items():
         np.testing.assert_array_equal(values, b[name], err_msg=name)
 
@@ -149,11 +141,11 @@ def test_touching_and_staying_are_two_things():
 def test_it_starts_at_q():
     """q_pregrasp says nothing: the objects are held already."""
     rows = twin_rows()
-    a, b = (judge(twin_shard(r)) for r in (rows, replace(rows, q_pregrasp=np.full_like(rows.q, 0.06))))
+    a, b = (judge(twin_shard(r), SEQ) for r in (rows, replace(rows, q_pregrasp=np.full_like(rows.q, 0.06))))
     for name, values in a.items():
         np.testing.assert_array_equal(values, b[name], err_msg=name)
     inside = replace(rows, q=rows.q - np.float32(0.012))
-    deep = judge(twin_shard(inside))
+    deep = judge(twin_shard(inside), SEQ)
     assert deep["pregrasp_penetration"] == pytest.approx(0.012, abs=2e-4)
     assert (deep["directions"] == -1).all()
 

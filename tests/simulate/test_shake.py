@@ -6,13 +6,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from support.jaws import EDGE, Jaws
+from support.judging import judge
 from support.twins import twin_rows, twin_shard
 
 from lgrasp.choices import EngineName
 from lgrasp.config import parse_model
 from lgrasp.errors import ConfigError, PhysicsError
 from lgrasp.simulate.protocol import GRAVITY, PROTOCOLS, Draws, Protocol, Shake
-from lgrasp.simulate.run import protocol_text, verdicts
+from lgrasp.simulate.run import protocol_text
 from lgrasp.simulate.scene import scene_of
 from lgrasp.simulate.shake import shake_course
 from lgrasp.simulate.verdict import AXES
@@ -23,11 +24,6 @@ SHAKE = PROTOCOLS["seq_shake"]
 WEIGHT = 500 * EDGE**3 * 9.8  # [N] of a cube
 SLIDING = 500.0  # [N/m] of a jaw
 TURNS = [0, 2, 4, 1, 3, 5]  # +x, +y, +z, -x, -y, -z: the order in which gravity has them
-
-
-def judge(shard, protocol, **more):
-    found = verdicts(scene_of(shard.hand, shard.objects), shard.grasps, protocol, **more)
-    return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
 
 
 def shaken(engine: EngineName, press: float, acceleration: float = 13.0, **numbers: float):

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.jaws import EDGE, Jaws
+from support.judging import judge
 
 from lgrasp.errors import ConfigError, PhysicsError
 from lgrasp.simulate.protocol import PROTOCOLS, find_protocol
-from lgrasp.simulate.run import protocol_text, verdicts
+from lgrasp.simulate.run import protocol_text
 from lgrasp.simulate.scene import scene_of
-from lgrasp.simulate.verdict import COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -25,12 +25,6 @@ def fc(request):
     if request.param == "physx":
         pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
     return FC.by(request.param)
-
-
-def judge(shard, protocol=FC, rows=None, **more):
-    found = verdicts(scene_of(shard.hand, shard.objects), rows or shard.grasps, protocol, **more)
-    assert set(found) == {f"{protocol.name}_{name}" for name in COLUMNS}
-    return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
 
 
 def press(force: float) -> float:
@@ -52,7 +46,7 @@ def test_friction_of_two_jaws(jaws: Jaws, fc, normal: float):
 
 
 def test_stops_at_the_first_loss(jaws: Jaws):
-    found = judge(jaws.shard(press(0.5)))
+    found = judge(jaws.shard(press(0.5)), FC)
     np.testing.assert_array_equal(found["directions"][0], [1, 1, 0, -1, -1, -1])
     assert np.isnan(found["displacement"][0, 3:]).all()
     assert found["displacement"][0, 2] > FC.most_displacement
@@ -81,15 +75,15 @@ def test_planted_failures(jaws: Jaws, fc):
 def test_contact_and_slip(jaws: Jaws):
     """At q the jaws just touch; a jaw that closes alone pushes the cube, and its contact slides nowhere."""
     good = jaws.shard(press(4.0))
-    found = judge(good)
+    found = judge(good, FC)
     assert found["contact_at_q"] == 2
     assert found["slip"] < 1e-3
     shifted = good.grasps.object_pose.copy()
     shifted[..., 1] += 0.006  # contacts are where q puts the links, 6 mm beside where they were meant to be
     q = good.grasps.q + np.float32(0.002)
-    assert judge(good, rows=Jaws.rows(good, q=q))["contact_at_q"] == 0  # 2 mm off
-    assert judge(good, rows=Jaws.rows(good, q=q))["slip"] == pytest.approx(0.0025, abs=1e-3)
-    assert judge(good, rows=Jaws.rows(good, object_pose=shifted))["slip"] < 1e-3
+    assert judge(good, FC, rows=Jaws.rows(good, q=q))["contact_at_q"] == 0  # 2 mm off
+    assert judge(good, FC, rows=Jaws.rows(good, q=q))["slip"] == pytest.approx(0.0025, abs=1e-3)
+    assert judge(good, FC, rows=Jaws.rows(good, object_pose=shifted))["slip"] < 1e-3
 
 
 def test_rows_stand_alone(jaws: Jaws, fc):
@@ -147,12 +141,12 @@ def test_progress_can_end_it(jaws: Jaws):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        judge(jaws.shard(press(1.0), count=50), progress=stop)
+        judge(jaws.shard(press(1.0), count=50), FC, progress=stop)
 
 
 def test_no_rows(jaws: Jaws):
     shard = jaws.shard(count=0)
-    found = judge(shard)
+    found = judge(shard, FC)
     assert found["directions"].shape == (0, 6)
 
 
@@ -173,10 +167,10 @@ def test_errors(jaws: Jaws, monkeypatch):
     shard = jaws.shard()
     for index, said in ((-1, r"row 1 has object_index \[-1\]"), (1, r"\[1\]; one object at least, of 1 that there")):
         with pytest.raises(PhysicsError, match=said):
-            judge(shard, rows=jaws.rows(jaws.shard(count=2), object_index=np.array([[0], [index]])))
+            judge(shard, FC, rows=jaws.rows(jaws.shard(count=2), object_index=np.array([[0], [index]])))
     heavy = shard.hand.urdf.replace("</link>", '<inertial><mass value="-1"/></inertial></link>', 1)
     with pytest.raises(PhysicsError, match="MuJoCo refuses hand 'jaws'"):
-        judge(jaws.shard(urdf=heavy))
+        judge(jaws.shard(urdf=heavy), FC)
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
     with pytest.raises(PhysicsError, match=r'pip install "lgrasp\[sim\]"'):
-        judge(shard)
+        judge(shard, FC)
