@@ -10,6 +10,7 @@ from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgraspbench, write_dexgraspbench
 from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
 from lgrasp.dataset.exports.folder import abandon, begin, check_empty, readme, write_assets, write_index
+from lgrasp.dataset.exports.graspgen import GRASPGEN_NOTES, read_graspgen, write_graspgen
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
@@ -44,6 +45,7 @@ FORMATS = {
     "dexgraspnet": Format(True, DEXGRASPNET_NOTES, _plain(write_dexgraspnet), read_dexgraspnet),
     "dexgraspbench": Format(True, DEXGRASPBENCH_NOTES, _plain(write_dexgraspbench), read_dexgraspbench),
     "isaac-grasp": Format(True, ISAAC_GRASP_NOTES, _plain(write_isaac_grasp), read_isaac_grasp),
+    "graspgen": Format(True, GRASPGEN_NOTES, _plain(write_graspgen), read_graspgen),
     "mjcf": Format(False, MJCF_NOTES, MjcfWriter, read_mjcf),
 }
 """Formats by the name that ``--to`` takes."""

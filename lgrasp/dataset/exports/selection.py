@@ -50,7 +50,7 @@ class Batch(NamedTuple):
     object_index: np.ndarray
     """Position in the selection's objects, shape [n, O]; -1 where absent."""
     holds: np.ndarray
-    """1 where a simulator saw the grasp hold or none ran, 0 where it saw it fail, shape [n]."""
+    """0 where a simulator saw the grasp fail, or a row fails a bound (metric ``valid``), else 1; shape [n]."""
     table: Mapping[str, np.ndarray]
     """Of grasps of an object on a table, else empty; by the names that are written: ``table_plane``, unit normal up and
     height along it [m], shape [n, 4], and ``table_approach``, unit direction in which the open hand comes, shape
@@ -129,7 +129,9 @@ class Selection:
             present = np.argmax(index >= 0, axis=1)[:, None]
             pose = np.take_along_axis(pose, present[..., None], 1)
             index = np.take_along_axis(index, present, 1)
-        holds = (read(HOLDS) > 0).astype(np.float64) if HOLDS in reader.columns else np.ones(len(some))
+        holds = np.ones(len(some))
+        for name in {HOLDS, "metrics/valid"} & reader.columns.keys():
+            holds *= read(name) > 0
         q, before, squeeze = (read(name)[:, source.columns] for name in ("q", "q_pregrasp", "q_squeeze"))
         table = {}
         if source.on_table:  # such rows hold one object

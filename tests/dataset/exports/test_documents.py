@@ -1,4 +1,4 @@
-"""The examples of docs/guides/exports.md and training.md run, and the network of the latter beats its baselines."""
+"""The examples of docs/guides/exports.md and training.md run, and the network of the latter learns."""
 
 import re
 from dataclasses import replace
@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from lgrasp.dataset.normalisation import Normalisation
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.split import make_split
 from lgrasp.dataset.writer import write_shard
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "guides"
@@ -39,13 +42,19 @@ def test_exports(folder, capsys):
 
 
 def test_training(folder, make_sequence, capsys):
+    """Of half of the rows the joints follow from the object's place; the others are failed ones, by their metric."""
     write_shard(folder / "sequences" / "four-00000.h5", make_sequence())
+    shard = read_shard(folder / "grasps" / "allegro-mug" / "robust" / "allegro-mug-00000.h5")
+    valid = np.arange(len(shard.grasps)) % 2 == 0
+    q = np.where(valid[:, None], shard.grasps.q, shard.grasps.q_pregrasp)
+    rows = replace(shard.grasps, q=q, metrics={"valid": valid.astype("f4")})
+    write_shard(folder / "mug" / "allegro-mug-00000.h5", replace(shard, grasps=rows))
+    make_split("mug", by="pose", negatives=True).write("split.json")
+    Normalisation.of("mug", split="split.json", negatives=True).write("normalisation.json")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small matrices: more threads only wait for each other
     exec(examples("training.md"), {})
     torch.set_num_threads(threads)
-    *lines, chosen, moved = capsys.readouterr().out.splitlines()
-    drawn, *baselines = [float(line.split()[-2]) for line in lines]
-    assert drawn < min(baselines)
-    assert chosen == "200 of 400 grasps"
+    right, moved = capsys.readouterr().out.splitlines()
+    assert float(right.split("%")[0]) > 70
     assert moved == "tensor(0.)"

@@ -16,7 +16,7 @@ from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.object.mass import mass_properties
 
-SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp"]
+SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp", "graspgen"]
 HANDS = ["allegro", "schunk_svh", "barrett", "shadow"]
 
 
@@ -62,7 +62,17 @@ def raw_isaac_grasp(out: Path, row: int):
     return matrix(entry["position"], wxyz(turn)), "base_link", entry["cspace_position"]
 
 
-RAW = dict(zip(SINGLE, (raw_dexgraspnet, raw_dexgraspbench, raw_isaac_grasp), strict=True))
+def raw_graspgen(out: Path, row: int):
+    document = json.loads((out / "grasps" / "cup.json").read_text())
+    assert (out / "objects" / document["object"]["file"]).is_file()
+    assert document["object"]["scale"] == 1.0
+    grasps = document["grasps"]
+    assert grasps["object_in_gripper"][row] is True
+    joints = dict(zip(grasps["joint_names"], grasps["cspace_position"][row], strict=True))
+    return np.array(grasps["transforms"][row]), "root_link", joints
+
+
+RAW = dict(zip(SINGLE, (raw_dexgraspnet, raw_dexgraspbench, raw_isaac_grasp, raw_graspgen), strict=True))
 
 
 def load(path: Path) -> yourdfpy.URDF:

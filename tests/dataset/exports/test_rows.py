@@ -56,6 +56,10 @@ def entries(folder, form: str) -> list[dict]:
     if form == "isaac-grasp":
         grasps = yaml.safe_load((folder / "grasps" / "cup.yaml").read_text())["grasps"]
         return [grasps[f"grasp_{number}"] for number in range(len(grasps))]
+    if form == "graspgen":
+        lists = json.loads((folder / "grasps" / "cup.json").read_text())["grasps"]
+        lists.pop("joint_names")
+        return [dict(zip(lists, entry, strict=True)) for entry in zip(*lists.values(), strict=True)]
     if form == "dexgraspnet":
         return load_objects(folder / "grasps" / "cup.npy")
     return [load_objects(file)[0] for file in sorted((folder / "grasps" / "cup").iterdir())]
@@ -188,7 +192,7 @@ def test_bad_input_leaves_nothing(tmp_path, shards):
     ]:
         with pytest.raises(error, match=words):
             export_shards(tmp_path / source, tmp_path / out, "dexgraspnet", **options)
-    with pytest.raises(ConfigError, match="dexgraspnet, dexgraspbench, isaac-grasp, mjcf"):
+    with pytest.raises(ConfigError, match="dexgraspnet, dexgraspbench, isaac-grasp, graspgen, mjcf"):
         export_shards(tmp_path / "a.h5", tmp_path / "out", "urdf")
     assert {p.name for p in tmp_path.iterdir()} == {"a.h5", "b.h5", "full", "file"}
     assert [p.name for p in (tmp_path / "full").iterdir()] == ["mine"]
