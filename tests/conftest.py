@@ -15,6 +15,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support.kernels import compile_together
 
+from lgrasp import notices
 from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.batch import run_stages
@@ -128,6 +129,15 @@ def job(swift: Pipeline, cache_root: Path, tmp_path: Path) -> Callable[..., Gene
 def run(job: Callable[..., GenerateJob]) -> Callable[..., JobOutcome]:
     """Run a small job; keywords replace fields of :class:`GenerateJob`, ``array`` and ``resume`` say which parts."""
     return lambda array=(0, 1), resume=True, **changes: generate(job(**changes), array=array, resume=resume)
+
+
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Notices, as a process of its own tells them."""
+    lines: list[str] = []
+    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(notices, "_listeners", [lines.append])
+    return lines
 
 
 @pytest.fixture(scope="session")

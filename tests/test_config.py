@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import pytest
 
-from lgrasp import notices
 from lgrasp.config import Params, parse_model
 from lgrasp.engine.registry import STAGES
 from lgrasp.errors import ConfigError
@@ -14,14 +13,6 @@ class Stage(Params):
     RENAMED: ClassVar = {"slack": "allowed_penetration"}
 
     allowed_penetration: float = 0.001
-
-
-@pytest.fixture
-def said(monkeypatch):
-    lines: list[str] = []
-    monkeypatch.setattr(notices, "_said", set())
-    monkeypatch.setattr(notices, "_listeners", [lines.append])
-    return lines
 
 
 def test_old_key_is_read_and_said_once(said):

@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 
 import pytest
+from support.places import ROOT
 
 from lgrasp.grasp.outcomes import METRICS
 from lgrasp.hold.run import METRICS as HOLD_METRICS
 
-ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("hands/*/*.md")])
 LINK = re.compile(r"\]\(([^)\s]+)\)")

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.places import ROOT
 from support.sources import parse
 
-ROOT = Path(__file__).resolve().parents[1]
 MOST_ARGUMENTS = 10
 
 FILES = {

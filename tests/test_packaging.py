@@ -10,9 +10,9 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from support.places import ROOT
 from support.sources import parse
 
-ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("torch", "warp", "trimesh", "yourdfpy", "h5py", "scipy", "numpy", "coacd", "pytorch_kinematics")
 DATA = ("hands", "objects", "pipelines", "configs", "models")
 

@@ -1,4 +1,4 @@
-"""Folders in which files are damaged, missing or in each other's place: what can be used is, the rest is told."""
+"""Folders in which files are damaged, missing or in each other's place: what can be used is, the rest is said."""
 
 import os
 import shutil
@@ -8,7 +8,6 @@ import h5py
 import pytest
 from support.jaws import jaw_rows, jaw_shard
 
-from lgrasp import notices
 from lgrasp.dataset.files import check_heaps, sha256
 from lgrasp.dataset.reader import open_hdf5
 from lgrasp.dataset.scenes import SceneRows
@@ -19,15 +18,6 @@ from lgrasp.errors import HandError, ShardError
 from lgrasp.hand.urdf import read_robot
 from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.run import judge
-
-
-@pytest.fixture
-def told(monkeypatch):
-    """Notices."""
-    lines: list[str] = []
-    monkeypatch.setattr(notices, "_said", set())
-    monkeypatch.setattr(notices, "_listeners", [lines.append])
-    return lines
 
 
 @pytest.fixture
@@ -49,12 +39,12 @@ def folder(tmp_path):
     return shards
 
 
-def test_what_is_damaged_is_not_drawn(folder, told):
+def test_what_is_damaged_is_not_drawn(folder, said):
     rows = SceneRows([folder, folder])
     assert [path.name for path in rows.files] == ["0.h5", "1.h5"]
     assert rows.sound(range(len(rows))) == [0, 1, 2, 3]
     assert rows.sound(range(2, 8), most=1) == [2]
-    assert [line.partition(": ")[0] for line in told] == [
+    assert [line.partition(": ")[0] for line in said] == [
         f"2 of 4 files are left out, first {folder / '2.h5'}",
         str(folder / "1.h5"),
     ]
@@ -71,10 +61,10 @@ def test_a_shard_in_the_place_of_another(run, raw_grasps, cache_root, tmp_path):
     whole = raw_grasps(out)
     first, second = sorted(out.glob("*.h5"))
     shutil.copy(first, second)
-    told: list[str] = []
-    again = run(rows=40, cache=Cache(cache_root, told.append))
+    said: list[str] = []
+    again = run(rows=40, cache=Cache(cache_root, said.append))
     assert (again.made, again.present) == (20, 20)
-    assert told == [f"{second} holds shard 0, not 1; rebuilding it"]
+    assert said == [f"{second} holds shard 0, not 1; rebuilding it"]
     assert raw_grasps(out) == whole
 
 
@@ -88,7 +78,7 @@ def test_states_of_files_that_cannot_be_read(run, tmp_path):
     assert state["changed"] == {first.name: "it cannot be read: No such file or directory"}
 
 
-def test_pipes_are_not_waited_for(folder, told):
+def test_pipes_are_not_waited_for(folder, said):
     os.mkfifo(folder / "4.h5")
     assert [path.name for path in SceneRows(folder).files] == ["0.h5", "1.h5"]
     for read, refused in (

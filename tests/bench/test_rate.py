@@ -1,10 +1,10 @@
 """Benchmarks: what is handed from run to run, the arithmetic of the published table, and its picture."""
 
 import json
-from pathlib import Path
 from statistics import median
 
 import pytest
+from support.places import QUICK
 
 from lgrasp.bench import rate as bench_module
 from lgrasp.bench.charts import check_plot, draw_table
@@ -22,8 +22,6 @@ from lgrasp.bench.rate import Bench
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.jobs.config import JobConfig, in_folder, load_config, plan_requests
 from lgrasp.jobs.generate import generate
-
-QUICK = str(Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml")
 
 OBJECTS = ("capsule", "mug", "box")
 PUBLISHED = Published(

@@ -3,14 +3,14 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from support.places import ROOT
 
 from lgrasp.dataset.writer import write_shard
 from lgrasp.grasp.schema import ATTRIBUTES, DATASETS, FORMAT_VERSION, SEQUENCE_DATASETS, TABLE_FIELDS
 
-TEXT = (Path(__file__).parents[2] / "docs" / "reference" / "file-format.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs" / "reference" / "file-format.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
 
 

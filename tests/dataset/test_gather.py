@@ -11,16 +11,6 @@ from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import MADE_FROM
-from lgrasp.notices import on_notice
-
-
-@pytest.fixture
-def said(monkeypatch):
-    lines: list[str] = []
-    monkeypatch.setattr("lgrasp.notices._said", set())
-    monkeypatch.setattr("lgrasp.notices._listeners", [])
-    on_notice(lines.append)
-    return lines
 
 
 def write(path, index, run="a", **statistics):

@@ -11,7 +11,6 @@ from support.jobs import SampleJob, StopAfter
 from support.shards import sample_shard
 from typer.testing import CliRunner
 
-from lgrasp import notices
 from lgrasp.dataset.status import folder_states
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.writer import write_shard
@@ -19,14 +18,6 @@ from lgrasp.engine.events import Events
 from lgrasp.engine.run import run
 from lgrasp.errors import ShardError
 from lgrasp_cli.main import app
-
-
-@pytest.fixture
-def said(monkeypatch) -> list[str]:
-    lines: list[str] = []
-    monkeypatch.setattr(notices, "_listeners", [lines.append])
-    monkeypatch.setattr(notices, "_said", set())
-    return lines
 
 
 def call(*arguments):

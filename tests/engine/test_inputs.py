@@ -4,15 +4,10 @@ import trimesh
 
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Loader, object_key
-from lgrasp.notices import on_notice
 from lgrasp.object.params import ObjectParams
 
 
-def test_warnings_of_an_object(tmp_path, cache_root, monkeypatch):
-    lines: list[str] = []
-    monkeypatch.setattr("lgrasp.notices._said", set())
-    monkeypatch.setattr("lgrasp.notices._listeners", [])
-    on_notice(lines.append)
+def test_warnings_of_an_object(tmp_path, cache_root, monkeypatch, said):
     open_box, near = trimesh.creation.box([0.05] * 3), trimesh.creation.box([0.05] * 3)
     open_box.update_faces(range(2, 12))
     near.apply_translation([0.1, 0, 0])
@@ -24,4 +19,4 @@ def test_warnings_of_an_object(tmp_path, cache_root, monkeypatch):
     assert model.notes[0] == "joined 2 geometries into one object"
     told = [f"object 'pair': {note}" for note in model.notes if note.startswith(("joined", "not watertight"))]
     assert len(told) == 2
-    assert lines == told * 2
+    assert said == told * 2

@@ -12,7 +12,6 @@ import pytest
 from support.jobs import SampleJob, StopAfter
 from support.shards import sample_shard
 
-from lgrasp import notices
 from lgrasp.dataset.manifest import compare, read_manifest, workers
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.writer import write_shard
@@ -119,10 +118,7 @@ def test_files_that_came_before_the_manifest_belong(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [b"", b"{", b"\x00\xff", b"[]", b'{"format": "lgrasp-manifest", "runs": 3}'])
-def test_a_damaged_manifest_is_said_and_written_again(tmp_path, damage, monkeypatch):
-    said: list[str] = []
-    monkeypatch.setattr(notices, "_listeners", [said.append])
-    monkeypatch.setattr(notices, "_said", set())
+def test_a_damaged_manifest_is_said_and_written_again(tmp_path, damage, said):
     run(SampleJob(out=tmp_path))
     whole = (tmp_path / "manifest.json").read_bytes()
     (tmp_path / "manifest.json").write_bytes(damage)
@@ -137,10 +133,7 @@ def test_manifest_that_is_no_file(tmp_path):
         run(SampleJob(out=tmp_path))
 
 
-def test_missing_changed_and_foreign_shards_in_a_merge(tmp_path, monkeypatch):
-    said: list[str] = []
-    monkeypatch.setattr(notices, "_listeners", [said.append])
-    monkeypatch.setattr(notices, "_said", set())
+def test_missing_changed_and_foreign_shards_in_a_merge(tmp_path, said):
     folder, out = tmp_path / "run", tmp_path / "all.h5"
     run(SampleJob(out=folder), StopAfter(2))
     with pytest.raises(ShardError, match=r"1 of 3 shards are missing, first toy-cup-00002\.h5; .*--partial"):

@@ -8,7 +8,6 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from lgrasp import notices
 from lgrasp.engine.inputs import input_keys, run_key
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.engine.registry import ORDERS, STAGES
@@ -207,10 +206,7 @@ def test_version_of_a_stage_is_in_the_key(swift, monkeypatch):
     assert swift.describe() != before
 
 
-def test_a_stage_is_read_by_its_old_name(tmp_path, monkeypatch):
-    said: list[str] = []
-    monkeypatch.setattr(notices, "_said", set())
-    monkeypatch.setattr(notices, "_listeners", [said.append])
+def test_a_stage_is_read_by_its_old_name(tmp_path, said):
     text = pipeline_files()["swift"].read_text()
     (tmp_path / "old.yaml").write_text(f"{text.rstrip()}\n  - validate: {{protocol: gravity6}}\n")
     (tmp_path / "new.yaml").write_text(f"{text.rstrip()}\n  - simulate: {{protocol: gravity6}}\n")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 import yourdfpy
+from support.places import ASSETS, ROOT
 
 from lgrasp.hand.contacts import link_points
 from lgrasp.hand.find import find_hand
@@ -16,8 +17,7 @@ from lgrasp.hand.spec import load_spec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
 
-ROOT = Path(__file__).resolve().parents[2]
-ASSETS = ROOT.parent / "shared" / "assets" / "hands"
+ASSETS = ASSETS / "hands"
 # name -> movable joints, drives, dependency groups
 HANDS = {
     "allegro": (16, 16, 4),

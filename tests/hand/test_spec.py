@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from support.hands import REAL, ROOT, minimal_spec
+from support.hands import REAL, minimal_spec
+from support.places import ROOT
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from support.hands import ROOT
+from support.places import QUICK
 
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.validate import validate_shard
@@ -15,8 +15,6 @@ from lgrasp.engine.run import run
 from lgrasp.errors import ConfigError, HandError
 from lgrasp.jobs.compare.job import CompareJob
 from lgrasp.jobs.requests.compare import CompareRequest, parse_variations
-
-QUICK = str(ROOT / "tests" / "lgrasp_cli" / "quick.yaml")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from support.hands import ROOT
+from support.places import QUICK
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.writer import write_shard
@@ -38,7 +38,6 @@ from lgrasp.simulate.protocol import find_protocol
 from lgrasp.stages.refine.params import RefineParams
 from lgrasp_cli.progress import Bar, JobProgress
 
-QUICK = str(ROOT / "tests" / "lgrasp_cli" / "quick.yaml")
 NAMES = ("generate", "sequence", "refine", "plan", "simulate", "scenes", "learn", "metrics", "export", "compare")
 
 

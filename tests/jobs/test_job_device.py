@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from support.places import QUICK
 
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import input_keys, load_inputs
@@ -61,9 +62,8 @@ def test_plan(on_cpu, cold, tmp_path):
 
 
 def test_scenes(on_cpu, cold, tmp_path):
-    pipeline = Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml"
     small = {"objects": 1, "camera": {"width": 40, "height": 30, "views": 1}}
-    given = {"objects": ["tiny"], "pipeline": str(pipeline), "stock": 3, "scenes": 1, "workers": 1, "scene": small}
+    given = {"objects": ["tiny"], "pipeline": QUICK, "stock": 3, "scenes": 1, "workers": 1, "scene": small}
     made = run(SceneJob(**given, out=tmp_path / "out", cache=cold))
     assert len(made.written) == 1
     assert on_cpu == []

@@ -1,16 +1,16 @@
 """A cached hand serves wherever its files lie: no path is part of what the cache holds."""
 
 import shutil
-from pathlib import Path
 
 import pytest
+from support.places import ASSETS
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.jobs.generate import GenerateJob, generate
 
-REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "hands" / "allegro"
+REAL = ASSETS / "hands" / "allegro"
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real Allegro with mesh fingertips is not here")

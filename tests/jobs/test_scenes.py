@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from support.places import QUICK
 
 from lgrasp.cloud.read import read_cloud
 from lgrasp.dataset.reader import read_shard
@@ -19,7 +20,6 @@ from lgrasp.jobs.config import read_scene_config, scene_configs
 from lgrasp.jobs.scenes.job import SceneJob, describe_scenes
 from lgrasp.scenes.files import SceneReader, check_scene, read_scene, scene_cloud, write_scene
 
-QUICK = Path(__file__).parents[1] / "lgrasp_cli" / "quick.yaml"
 OBJECTS = ["box", "sphere", "tiny"]
 SCENES = 3
 
@@ -32,7 +32,7 @@ def make(cache_root: Path):
         data = {
             "hand": "allegro",
             "objects": OBJECTS,
-            "pipeline": str(QUICK),
+            "pipeline": QUICK,
             "stock": 40,
             "scenes": SCENES,
             "out": out,

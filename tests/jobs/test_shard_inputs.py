@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.places import ASSETS
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
@@ -24,7 +25,7 @@ from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, named_object, ob
 from lgrasp.runtime.device import resolve_device
 
 CPU = resolve_device("cpu")
-REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "hands" / "allegro"
+REAL = ASSETS / "hands" / "allegro"
 
 
 @pytest.fixture(scope="module")

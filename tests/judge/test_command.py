@@ -10,13 +10,13 @@ import h5py
 import numpy as np
 import pytest
 from support.jawshard import URDF, row, write_shard
+from support.places import ROOT
 from typer.testing import CliRunner
 
 from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.run import judge
 from lgrasp_cli.main import app
 
-ROOT = Path(__file__).resolve().parents[2]
 ALONE = """
 import sys
 

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from support.places import QUICK
 
 from lgrasp import notices
 from lgrasp.runtime.device import start
 from lgrasp.runtime.kernels import load_kernels
 from lgrasp_cli import progress
 from lgrasp_cli.main import main
-
-QUICK = str(Path(__file__).parent / "quick.yaml")
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import yaml
-from support.hands import ROOT
+from support.places import ROOT
 from support.urdfs import gripper
 
 from lgrasp.hand.names import PACKAGE_HANDS

@@ -1,10 +1,10 @@
 """docs/reference/cli.md says what the commands say."""
 
-from pathlib import Path
+from support.places import ROOT
 
 from lgrasp_cli.reference import cli_page
 
-PAGE = Path(__file__).parents[2] / "docs" / "reference" / "cli.md"
+PAGE = ROOT / "docs" / "reference" / "cli.md"
 
 
 def test_page_equals_commands():

@@ -1,12 +1,11 @@
 """``lgrasp render``."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from PIL import Image
+from support.places import TINY_SHARD
 
-SHARD = Path(__file__).parents[1] / "dataset" / "exports" / "allegro-tiny.h5"
+SHARD = TINY_SHARD
 
 
 def test_pictures_of_rows(cli, tmp_path):

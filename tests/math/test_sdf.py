@@ -2,36 +2,10 @@
 
 import numpy as np
 import pytest
-import warp as wp
+from support.look_up import look_up
 from support.sdf import trilinear, trilinear_gradient
 
-from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_value
-from lgrasp.runtime.device import KERNEL_OPTIONS
-
-wp.set_module_options(KERNEL_OPTIONS)
-
 SHAPE, CELL, ORIGIN, RADIUS = (21, 26, 31), 0.004, np.array([-0.04, -0.05, -0.06]), 0.02
-
-
-@wp.kernel
-def _look_up(s: Sdf, p: wp.array(dtype=wp.vec3), value_out: wp.array(dtype=float), slope_out: wp.array(dtype=wp.vec4)):
-    i = wp.tid()
-    value_out[i] = sdf_value(s, p[i])
-    slope_out[i] = sdf_gradient(s, p[i])
-
-
-def look_up(device, values: np.ndarray, p: np.ndarray, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Values (n,) and (gradient, value) (n, 4) at points p; ``first`` numbers of another grid come before this one."""
-    s = Sdf()
-    flat = np.concatenate([np.full(first, np.nan), values.ravel(), [np.nan]]).astype(np.float32)
-    s.values = wp.array(flat, dtype=wp.float32, device=device)
-    s.first = first
-    s.nx, s.ny, s.nz = values.shape
-    s.origin = wp.vec3(*ORIGIN)
-    s.inv_cell = 1 / CELL
-    value, gradient = wp.empty(len(p), dtype=float, device=device), wp.empty(len(p), dtype=wp.vec4, device=device)
-    wp.launch(_look_up, len(p), [s, wp.array(p.astype(np.float32), dtype=wp.vec3, device=device)], [value, gradient])
-    return value.numpy(), gradient.numpy()
 
 
 def nodes() -> np.ndarray:
@@ -45,7 +19,7 @@ def inside(n: int, seed: int) -> np.ndarray:
 def test_value_and_gradient_are_trilinear(device):
     values = np.random.default_rng(0).normal(size=SHAPE) * 0.01
     p = inside(5000, 1)
-    value, gradient = look_up(device, values, p, first=17)
+    value, gradient = look_up(device, values, ORIGIN, CELL, p, first=17)
     np.testing.assert_allclose(value, trilinear(values, ORIGIN, CELL, p), atol=2e-7)
     np.testing.assert_allclose(gradient[:, 3], value, atol=1e-7)
     slope = trilinear_gradient(values, ORIGIN, CELL, p)
@@ -57,14 +31,14 @@ def test_value_and_gradient_are_trilinear(device):
 def test_nodes_are_met_exactly(device):
     values = np.random.default_rng(2).normal(size=SHAPE) * 0.01
     p = nodes()[:-1, :-1, :-1].reshape(-1, 3)
-    value, _ = look_up(device, values, p)
+    value, _ = look_up(device, values, ORIGIN, CELL, p)
     np.testing.assert_allclose(value, values[:-1, :-1, :-1].ravel(), atol=3e-7)
 
 
 def test_last_layer_is_not_lost(device):
     values = np.random.default_rng(3).normal(size=SHAPE) ** 2 * 0.01 + 0.001
     top = nodes()[-1].reshape(-1, 3)
-    value, gradient = look_up(device, values, top)
+    value, gradient = look_up(device, values, ORIGIN, CELL, top)
     np.testing.assert_allclose(value, values[-1].ravel(), atol=2e-4)
     assert np.isfinite(gradient).all()
 
@@ -78,7 +52,7 @@ def test_far_points_get_a_lower_bound(device):
     exact = np.linalg.norm(p, axis=1) - RADIUS
     x = (p - ORIGIN) / CELL
     outside = ((x < 0) | (x > np.array(SHAPE) - 1)).any(1)
-    value, gradient = look_up(device, values, p)
+    value, gradient = look_up(device, values, ORIGIN, CELL, p)
     assert outside.sum() > 3000
     assert (value[outside] <= exact[outside] + 1e-4).all()  # 0.1 mm of interpolation
     # positive outside, and not worse than half: a ray to the grid's surface and the rest of the way back
@@ -93,12 +67,12 @@ def test_far_points_get_a_lower_bound(device):
 @pytest.mark.parametrize("p", [[1e9, 0, 0], [-1e9, 1e9, 1e9], [0, 0, -1e6]])
 def test_absurd_points_are_far(device, p):
     values = np.linalg.norm(nodes(), axis=-1) - RADIUS
-    value, gradient = look_up(device, values, np.array([p], float))
+    value, gradient = look_up(device, values, ORIGIN, CELL, np.array([p], float))
     assert value[0] > 1e5
     assert np.isfinite(gradient).all()
 
 
 def test_flat_grid_has_no_direction_but_is_finite(device):
-    value, gradient = look_up(device, np.full(SHAPE, 0.01), inside(50, 5))
+    value, gradient = look_up(device, np.full(SHAPE, 0.01), ORIGIN, CELL, inside(50, 5))
     np.testing.assert_allclose(value, 0.01)
     assert np.isfinite(gradient).all()

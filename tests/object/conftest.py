@@ -4,10 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support.places import ASSETS
 
 from lgrasp.object.params import ObjectParams
 
-REAL = Path(__file__).resolve().parents[3] / "shared" / "assets" / "objects"
+REAL = ASSETS / "objects"
 
 
 @pytest.fixture(scope="session")

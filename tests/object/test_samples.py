@@ -1,16 +1,15 @@
 """The shipped sample objects are what their script builds."""
 
-from pathlib import Path
-
 import pytest
 import trimesh
 import yaml
+from support.places import ROOT
 from support.samples import SAMPLES, build_sample, write_samples
 
 from lgrasp.object.find import find_object
 from lgrasp.object.preprocess import preprocess_object
 
-SHIPPED = Path(__file__).resolve().parents[2] / "objects"
+SHIPPED = ROOT / "objects"
 
 
 @pytest.mark.parametrize("name", SAMPLES)

@@ -1,15 +1,15 @@
 """docs/guides/scenes.md names every member of the format and every parameter with its default."""
 
 import re
-from pathlib import Path
 
 import yaml
+from support.places import ROOT
 
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES
 from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.scenes.schema import ATTRIBUTES, DATASETS, FORMAT, FORMAT_VERSION
 
-TEXT = (Path(__file__).parents[2] / "docs" / "guides" / "scenes.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs" / "guides" / "scenes.md").read_text(encoding="utf-8")
 NAMES = {"f4": "float32", "i4": "int32", "i2": "int16", "u2": "uint16", "u8": "uint64", "?": "bool"}
 
 

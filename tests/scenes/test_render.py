@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
-import warp as wp
 
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.camera import Intrinsics, look_at
 from lgrasp.picture.depth import NOTHING, LabelledMesh, join_surfaces, render
-from lgrasp.runtime.device import start
 from lgrasp.scenes.camera import intrinsics_of, place_cameras
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.render import (
@@ -23,14 +21,6 @@ from lgrasp.scenes.render import (
 SIZE = 0.8
 RADIUS = 0.08
 CENTRE = np.array([0.05, -0.03, 0.2])
-
-
-@pytest.fixture(scope="module", params=["cpu", "cuda:0"])
-def device(request):
-    start()
-    if request.param != "cpu" and wp.get_cuda_device_count() == 0:
-        pytest.skip("no GPU here")
-    return request.param
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from support.places import ROOT
 
 from lgrasp.engine.pipeline import pipeline_files
 from lgrasp.engine.registry import OPTIONAL, ORDERS, STAGES
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "guides" / "pipeline.md"
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from support.hands import ROOT
+from support.places import ROOT
 
 from lgrasp.errors import ConfigError, HandError
 from lgrasp.hand.find import find_hand

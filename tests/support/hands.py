@@ -4,14 +4,14 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from support.places import ASSETS
 
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.spec import HandSpec
 
-ROOT = Path(__file__).resolve().parents[2]
-REAL = ROOT.parent / "shared" / "assets" / "hands"
+REAL = ASSETS / "hands"
 
 CONTACT = {
     "leap": ["fingertip", "fingertip_2", "fingertip_3", "thumb_fingertip"],

@@ -1,13 +1,13 @@
 """What a user sees and does in a browser; slow there, so all of it on one page for each kind."""
 
 import io
-from pathlib import Path
 
 import numpy as np
 import trimesh
 from PIL import Image
+from support.places import TINY_SHARD
 
-SHARD = Path(__file__).parents[1] / "dataset" / "exports" / "allegro-tiny.h5"
+SHARD = TINY_SHARD
 
 
 def orange(picture: Image.Image) -> int:

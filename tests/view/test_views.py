@@ -1,11 +1,11 @@
 """What the viewer shows, by what it holds; no browser."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.jaws import jaw_rows, jaw_shard
+from support.places import TINY_SHARD
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.errors import ConfigError
@@ -13,7 +13,7 @@ from lgrasp.picture.camera import Intrinsics
 from lgrasp.scenes.files import write_scene
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord
 
-SHARD = Path(__file__).parents[1] / "dataset" / "exports" / "allegro-tiny.h5"
+SHARD = TINY_SHARD
 
 
 @pytest.fixture(scope="module")

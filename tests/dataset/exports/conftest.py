@@ -11,12 +11,11 @@ import trimesh
 import yaml
 import yourdfpy
 from scipy.spatial.transform import Rotation
+from support.places import ASSETS, ROOT
 
 from lgrasp.dataset.writer import write_shard
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 
-ROOT = Path(__file__).resolve().parents[3]
-ASSETS = ROOT.parent / "shared" / "assets"
 REAL = {"schunk_svh": "schunk_svh/schunk_svh.urdf", "barrett": "barrett/barrett_mimic.urdf"}
 
 

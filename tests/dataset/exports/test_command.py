@@ -7,16 +7,16 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from support.places import TINY_SHARD
 
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp_cli.main import main
 from lgrasp_cli.progress import JobProgress
 
-GENERATED = Path(__file__).parent / "allegro-tiny.h5"  # lgrasp generate --object tiny -n 10
+GENERATED = TINY_SHARD  # lgrasp generate --object tiny -n 10
 
 
 @pytest.fixture

@@ -2,18 +2,18 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from support.places import ROOT
 
 from lgrasp.dataset.normalisation import Normalisation
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.split import make_split
 from lgrasp.dataset.writer import write_shard
 
-DOCS = Path(__file__).resolve().parents[3] / "docs" / "guides"
+DOCS = ROOT / "docs" / "guides"
 
 
 def examples(name: str) -> str:

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import trimesh
-from support.hands import ROOT
+from support.places import ROOT
 from support.urdfs import fingers, gripper, turned
 
 from lgrasp.errors import HandError

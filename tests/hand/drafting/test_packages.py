@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from support.hands import ROOT
+from support.places import ROOT
 from support.urdfs import gripper
 
 from lgrasp.errors import HandError, ObjectError

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.hands import REAL, ROOT
+from support.hands import REAL
+from support.places import ROOT
 from support.urdfs import fingers, gripper, turned
 
 from lgrasp.hand.drafting.draft import draft_spec

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
-from support.hands import ROOT
+from support.places import ROOT
 from support.urdfs import fingers
 
 from lgrasp.errors import HandError

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.hands import FILES, REAL, ROOT, hand_source, minimal_spec
+from support.hands import FILES, REAL, hand_source, minimal_spec
+from support.places import ROOT
 from support.urdfs import fingers, gripper, turned
 
 from lgrasp.hand.build import build_hand

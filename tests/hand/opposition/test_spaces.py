@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lxml import etree
 from scipy.ndimage import map_coordinates
-from support.hands import ROOT, hand_model, hand_source
+from support.hands import hand_model, hand_source
+from support.places import ROOT
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
