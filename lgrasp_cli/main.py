@@ -22,9 +22,10 @@ from lgrasp_cli.run import run
 from lgrasp_cli.sequence import sample, sequence
 from lgrasp_cli.simulate import simulate
 from lgrasp_cli.status import status
+from lgrasp_cli.submit import WORDS, submit
 
 _PANELS = {
-    "Generate": (generate, sequence, sample, plan, refine, run),
+    "Generate": (generate, sequence, sample, plan, refine, run, submit),
     "Check": (simulate, judge, status),
     "Look": (render, view, hands.app, catalog.objects, catalog.pipelines),
     "Data": (dataset.app, dataset.export, scenes.app),
@@ -54,7 +55,7 @@ for panel, members in _PANELS.items():
         if isinstance(member, typer.Typer):
             app.add_typer(member, rich_help_panel=panel)
         else:
-            app.command(rich_help_panel=panel)(member)
+            app.command(rich_help_panel=panel, context_settings=WORDS if member is submit else None)(member)
 app.command("validate", hidden=True)(old_name(simulate, "lgrasp validate", "lgrasp simulate"))
 
 

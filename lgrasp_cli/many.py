@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from lgrasp_cli.tables import TextTable, print_report
-from lgrasp_cli.working import How, conclude, run_job
+from lgrasp_cli.working import How, conclude, merely_checked, run_job
 
 if TYPE_CHECKING:
     from lgrasp.engine.request import Request
@@ -19,6 +19,8 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
     Args:
         dry_run: show what would be done instead.
     """
+    if merely_checked(requests, how.cache):
+        return
     if dry_run:
         show_plans([(r.job(how.cache), own) for r, own in zip(requests, how.of_each(requests), strict=True)], how)
         return

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +25,40 @@ if TYPE_CHECKING:
 
 Show = Callable[[dict[str, Any]], Sequence[Block]]
 """What is shown of the report of a job."""
+
+
+_CHECKED: ContextVar[list[int] | None] = ContextVar("checked", default=None)
+
+
+@contextmanager
+def only_checked() -> "Iterator[list[int]]":
+    """Commands check their jobs in the block and run none; numbers of parts of the jobs, once they are checked."""
+    found: list[int] = []
+    token = _CHECKED.set(found)
+    try:
+        yield found
+    finally:
+        _CHECKED.reset(token)
+
+
+def merely_checked(requests: "Sequence[Request]", cache: "Cache") -> bool:
+    """True in a block of :func:`only_checked`: jobs are checked now.
+
+    Raises:
+        LgraspError: a value, a name or a path that cannot be.
+    """
+    found = _CHECKED.get()
+    if found is None:
+        return False
+    from lgrasp.engine.run import Job
+    from lgrasp.files import check_folder
+
+    for request in requests:
+        request.check()
+        job = request if isinstance(request, Job) else request.job(cache)
+        found.append(len(job.parts()))
+        check_folder(job.folder)
+    return True
 
 
 @dataclass(frozen=True)
@@ -96,6 +131,8 @@ class How:
             show: what a user decides by, of its report.
             profile: what --verbose adds.
         """
+        if merely_checked([job], self.cache):
+            return
         with self.spread([job]) as (how,):
             data, outcome = run_job(job, how)
         nothing = self.quiet or self.json_path == "-" or (outcome.cancelled and not outcome.paths)
@@ -150,6 +187,8 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
             notice(f"--shard-index and --num-shards are now --array {array}; the old names work in this release only")
         shares = parse_array(array)
         cache = open_cache(cache_dir, fresh=rebuild)
+        if _CHECKED.get() is not None:  # the devices are those of another computer
+            device = None
         several = device if device is not None and (device == "all" or "," in device) else None
         first = device if several is None else {"all": "auto"}.get(several, several.split(",")[0])
         command(

@@ -1,0 +1,178 @@
+"""``lgrasp submit``: a command as a SLURM job, whose tasks share its files."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from lgrasp_cli.tables import Answer, plural, reporting
+
+WORDS = {"allow_interspersed_args": False}
+"""Settings of the command: from its first word on, the words are those of the other command."""
+
+_PATIENCE = 60.0  # [s] for sbatch
+
+
+@reporting
+def submit(
+    context: typer.Context,
+    words: Annotated[list[str], Argument(metavar="COMMAND", help="Command that makes files, and its options.")],
+    tasks: Annotated[int, Option(min=1, help="Tasks that share the files.")] = 1,
+    gpus: Annotated[int, Option(min=0, help="GPUs of a task; it uses all.")] = 0,
+    cpus: Annotated[int | None, Option(min=1, help="CPU cores of a task.")] = None,
+    memory: Annotated[str | None, Option("--mem", help="Memory of a task: 16G.")] = None,
+    limit: Annotated[str | None, Option("--time", help="Time limit of a task: 2:00:00.")] = None,
+    partition: Annotated[str | None, Option(help="Partition.")] = None,
+    account: Annotated[str | None, Option(help="Account.")] = None,
+    name: Annotated[str | None, Option(help="Name of the job; default: lgrasp-COMMAND.")] = None,
+    more: Annotated[
+        list[str] | None, Option("--sbatch", metavar="NAME=VALUE", help="Another option of sbatch; repeatable.")
+    ] = None,
+    logs: Annotated[Path, Option(help="Folder of script and logs.")] = Path("logs"),
+    dry_run: Annotated[bool, Option("--dry-run", help="Print the script, submit nothing.")] = False,
+) -> Answer:
+    """Submit a command to SLURM, as an array of tasks that share its files; the command is checked first.
+
+    Example: lgrasp submit --tasks 10 --gpus 1 --time 2:00:00 -- generate --object mug -n 100000
+    """
+    from lgrasp.errors import ConfigError
+
+    words = words[1:] if words[0] == "lgrasp" else words
+    parts = _checked(context.find_root().command, words)
+    if parts < tasks:
+        raise ConfigError(
+            f"--tasks {tasks}: the command makes {plural(parts, 'file')}; give --tasks {parts} or fewer, or make "
+            "smaller files (--shard-rows)"
+        )
+    if gpus > 1 and not any(re.match("--device(=|$)", word) for word in words):
+        words = [*words, "--device", "all"]
+    name = name or f"lgrasp-{words[0]}"
+    if not re.fullmatch(r"[\w.+-]+", name):
+        raise ConfigError(f"--name '{name}' may hold letters, digits and '.', '_', '+', '-' only")
+    options = {
+        "job-name": name,
+        "output": str(logs.absolute() / ("%x-%A_%a.log" if tasks > 1 else "%x-%j.log")),
+        "open-mode": "append",  # of a task that is requeued
+        "array": f"0-{tasks - 1}" if tasks > 1 else None,
+        "gres": f"gpu:{gpus}" if gpus else None,
+        "cpus-per-task": cpus,
+        "mem": memory,
+        "time": limit,
+        "partition": partition,
+        "account": account,
+    } | _more(more or [])
+    script = _script({option: str(value) for option, value in options.items() if value is not None}, words)
+    if dry_run:
+        return Answer({"script": script, "tasks": tasks, "files": parts}, [script, "dry run: nothing was submitted"])
+    if not shutil.which("sbatch"):
+        typer.echo(script)
+        raise ConfigError("there is no sbatch here: nothing was submitted; this is the script")
+    job, path = _submit(script, logs, name)
+    pairs = [
+        ("job", f"{job}: {plural(tasks, 'task')}, {plural(parts, 'file')}"),
+        ("script", str(path)),
+        ("logs", options["output"].replace("%x", name).replace("%A", job).replace("%j", job).replace("%a", "TASK")),
+        ("cancel", f"scancel {job}"),
+    ]
+    return Answer({"job": job, "tasks": tasks, "files": parts, "script": str(path), "logs": str(logs)}, [pairs])
+
+
+def _checked(program: Any, words: list[str]) -> int:
+    """How many files a command of the program makes; it is checked as far as can be told before anything is loaded.
+
+    Raises:
+        LgraspError: an option, a name, a number or a path that cannot be.
+    """
+    from lgrasp.errors import ConfigError
+    from lgrasp_cli.working import only_checked
+
+    known = program
+    for word in words:
+        if not (known := getattr(known, "commands", {}).get(word)):
+            break
+        if any(option.name == "array" for option in known.params):
+            break
+    if known is None or not any(option.name == "array" for option in known.params):
+        raise ConfigError(f"'{' '.join(words[:2])}' is no command that makes files, such as generate, simulate or run")
+    for word in words:
+        if re.match(r"--(array|dry-run)(=|$)", word):
+            raise ConfigError(
+                f"{word} has no place in a command that is submitted; tasks share its files by themselves"
+            )
+    with only_checked() as parts:
+        program.main(args=words, prog_name="lgrasp", standalone_mode=False)
+    return sum(parts)
+
+
+def _more(options: list[str]) -> dict[str, str]:
+    from lgrasp.errors import ConfigError
+
+    found = {}
+    for option in options:
+        name, sign, value = option.partition("=")
+        if not re.fullmatch(r"[a-z][a-z-]*", name := name.removeprefix("--")):
+            raise ConfigError(f"--sbatch '{option}': give a long name of sbatch, and its value, such as qos=high")
+        found[name] = value if sign else ""
+    return found
+
+
+def _script(options: dict[str, str], words: list[str]) -> str:
+    """The script for sbatch.
+
+    Raises:
+        ConfigError: a value of several lines.
+    """
+    from lgrasp.errors import ConfigError
+
+    for option, value in options.items():
+        if not value.isprintable():
+            raise ConfigError(f"--{option} {value!r} must be one line")
+    lines = [f"#SBATCH --{option}" + (f"={shlex.quote(value)}" if value else "") for option, value in options.items()]
+    kept = [
+        f"export {key}={shlex.quote(os.environ[key])}"
+        for key in ("LGRASP_CACHE_DIR", "PYTHONPATH")
+        if key in os.environ
+    ]
+    run = shlex.join([sys.executable, "-m", "lgrasp_cli", *words])
+    return "\n".join(["#!/bin/bash", *lines, f"cd {shlex.quote(os.getcwd())} || exit 2", *kept, f"exec {run}"]) + "\n"
+
+
+def _submit(script: str, logs: Path, name: str) -> tuple[str, Path]:
+    """Number of the submitted job, and the script's file.
+
+    Raises:
+        ConfigError: sbatch refuses it.
+        OutputError: the folder cannot be written.
+    """
+    from lgrasp.errors import ConfigError
+    from lgrasp.files import check_folder, write_file
+
+    check_folder(logs)
+    logs.mkdir(parents=True, exist_ok=True)  # SLURM makes none
+    own = {key: value for key, value in os.environ.items() if key != "TMPDIR"}  # which goes with this process
+    try:
+        done = subprocess.run(
+            ["sbatch", "--parsable"],
+            input=script,
+            env=own,
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ConfigError(f"sbatch cannot be run: {error}") from None
+    if done.returncode:
+        reason = done.stderr.strip().removeprefix("sbatch: ") or f"exit code {done.returncode}"
+        raise ConfigError(f"sbatch refuses it: {reason}")
+    job = done.stdout.strip().split(";")[0]
+    path = logs / f"{name}-{job}.sh"
+    write_file(path, script)
+    return job, path
