@@ -16,6 +16,7 @@ from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_gra
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
 from lgrasp.dataset.exports.reading import GraspSet
 from lgrasp.dataset.exports.selection import Selection, select_rows
+from lgrasp.dataset.exports.usd import USD_NOTES, UsdWriter, read_usd
 from lgrasp.dataset.files import Paths
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.files import write_file
@@ -46,6 +47,7 @@ FORMATS = {
     "dexgraspbench": Format(True, DEXGRASPBENCH_NOTES, _plain(write_dexgraspbench), read_dexgraspbench),
     "isaac-grasp": Format(True, ISAAC_GRASP_NOTES, _plain(write_isaac_grasp), read_isaac_grasp),
     "graspgen": Format(True, GRASPGEN_NOTES, _plain(write_graspgen), read_graspgen),
+    "usd": Format(True, USD_NOTES, UsdWriter, read_usd),
     "mjcf": Format(False, MJCF_NOTES, MjcfWriter, read_mjcf),
 }
 """Formats by the name that ``--to`` takes."""

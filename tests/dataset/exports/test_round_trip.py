@@ -10,13 +10,14 @@ import pytest
 import trimesh
 import yaml
 import yourdfpy
+from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.object.mass import mass_properties
 
-SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp", "graspgen"]
+SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp", "graspgen", "usd"]
 HANDS = ["allegro", "schunk_svh", "barrett", "shadow"]
 
 
@@ -72,7 +73,17 @@ def raw_graspgen(out: Path, row: int):
     return np.array(grasps["transforms"][row]), "root_link", joints
 
 
-RAW = dict(zip(SINGLE, (raw_dexgraspnet, raw_dexgraspbench, raw_isaac_grasp, raw_graspgen), strict=True))
+def raw_usd(out: Path, row: int):
+    stage = Usd.Stage.Open(str(out / "grasps" / "cup.usdc"))  # prims are gone with it
+    hand = stage.GetPrimAtPath("/World/hand")
+    assert hand.GetAttribute("lgrasp:holds").Get(row)
+    joints = dict(
+        zip(hand.GetAttribute("lgrasp:jointNames").Get(), hand.GetAttribute("lgrasp:grasp").Get(row), strict=True)
+    )
+    return np.array(hand.GetAttribute("lgrasp:root").Get(row)).T, "root_link", joints
+
+
+RAW = dict(zip(SINGLE, (raw_dexgraspnet, raw_dexgraspbench, raw_isaac_grasp, raw_graspgen, raw_usd), strict=True))
 
 
 def load(path: Path) -> yourdfpy.URDF:
@@ -109,6 +120,39 @@ def test_read_back(tmp_path, shards, hand, form):
     turned = tuple(reversed(read.joint_names))
     assert_same(read_grasps(tmp_path / "out", form, joint_names=turned), shard, form)
     assert read_grasps(tmp_path / "out", form, joint_names=turned).joint_names == turned
+
+
+@pytest.mark.parametrize("hand", ["allegro", "shadow"])
+def test_points_of_a_stage(tmp_path, shards, hand):
+    """In each posture and row the points of every link in the world, by OpenUSD, are where yourdfpy has that link; the
+    object's are those of the shard."""
+    shard = shards.make(tmp_path / "a.h5", hand, n=3)
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "usd")
+    (tmp_path / "hand.urdf").write_text(shard.hand.urdf)
+    urdf = yourdfpy.URDF.load(str(tmp_path / "hand.urdf"), load_meshes=False)
+    stage = Usd.Stage.Open(str(tmp_path / "out" / "grasps" / "cup.usdc"))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, 2)
+    assert (UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)) == (1.0, "Z")
+    variants = stage.GetPrimAtPath("/World/hand").GetVariantSet("posture")
+    assert variants.GetVariantSelection() == "grasp"
+    cup = UsdGeom.Mesh(stage.GetPrimAtPath("/World/cup"))
+    np.testing.assert_array_equal(cup.GetPointsAttr().Get(), shard.objects[0].vertices)
+    links = {name.replace(".", "_"): name for name in shard.hand.link_names}
+    shown = list(stage.GetPrimAtPath("/World/hand").GetChildren())
+    assert len(shown) > 10
+    for posture, q in (("grasp", shard.grasps.q), ("pregrasp", shard.grasps.q_pregrasp)):
+        variants.SetVariantSelection(posture)
+        for row in range(3):
+            pose, now = shard.grasps.object_pose[row, 0], UsdGeom.XformCache(row)
+            T_base_object = matrix(pose[:3], Rotation.from_quat(pose[3:], scalar_first=True))
+            posed(urdf, dict(zip(shard.hand.joint_names, q[row], strict=True)))
+            for prim in shown:
+                mesh = prim.GetChild("mesh")
+                points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get(), float)
+                points = np.append(points, np.ones((len(points), 1)), 1)
+                T = np.linalg.inv(T_base_object) @ urdf.get_transform(links[prim.GetName()], shard.hand.base_link)
+                got = points @ np.array(now.GetLocalToWorldTransform(mesh))
+                np.testing.assert_allclose(got, points @ T.T, atol=1e-6)
 
 
 @pytest.mark.parametrize("form", SINGLE)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from lxml import etree
+from pxr import Usd
 
 from lgrasp.dataset.conditions import Condition, parse_condition
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
@@ -60,6 +61,11 @@ def entries(folder, form: str) -> list[dict]:
         lists = json.loads((folder / "grasps" / "cup.json").read_text())["grasps"]
         lists.pop("joint_names")
         return [dict(zip(lists, entry, strict=True)) for entry in zip(*lists.values(), strict=True)]
+    if form == "usd":
+        stage = Usd.Stage.Open(str(folder / "grasps" / "cup.usdc"))  # prims are gone with it
+        hand = stage.GetPrimAtPath("/World/hand")
+        names = [a.GetName() for a in hand.GetAttributes() if "table" in a.GetName()]
+        return [{n.removeprefix("lgrasp:"): hand.GetAttribute(n).Get(t) for n in names} for t in range(4)]
     if form == "dexgraspnet":
         return load_objects(folder / "grasps" / "cup.npy")
     return [load_objects(file)[0] for file in sorted((folder / "grasps" / "cup").iterdir())]
@@ -192,7 +198,7 @@ def test_bad_input_leaves_nothing(tmp_path, shards):
     ]:
         with pytest.raises(error, match=words):
             export_shards(tmp_path / source, tmp_path / out, "dexgraspnet", **options)
-    with pytest.raises(ConfigError, match="dexgraspnet, dexgraspbench, isaac-grasp, graspgen, mjcf"):
+    with pytest.raises(ConfigError, match="dexgraspnet, dexgraspbench, isaac-grasp, graspgen, usd, mjcf"):
         export_shards(tmp_path / "a.h5", tmp_path / "out", "urdf")
     assert {p.name for p in tmp_path.iterdir()} == {"a.h5", "b.h5", "full", "file"}
     assert [p.name for p in (tmp_path / "full").iterdir()] == ["mine"]
