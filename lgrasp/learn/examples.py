@@ -50,7 +50,7 @@ def make_examples(
     params: LearnParams,
     rng: np.random.Generator,
     clouds: int,
-    device: str,
+    device: str = "cpu",
 ) -> Examples:
     """Clouds and labels of one object.
 

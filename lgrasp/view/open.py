@@ -29,7 +29,7 @@ _Make = Callable[["viser.ViserServer"], View]
 
 
 def open_view(
-    what: Sequence[str], cache: Cache, *, host: str, port: int, row: int, where: Sequence[str]
+    what: Sequence[str], cache: Cache, *, host: str, port: int, row: int = 0, where: Sequence[str] = ()
 ) -> tuple["viser.ViserServer", View]:
     """A server that shows what is named.
 

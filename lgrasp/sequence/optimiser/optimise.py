@@ -43,8 +43,8 @@ def optimise(
     held: np.ndarray,
     seed: np.ndarray,
     params: OptimiserParams,
-    method: Literal["anneal", "mala"],
-    device: str,
+    method: Literal["anneal", "mala"] = "anneal",
+    device: str = "cpu",
     rows: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Optimised:
