@@ -1,5 +1,6 @@
 """What tests of engine, tables and stages share: a hand, a small contact field and an object, made once."""
 
+import gc
 import os
 import signal
 import socket
@@ -32,6 +33,11 @@ from lgrasp.stages.context import Context
 OBJECT = "mug"
 RECORDS = 20_000
 CANDIDATES = 2000
+
+
+def pytest_collection_finish() -> None:
+    """What was imported and collected stays: the garbage collector need not look at it again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

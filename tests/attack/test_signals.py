@@ -18,9 +18,10 @@ TIMES = {"generate": 1, "dataset merge": 1, "simulate": 1}
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks for processes in /proc")
-def test_random_moments(tmp_path):
+def test_random_moments(load, cache_root, tmp_path):
+    load("tiny")  # what the commands begin with, and other tests
     random, ways = np.random.default_rng(15), cycle(WAYS)
-    place = Soak(tmp_path, Path(wp.config.kernel_cache_dir).parent, launch=start_forked)
+    place = Soak(tmp_path, Path(wp.config.kernel_cache_dir).parent, cache=cache_root, launch=start_forked)
     found = [place.end(name, next(ways), random.uniform()) for name, times in TIMES.items() for _ in range(times)]
     assert len(found) == sum(TIMES.values())
     assert any(attack.died for attack in found)

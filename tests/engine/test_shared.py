@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.field.params import FieldParams
 from lgrasp.grasp.records import GraspRows
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.find import find_hand
@@ -18,6 +19,8 @@ from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.judge.run import judge
 from lgrasp.runtime.device import resolve_device
 
+FIELD = FieldParams(records=20_000, index="bvh")  # as other tests make it of these hands
+
 
 @pytest.fixture
 def cache(cache_root) -> Cache:
@@ -26,8 +29,7 @@ def cache(cache_root) -> Cache:
 
 @pytest.mark.parametrize("name", ["barrett", "schunk_svh"])
 def test_rows_take_the_listed_values_and_are_valid(name, cache, tmp_path):
-    pipeline = load_pipeline("swift")
-    pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 40_000})})
+    pipeline = load_pipeline("swift").model_copy(update={"field": FIELD})
     outcome = generate(GenerateJob(hand=name, object="sphere", rows=60, pipeline=pipeline, out=tmp_path, cache=cache))
     assert outcome.rows == 60
     shard = read_shard(outcome.paths[0])
@@ -90,8 +92,7 @@ def test_joints_that_only_the_rules_couple_are_in_the_shard(cache, tmp_path):
     text = "\n".join(line for line in find_hand("barrett").urdf.read_text().splitlines() if "<mimic" not in line)
     bare = tmp_path / "bare.urdf"
     bare.write_text(text)
-    pipeline = load_pipeline("swift")
-    pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 40_000})})
+    pipeline = load_pipeline("swift").model_copy(update={"field": FIELD})
     outcome = generate(
         GenerateJob(hand=str(bare), object="sphere", rows=40, pipeline=pipeline, out=tmp_path / "out", cache=cache)
     )

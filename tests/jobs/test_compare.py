@@ -25,7 +25,7 @@ def compared(cache_root, tmp_path_factory):
         "hands": ("allegro",),
         "objects": ("sphere",),
         "vary": ("link_scale:1.1",),
-        "rows": 30,
+        "rows": 12,
         "pipeline": QUICK,
     }
     job = CompareJob(**given, out=out, device="cpu", workers=1, cache=Cache(cache_root))
@@ -44,13 +44,13 @@ def test_numbers_are_those_of_the_shards(compared):
         assert validate_shard(path) == []
         cell = hand["objects"]["sphere"]
         with ShardReader(path) as reader:
-            assert cell["rows"] == len(reader) == 30
+            assert cell["rows"] == len(reader) == 12
             assert cell["hold"] == pytest.approx(reader.column("metrics/hold_success").mean())
             assert cell["epsilon"] == pytest.approx(float(np.median(reader.column("metrics/epsilon"))))
             kept, tried = (float(reader.statistics[name]) for name in ("filter_kept", "candidates"))
             assert cell["yield"] == pytest.approx(kept / tried)  # all rows are strict
         assert 0 < cell["surface"] < 1
-        assert 0 < cell["approach"] <= 30 / 288
+        assert 0 < cell["approach"] <= 12 / 288
         assert hand["all"]["yield"] == cell["yield"]  # the mean over one object
         assert hand["all"]["pca_ratio"] == cell["pca_ratio"]
     small, large = (hand["workspace"] for hand in data["hands"])

@@ -3,8 +3,6 @@
 import fcntl
 import shutil
 import signal
-import subprocess
-import sys
 import time
 import weakref
 from pathlib import Path
@@ -12,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.resumed import Child
 
 from lgrasp.dataset.manifest import compare, read_manifest, workers
 from lgrasp.engine import shard as shard_module
@@ -19,43 +18,6 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.jobs.generate import GenerateJob, generate
-
-CHILD = """
-import os, signal, sys
-from pathlib import Path
-from lgrasp.engine.cache import Cache
-from lgrasp.engine.events import Events
-from lgrasp.jobs.generate import GenerateJob, generate
-from lgrasp.engine.pipeline import load_pipeline
-from lgrasp.field.params import FieldParams
-
-class Say(Events):
-    def started(self, parts, present):
-        print("started", flush=True)
-
-out, cache, rows, shard_rows, index, number = sys.argv[1:7]
-if sys.argv[7:] == ["die"]:  # with all bytes written, before the file has its name
-    os.replace = lambda a, b, replace=os.replace: (
-        os.kill(os.getpid(), signal.SIGKILL) if str(b).endswith("00001.h5") else replace(a, b)
-    )
-pipeline = load_pipeline("swift").model_copy(update={"field": FieldParams(records=20_000)})
-generate(
-    GenerateJob(hand="allegro", object="mug", rows=int(rows), pipeline=pipeline, out=out, device="cpu", workers=1,
-        shard_rows=int(shard_rows), cache=Cache(cache)),
-    Say(),
-    array=(int(index), int(number)),
-)
-"""
-
-
-def start(out, cache, rows, shard_rows=20, index=0, number=1, *more) -> subprocess.Popen:
-    arguments = [str(a) for a in (out, cache, rows, shard_rows, index, number, *more)]
-    return subprocess.Popen([sys.executable, "-c", CHILD, *arguments], stdout=subprocess.PIPE, text=True)
-
-
-def finish(child: subprocess.Popen) -> int:
-    child.communicate(timeout=120)
-    return child.returncode
 
 
 def leftovers(folder):
@@ -277,12 +239,11 @@ def test_killed_at_random_moments(whole, raw_grasps, job, cache_root, tmp_path):
     random = np.random.default_rng(11)
     out = tmp_path / "killed"
     for _ in range(3):
-        child = start(out, cache_root, 80)
-        assert child.stdout
-        assert child.stdout.readline() == "started\n"
+        child = Child(out, cache_root, 80)
+        assert child.begun()
         time.sleep(random.uniform(0.0, 0.6))
         child.kill()
-        finish(child)
+        child.finish()
     generate(job(rows=80, out=out))
     assert raw_grasps(out) == raw_grasps(whole)
     assert listed(out) == listed(whole)
@@ -291,7 +252,7 @@ def test_killed_at_random_moments(whole, raw_grasps, job, cache_root, tmp_path):
 
 def test_killed_while_writing(whole, raw_grasps, job, cache_root, tmp_path):
     out = tmp_path / "killed"
-    assert finish(start(out, cache_root, 80, 20, 0, 1, "die")) == -signal.SIGKILL
+    assert Child(out, cache_root, 80, dies=True).finish() == -signal.SIGKILL
     left, mark = sorted(leftovers(out))
     assert left.endswith(".h5.tmp")
     assert mark.endswith(".running.tmp")
@@ -313,8 +274,8 @@ def test_killed_while_writing(whole, raw_grasps, job, cache_root, tmp_path):
 
 def test_processes_share_an_empty_cache(whole, raw_grasps, tmp_path):
     out, cache = tmp_path / "array", tmp_path / "cache"
-    children = [start(out, cache, 80, 20, task, 2) for task in range(2)]
-    assert [finish(child) for child in children] == [0, 0]
+    children = [Child(out, cache, 80, task=(task, 2)) for task in range(2)]
+    assert [child.finish() for child in children] == [0, 0]
     assert raw_grasps(out) == raw_grasps(whole)
     assert not leftovers(out)
     assert listed(out) == listed(whole)

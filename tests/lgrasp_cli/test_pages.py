@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 BLOCK = re.compile(r"^(<!-- not run.*?-->\n)?```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-FEWER = {"generate": ("-n", "10"), "render": ("-n", "2")}
+FEWER = {"generate": ("-n", "4"), "render": ("-n", "2")}
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/guides/quickstart.md", "docs/guides/steer.md"])

@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from multiprocessing import get_context
+from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -23,6 +24,13 @@ _IMPORTED = (
     "lgrasp.jobs.sequence.job",
     "mujoco",
 )
+
+
+def fork_server() -> ForkServerContext:
+    """Starts processes that have lgrasp imported."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload(list(_IMPORTED))
+    return context
 
 
 class Forked:
@@ -42,9 +50,7 @@ class Forked:
 
 def start_forked(arguments: Sequence[str], folder: Path, environment: Mapping[str, str], said: Path) -> Forked:
     """Start a command in a session of its own; see :func:`lgrasp.bench.soak.processes.start_process`."""
-    context = get_context("forkserver")
-    context.set_forkserver_preload(list(_IMPORTED))
-    process = context.Process(target=_run, args=(list(arguments), folder, dict(environment), said))
+    process = fork_server().Process(target=_run, args=(list(arguments), folder, dict(environment), said))
     process.start()
     assert process.pid is not None
     while process.exitcode is None and os.getsid(process.pid) != process.pid:

@@ -53,6 +53,7 @@ class Soak:
     Args:
         folder: exists and is empty.
         kernels: folder of compiled kernels, which is copied if it is there; those that are missing are compiled.
+        cache: folder of a cache whose hands, objects and fields commands begin with; none: the first ones make theirs.
         launch: starts commands.
         say: called with lines of progress.
     """
@@ -62,6 +63,7 @@ class Soak:
         folder: Path,
         kernels: Path,
         *,
+        cache: Path | None = None,
         launch: Launch = start_process,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
@@ -71,6 +73,9 @@ class Soak:
             shutil.copytree(kernels, self._kernels, ignore=shutil.ignore_patterns("*.tmp", "*_p*_t*"))
         self._whole: dict[str, tuple[dict[str, str], float]] = {}
         self._warm.mkdir()
+        if cache:
+            for kind in ("hand", "object", "field"):
+                shutil.copytree(cache / kind, self._warm / kind, ignore=shutil.ignore_patterns("*.tmp"))
         self._inputs.mkdir()
         shutil.copy(find_hand("barrett").urdf, self._inputs / "hand.urdf")
         self._number = 0
