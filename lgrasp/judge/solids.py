@@ -164,7 +164,9 @@ class MeshSolid(JudgedSolid):
 def mesh_solids(link: int, T: np.ndarray, mesh: trimesh.Trimesh) -> list[JudgedSolid]:
     """One solid per closed body; a mesh with open or inside-out bodies stays whole."""
     parts = mesh.split(only_watertight=False)
-    if len(parts) > 1 and all(p.is_watertight and p.volume > 0 for p in parts):
+    with np.errstate(all="ignore"):  # parts without volume have no centre
+        closed = len(parts) > 1 and all(p.is_watertight and p.volume > 0 for p in parts)
+    if closed:
         return [MeshSolid(link, T, p) for p in parts]
     return [MeshSolid(link, T, mesh)]
 
