@@ -71,8 +71,11 @@ class SceneRows:
         return self.files[file], row - ([0, *self._ends][file])
 
     def spread(self, count: int) -> list[int]:
-        """So many rows evenly over all of them, or all if there are fewer."""
-        return spread(len(self), count)
+        """So many rows evenly over all grasps, or all of these if there are fewer."""
+        grasps = self.chosen(())
+        grasps = grasps if len(grasps) else np.arange(len(self))  # all rows fail a bound
+        count = min(count, len(grasps))
+        return [int(grasps[(2 * k + 1) * len(grasps) // (2 * count)]) for k in range(count)]
 
     def sound(self, rows: Iterable[int], most: int | None = None) -> list[int]:
         """The first of some rows that can be read; a shard with one that cannot is left out from there on.
@@ -170,12 +173,6 @@ class SceneRows:
         path, _ = self.place(row)
         hand, objects, _ = self._contents(path)
         return hand.name, " + ".join(o.id for o in objects)
-
-
-def spread(rows: int, count: int) -> list[int]:
-    """So many numbers evenly over 0 to ``rows - 1``, or all if there are fewer."""
-    count = min(count, rows)
-    return [(2 * k + 1) * rows // (2 * count) for k in range(count)]
 
 
 def draw_rows(

@@ -17,7 +17,7 @@ from lgrasp.dataset.report.quantity import Distribution
 from lgrasp.dataset.report.survey import Head, survey
 from lgrasp.dataset.report.tables import Block
 from lgrasp.dataset.report.verdicts import held_numbers
-from lgrasp.dataset.scenes import SceneRows, draw_rows, spread
+from lgrasp.dataset.scenes import SceneRows, draw_rows
 from lgrasp.errors import LgraspError, OutputError
 from lgrasp.files import write_file
 from lgrasp.picture.sheet import image_bytes
@@ -52,15 +52,12 @@ def pictures(paths: Paths, most: int = _PICTURES, columns: int = _PICTURES // 2)
     """Some rows, drawn side by side; a note if none can be."""
     try:
         rows = SceneRows(paths)
-        grasps = rows.chosen(())
-        chosen = rows.sound([int(grasps[k]) for k in spread(len(grasps), most)])
+        chosen = rows.sound(rows.spread(most))
         image = draw_rows(rows, chosen, size=_SIZE, columns=columns)
     except LgraspError as error:  # what is reported need not be of a hand that can be drawn
         return [{"words": f"No pictures: {error}", "kind": "note"}]
     data = base64.b64encode(image_bytes(image, ".jpg")).decode()
-    caption = (
-        f"{len(chosen)} of {len(grasps):,} rows, evenly spread. Dots are contacts. More: lgrasp render, lgrasp view"
-    )
+    caption = f"{len(chosen)} grasps, evenly spread. Dots are contacts. More: lgrasp render, lgrasp view"
     return [{"jpeg": data, "caption": caption}]
 
 
