@@ -57,7 +57,8 @@ def pictures(paths: Paths, most: int = _PICTURES, columns: int = _PICTURES // 2)
     except LgraspError as error:  # what is reported need not be of a hand that can be drawn
         return [{"words": f"No pictures: {error}", "kind": "note"}]
     data = base64.b64encode(image_bytes(image, ".jpg")).decode()
-    caption = f"{len(chosen)} grasps, evenly spread. Dots are contacts. More: lgrasp render, lgrasp view"
+    among = f"{len(chosen)} of {len(rows.chosen(())):,} rows"
+    caption = f"{among}, evenly spread. Dots are contacts. More: lgrasp render, lgrasp view"
     return [{"jpeg": data, "caption": caption}]
 
 
