@@ -215,7 +215,7 @@ def update_manifest(folder: Path, change: Callable[[Manifest], None]) -> None:
         try:
             manifest = _read_or_say(path)
             before = manifest and manifest.text()
-            manifest = manifest or Manifest(runs=_there(folder))
+            manifest = manifest or Manifest(runs=listed_there(folder))
             change(manifest)
             if not manifest.runs:
                 path.unlink()
@@ -234,22 +234,7 @@ def _read_or_say(path: Path) -> Manifest | None:
         return None
 
 
-def write_manifest(folder: str | os.PathLike[str]) -> Path:
-    """Write ``manifest.json`` of a folder anew, with the shards that are there, of whatever runs.
-
-    Raises:
-        ShardError: The folder holds no shard.
-        OutputError: The manifest cannot be written.
-    """
-    path, runs = Path(folder) / MANIFEST, _there(Path(folder))
-    if not runs:
-        raise ShardError(f"no shard (*.h5) in {folder}")
-    with locked(path):
-        write_file(path, Manifest(runs=runs).text())
-    return path
-
-
-def _there(folder: Path) -> list[ListedRun]:
+def listed_there(folder: Path) -> list[ListedRun]:
     """The shards in a folder as one run without a key; merged files and what is no shard are left out."""
     from lgrasp.dataset.reader import ShardReader  # slow to load, and not needed to read manifests
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from support.shards import write_manifest
 
 from lgrasp.dataset.files import find_shards
 from lgrasp.dataset.info import describe
-from lgrasp.dataset.manifest import write_manifest
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard

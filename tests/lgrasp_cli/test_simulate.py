@@ -10,9 +10,9 @@ import h5py
 import numpy as np
 import pytest
 from support.jaws import EDGE, Jaws
+from support.shards import write_manifest
 from support.twins import twin_rows, twin_shard
 
-from lgrasp.dataset.manifest import write_manifest
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard

@@ -1,9 +1,11 @@
 """Made-up shards that conform."""
 
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 
+from lgrasp.dataset.manifest import MANIFEST, Manifest, listed_there
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 
 
@@ -152,3 +154,10 @@ def assert_same_rows(a: GraspRows, b: GraspRows) -> None:
     assert a.metric_units == b.metric_units
     assert (a.sequence and tuple(a.sequence.space_names)) == (b.sequence and tuple(b.sequence.space_names))
     assert a.physics_protocols == b.physics_protocols
+
+
+def write_manifest(folder: Path) -> Path:
+    """A manifest of the shards that are in a folder, of whatever runs."""
+    path = folder / MANIFEST
+    path.write_text(Manifest(runs=listed_there(folder)).text())
+    return path
