@@ -1,4 +1,4 @@
-"""Point clouds and distance grids as objects: models without faces that all else takes for an object."""
+"""Point clouds as objects: models without faces that all else takes for an object."""
 
 import hashlib
 from collections.abc import Callable
@@ -69,41 +69,6 @@ def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud"
     points, normals = _smoothed(points, normals)
     note = "a point cloud: what was not seen of the object is unknown"
     return _model(name, digest.hexdigest(), center, points, normals, _distances(points, normals), points.mean(0), note)
-
-
-def sdf_object(values: np.ndarray, origin: np.ndarray, cell: float, *, name: str = "sdf") -> ObjectModel:
-    """An ObjectModel without faces from a grid of signed distances, of a whole object.
-
-    The surface is where nodes next to it lead along the slope; the centre of mass is that of the volume.
-
-    Args:
-        values: signed distances [m], negative inside, (nx, ny, nz).
-        origin: node (0, 0, 0) [m], (3,). cell: spacing of nodes [m].
-
-    Raises:
-        ObjectError: not finite, no inside, an inside that reaches the border, a size that no hand grasps.
-    """
-    v = np.asarray(values, float)
-    if v.ndim != 3 or min(v.shape) < 4 or not np.isfinite(v).all() or not cell > 0:
-        raise ObjectError(
-            f"grid '{name}' of shape {list(v.shape)}: need [nx, ny, nz] finite values, 4 a side, cell > 0"
-        )
-    inner = v[1:-1, 1:-1, 1:-1]
-    if not (inner < 0).any() or (v < 0).sum() != (inner < 0).sum():
-        raise ObjectError(
-            f"grid '{name}': values are negative inside an object, which must lie within the grid's border"
-        )
-    near = np.abs(v) < cell
-    normals = np.stack([*np.gradient(v, cell)], -1)[near]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
-    points = np.argwhere(near) * cell + np.asarray(origin, float) - v[near][:, None] * normals
-    _check_size(f"grid '{name}'", points)
-    keep = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
-    center = 0.5 * (points.min(0) + points.max(0))
-    com = (np.argwhere(v < 0) * cell + origin).mean(0) - center
-    grid = v.astype(np.float32), (np.asarray(origin, float) - center).astype(np.float32), float(cell)
-    digest = hashlib.sha256(grid[0].tobytes() + np.asarray([*np.ravel(origin), cell], float).tobytes()).hexdigest()
-    return _model(name, digest, center, points[keep] - center, normals[keep], grid, com, "a grid of distances")
 
 
 def completed_object(seen: ObjectModel, distance: Callable[[np.ndarray], np.ndarray], reach: float) -> ObjectModel:

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from lgrasp.cloud.model import TRUST, cloud_object, sdf_object, searched_object
+from lgrasp.cloud.model import TRUST, cloud_object, searched_object
 from lgrasp.errors import ObjectError
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.sdf import SdfGrid, sample_sdf
-from lgrasp.planning.params import PlanParams
-from lgrasp.planning.planner import Planner
 
 RADIUS = 0.05
 
@@ -98,38 +96,3 @@ def test_bad_clouds(change, said):
     n = sphere(1000)
     with pytest.raises(ObjectError, match=said):
         cloud_object(*change(RADIUS * n, n))
-
-
-def ellipsoid_grid(cell: float = 0.003) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (to first order) from an ellipsoid about (0.1, 0, 0.2), and the grid's origin."""
-    axes, at = np.array([0.03, 0.04, 0.05]), np.array([0.1, 0, 0.2])
-    count = np.ceil(2 * (axes + 0.012) / cell).astype(int)
-    p = (np.indices(count.tolist()).transpose(1, 2, 3, 0) - (count - 1) / 2) * cell
-    length, slope = np.linalg.norm(p / axes, axis=-1), np.linalg.norm(p / axes**2, axis=-1)
-    return length * (length - 1) / slope.clip(1e-9), at - (count - 1) / 2 * cell
-
-
-def test_a_grid_of_distances_is_an_object(inputs):
-    values, origin = ellipsoid_grid()
-    model = sdf_object(values, origin, 0.003)
-    on = (model.contact_points + model.center - [0.1, 0, 0.2]) / [0.03, 0.04, 0.05]
-    np.testing.assert_allclose(np.linalg.norm(on, axis=1), 1, atol=0.03)
-    assert (model.contact_normals * on).sum(1).min() > 0
-    np.testing.assert_allclose(model.com + model.center, [0.1, 0, 0.2], atol=1e-3)
-    planned = Planner(inputs.hand, model, 0.12, PlanParams(rolls=6, finalists=2)).run(12)
-    assert len(planned.grasps) > 6
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda v: v + 1, "negative inside"),
-        (lambda v: v - 0.02, "within the grid's border"),
-        (lambda v: v * np.nan, "finite"),
-        (lambda v: v[0], r"shape \["),
-    ],
-)
-def test_bad_grids_are_refused(change, said):
-    values, origin = ellipsoid_grid()
-    with pytest.raises(ObjectError, match=said):
-        sdf_object(change(values), origin, 0.003)
