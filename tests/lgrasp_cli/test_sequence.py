@@ -170,5 +170,5 @@ def test_networks_that_cannot_be_used(cli, small):
     assert "absent.pt: no such file" in cli("sample", "absent.pt", "mug", "sphere").error()
     Path("bad.pt").write_bytes(b"nonsense")
     assert "bad.pt: not a network" in cli("sample", "bad.pt", "mug", "sphere", "--device", "cpu").error()
-    assert "needs diffuser" in cli("sample", "bad.pt", "mug", "sphere", "-p", small).error()
+    assert "needs diffuser" in cli("sample", "seq-allegro", "mug", "sphere", "-p", small).error()
     assert "unknown key 'joint_steps'" in cli("learn", "fit", "--model", "diffuser", "out", "--joint-steps", 3).error()
