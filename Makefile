@@ -15,7 +15,7 @@ PYTHON := $(shell for p in python3 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in [(3, 11), (3, 12)])' >/dev/null 2>&1 && echo $$p && break; done)
 endif
 
-WORKERS ?= 3
+WORKERS ?= 2
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test check lint format type pytest docs bench wheel clean
@@ -56,7 +56,7 @@ format: setup
 type: setup
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# WORKERS test files run side by side, each on one thread (some wait for processes), in their order (few of the last are long);
+# WORKERS test files run side by side, each on one thread, in their order (few of the last are long);
 # a crash ends the run. Tests start hundreds of processes: bytecode is kept.
 pytest: setup
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --max-worker-restart 0
