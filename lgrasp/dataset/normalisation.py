@@ -14,14 +14,15 @@ from lgrasp.dataset.torch_stream import GraspIterableDataset
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.rotations import (
     inverse_motion,
-    matrix_from_quaternion,
     matrix_from_sixd,
-    quaternion_from_matrix,
+    motion_from_pose,
+    pose_from_motion,
     sixd_from_matrix,
 )
 
 _ROWS = 65_536  # at a time
 _LEAST = 1e-6  # a number that varies less stays as it is
+_TO_DEVICE, _TO_STORED = [0, 1, 2, 4, 5, 6, 3], [0, 1, 2, 6, 3, 4, 5]  # order of a pose's numbers
 
 
 class Normalisation(JsonFile):
@@ -83,9 +84,8 @@ class Normalisation(JsonFile):
         """The inverse for any vectors (B, 9 + K): object pose in the hand base frame (B, 7), joints (B, K)."""
         mean, std = self._scale(vectors)
         vectors = vectors * std + mean
-        R, t = inverse_motion(matrix_from_sixd(vectors[..., 3:9]), vectors[..., :3])
-        x, y, z, w = quaternion_from_matrix(R).unbind(-1)
-        return torch.cat([t, torch.stack([w, x, y, z], -1)], -1), vectors[..., 9:]
+        pose = pose_from_motion(*inverse_motion(matrix_from_sixd(vectors[..., 3:9]), vectors[..., :3]))
+        return pose[..., _TO_STORED], vectors[..., 9:]
 
     def _scale(self, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mean, std = (like.new_tensor(numbers) for numbers in (self.mean, self.std))
@@ -100,5 +100,5 @@ def grasp_vectors(object_pose: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         q: joints [rad or m], (B, K).
     """
     pose = object_pose[:, 0] if object_pose.ndim == 3 else object_pose
-    R, t = inverse_motion(matrix_from_quaternion(pose[:, [4, 5, 6, 3]]), pose[:, :3])
+    R, t = inverse_motion(*motion_from_pose(pose[:, _TO_DEVICE]))
     return torch.cat([t, sixd_from_matrix(R), q], -1)

@@ -40,6 +40,8 @@ def check_empty(out: Path, run_key: str = "") -> None:
 
 HAND, OBJECTS, GRASPS = "hand", "objects", "grasps"
 """Folders of an export."""
+CSPACE_POSTURES = ("cspace_position", "pregrasp_cspace_position", "squeeze_cspace_position")
+"""Names of the joints at the grasp, before it, and as targets, in NVIDIA's formats."""
 INDEX, INDEX_FORMAT = "export.json", "lgrasp-export"
 _UNFINISHED = "unfinished.json"  # what becomes the index
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lgrasp.dataset.exports.folder import GRASPS
+from lgrasp.dataset.exports.folder import CSPACE_POSTURES, GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.reading import GraspSet, open_folder
 from lgrasp.dataset.exports.selection import Batch, Selection
@@ -15,7 +15,6 @@ from lgrasp.errors import ShardError
 from lgrasp.files import new_file
 from lgrasp.geometry.poses import pose_from_matrix, pose_matrix
 
-_POSTURES = ("cspace_position", "pregrasp_cspace_position", "squeeze_cspace_position")
 _DECIMALS = 9
 
 GRASPGEN_NOTES = """\
@@ -40,7 +39,7 @@ def write_graspgen(selection: Selection, frames: HandFrames, out: Path, advance:
     lists: dict[str, Callable[[Batch], np.ndarray]] = {
         "transforms": lambda batch: pose_matrix(frames.root_in_object(batch.object_pose[:, 0], batch.q)),
         "object_in_gripper": lambda batch: batch.holds > 0,
-        **{name: lambda batch, k=k: batch.postures[k] for k, name in enumerate(_POSTURES)},
+        **{name: lambda batch, k=k: batch.postures[k] for k, name in enumerate(CSPACE_POSTURES)},
     }
     if selection.on_table:
         lists |= {name: lambda batch, name=name: batch.table[name] for name in ("table_plane", "table_approach")}
@@ -86,7 +85,7 @@ def read_graspgen(path: Path | str, *, joint_names: Sequence[str] | None = None)
                 raise ShardError(f"{file}: names no joints (joint_names, cspace_position), which a hand's grasps need")
             order = folder.order(list(map(str, grasps["joint_names"])), file)
             at_grasp = grasps["cspace_position"]
-            postures = [np.array(grasps.get(name, at_grasp), np.float64) for name in _POSTURES]
+            postures = [np.array(grasps.get(name, at_grasp), np.float64) for name in CSPACE_POSTURES]
             joints = np.stack(postures, 1).reshape(len(transforms), 3, len(order))
             if not np.isfinite(joints).all():
                 raise ValueError("a joint is not finite")

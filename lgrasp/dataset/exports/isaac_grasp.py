@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from lgrasp.config import load_yaml
-from lgrasp.dataset.exports.folder import GRASPS
+from lgrasp.dataset.exports.folder import CSPACE_POSTURES, GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.reading import GraspSet, open_folder
 from lgrasp.dataset.exports.selection import Batch, Selection
@@ -16,8 +16,6 @@ from lgrasp.dataset.files import parsing
 from lgrasp.errors import ShardError
 from lgrasp.files import new_file
 from lgrasp.geometry.poses import inverse
-
-_POSTURES = ("cspace_position", "pregrasp_cspace_position", "squeeze_cspace_position")
 
 ISAAC_GRASP_NOTES = """\
 grasps/CODE.yaml   isaac_grasp format, version 1.0: all grasps of one object by name.
@@ -57,7 +55,10 @@ def _entries(batch: Batch, frames: HandFrames) -> str:
             f"    confidence: {batch.holds[row]:.1f}",
             f"    position: [{x}, {y}, {z}]",
             f"    orientation: {{w: {w}, xyz: [{', '.join(v)}]}}",
-            *(f"    {name}: {{{form % tuple(q[row])}}}" for name, q in zip(_POSTURES, batch.postures, strict=True)),
+            *(
+                f"    {name}: {{{form % tuple(q[row])}}}"
+                for name, q in zip(CSPACE_POSTURES, batch.postures, strict=True)
+            ),
             *(f"    {name}: [{', '.join(f'{v:.9f}' for v in values)}]" for name, values in tables[row].items()),
         ]
     return "\n".join(lines) + "\n"
@@ -84,7 +85,7 @@ def read_isaac_grasp(path: Path | str, *, joint_names: Sequence[str] | None = No
             try:
                 turn, at_grasp = entry["orientation"], entry["cspace_position"]
                 poses.append([float(x) for x in (*entry["position"], turn["w"], *turn["xyz"])])
-                postures = [entry.get(posture, at_grasp) for posture in _POSTURES]
+                postures = [entry.get(posture, at_grasp) for posture in CSPACE_POSTURES]
                 for joints in postures:
                     folder.order(list(map(str, joints)), where)
                 q.append([[float(joints[joint]) for joint in folder.wanted] for joints in postures])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lgrasp.geometry.poses import pose_matrix
+from lgrasp.geometry.poses import device_matrix
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.outcomes import failed_bounds
@@ -61,5 +61,5 @@ def _from_above(table: GraspTable, planes: np.ndarray) -> np.ndarray:
     """Directions of approach, (n, 3); straight to the table where the hand has no way."""
     way = table.table["approach"]
     up = planes[table.table["pose"], :3]
-    down = -np.einsum("nij,nj->ni", pose_matrix(table.pose[:, [0, 1, 2, 6, 3, 4, 5]].astype(float))[:, :3, :3], up)
+    down = -np.einsum("nij,nj->ni", device_matrix(table.pose)[:, :3, :3], up)
     return np.where(np.isnan(way[:, :1]), down, way).astype(np.float32)
