@@ -304,15 +304,17 @@ def _unique(path: Path) -> Path:
     return path.with_name(f"{path.stem}.{_machine()}-{uuid.uuid4().hex[:12]}{path.suffix}.tmp")
 
 
-def _hold(path: Path, make: Callable[[Path], int]) -> Path:
+def _hold(path: Path, make: Callable[[Path], int | None]) -> Path:
     """A new temporary file or folder beside a path, locked until it is discarded or its process ends in any way.
 
     Args:
-        make: makes it and gives a descriptor of it.
+        make: makes it and gives a descriptor of it, or None if it is gone already.
     """
     while True:
         temporary = _unique(path)
         descriptor = make(temporary)
+        if descriptor is None:
+            continue
         if fcntl:
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -322,9 +324,12 @@ def _hold(path: Path, make: Callable[[Path], int]) -> Path:
         os.close(descriptor)
 
 
-def _make_folder(path: Path, mode: int = 0o777) -> int:
+def _make_folder(path: Path, mode: int = 0o777) -> int | None:
+    """Make a folder and open it; None if another process took it for a leftover between the two calls."""
     path.mkdir(mode)
-    return os.open(path, os.O_RDONLY)
+    with suppress(FileNotFoundError):
+        return os.open(path, os.O_RDONLY)
+    return None
 
 
 def _discard(path: Path) -> None:

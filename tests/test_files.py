@@ -12,7 +12,15 @@ import pytest
 from support.sources import parse
 
 from lgrasp.errors import OutputError
-from lgrasp.files import discard_temporaries, new_file, new_folder, remove_leftovers, scratch_folder, write_file
+from lgrasp.files import (
+    discard_temporaries,
+    new_file,
+    new_folder,
+    remove_leftovers,
+    scratch_folder,
+    temporary_folder,
+    write_file,
+)
 
 KILLED = """
 import os, signal, sys, tempfile
@@ -74,6 +82,22 @@ def test_temporary_folders_of_killed_processes_go(tmp_path, monkeypatch):
     assert len(list(tmp_path.iterdir())) == 2
     discard_temporaries()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_taken_for_a_leftover_at_once_is_made_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    mkdir, taken = Path.mkdir, []
+
+    def take(path, *more, **options):
+        mkdir(path, *more, **options)
+        if path.suffix == ".tmp" and len(taken) < 3:
+            taken.extend(remove_leftovers(path.parent, path.name))
+
+    monkeypatch.setattr(Path, "mkdir", take)
+    with temporary_folder() as folder, new_folder(tmp_path / "made"):
+        (folder / "one").touch()
+    assert len(taken) == 3
+    assert [path.name for path in tmp_path.rglob("*")] == ["made"]
 
 
 def test_a_process_that_is_ended_removes_what_it_was_writing(tmp_path):
