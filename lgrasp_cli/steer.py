@@ -27,7 +27,12 @@ Fingers = Annotated[
     ),
 ]
 Links = Annotated[
-    str | None, Option(metavar="NAMES", help="Links that may touch, and no others.", rich_help_panel=_PANEL)
+    str | None,
+    Option(
+        metavar="NAMES",
+        help="Links that may touch, and no others; LINK:radial or LINK:ulnar: with that side.",
+        rich_help_panel=_PANEL,
+    ),
 ]
 Palm = Annotated[
     str | None, Option(rich_help_panel=_PANEL, **one_of(PalmUse, "PALM", "Whether the palm may or must touch."))

@@ -112,8 +112,7 @@ def input_keys(
 
 def hand_model_key(digest: str, hands: HandParams = LISTED) -> str:
     """Content key of the model of a hand, given the :func:`hand_digest` of it."""
-    described = {} if hands == LISTED else hands.model_dump(mode="json")
-    return content_key("hand", HAND_VERSION, content=digest, **described)
+    return content_key("hand", HAND_VERSION, content=digest, **hands.describe())
 
 
 def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str]:
@@ -155,11 +154,17 @@ class Loader:
             from lgrasp.geometry.decompose import decompose
             from lgrasp.hand.build import build_hand  # slow to load, as all that makes what is not cached
 
+            digest = hand_digest(source.urdf, source.spec) if hands != LISTED else ""
+            if hands.sides:
+                from lgrasp.hand.opposition.sided_hand import sided_hand
+
+                bare = hands.model_copy(update={"sides": ()})
+                model = self.hand(source, hand_model_key(digest, bare), bare)
+                return sided_hand(source, model, hands.sides, self.device)
             if hands.contact_links == "all":
                 from lgrasp.hand.whole_hand import whole_hand
 
-                listed = self.hand(source, hand_model_key(hand_digest(source.urdf, source.spec)))
-                return whole_hand(source, listed, self.device)
+                return whole_hand(source, self.hand(source, hand_model_key(digest)), self.device)
             return build_hand(source.urdf, source.spec, self.device, decompose=partial(decompose, store=self.cache))
 
         return self.get("hand", HandModel, key, make)

@@ -169,7 +169,7 @@ class Pipeline(_Head):
             "order": _ORDER_VERSION,
             "bounds": self.bounds.describe(),
             **({"steer": self.steer.describe()} if self.steer.asks else {}),
-            **({"hand": self.hand.model_dump(mode="json")} if self.hand != LISTED else {}),
+            **({"hand": self.hand.describe()} if self.hand != LISTED else {}),
             "stages": [{s.name: {"version": s.version, **p.model_dump(mode="json")}} for s, p in self.sections],
         }
 

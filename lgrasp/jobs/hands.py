@@ -11,7 +11,7 @@ from lgrasp.hand.urdf import read_urdf
 from lgrasp.notices import notice
 from lgrasp.policy.model import read_policy
 from lgrasp.policy.names import SHIPPED, shipped_policy
-from lgrasp.steer.typed import made_types, typed
+from lgrasp.steer.typed import Anatomy, asked_sides, made_types, typed
 
 _TWO = 2  # contacts that any grasp has
 
@@ -26,16 +26,18 @@ def hand_source(name: str) -> HandSource:
 
 
 def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
-    """A pipeline whose grasp type and pose policy, if they are asked for, are those of a hand; one line tells where it
-    asks for more contacts than the hand has fingers and palm, and it then asks for so many.
+    """A pipeline whose grasp type, sides of links and pose policy, if they are asked for, are those of a hand; one line
+    tells where it asks for more contacts than the hand has fingers and palm, and it then asks for so many.
 
     Raises:
         HandError: no such hand.
-        ConfigError: see :func:`~lgrasp.steer.typed.typed`; a policy that is none, or of another hand.
+        ConfigError: see :func:`~lgrasp.steer.typed.typed` and :func:`~lgrasp.steer.typed.asked_sides`; a policy that is
+            none, or of another hand.
     """
     pipeline = _within_reach(pipeline, hand)
-    policy = pipeline.params("place").policy
-    if pipeline.steer.grasp_type is None and policy is None:
+    policy, steer = pipeline.params("place").policy, pipeline.steer
+    looked_up = steer.grasp_type is not None or any(steer.sides.values())
+    if not looked_up and policy is None:
         return pipeline
     source = hand_source(hand)
     if policy == SHIPPED:
@@ -43,14 +45,18 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
         free = not (pipeline.steer.asks or pipeline.on_table)
         shipped = shipped_policy(source.name, pipeline.hand.contact_links) if free else None
         pipeline = pipeline.with_params("place", policy=str(shipped) if shipped else None)
-    if pipeline.steer.grasp_type is None and policy in (None, SHIPPED):
+    if not looked_up and policy in (None, SHIPPED):
         return pipeline
-    tree = build_tree(read_urdf(source.urdf), source.spec)
+    urdf = read_urdf(source.urdf)
+    tree = build_tree(urdf, source.spec)
     if policy not in (None, SHIPPED):
         read_policy(policy).check_hand(source.name, tree.joint_names, policy)
-    if pipeline.steer.grasp_type is None:
+    if not looked_up:
         return pipeline
-    return pipeline.model_copy(update={"steer": typed(pipeline.steer, source.spec, tree)})
+    anatomy = Anatomy(source.spec, urdf, tree)
+    steer = typed(steer, anatomy)
+    sides = asked_sides(steer, anatomy)
+    return pipeline.model_copy(update={"steer": steer, "hand": pipeline.hand.model_copy(update={"sides": sides})})
 
 
 def _within_reach(pipeline: Pipeline, hand: str) -> Pipeline:
@@ -92,7 +98,7 @@ def describe_hand(name: str) -> dict[str, Any]:
         "palm_links": list(spec.palm.links),
         "canonical_box": spec.canonical_box.model_dump(),
         "opposition_spaces": {name: list(space.joints) for name, space in spec.opposition_spaces.items()},
-        "grasp_types": made_types(spec, tree)._asdict(),
+        "grasp_types": made_types(Anatomy(spec, urdf, tree))._asdict(),
         "licence": spec.licence,
         "source": spec.source,
         "notes": [spec.notes] if isinstance(spec.notes, str) and spec.notes else list(spec.notes),

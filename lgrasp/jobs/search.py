@@ -115,7 +115,9 @@ class SearchJob(SearchRequest, Job):
         steer, inputs = self.pipeline.steer, self.inputs
         if not steer.asks:
             return {}
-        return {"steered": describe_touching(steer, inputs.steer.touching, inputs.hand.model, inputs.steer.poses)}
+        told = describe_touching(steer, inputs.steer.touching, inputs.hand.model, inputs.steer.poses)
+        sides = [side.model_dump(mode="json") for side in self.pipeline.hand.sides]
+        return {"steered": told | ({"sides": sides} if sides else {})}
 
     def difference(self, path: Path) -> str:
         with ShardReader(path) as reader:

@@ -202,7 +202,8 @@ class RowChecks:
             pairs = zip(self.index[good, 0], self.table["pose"][good].astype(int), strict=True)
             planes = np.array([shard.tables[k][pose] for k, pose in pairs])
         links = np.where(self.used[good], np.asarray(self.g["contact_links"])[good], -1).reshape(len(good), -1)
-        self.failed["steered"][good] = disobeys(asked, shard.link_names, links, T_objects, planes)
+        normals = self.link_normals[good].reshape(*links.shape, -1, 3)
+        self.failed["steered"][good] = disobeys(asked, shard.link_names, links, normals, T_objects, planes)
 
     def _self_penetration(self, T_links: np.ndarray) -> None:
         hand, depth = self.hand, np.zeros(len(self.good))
@@ -240,7 +241,8 @@ class RowChecks:
             self._set("object_object", 1e3 * between)
 
     def _contacts(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
-        """Contact distances and normals; keeps the recomputed outward object normals for the wrenches."""
+        """Contact distances and normals; keeps the recomputed outward object normals for the wrenches, and the links'
+        (link frame)."""
         self.normals = np.full((*self.used.shape, 3), np.nan)
         i, o, c = np.nonzero(self.used[self.good])
         r = self.good[i]
@@ -254,6 +256,8 @@ class RowChecks:
         T = np.linalg.inv(T_objects[i, o]) @ T_links[i, links]  # object from link
         local = np.einsum("nji,nj->ni", T[:, :3, :3], points - T[:, :3, 3])
         on_link, link_normals = on_links(self.hand.solids, links, local, -np.einsum("nji,nj->ni", T[:, :3, :3], given))
+        self.link_normals = np.full((*self.used.shape, *link_normals.shape[1:]), np.nan)
+        self.link_normals[r, o, c] = link_normals
         link_normals = np.einsum("nij,npj->npi", T[:, :3, :3], link_normals)
         between = angle_deg(-link_normals[:, :, None], object_normals[:, None])  # (n, P, P)
         length = np.linalg.norm(given, axis=1, keepdims=True)

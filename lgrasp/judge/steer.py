@@ -1,4 +1,5 @@
-"""Whether rows obey what their shard says was asked of them: which links touch, where the palm faces, which poses."""
+"""Whether rows obey what their shard says was asked of them: which links touch, with which side, where the palm faces,
+which poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 COSINE_SLACK = 1e-4
 """Of the palm's direction outside its cone."""
+SIDE_SLACK = 5.0
+"""Of a link's normal outside the cone of its side [deg]."""
 PLANE_SLACK = 1e-4
 """Of the numbers of the plane that the hand stays above."""
 
@@ -25,6 +28,7 @@ class Asked:
 
     links: frozenset[str] | None  # that may touch, None: any
     every: tuple[frozenset[str], ...]  # of each set one link touches
+    sides: dict[str, tuple[np.ndarray, float]]  # unit axis (3,), link frame, and half angle [deg] of a link's side
     facing: np.ndarray | None  # (3,) unit vector that the palm faces along, base frame
     approach: np.ndarray | None  # (3,) unit middle of its cone, object's frame
     cosine: float
@@ -48,6 +52,7 @@ def read_asked(config: Any) -> Asked | None:
     return Asked(
         links=frozenset(told["links"]) if "links" in told else None,
         every=tuple(frozenset(links) for links in told.get("every", ())),
+        sides={side["link"]: (_unit(side["axis"]), float(side["angle"])) for side in told.get("sides", ())},
         facing=facing,
         approach=_unit(cone["direction"]) if cone else None,
         cosine=float(np.cos(np.radians(cone["angle"]))) if cone else -1.0,
@@ -60,6 +65,7 @@ def disobeys(
     asked: Asked,
     names: Sequence[str],
     links: np.ndarray,
+    normals: np.ndarray,
     T_objects: np.ndarray,
     planes: np.ndarray | None,
 ) -> np.ndarray:
@@ -68,6 +74,7 @@ def disobeys(
     Args:
         names: of the shard's links.
         links: in contact, -1 none, indices of ``names``, (n, C).
+        normals: admissible ones of the links at the contacts, outward, link frame, (n, C, P, 3).
         T_objects: of the object, base frame, (n, 4, 4).
         planes: that rows say the hand is above, object's frame, (n, 5); None: they say none.
     """
@@ -77,6 +84,11 @@ def disobeys(
     bad = np.logical_or.reduce([none, *others])
     for some in asked.every:
         bad |= ~np.logical_or.reduce([none, *(found for name, found in touching.items() if name in some)])
+    for k, name in enumerate(names):
+        if name in asked.sides:
+            axis, angle = asked.sides[name]
+            inside = normals @ axis >= np.cos(np.radians(min(angle + SIDE_SLACK, 180.0)))  # False where it is NaN
+            bad |= ((links == k) & ~inside.any(axis=2)).any(axis=1)
     if asked.approach is not None:
         middle = np.einsum("nij,j->ni", T_objects[:, :3, :3], asked.approach)
         bad |= ~(middle @ asked.facing >= asked.cosine - COSINE_SLACK)

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from lgrasp.choices import PalmUse, Role
+from lgrasp.choices import PalmUse, Role, SideName
 from lgrasp.config import Params, did_you_mean, parse_model, read_yaml, yaml_files
 from lgrasp.errors import ConfigError
 
@@ -14,6 +14,9 @@ class GraspType(Params):
 
     fingers: tuple[Role, ...] = Field(min_length=1, description="Fingers that all touch, and no others.")
     parts: Literal["distal", "all"] = Field(description="Contact links that may touch: the last of a finger, or all.")
+    sides: dict[Role, SideName] = Field(
+        default_factory=dict, description="Of the fingers, those that touch with a side, and which."
+    )
     palm: PalmUse = Field(description="Whether it touches.")
     may_lack: tuple[Role, ...] = Field(default=(), description="Of the fingers, those that a hand may lack.")
     alike: dict[str, str] = Field(
@@ -25,26 +28,26 @@ class TypesFile(Params):
     """A file of grasp types."""
 
     types: dict[str, GraspType]
-    left_out: dict[str, str] = Field(default_factory=dict, description="Types that cannot be steered: name, and why.")
 
 
-def read_types() -> TypesFile:
+def read_types() -> dict[str, GraspType]:
     """The grasp types of all files; of one name the first on the search path.
 
     Raises:
         ConfigError: a file that cannot be read, or is none of grasp types.
     """
     types: dict[str, GraspType] = {}
-    left_out: dict[str, str] = {}
     for path in yaml_files("configs/grasp_types").values():
-        found = parse_model(TypesFile, read_yaml(path), str(path))
-        types, left_out = found.types | types, found.left_out | left_out
-    return TypesFile(types=types, left_out=left_out)
+        types = parse_model(TypesFile, read_yaml(path), str(path)).types | types
+    return types
 
 
 def type_names() -> dict[str, str]:
     """Every name that can be asked for -> the type that has its contacts, itself or another."""
-    types = read_types().types
+    return _names(read_types())
+
+
+def _names(types: dict[str, GraspType]) -> dict[str, str]:
     return {other: name for name, kind in types.items() for other in kind.alike} | {name: name for name in types}
 
 
@@ -54,9 +57,8 @@ def find_type(name: str) -> GraspType:
     Raises:
         ConfigError: none of that name.
     """
-    told, names = read_types(), type_names()
-    if name in told.left_out:
-        raise ConfigError(f"grasp type '{name}' cannot be steered: {told.left_out[name]}")
+    types = read_types()
+    names = _names(types)
     if name not in names:
         raise ConfigError(f"unknown grasp type '{name}'; {did_you_mean(name, names)}known: {', '.join(sorted(names))}")
-    return told.types[names[name]]
+    return types[names[name]]

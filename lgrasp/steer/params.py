@@ -4,11 +4,11 @@ import hashlib
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, cast, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from lgrasp.choices import PalmUse
+from lgrasp.choices import PalmUse, SideName
 from lgrasp.config import Params
 from lgrasp.object.region_text import ACCEPTED, Region, describe_region, parse_regions
 from lgrasp.steer.grasp_types import find_type
@@ -71,7 +71,9 @@ class Steering(Params):
     )
 
     links: tuple[str, ...] = Field(
-        default=(), description="Links whose contact surface may touch, and no other; none: any."
+        default=(),
+        description="Links whose contact surface may touch, and no other, or LINK:radial, LINK:ulnar: with that side; "
+        "none: any.",
     )
     palm: PalmUse = Field(default="yes", description="Whether the palm touches: yes, it may; no; must.")
 
@@ -161,6 +163,16 @@ class Steering(Params):
     @classmethod
     def _names(cls, value: Any) -> Any:
         return tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else value
+
+    @property
+    def sides(self) -> dict[str, SideName | None]:
+        """Each of the links, and the side that touches; None: its contact surface."""
+        told: dict[str, SideName | None] = {}
+        for text in self.links:
+            link, _, side = text.rpartition(":")
+            known = bool(link) and side in get_args(SideName)
+            told[link if known else text] = cast(SideName, side) if known else None
+        return told
 
     @property
     def asks(self) -> bool:

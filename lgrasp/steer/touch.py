@@ -43,7 +43,7 @@ def find_touching(steering: Steering, model: HandModel, fingers: Fingers) -> Tou
     points, groups = np.ones(len(model.contact_points), bool), np.ones(model.groups, bool)
     group = np.repeat(np.arange(model.groups + 1), np.diff(model.contact_first))
     if steering.links:
-        points &= np.isin(model.contact_link, _links(steering.links, model))
+        points &= np.isin(model.contact_link, _links(list(steering.sides), model))
     if steering.palm == "no":
         points &= group < model.groups
     palm = bool(points[group == model.groups].any())

@@ -1,14 +1,29 @@
-"""A grasp type in the words of one hand: its fingers, links and palm."""
+"""A grasp type in the words of one hand: its fingers, links and palm; and the sides of links that are asked for."""
 
 from typing import NamedTuple
 
+from lgrasp.choices import Role
 from lgrasp.config import parse_model
 from lgrasp.errors import ConfigError
 from lgrasp.hand.fingers import Roles, finger_roles
+from lgrasp.hand.params import LinkSide
+from lgrasp.hand.sides import RadialAxes, link_side, radial_axes
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree
+from lgrasp.hand.urdf import Urdf
 from lgrasp.steer.grasp_types import GraspType, find_type, read_types
 from lgrasp.steer.params import Steering
+
+_SIDED_BODIES = 2  # the last of a finger: sides of its proximal link are at the palm
+
+
+class Anatomy:
+    """What grasp types ask of a hand: which finger is which, and which sides they have."""
+
+    def __init__(self, spec: HandSpec, urdf: Urdf, tree: Tree) -> None:
+        self.spec, self.tree = spec, tree
+        self.roles: Roles = finger_roles(spec, tree)
+        self.radial: RadialAxes = radial_axes(spec, urdf, tree)
 
 
 class MadeTypes(NamedTuple):
@@ -20,7 +35,7 @@ class MadeTypes(NamedTuple):
     """Type -> why it cannot be made."""
 
 
-def typed(steering: Steering, spec: HandSpec, tree: Tree) -> Steering:
+def typed(steering: Steering, hand: Anatomy) -> Steering:
     """A steering whose fingers, links and palm are those of its grasp type on one hand; itself if it has no type.
 
     Raises:
@@ -29,16 +44,14 @@ def typed(steering: Steering, spec: HandSpec, tree: Tree) -> Steering:
     if steering.grasp_type is None:
         return steering
     name, kind = steering.grasp_type, find_type(steering.grasp_type)
-    roles = finger_roles(spec, tree)
-    if lack := _lack(kind, roles, spec):
+    if lack := _lack(kind, hand):
         raise ConfigError(f"grasp type {name}: {lack}")
-    chosen = [roles[role] for role in kind.fingers if role in roles]
-    able = {link for _, own in chosen for link in own}
-    links = tuple(link for _, own in chosen for link in own if tree.body_of(link) == tree.body_of(own[-1]))
-    palm = () if kind.palm == "no" else spec.palm.links
+    chosen: Roles = {role: hand.roles[role] for role in kind.fingers if role in hand.roles}
+    links = [link for role in chosen for link in _links(kind, hand, role)]
+    able = {link for _, own in chosen.values() for link in own}
     asked = {
-        "fingers": tuple(finger for finger, _ in chosen),
-        "links": (*links, *palm) if kind.parts == "distal" and set(links) < able else (),
+        "fingers": tuple(finger for finger, _ in chosen.values()),
+        "links": (*links, *(() if kind.palm == "no" else hand.spec.palm.links)) if set(links) != able else (),
         "palm": kind.palm,
     }
     for key, value in asked.items():
@@ -47,27 +60,58 @@ def typed(steering: Steering, spec: HandSpec, tree: Tree) -> Steering:
     return parse_model(Steering, steering.model_dump() | asked, f"grasp type {name}")
 
 
-def made_types(spec: HandSpec, tree: Tree) -> MadeTypes:
+def asked_sides(steering: Steering, hand: Anatomy) -> tuple[LinkSide, ...]:
+    """The sides of links that a steering asks for.
+
+    Raises:
+        ConfigError: a link without such sides.
+    """
+    axes = {link: axis for own in hand.radial.values() for link, axis in own.items()}
+    found = []
+    for link, side in steering.sides.items():
+        if side is not None and link not in axes:
+            raise ConfigError(
+                f"steer.links: link '{link}' of hand '{hand.spec.name}' has no {side} side; "
+                f"links with sides: {', '.join(axes) or 'none'}"
+            )
+        found += [] if side is None else [link_side(link, side, axes[link])]
+    return tuple(found)
+
+
+def made_types(hand: Anatomy) -> MadeTypes:
     """Which grasp types a hand can make; of those with the same contacts the first is told with the others' names."""
     makes: dict[Steering, list[str]] = {}
     cannot: dict[str, str] = {}
-    roles = finger_roles(spec, tree)
-    for name, kind in read_types().types.items():
-        if lack := _lack(kind, roles, spec):
+    for name, kind in read_types().items():
+        if lack := _lack(kind, hand):
             cannot |= dict.fromkeys((name, *kind.alike), lack)
             continue
-        made = typed(Steering(grasp_type=name), spec, tree).model_copy(update={"grasp_type": None})
+        made = typed(Steering(grasp_type=name), hand).model_copy(update={"grasp_type": None})
         makes.setdefault(made, []).extend((name, *kind.alike))
     return MadeTypes({first: tuple(others) for first, *others in makes.values()}, cannot)
 
 
-def _lack(kind: GraspType, roles: Roles, spec: HandSpec) -> str:
+def _links(kind: GraspType, hand: Anatomy, role: Role) -> list[str]:
+    """Links of a finger that touch in a type, with their sides."""
+    tree, side = hand.tree, kind.sides.get(role)
+    own = list(hand.radial[role] if side else hand.roles[role][1])
+    bodies = sorted({tree.body_of(link) for link in own})[-_SIDED_BODIES if kind.parts == "all" and side else -1 :]
+    if kind.parts == "all" and not side:
+        return own
+    return [f"{link}:{side}" if side else link for link in own if tree.body_of(link) in bodies]
+
+
+def _lack(kind: GraspType, hand: Anatomy) -> str:
     """What a hand lacks for a type, empty if nothing."""
+    roles, name = hand.roles, hand.spec.name
     missing = [role for role in kind.fingers if role not in roles and role not in kind.may_lack]
     if missing:
         told = ", ".join(role if role == own[0] else f"{own[0]} as {role}" for role, own in roles.items())
         what = "thumb" if missing[0] == "thumb" else f"{missing[0]} finger"
-        return f"hand '{spec.name}' has no {what}; its fingers: {told}"
-    if kind.palm == "must" and not spec.palm.links:
-        return f"hand '{spec.name}' has no palm that may touch"
+        return f"hand '{name}' has no {what}; its fingers: {told}"
+    flat = [roles[role][0] for role in kind.sides if role in roles and role not in hand.radial]
+    if flat:
+        return f"hand '{name}' has no sides of finger {flat[0]}: it stands beside no other"
+    if kind.palm == "must" and not hand.spec.palm.links:
+        return f"hand '{name}' has no palm that may touch"
     return ""

@@ -64,6 +64,28 @@ def test_a_tripod_touches_with_three_tips_and_nothing_else(steered):
     assert config["pipeline"]["steer"]["grasp_type"] == config["steered"]["grasp_type"] == "prismatic-2-finger"
 
 
+def test_a_lateral_grasp_touches_with_the_side_of_the_index_finger(steered, link_poses, tmp_path):
+    """Its radial side looks along y of its links, and the thumb's tip presses against it; the judge finds another."""
+    shard = steered(grasp_type="lateral", rows=6)
+    rows, names = shard.grasps, np.array(shard.hand.link_names)
+    assert all(
+        "link_15.0_tip" in links and links & {"link_2.0", "link_3.0", "link_3.0_tip"} and len(links) == 2
+        for links in touching(shard)
+    )
+    T = pose_matrix(rows.object_pose[:, 0].astype(float))
+    row, at = np.nonzero(~np.isin(rows.contact_links[:, 0], [-1, list(names).index("link_15.0_tip")]))
+    inward = -np.einsum("nij,nj->ni", T[row, :3, :3], rows.contact_normals[row, 0, at])
+    link = link_poses(rows.q)[row, rows.contact_links[row, 0, at]]
+    assert (np.einsum("nji,nj->ni", link[:, :3, :3], inward)[:, 1] > np.cos(np.radians(45 + 15))).all()
+    (path,) = (tmp_path / "steered").glob("*.h5")
+    assert judge(path).valid_share == 1.0
+    config = shard.header.config
+    sides = [side | {"axis": [0, -1, 0]} for side in config["steered"]["sides"]]
+    with h5py.File(path, "r+") as file:
+        file.attrs["config"] = json.dumps(config | {"steered": config["steered"] | {"sides": sides}})
+    assert judge(path).failed["steered"].all()
+
+
 def test_a_type_that_the_hand_cannot_make(job, swift):
     with pytest.raises(ConfigError, match="grasp type precision-disk: hand 'allegro' has no little finger"):
         job(pipeline=swift.with_steering(grasp_type="precision-disk"))

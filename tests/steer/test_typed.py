@@ -1,8 +1,10 @@
 """Grasp types in the words of a hand."""
 
 import shutil
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from support.places import ROOT
@@ -13,75 +15,101 @@ from lgrasp.hand.fingers import finger_roles
 from lgrasp.hand.spec import load_spec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.steer.grasp_types import read_types, type_names
+from lgrasp.steer.grasp_types import type_names
 from lgrasp.steer.params import Steering
-from lgrasp.steer.typed import made_types, typed
+from lgrasp.steer.typed import Anatomy, asked_sides, made_types, typed
 
 HANDS = ("allegro", "shadow", "leap", "barrett", "dclaw", "schunk_svh")
 
 
+@cache
 def parts(name):
-    """Rules and joint tree of a hand."""
+    """What types ask of a hand."""
     source = find_hand(name)
-    return source.spec, build_tree(read_urdf(source.urdf), source.spec)
+    urdf = read_urdf(source.urdf)
+    return Anatomy(source.spec, urdf, build_tree(urdf, source.spec))
 
 
-@pytest.mark.parametrize("hand", HANDS)
-def test_every_type_is_made_or_refused_by_what_is_missing(hand):
-    spec, tree = parts(hand)
-    made = made_types(spec, tree)
-    contact = {link for rule in spec.contact for link in rule.links} | set(spec.palm.links)
-    for name in type_names():
-        if name in made.cannot:
-            with pytest.raises(ConfigError, match=f"grasp type {name}: hand '{hand}' has no ") as error:
-                typed(Steering(grasp_type=name), spec, tree)
+@pytest.mark.parametrize("name", HANDS)
+def test_every_type_is_made_or_refused_by_what_is_missing(name):
+    hand = parts(name)
+    made = made_types(hand)
+    contact = {link for rule in hand.spec.contact for link in rule.links} | set(hand.spec.palm.links)
+    for kind in type_names():
+        if kind in made.cannot:
+            with pytest.raises(ConfigError, match=f"grasp type {kind}: hand '{name}' has no ") as error:
+                typed(Steering(grasp_type=kind), hand)
             assert "\n" not in str(error.value)
         else:
-            found = typed(Steering(grasp_type=name), spec, tree)
+            found = typed(Steering(grasp_type=kind), hand)
             assert len(found.fingers) + (found.palm == "must") >= 2
-            assert set(found.fingers) <= set(spec.fingers)
-            assert set(found.links) <= contact
-            assert typed(found, spec, tree) == found
+            assert set(found.fingers) <= set(hand.spec.fingers)
+            assert {link for link, side in found.sides.items() if side is None} <= contact
+            assert [(side.link, side.side) for side in asked_sides(found, hand)] == [
+                (link, side) for link, side in found.sides.items() if side
+            ]
+            assert typed(found, hand) == found
     assert sorted([*made.makes, *sum(made.makes.values(), ()), *made.cannot]) == sorted(type_names())
 
 
 def test_types_with_the_same_contacts_are_told_together():
-    for hand in HANDS:
-        spec, tree = parts(hand)
+    for name in HANDS:
+        hand = parts(name)
         kinds = [
-            typed(Steering(grasp_type=name), spec, tree).model_copy(update={"grasp_type": None})
-            for name in made_types(spec, tree).makes
+            typed(Steering(grasp_type=kind), hand).model_copy(update={"grasp_type": None})
+            for kind in made_types(hand).makes
         ]
         assert len(set(kinds)) == len(kinds)
 
 
 def test_the_taxonomy_is_whole():
-    """All 33 types of the taxonomy are told: made by contacts, or left out with a reason."""
-    told = read_types()
-    assert len(type_names()) + len(told.left_out) == 33
-    assert not set(type_names()) & set(told.left_out)
-    with pytest.raises(ConfigError, match="grasp type 'lateral' cannot be steered: the thumb presses"):
-        Steering(grasp_type="lateral")
+    assert len(type_names()) == 33
     with pytest.raises(ConfigError, match="unknown grasp type 'tripot'; did you mean 'tripod'"):
         Steering(grasp_type="tripot")
 
 
 def test_a_tripod_of_shadow():
-    found = typed(Steering(grasp_type="tripod"), *parts("shadow"))
+    found = typed(Steering(grasp_type="tripod"), parts("shadow"))
     assert found.fingers == ("thumb", "index", "middle")
     assert found.links == ("thdistal", "ffdistal", "mfdistal")
     assert found.palm == "no"
-    assert typed(Steering(grasp_type="sphere-3-finger"), *parts("shadow")).links == ()
+    assert typed(Steering(grasp_type="sphere-3-finger"), parts("shadow")).links == ()
+
+
+def test_a_lateral_grasp_of_shadow():
+    found = typed(Steering(grasp_type="lateral"), parts("shadow"))
+    assert found.links == ("thdistal", "ffmiddle:radial", "ffdistal:radial")
+    assert {side.axis for side in asked_sides(found, parts("shadow"))} == {(1.0, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize("name", ["allegro", "leap", "shadow"])
+def test_the_fingers_of_a_hand_face_each_other_as_its_rules_say(name):
+    """The opposition space of index and middle finger was written by hand: one's ulnar, the other's radial side."""
+    hand = parts(name)
+    ulnar, radial = hand.spec.opposition_spaces["index-middle"].sides
+    for own, side, sign in ((hand.radial["index"], ulnar, -1), (hand.radial["middle"], radial, 1)):
+        for part in side:
+            for link in part.links:
+                np.testing.assert_allclose(sign * own[link], part.axis, atol=0.02)
+
+
+def test_links_without_sides_are_told():
+    for name, link, words in (
+        ("allegro", "link_15.0_tip", "'allegro' has no radial side; links with sides: link_0.0, link_1.0"),
+        ("dclaw", "link_f2_3", "'dclaw' has no radial side; links with sides: none"),
+    ):
+        with pytest.raises(ConfigError, match=f"steer.links: link '{link}' of hand {words}"):
+            asked_sides(Steering(links=(f"{link}:radial",)), parts(name))
 
 
 @pytest.mark.parametrize("asked", [{"fingers": "thumb,ring"}, {"links": "link_3.0_tip"}, {"palm": "must"}])
 def test_what_touches_is_told_once(asked):
     with pytest.raises(ConfigError, match=f"grasp type tripod says what touches: leave out steer.{next(iter(asked))}"):
-        typed(Steering(grasp_type="tripod", **asked), *parts("allegro"))
+        typed(Steering(grasp_type="tripod", **asked), parts("allegro"))
 
 
 def test_roles_of_hand_yaml_and_of_names(tmp_path: Path):
-    assert {role: finger for role, (finger, _) in finger_roles(*parts("barrett")).items()} == {
+    assert {role: finger for role, (finger, _) in parts("barrett").roles.items()} == {
         "thumb": "three",
         "index": "one",
         "middle": "two",
@@ -93,7 +121,7 @@ def test_roles_of_hand_yaml_and_of_names(tmp_path: Path):
         (folder / "hand.yaml").write_text(yaml.safe_dump(data | changes))
         return folder / "hand.yaml"
 
-    tree = parts("allegro")[1]
+    tree = parts("allegro").tree
     renamed = dict(zip(["rh_ffdistal", "rh_b", "rh_c", "rh_thumb_tip"], data["fingers"].values(), strict=True))
     spec = load_spec(write(fingers=renamed))
     assert [finger for finger, _ in finger_roles(spec, tree).values()] == list(
