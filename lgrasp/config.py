@@ -1,6 +1,7 @@
 """YAML declarations -> checked pydantic models; unknown keys fail and name the nearest valid one."""
 
 import difflib
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -29,6 +30,23 @@ def device_name(name: str) -> str:
         raise ValueError(f"device '{name}' cannot be; choose auto, cpu or cuda:N")
     return name
 
+
+def comma_numbers(text: str, count: int) -> tuple[float, ...]:
+    """Numbers that commas separate.
+
+    Raises:
+        ValueError: other than ``count`` finite ones.
+    """
+    try:
+        found = tuple(map(float, text.split(",")))
+    except ValueError:
+        found = ()
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise ValueError(f"give {count} numbers, separated by commas")
+    return found
+
+
+Numbers = tuple[float, float, float]
 
 # fields that several models have
 Seed = Annotated[int, Field(ge=0, lt=2**63, description="Decides every random draw.")]

@@ -175,10 +175,12 @@ def _report_pairs(numbers: dict[str, Any], out: Path) -> list[tuple[str, str]]:
     over = _sums({name: metric["over_bound"] or 0 for name, metric in group["metrics"].items()} for group in groups)
     held = _sums({n: group["rows"] for n, group in hand["held"].items()} for hand in numbers["hands"])
     near = sum(group["near_duplicates"]["duplicates"] for group in groups)
+    from lgrasp.dataset.report.verdicts import passed_words
+
     physics = []
     for name in sorted({name for group in groups for name in group["physics"]}):
         found = [group["physics"][name] for group in groups if name in group["physics"]]
-        physics.append((f"hold in {name}", f"{sum(f['held'] for f in found):,} of {sum(f['run'] for f in found):,}"))
+        physics.append((passed_words(name), f"{sum(f['held'] for f in found):,} of {sum(f['run'] for f in found):,}"))
     pairs = [
         ("grasps", f"{numbers['rows']:,} in {plural(numbers['shards'], 'shard')}, {numbers['bytes'] / 1e6:,.1f} MB"),
         ("hands", ", ".join(f"{h['hand']} ({plural(len(h['objects']), 'object')})" for h in numbers["hands"])),

@@ -16,6 +16,7 @@ from lgrasp_cli.generate import generate
 from lgrasp_cli.look import render, view
 from lgrasp_cli.options import old_name, warn
 from lgrasp_cli.plan import plan
+from lgrasp_cli.reach import reach
 from lgrasp_cli.refine import refine
 from lgrasp_cli.renamed import renew
 from lgrasp_cli.run import run
@@ -26,7 +27,7 @@ from lgrasp_cli.submit import WORDS, submit
 
 _PANELS = {
     "Generate": (generate, sequence, sample, plan, refine, run, submit),
-    "Check": (simulate, judge, status),
+    "Check": (simulate, reach, judge, status),
     "Look": (render, view, hands.app, catalog.objects, catalog.pipelines),
     "Data": (dataset.app, dataset.export, scenes.app),
     "Learn": (learn.app,),

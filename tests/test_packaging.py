@@ -24,7 +24,7 @@ ORDER = (
     ("grasp",),
     ("picture",),
     ("simulate", "dataset", "refine"),
-    ("planning", "scenes", "hold", "steer", "policy"),
+    ("planning", "scenes", "hold", "steer", "policy", "reach"),
     ("stages",),
     ("sequence", "learn"),
     ("engine",),

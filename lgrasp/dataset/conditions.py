@@ -37,7 +37,8 @@ class Condition(NamedTuple):
         """
         single = [OBJECTS_HELD, *(name for name, (shape, _) in reader.columns.items() if len(shape) == 1)]
         if self.column not in single:
-            hint = " (lgrasp simulate adds physics columns)" if self.column.startswith("physics/") else ""
+            maker = "reach" if self.column.startswith("physics/reach_") else "simulate"
+            hint = f" (lgrasp {maker} adds physics columns)" if self.column.startswith("physics/") else ""
             known = ", ".join(single)
             raise ShardError(f"{reader.path}: no column {self.column!r}{hint}; with one number per row it has {known}")
         held = self.column == OBJECTS_HELD

@@ -113,6 +113,7 @@ KINDS = {
     "refine": "lgrasp.jobs.requests.shards:RefineRequest",
     "plan": "lgrasp.jobs.requests.plan:PlanRequest",
     "simulate": "lgrasp.jobs.requests.shards:SimulateRequest",
+    "reach": "lgrasp.jobs.requests.shards:ReachRequest",
     "scenes": "lgrasp.jobs.requests.scenes:SceneRequest",
     "learn": "lgrasp.jobs.requests.shards:FitRequest",
     "policy": "lgrasp.jobs.requests.learn:PolicyRequest",

@@ -1,7 +1,6 @@
 """Simulates the rows of shards and adds the verdicts to them, or to copies."""
 
-import json
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,19 +10,15 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from lgrasp.dataset.extend import extend_shard
-from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
-from lgrasp.engine.folder import Found
-from lgrasp.engine.shard_job import ShardJob, rows_digest
 from lgrasp.errors import PhysicsError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.jobs.difference import config_difference
 from lgrasp.jobs.kept_verdicts import GPU_BLOCK, KeptVerdicts
 from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.jobs.shard_inputs import mesh_hash
+from lgrasp.jobs.verdicts import VerdictJob
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kept import Keeper
@@ -36,55 +31,35 @@ from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, LIFT_COLUMNS, OBJECT
 _MIN_HOLDING_LINKS = 2  # links that it takes to hold anything
 
 
-class SimulateJob(SimulateRequest, ShardJob):
+class SimulateJob(SimulateRequest, VerdictJob):
     """Adds verdicts of a physics simulation to shards, in place or to copies."""
 
     command: ClassVar[str] = "simulate"
+    version: ClassVar[int] = 2
 
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)
     _scene: tuple[Hashable, Scene] | None = PrivateAttr(None)  # the latest
 
-    def key(self) -> str:
-        return content_key("simulate", 2, settings=self._settings())
+    @property
+    def verdict(self) -> tuple[str, str]:
+        return self.protocol.name, f"{self.protocol.name}_holds"
 
-    def _settings(self) -> dict[str, Any]:
-        """What decides a verdict besides its row, as far as it is the same for all shards."""
+    def settings(self) -> dict[str, Any]:
         described = self.protocol.model_dump(mode="json")
         return described | {"all_directions": self.all_directions, "device": self._kind()}
 
+    def told(self, protocol: dict[str, Any]) -> dict[str, Any]:
+        device = "gpu" if str(protocol.get("simulator")).startswith("mujoco_warp") else "cpu"
+        # what shards do not tell that were written before there was a choice
+        older = {"engine": "mujoco", "draws": None, "lift": None, "shake": None}
+        return older | super().told(protocol) | {"device": device}
+
     def check_source(self, reader: ShardReader) -> None:
-        check_heaps(reader.path)
+        super().check_source(reader)
         steered = reader.header.config.get("steered")
         if self.protocol.table and isinstance(steered, dict) and "above" in steered:
             raise PhysicsError(f"{reader.path}: {NO_TABLE}")
-        for _ in reader.blocks():  # whose checksums are compared
-            pass
-
-    def found(self, part: Part) -> Found | None:
-        if not self.in_place:  # else the source was checked
-            super().found(part)
-        with ShardReader(part.file) as reader:
-            text = reader.rows(0, 0).physics_protocols.get(f"{self.protocol.name}_holds")
-            if text is None and self.in_place:
-                return None
-            rows, digest = len(reader), rows_digest(reader)
-        job = content_key("simulate", 2, settings=_told(text or "{}", self._settings()))
-        return Found(content_key("part", 1, job=job, rows=digest), rows)
-
-    def refusal(self, path: Path) -> str:
-        if not self.in_place:
-            return super().refusal(path)
-        name = self.protocol.name
-        return f"{path} has other verdicts of {name} ({self.difference(path)}); --overwrite replaces them"
-
-    def difference(self, path: Path) -> str:
-        with ShardReader(path) as reader:
-            text = reader.rows(0, 0).physics_protocols.get(f"{self.protocol.name}_holds")
-        if text is None:
-            return "it has no verdicts of this protocol"
-        settings = self._settings()
-        return config_difference(_told(text, settings), settings) or "other grasps"
 
     def parts(self) -> list[Part]:
         check_installed(resolve_device(self.device).alias, self.protocol)
@@ -178,19 +153,6 @@ class SimulateJob(SimulateRequest, ShardJob):
                     self.cache.warn(line)
             self._scene = key, scene
         return self._scene[1]
-
-
-def _told(text: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that verdicts were made with, from their ``protocol`` attribute."""
-    try:
-        told = json.loads(text)
-        simulator = str(told.get("simulator"))
-    except (ValueError, AttributeError, RecursionError):
-        return {}
-    device = "gpu" if simulator.startswith("mujoco_warp") else "cpu"
-    # what shards do not tell that were written before there was a choice
-    older = {"engine": "mujoco", "draws": None, "lift": None, "shake": None}
-    return older | {name: told[name] for name in settings if name in told} | {"device": device}
 
 
 @dataclass(frozen=True)

@@ -9,32 +9,15 @@ from typing import TYPE_CHECKING, Any, Self, cast, get_args
 from pydantic import Field, field_validator, model_validator
 
 from lgrasp.choices import PalmUse, SideName
-from lgrasp.config import Params
+from lgrasp.config import Numbers, Params, comma_numbers
 from lgrasp.object.region_text import ACCEPTED, Region, describe_region, parse_regions
 from lgrasp.steer.grasp_types import find_type
 
 if TYPE_CHECKING:
     import numpy as np
 
-Numbers = tuple[float, float, float]
-
 STEER_VERSION = 1
 """Raised whenever the same steering gives other grasps."""
-
-
-def _numbers(text: str, count: int) -> tuple[float, ...]:
-    """Numbers that commas separate.
-
-    Raises:
-        ValueError: other than ``count`` finite ones.
-    """
-    try:
-        found = tuple(map(float, text.split(",")))
-    except ValueError:
-        found = ()
-    if len(found) != count or not all(map(math.isfinite, found)):
-        raise ValueError(f"give {count} numbers, separated by commas")
-    return found
 
 
 class ApproachCone(Params):
@@ -49,7 +32,7 @@ class ApproachCone(Params):
         if not isinstance(value, str):
             return value
         direction, colon, angle = value.partition(":")
-        return {"direction": _numbers(direction, 3)} | ({"angle": angle} if colon else {})
+        return {"direction": comma_numbers(direction, 3)} | ({"angle": angle} if colon else {})
 
     @field_validator("direction")
     @classmethod
@@ -98,7 +81,7 @@ class Steering(Params):
     @field_validator("above", mode="before")
     @classmethod
     def _plane(cls, value: Any) -> Any:
-        return _numbers(value, 4) if isinstance(value, str) else value
+        return comma_numbers(value, 4) if isinstance(value, str) else value
 
     @field_validator("above")
     @classmethod

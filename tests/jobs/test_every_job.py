@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from support.places import QUICK
+from support.urdfs import arm
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.writer import write_shard
@@ -27,6 +28,7 @@ from lgrasp.jobs.export import ExportJob
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.learn.job import FitJob, load_predictor
 from lgrasp.jobs.metrics import MetricsJob
+from lgrasp.jobs.reach import ReachJob
 from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.scenes.job import SceneJob
@@ -34,11 +36,24 @@ from lgrasp.jobs.sequence.job import SequenceJob
 from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.learn.params import LearnParams
 from lgrasp.planning.params import PlanParams
+from lgrasp.reach.placement import Placement
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.stages.refine.params import RefineParams
 from lgrasp_cli.progress import Bar, JobProgress
 
-NAMES = ("generate", "sequence", "refine", "plan", "simulate", "scenes", "learn", "metrics", "export", "compare")
+NAMES = (
+    "generate",
+    "sequence",
+    "refine",
+    "plan",
+    "simulate",
+    "reach",
+    "scenes",
+    "learn",
+    "metrics",
+    "export",
+    "compare",
+)
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +104,9 @@ def jobs(swift, source: Path, shards, two_spaces: str, cache_root: Path) -> Call
         if name == "simulate":
             pytest.importorskip("mujoco")
             return SimulateJob(**made, protocol=find_protocol("fc"))
+        if name == "reach":
+            made["arm"] = arm(source.parent)
+            return ReachJob(**made, at=Placement(position=(0.4, 0.0, 0.3)), tries=4)
         if name == "generate":
             return GenerateJob(**base, object="mug", rows=12, shard_rows=4, batch=128, pipeline=swift)
         if name == "sequence":

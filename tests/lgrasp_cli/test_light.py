@@ -68,12 +68,15 @@ refine no-folder --out x --from isaacgrasp
 refine no-folder --out x --set refine.tris=1
 simulate no-folder
 simulate no-folder --protocol fcc
+reach no-folder --arm no/such.urdf --at 0,0,0
+reach no-folder --arm hand.yaml --at 0,0
 run no-config
 run smoke -n 0
 run job-refine.yaml
 run job-sequence.yaml
 run job-plan.yaml
 run job-simulate.yaml
+run job-reach.yaml
 run job-scenes.yaml
 run job-learn.yaml
 run job-metrics.yaml
@@ -127,7 +130,7 @@ COMPLETED = {
     "gen": "generate",
 }
 
-KINDS = ("generate", "refine", "sequence", "plan", "simulate", "scenes", "learn", "metrics", "export")
+KINDS = ("generate", "refine", "sequence", "plan", "simulate", "reach", "scenes", "learn", "metrics", "export")
 
 SCRIPT = f"""
 import contextlib, io, json, os, shlex, sys

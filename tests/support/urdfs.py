@@ -17,6 +17,31 @@ HINGE = (
 BAR = '<geometry><box size="0.015 0.015 0.05"/></geometry>'
 BASE = '<link name="base"><collision><geometry><box size="0.04 0.1 0.03"/></geometry></collision></link>'
 
+ARM_HEIGHTS = (0.3, 0.0, 0.2, 0.2, 0.2, 0.2, 0.1)
+ARM_LINK = (
+    '<link name="{n}"><collision><origin xyz="0 0 {half}"/><geometry><cylinder radius="0.03" length="{size}"/>'
+    "</geometry></collision></link>"
+)
+ARM_JOINT = (
+    '<joint name="turn_{i}" type="revolute"><parent link="{p}"/><child link="{c}"/><origin xyz="0 0 {z}"/>'
+    '<axis xyz="{axis}"/><limit lower="-{most}" upper="{most}"/></joint>'
+)
+
+
+def arm(folder: Path, more: str = "") -> Path:
+    """An upright arm of seven joints that turn about z and y in turn, 1.25 m long; ``more`` links and joints."""
+    links, joints = ['<link name="base"/>'], []
+    for i, z in enumerate(ARM_HEIGHTS):
+        size = [*ARM_HEIGHTS, 0.05][i + 1] or 0.05
+        links.append(ARM_LINK.format(n=f"arm_{i}", half=size / 2, size=size))
+        about = {"axis": "0 1 0", "most": 2.1} if i % 2 else {"axis": "0 0 1", "most": 2.9}
+        joints.append(ARM_JOINT.format(i=i, p=f"arm_{i - 1}" if i else "base", c=f"arm_{i}", z=z, **about))
+    joints.append('<joint name="end" type="fixed"><parent link="arm_6"/><child link="flange"/>')
+    joints.append('<origin xyz="0 0 0.05" rpy="0 0 0.5"/></joint><link name="flange"/>')
+    path = folder / "arm.urdf"
+    path.write_text(f'<robot name="arm">{"".join(links)}{"".join(joints)}{more}</robot>')
+    return path
+
 
 def gripper(folder: Path, *, mimic: bool = False, kind: str = "collision") -> Path:
     """Two prismatic jaws."""

@@ -27,6 +27,7 @@ from lgrasp.dataset.report.tables import (
     run_tables,
     validity_table,
 )
+from lgrasp.dataset.report.verdicts import passed_words
 
 
 def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows], pictures: Sequence[Block] = ()) -> str:
@@ -86,7 +87,7 @@ def _head(numbers: dict[str, Any]) -> list[Block]:
         found = [group["physics"][name] for group in groups if name in group["physics"]]
         run = sum(f["run"] for f in found)
         if run:
-            shown.append((f"{sum(f['held'] for f in found) / run:.1%}", f"hold in physics ({name})"))
+            shown.append((f"{sum(f['held'] for f in found) / run:.1%}", passed_words(name)))
     lead = "Numbers are those stored in the shards; near-duplicates, poses and coverage are computed from the rows."
     remarks = [{"words": line, "kind": "note"} for line in numbers["remarks"]]
     return [{"words": lead, "kind": "dim"}, *remarks, {"tiles": shown}]

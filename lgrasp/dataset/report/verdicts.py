@@ -1,6 +1,7 @@
 """Verdicts of simulators: how many grasps hold, and in which direction the others fail."""
 
 import json
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -13,11 +14,19 @@ from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.protocol import DIRECTIONS
 
 _HOLDS, _DIRECTIONS = "_holds", "_directions"
+_REACH, _OK = "reach", "_ok"
+_PASSED = re.compile(f"(.+){_HOLDS}|({_REACH}){_OK}")
+
+
+def passed_words(name: str) -> str:
+    """What a grasp does that has the verdict of some name."""
+    return "reached by the arm" if name == _REACH else f"hold in physics ({name})"
 
 
 @dataclass
 class Verdicts:
-    """Counts of one protocol P: of the columns ``P_holds`` [N], ``P_directions`` [N, 6] and further ``P_...`` [N]."""
+    """Counts of one protocol P: of the columns ``P_holds`` [N] (``reach_ok`` of an arm), ``P_directions`` [N, 6] and
+    further ``P_...`` [N], codes left out."""
 
     protocols: list[str] = field(default_factory=list)
     """Texts of the protocol, different ones once each."""
@@ -31,13 +40,13 @@ class Verdicts:
     def add(self, column: str, values: np.ndarray) -> None:
         """Count one column, named without the protocol; values below 0 and NaN were not run."""
         run = values >= 0  # NaN: false
-        if column == _HOLDS and values.ndim == 1:
+        if column in (_HOLDS, _OK) and values.ndim == 1:
             self.run += int(run.sum())
             self.held += int((values[run] > 0).sum())
         elif column == _DIRECTIONS and values.shape[1:] == (len(DIRECTIONS),):
             self.direction_run += run.sum(0)
             self.direction_failed += (run & (values == 0)).sum(0)
-        elif values.ndim == 1:
+        elif values.ndim == 1 and values.dtype != np.int8:
             count, total = self.sums.get(column[1:], (0, 0.0))
             self.sums[column[1:]] = count + int(run.sum()), total + float(values[run].sum(dtype=float))
 
@@ -57,17 +66,18 @@ class Verdicts:
 
 
 def add_verdicts(into: dict[str, Verdicts], rows: GraspRows, chosen: np.ndarray) -> None:
-    """Count the columns of ``physics/`` of some rows, by protocol; what belongs to no ``P_holds`` is passed over.
+    """Count the columns of ``physics/`` of some rows, by protocol; what belongs to none of these is passed over.
 
     Where one protocol's name begins another's, a column is of the longer one. ``chosen`` [n] are indices.
     """
-    names = [column.removesuffix(_HOLDS) for column in rows.physics if column.endswith(_HOLDS)]
+    found = {column: match[1] or match[2] for column in rows.physics if (match := _PASSED.fullmatch(column))}
+    names = found.values()
     for column, values in rows.physics.items():
         name = max((name for name in names if column.startswith(f"{name}_")), key=len, default=None)
         if name is not None:
             into.setdefault(name, Verdicts()).add(column.removeprefix(name), values[chosen])
-    for name in names:
-        text = rows.physics_protocols[name + _HOLDS]
+    for column, name in found.items():
+        text = rows.physics_protocols[column]
         if text not in into[name].protocols:
             into[name].protocols.append(text)
 

@@ -11,7 +11,7 @@ from lgrasp.choices import EngineName, FormatName, MetricName
 from lgrasp.config import DeviceName, ShardPaths, apply_settings, parse_model
 from lgrasp.dataset.files import find_shards, shards_below
 from lgrasp.engine.request import Request, ShardRequest
-from lgrasp.errors import ConfigError, OutputError, ShardError
+from lgrasp.errors import ConfigError, HandError, OutputError, ShardError
 from lgrasp.files import check_folder
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.names import hand_path
@@ -19,6 +19,8 @@ from lgrasp.hold.params import HoldTest
 from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.params import LearnParams
+from lgrasp.paths import check_file
+from lgrasp.reach.placement import ORIGIN, Placement
 from lgrasp.refine.params import COARSE, LocalSearch
 from lgrasp.simulate.protocol import Protocol, find_protocol
 from lgrasp.stages.refine.params import RefineParams
@@ -27,14 +29,30 @@ Format = Annotated[FormatName, BeforeValidator(lambda name: name.replace("_", "-
 """A format of another program; isaac_grasp is read too."""
 
 
-class SimulateRequest(ShardRequest):
+class VerdictRequest(ShardRequest):
+    """Verdicts, added to shards, in place or to copies."""
+
+    out: Path | None = Field(default=None, description="Folder of copies; default: the shards get the verdicts.")
+
+    @property
+    def folder(self) -> Path:
+        if self.out is not None:
+            return self.out
+        folders = [path if path.is_dir() else path.parent for path in self.shards]
+        return folders[0] if len(set(folders)) == 1 else Path(os.path.commonpath([f.absolute() for f in folders]))
+
+    @property
+    def in_place(self) -> bool:
+        return self.out is None
+
+
+class SimulateRequest(VerdictRequest):
     """Verdicts of a physics simulation, added to shards, in place or to copies."""
 
     maker: ClassVar[str] = "lgrasp.jobs.simulate:SimulateJob"
 
     protocol: Protocol = Field(description="Named protocol.")
     engine: EngineName | None = Field(default=None, description="Simulator; default: the protocol's, MuJoCo.")
-    out: Path | None = Field(default=None, description="Folder of copies; default: the shards get the verdicts.")
     device: DeviceName = "cpu"
     all_directions: bool = Field(
         default=False, description="Go on after the first direction in which an object is lost."
@@ -51,16 +69,23 @@ class SimulateRequest(ShardRequest):
             self.protocol = self.protocol.by(self.engine)
         return self
 
-    @property
-    def folder(self) -> Path:
-        if self.out is not None:
-            return self.out
-        folders = [path if path.is_dir() else path.parent for path in self.shards]
-        return folders[0] if len(set(folders)) == 1 else Path(os.path.commonpath([f.absolute() for f in folders]))
 
-    @property
-    def in_place(self) -> bool:
-        return self.out is None
+class ReachRequest(VerdictRequest):
+    """Joints of an arm with which its hand makes the grasps of shards, added to them, in place or to copies."""
+
+    maker: ClassVar[str] = "lgrasp.jobs.reach:ReachJob"
+
+    arm: Path = Field(description="URDF of the arm.")
+    tip: str | None = Field(default=None, description="Link that carries the hand; default: the arm's last one.")
+    mount: Placement = Field(default=ORIGIN, description="Base link of the hand in the frame of the tip.")
+    at: Placement = Field(
+        description="Object's frame, or of grasps on a table the place on it, in the frame of the arm's root link."
+    )
+    tries: int = Field(default=32, ge=1, le=4096, description="Postures of the arm from which a pose is searched.")
+
+    def check(self) -> None:
+        check_file(self.arm, (".urdf",), "--arm: a URDF", HandError)
+        super().check()
 
 
 class MetricsRequest(ShardRequest):

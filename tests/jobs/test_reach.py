@@ -1,0 +1,158 @@
+"""lgrasp reach: joints of an arm for grasps, against forward kinematics of another library."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yourdfpy
+from support.shards import sample_on_table, sample_shard
+from support.urdfs import arm
+
+from lgrasp.dataset.conditions import parse_condition
+from lgrasp.dataset.exports.selection import select_rows
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.cache import Cache
+from lgrasp.engine.run import run
+from lgrasp.errors import HandError, OutputError, ShardError
+from lgrasp.geometry.poses import compose, inverse, pose_from_matrix, pose_matrix
+from lgrasp.jobs.reach import ReachJob
+from lgrasp.reach.arm import read_arm
+from lgrasp.reach.targets import CODES
+
+AT, MOUNT = "0.4,0.1,0.05:30", "0.01,0,0.02:10,20,30"
+
+
+def arm_kinematics(path):
+    """forward(q): transforms of all links (n, 4, 4) by name, for joints (n, J)."""
+    model = yourdfpy.URDF.load(str(path), load_meshes=False)
+
+    def forward(q):
+        found = {name: [] for name in model.link_map}
+        for row in q:
+            model.update_cfg(row)
+            for name, poses in found.items():
+                poses.append(model.get_transform(name))
+        return {name: np.array(poses) for name, poses in found.items()}
+
+    return forward, np.array([[j.limit.lower, j.limit.upper] for j in model.actuated_joints])
+
+
+@pytest.fixture
+def job(tmp_path):
+    """job(shard): reaches for the rows of a shard, which is written."""
+    path = arm(tmp_path)
+
+    def job(shard, **more):
+        write_shard(tmp_path / "in" / "toy-cup-00000.h5", shard)
+        given = {"arm": path, "at": AT, "mount": MOUNT, "device": "cpu", "workers": 1, "cache": Cache(tmp_path / "c")}
+        return ReachJob.model_validate(given | {"shards": (tmp_path / "in",)} | more)
+
+    return job
+
+
+def with_poses(shard, pose):
+    rows = replace(shard.grasps, object_pose=np.asarray(pose, "f4").reshape(-1, 1, 7))
+    return replace(shard, grasps=rows)
+
+
+def test_postures_put_the_hand_where_rows_say(job, tmp_path):
+    """Poses that the arm takes in some posture are reached, others of its length are too far; limits are kept."""
+    forward, limits = arm_kinematics(arm(tmp_path))
+    rng = np.random.default_rng(3)
+    n = 24
+    mount = pose_matrix(job(sample_shard(1)).mount.pose)
+    hand = forward(rng.uniform(*(0.9 * limits.T), (n, 7)))["flange"] @ mount
+    hand[: n // 3, :3, 3] *= 4.0 / np.linalg.norm(hand[: n // 3, :3, 3], axis=1)[:, None]
+    at = np.broadcast_to(job(sample_shard(1)).at.pose, (n, 7))
+    shard = with_poses(sample_shard(n), compose(inverse(pose_from_matrix(hand)), at))
+    outcome = run(job(shard, tries=64))
+    found = read_shard(outcome.paths[0]).grasps.physics
+    ok = found["reach_ok"]
+    assert ok.tolist() == [False] * (n // 3) + [True] * (n - n // 3)
+    assert [CODES[code] for code in found["reach_code"]] == ["no_posture"] * (n // 3) + ["reached"] * (n - n // 3)
+    q = found["reach_q_arm"]
+    assert np.isnan(q[~ok]).all()
+    assert ((q[ok] >= limits[:, 0] - 1e-6) & (q[ok] <= limits[:, 1] + 1e-6)).all()
+    reached = forward(q[ok])["flange"] @ mount
+    assert np.abs(reached[:, :3, 3] - hand[ok, :3, 3]).max() < 2e-4
+    assert np.abs(reached[:, :3, :3] - hand[ok, :3, :3]).max() < 2e-3
+    assert (found["reach_manipulability"][ok] > 0).all()
+    np.testing.assert_allclose(found["reach_object_pose"], at, atol=1e-6)
+    assert outcome.job.report(outcome)["results"] == [
+        {"hand": "toy", "object": "cup.obj", "rows": n, "reached": 16, "no_posture": 8, "no_way": 0, "hits_table": 0}
+    ]
+
+
+def test_objects_on_a_table_are_reached_from_above_it(job, tmp_path):
+    path = arm(tmp_path)
+    forward, _ = arm_kinematics(path)
+    shard = sample_on_table(64)
+    pose = shard.grasps.object_pose[:, 0] * np.array([0.15, 0.15, 0.15, 1, 1, 1, 1])
+    made = job(with_poses(shard, pose))
+    rows = read_shard(run(made).paths[0]).grasps
+    found, tables = rows.physics, shard.objects[0].tables
+    placed, up = pose_matrix(found["reach_object_pose"].astype(float)), tables[rows.table["pose"]]
+    np.testing.assert_allclose((placed[:, :3, :3] @ up[:, :3, None])[..., 0], np.tile([0, 0, 1], (64, 1)), atol=1e-6)
+    np.testing.assert_allclose(placed[:, :3, 3], np.column_stack([np.tile([0.4, 0.1], (64, 1)), 0.05 - up[:, 3]]))
+    codes = np.bincount(found["reach_code"], minlength=len(CODES))
+    assert (codes[[0, 3]] > 3).all(), codes
+    ok = found["reach_ok"]
+    mount, described = pose_matrix(made.mount.pose), read_arm(path, None, np.eye(4))
+    for name, back in (("reach_q_arm", 0.0), ("reach_q_arm_approach", 0.15)):
+        links = forward(found[name][ok])
+        hand = links["flange"] @ mount
+        hand[:, :3, 3] += back * (hand[:, :3, :3] @ rows.table["approach"][ok, :, None])[..., 0]
+        assert np.abs(hand @ pose_matrix(pose[ok]) - placed[ok]).max() < 2e-3
+        low = [links[link] @ np.append(point, 1) for link, points in described.points.items() for point in points]
+        assert np.min(low, 0)[:, 2].min() > 0.05 - 1e-5
+
+
+def test_a_shard_keeps_its_verdicts(job, tmp_path):
+    shard = sample_shard(12)
+    rows = with_poses(shard, shard.grasps.object_pose[:, 0] * np.array([0.1, 0.1, 0.1, 1, 1, 1, 1]))
+    first = job(rows)
+    assert run(first).made == 12
+    again = run(first.changed())
+    assert (again.made, again.present) == (0, 12)
+    other = first.changed(at=first.at.model_copy(update={"position": (5.0, 0.0, 0.0)}))
+    with pytest.raises(OutputError, match=r"verdicts of reach \(at.position: .* requested\); --overwrite"):
+        run(other)
+    reached = int(read_shard(again.paths[0]).grasps.physics["reach_ok"].sum())
+    assert reached > 0
+    where = [parse_condition("physics/reach_ok"), parse_condition("physics/reach_manipulability > 0")]
+    assert select_rows(tmp_path / "in", where=where).rows == reached
+    run(other, resume=False)
+    with pytest.raises(ShardError, match="none satisfies physics/reach_ok"):
+        select_rows(tmp_path / "in", where=where)
+
+
+@pytest.mark.parametrize(
+    ("more", "tip", "match"),
+    [
+        ("", "hand", "no link 'hand' that joints move; it has arm_0, "),
+        ("", "base", "no link 'base'"),
+        (
+            '<link name="eye"/><joint name="e" type="fixed"><parent link="arm_6"/><child link="eye"/></joint>',
+            None,
+            "2 last links; name one with --tip: flange, eye",
+        ),
+        (
+            '<link name="x"/><joint name="e" type="revolute"><parent link="arm_6"/><child link="x"/>'
+            '<limit lower="0" upper="1"/><mimic joint="turn_0"/></joint>',
+            "x",
+            "joint 'e' follows 'turn_0'",
+        ),
+    ],
+)
+def test_arms_that_cannot_be_used(tmp_path, more, tip, match):
+    with pytest.raises(HandError, match=match):
+        read_arm(arm(tmp_path, more), tip, np.eye(4))
+
+
+def test_an_arm_without_its_meshes_is_its_origins(tmp_path):
+    mesh = '<link name="x"><collision><geometry><mesh filename="gone.stl"/></geometry></collision></link>'
+    joint = '<joint name="e" type="fixed"><parent link="arm_6"/><child link="x"/></joint>'
+    found = read_arm(arm(tmp_path, mesh + joint), "flange", np.eye(4))
+    assert "gone.stl" in found.note
+    assert {len(points) for points in found.points.values()} == {1}
