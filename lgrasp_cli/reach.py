@@ -19,12 +19,12 @@ def reach(
         str,
         Option(
             metavar="X,Y,Z[:YAW]",
-            help="Where the object stands before the arm's root link, metres and degrees; also X,Y,Z:ROLL,PITCH,YAW.",
+            help="Place of the object before the arm's root link, metres and degrees; also X,Y,Z:ROLL,PITCH,YAW.",
         ),
     ],
     mount: Annotated[
         str | None,
-        Option(metavar="X,Y,Z[:R,P,Y]", help="Base link of the hand in the frame of the tip; default: the same."),
+        Option(metavar="X,Y,Z[:R,P,Y]", help="Base link of the hand in the frame of the tip."),
     ] = None,
     tip: Annotated[str | None, Option(metavar="LINK", help="Link that carries the hand; default: the last.")] = None,
     tries: Annotated[int | None, Option(min=1, help="Postures from which each pose is searched.")] = None,
@@ -33,8 +33,6 @@ def reach(
     ] = None,
 ) -> None:
     """Tell which grasps an arm can make, and add its joints to the shards, as columns physics/reach_...
-
-    Grasps on a table are reached along their whole straight way, with the links of the arm above the table.
 
     Example: lgrasp reach grasps/allegro-mug/robust-table --arm arm.urdf --at 0.5,0,0
     """
