@@ -62,7 +62,7 @@ def test_postures_put_the_hand_where_rows_say(job, tmp_path):
     rng = np.random.default_rng(3)
     n = 24
     mount = pose_matrix(job(sample_shard(1)).mount.pose)
-    hand = forward(rng.uniform(*(0.9 * limits.T), (n, 7)))["flange"] @ mount
+    hand = forward(rng.uniform(0.9 * limits[:, 0], 0.9 * limits[:, 1], (n, 7)))["flange"] @ mount
     hand[: n // 3, :3, 3] *= 4.0 / np.linalg.norm(hand[: n // 3, :3, 3], axis=1)[:, None]
     at = np.broadcast_to(job(sample_shard(1)).at.pose, (n, 7))
     shard = with_poses(sample_shard(n), compose(inverse(pose_from_matrix(hand)), at))
@@ -92,6 +92,7 @@ def test_objects_on_a_table_are_reached_from_above_it(job, tmp_path):
     made = job(with_poses(shard, pose))
     rows = read_shard(run(made).paths[0]).grasps
     found, tables = rows.physics, shard.objects[0].tables
+    assert tables is not None
     placed, up = pose_matrix(found["reach_object_pose"].astype(float)), tables[rows.table["pose"]]
     np.testing.assert_allclose((placed[:, :3, :3] @ up[:, :3, None])[..., 0], np.tile([0, 0, 1], (64, 1)), atol=1e-6)
     np.testing.assert_allclose(placed[:, :3, 3], np.column_stack([np.tile([0.4, 0.1], (64, 1)), 0.05 - up[:, 3]]))
