@@ -16,8 +16,8 @@ PalmUse = Literal["yes", "no", "must"]
 """Whether the palm of a hand may touch."""
 Role = Literal["thumb", "index", "middle", "ring", "little"]
 """Human finger that a finger acts as."""
-SideName = Literal["radial", "ulnar"]
-"""Side of a finger's link: where of a row of fingers the index finger stands, or the other one."""
+SideName = Literal["radial", "ulnar", "tip"]
+"""Side of a finger's link: where of a row of fingers the index finger stands, the other one, or the end."""
 ShapeKind = Literal[
     *("mug", "bottle", "bowl", "plate", "box", "can", "ball", "hammer", "screwdriver"),
     *("single", "joined", "cup", "ring", "tool"),

@@ -30,7 +30,7 @@ Links = Annotated[
     str | None,
     Option(
         metavar="NAMES",
-        help="Links that may touch, and no others; LINK:radial or LINK:ulnar: with that side.",
+        help="Links that may touch, and no others; LINK:radial, LINK:ulnar or LINK:tip: with that side.",
         rich_help_panel=_PANEL,
     ),
 ]

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 COSINE_SLACK = 1e-4
 """Of the palm's direction outside its cone."""
-SIDE_SLACK = 5.0
-"""Of a link's normal outside the cone of its side [deg]."""
+SIDE_SLACK = 15.0
+"""Of a link's normal outside the cone of its side [deg]; contacts are found on a smoother surface than the mesh."""
 PLANE_SLACK = 1e-4
 """Of the numbers of the plane that the hand stays above."""
 

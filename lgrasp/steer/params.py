@@ -55,8 +55,8 @@ class Steering(Params):
 
     links: tuple[str, ...] = Field(
         default=(),
-        description="Links whose contact surface may touch, and no other, or LINK:radial, LINK:ulnar: with that side; "
-        "none: any.",
+        description="Links whose contact surface may touch, and no other, or LINK:radial, LINK:ulnar, LINK:tip: with "
+        "that side; none: any.",
     )
     palm: PalmUse = Field(default="yes", description="Whether the palm touches: yes, it may; no; must.")
 

@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
-from lgrasp.choices import Role
+from lgrasp.choices import Role, SideName
 from lgrasp.config import parse_model
 from lgrasp.errors import ConfigError
 from lgrasp.hand.fingers import Roles, finger_roles
 from lgrasp.hand.params import LinkSide
-from lgrasp.hand.sides import RadialAxes, link_side, radial_axes
+from lgrasp.hand.sides import LinkSides, finger_sides
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf
@@ -23,7 +23,7 @@ class Anatomy:
     def __init__(self, spec: HandSpec, urdf: Urdf, tree: Tree) -> None:
         self.spec, self.tree = spec, tree
         self.roles: Roles = finger_roles(spec, tree)
-        self.radial: RadialAxes = radial_axes(spec, urdf, tree)
+        self.sides: dict[Role, LinkSides] = finger_sides(spec, urdf, tree)
 
 
 class MadeTypes(NamedTuple):
@@ -66,15 +66,17 @@ def asked_sides(steering: Steering, hand: Anatomy) -> tuple[LinkSide, ...]:
     Raises:
         ConfigError: a link without such sides.
     """
-    axes = {link: axis for own in hand.radial.values() for link, axis in own.items()}
+    known = {
+        (link, name): side for own in hand.sides.values() for link, sides in own.items() for name, side in sides.items()
+    }
     found = []
     for link, side in steering.sides.items():
-        if side is not None and link not in axes:
+        if side is not None and (link, side) not in known:
             raise ConfigError(
-                f"steer.links: link '{link}' of hand '{hand.spec.name}' has no {side} side; "
-                f"links with sides: {', '.join(axes) or 'none'}"
+                f"steer.links: link '{link}' of hand '{hand.spec.name}' has no side '{side}'; "
+                f"links that have: {', '.join(link for link, name in known if name == side) or 'none'}"
             )
-        found += [] if side is None else [link_side(link, side, axes[link])]
+        found += [] if side is None else [known[link, side]]
     return tuple(found)
 
 
@@ -94,11 +96,16 @@ def made_types(hand: Anatomy) -> MadeTypes:
 def _links(kind: GraspType, hand: Anatomy, role: Role) -> list[str]:
     """Links of a finger that touch in a type, with their sides."""
     tree, side = hand.tree, kind.sides.get(role)
-    own = list(hand.radial[role] if side else hand.roles[role][1])
+    own = _sided(hand, role, side) if side else list(hand.roles[role][1])
     bodies = sorted({tree.body_of(link) for link in own})[-_SIDED_BODIES if kind.parts == "all" and side else -1 :]
     if kind.parts == "all" and not side:
         return own
     return [f"{link}:{side}" if side else link for link in own if tree.body_of(link) in bodies]
+
+
+def _sided(hand: Anatomy, role: Role, side: SideName) -> list[str]:
+    """Links of a finger that have a side."""
+    return [link for link, sides in hand.sides.get(role, {}).items() if side in sides]
 
 
 def _lack(kind: GraspType, hand: Anatomy) -> str:
@@ -109,9 +116,9 @@ def _lack(kind: GraspType, hand: Anatomy) -> str:
         told = ", ".join(role if role == own[0] else f"{own[0]} as {role}" for role, own in roles.items())
         what = "thumb" if missing[0] == "thumb" else f"{missing[0]} finger"
         return f"hand '{name}' has no {what}; its fingers: {told}"
-    flat = [roles[role][0] for role in kind.sides if role in roles and role not in hand.radial]
-    if flat:
-        return f"hand '{name}' has no sides of finger {flat[0]}: it stands beside no other"
+    for role, side in kind.sides.items():
+        if role in roles and not _sided(hand, role, side):
+            return f"hand '{name}' has no links with side '{side}' on finger '{roles[role][0]}'"
     if kind.palm == "must" and not hand.spec.palm.links:
         return f"hand '{name}' has no palm that may touch"
     return ""

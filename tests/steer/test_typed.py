@@ -87,16 +87,26 @@ def test_the_fingers_of_a_hand_face_each_other_as_its_rules_say(name):
     """The opposition space of index and middle finger was written by hand: one's ulnar, the other's radial side."""
     hand = parts(name)
     ulnar, radial = hand.spec.opposition_spaces["index-middle"].sides
-    for own, side, sign in ((hand.radial["index"], ulnar, -1), (hand.radial["middle"], radial, 1)):
-        for part in side:
-            for link in part.links:
-                np.testing.assert_allclose(sign * own[link], part.axis, atol=0.02)
+    axes = {link: own["ulnar"].axis for link, own in hand.sides["index"].items()}
+    axes |= {link: own["radial"].axis for link, own in hand.sides["middle"].items()}
+    for part in (*ulnar, *radial):
+        for link in part.links:
+            np.testing.assert_allclose(axes[link], part.axis, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "links", "axis"), [("allegro", 4, (0, 0, 1)), ("shadow", 5, (0, 0, 1)), ("leap", 4, (0, -1, 0))]
+)
+def test_tips_look_along_their_fingers(name, links, axis):
+    """By the frames of the makers' URDFs."""
+    sides = [side for own in parts(name).sides.values() for found in own.values() for side in found.values()]
+    assert [side.axis for side in sides if side.side == "tip"] == links * [axis]
 
 
 def test_links_without_sides_are_told():
     for name, link, words in (
-        ("allegro", "link_15.0_tip", "'allegro' has no radial side; links with sides: link_0.0, link_1.0"),
-        ("dclaw", "link_f2_3", "'dclaw' has no radial side; links with sides: none"),
+        ("allegro", "link_15.0_tip", "'allegro' has no side 'radial'; links that have: link_0.0, link_1.0"),
+        ("dclaw", "link_f2_3", "'dclaw' has no side 'radial'; links that have: none"),
     ):
         with pytest.raises(ConfigError, match=f"steer.links: link '{link}' of hand {words}"):
             asked_sides(Steering(links=(f"{link}:radial",)), parts(name))
