@@ -31,6 +31,18 @@ def device_name(name: str) -> str:
     return name
 
 
+def split_devices(names: str | None) -> tuple[str | None, str | None]:
+    """Several devices (``all``, or names that commas separate), None if it is one; and that, or the first of them.
+
+    Raises:
+        ValueError: no device has one of several names.
+    """
+    if names is None or (names != "all" and "," not in names):
+        return None, names
+    first, *_ = ["auto"] if names == "all" else map(device_name, names.split(","))
+    return names, first
+
+
 def comma_numbers(text: str, count: int) -> tuple[float, ...]:
     """Numbers that commas separate.
 

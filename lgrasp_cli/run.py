@@ -1,5 +1,6 @@
 """``lgrasp run``: jobs of any kind, from a config."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -30,8 +31,10 @@ def run(
 
     Example: lgrasp run configs/smoke.yaml
     """
-    from lgrasp.jobs.config import load_requests
+    from lgrasp.jobs.config import config_devices, load_requests
 
     changes = given(rows=rows, out=out, object_dir=object_dir, seed=seed, device=how.device, workers=how.workers)
     changes |= {key: value for key, value in (("objects", objects), ("held_out", held_out)) if value}
-    run_all(load_requests(config, changes), how, dry_run=dry_run)
+    requests = load_requests(config, changes)
+    how = how if how.device else replace(how, devices=config_devices(config)[0])
+    run_all(requests, how, dry_run=dry_run)

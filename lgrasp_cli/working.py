@@ -178,6 +178,7 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
         **options: Any,
     ) -> None:
         check_report(json_path)
+        from lgrasp.config import split_devices
         from lgrasp.runtime.array import parse_array
 
         if shard_index is not None or num_shards is not None:
@@ -189,8 +190,7 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
         cache = open_cache(cache_dir, fresh=rebuild)
         if _CHECKED.get() is not None:  # the devices are those of another computer
             device = None
-        several = device if device is not None and (device == "all" or "," in device) else None
-        first = device if several is None else {"all": "auto"}.get(several, several.split(",")[0])
+        several, first = split_devices(device)
         command(
             **options, how=How(cache, first, workers, shares, overwrite, json_path, quiet, verbose, devices=several)
         )

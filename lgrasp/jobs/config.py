@@ -19,6 +19,7 @@ from lgrasp.config import (
     find_yaml,
     parse_model,
     read_yaml,
+    split_devices,
     yaml_files,
 )
 from lgrasp.engine.folder import run_folder
@@ -126,14 +127,30 @@ KINDS = {
 """Kind of a job, as key ``job`` of a config names it, and its keys; those of ``generate`` are :class:`JobConfig`."""
 
 
+def config_devices(name: str) -> tuple[str | None, str | None]:
+    """What key ``device`` of a config by name or by path names: see :func:`lgrasp.config.split_devices`.
+
+    Raises:
+        ConfigError: no such config, or no such device.
+    """
+    path = find_yaml(name, config_files(), "config")
+    names = read_yaml(path).get("device")
+    try:
+        return split_devices(names) if isinstance(names, str) else (None, None)
+    except ValueError as error:
+        raise ConfigError(f"config {path}: key 'device' = '{names}': {error}") from None
+
+
 def load_requests(name: str, changes: dict[str, Any]) -> list[Request]:
-    """The jobs that a config by name or by path asks for, some keys replaced.
+    """The jobs that a config by name or by path asks for, some keys replaced; of several devices on the first.
 
     Raises:
         ConfigError: no such config or kind of job, or a wrong key or value.
     """
     path = find_yaml(name, config_files(), "config")
     data = read_yaml(path)
+    several, first = config_devices(name)
+    data |= {"device": first} if several else {}
     kind = data.pop("job", "generate")
     if kind not in ("generate", *KINDS):
         hint = did_you_mean(str(kind), ("generate", *KINDS))

@@ -5,6 +5,11 @@ import signal
 from pathlib import Path
 
 import pytest
+from support.shards import sample_shard
+
+from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.run import run
+from lgrasp.jobs.lanes import Lanes
 
 STAGES = ["place", "domain", "ik", "search", "filter"]
 
@@ -162,6 +167,25 @@ def test_run_by_an_array(cli, tmp_path, quick, monkeypatch):
     assert "array task 0 of 3: there are 2 shards to share" in result.err
 
 
+def test_run_on_several_devices(cli, tmp_path, monkeypatch):
+    """A config names them as the option does, which replaces its own."""
+    given = []
+
+    class Recorded(Lanes):
+        def outcome(self, number, job, events):
+            given.append([device.alias for device in self._devices])
+            return run(job, events)
+
+    monkeypatch.setattr("lgrasp.jobs.lanes.Lanes", Recorded)
+    write_shard(tmp_path / "in" / "toy-cup-00000.h5", sample_shard(3))
+    config = "job: metrics\nshards: [in]\nadd: [volume]\nout: out\nworkers: 1\ndevice: cpu,cpu\n"
+    (tmp_path / "c.yaml").write_text(config)
+    for more, lanes in ((), [["cpu", "cpu"]]), (("--device", "cpu"), []), (("--device", "cpu,cpu,cpu"), [["cpu"] * 3]):
+        given.clear()
+        assert cli("run", "c.yaml", *more).code == 0
+        assert given == lanes
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -170,6 +194,7 @@ def test_run_by_an_array(cli, tmp_path, quick, monkeypatch):
         ("objects: [tiny]\nrows: 0", "rows"),
         ("objects: [tiny]\npipelines: [swfit]", "did you mean 'swift'"),
         ("objects: [tiny]\nobject_dir: nowhere", "nowhere"),
+        ("objects: [tiny]\ndevice: cpu,gpu", "key 'device' = 'cpu,gpu': device 'gpu' cannot be"),
     ],
 )
 def test_wrong_configs(cli, tmp_path, text, words):
