@@ -70,7 +70,7 @@ class ReachJob(ReachRequest, VerdictJob):
             placed = placed_objects(self.at, rows, objects)
         except ShardError as error:
             raise ShardError(f"{part.source}: {error}") from None
-        search = ArmSearch(self.described, self.tries, self.device_used.alias)
+        search = ArmSearch(self.described, self.tries)
         found = search(
             hand_targets(self.at, rows, placed),
             threads(self.workers),

@@ -59,7 +59,7 @@ class Arm:
         slides = [max(abs(joint.lower), abs(joint.upper)) for joint in self.moving if joint.prismatic]
         return T[:3, 3], float(sum(lengths) + sum(slides) + np.linalg.norm(self.T_tip_hand[:3, 3]))
 
-    def chain(self, device: str) -> "SerialChain":
+    def chain(self) -> "SerialChain":
         """The chain from the root link to the hand's base link, whose frames are named by links."""
         import torch
         from pytorch_kinematics.chain import Chain, SerialChain
@@ -79,7 +79,7 @@ class Arm:
         frames.append(frame(f"hand on {self.tip}", self.T_tip_hand))
         for above, below in pairwise(frames):
             above.add_child(below)
-        return SerialChain(Chain(frames[0]), frames[-1].name).to(device=device)
+        return SerialChain(Chain(frames[0]), frames[-1].name)
 
 
 def read_arm(path: Path, tip: str | None, T_tip_hand: np.ndarray) -> Arm:

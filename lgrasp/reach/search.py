@@ -22,7 +22,7 @@ MOST_TURN = 0.5
 _REACHED, _POSE, _WAY, _TABLE = range(len(CODES))
 _TOGETHER = 4  # starts of a round; rows that are reached take part in no other
 _ROUGH, _WITHIN, _NEXT = 15, 10, 6  # iterations without limits, within them, and from one step of the way to the next
-_ROWS = {"cpu": 256, "cuda": 16_384}  # at a time
+_ROWS = 256  # at a time
 
 
 class Reached(NamedTuple):
@@ -43,12 +43,10 @@ class ArmSearch:
 
     Args:
         tries: starts of each pose, well spread within the limits.
-        device: ``cpu`` or ``cuda:N``.
     """
 
-    def __init__(self, arm: Arm, tries: int, device: str = "cpu") -> None:
-        self._arm, self._device = arm, device
-        self._chain = arm.chain(device)
+    def __init__(self, arm: Arm, tries: int) -> None:
+        self._arm, self._chain = arm, arm.chain()
         low, high = self._chain.low, self._chain.high
         drawn = torch.quasirandom.SobolEngine(len(arm.moving), scramble=True, seed=0).draw(tries).to(low)
         self._starts = low + drawn * (high - low)
@@ -60,21 +58,19 @@ class ArmSearch:
         """Joints for targets.
 
         Args:
-            workers: threads, on a CPU.
+            workers: threads.
             progress: called with targets done and reached.
         """
-        kind, threads = self._device.partition(":")[0], torch.get_num_threads()
+        threads = torch.get_num_threads()
 
         def work(first: int) -> Reached:
             torch.set_num_threads(1)  # on small arrays several wait for each other
-            way = None if targets.way is None else targets.way[first : first + _ROWS[kind]]
-            return self._block(Targets(targets.T[first : first + _ROWS[kind]], way, targets.table))
+            way = None if targets.way is None else targets.way[first : first + _ROWS]
+            return self._block(Targets(targets.T[first : first + _ROWS], way, targets.table))
 
         parts, done, reached = [], 0, 0
         try:
-            for _, part in in_order(
-                work, range(0, len(targets.T), _ROWS[kind]), workers if kind == "cpu" else 1, ahead=1
-            ):
+            for _, part in in_order(work, range(0, len(targets.T), _ROWS), workers, ahead=1):
                 parts.append(part)
                 done, reached = done + len(part.code), reached + int((part.code == 0).sum())
                 progress(done, reached)
@@ -131,7 +127,7 @@ class ArmSearch:
         code = torch.where(good, torch.where(height < 0, _TABLE, _REACHED), _WAY)
         J = self._chain.jacobian_tensor(q)
         measure = torch.linalg.det(J @ J.mT).clamp_min(0.0).sqrt()
-        return [x.cpu().numpy() for x in (row, code, torch.where(code == _REACHED, measure, -1.0), q, at)]
+        return [x.numpy() for x in (row, code, torch.where(code == _REACHED, measure, -1.0), q, at)]
 
     def _follow(self, q: torch.Tensor, T: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Joints (n, J) for poses (n, 4, 4) near those of q (n, J), and which came there (n,)."""
@@ -142,7 +138,7 @@ class ArmSearch:
 
     def _height(self, q: torch.Tensor, table: np.ndarray | None) -> torch.Tensor:
         """Of the lowest point of the links above the table [m] (n,)."""
-        height = torch.full((len(q),), torch.inf, dtype=q.dtype, device=q.device)
+        height = torch.full((len(q),), torch.inf, dtype=q.dtype)
         if table is None or not len(q):
             return height
         up, links = self._put(table), self._chain.forward_kinematics_tensor(q)
@@ -153,7 +149,7 @@ class ArmSearch:
         return height
 
     def _put(self, values: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(values, dtype=self._chain.dtype, device=self._device)
+        return torch.as_tensor(values, dtype=self._chain.dtype)
 
     def _ik(self, starts: torch.Tensor, iterations: int, **how: Any) -> PseudoInverseIK:
         return PseudoInverseIK(

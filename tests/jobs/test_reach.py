@@ -87,17 +87,17 @@ def test_postures_put_the_hand_where_rows_say(job, tmp_path):
 def test_objects_on_a_table_are_reached_from_above_it(job, tmp_path):
     path = arm(tmp_path)
     forward, _ = arm_kinematics(path)
-    shard = sample_on_table(64)
+    shard = sample_on_table(32)
     pose = shard.grasps.object_pose[:, 0] * np.array([0.15, 0.15, 0.15, 1, 1, 1, 1])
     made = job(with_poses(shard, pose))
     rows = read_shard(run(made).paths[0]).grasps
     found, tables = rows.physics, shard.objects[0].tables
     assert tables is not None
     placed, up = pose_matrix(found["reach_object_pose"].astype(float)), tables[rows.table["pose"]]
-    np.testing.assert_allclose((placed[:, :3, :3] @ up[:, :3, None])[..., 0], np.tile([0, 0, 1], (64, 1)), atol=1e-6)
-    np.testing.assert_allclose(placed[:, :3, 3], np.column_stack([np.tile([0.4, 0.1], (64, 1)), 0.05 - up[:, 3]]))
+    np.testing.assert_allclose((placed[:, :3, :3] @ up[:, :3, None])[..., 0], np.tile([0, 0, 1], (32, 1)), atol=1e-6)
+    np.testing.assert_allclose(placed[:, :3, 3], np.column_stack([np.tile([0.4, 0.1], (32, 1)), 0.05 - up[:, 3]]))
     codes = np.bincount(found["reach_code"], minlength=len(CODES))
-    assert (codes[[0, 3]] > 3).all(), codes
+    assert (codes[[0, 3]] > 2).all(), codes
     ok = found["reach_ok"]
     mount, described = pose_matrix(made.mount.pose), read_arm(path, None, np.eye(4))
     for name, back in (("reach_q_arm", 0.0), ("reach_q_arm_approach", 0.15)):

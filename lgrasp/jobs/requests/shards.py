@@ -82,8 +82,11 @@ class ReachRequest(VerdictRequest):
         description="Object's frame, or of grasps on a table the place on it, in the frame of the arm's root link."
     )
     tries: int = Field(default=32, ge=1, le=4096, description="Postures of the arm from which a pose is searched.")
+    device: DeviceName = "cpu"
 
     def check(self) -> None:
+        if self.device.startswith("cuda"):
+            raise ConfigError(f"device '{self.device}': lgrasp reach searches on the CPU; leave it out")
         check_file(self.arm, (".urdf",), "--arm: a URDF", HandError)
         super().check()
 
