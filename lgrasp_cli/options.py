@@ -123,15 +123,13 @@ def position(text: str | None) -> list[float] | None:
     Raises:
         ConfigError: not three numbers.
     """
+    from lgrasp.config import comma_numbers
     from lgrasp.errors import ConfigError
 
     try:
-        numbers = [float(part) for part in text.split(",")] if text is not None else None
-    except ValueError:
-        numbers = []
-    if numbers is not None and len(numbers) != 3:
-        raise ConfigError(f"--viewpoint '{text}': three numbers separated by commas, such as 0,0,0.7")
-    return numbers
+        return None if text is None else list(comma_numbers(text, 3))
+    except ValueError as error:
+        raise ConfigError(f"--viewpoint '{text}': {error}, such as 0,0,0.7") from None
 
 
 def choose_pipeline(
