@@ -12,7 +12,7 @@ from lgrasp.object.region_text import Region
 from lgrasp.object.regions import MEMBER, region_weights
 from lgrasp.object.surface import opposite_points
 
-_DRAWS = 4096  # entries among which points of unequal weight are drawn
+_DRAWS = 8192  # entries among which points of unequal weight are drawn
 
 
 def surface_weights(
@@ -58,7 +58,8 @@ def steer_object(model: ObjectModel, weights: SurfaceWeights, *, seed: int = 0, 
     density = asked + rest
     often = (density > 0).astype(int)
     if np.ptp(density[density > 0]) > 1e-6 * density.max():
-        often *= np.maximum(1, np.rint(density / density.sum() * max(_DRAWS, n))).astype(int)
+        upto = np.cumsum(density) / density.sum() * max(_DRAWS, 2 * n)
+        often = np.diff(np.rint(upto).astype(int), prepend=0)
     rows = np.repeat(np.arange(n), often)
     points, normals = model.contact_points[rows], model.contact_normals[rows]
     opposite = opposite_points(points, normals, seed=seed, device=device)

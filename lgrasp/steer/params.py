@@ -16,7 +16,7 @@ from lgrasp.steer.grasp_types import find_type
 if TYPE_CHECKING:
     import numpy as np
 
-STEER_VERSION = 1
+STEER_VERSION = 2
 """Raised whenever the same steering gives other grasps."""
 
 

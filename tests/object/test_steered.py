@@ -83,6 +83,13 @@ def test_share_of_the_draws(ball, from_, share, drawn):
     assert steered.off_centre == 0.0
 
 
+def test_the_share_is_drawn_however_many_points_there_are(ball, monkeypatch):
+    monkeypatch.setattr("lgrasp.object.steered._DRAWS", 0)
+    on = (ball.points[:, 0] >= 0.1).astype(float)
+    steered = steer_object(ball.model, weighted(ball, touch=on, share=0.7))
+    assert steered.touch.mean() == pytest.approx(0.7, abs=0.01)
+
+
 def test_nothing_left_is_refused(ball):
     with pytest.raises(ConfigError, match="leaves none of the 50 surface points") as caught:
         steer_object(
