@@ -157,8 +157,8 @@ Joint order, where values have no names:
 
 
 _TABLE = """\
-  table_plane      what the object stands on (generate --table) or the hand is above (--above): unit normal up and height
-                   along it [m], in the object's frame
+  table_plane      what the object stands on (generate --table) or the hand is above (--above): unit normal up and
+                   height along it [m], in the object's frame
   table_approach   unit direction in which the open hand comes, same frame; both are additions of lgrasp
 """
 
