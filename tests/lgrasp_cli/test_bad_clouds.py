@@ -181,7 +181,7 @@ def test_a_mesh_gives_its_vertices_and_their_normals(plan, tmp_path):
         (["--cloud", "a.npz", "--cloud", "a.npz", "--label", 3, "--label", 4], "label 4 selects 0 points"),
         (["--cloud", "a.npz", "--cloud", "a.npz", "--scale", "0.06:0.1"], "clouds have the size that they have"),
         (["--cloud", "a.npz", "--cloud", "a.npz", "--simulate", "seq6"], "a simulator needs meshes"),
-        (["--cloud", "a.npz", "--cloud", "a.npz", "--viewpoint", "0,0"], "three numbers separated by commas"),
+        (["--cloud", "a.npz", "--cloud", "a.npz", "--viewpoint", "0,0"], "give 3 numbers, separated by commas"),
         (["mug", "sphere", "--viewpoint", "0,0,0"], "--viewpoint belongs to --cloud"),
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, list) else "",
