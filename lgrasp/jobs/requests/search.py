@@ -81,7 +81,7 @@ class GenerateRequest(SearchRequest):
             )
         if self.negatives and "simulate" in self.pipeline.order:
             raise ConfigError(
-                "--negatives: rows that fail a bound may hold; leave --simulate out, then lgrasp simulate judges all rows"
+                "--negatives: rows that fail a bound may hold; leave --simulate out, then lgrasp simulate judges all"
             )
         find_object(self.object)
         super().check()
