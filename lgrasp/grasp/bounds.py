@@ -86,19 +86,27 @@ class GraspBounds(Params):
         default=DRIVE_STIFFNESS, gt=0, le=1e6, description="Position control that q_squeeze is meant for [N m/rad]."
     )
 
-    max_squeeze_lead: float = Field(
-        default=1.0,
-        gt=0,
-        le=10,
-        description="How far the joint targets of q_squeeze may be ahead of q; where they would be further, the hand "
-        "presses with less [rad; sliding joints over 10 cm].",
-    )
     min_squeeze_travel: float = Field(
         default=0.0,
         ge=0,
         le=0.1,
         description="How far q_squeeze would take the contacts if the object gave way, mean by force [m]; 0 asks for "
         "nothing.",
+    )
+
+    min_stable_squeeze: float = Field(
+        default=0.0,
+        ge=0,
+        le=1000,
+        description="Least force at which a squeeze of soft joints would push the object out sideways [N]; 0 asks for "
+        "nothing.",
+    )
+    squeeze_margin: float = Field(
+        default=0.0,
+        ge=0,
+        le=100,
+        description="How many times smaller than that the force of q_squeeze is at least; the hand presses with less "
+        "where it must; 0 asks for nothing.",
     )
 
     @model_validator(mode="before")

@@ -26,6 +26,7 @@ from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome
 from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, open_fingers, open_poses, try_fingers
 from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, drop_light, grasp_epsilon, resist_loads
+from lgrasp.grasp.stability_kernels import find_stable_squeeze
 from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.model import HandModel
@@ -101,7 +102,7 @@ class Check:
         wp.launch(list_kept, len(self), [self.found, upto], [row], device=self.hand.device)
         packed, on_table = self._pack(seed, row), self.obj.planes is not None
         self._share(row, tally)
-        bounded = self.limits.min_squeeze_travel > 0.0
+        bounded = max(self.limits.min_squeeze_travel, self.limits.min_stable_squeeze) > 0.0
         if bounded:
             wp.launch(drop_limp, len(self), [self.limits, packed], [row, tally.device], device=self.hand.device)
         if on_table:
@@ -130,6 +131,7 @@ class Check:
         *fetched, outcome = fetch([*columns.values(), self.found.outcome])
         table = _table(dict(zip(columns, fetched, strict=True)), len(self))
         limp = table.metrics["squeeze_travel"] < self.limits.min_squeeze_travel
+        limp |= table.metrics["stable_squeeze"] < self.limits.min_stable_squeeze
         outcome = np.where(limp & (outcome == Outcome.KEPT), Outcome.SQUEEZE, outcome)
         if on_table:
             lost = np.isnan(table.table["approach"][:, 0]) & (outcome == Outcome.KEPT)
@@ -169,6 +171,7 @@ class Check:
         wp.launch(control_poses, (m, model.groups), inputs, [packed, opened], device=d)
         if model.tree.shared_names:
             wp.launch(press_shared, m, inputs, [packed], device=d)
+        wp.launch(find_stable_squeeze, m, inputs, [packed], device=d)
         wp.launch(limit_squeeze, m, [hand, limits, row], [packed], device=d)
         stuck = wp.zeros(1 + m, dtype=wp.int32, device=d)
         inputs = [hand, obj, self.held.struct, limits, at, opened, row]
@@ -191,7 +194,7 @@ def _table(columns: dict[str, np.ndarray], count: int) -> GraspTable:
     """The first ``count`` rows of what :func:`_columns` gave."""
     x: dict[str, Any] = {name: values[:count] for name, values in columns.items() if name != "numbers"}
     numbers = dict(zip(MEASURED, columns["numbers"][:, :count], strict=True))
-    numbers |= {name: x.pop(name) for name in ("epsilon", "self_penetration", "pregrasp_opening", "squeeze_travel")}
+    numbers |= {name: x.pop(name) for name in METRICS if name in x}
     numbers["force_closure"] = (numbers["epsilon"] > 0).astype(np.float32)
     numbers["normal_error"] = np.arccos(np.clip(numbers["facing"], -1, 1))
     x["index"] = x["index"].astype(np.int64)

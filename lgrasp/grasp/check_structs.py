@@ -31,8 +31,9 @@ class Limits:
     min_table_distance: wp.float32
     squeeze_force: wp.float32
     squeeze_stiffness: wp.float32
-    max_squeeze_lead: wp.float32
     min_squeeze_travel: wp.float32
+    min_stable_squeeze: wp.float32
+    squeeze_margin: wp.float32
     deepest: wp.float32  # penetrations above this are not distinguished
     whole: wp.int32  # 1: rows that failed are measured to the end
 
@@ -98,6 +99,7 @@ class Packed:
     self_penetration: wp.array(dtype=wp.float32)  # (m,) [m]
     pregrasp_opening: wp.array(dtype=wp.float32)  # (m,) [rad or m]
     squeeze_travel: wp.array(dtype=wp.float32)  # (m,) [m]
+    stable_squeeze: wp.array(dtype=wp.float32)  # (m,) [N]
     resting: wp.array(dtype=wp.int32)  # (m,) resting pose of the object; only where there is a table, as the next
     approach: wp.array(dtype=wp.vec3)  # (m,) direction in which the open hand comes, base frame; NaN none
 

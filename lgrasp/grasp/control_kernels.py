@@ -163,8 +163,9 @@ def press_shared(
 
 @wp.kernel
 def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), packed_out: Packed):
-    """Targets of the squeeze within joint limits; where one is further ahead than ``max_squeeze_lead``, all forces of
-    the hand shrink alike. And how far that takes the contacts, mean by force, if the object gives way.
+    """Targets of the squeeze within joint limits; where its force would be nearer to the stable one than
+    ``squeeze_margin``, all forces of the hand shrink alike. And how far that takes the contacts, mean by force, if the
+    object gives way.
 
     Args:
         row: (m,) hand of each row, -1 none.
@@ -172,35 +173,32 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
     i = wp.tid()
     if row[i] < 0:
         return
-    lead = float(0.0)
+    most = limits.squeeze_margin * limits.squeeze_force
+    share = wp.where(most > packed_out.stable_squeeze[i], packed_out.stable_squeeze[i] / most, 1.0)
     work = float(0.0)
     for c in range(packed_out.q.shape[1]):
         q = packed_out.q[i, c]
-        wanted = packed_out.q_squeeze[i, c]
+        wanted = q + (packed_out.q_squeeze[i, c] - q) * share
         target = wp.clamp(wanted, hand.kin.column_lower[c], hand.kin.column_upper[c])
         arm = wp.where(hand.kin.column_sliding[c] == 1, SLIDING_ARM, 1.0)
         work += limits.squeeze_stiffness * (wanted - q) * (target - q) / (arm * arm)
-        lead = wp.max(lead, wp.abs(target - q) / arm)
         packed_out.q_squeeze[i, c] = target
-    share = float(1.0)
-    if lead > limits.max_squeeze_lead:
-        share = limits.max_squeeze_lead / lead
-        for c in range(packed_out.q.shape[1]):
-            q = packed_out.q[i, c]
-            packed_out.q_squeeze[i, c] = q + (packed_out.q_squeeze[i, c] - q) * share
-    packed_out.squeeze_travel[i] = share * work / wp.max(limits.squeeze_force, _LEAST_FORCE)
+    packed_out.squeeze_travel[i] = work / wp.max(share * limits.squeeze_force, _LEAST_FORCE)
 
 
 @wp.kernel
 def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32), counts_out: wp.array(dtype=wp.int32)):
-    """Rows that squeeze the object by less than ``min_squeeze_travel`` become none.
+    """Rows that squeeze the object by less than ``min_squeeze_travel``, or cannot stably with ``min_stable_squeeze``,
+    become none.
 
     Args:
         row_out: (m,) hand of each row, -1 none.
         counts_out: (reasons,) these rows are moved from those that are kept.
     """
     i = wp.tid()
-    if row_out[i] >= 0 and packed.squeeze_travel[i] < limits.min_squeeze_travel:
+    if row_out[i] < 0:
+        return
+    if packed.squeeze_travel[i] < limits.min_squeeze_travel or packed.stable_squeeze[i] < limits.min_stable_squeeze:
         row_out[i] = -1
         wp.atomic_sub(counts_out, KEPT, 1)
         wp.atomic_add(counts_out, SQUEEZE, 1)

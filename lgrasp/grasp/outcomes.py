@@ -47,7 +47,7 @@ SHARED = (*REASONS, "touch")
 
 FAILED_BOUNDS = (
     *("none", "min_contacts", "max_gap", "max_normal_angle", "min_self_distance", "max_penetration", "max_gswo"),
-    *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel"),
+    *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel", "min_stable_squeeze"),
 )
 """By code, the first bound that a row fails, of :class:`~lgrasp.grasp.bounds.GraspBounds`; ``approach``: no straight
 way of the open hand to the object clears the table."""
@@ -59,7 +59,6 @@ _FAILED = {
     Outcome.UNRESISTED_LOAD: "max_unresisted_load",
     Outcome.TABLE: "min_table_distance",
     Outcome.APPROACH: "approach",
-    Outcome.SQUEEZE: "min_squeeze_travel",
 }
 
 MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
@@ -68,6 +67,7 @@ MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
 METRICS = (
     *("fswo", "gswo", "unresisted_load", "epsilon", "force_closure"),
     *("penetration", "self_penetration", "gap", "normal_error", "pregrasp_opening", "squeeze_travel"),
+    "stable_squeeze",
 )
 """Columns of the metrics table."""
 
@@ -81,4 +81,7 @@ def failed_bounds(table: GraspTable, outcome: np.ndarray, bounds: GraspBounds) -
     codes = np.zeros(max(Outcome) + 1, np.float32)
     for failed, name in _FAILED.items():
         codes[failed] = at[name]
-    return np.where(outcome == Outcome.CONTACT, contact, codes[outcome]).astype(np.float32)
+    limp = table.metrics["squeeze_travel"] < bounds.min_squeeze_travel
+    squeeze = np.where(limp, at["min_squeeze_travel"], at["min_stable_squeeze"])
+    late = np.where(outcome == Outcome.SQUEEZE, squeeze, codes[outcome])
+    return np.where(outcome == Outcome.CONTACT, contact, late).astype(np.float32)

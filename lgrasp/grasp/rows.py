@@ -17,6 +17,7 @@ METRIC_UNITS = {
     "normal_error": "rad",
     "pregrasp_opening": "rad or m",
     "squeeze_travel": "m",
+    "stable_squeeze": "N",
     "hold_drift": "m",
     "failed_bound": CODE + ", ".join(f"{code} {name}" for code, name in enumerate(FAILED_BOUNDS)),
 }

@@ -9,8 +9,8 @@ from lgrasp.grasp.rows import CONTACTS
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.tree import Tree
 
-_WORST = {"epsilon": np.fmin, "force_closure": np.fmin, "pregrasp_opening": np.fmin, "squeeze_travel": np.fmin}
-"""How a metric of several steps becomes one of the row; the largest unless stated otherwise."""
+_LEAST = ("epsilon", "force_closure", "pregrasp_opening", "squeeze_travel", "stable_squeeze")
+"""Metrics of which the smallest of several steps is that of the row; of others it is the largest."""
 
 
 @dataclass(frozen=True)
@@ -119,5 +119,6 @@ def extend(
     }
     metrics = dict(grasps.metrics)
     for name, values in before.metrics.items():
-        metrics[name] = _WORST.get(name, np.fmax)(values[row], metrics[name])
+        worst = np.fmin if name in _LEAST else np.fmax
+        metrics[name] = worst(values[row], metrics[name])
     return SequenceTable(parent=row.astype(np.int64), candidate=grasps.index, metrics=metrics, **longer)

@@ -18,9 +18,10 @@ from lgrasp.runtime.fetch import to_numpy
 
 wp.set_module_options(KERNEL_OPTIONS)
 
+ALMOST_ALWAYS = 0.95
+"""Links that touch in a larger share of all postures are left to touch."""
 _SAMPLED_POSTURES = 256
 _CONFIRMING_POSTURES = 2000  # postures in which a pair must touch to count as touching always
-_ALMOST_ALWAYS = 0.95  # of all postures
 _UNUSABLE_SHARE = 0.98  # of all postures
 _GRID_ERROR = 5.0e-5  # [m] that distance grids may err
 
@@ -106,7 +107,7 @@ def with_pairs(
         members = (links == pair).all(1)
         share = touch[:, members].any(1).mean()
         a, b = (names[k] for k in pair)
-        if share > _ALMOST_ALWAYS and (a in dented or b in dented):
+        if share > ALMOST_ALWAYS and (a in dented or b in dented):
             keep[members] = False
             found, note = _true_overlap(model, (a, b), meshes, q, device)
             sides += found

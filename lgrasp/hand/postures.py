@@ -10,6 +10,9 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
 from lgrasp.runtime.device import start
 
+SAMPLED_POSTURES = 1200
+"""Random postures that tell what fingers can reach."""
+
 _Index = int | slice | list[int] | np.ndarray
 
 

@@ -34,7 +34,10 @@ def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
                 "too little of the normal force is on the region to touch; a smaller share or larger region gives more"
             )
         if 2 * found.get("squeeze", 0) > whole:
-            reason = "the joints hardly press on the object; bounds.min_squeeze_travel=0 asks for nothing"
+            reason = (
+                "the joints hardly press on the object, or push it out; bounds.min_squeeze_travel=0 and "
+                "bounds.min_stable_squeeze=0 ask for nothing"
+            )
         if share < least:
             worst, least = stage, share
             words = f"{found.get(after, 0):,} of {whole:,} survive: {reason}"

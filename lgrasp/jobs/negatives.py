@@ -25,6 +25,7 @@ _LOOSE: dict[str, float] = {
     "max_gswo": 0.5,
     "max_unresisted_load": 1.0,
     "min_squeeze_travel": 0.0,
+    "min_stable_squeeze": 0.0,
     "min_table_distance": 0.0,
     "min_self_distance": 0.0,
 }

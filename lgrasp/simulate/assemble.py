@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
+from lgrasp.hand.pairs import ALMOST_ALWAYS
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.urdf import joint_end, numbers, parse_robot
 from lgrasp.simulate.builder import (
@@ -94,7 +95,6 @@ TABLE = "lgrasp table"
 
 _COUPLING = (0.99, 0.999)  # impedance of coupled joints: with MuJoCo's own they give way more than the drive
 _SAMPLED_POSTURES = 200
-_ALMOST_ALWAYS = 0.95  # of all postures; links that touch so often are left to touch
 
 
 def assemble(
@@ -193,4 +193,4 @@ def _always_touching(mujoco: Any, model: Any) -> list[tuple[int, int]]:
         touching = np.sort(model.geom_bodyid[data.contact.geom], axis=1)
         for a, b in {(int(a), int(b)) for a, b in touching[data.contact.dist < 0]}:
             count[a, b] = count.get((a, b), 0) + 1
-    return sorted(pair for pair, n in count.items() if n > _ALMOST_ALWAYS * _SAMPLED_POSTURES)
+    return sorted(pair for pair, n in count.items() if n > ALMOST_ALWAYS * _SAMPLED_POSTURES)

@@ -9,12 +9,11 @@ from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.finger_structure import FingerStructure, probe_spec, tip_link
 from lgrasp.hand.drafting.reach import Hold, Touch, best_hold, finger_touches, still_touches
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.postures import Postures, sample_bodies
+from lgrasp.hand.postures import SAMPLED_POSTURES, Postures, sample_bodies
 from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.surface_visibility import link_surfaces, surface_visibility, tip_point
 from lgrasp.hand.urdf import Urdf
 
-_SAMPLED_POSTURES = 1200
 _MIN_TIP_AREA = 5.0e-5  # [m^2] distal half of a fingertip
 _PALM_SPREAD = 45.0  # [degrees]
 _MIN_LINK_AREA = 2.0e-5  # [m^2] contact surface of a link
@@ -58,7 +57,7 @@ def survey_contacts(
     probe = probe_spec(name, tip_link(urdf, structure), locked, structure.base_link)
     model = build_hand(urdf.path, probe, pieces_only=True)
     tree = model.tree
-    postures = sample_bodies(model, model.random_postures(_SAMPLED_POSTURES))
+    postures = sample_bodies(model, model.random_postures(SAMPLED_POSTURES))
     surfaces = link_surfaces(urdf, model)
     used = structure.tips if jaws is None else (tree.body_of(jaws[1]),)
     tips = {b: tip_point([s for s in surfaces if s.body == b], 0.2) for b in used}
@@ -80,7 +79,7 @@ def survey_contacts(
     hold = best_hold(touches.values(), depth)
     palm = _palm_sides([s for s in surfaces if s.body == 0], None if hold is None else hold.centre)
     if palm:
-        still = still_touches("palm", *_allowed(palm, 0), 8 * _SAMPLED_POSTURES)
+        still = still_touches("palm", *_allowed(palm, 0), 8 * SAMPLED_POSTURES)
         hold = best_hold([*touches.values(), still], depth)
     return ContactSurvey(model, structure, locked, postures, surfaces, sides, palm, hold)
 

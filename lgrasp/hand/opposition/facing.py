@@ -8,13 +8,12 @@ import numpy as np
 
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import Space
-from lgrasp.hand.postures import Postures, sample_bodies
+from lgrasp.hand.postures import SAMPLED_POSTURES, Postures, sample_bodies
 from lgrasp.hand.surface import ContactLink
 
 _MIN_FACING_COSINE = np.cos(np.radians(35.0))  # of each hand normal to the line between the two, at least
 _MIN_PALM_COSINE = np.cos(np.radians(16.0))  # of the palm's, which no finger can turn
 _WIDTH_RANGE = (0.002, 0.20)  # [m]
-_SAMPLED_POSTURES = 1200
 _PAIRS_DRAWN = 400_000  # pairs of points that are looked at
 _MIN_FACING_PAIRS = 100  # of them that must face each other for a space to hold anything
 _MIN_PRESSED_SHARE = 0.3  # share of those that a joint must move towards each other
@@ -58,9 +57,9 @@ def opposed(
 def space_postures(model: HandModel, device: str = "cpu") -> Postures:
     """Random postures of a hand; row r has the shared joints at setting r modulo the number of settings."""
     tree = model.tree
-    q = model.random_postures(_SAMPLED_POSTURES)
+    q = model.random_postures(SAMPLED_POSTURES)
     shared = np.isin(tree.joint_names, tree.shared_names)
-    q[:, shared] = np.resize(tree.settings[:, shared], (_SAMPLED_POSTURES, int(shared.sum())))
+    q[:, shared] = np.resize(tree.settings[:, shared], (SAMPLED_POSTURES, int(shared.sum())))
     return sample_bodies(model, q, device)
 
 

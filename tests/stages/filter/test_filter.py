@@ -9,6 +9,7 @@ from support.wrench import residual
 
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.outcomes import REASONS
+from lgrasp.grasp.stability_kernels import CONTACT_STIFFNESS, MOST_SQUEEZE
 from lgrasp.grasp.tables import ContactSets
 from lgrasp.stages.filter.stage import run
 
@@ -81,56 +82,78 @@ def test_contacts(finished, inputs, link_poses, link_distance):
     np.testing.assert_allclose(grasps.metrics["gap"], worst, atol=1.5e-4)
 
 
-def test_control_poses(finished, inputs, link_poses):
+@pytest.fixture(scope="module")
+def touching(finished, inputs, link_poses):
+    """Contacts of each row in the base frame: points p, normals n, forces f of 1 N, (N, C, 3), NaN where there is none;
+    how joints move the points, (N, C, 3, K), by central differences; and how far the pregrasp takes them, (N, C, 3)."""
+    grasps, tree = finished[0], inputs.hand.model.tree
+    R, t = Rotation.from_quat(grasps.pose[:, 3:]).as_matrix()[:, None], grasps.pose[:, None, :3]
+    p, n, f = (
+        np.einsum("ncij,ncj->nci", R, x) for x in (grasps.contact_points, grasps.contact_normals, grasps.contact_forces)
+    )
+    p += t
+
+    def at(q):
+        """The points of the links that touch at q are here at ``q``."""
+        moved = []
+        for X in (link_poses(grasps.q), link_poses(q)):
+            moved.append(X[np.arange(len(p))[:, None], grasps.contact_links])
+        local = np.einsum("ncji,ncj->nci", moved[0][..., :3, :3], p - moved[0][..., :3, 3])
+        return np.einsum("ncij,ncj->nci", moved[1][..., :3, :3], local) + moved[1][..., :3, 3]
+
+    steps = 1e-3 * np.eye(len(tree.joint_lower))
+    J = np.stack([(at(grasps.q + step) - at(grasps.q - step)) / 2e-3 for step in steps], -1)
+    return p, n, f, J, at(grasps.q_pregrasp) - p
+
+
+def squeeze(grasps, touching, tree, bounds, share=1.0):
+    """Torques of the joints that press, and the targets that ask for a share of them within limits, (N, K) each."""
+    torque = bounds.squeeze_force * np.nansum(np.einsum("nci,ncik->nck", *touching[2:4]), 1)
+    wanted = grasps.q + np.reshape(share, (-1, 1)) * torque / bounds.squeeze_stiffness
+    return torque, np.clip(wanted, tree.listed_limits[:, 0], tree.listed_limits[:, 1])
+
+
+def test_control_poses(finished, touching, inputs):
     """The pregrasp backs off along the contact normals; the squeeze presses with the balancing forces."""
     grasps, _, bounds = finished
     tree = inputs.hand.model.tree
-    R, t = Rotation.from_quat(grasps.pose[:, 3:]), grasps.pose[:, :3]
-    base, opened = (link_poses(q) for q in (grasps.q, grasps.q_pregrasp))
-    away, torque = [], np.zeros_like(grasps.q)
-    for c in range(inputs.hand.model.groups + 1):
-        rows = np.flatnonzero(grasps.contact_links[:, c] >= 0)
-        if not len(rows):
-            continue
-        link = grasps.contact_links[rows, c]
-        p = R[rows].apply(grasps.contact_points[rows, c]) + t[rows]
-        n = R[rows].apply(grasps.contact_normals[rows, c])
-        f = R[rows].apply(grasps.contact_forces[rows, c]) * bounds.squeeze_force
-        B = base[rows, link]
-        local = np.einsum("nji,nj->ni", B[:, :3, :3], p - B[:, :3, 3])
-
-        def moved(X, rows=rows, link=link, local=local, p=p):
-            T = X[rows, link]
-            return np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3] - p
-
-        away += (moved(opened) * n).sum(1)[tree.link_body[link] > 0].tolist()
-        for d in range(grasps.q.shape[1]):  # J^T f by central differences
-            step = np.zeros_like(grasps.q)
-            step[:, d] = 1e-3
-            column = (moved(link_poses(grasps.q + step)) - moved(link_poses(grasps.q - step))) / 2e-3
-            torque[rows, d] += (column * f).sum(1)
-    assert np.median(away) > 0.7 * bounds.pregrasp_distance
-    assert np.quantile(away, 0.1) >= 0
-    wanted = grasps.q + torque / bounds.squeeze_stiffness
-    inside = np.clip(wanted, tree.listed_limits[:, 0], tree.listed_limits[:, 1])
+    n, away = touching[1], touching[4]
+    back = (away * n).sum(-1)[np.isin(grasps.contact_links, np.flatnonzero(tree.link_body > 0))]
+    assert np.median(back) > 0.7 * bounds.pregrasp_distance
+    assert np.quantile(back, 0.1) >= 0
+    torque, inside = squeeze(grasps, touching, tree, bounds)
     np.testing.assert_allclose(grasps.q_squeeze, inside, atol=2e-4)
     travel = (torque * (grasps.q_squeeze - grasps.q)).sum(1) / bounds.squeeze_force
     np.testing.assert_allclose(grasps.metrics["squeeze_travel"], travel, atol=1e-5)
 
 
-def test_soft_grasps_are_squeezed_less(finished, tables, context, swift):
-    """Targets far ahead are brought back, those of a hand all by the same share; nothing else changes."""
+def test_stable_squeeze(finished, touching):
+    """It is where the stiffness of the object on springs and joints, all its six motions, stops being positive."""
     grasps, _, bounds = finished
-    most = 0.05
-    gentle, _ = run(
-        tables.search, swift.params("filter"), context.changed(bounds=bounds.changed(max_squeeze_lead=most))
-    )
-    ahead, less = grasps.q_squeeze - grasps.q, gentle.q_squeeze - gentle.q
-    lead = np.abs(ahead).max(1)
-    assert (lead > most).sum() > 10
-    share = np.minimum(1, most / lead)
-    np.testing.assert_allclose(less, ahead * share[:, None], atol=1e-5)
-    np.testing.assert_allclose(gentle.metrics["squeeze_travel"], grasps.metrics["squeeze_travel"] * share, rtol=1e-4)
+    for i in range(0, len(grasps), 4):
+        p, _, f, J, _ = (x[i][grasps.contact_links[i] >= 0] for x in touching)
+        arms = np.cross(p - p.mean(0), np.eye(3)[:, None]).transpose(1, 0, 2)  # of unit forces at the contacts
+        G = np.concatenate([np.tile(np.eye(3), len(p)), np.hstack([arm.T for arm in arms])])
+        J = np.concatenate(list(J))
+        K = G @ np.linalg.inv(J @ J.T / bounds.squeeze_stiffness + np.eye(len(J)) / CONTACT_STIFFNESS) @ G.T
+        A = np.zeros((6, 6))
+        for r, force in zip(p - p.mean(0), f, strict=True):
+            A[3:, 3:] += r @ force * np.eye(3) - (np.outer(r, force) + np.outer(force, r)) / 2
+        stable = grasps.metrics["stable_squeeze"][i]
+        for share, holds in ((0.98, True), (1.02, False)):
+            twist = np.diag([0, 0, 0, 1e-3, 1e-3, 1e-3])  # of contacts in one line
+            least = np.linalg.eigvalsh(K + twist + share * stable * A)[0]
+            assert (least > 0) == (holds or stable >= MOST_SQUEEZE)
+
+
+def test_soft_grasps_are_squeezed_less(finished, touching, inputs, tables, context, swift):
+    """Where a squeeze is too near to the stable one, all joints of the hand press less; nothing else changes."""
+    grasps, _, bounds = finished
+    gentle, _ = run(tables.search, swift.params("filter"), context.changed(bounds=bounds.changed(squeeze_margin=4.0)))
+    share = np.minimum(1, grasps.metrics["stable_squeeze"] / (4.0 * bounds.squeeze_force))
+    assert 10 < (share < 1).sum() < len(grasps)
+    _, inside = squeeze(grasps, touching, inputs.hand.model.tree, bounds, share)
+    np.testing.assert_allclose(gentle.q_squeeze, inside, atol=2e-4)
     np.testing.assert_array_equal(gentle.q, grasps.q)
     np.testing.assert_array_equal(gentle.contact_forces, grasps.contact_forces)
 
@@ -168,12 +191,13 @@ def test_pregrasp_opening(finished, inputs):
     np.testing.assert_array_equal(grasps.metrics["force_closure"], grasps.metrics["epsilon"] > 0)
 
 
-def test_grasps_that_hardly_squeeze_are_dropped_where_asked(tables, context, swift):
+@pytest.mark.parametrize("metric", ["squeeze_travel", "stable_squeeze"])
+def test_grasps_that_hardly_squeeze_are_dropped_where_asked(tables, context, swift, metric):
     params = swift.params("filter")
     free = run(tables.search, params, context)
-    least = float(np.quantile(free[0].metrics["squeeze_travel"], 0.3))
-    bound = run(tables.search, params, replace(context, bounds=context.bounds.changed(min_squeeze_travel=least)))
-    kept = free[0].metrics["squeeze_travel"] >= least
+    least = float(np.quantile(free[0].metrics[metric], 0.3))
+    bound = run(tables.search, params, replace(context, bounds=context.bounds.changed(**{f"min_{metric}": least})))
+    kept = free[0].metrics[metric] >= np.float32(least)
     assert bound[1]["squeeze"] == (~kept).sum() > 10
     assert bound[1]["kept"] == len(bound[0]) == kept.sum()
     np.testing.assert_array_equal(free[0].q[kept], bound[0].q)
