@@ -2,6 +2,7 @@
 
 import gc
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -138,6 +139,20 @@ def run(job: Callable[..., GenerateJob]) -> Callable[..., JobOutcome]:
 
 
 @pytest.fixture
+def known_hands(inputs: Inputs, cache_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Benchmarks, whose cache is empty at first, find the hands of the tests in it."""
+    from lgrasp.bench.rate import Bench
+
+    enter = Bench.__enter__
+
+    def known(self: Bench) -> Bench:
+        shutil.copytree(cache_root / "hand", enter(self)._cache.root / "hand")
+        return self
+
+    monkeypatch.setattr(Bench, "__enter__", known)
+
+
+@pytest.fixture
 def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Notices, as a process of its own tells them."""
     lines: list[str] = []
@@ -202,9 +217,18 @@ def _warp(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _plain_pictures() -> Iterator[None]:
-    """One ray through a pixel: pictures show the same in an eighth of the time."""
+def _unsynced() -> Iterator[None]:
+    """No test cuts the power: thousands of files need not reach the disk one by one."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _plain_pictures() -> Iterator[None]:
+    """One ray through a pixel, small pictures in reports: they show the same in an eighth of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lgrasp.dataset.report.write._SIZE", 48)
         for name in ("_SAMPLES", "_RAYS"):
             patch.setattr(f"lgrasp.picture.draw.{name}", 1)
         yield

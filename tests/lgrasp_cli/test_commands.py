@@ -211,7 +211,7 @@ def test_shipped_configs(cli):
     assert "did you mean 'smoke'" in cli("run", "smok").error()
 
 
-def test_bench(cli, tmp_path, quick):
+def test_bench(cli, tmp_path, quick, known_hands):
     base = ("bench", "--objects", "tiny", "--pipelines", quick, "-n", 10, "--repeat", 2, "--device", "cpu")
     result = cli(*base, "--json", tmp_path / "b.json")
     assert result.code == 0, result.err
@@ -226,7 +226,7 @@ def test_bench(cli, tmp_path, quick):
 
 
 @pytest.fixture
-def table1(cli, quick, tmp_path_factory):
+def table1(cli, quick, tmp_path_factory, known_hands):
     """table1(*more): two small cells."""
     slow = tmp_path_factory.mktemp("pipelines") / "slow.yaml"
     slow.write_text(Path(quick).read_text().replace("name: quick", "name: slow"))
