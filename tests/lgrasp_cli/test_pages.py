@@ -1,14 +1,18 @@
-"""README, quickstart and the page on steering run as written, but with fewer rows, in an empty folder."""
+"""README, quickstart and the page on steering run as written, but with fewer rows and a small contact field, in an
+empty folder."""
 
 import re
 import shlex
-from pathlib import Path
 
 import pytest
+from support.places import QUICK, ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 BLOCK = re.compile(r"^(<!-- not run.*?-->\n)?```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-FEWER = {"generate": ("-n", "4"), "render": ("-n", "2")}
+FEWER = {
+    "build-field": ("-p", QUICK),
+    "generate": ("-n", "4", "--set", "field.records=20000"),
+    "render": ("-n", "2"),
+}
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/guides/quickstart.md", "docs/guides/steer.md"])

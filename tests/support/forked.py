@@ -12,18 +12,7 @@ from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-_IMPORTED = (
-    "lgrasp_cli.main",
-    "lgrasp.api",
-    "lgrasp.dataset.report.write",
-    "lgrasp.hand.drafting.import_urdf",
-    "lgrasp.jobs.export",
-    "lgrasp.jobs.learn.job",
-    "lgrasp.jobs.metrics",
-    "lgrasp.jobs.scenes.job",
-    "lgrasp.jobs.sequence.job",
-    "mujoco",
-)
+_IMPORTED = ("lgrasp_cli.main", "lgrasp.jobs.generate", "lgrasp.jobs.simulate", "mujoco")
 
 
 def fork_server() -> ForkServerContext:
