@@ -27,7 +27,7 @@ from lgrasp.planning.params import PlanParams
 
 PENETRATION, GAP, CLOUD_GAP, ANGLE = 2.0, 4.0, 6.0, 45.0  # [mm, deg] that docs/guides/refine.md promises
 ROUNDING = 0.1  # [mm] of distance grids; the judge measures meshes
-RADIUS, STARTS = 0.035, 12
+RADIUS, STARTS = 0.035, 8
 
 
 @pytest.fixture(scope="module")
