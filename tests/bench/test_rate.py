@@ -29,11 +29,6 @@ PUBLISHED = Published(
 )
 
 
-@pytest.fixture(autouse=True)
-def _hand(known_hands):
-    """The hand is not made again."""
-
-
 @pytest.fixture
 def runs(monkeypatch):
     """The jobs that a benchmark runs, with what came out."""
@@ -61,7 +56,7 @@ def test_yield_and_inputs_go_from_run_to_run(job, runs):
     assert all(0 < rate < 100 for rate in after)
     assert [r["grasps"] for r in results] == [40, 20]
     assert all(not trial.out.exists() for trial, _ in runs)
-    # only the first run of all made object and field
+    # only the first run of all made hand, object and field
     assert [all(outcome.job.inputs.hits.values()) for _, outcome in runs] == [False] + [True] * (len(runs) - 1)
     assert len(runs) > count
     assert later["build_seconds"] == results[0]["build_seconds"]
@@ -230,7 +225,7 @@ def test_measured_cells_are_left_alone(table, job):
     assert list(measure_table(Bench(), table, config(), job().cache)) == []
 
 
-def test_cells_that_cannot_be_measured(job):
+def test_cells_that_cannot_be_measured(job, known_hands):
     chosen = config(objects=("absent", "tiny"), pipelines=(QUICK,), rows=10)
     with Bench() as several:
         parts = list(measure_table(several, new_table(chosen, repeat=1, baseline_rows=1), chosen, job().cache))
