@@ -1,18 +1,13 @@
-"""README, quickstart and the page on steering run as written, but with fewer rows and a small contact field, in an
-empty folder."""
+"""README, quickstart and the page on steering run as written, but with fewer rows, in an empty folder."""
 
 import re
 import shlex
 
 import pytest
-from support.places import QUICK, ROOT
+from support.places import ROOT
 
 BLOCK = re.compile(r"^(<!-- not run.*?-->\n)?```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-FEWER = {
-    "build-field": ("-p", QUICK),
-    "generate": ("-n", "4", "--set", "field.records=20000"),
-    "render": ("-n", "2"),
-}
+FEWER = {"generate": ("-n", "4"), "render": ("-n", "2")}
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/guides/quickstart.md", "docs/guides/steer.md"])
