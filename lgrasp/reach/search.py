@@ -127,7 +127,7 @@ class ArmSearch:
         code = torch.where(good, torch.where(height < 0, _TABLE, _REACHED), _WAY)
         J = self._chain.jacobian_tensor(q)
         measure = torch.linalg.det(J @ J.mT).clamp_min(0.0).sqrt()
-        return [x.numpy() for x in (row, code, torch.where(code == _REACHED, measure, -1.0), q, at)]
+        return [x.cpu().numpy() for x in (row, code, torch.where(code == _REACHED, measure, -1.0), q, at)]
 
     def _follow(self, q: torch.Tensor, T: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Joints (n, J) for poses (n, 4, 4) near those of q (n, J), and which came there (n,)."""
