@@ -93,7 +93,7 @@ def test_bad_input(cli, tmp_path, arguments, said):
 
 def test_bad_viewpoint(cli, cloud):
     assert "give 3 numbers" in cli("plan", "--cloud", cloud, "--viewpoint", "1,2").error()
-    assert "viewpoint [nan, 0.0, 0.0]" in cli("plan", "--cloud", cloud, "--viewpoint", "nan,0,0").error()
+    assert "'nan,0,0': give 3 numbers" in cli("plan", "--cloud", cloud, "--viewpoint", "nan,0,0").error()
 
 
 def test_interrupted(process, tmp_path):
