@@ -1,7 +1,7 @@
 """On what and where: default folders and configs/*.yaml."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -134,7 +134,11 @@ def config_devices(name: str) -> tuple[str | None, str | None]:
         ConfigError: no such config, or no such device.
     """
     path = find_yaml(name, config_files(), "config")
-    names = read_yaml(path).get("device")
+    return _devices(path, read_yaml(path))
+
+
+def _devices(path: Path, data: Mapping[str, Any]) -> tuple[str | None, str | None]:
+    names = data.get("device")
     try:
         return split_devices(names) if isinstance(names, str) else (None, None)
     except ValueError as error:
@@ -149,7 +153,7 @@ def load_requests(name: str, changes: dict[str, Any]) -> list[Request]:
     """
     path = find_yaml(name, config_files(), "config")
     data = read_yaml(path)
-    several, first = config_devices(name)
+    several, first = _devices(path, data)
     data |= {"device": first} if several else {}
     kind = data.pop("job", "generate")
     if kind not in ("generate", *KINDS):
