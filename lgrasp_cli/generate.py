@@ -41,9 +41,7 @@ def generate(
     settings: Settings = None,
     out: Annotated[
         Path | None,
-        Option(
-            help="Folder of the shards (of several: for HAND-OBJECT/PIPELINE); default: grasps/HAND-OBJECT/PIPELINE."
-        ),
+        Option(help="Folder of the shards (of several jobs: of HAND-OBJECT/PIPELINE); default: that one, in grasps."),
     ] = None,
     seed: Seed = None,
     contacts: Contacts = None,

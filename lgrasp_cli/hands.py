@@ -101,7 +101,7 @@ def _unmade(cannot: dict[str, str]) -> dict[str, list[str]]:
 
 @app.command("add")
 def add_hand(
-    file: Annotated[Path, Argument(exists=True, dir_okay=False, help="URDF or MJCF file of the hand.")],
+    file: Annotated[Path, Argument(metavar="FILE", exists=True, dir_okay=False, help="URDF or MJCF file of the hand.")],
     name: Annotated[str | None, Option(help="Name of the hand; default: the file's, or LINK.")] = None,
     out: Annotated[Path | None, Option(help="Folder of the hand; default: hands/NAME in your data folder.")] = None,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace the hand of that name.")] = False,

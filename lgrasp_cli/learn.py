@@ -19,7 +19,9 @@ app = typer.Typer(name="learn", help="Train and measure networks that predict gr
 @working
 def fit(
     how: How,
-    shards: Annotated[list[Path] | None, Argument(help="Shard files or folders; none for a pose policy.")] = None,
+    shards: Annotated[
+        list[Path] | None, Argument(metavar="SHARDS", help="Shard files or folders; none for a pose policy.")
+    ] = None,
     model: Annotated[str, Option(**one_of(NetworkName, "NETWORK", "What is trained."))] = "coarse",
     out: Annotated[
         Path | None,

@@ -18,7 +18,7 @@ Hand = Annotated[str, Option(help="Name of a hand, a URDF file, or a folder with
 HandArgument = Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.", **HAND)]
 Mesh = Annotated[str, Option("--object", "-o", help="Mesh file, or the name of an object.", **OBJECT)]
 MeshArgument = Annotated[str, Argument(help="Mesh file, or the name of an object.", **OBJECT)]
-Shards = Annotated[list[Path], Argument(help="Shard files, or folders of any depth.")]
+Shards = Annotated[list[Path], Argument(metavar="SHARDS", help="Shard files, or folders of any depth.")]
 PipelineName = Annotated[str, Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.", **PIPELINE)]
 Seed = Annotated[int | None, Option(help="Base seed; default: the pipeline's.")]
 Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]

@@ -116,6 +116,7 @@ class Bar:
             task = self._bar.tasks[0]
             task.total = None if share is None else 1.0
             self._bar.update(self._task, description=what, completed=share or 0.0, count=count, tail=tail)
+            task.finished_time = None  # the clock goes on: what is full may be the first of many
         elif not self._quiet and time.monotonic() - self._said >= _PLAIN_INTERVAL:
             self._said = time.monotonic()
             say("  ".join(filter(None, (what, count, tail))))

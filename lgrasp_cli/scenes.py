@@ -15,7 +15,7 @@ app = typer.Typer(
     name="scenes", help="Objects on tables, with point clouds, masks and feasible grasps.", no_args_is_help=True
 )
 
-_Paths = Annotated[list[Path], Argument(help="Scene files, or folders of *.h5 files.")]
+_Paths = Annotated[list[Path], Argument(metavar="SCENES", help="Scene files, or folders of *.h5 files.")]
 
 
 @app.command()

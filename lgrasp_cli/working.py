@@ -180,6 +180,7 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
         check_report(json_path)
         from lgrasp.config import split_devices
         from lgrasp.runtime.array import parse_array
+        from lgrasp.runtime.driver import check_driver
 
         if shard_index is not None or num_shards is not None:
             from lgrasp.notices import notice
@@ -191,6 +192,7 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
         if _CHECKED.get() is not None:  # the devices are those of another computer
             device = None
         several, first = split_devices(device)
+        check_driver(first)
         command(
             **options, how=How(cache, first, workers, shares, overwrite, json_path, quiet, verbose, devices=several)
         )

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from lgrasp.config import read_yaml
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.errors import ConfigError
@@ -90,6 +92,10 @@ def _told(path: Path, report: dict[str, Any]) -> dict[str, Any]:
     return {"file": str(path), "bytes": path.stat().st_size, "report": report}
 
 
+def _meaning(params: BaseModel, key: str) -> str:
+    return type(params).model_fields[key].description or ""
+
+
 def describe_pipeline(name: str) -> dict[str, Any]:
     """Every resolved parameter of a pipeline as (part, parameter, value, meaning).
 
@@ -105,7 +111,11 @@ def describe_pipeline(name: str) -> dict[str, Any]:
     ]
     for part, params in parts:
         for key, value in params.model_dump(mode="json").items():
-            rows.append((part, key, value, type(params).model_fields[key].description or ""))
+            inner = getattr(params, key)
+            if isinstance(inner, BaseModel):
+                rows += [(part, f"{key}.{name}", value[name], _meaning(inner, name)) for name in value]
+            else:
+                rows.append((part, key, value, _meaning(params, key)))
     return {
         "name": pipeline.name,
         "description": pipeline.description,

@@ -74,7 +74,7 @@ class ReachJob(ReachRequest, VerdictJob):
         found = search(
             hand_targets(self.at, rows, placed),
             threads(self.workers),
-            lambda done, reached: progress(done, f"{reached:,} reached"),
+            lambda done, reached: progress(done, f"{reached / max(done, 1):.0%} reached"),
         )
         columns = {
             "ok": found.code == 0,

@@ -76,7 +76,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
             )
 
             def told(done: int, held: int) -> None:
-                progress(kept.rows + done, f"{kept.held + held:,} hold")
+                progress(kept.rows + done, f"{(kept.held + held) / max(kept.rows + done, 1):.0%} hold")
 
             while (block := kept.next_block(rows, workers)) or not kept.columns:
                 found = verdicts(

@@ -12,7 +12,9 @@ _PLAIN_INTERVAL = 10.0  # [s] between lines of progress where standard error is 
 
 
 def judge(
-    shards: Annotated[list[Path], typer.Argument(help="Shards, or folders that hold some at any depth.")],
+    shards: Annotated[
+        list[Path], typer.Argument(metavar="SHARDS", help="Shards, or folders that hold some at any depth.")
+    ],
     rows: Annotated[int | None, typer.Option(help="Judge this many rows, drawn at random; default: all.")] = None,
     urdf: Annotated[Path | None, typer.Option(help="Original URDF in place of the stored one.")] = None,
     mesh: Annotated[

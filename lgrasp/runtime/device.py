@@ -14,6 +14,7 @@ import warp as wp
 from lgrasp.errors import DeviceError
 from lgrasp.paths import cache_dir
 from lgrasp.runtime.cores import cores
+from lgrasp.runtime.driver import has_driver
 from lgrasp.runtime.kernel_cache import drop_damaged, enter, note_checksums, usable_folder
 
 KERNEL_OPTIONS = {"enable_backward": False, "max_unroll": 1}
@@ -69,11 +70,7 @@ def _share_memory() -> None:
 @contextlib.contextmanager
 def _without_driver_warning() -> Iterator[None]:
     """Without a GPU driver, drop the line that Warp's native code writes on stderr about it; other output is kept."""
-    try:
-        ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
-    except OSError:
-        pass
-    else:
+    if has_driver():
         yield
         return
     try:

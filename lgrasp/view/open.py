@@ -34,7 +34,7 @@ def open_view(
     """A server that shows what is named.
 
     Args:
-        what: shards or folders of them; or one scene file, hand or object, by name or path.
+        what: shards or folders of them; or one scene file (of a folder the first), hand or object, by name or path.
         row: the first that is shown, counted through all shards.
         where: conditions on rows.
 
@@ -70,11 +70,12 @@ def _hand(name: str, cache: Cache) -> "_Make":
 def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) -> "_Make":
     """What makes the view, all input read."""
     name, path, kind = what[0], Path(what[0]).expanduser(), kind_of(what)
-    if len(what) == 1 and path.is_file() and path.suffix == ".h5":
-        with open_hdf5(path) as file:
+    inside = sorted(path.glob("*.h5")) if kind == "files" and path.is_dir() else [path]
+    if len(what) == 1 and inside and inside[0].is_file() and inside[0].suffix == ".h5":
+        with open_hdf5(inside[0]) as file:
             is_scene = file.attrs.get("format") == FORMAT
         if is_scene:
-            return partial(TableView, scene=read_scene(path))
+            return partial(TableView, scene=read_scene(inside[0]))
     if kind == "hand":
         return _hand(name, cache)
     if kind == "object":

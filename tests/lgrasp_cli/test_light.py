@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from lgrasp.runtime.driver import has_driver
+
 HEAVY = ("torch", "warp", "trimesh", "scipy", "h5py", "numpy", "mujoco", "matplotlib", "yourdfpy", "coacd")
 
 LISTS = """
@@ -113,6 +115,9 @@ bench sequence --methods feild
 bench refine --objects mugg
 judge no-folder
 """
+
+if not has_driver():
+    WRONG += "generate --object mug --device cuda:3\n"
 
 COMPLETED = {
     "generate --hand al": "allegro",

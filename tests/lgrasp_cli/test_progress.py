@@ -55,6 +55,15 @@ def test_nothing_but_the_bar_is_cut(terminal, clock):
     assert re.search(r"^sequences .*1,010,000/2,000,000 .* 0:16:30 left  1,000/s  612,345 hold$", found[-1])
 
 
+def test_the_clock_goes_on_when_something_is_full(terminal):
+    screen = terminal()
+    with Bar() as bar:
+        bar.share("index", 1.0)
+        bar._bar.tasks[0]._get_time, bar._bar.tasks[0].start_time = lambda: 75.0, 0.0
+        bar.show("grasps", 1, 10)
+    assert re.search(r" 1/10 0:01:15", lines(screen)[-1])
+
+
 def test_work_on_rows_to_come_counts(terminal, clock):
     """A round of sequences takes long and gives all of them at its end."""
     clock(0, 0, 30)

@@ -129,7 +129,7 @@ def test_a_scene(opened, tmp_path):
         ),
     )
     write_scene(tmp_path / "scene.h5", scene)
-    shown = opened(tmp_path / "scene.h5")[1].meshes()
+    shown = opened(tmp_path)[1].meshes()
     cube, palm = shown.geometry["object0"], shown.graph.get("base")[0]
     np.testing.assert_allclose(cube.bounds.mean(0), [0, 0, 0.02], atol=1e-6)
     assert palm[2, 3] == pytest.approx(0.4)
