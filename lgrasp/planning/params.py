@@ -58,11 +58,14 @@ class PlanParams(Params):
     rank_friction: float = Field(
         default=0.3, gt=0, le=2, description="Friction coefficient at which the hands of a start are compared."
     )
-    hold: HoldTest = Field(
-        default=HoldTest(),
-        description="How the finalists are tried: of those that pass the checks the one that holds most often is the "
-        "plan.",
+    tried: int = Field(
+        default=10,
+        ge=0,
+        le=64,
+        description="Hands of each start that are tried, those that resist most first: the one that holds most often "
+        "is the plan. 0: none.",
     )
+    hold: HoldTest = Field(default=HoldTest(), description="How they are tried.")
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
     def weights(self) -> dict[str, float]:

@@ -134,7 +134,7 @@ class Planner:
             search.run(at, rounds=p.opening)
             start, at = self._best(at, start, _loosened(p.bounds), p.finalists)
             search.run(at, first=p.opening)
-            start, at = self._best(at, start, p.bounds, 1, tried=True)
+            start, at = self._best(at, start, p.bounds, 1, tried=p.tried)
         return self._checked(at, start, p.bounds)
 
     def _opened(self, search: Descent, points: np.ndarray, first: int) -> tuple[np.ndarray, Hands]:
@@ -157,29 +157,27 @@ class Planner:
         return starts.repeat(each), self._put(device_inverse(self.guesses.pose[rows]), self.guesses.q[rows])
 
     def _best(
-        self, at: Hands, start: np.ndarray, bounds: GraspBounds, count: int, *, tried: bool = False
+        self, at: Hands, start: np.ndarray, bounds: GraspBounds, count: int, *, tried: int = 0
     ) -> tuple[np.ndarray, Hands]:
-        """The ``count`` best hands of each start: those that pass the checks first, then, where hands are tried, those
-        that hold most often, then those that resist most."""
+        """The ``count`` best hands of each start: those that pass the checks first, then, of the ``tried`` best of
+        these, those that hold most often, then those that resist most."""
         bounds = bounds.changed(friction=self.params.rank_friction)
         table, outcome = self._checked(at, start, bounds)
-        lost = 1 - self._held(table, outcome) if tried else np.zeros(len(start))
-        resist = [-table.metrics["epsilon"], table.metrics["unresisted_load"]]
-        keys = [np.arange(len(start)), *resist, lost, outcome != Outcome.KEPT, start]
-        order = np.lexsort(keys)
-        place = np.arange(len(start)) - np.searchsorted(start[order], start[order])
-        rows = np.sort(order[place < count])
+        keys = [np.arange(len(start)), -table.metrics["epsilon"], table.metrics["unresisted_load"]]
+        place = _places(start, [*keys, outcome != Outcome.KEPT])
+        held = self._held(table, np.flatnonzero((outcome == Outcome.KEPT) & (place < tried)))
+        rows = np.flatnonzero(_places(start, [*keys, -held, outcome != Outcome.KEPT]) < count)
         pose, q = at.arrays()
         return start[rows], self._put(pose[rows], q[rows])
 
-    def _held(self, table: GraspTable, outcome: np.ndarray) -> np.ndarray:
-        """Share of the trials in which each of some hands holds, (M,); 0 of those that do not pass the checks."""
-        passed, held, tester = np.flatnonzero(outcome == Outcome.KEPT), np.zeros(len(outcome)), self._scene.tester
-        if tester is None or not len(passed):
+    def _held(self, table: GraspTable, rows: np.ndarray) -> np.ndarray:
+        """Share of the trials in which each hand of some rows holds, (M,); 0 of the others."""
+        held, tester = np.zeros(len(table.index)), self._scene.tester
+        if tester is None or not len(rows):
             return held
-        found = tester.run(ControlPoses.of(take_grasps(table, passed)), 0)
+        found = tester.run(ControlPoses.of(take_grasps(table, rows)), 0)
         draws = self.params.hold.draws
-        held[passed] = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
+        held[rows] = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
         return held
 
     def _starts(self, points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -206,6 +204,14 @@ class Planner:
         back, obj = device_inverse(pose), self._scene.object
         contacts = find_contacts(self.hand, obj, back, q, bounds, self.palmar)
         return check_grasps(self.hand, obj, back, q, contacts, bounds, around=self._scene.around, index=start)
+
+
+def _places(start: np.ndarray, keys: list[np.ndarray]) -> np.ndarray:
+    """Place of each hand among those of its start (M,), by the last key, then the one before it."""
+    order = np.lexsort([*keys, start])
+    place = np.empty(len(start), int)
+    place[order] = np.arange(len(start)) - np.searchsorted(start[order], start[order])
+    return place
 
 
 @dataclass(frozen=True)
