@@ -5,12 +5,12 @@ import io
 import json
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lgrasp.config import did_you_mean
-from lgrasp.errors import ConfigError
+from lgrasp.errors import ConfigError, HandError
 from lgrasp.paths import data_dirs
 
 if TYPE_CHECKING:
@@ -111,6 +111,35 @@ def with_network_hand(asked: Any) -> Any:
     if not isinstance(asked, dict) or asked.get("hand") is not None or asked.get("model") is None:
         return asked
     return asked | {"hand": read_card(find_network(str(asked["model"])))["hand"]}
+
+
+def check_network(name: str, kind: str, hand: str) -> None:
+    """Refuse a network of another kind or hand before anything is loaded; hands of shards, and those whose rules must
+    be drafted first, are left to the job.
+
+    Raises:
+        ConfigError: there is no such network, or it is of another kind or hand.
+    """
+    path = find_network(name)
+    card = read_card(path, kind)
+    if hand.endswith(".h5"):
+        return
+    from lgrasp.hand.digest import hand_digest
+    from lgrasp.hand.find import find_hand
+
+    with suppress(HandError):
+        source = find_hand(hand)
+        check_network_hand(path, card["hand"], card["hand_sha256"], source.name, hand_digest(source.urdf, source.spec))
+
+
+def check_network_hand(path: Path, hand: str, sha256: str, asked: str, digest: str) -> None:
+    """Refuse a network of another hand than the one that is asked for.
+
+    Raises:
+        ConfigError: it is.
+    """
+    if sha256 != digest:
+        raise ConfigError(f"{path} is of hand '{hand}', not of '{asked}' (or of another model of it)")
 
 
 def _card(path: Path) -> dict[str, Any]:

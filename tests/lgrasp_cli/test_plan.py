@@ -10,6 +10,8 @@ import trimesh
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
+from lgrasp.jobs.requests.plan import PlanRequest
+from lgrasp.jobs.requests.search import SampleRequest
 
 QUICK = ("--starts", 4, "--device", "cpu")
 
@@ -43,6 +45,17 @@ def test_object(cli, tmp_path):
     assert json.loads(again.out)["present"] == data["grasps"]
     line = cli("plan", "--object", "sphere", *QUICK, "--stand-off", 0.1, "--out", tmp_path / "out").error()
     assert "--overwrite" in line
+
+
+def test_the_hand_is_that_of_the_network(cli, monkeypatch):
+    """Another is refused before anything is loaded."""
+    assert PlanRequest(object="mug", model="grasp-shadow").hand == "shadow"
+    monkeypatch.setattr(PlanRequest, "maker", "no.such:Job")
+    line = cli("plan", "--object", "mug", "--model", "grasp-shadow", "--hand", "barrett").error()
+    assert "grasp-shadow.pt is of hand 'shadow', not of 'barrett'" in line
+    monkeypatch.setattr(SampleRequest, "maker", "no.such:Job")
+    line = cli("sample", "seq-allegro", "mug", "sphere", "--hand", "shadow").error()
+    assert "seq-allegro.pt is of hand 'allegro', not of 'shadow'" in line
 
 
 def test_cloud_is_stored(cli, cloud, tmp_path):

@@ -15,7 +15,7 @@ from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import Job
-from lgrasp.errors import ConfigError, LgraspError, StarvedError
+from lgrasp.errors import LgraspError, StarvedError
 from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader
 from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.hand.arrays import upload_hand
@@ -28,7 +28,7 @@ from lgrasp.jobs.refine.predicted import predicted_planner
 from lgrasp.jobs.requests.plan import PlanRequest
 from lgrasp.jobs.shard_inputs import mesh_hash, named_hand, named_object
 from lgrasp.learn.grasp.file import Networks, load_networks
-from lgrasp.learn.networks import find_network
+from lgrasp.learn.networks import check_network_hand, find_network
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.params import PlanParams, cloud_params
 from lgrasp.planning.planner import Planner
@@ -140,10 +140,7 @@ class PlanJob(PlanRequest, Job):
         if self.model is not None and self._networks is None:
             path, (source, hand, _, _) = find_network(self.model), self._models()
             self._networks = load_networks(path)
-            if self._networks.hand_sha256 != hand.sha256:
-                raise ConfigError(
-                    f"{path} is of hand '{self._networks.hand}', not of '{source.name}' (or of another model of it)"
-                )
+            check_network_hand(path, self._networks.hand, self._networks.hand_sha256, source.name, hand.sha256)
         return self._networks
 
     def _model_key(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.jobs.requests.shards import look_up
-from lgrasp.learn.networks import find_network, read_card, with_network_hand
+from lgrasp.learn.networks import check_network, with_network_hand
 from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
 from lgrasp.planning.params import PlanParams
@@ -89,7 +89,7 @@ class PlanRequest(Request):
         if self.mask is not None:
             check_file(self.mask, MASK_SUFFIXES, "a mask", CloudError)
         if self.model is not None:
-            read_card(find_network(self.model), "grasp")
+            check_network(self.model, "grasp", self.hand)
         if self.out is not None:
             check_folder(self.out)
 

@@ -16,7 +16,7 @@ from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
-from lgrasp.learn.networks import find_network, read_card, with_network_hand
+from lgrasp.learn.networks import check_network, with_network_hand
 from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
 from lgrasp.sequence.size import parse_size
@@ -194,4 +194,4 @@ class SampleRequest(SequenceRequest):
                 f"pipeline '{self.pipeline.name}' has sequence.method {method}; a network needs diffuser, as pipeline "
                 "sample has"
             )
-        read_card(find_network(self.model), "diffuser")
+        check_network(self.model, "diffuser", self.hand)
