@@ -129,9 +129,10 @@ def table1(
     check_report(json_path)
     _check(config)
     cache = open_cache(None)
-    from lgrasp.bench.charts import check_plot, draw_table
+    from lgrasp.bench.charts import draw_table
     from lgrasp.bench.comparison import new_table, read_table, without_missing
     from lgrasp.bench.page import load_published
+    from lgrasp.picture.plot import check_plot
 
     if plot:
         check_plot(plot)

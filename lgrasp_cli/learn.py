@@ -9,7 +9,7 @@ from typer import Argument, Option
 from lgrasp.choices import NetworkName
 from lgrasp_cli.names import HAND, NETWORK, OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import CacheDir, Device, Quiet, Shards, choose_pipeline, given, open_cache
-from lgrasp_cli.tables import Answer, Block, TextTable, following, plural, reporting, took
+from lgrasp_cli.tables import Answer, Block, TextTable, following, plural, reporting, share, took
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(name="learn", help="Train and measure networks that predict grasps.", no_args_is_help=True)
@@ -107,8 +107,9 @@ def evaluate(
 ) -> Answer:
     """Measure a network on shards.
 
-    coarse: energies on new clouds before and after 3, 6, 10 and 13 rounds of the refiner. grasp: plans from new clouds
-    of all sides and of one, checked on the true meshes. diffuser: the loss, and penetration of draws as they come.
+    coarse: the best four answers for each new cloud: energies by rounds of the refiner; what is valid, before and after
+    refine --coarse. grasp: plans from new clouds of all sides and of one, checked on the true meshes. diffuser: the
+    loss, and penetration of draws as they come.
 
     Example: lgrasp learn eval grasp.pt grasps --out plans
     """
@@ -130,10 +131,21 @@ def evaluate(
 
         data = measure(path, shards, cache, seed=seed, device=device)
         return Answer(data, [] if quiet else [_draws(data)])
-    from lgrasp.jobs.learn.job import evaluate as run
+    from lgrasp.jobs.learn.coarse_eval import evaluate as run
 
     data = run(path, shards, cache, clouds=clouds, seed=seed, device=device)
-    pairs = [
+    return Answer(data, [] if quiet else [_coarse(data)])
+
+
+def _coarse(data: dict[str, Any]) -> Block:
+    def told(found: dict[str, Any]) -> str:
+        words = f"{share(found['valid'], data['poses'])} valid ({data['profile']})"
+        if found["valid"]:
+            words += f", {share(found['force_closure'], found['valid'])} of them with force closure"
+            words += f", mean epsilon {found['epsilon']:.3f}"
+        return words
+
+    return [
         ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
         ("poses", f"{data['poses']:,}"),
         ("coarse", f"{data['coarse']:.4f}"),
@@ -141,8 +153,9 @@ def evaluate(
             (f"{steps}-step", f"{energy:.4f}  ({data['coarse'] / energy:.1f}x lower)")
             for steps, energy in zip(data["rounds"], data["refined"], strict=True)
         ),
+        ("as predicted", told(data["alone"])),
+        ("searched", told(data["searched"])),
     ]
-    return Answer(data, [] if quiet else [pairs])
 
 
 def _draws(data: dict[str, Any]) -> Block:
@@ -184,19 +197,53 @@ def list_networks() -> Answer:
     found = listed()
     rows = []
     for network in found:
-        figures = [f"{name} {value:.3g}" for name, value in network["report"].items() if isinstance(value, float)]
-        size = f"{network['bytes'] / 1e6:.1f} MB"
-        rows.append(
-            (
-                network["name"],
-                network["kind"],
-                network["hand"],
-                size,
-                _learnt_from(network["report"]),
-                ", ".join(figures),
-            )
-        )
+        size, report = f"{network['bytes'] / 1e6:.1f} MB", network["report"]
+        told = _learnt_from(report), _figures(report)
+        rows.append((network["name"], network["kind"], network["hand"], size, *told))
     return Answer(found, [TextTable(("name", "kind", "hand", "size", "learnt from", "figures"), rows, right=("size",))])
+
+
+@app.command()
+@reporting
+def show(
+    network: Annotated[str, Argument(help="File written by lgrasp learn fit, or a name of learn list.", **NETWORK)],
+    plot: Annotated[Path | None, Option(metavar="FILE.png", help="Also draw the losses along its training.")] = None,
+) -> Answer:
+    """Show the card of a network: what it learnt from, how good it is, the losses along its training.
+
+    Example: lgrasp learn show grasp.pt --plot curve.png
+    """
+    from lgrasp.errors import ConfigError
+    from lgrasp.jobs.listing import describe_network
+
+    data = describe_network(network)
+    report, curves = data["report"], data["report"].get("curves", {})
+    if plot:
+        from lgrasp.learn.curve import draw_curves
+        from lgrasp.picture.plot import check_plot
+
+        check_plot(plot)
+        if not curves:
+            raise ConfigError(f"{data['file']}: its card has no curve; networks trained with this version have one")
+        draw_curves(curves, f"{data['name']}: {data['kind']}, {data['hand']}", plot)
+    pairs = [
+        ("network", f"{data['file']} ({data['bytes'] / 1e6:.1f} MB)"),
+        ("kind, hand", f"{data['kind']}; {data['hand']}"),
+        ("learnt from", _learnt_from(report)),
+        ("figures", _figures(report)),
+    ]
+    for part, measured in curves.items():
+        pairs += [(f"{part}, {name}", _course(points)) for name, points in measured.items() if points]
+    return Answer(data, [[*pairs, *([("plot", str(plot))] if plot else [])]])
+
+
+def _course(points: list[list[float]]) -> str:
+    (_, first), (steps, last) = points[0], points[-1]
+    return f"{first:.4g} to {last:.4g} in {plural(int(steps), 'step')}"
+
+
+def _figures(report: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {value:.3g}" for name, value in report.items() if isinstance(value, float))
 
 
 def _learnt_from(report: dict[str, Any]) -> str:

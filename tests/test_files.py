@@ -114,7 +114,6 @@ def test_a_pipe_does_not_hold_up(tmp_path):
 WRITERS = {"write_text", "write_bytes", "copyfile", "copytree", "save", "savez", "savefig", "dump", "imwrite", "imsave"}
 WRITTEN_BY_HAND = {
     "lgrasp/api.py": "grasps that are saved as a shard",
-    "lgrasp/bench/charts.py": "a picture in memory",
     "lgrasp/bench/soak/processes.py": "a temporary folder",
     "lgrasp/bench/soak/trials.py": "a temporary folder",
     "lgrasp/dataset/report/plots.py": "a picture in memory",
@@ -131,6 +130,7 @@ WRITTEN_BY_HAND = {
     "lgrasp/judge/run.py": "a temporary folder",
     "lgrasp/learn/networks.py": "a network in memory",
     "lgrasp/object/load.py": "reads a scene",
+    "lgrasp/picture/plot.py": "a picture in memory",
     "lgrasp/picture/sheet.py": "a picture in memory",
     "lgrasp/policy/model.py": "a network in memory",
     "lgrasp/runtime/kernel_cache.py": "a temporary folder",

@@ -1,26 +1,13 @@
 """A benchmark table as bars, without a display."""
 
-import io
 from pathlib import Path
 from typing import Any
 
-from lgrasp.errors import OutputError
-from lgrasp.files import check_file, write_file
+from lgrasp.picture.plot import write_plot
 
 _COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#9467bd")
 _PUBLISHED = "#b0b0b0"
 _BARS = 0.84  # of the distance between two objects
-
-
-def check_plot(path: Path) -> None:
-    """Check, before a long job, that a plot can be written there.
-
-    Raises:
-        OutputError: not a .png, a folder, or a place that cannot be written.
-    """
-    if path.suffix.lower() != ".png":
-        raise OutputError(f"--plot {path}: the plot is a PNG; name a file that ends in .png")
-    check_file(path)
 
 
 def draw_table(table: dict[str, Any], path: Path) -> None:
@@ -49,9 +36,7 @@ def draw_table(table: dict[str, Any], path: Path) -> None:
     if hands:
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
-    data = io.BytesIO()
-    figure.savefig(data, format="png")
-    write_file(path, data.getvalue())
+    write_plot(figure, path)
 
 
 def _draw_hand(axes: Any, table: dict[str, Any], cells: list[dict[str, Any]]) -> None:

@@ -10,7 +10,7 @@ from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.errors import ConfigError
 from lgrasp.hand.names import PACKAGE_HANDS, known_hands, pip_line
 from lgrasp.hand.spec import load_spec
-from lgrasp.learn.networks import known_networks, read_card
+from lgrasp.learn.networks import find_network, known_networks, read_card
 from lgrasp.object.find import list_objects as named_objects
 from lgrasp.paths import data_dirs, is_installed
 from lgrasp.policy.names import SHIPPED, shipped_policy
@@ -81,11 +81,29 @@ def list_networks() -> list[dict[str, Any]]:
     for hand in known_hands():
         kinds = {shipped_policy(hand, "all"): "pose, all links", shipped_policy(hand, "listed"): "pose"}
         for path in sorted(path for path in kinds if path):
-            from lgrasp.policy.model import read_policy  # numpy
-
-            report = read_policy(path).about["report"]
-            found.append({"name": SHIPPED, "kind": kinds[path], "hand": hand, **_told(path, report)})
+            found.append({"name": SHIPPED, "kind": kinds[path], "hand": hand, **_told(path, _about_policy(path)[1])})
     return found
+
+
+def describe_network(name: str) -> dict[str, Any]:
+    """The same as :func:`list_networks` says of one, a file or a name.
+
+    Raises:
+        ConfigError: no such network.
+    """
+    path = find_network(name)
+    if path.suffix == ".npz":
+        hand, report = _about_policy(path)
+        return {"name": path.stem, "kind": "pose", "hand": hand, **_told(path, report)}
+    card = read_card(path)
+    return {"name": path.stem, "kind": card["kind"], "hand": card["hand"], **_told(path, card["report"])}
+
+
+def _about_policy(path: Path) -> tuple[str, dict[str, Any]]:
+    from lgrasp.policy.model import read_policy  # numpy
+
+    policy = read_policy(path)
+    return policy.hand, policy.about["report"]
 
 
 def _told(path: Path, report: dict[str, Any]) -> dict[str, Any]:

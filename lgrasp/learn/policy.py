@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.params import PosePolicyParams
 from lgrasp.policy.model import HIT_FEATURES, MOST_HITS, WIDTH, Weights
 from lgrasp.policy.score import (
@@ -80,8 +81,10 @@ def inputs_of(seen: Seen) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return hits, used, extras
 
 
-def fit_network(seen: Seen, yields: np.ndarray, params: PosePolicyParams) -> PoseNet:
-    """A network of poses and whether they gave a grasp, (N,)."""
+def fit_network(
+    seen: Seen, yields: np.ndarray, params: PosePolicyParams
+) -> tuple[PoseNet, dict[str, list[list[float]]]]:
+    """A network of poses and whether they gave a grasp, (N,), and its loss along the training."""
     inputs, wanted = inputs_of(seen), torch.from_numpy(yields.astype(np.float32))
     state = torch.random.get_rng_state()
     torch.manual_seed(params.seed)
@@ -89,15 +92,17 @@ def fit_network(seen: Seen, yields: np.ndarray, params: PosePolicyParams) -> Pos
     optimiser = torch.optim.AdamW(net.parameters(), lr=params.rate, weight_decay=params.decay)
     steps = max(1, params.epochs * len(wanted) // params.batch)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, params.rate, total_steps=steps + 1)
-    for _ in range(steps):
+    curve = LossCurve(steps)
+    for step in range(steps):
         rows = torch.randint(len(wanted), (params.batch,))
         loss = torch.nn.functional.binary_cross_entropy_with_logits(net(*(a[rows] for a in inputs)), wanted[rows])
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         rate.step()
+        curve(step + 1, loss.item())
     torch.random.set_rng_state(state)
-    return net.eval()
+    return net.eval(), {"loss": curve.points}
 
 
 @torch.no_grad()

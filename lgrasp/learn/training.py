@@ -8,11 +8,13 @@ from torch.nn import functional
 
 from lgrasp.hand.model import HandModel
 from lgrasp.learn.examples import Examples
-from lgrasp.learn.network import Coarse, CoarseNet
+from lgrasp.learn.network import Coarse, CoarseNet, best_answers
 from lgrasp.learn.params import LearnParams
 from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.refiner import Pose, Refiner
 
+ANSWERS = 4
+"""Of each cloud that are measured, the best ones."""
 _ANY_REACH = 10.0  # [m]
 
 
@@ -114,13 +116,11 @@ class Trainer:
         return self._refiners[key]
 
     @torch.no_grad()
-    def predict(self, examples: Examples, seeds: int) -> Coarse:
-        """Answers on the first ``seeds`` points of every cloud: fixed ones, for comparisons."""
-        examples = _moved(examples, self.device)
-        clouds, n = examples.points.shape[:2]
-        which = torch.arange(clouds, device=self.device).repeat_interleave(min(seeds, n))
-        seed = torch.arange(min(seeds, n), device=self.device).repeat(clouds)
-        return self.net(examples.points[which], examples.normals[which], seed)
+    def predict(self, examples: Examples, answers: int) -> Coarse:
+        """The best ``answers`` answers for every cloud."""
+        clouds = zip(*_moved(examples, self.device)[1:3], strict=True)
+        parts = [best_answers(self.net, points, normals, answers) for points, normals in clouds]
+        return Coarse(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
     def _pose_loss(self, batch: _Batch, examples: Examples) -> torch.Tensor:
         points, _, seeds = batch
@@ -139,7 +139,7 @@ def _moved(e: Examples, device: torch.device) -> Examples:
 
 
 class Measured(NamedTuple):
-    """Means over all clouds and seeds that were measured on."""
+    """Means over all answers that were measured."""
 
     poses: int
     coarse: float
@@ -150,16 +150,15 @@ class Measured(NamedTuple):
     """E* after each number of rounds that was asked for."""
 
 
-def measure(trainer: Trainer, examples: Sequence[Examples], *, seeds: int = 4, rounds: Sequence[int] = ()) -> Measured:
-    """Energies of the answers at the same seeds of the same clouds, every time.
+def measure(trainer: Trainer, examples: Sequence[Examples], *, rounds: Sequence[int] = ()) -> Measured:
+    """Energies of the best answers for clouds.
 
     Args:
-        seeds: points of each cloud that are asked.
         rounds: numbers of rounds of the refiner.
     """
     parts: list[torch.Tensor] = []
     for e in examples:
-        coarse, refiner = trainer.predict(e, seeds), trainer.refiner(e)
+        coarse, refiner = trainer.predict(e, ANSWERS), trainer.refiner(e)
         start = Pose(*coarse[:3])
         poses = [start, Pose(*(x.detach() for x in refiner.unrolled(*start, steps=trainer.params.unrolled)))]
         poses += [refiner(*start, rounds=steps).pose for steps in rounds]

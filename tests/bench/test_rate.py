@@ -7,7 +7,7 @@ import pytest
 from support.places import QUICK
 
 from lgrasp.bench import rate as bench_module
-from lgrasp.bench.charts import check_plot, draw_table
+from lgrasp.bench.charts import draw_table
 from lgrasp.bench.comparison import (
     comparison_page,
     measure_table,
@@ -22,6 +22,7 @@ from lgrasp.bench.rate import Bench
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.jobs.config import JobConfig, in_folder, load_config, plan_requests
 from lgrasp.jobs.generate import generate
+from lgrasp.picture.plot import check_plot
 
 OBJECTS = ("capsule", "mug", "box")
 PUBLISHED = Published(

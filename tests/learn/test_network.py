@@ -126,10 +126,10 @@ def test_training_lowers_the_loss_and_joint_training_the_energy(inputs: Inputs, 
     trainer.fit_poses(160, 3e-3, lambda step, loss: losses.append(loss))
     assert np.mean(losses[-20:]) < 0.85 * np.mean(losses[:20])
     before = copy.deepcopy(trainer.net.state_dict())
-    frozen = measure(trainer, [held_out], seeds=2)
-    assert frozen == measure(trainer, [held_out], seeds=2)
+    frozen = measure(trainer, [held_out])
+    assert frozen == measure(trainer, [held_out])
     trainer.fit_jointly()
-    joint = measure(trainer, [held_out], seeds=2, rounds=(2,))
+    joint = measure(trainer, [held_out], rounds=(2,))
     assert joint.unrolled < 0.85 * frozen.unrolled
     assert joint.refined[0] < joint.coarse
     assert any((before[name] != values).any() for name, values in trainer.net.state_dict().items())

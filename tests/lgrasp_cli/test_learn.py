@@ -30,6 +30,22 @@ def test_fit_and_eval(generate, cli):
     assert found["rounds"] == [3, 6, 10, 13]
     assert len(found["refined"]) == 4
     assert found["refined"][-1] < found["coarse"]
+    assert found["unknown"] == []
+    for name in ("alone", "searched"):
+        of_all = found[name]
+        assert of_all["objects"]["tiny"]["valid"] == of_all["valid"] <= found["poses"]
+        assert of_all["force_closure"] <= of_all["valid"]
+    assert found["searched"]["valid"] >= found["alone"]["valid"]
+    told = cli("learn", "show", "net.pt", "--plot", "curve.png", "--json", "card.json")
+    assert told.code == 0, told
+    assert "poses, loss" in told.out
+    curves = json.loads(Path("card.json").read_text())["report"]["curves"]
+    assert curves == data["curves"]
+    assert [step for step, _ in curves["poses"]["loss"]] == list(range(1, 11))
+    assert len(curves["joint"]["energy"]) == 2
+    assert Path("curve.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert "its card has no curve" in cli("learn", "show", "seq-allegro", "--plot", "curve.png").error()
+    assert "ends in .png" in cli("learn", "show", "net.pt", "--plot", "curve.svg").error()
     Path("bad.pt").write_bytes(b"nonsense")
     assert "not a network" in cli("learn", "eval", "bad.pt", "out").error()
     assert "absent.pt: no such file, nor a network" in cli("learn", "eval", "absent.pt", "out").error()
@@ -134,7 +150,12 @@ def test_grasps_are_planned_from_a_cloud_by_a_network(generate, cli):
     fit = ["learn", "fit", "--model", "grasp", "out", "--steps", 4, "--batch", 64, "--device", "cpu", *options]
     done = cli(*fit, "--out", "net.pt", "--json", "fit.json")
     assert done.code == 0, done
-    assert json.loads(Path("fit.json").read_text())["examples"] == 64
+    report = json.loads(Path("fit.json").read_text())
+    assert report["examples"] == 64
+    assert {part: list(curves) for part, curves in report["curves"].items()} == {
+        "completion": ["loss"],
+        "drawing": ["loss"],  # no object is held out
+    }
     assert cli(*fit, "--out", "again.pt").code == 0
     one, two = (torch.load(name, weights_only=True) for name in ("net.pt", "again.pt"))
     assert all(torch.equal(values, two[name]) for name, values in one.items())
@@ -172,6 +193,7 @@ def test_a_pose_policy_is_trained_and_used(cli, tmp_path):
     assert Path("a.npz").read_bytes() == Path("b.npz").read_bytes()
     assert "--set place.policy=b.npz" in done.out
     assert json.loads(Path("fit.json").read_text())["yielding"] > 16
+    assert "contacts, loss" in cli("learn", "show", "b.npz").out
     use = ["generate", "--object", "tiny", "-n", 5, "--pipeline", pipeline, "--out", "rated", "--device", "cpu"]
     assert cli(*use, "--set", "place.policy=a.npz").code == 0
     assert "place.policy: absent.npz: No such file" in cli(*use, "--set", "place.policy=absent.npz").error()

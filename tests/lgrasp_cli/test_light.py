@@ -108,6 +108,7 @@ scenes check no-folder
 scenes info no-folder
 learn fit no-folder
 learn eval no.pt no-folder
+learn show no.pt
 bench --objects mugg
 bench -n 0
 bench table1 --hands alegro

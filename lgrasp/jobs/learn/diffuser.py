@@ -50,9 +50,10 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
         if not len(trainer.rows):
             raise ConfigError(f"diffuser.held_out {p.held_out}: every step has to do with a mesh that is held out")
         read = time.perf_counter() - start
-        trainer.fit(lambda step, loss: progress(step, f"loss {loss:.3f}"))
+        curve = trainer.fit(lambda step, loss: progress(step, f"loss {loss:.3f}"))
         seconds = {"reading": read, "training": time.perf_counter() - start - read}
-        report = training_report(hand.name, trainer, _names(found, ~unseen), _names(found, unseen), seconds)
+        names = _names(found, ~unseen), _names(found, unseen)
+        report = training_report(hand.name, trainer, *names, seconds, {"drawing": curve})
         about = AboutDiffuser(hand.name, hand.sha256, found.space_names, p, self.key(), report)
         return Made(part.rows, diffuser_bytes(trainer.kept, about))
 

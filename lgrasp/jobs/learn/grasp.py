@@ -15,6 +15,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.jobs.learn.network import NetworkJob, training_report
 from lgrasp.jobs.requests.shards import GraspRequest
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
+from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.diffuser.examples import SequenceSteps, make_net, unseen_objects
 from lgrasp.learn.diffuser.features import mesh_centre
 from lgrasp.learn.diffuser.senses import coarse_grid
@@ -51,16 +52,18 @@ class GraspJob(GraspRequest, NetworkJob):
         completes = CompletionNet(p.channels).to(alias)
         torch.random.set_rng_state(state)
         start = time.perf_counter()
-        error = fit_completion(completes, views, unseen, p, lambda step, loss: progress(step, f"loss {loss:.3f}"))
+        completion = LossCurve(p.completion_steps, lambda step, loss: progress(step, f"loss {loss:.3f}"))
+        error = fit_completion(completes, views, unseen, p, completion)
         seconds["completion"] = time.perf_counter() - start
         start = time.perf_counter()
         draws = make_net(hand, 1, p)
         examples = grasp_examples(hand.tree, steps, views, draws, completes, p)
         trainer = StepTrainer(draws, examples, unseen, p, alias)
-        trainer.fit(lambda step, loss: progress(p.completion_steps + step, f"loss {loss:.3f}"))
+        curve = trainer.fit(lambda step, loss: progress(p.completion_steps + step, f"loss {loss:.3f}"))
         seconds["training"] = time.perf_counter() - start
         names = (_names(records, ~unseen), _names(records, unseen))
-        report = training_report(hand.name, trainer, *names, seconds) | {"completion_loss": error}
+        curves = {"completion": {"loss": completion.points}, "drawing": curve}
+        report = training_report(hand.name, trainer, *names, seconds, curves) | {"completion_loss": error}
         made = Networks(trainer.kept, completes, p, hand.name, hand.sha256, self.key(), report)
         return Made(part.rows, predictor_bytes(made))
 

@@ -15,15 +15,13 @@ from lgrasp.hand.model import HandModel
 from lgrasp.jobs.learn.network import NetworkJob
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import object_of_shard
+from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.examples import Examples, make_examples
 from lgrasp.learn.network import CoarseNet
 from lgrasp.learn.networks import network_bytes, open_network
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import Measured, Trainer, measure
 from lgrasp.runtime.device import resolve_device
-
-ROUNDS = (3, 6, 10, 13)
-"""Outer steps of the refiner that the published table has."""
 
 _MIN_GRASPS = 16  # grasps to learn from
 
@@ -47,53 +45,32 @@ class FitJob(NetworkJob):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, device = self.params, self.device_used.alias
-        hand, train, held_out = _examples(self.shards, self.hand, p, self.cache, device)
+        hand, train, held_out = read_examples(self.shards, self.hand, p, self.cache, device)
         self.enough(sum(len(e.q) for e in train), "grasps", _MIN_GRASPS)
         trainer = Trainer(hand, train, p, device=device)
         start = time.perf_counter()
-        trainer.fit_poses(p.steps, p.rate, lambda step, loss: progress(step, f"loss {loss:.3f}"))
+        poses = LossCurve(p.steps, lambda step, loss: progress(step, f"loss {loss:.3f}"))
+        trainer.fit_poses(p.steps, p.rate, poses)
         seconds = {"poses": time.perf_counter() - start}
         report: dict[str, Any] = {"hand": hand.name, "objects": [e.model.name for e in train]}
-        report["frozen"] = _numbers(measure(trainer, held_out))
+        curves = {"poses": {"loss": poses.points}}
+        report["frozen"] = energy_numbers(measure(trainer, held_out))
         if p.joint_steps:
             before = copy.deepcopy(trainer.net.state_dict())
             trainer.fit_poses(p.joint_steps, p.joint_rate)
-            report["longer"] = _numbers(measure(trainer, held_out))
+            report["longer"] = energy_numbers(measure(trainer, held_out))
             trainer.net.load_state_dict(before)
             start = time.perf_counter()
-            trainer.fit_jointly(lambda step, energy: progress(p.steps + step, f"energy {energy:.3f}"))
+            joint = LossCurve(p.joint_steps, lambda step, energy: progress(p.steps + step, f"energy {energy:.3f}"))
+            trainer.fit_jointly(joint)
+            curves["joint"] = {"energy": joint.points}
             seconds["joint"] = time.perf_counter() - start
-            report["joint"] = _numbers(measure(trainer, held_out))
+            report["joint"] = energy_numbers(measure(trainer, held_out))
             report["lowered"] = {
                 name: 1.0 - report["joint"][name] / report["frozen"][name] for name in ("coarse", "unrolled")
             }
-        report |= {"seconds": seconds, "params": p.model_dump(mode="json")}
+        report |= {"seconds": seconds, "curves": curves, "params": p.model_dump(mode="json")}
         return Made(part.rows, _bytes(trainer, hand, self.key(), report))
-
-
-def evaluate(
-    path: Path, shards: Sequence[Path], cache: Cache, *, clouds: int = 8, seed: int = 1, device: str = "auto"
-) -> dict[str, Any]:
-    """Energies of a predictor's answers on new clouds of the objects of shards, and of what the refiner makes of them.
-
-    Raises:
-        ConfigError: the file is no predictor, or of another hand than the shards.
-        LgraspError: shards cannot be used.
-    """
-    alias = resolve_device(device).alias
-    net, saved = load_predictor(path)
-    params = LearnParams.model_validate(saved["params"]).model_copy(update={"clouds": clouds, "seed": seed})
-    hand, examples, _ = _examples(shards, None, params.model_copy(update={"held_out": 1}), cache, alias)
-    if hand.sha256 != saved["hand_sha256"]:
-        raise ConfigError(
-            f"{path} is of hand '{saved['hand']}', the shards are of '{hand.name}' (or another model of it)"
-        )
-    trainer = Trainer(hand, examples, params, device=alias)
-    trainer.net.load_state_dict(net.state_dict())
-    start = time.perf_counter()
-    found = measure(trainer, examples, rounds=ROUNDS)
-    names = {"hand": hand.name, "objects": [e.model.name for e in examples], "rounds": list(ROUNDS)}
-    return names | _numbers(found) | {"refined": list(found.refined), "seconds": time.perf_counter() - start}
 
 
 def load_predictor(path: Path) -> tuple[CoarseNet, dict[str, Any]]:
@@ -108,11 +85,12 @@ def load_predictor(path: Path) -> tuple[CoarseNet, dict[str, Any]]:
         return net, card
 
 
-def _numbers(found: Measured) -> dict[str, Any]:
+def energy_numbers(found: Measured) -> dict[str, Any]:
+    """What a report says of energies."""
     return {"poses": found.poses, "coarse": found.coarse, "unrolled": found.unrolled}
 
 
-def _examples(
+def read_examples(
     shards: Sequence[Path], name: str | None, params: LearnParams, cache: Cache, device: str
 ) -> tuple[HandModel, list[Examples], list[Examples]]:
     """The hand; clouds to train on and others, with the grasps, object by object."""

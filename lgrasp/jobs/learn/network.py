@@ -18,6 +18,7 @@ from lgrasp.files import write_file
 from lgrasp.jobs.requests.shards import FitRequest
 
 if TYPE_CHECKING:  # torch takes a second to import
+    from lgrasp.learn.curve import Curves
     from lgrasp.learn.diffuser.training import StepTrainer
 
 
@@ -78,7 +79,12 @@ class NetworkJob(FitRequest, Job):
 
 
 def training_report(
-    hand: str, trainer: "StepTrainer", objects: list[str], unseen: list[str], seconds: dict[str, float]
+    hand: str,
+    trainer: "StepTrainer",
+    objects: list[str],
+    unseen: list[str],
+    seconds: dict[str, float],
+    curves: "Curves",
 ) -> dict[str, Any]:
     """What is said of a network that draws hands: what it learnt from, its losses, the time it took [s].
 
@@ -94,5 +100,6 @@ def training_report(
         "loss": loss,
         "unseen_loss": None if np.isnan(held_out) else held_out,
         "seconds": seconds,
+        "curves": curves,
         "params": trainer.params.model_dump(mode="json"),
     }

@@ -117,7 +117,8 @@ class PolicyJob(PolicyRequest, Job):
                 f"raise candidates or shapes"
             )
         start = time.perf_counter()
-        nets = [fit_network(train.reach, train.reach_yields, p), fit_network(train.contacts, train.contacts_yields, p)]
+        by_reach, reach_curve = fit_network(train.reach, train.reach_yields, p)
+        by_contacts, contacts_curve = fit_network(train.contacts, train.contacts_yields, p)
         seconds["training"] = time.perf_counter() - start
         report = {
             "hand": hand.name,
@@ -125,13 +126,15 @@ class PolicyJob(PolicyRequest, Job):
             "held_out": held,
             "poses": len(train.contacts_yields) + len(test.contacts_yields),
             "yielding": int(train.contacts_yields.sum() + test.contacts_yields.sum()),
-            "reach": ranking(rate(nets[0], test.reach), test.reach_yields),
-            "contacts": ranking(rate(nets[1], test.contacts), test.contacts_yields),
+            "reach": ranking(rate(by_reach, test.reach), test.reach_yields),
+            "contacts": ranking(rate(by_contacts, test.contacts), test.contacts_yields),
             "seconds": seconds,
+            "curves": {"reach": reach_curve, "contacts": contacts_curve},
         }
         about = {"run_key": self.key(), "report": {k: v for k, v in report.items() if k != "seconds"}}
-        reach, contacts = (net.weights() for net in nets)
-        made = PosePolicy(hand.name, hand.tree.joint_names, hand.groups, points, reach, contacts, about)
+        made = PosePolicy(
+            hand.name, hand.tree.joint_names, hand.groups, points, by_reach.weights(), by_contacts.weights(), about
+        )
         return Made(part.rows, policy_bytes(made), report)
 
     def _examples(self, number: int, points: np.ndarray) -> PoseExamples:

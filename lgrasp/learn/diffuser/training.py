@@ -6,14 +6,16 @@ from collections.abc import Callable
 
 import torch
 
+from lgrasp.learn.curve import add_point
 from lgrasp.learn.diffuser.examples import StepExamples, split_steps
 from lgrasp.learn.diffuser.network import DiffuserNet, Situation
 from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.learn.diffuser.process import PROCESSES, Process
 
 _TOLD = 50  # steps between two looks at the loss: each look waits for the device
+_LOOKS = 40  # at what is learnt, for the curve
 _WARM = 200  # steps in which the learning rate rises
-_EVALUATED = 16_384  # steps of sequences at most
+_EVALUATED, _LOOKED_AT = 16_384, 2048  # steps of sequences at most: after the training, for the curve
 
 
 class StepTrainer:
@@ -39,13 +41,19 @@ class StepTrainer:
         self.rows, self.unseen_rows = split_steps(examples.steps.object, examples.steps.held, unseen.to(self.device))
         self._random = torch.Generator(self.device).manual_seed(params.seed)
 
-    def fit(self, told: Callable[[int, float], None] | None = None) -> None:
-        """All steps of the training; ``told`` is called with (step, mean loss since the last call) now and then."""
+    def fit(self, told: Callable[[int, float], None] | None = None) -> dict[str, list[list[float]]]:
+        """All steps of the training; ``told`` is called with (step, mean loss since the last call) now and then.
+
+        Returns:
+            Loss of the kept weights on objects that are trained on and on ``unseen`` ones, along the training.
+        """
+        curves: dict[str, list[list[float]]] = {"loss": [], "unseen": []}
         with torch.random.fork_rng():
             torch.manual_seed(self.params.seed)  # of dropout
-            self._fit(told)
+            self._fit(told, curves)
+        return {name: points for name, points in curves.items() if points}
 
-    def _fit(self, told: Callable[[int, float], None] | None) -> None:
+    def _fit(self, told: Callable[[int, float], None] | None, curves: dict[str, list[list[float]]]) -> None:
         p, weights = self.params, list(self.net.parameters())
         optimiser = torch.optim.AdamW(weights, lr=p.rate, weight_decay=p.decay, fused=self.device.type == "cuda")
         rate = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _share(step, p.steps))
@@ -67,6 +75,11 @@ class StepTrainer:
             if told and ((step + 1) % _TOLD == 0 or step + 1 == p.steps):
                 told(step + 1, float(total) / counted)
                 total, counted = torch.zeros((), device=self.device), 0
+            if (step + 1) % math.ceil(p.steps / _LOOKS) == 0 or step + 1 == p.steps:
+                for points, rows in zip(curves.values(), (self.rows, self.unseen_rows), strict=True):
+                    if len(rows):
+                        found = mean_loss(self.kept, self.examples, rows, self.process, most=_LOOKED_AT)
+                        add_point(points, step + 1, found)
 
     def losses(self) -> tuple[float, float]:
         """Loss of the kept weights on steps that it was trained on, and on those of unseen objects (NaN of none)."""
@@ -82,10 +95,12 @@ class StepTrainer:
 
 
 @torch.no_grad()
-def mean_loss(net: DiffuserNet, examples: StepExamples, rows: torch.Tensor, process: Process) -> float:
-    """Loss on some of the steps (16,384 at most), NaN of none."""
+def mean_loss(
+    net: DiffuserNet, examples: StepExamples, rows: torch.Tensor, process: Process, *, most: int = _EVALUATED
+) -> float:
+    """Loss on some of the steps, ``most`` at most; NaN of none."""
     draw = torch.Generator(rows.device).manual_seed(1)
-    rows = rows[torch.randperm(len(rows), generator=draw, device=rows.device)[:_EVALUATED]]
+    rows = rows[torch.randperm(len(rows), generator=draw, device=rows.device)[:most]]
     parts = [_loss(net, examples, part, process, draw) * len(part) for part in rows.split(4096)]
     return float(sum(parts)) / len(rows) if len(rows) else float("nan")
 
