@@ -19,8 +19,11 @@ from lgrasp.refine.refiner import Pose
 PARAMS = LearnParams.model_validate({"points": 48, "width": 32, "batch": 24, "clouds": 4, "held_out": 3})
 
 
+Labels = tuple[np.ndarray, np.ndarray]
+
+
 @pytest.fixture(scope="module")
-def labels(inputs: Inputs) -> tuple[np.ndarray, np.ndarray]:
+def labels(inputs: Inputs) -> Labels:
     """T_hand_object and q of open hands 2 cm before points of the surface, alike in the frames of these points."""
     obj, model = inputs.object.model, inputs.hand.model
     rows = np.random.default_rng(0).permutation(len(obj.contact_points))[:60]
@@ -35,7 +38,7 @@ def labels(inputs: Inputs) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def examples(inputs: Inputs, labels) -> Examples:
+def examples(inputs: Inputs, labels: Labels) -> Examples:
     rng = np.random.default_rng(1)
     return make_examples(inputs.hand.model, inputs.object.model, *labels, PARAMS, rng, PARAMS.clouds)
 
@@ -112,7 +115,7 @@ def test_far_hands_have_a_high_energy(inputs: Inputs, examples: Examples):
     assert (whole_energy(refiner, farther) > whole_energy(refiner, away)).all()
 
 
-def test_training_lowers_the_loss_and_joint_training_the_energy(inputs: Inputs, labels, examples: Examples):
+def test_training_lowers_the_loss_and_joint_training_the_energy(inputs: Inputs, labels: Labels, examples: Examples):
     rng = np.random.default_rng(2)
     held_out = make_examples(inputs.hand.model, inputs.object.model, *labels, PARAMS, rng, PARAMS.held_out)
     params = PARAMS.model_copy(update={"joint_steps": 12, "unrolled": 2, "joint_rate": 1e-3})
