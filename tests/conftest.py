@@ -36,6 +36,28 @@ RECORDS = 20_000
 CANDIDATES = 2000
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Of two processes the second collects from the end: what one has compiled to bytecode, the other need not."""
+    tests = Path(__file__).parent
+    if _from_the_end() and [config.invocation_params.dir / arg for arg in config.args] == [tests]:
+        config.args[:] = [str(path) for path in sorted(tests.iterdir(), reverse=True) if _collected(path)]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """All processes have the same order."""
+    items.sort(key=lambda item: item.path.parts)
+
+
+def _collected(path: Path) -> bool:
+    return path.is_dir() or path.match("test_*.py")
+
+
+def _from_the_end() -> bool:
+    """Whether this is the second of several processes, which begins at the other end than the first."""
+    return os.environ.get("PYTEST_XDIST_WORKER", "").endswith("1")
+
+
 def pytest_collection_finish() -> None:
     """What was imported and collected stays: the garbage collector need not look at it again and again."""
     gc.freeze()
@@ -212,8 +234,8 @@ def raw_grasps() -> Callable[[Path], dict[str, dict[str, bytes]]]:
 @pytest.fixture(scope="session", autouse=True)
 def _warp(tmp_path_factory: pytest.TempPathFactory) -> None:
     start()
-    if worker := os.environ.get("PYTEST_XDIST_WORKER"):
-        compile_together(tmp_path_factory.getbasetemp().parent, backwards=worker.endswith("1"))
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        compile_together(tmp_path_factory.getbasetemp().parent, backwards=_from_the_end())
 
 
 @pytest.fixture(scope="session", autouse=True)

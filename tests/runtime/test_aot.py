@@ -12,7 +12,15 @@ from lgrasp.runtime.kernels import import_all, kernel_modules
 
 OLDEST, NEWEST = 75, 90  # what compiles for the oldest compiles for all after it; H100 and H200 are the newest
 
-DEBUG = {"lgrasp.hold.kernels"}  # large: with optimization it takes half a minute to compile
+DEBUG = {  # these take longer to compile with optimization
+    "lgrasp.hold.kernels",
+    "lgrasp.grasp.quality_kernels",
+    "lgrasp.refine.descent_kernels",
+    "lgrasp.stages.domain.chance_kernels",
+    "lgrasp.stages.search.kernels",
+    "lgrasp.stages.search.mutate_kernels",
+    "lgrasp.stages.search.swap_kernels",
+}
 
 import_all()
 
