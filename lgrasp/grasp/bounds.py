@@ -12,6 +12,9 @@ from lgrasp.math.constants import DRIVE_STIFFNESS
 if TYPE_CHECKING:
     import numpy as np
 
+ANY_CLOSING = 10.0
+"""[rad or m]; joints never close by so much."""
+
 PROFILES: dict[str, dict[str, float]] = {
     "strict": {},
     "plan": {
@@ -75,6 +78,12 @@ class GraspBounds(Params):
     )
     min_pregrasp_distance: float = Field(
         default=0.001, ge=0, le=0.05, description="Least distance of touching fingers and object in q_pregrasp."
+    )
+    max_closing_travel: float = Field(
+        default=ANY_CLOSING,
+        ge=0,
+        le=ANY_CLOSING,
+        description="Farthest that a joint moves from q_pregrasp to q [rad or m]; 10 asks for nothing.",
     )
     min_table_distance: float = Field(
         default=0.001, ge=0, le=0.05, description="Least distance of the hand from the table, where there is one."

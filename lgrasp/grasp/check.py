@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.grasp.approach_kernels import RETREATS, Palm, check_table, choose_approach, try_retreats
-from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.bounds import ANY_CLOSING, GraspBounds
 from lgrasp.grasp.check_kernels import (
     ALL,
     check_postures,
@@ -103,6 +103,7 @@ class Check:
         packed, on_table = self._pack(seed, row), self.obj.planes is not None
         self._share(row, tally)
         bounded = max(self.limits.min_squeeze_travel, self.limits.min_stable_squeeze) > 0.0
+        bounded |= self.limits.max_closing_travel < ANY_CLOSING
         if bounded:
             wp.launch(drop_limp, len(self), [self.limits, packed], [row, tally.device], device=self.hand.device)
         if on_table:
@@ -132,6 +133,7 @@ class Check:
         table = _table(dict(zip(columns, fetched, strict=True)), len(self))
         limp = table.metrics["squeeze_travel"] < self.limits.min_squeeze_travel
         limp |= table.metrics["stable_squeeze"] < self.limits.min_stable_squeeze
+        limp |= table.metrics["closing_travel"] > self.limits.max_closing_travel
         outcome = np.where(limp & (outcome == Outcome.KEPT), Outcome.SQUEEZE, outcome)
         if on_table:
             lost = np.isnan(table.table["approach"][:, 0]) & (outcome == Outcome.KEPT)
@@ -196,6 +198,7 @@ def _table(columns: dict[str, np.ndarray], count: int) -> GraspTable:
     numbers = dict(zip(MEASURED, columns["numbers"][:, :count], strict=True))
     numbers |= {name: x.pop(name) for name in METRICS if name in x}
     numbers["force_closure"] = (numbers["epsilon"] > 0).astype(np.float32)
+    numbers["closing_travel"] = np.abs(x["q"] - x["q_pregrasp"]).max(axis=1, initial=0.0)
     numbers["normal_error"] = np.arccos(np.clip(numbers["facing"], -1, 1))
     x["index"] = x["index"].astype(np.int64)
     x["table"] = {name: x.pop(column) for column, name in _ON_TABLE.items() if column in x}

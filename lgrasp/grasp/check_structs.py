@@ -33,6 +33,7 @@ class Limits:
     squeeze_stiffness: wp.float32
     min_squeeze_travel: wp.float32
     min_stable_squeeze: wp.float32
+    max_closing_travel: wp.float32
     squeeze_margin: wp.float32
     deepest: wp.float32  # penetrations above this are not distinguished
     whole: wp.int32  # 1: rows that failed are measured to the end

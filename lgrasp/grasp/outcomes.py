@@ -48,6 +48,7 @@ SHARED = (*REASONS, "touch")
 FAILED_BOUNDS = (
     *("none", "min_contacts", "max_gap", "max_normal_angle", "min_self_distance", "max_penetration", "max_gswo"),
     *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel", "min_stable_squeeze"),
+    "max_closing_travel",
 )
 """By code, the first bound that a row fails, of :class:`~lgrasp.grasp.bounds.GraspBounds`; ``approach``: no straight
 way of the open hand to the object clears the table."""
@@ -67,7 +68,7 @@ MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
 METRICS = (
     *("fswo", "gswo", "unresisted_load", "epsilon", "force_closure"),
     *("penetration", "self_penetration", "gap", "normal_error", "pregrasp_opening", "squeeze_travel"),
-    "stable_squeeze",
+    *("stable_squeeze", "closing_travel"),
 )
 """Columns of the metrics table."""
 
@@ -82,6 +83,7 @@ def failed_bounds(table: GraspTable, outcome: np.ndarray, bounds: GraspBounds) -
     for failed, name in _FAILED.items():
         codes[failed] = at[name]
     limp = table.metrics["squeeze_travel"] < bounds.min_squeeze_travel
-    squeeze = np.where(limp, at["min_squeeze_travel"], at["min_stable_squeeze"])
+    far = table.metrics["closing_travel"] > bounds.max_closing_travel
+    squeeze = np.select([limp, far], [at["min_squeeze_travel"], at["max_closing_travel"]], at["min_stable_squeeze"])
     late = np.where(outcome == Outcome.SQUEEZE, squeeze, codes[outcome])
     return np.where(outcome == Outcome.CONTACT, contact, late).astype(np.float32)

@@ -18,6 +18,7 @@ METRIC_UNITS = {
     "pregrasp_opening": "rad or m",
     "squeeze_travel": "m",
     "stable_squeeze": "N",
+    "closing_travel": "rad or m",
     "hold_drift": "m",
     "failed_bound": CODE + ", ".join(f"{code} {name}" for code, name in enumerate(FAILED_BOUNDS)),
 }

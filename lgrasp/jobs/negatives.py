@@ -9,6 +9,7 @@ from lgrasp.engine.batch import block_size, run_stages
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import shard_context, shard_effort
+from lgrasp.grasp.bounds import ANY_CLOSING
 from lgrasp.grasp.row_order import RowOrder
 from lgrasp.grasp.tables import GraspTable, join_rows, take_rows, widen_grasps
 from lgrasp.stages.filter.failed import failed_rows
@@ -26,6 +27,7 @@ _LOOSE: dict[str, float] = {
     "max_unresisted_load": 1.0,
     "min_squeeze_travel": 0.0,
     "min_stable_squeeze": 0.0,
+    "max_closing_travel": ANY_CLOSING,
     "min_table_distance": 0.0,
     "min_self_distance": 0.0,
 }

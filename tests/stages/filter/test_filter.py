@@ -203,6 +203,18 @@ def test_grasps_that_hardly_squeeze_are_dropped_where_asked(tables, context, swi
     np.testing.assert_array_equal(free[0].q[kept], bound[0].q)
 
 
+def test_grasps_that_close_from_far_away_are_dropped_where_asked(tables, context, swift):
+    params = swift.params("filter")
+    free = run(tables.search, params, context)[0]
+    travel = np.abs(free.q - free.q_pregrasp).max(1)
+    np.testing.assert_array_equal(free.metrics["closing_travel"], travel)
+    most = float(np.quantile(travel, 0.7))
+    bound = run(tables.search, params, replace(context, bounds=context.bounds.changed(max_closing_travel=most)))
+    kept = travel <= np.float32(most)
+    assert bound[1]["squeeze"] == (~kept).sum() > 10
+    np.testing.assert_array_equal(free.q[kept], bound[0].q)
+
+
 def test_unresisted_load_is_bounded_where_asked(tables, context, swift):
     params, other = swift.params("filter"), replace(context, bounds=GraspBounds(max_unresisted_load=0.2))
     free, bound = run(tables.search, params, context), run(tables.search, params, other)
