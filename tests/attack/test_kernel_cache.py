@@ -34,6 +34,8 @@ print(int(x.numpy()[1]))
 KERNEL = """
 import warp as wp
 
+wp.set_module_options({"enable_backward": False, "optimization_level": 0})
+
 @wp.kernel
 def double(x: wp.array(dtype=wp.float32)):
     x[wp.tid()] = 2.0 * x[wp.tid()]

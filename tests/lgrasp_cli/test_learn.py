@@ -79,7 +79,7 @@ def test_shards_that_cannot_be_learned_from(generate, cli, tmp_path):
         file["grasps/q"][1, 2] = np.nan
     assert f"{path}: q is not finite (row 1, 1 rows)" in refused("out")
     assert generate("--hand", "barrett", rows=2, out=tmp_path / "other").code == 0
-    assert generate("--force", rows=3).code == 0
+    assert generate("--overwrite", rows=3).code == 0
     line = refused("out", "other")
     assert "barrett-tiny-00000.h5: its grasps are of hand 'barrett'" in line
     assert f"those of {path} of 'allegro'" in line
