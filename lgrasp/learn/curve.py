@@ -20,18 +20,19 @@ class LossCurve:
     Args:
         steps: of the training.
         told: is told the same.
+        turn: steps after which all objects had theirs; stretches are whole turns.
     """
 
-    def __init__(self, steps: int, told: Callable[[int, float], None] | None = None) -> None:
+    def __init__(self, steps: int, told: Callable[[int, float], None] | None = None, *, turn: int = 1) -> None:
         self.points: list[list[float]] = []
         """Last step and mean loss of each of as many equal stretches."""
-        self._steps, self._told = steps, told
+        self._steps, self._told, self._stretch = steps, told, math.ceil(steps / POINTS / turn) * turn
         self._recent: list[float] = []
 
     def __call__(self, step: int, loss: float) -> None:
         self._recent.append(loss)
         last = self.points[-1][0] if self.points else 0
-        if step - last >= math.ceil(self._steps / POINTS) or step >= self._steps:
+        if step - last >= self._stretch or step >= self._steps:
             add_point(self.points, step, sum(self._recent) / len(self._recent))
             self._recent = []
         if self._told:

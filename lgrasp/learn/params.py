@@ -9,7 +9,7 @@ class LearnParams(Params):
     """Input and size of the network, and the length of its training."""
 
     points: int = Field(96, ge=16, le=8192, description="Points of a cloud that the network sees.")
-    width: int = Field(64, ge=8, le=4096, description="Channels of a point; the whole has twice as many.")
+    width: int = Field(128, ge=8, le=4096, description="Channels of a point; the whole has twice as many.")
     scale: float = Field(0.05, gt=0, le=1.0, description="Unit of length of the network.")
     near: float = Field(0.02, gt=0, le=0.2, description="Largest distance of a grasp's seeds from its palm point.")
     choices: int = Field(16, ge=1, le=1024, description="Grasps nearest to a seed; the closest to the answer pulls.")

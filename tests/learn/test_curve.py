@@ -6,6 +6,14 @@ import pytest
 from lgrasp.learn.curve import POINTS, LossCurve
 
 
+def test_points_are_of_whole_turns():
+    curve = LossCurve(100, turn=7)
+    for step in range(1, 101):
+        curve(step, float(step % 7))
+    assert [step for step, _ in curve.points] == [*range(7, 100, 7), 100]
+    assert {value for _, value in curve.points[:-1]} == {3.0}
+
+
 @pytest.mark.parametrize(("steps", "every"), [(7, 1), (1000, 1), (1050, 50), (1030, 50)])
 def test_points_are_means_of_all_losses(steps, every):
     told = []

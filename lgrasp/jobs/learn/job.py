@@ -49,7 +49,8 @@ class FitJob(NetworkJob):
         self.enough(sum(len(e.q) for e in train), "grasps", _MIN_GRASPS)
         trainer = Trainer(hand, train, p, device=device)
         start = time.perf_counter()
-        poses = LossCurve(p.steps, lambda step, loss: progress(step, f"loss {loss:.3f}"))
+        turn = len(train)
+        poses = LossCurve(p.steps, lambda step, loss: progress(step, f"loss {loss:.3f}"), turn=turn)
         trainer.fit_poses(p.steps, p.rate, poses)
         seconds = {"poses": time.perf_counter() - start}
         report: dict[str, Any] = {"hand": hand.name, "objects": [e.model.name for e in train]}
@@ -61,7 +62,11 @@ class FitJob(NetworkJob):
             report["longer"] = energy_numbers(measure(trainer, held_out))
             trainer.net.load_state_dict(before)
             start = time.perf_counter()
-            joint = LossCurve(p.joint_steps, lambda step, energy: progress(p.steps + step, f"energy {energy:.3f}"))
+
+            def told(step: int, energy: float) -> None:
+                progress(p.steps + step, f"energy {energy:.3f}")
+
+            joint = LossCurve(p.joint_steps, told, turn=turn)
             trainer.fit_jointly(joint)
             curves["joint"] = {"energy": joint.points}
             seconds["joint"] = time.perf_counter() - start
