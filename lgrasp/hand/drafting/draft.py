@@ -273,7 +273,7 @@ def _say_contacts(survey: ContactSurvey, names: list[str]) -> list[str]:
         touches = f"may touch with {', '.join(sides)} ({area:.1f} cm2; contact)"
         nothing = "shows the others no surface, so it touches nothing (contact)"
         joints = len(frozenset().union(*(structure.drives[tip] for tip in tips)))
-        decided.append(f"finger '{finger}': {joints} drives, {touches if sides else nothing}")
+        decided.append(f"finger '{finger}': {joints} drive{'s' * (joints != 1)}, {touches if sides else nothing}")
         if len(tips) > 1:
             decided.append(f"finger '{finger}': {len(tips)} tips are driven together and make one contact at a time")
     if not survey.palm:
