@@ -62,7 +62,7 @@ def test_help(cli):
         (["a.h5", "--to", "dexgraspnt", "--out", "made"], "choose dexgraspnet, dexgraspbench"),
         (["a.h5", "--to", "mjcf"], "--out"),
         (["a.h5", "--out", "made"], "--to"),
-        (["--to", "mjcf", "--out", "made"], "shards"),
+        (["--to", "mjcf", "--out", "made"], "SHARDS"),
         (["b.h5", "--to", "mjcf", "--out", "made"], "b.h5: no such file"),
         (["note.txt", "--to", "mjcf", "--out", "made"], "note.txt: not a whole HDF5 file"),
         (["a.h5", "--to", "mjcf", "--out", "note.txt"], "note.txt is a file"),
