@@ -23,7 +23,7 @@ from lgrasp.grasp.check_kernels import (
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
 from lgrasp.grasp.control_kernels import control_poses, drop_limp, limit_squeeze, press_shared
 from lgrasp.grasp.held import HeldArrays, hold_nothing
-from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome
+from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome, failed_squeeze
 from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, open_fingers, open_poses, try_fingers
 from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, drop_light, grasp_epsilon, resist_loads
 from lgrasp.grasp.stability_kernels import find_stable_squeeze
@@ -131,9 +131,7 @@ class Check:
         columns = _columns(packed, on_table)
         *fetched, outcome = fetch([*columns.values(), self.found.outcome])
         table = _table(dict(zip(columns, fetched, strict=True)), len(self))
-        limp = table.metrics["squeeze_travel"] < self.limits.min_squeeze_travel
-        limp |= table.metrics["stable_squeeze"] < self.limits.min_stable_squeeze
-        limp |= table.metrics["closing_travel"] > self.limits.max_closing_travel
+        limp = np.any(failed_squeeze(table, self.limits), axis=0)
         outcome = np.where(limp & (outcome == Outcome.KEPT), Outcome.SQUEEZE, outcome)
         if on_table:
             lost = np.isnan(table.table["approach"][:, 0]) & (outcome == Outcome.KEPT)
@@ -198,7 +196,6 @@ def _table(columns: dict[str, np.ndarray], count: int) -> GraspTable:
     numbers = dict(zip(MEASURED, columns["numbers"][:, :count], strict=True))
     numbers |= {name: x.pop(name) for name in METRICS if name in x}
     numbers["force_closure"] = (numbers["epsilon"] > 0).astype(np.float32)
-    numbers["closing_travel"] = np.abs(x["q"] - x["q_pregrasp"]).max(axis=1, initial=0.0)
     numbers["normal_error"] = np.arccos(np.clip(numbers["facing"], -1, 1))
     x["index"] = x["index"].astype(np.int64)
     x["table"] = {name: x.pop(column) for column, name in _ON_TABLE.items() if column in x}

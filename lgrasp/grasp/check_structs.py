@@ -101,6 +101,7 @@ class Packed:
     pregrasp_opening: wp.array(dtype=wp.float32)  # (m,) [rad or m]
     squeeze_travel: wp.array(dtype=wp.float32)  # (m,) [m]
     stable_squeeze: wp.array(dtype=wp.float32)  # (m,) [N]
+    closing_travel: wp.array(dtype=wp.float32)  # (m,) [rad or m]
     resting: wp.array(dtype=wp.int32)  # (m,) resting pose of the object; only where there is a table, as the next
     approach: wp.array(dtype=wp.vec3)  # (m,) direction in which the open hand comes, base frame; NaN none
 

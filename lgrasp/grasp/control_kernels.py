@@ -198,11 +198,8 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     i = wp.tid()
     if row_out[i] < 0:
         return
-    closing = float(0.0)
-    for c in range(packed.q.shape[1]):
-        closing = wp.max(closing, wp.abs(packed.q[i, c] - packed.q_pregrasp[i, c]))
     limp = packed.squeeze_travel[i] < limits.min_squeeze_travel or packed.stable_squeeze[i] < limits.min_stable_squeeze
-    if limp or closing > limits.max_closing_travel:
+    if limp or packed.closing_travel[i] > limits.max_closing_travel:
         row_out[i] = -1
         wp.atomic_sub(counts_out, KEPT, 1)
         wp.atomic_add(counts_out, SQUEEZE, 1)

@@ -1,6 +1,7 @@
 """Outcomes of checked grasps, and the numbers kept of them."""
 
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -73,6 +74,22 @@ METRICS = (
 """Columns of the metrics table."""
 
 
+_SQUEEZE_BOUNDS = ("min_squeeze_travel", "max_closing_travel", "min_stable_squeeze")
+
+
+def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
+    """Which of n rows fail each of _SQUEEZE_BOUNDS, (n,) bool, in its order.
+
+    Args:
+        bounds: GraspBounds, or the same numbers on a device.
+    """
+    return [
+        table.metrics["squeeze_travel"] < bounds.min_squeeze_travel,
+        table.metrics["closing_travel"] > bounds.max_closing_travel,
+        table.metrics["stable_squeeze"] < bounds.min_stable_squeeze,
+    ]
+
+
 def failed_bounds(table: GraspTable, outcome: np.ndarray, bounds: GraspBounds) -> np.ndarray:
     """Codes of FAILED_BOUNDS of checked rows with their outcomes, (n,) float32; 0 of rows that pass."""
     few = (table.contact_links >= 0).sum(1) < bounds.min_contacts
@@ -82,8 +99,6 @@ def failed_bounds(table: GraspTable, outcome: np.ndarray, bounds: GraspBounds) -
     codes = np.zeros(max(Outcome) + 1, np.float32)
     for failed, name in _FAILED.items():
         codes[failed] = at[name]
-    limp = table.metrics["squeeze_travel"] < bounds.min_squeeze_travel
-    far = table.metrics["closing_travel"] > bounds.max_closing_travel
-    squeeze = np.select([limp, far], [at["min_squeeze_travel"], at["max_closing_travel"]], at["min_stable_squeeze"])
+    squeeze = np.select(failed_squeeze(table, bounds), [at[name] for name in _SQUEEZE_BOUNDS])
     late = np.where(outcome == Outcome.SQUEEZE, squeeze, codes[outcome])
     return np.where(outcome == Outcome.CONTACT, contact, late).astype(np.float32)

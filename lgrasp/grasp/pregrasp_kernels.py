@@ -108,11 +108,14 @@ def open_poses(
         stuck_out[1 + wp.atomic_add(stuck_out, 0, 1)] = i
         return
     least = float(_NOT_TOUCHING)
+    most = float(0.0)
     for g in range(G):
         x = at.posture[s, g] + share * (opened[i, g] - at.posture[s, g])
         moved = put_pregrasp(hand, g, x, at.posture[s, g], i, packed_out)
+        most = wp.max(most, moved)
         if at.chosen[s, g] >= 0:
             least = wp.min(least, moved)
+    packed_out.closing_travel[i] = most
     packed_out.pregrasp_opening[i] = wp.where(least == _NOT_TOUCHING, 0.0, least)
 
 
@@ -197,6 +200,7 @@ def open_fingers(
     for g in range(G):
         group_forward(hand.kin, g, at.posture[s, g], X, hand.kin.joint_first[g])
     least = float(_NOT_TOUCHING)
+    most = float(0.0)
     for g in range(G):
         x = at.posture[s, g]
         done = wp.where(at.chosen[s, g] >= 0, 0, 1)
@@ -213,6 +217,8 @@ def open_fingers(
             x = at.posture[s, g]
             group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
         moved = put_pregrasp(hand, g, x, at.posture[s, g], i, packed_out)
+        most = wp.max(most, moved)
         if at.chosen[s, g] >= 0:
             least = wp.min(least, moved)
+    packed_out.closing_travel[i] = most
     packed_out.pregrasp_opening[i] = wp.where(least == _NOT_TOUCHING, 0.0, least)
