@@ -185,15 +185,18 @@ def test_tasks_resume_and_stop(jobs, tmp_path: Path, name: str):
     assert whole.rows > 0
     assert bar.last == (sum(part.rows for part in whole.parts) or whole.rows,) * 2
     expected = contents(tmp_path / "whole")
+    for task in (1, 0):
+        run(jobs(name, tmp_path / "array"), array=(task, 2))
+    assert contents(tmp_path / "array") == expected
+    again = run(jobs(name, tmp_path / "array"))
+    assert (again.made, again.present) == (0, whole.rows)
     stopped = run(jobs(name, tmp_path / "cut"), Stop())
     assert stopped.cancelled
     assert not stopped.paths
-    for task in (1, 0):
-        assert not run(jobs(name, tmp_path / "cut"), array=(task, 2)).cancelled
+    done = run(jobs(name, tmp_path / "cut"))
+    assert not done.cancelled
     assert contents(tmp_path / "cut") == expected
-    again = run(jobs(name, tmp_path / "cut"))
-    assert (again.made, again.present) == (0, whole.rows)
-    data = job_report(again)
+    data = job_report(done)
     assert json.loads(json.dumps(data)) == data
     assert {"asked", "made", "present", "out", "shards", "device", "seconds", "starved", "cancelled"} <= set(data)
 
