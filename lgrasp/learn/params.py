@@ -30,6 +30,9 @@ class PosePolicyParams(Params):
 
     shapes: int = Field(48, ge=2, le=10_000, description="Random shapes to learn from, where no objects are named.")
     candidates: int = Field(2048, ge=64, le=10**6, description="Candidates of each object, searched to the end.")
+    failures: float = Field(
+        1.0, gt=0, le=1, description="Share of the poses without a grasp to learn from; less where grasps are rare."
+    )
     draws: int = Field(2, ge=1, le=64, description="Times that the contacts in reach of a pose are drawn.")
     held_out: float = Field(0.125, gt=0, lt=1, description="Share of the objects that is kept for the report.")
     batch: int = Field(512, ge=1, le=65_536, description="Poses per training step.")

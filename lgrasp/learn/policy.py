@@ -1,5 +1,6 @@
 """The networks of a pose policy in torch, and their training."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -84,7 +85,10 @@ def inputs_of(seen: Seen) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 def fit_network(
     seen: Seen, yields: np.ndarray, params: PosePolicyParams
 ) -> tuple[PoseNet, dict[str, list[list[float]]]]:
-    """A network of poses and whether they gave a grasp, (N,), and its loss along the training."""
+    """A network of poses and whether they gave a grasp, (N,), and its loss along the training.
+
+    Where only the share ``params.failures`` of the poses without a grasp is given, the odds count the others too.
+    """
     inputs, wanted = inputs_of(seen), torch.from_numpy(yields.astype(np.float32))
     state = torch.random.get_rng_state()
     torch.manual_seed(params.seed)
@@ -102,6 +106,8 @@ def fit_network(
         rate.step()
         curve(step + 1, loss.item())
     torch.random.set_rng_state(state)
+    with torch.no_grad():
+        net.last.bias.add_(math.log(params.failures))
     return net.eval(), {"loss": curve.points}
 
 

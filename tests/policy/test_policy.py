@@ -157,6 +157,22 @@ def test_a_network_learns_where_objects_are_held():
     assert ranking(np.zeros(3), np.zeros(3, bool)) is None
 
 
+def test_odds_count_the_failures_left_out():
+    """A network of a tenth of the failures tells as many grasps as there are among all poses."""
+    rng, n = np.random.default_rng(1), 20_000
+    com = rng.normal(0, 0.03, (n, 3)).astype(np.float32)
+    yields = (com[:, 0] > 0.03) & (rng.random(n) < 0.25)
+    told = yields | (rng.random(n) < 0.1)
+    hits = np.zeros((n, 1, MOST_HITS, 6), np.float32)
+    seen = Seen(hits, np.zeros((n, 1), int), np.zeros((n, 1)), com, np.zeros(n, bool), np.zeros((n, 0), np.float32))
+    some = Seen(*(column[told] for column in seen))
+    asked = PosePolicyParams.model_validate({"failures": 0.1, "epochs": 60, "batch": 256})
+    net, _ = fit_network(some, yields[told], asked)
+    chance = 1 / (1 + np.exp(-rate(net, seen)))
+    assert chance.sum() == pytest.approx(yields.sum(), rel=0.15)
+    assert chance[com[:, 0] > 0.045].mean() == pytest.approx(0.25, rel=0.2)
+
+
 def test_keys_go_by_what_a_policy_holds(swift, policy):
     a, b, c = policy(x=1.0), policy(x=1.0), policy(x=2.0)
     keys = [swift.with_params("place", policy=str(path)).describe() for path in (a, b, c)]

@@ -8,7 +8,8 @@ from lgrasp.engine.batch import run_stage
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.field.model import ContactField
 from lgrasp.grasp.structs import State
-from lgrasp.grasp.tables import CandidateTable, PoseTable
+from lgrasp.grasp.tables import CandidateTable, PoseTable, select_poses
+from lgrasp.learn.params import PosePolicyParams
 from lgrasp.learn.policy import Seen, join_seen
 from lgrasp.policy.model import MOST_HITS, POINTS
 from lgrasp.policy.score import COUNT_SCALE
@@ -17,7 +18,7 @@ from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.observe import Reach, observe_reach
 
-_BATCH = 256  # candidates
+_CPU_BATCH, _GPU_BATCH = 256, 16_384  # candidates
 _DRAW_STRIDE = 7919  # between the seeds of draws
 
 
@@ -50,33 +51,33 @@ def reach_points(field: ContactField, seed: int) -> np.ndarray:
 
 
 def make_pose_examples(
-    pipeline: Pipeline, context: Context, points: np.ndarray, candidates: int, draws: int
+    pipeline: Pipeline, context: Context, points: np.ndarray, params: PosePolicyParams
 ) -> PoseExamples:
-    """Search ``candidates`` poses of the context's object to the end.
+    """Search poses of the context's object to the end, and tell what is seen at those that gave a grasp and at a share
+    of the others.
 
     Args:
         points: of the policy, (M, 3) base frame [m].
-        draws: times that the contacts in reach are drawn.
     """
-    parts = [_batch(pipeline, context, points, first, draws) for first in range(0, candidates, _BATCH)]
+    most = _GPU_BATCH if context.device.startswith("cuda") else _CPU_BATCH
+    parts = [
+        _batch(pipeline, context, points, params, first, min(most, params.candidates - first))
+        for first in range(0, params.candidates, most)
+    ]
     return join_examples(parts)
 
 
-def _batch(pipeline: Pipeline, context: Context, points: np.ndarray, first: int, draws: int) -> PoseExamples:
+def _batch(
+    pipeline: Pipeline, context: Context, points: np.ndarray, params: PosePolicyParams, first: int, count: int
+) -> PoseExamples:
     meter = Meter(context.device)
-    poses = run_stage("place", (first, _BATCH), pipeline, context, meter)
+    poses = run_stage("place", (first, count), pipeline, context, meter)
     index = to_numpy(poses.index)[: len(poses)]
-    _, com, palm = _placed(poses, context)
-    samples = pipeline.params("place").samples
-    seen = [
-        seen_reach(observe_reach(poses, points, samples, first + draw * _DRAW_STRIDE, context), com, palm)
-        for draw in range(draws)
-    ]
     table: Any = poses
     once = pipeline.with_params("domain", rounds=1)
     for stage in ("domain", "ik"):
         table = run_stage(stage, table, once, context, meter)
-    contacts = seen_contacts(table, context)
+    early = select_poses(table, np.arange(len(index)), context.device)  # later rounds write where the first did
     for number in range(1, pipeline.params("domain").rounds):
         for stage in ("domain", "ik"):
             table = run_stage(stage, table, once, context.changed(round=number), meter)
@@ -84,7 +85,17 @@ def _batch(pipeline: Pipeline, context: Context, points: np.ndarray, first: int,
     for stage in order[order.index("ik") + 1 : order.index("filter") + 1]:
         found = run_stage(stage, found, pipeline, context, meter)
     yields = np.isin(index, found.index)
-    return PoseExamples(join_seen(seen), np.tile(yields, draws), contacts, yields)
+    drawn = np.random.default_rng((context.base_seed, context.shard, first)).random(len(index))
+    told = np.flatnonzero(yields | (drawn < params.failures))
+    chosen = select_poses(early, told, context.device)
+    _, com, palm = _placed(chosen.poses, context)
+    samples = pipeline.params("place").samples
+    seen = [
+        seen_reach(observe_reach(chosen.poses, points, samples, first + draw * _DRAW_STRIDE, context), com, palm)
+        for draw in range(params.draws)
+    ]
+    yields = yields[told]
+    return PoseExamples(join_seen(seen), np.tile(yields, params.draws), seen_contacts(chosen, context), yields)
 
 
 def _placed(poses: PoseTable, context: Context) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -144,7 +144,7 @@ class PolicyJob(PolicyRequest, Job):
         obj = upload_object(self._object(number), alias)
         learned = self.learned
         context = Context(self._hand, obj, self._field, alias, p.seed, number, bounds=learned.bounds)
-        return make_pose_examples(learned, context, points, p.candidates, p.draws)
+        return make_pose_examples(learned, context, points, p)
 
     def _object(self, number: int) -> ObjectModel:
         params, alias = self.pipeline.object, self.device_used.alias
