@@ -30,7 +30,12 @@ class _Head(Params):
     name: str
     description: str = ""
     seed: Seed = 0
-    effort: int = Field(default=400, ge=1, le=10**6, description="Candidates tried per requested row before giving up.")
+    effort: int = Field(
+        default=400,
+        ge=1,
+        le=10**6,
+        description="Candidates tried per requested row before giving up; 16 times as many if that promises the rows.",
+    )
 
 
 class _Declared(_Head):

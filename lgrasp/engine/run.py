@@ -113,7 +113,7 @@ class Job(Request, ABC):
             if found.shard not in (-1, part.shard_index):
                 self.cache.warn(f"{part.file} holds shard {found.shard}, not {part.shard_index}; rebuilding it")
                 continue
-            if found.rows >= part.rows or found.tried >= self.effort(part.rows):
+            if found.rows >= part.rows or self.gave_up(part.rows, found):
                 present[part.number] = found.rows
             else:
                 self._growing.add(part.number)
@@ -148,9 +148,9 @@ class Job(Request, ABC):
         """Remove leftovers of killed processes that wrote parts; files being written stay."""
         clean_folder([part.file for part in parts])
 
-    def effort(self, rows: int) -> int:
-        """Candidates that a part of some rows may try; one that tried them all stays, though rows are missing."""
-        return 0
+    def gave_up(self, rows: int, found: Found) -> bool:
+        """Whether a part whose file has fewer than its rows stays as it is: all that it may try was tried."""
+        return True
 
     def load(self, events: Events, missing: bool) -> None:
         """Load the inputs of the parts onto ``self.device_used``.

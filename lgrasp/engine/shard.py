@@ -26,6 +26,7 @@ from lgrasp.stages.context import Context
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
 _LEAST_PLACED = 65_536  # candidates of which one must be placed where poses are steered, else a shard ends
 _EFFORT_STEP = 1024  # candidates: what a shard may try is a multiple of it
+_PATIENCE = 16  # times its effort that a shard may try where grasps are rare
 _CPU_BATCH, _CPU_LARGEST = 256, 512  # candidates of a batch; the second with several passes
 _PHYSICS_BATCH = 64  # candidates, when their grasps are simulated on the CPU, which takes long
 _GPU_SMALLEST, _GPU_LARGEST = 2_048, 65_536  # candidates of a batch
@@ -104,9 +105,19 @@ def _batch_size(
 
 
 def shard_effort(pipeline: Pipeline, rows: int) -> int:
-    """Candidates that a shard of ``rows`` rows may try."""
+    """Candidates that a shard of ``rows`` rows tries before it may give up."""
     steps = -(-max(_LEAST_EFFORT, rows * pipeline.effort) // _EFFORT_STEP)
     return min(steps * _EFFORT_STEP, _STREAM)
+
+
+def gave_up(pipeline: Pipeline, rows: int, found: int, tried: int) -> bool:
+    """Whether a shard that has only ``found`` of its rows ends after some candidates.
+
+    Beyond its effort it goes on while 16 times that promise half of the rows at least.
+    """
+    effort = shard_effort(pipeline, rows)
+    most = min(_PATIENCE * effort, _STREAM)
+    return tried >= most or (tried >= effort and 2 * found * most < rows * tried)
 
 
 def shard_context(pipeline: Pipeline, inputs: Inputs, shard: int) -> Context:
@@ -195,8 +206,10 @@ def make_shard(
     limit = shard_effort(pipeline, rows) if found.count < rows else 0
     some = min(limit, _LEAST_PLACED) if pipeline.steer.asks else limit  # the same whatever the batches are
     search(some)
-    if some < limit and found.count < rows and result.counts["place"]["kept"]:
+    if found.count < rows and result.counts["place"]["kept"]:
         search(limit)
+        while found.count < rows and not gave_up(pipeline, rows, found.count, result.candidates):
+            search(min(2 * result.candidates, _STREAM))
     result.grasps = found.shuffled()
     result.wall = earlier + time.perf_counter() - start
     result.exhausted = found.count < rows

@@ -13,10 +13,11 @@ from pydantic import PrivateAttr, model_validator
 from lgrasp.dataset.info import closure_share, stage_counts, survivors
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
+from lgrasp.engine.folder import Found
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.run import run
-from lgrasp.engine.shard import Execution, make_shard, shard_effort
+from lgrasp.engine.shard import Execution, gave_up, make_shard
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.duplicates import near_pairs
@@ -87,8 +88,8 @@ class GenerateJob(GenerateRequest, SearchJob):
         described = self.pipeline.describe() | ({"negatives": self.negatives} if self.negatives else {})
         return run_key(described, self.keys, self.shard_rows)
 
-    def effort(self, rows: int) -> int:
-        return shard_effort(self.pipeline, rows)
+    def gave_up(self, rows: int, found: Found) -> bool:
+        return gave_up(self.pipeline, rows, found.rows, found.tried)
 
     def load_inputs(self, events: Events) -> Inputs:
         pipeline, device, self._rate = self.pipeline, self.device_used, self.rate

@@ -3,6 +3,7 @@
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from lgrasp.engine import shard as shard_module
@@ -99,6 +100,20 @@ def test_last_batch_is_shorter(swift, inputs, monkeypatch):
     assert result.candidates == 150
     assert result.counts["place"]["tried"] == 150
     assert int(result.grasps.index.max()) < 150
+
+
+def test_goes_on_where_that_promises_the_rows(swift, inputs, monkeypatch):
+    """Beyond its effort a shard tries twice as much at a time; it finds the same rows whatever its batches are."""
+    monkeypatch.setattr(shard_module, "_LEAST_EFFORT", 512)
+    poor = swift.model_copy(update={"effort": 1})
+    first, second = (make_shard(poor, inputs, 0, 600, Execution(2, batch)) for batch in (256, 512))
+    assert first.candidates > 1024
+    assert not first.exhausted
+    np.testing.assert_array_equal(first.grasps.index, second.grasps.index)
+    assert shard_module.gave_up(poor, 100, 1, 1024)  # 16 times the effort would give 16
+    assert not shard_module.gave_up(poor, 100, 4, 1024)
+    assert shard_module.gave_up(poor, 100, 99, 16 * 1024)
+    assert not shard_module.gave_up(poor, 100, 0, 1023)
 
 
 def test_rows_of_written_shards_are_let_go(run):

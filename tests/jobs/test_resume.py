@@ -154,6 +154,7 @@ class TestStarving:
     @pytest.fixture(autouse=True)
     def _short_effort(self, monkeypatch):
         monkeypatch.setattr(shard_module, "_LEAST_EFFORT", 1024)
+        monkeypatch.setattr(shard_module, "_PATIENCE", 1)
 
     @pytest.fixture
     def poor(self, swift):

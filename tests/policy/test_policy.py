@@ -206,13 +206,11 @@ def test_refused_files(swift, policy, tmp_path, inputs):
 
 def test_shipped_policies_are_of_their_hands(swift):
     asked = swift.with_params("place", policy="hand")
-    for name in ("allegro", "leap"):
+    for name in ("allegro", "barrett", "dclaw", "leap", "schunk_svh", "shadow"):
         path = for_hand(asked, name).params("place").policy
         assert path.endswith(f"{name}/pose_policy.npz")
         assert for_hand(swift.with_params("place", policy=path), name).params("place").policy == path
     power = load_pipeline("power")
     for name in ("allegro", "leap", "shadow"):
         assert for_hand(power, name).params("place").policy.endswith(f"{name}/power_policy.npz")
-    assert for_hand(asked, "shadow").params("place").policy is None
-    assert for_hand(asked, "dclaw").params("place").policy is None
     assert for_hand(asked.with_table(), "allegro").params("place").policy is None

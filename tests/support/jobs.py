@@ -8,7 +8,7 @@ from support.shards import sample_shard
 
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
-from lgrasp.engine.folder import shard_path
+from lgrasp.engine.folder import Found, shard_path
 from lgrasp.engine.run import Job
 
 
@@ -47,8 +47,8 @@ class SampleJob(Job):
         header = replace(shard.header, config={"run_key": self.key()})
         return Made(rows, replace(shard, header=header, statistics=statistics))
 
-    def effort(self, rows: int) -> int:
-        return 1
+    def gave_up(self, rows: int, found: Found) -> bool:
+        return found.tried >= 1
 
     def report(self, outcome: JobOutcome):
         return {}

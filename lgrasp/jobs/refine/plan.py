@@ -13,7 +13,7 @@ from lgrasp.dataset.info import closure_share
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
-from lgrasp.engine.folder import shard_path
+from lgrasp.engine.folder import Found, shard_path
 from lgrasp.engine.run import Job
 from lgrasp.errors import LgraspError, StarvedError
 from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader
@@ -89,8 +89,8 @@ class PlanJob(PlanRequest, Job):
         source, _, model, _ = self._models()
         return {"hand": source.name, "objects": [model.name]}
 
-    def effort(self, rows: int) -> int:
-        return rows
+    def gave_up(self, rows: int, found: Found) -> bool:
+        return found.tried >= rows
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         source, hand, model, around = self._models()

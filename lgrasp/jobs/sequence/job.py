@@ -8,6 +8,7 @@ import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
+from lgrasp.engine.folder import Found
 from lgrasp.errors import LgraspError, ObjectError, StarvedError
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.sequences import SequenceTable
@@ -55,8 +56,8 @@ class SequenceJob(SequenceRequest, SearchJob):
     def key(self) -> str:
         return self.keys.run_key(self.pipeline.describe(), self.shard_rows, self.simulate)
 
-    def effort(self, rows: int) -> int:
-        return most_rounds(self.pipeline, rows)
+    def gave_up(self, rows: int, found: Found) -> bool:
+        return found.tried >= most_rounds(self.pipeline, rows)
 
     def load_inputs(self, events: Events) -> SequenceInputs:
         pipeline = self.pipeline
