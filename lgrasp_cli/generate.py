@@ -111,8 +111,7 @@ def generate(
         run_all(requests, how, dry_run=dry_run)
         return
     request = requests[0].model_copy(update={"out": out}) if out else requests[0]
-    request.check()
-    job = request.job(how.cache)
+    job = how.checked(request)
     if dry_run:
         show_plans([(job, how)], how)
     else:

@@ -56,8 +56,7 @@ def _run_one(request: "Request", how: How) -> dict[str, Any]:
     data: dict[str, Any] = {"title": request.title, "unit": request.unit}
     status, text, code = "done", "", 0
     try:
-        request.check()
-        job = request.job(how.cache)
+        job = how.checked(request)
         from lgrasp.engine.run import own_parts  # not before the check
 
         if how.array.total and not own_parts(job, how.array)[-1]:

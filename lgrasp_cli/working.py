@@ -115,8 +115,16 @@ class How:
         """
         from lgrasp.config import parse_model
 
-        request = parse_model(kind, given(**options) | self.shared, where)
+        return self.checked(parse_model(kind, given(**options) | self.shared, where))
+
+    def checked(self, request: "Request") -> "Job":
+        """The job of a request, the only one, that is checked before what makes it is imported.
+
+        Raises:
+            LgraspError: a value, a name or a path that cannot be, or more tasks of SLURM than parts.
+        """
         request.check()
+        self.array.check_early(request.known_parts, request.part)
         return request.job(self.cache)
 
     @property
@@ -187,10 +195,10 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
 
             array = f"{shard_index or 0}/{1 if num_shards is None else num_shards}"
             notice(f"--shard-index and --num-shards are now --array {array}; the old names work in this release only")
+        if _CHECKED.get() is not None:  # devices and tasks are those of another computer
+            device, array = None, "off"
         shares = parse_array(array)
         cache = open_cache(cache_dir, fresh=rebuild)
-        if _CHECKED.get() is not None:  # the devices are those of another computer
-            device = None
         several, first = split_devices(device)
         check_driver(first)
         command(

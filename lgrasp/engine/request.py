@@ -23,6 +23,8 @@ class Request(Params):
     """Where the job is: ``module:class``."""
     unit: ClassVar[str] = "grasps"
     """What is counted."""
+    part: ClassVar[str] = "shard"
+    """What a part is."""
 
     device: DeviceName = "auto"
     workers: Workers = 0
@@ -36,6 +38,11 @@ class Request(Params):
     def in_place(self) -> bool:
         """True if the parts are made in files of other runs, which stay theirs."""
         return False
+
+    @property
+    def known_parts(self) -> int | None:
+        """Number of parts; None: only the job can tell."""
+        return None
 
     def check(self) -> None:
         """Look up names, numbers and paths; nothing is loaded.
@@ -72,6 +79,10 @@ class ShardRequest(Request):
     def check(self) -> None:
         check_folder(self.folder)
         shards_below(self.shards, self.inside)
+
+    @property
+    def known_parts(self) -> int | None:
+        return len(shards_below(self.shards, self.inside))
 
     @property
     def inside(self) -> Path | None:

@@ -38,8 +38,6 @@ class Job(Request, ABC):
 
     command: ClassVar[str]
     """Words of the command line that run the job."""
-    part: ClassVar[str] = "shard"
-    """What a part is."""
     asks: ClassVar[bool] = False
     """True if fewer rows than requested may be found. A part without any then ends the job."""
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.stages.", "lgrasp.grasp.", "lgrasp.hold.")

@@ -67,7 +67,7 @@ class SearchJob(SearchRequest, Job):
             check_installed(resolve_device(self.device).alias, find_protocol(self.protocol))
         hand, name = self.keys.source.name, self.object_name
         return [
-            Part(s, shard_path(self.out, hand, name, s), min(size, rows - s * size)) for s in range(-(-rows // size))
+            Part(s, shard_path(self.out, hand, name, s), min(size, rows - s * size)) for s in range(self.known_parts)
         ]
 
     def load(self, events: Events, missing: bool) -> None:

@@ -97,15 +97,35 @@ class Array(NamedTuple):
         Raises:
             ConfigError: SLURM started more tasks than there are parts.
         """
-        number = self.total or len(parts)
+        self.check_busy(len(parts), what)
+        own = range((self.task - self.before) % self.tasks, len(parts), self.tasks)
+        return [parts[i] for i in own if (self.before + i) // self.tasks % self.lanes == self.lane]
+
+    def check_early(self, number: int | None, what: str) -> None:
+        """As :meth:`share`, of the parts of one job, as far as it can be told before the job is loaded.
+
+        Args:
+            number: parts of the job; None: not known yet.
+        """
+        if number is not None and self.slurm and self.slurm.whole:
+            self.resolved().check_busy(number, what)
+
+    def check_busy(self, number: int, what: str) -> None:
+        """Refuse an array of SLURM in which a task has nothing to do.
+
+        Args:
+            number: parts of the job.
+
+        Raises:
+            ConfigError: there are fewer parts than tasks.
+        """
+        number = self.total or number
         if self.slurm and number < self.tasks:
             raise ConfigError(
                 f"array task {self.task} of {self.tasks}: there {'is' if number == 1 else 'are'} {number} {what}"
                 f"{'' if number == 1 else 's'} to share; give --array off if every task has a job of its own, or "
                 f"--array {self.task}/{self.tasks} if tasks may have nothing to do"
             )
-        own = range((self.task - self.before) % self.tasks, len(parts), self.tasks)
-        return [parts[i] for i in own if (self.before + i) // self.tasks % self.lanes == self.lane]
 
     @property
     def text(self) -> str:

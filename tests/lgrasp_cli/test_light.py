@@ -115,6 +115,9 @@ bench table1 --hands alegro
 bench sequence --methods feild
 bench refine --objects mugg
 judge no-folder
+<ARRAY> generate --object mug -n 10 --out x
+<ARRAY> run small.yaml
+<ARRAY> scenes make mug -n 3 --out x
 """
 
 if not has_driver():
@@ -140,15 +143,22 @@ KINDS = ("generate", "refine", "sequence", "plan", "simulate", "reach", "scenes"
 
 SCRIPT = f"""
 import contextlib, io, json, os, shlex, sys
+from unittest.mock import patch
 from lgrasp_cli.main import main
 seen = set()
 for command in sys.stdin.read().splitlines():
-    sys.argv, err = ["lgrasp", *shlex.split(command)], io.StringIO()
+    array, words = {{}}, shlex.split(command)
+    if words[:1] == ["<ARRAY>"]:  # the second of four tasks
+        array = {{f"SLURM_ARRAY_TASK_{{name}}": n for name, n in zip(("ID", "MIN", "MAX", "STEP", "COUNT"), "10314")}}
+        words = words[1:]
+    sys.argv, err = ["lgrasp", *words], io.StringIO()
     if command.startswith("<TAB> "):
         words = ["lgrasp", *command.split()[1:]]
         os.environ |= {{"_LGRASP_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words)}}
         os.environ["COMP_CWORD"], sys.argv = str(len(words) - 1), ["lgrasp"]
-    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(err):
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(err), patch.dict(
+        os.environ, array
+    ):
         try:
             main()
         except SystemExit as leaving:
@@ -169,6 +179,7 @@ def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("light")
     for kind in KINDS:
         (folder / f"job-{kind}.yaml").write_text(f"job: {kind}\nscrds: [1]\n")
+    (folder / "small.yaml").write_text("objects: [mug]\nrows: 10\nout: x\n")
     (folder / "hand.yaml").write_text("hands: [alegro]\nobjects: [mug]\n")
     env = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
     run = subprocess.run(

@@ -22,6 +22,7 @@ class SceneRequest(Request):
 
     maker: ClassVar[str] = "lgrasp.jobs.scenes.job:SceneJob"
     unit: ClassVar[str] = "scenes"
+    part: ClassVar[str] = "scene"
 
     hand: str | None = Field(default=None, description="Name or path; default: that of the grasps, else allegro.")
     objects: tuple[str, ...] = Field(default=(), description="Names or paths; default: all objects of the grasps.")
@@ -34,6 +35,10 @@ class SceneRequest(Request):
     out: Path = Field(default=Path("scenes"), description="Folder of the scenes.")
     workers: int = Field(default=0, ge=0, description="Scenes made at once; 0: one a core.")
     scene: SceneParams = Field(default_factory=lambda: SceneParams.model_validate({}))
+
+    @property
+    def known_parts(self) -> int:
+        return self.scenes
 
     def check(self) -> None:
         check_number(self.scenes, "scenes; use several --out")

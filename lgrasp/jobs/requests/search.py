@@ -32,12 +32,16 @@ class SearchRequest(Request):
     out: ShardFolder
     shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
 
+    @property
+    def known_parts(self) -> int:
+        return -(-self.rows // self.shard_rows)
+
     def check(self) -> None:
         if self.rows <= 0:
             raise ConfigError(f"-n {self.rows}: request at least 1")
         if self.shard_rows <= 0:
             raise ConfigError(f"--shard-rows {self.shard_rows}: must be at least 1")
-        check_number(-(-self.rows // self.shard_rows), "shards; use larger --shard-rows or several --out")
+        check_number(self.known_parts, "shards; use larger --shard-rows or several --out")
         if self.pipeline.on_table and (self.pipeline.sequence is not None or "refine" in self.pipeline.order):
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}' with place.table: only for one object, and without stage refine"

@@ -148,6 +148,10 @@ class RefineRequest(ShardRequest):
             raise ShardError(f"{self.shards[0]}: no such file or folder")
         check_folder(self.folder)
 
+    @property
+    def known_parts(self) -> int | None:
+        return super().known_parts if self.form is None else None
+
     def numbers(self, told: GraspBounds) -> tuple[GraspBounds, RefineParams]:
         """What rows of a shard that passed ``told`` must pass, and how they are searched.
 

@@ -28,7 +28,6 @@ class SceneJob(SceneRequest, Job):
     """Scenes of one hand, one a file."""
 
     command: ClassVar[str] = "scenes make"
-    part: ClassVar[str] = "scene"
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.scenes.",)
     one_key: ClassVar[bool] = False
     differs: ClassVar[str] = "other hand, objects, grasps, parameters or seed"
