@@ -1,6 +1,11 @@
 """One exception tree. Every message is one line that states the value, its file and what would be accepted."""
 
 
+def short_reason(error: BaseException, most: int = 200) -> str:
+    """What an error says, on one line of so many characters; its kind where it says nothing."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
+
+
 class LgraspError(Exception):
     """Base of every error that lgrasp raises on purpose; the command line prints it on one line and exits."""
 

@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES
-from lgrasp.errors import CloudError, ShardError
-from lgrasp.object.load import quiet_parsers, read_bytes, short_reason
+from lgrasp.errors import CloudError, ShardError, short_reason
+from lgrasp.object.load import quiet_parsers, read_bytes
 
 SceneCloud = Callable[[Path], dict[str, np.ndarray]]
 """Reads the merged cloud of a scene (.h5): points (n, 3) [m], normals (n, 3), labels (n,)."""
@@ -41,7 +41,7 @@ def read_arrays(path: Path, read_scene: SceneCloud | None) -> dict[str, np.ndarr
         with quiet_parsers():
             found = _PARSERS[kind](data)
     except Exception as error:  # the parsers raise anything on garbage
-        raise CloudError(f"{path}: not a readable {kind} cloud ({short_reason(error)})") from None
+        raise CloudError(f"{path}: not a readable {kind} cloud ({short_reason(error, 120)})") from None
     points = found["points"]
     if points.ndim not in (2, 3) or points.shape[-1] not in (3, 6) or points.dtype.kind not in "fiu":
         raise CloudError(
@@ -71,7 +71,7 @@ def read_mask(path: Path, count: int) -> np.ndarray:
         values = _load_numpy(data, (*_LABELS, "mask"), "labels")
         values = next(values[name] for name in (*_LABELS, "mask", "") if name in values)
     except Exception as error:  # the parsers raise anything on garbage
-        raise CloudError(f"{path}: not a readable mask ({short_reason(error)})") from None
+        raise CloudError(f"{path}: not a readable mask ({short_reason(error, 120)})") from None
     return check_labels(np.asarray(values), count, str(path))
 
 

@@ -11,7 +11,6 @@ from lgrasp.errors import ObjectError
 from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
-from lgrasp.object.sdf import SdfGrid
 from lgrasp.object.surface import opposite_points, probe_fits
 
 TRUST = 0.02
@@ -119,7 +118,7 @@ def searched_object(whole: ObjectModel, params: ObjectParams, device: str = "cpu
     """
     points, kept = np.unique(whole.obstacle_points, axis=0, return_index=True)
     points, normals = points.astype(float), whole.obstacle_normals[kept].astype(float)
-    sdf, middle = SdfGrid(whole.sdf, whole.sdf_origin, whole.sdf_cell), np.quantile(points, _BOX, axis=0).mean(0)
+    sdf, middle = whole.grid, np.quantile(points, _BOX, axis=0).mean(0)
     fits = probe_fits(sdf, points, normals, params.probe_radius, params.probe_tolerance)
     near = cKDTree(points).query(points, min(_FOLD_POINTS, len(points)), workers=-1)[1]
     cosine = np.einsum("nki,ni->nk", normals[near], normals).min(1)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from struct import unpack_from
 
-from lgrasp.errors import ShardError
+from lgrasp.errors import ShardError, short_reason
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 """Shard files, or folders of them."""
@@ -26,8 +26,7 @@ def parsing(path: str | os.PathLike[str], what: str = "", kinds: tuple[type[Exce
     except OSError as error:
         raise ShardError(f"{error.filename or path}: {error.strerror or error}") from error
     except kinds as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ShardError(f"{path}: not {what}: {reason}") from error
+        raise ShardError(f"{path}: not {what}: {short_reason(error)}") from error
 
 
 def check_regular(path: str | os.PathLike[str]) -> None:

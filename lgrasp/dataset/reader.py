@@ -13,7 +13,7 @@ import numpy as np
 
 from lgrasp.dataset.files import check_heaps, check_regular
 from lgrasp.dataset.structure import expand, format_problems, shard_problems
-from lgrasp.errors import ShardError
+from lgrasp.errors import ShardError, short_reason
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, TABLE_FIELDS
 
@@ -27,8 +27,7 @@ def reading(path: str | os.PathLike[str]) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ShardError(f"{path}: cannot be read, it is damaged: {reason}") from error
+        raise ShardError(f"{path}: cannot be read, it is damaged: {short_reason(error)}") from error
 
 
 def open_hdf5(path: str | os.PathLike[str]) -> h5py.File:

@@ -72,7 +72,7 @@ def object_solid(model: ObjectModel, count: int) -> PointSolid:
     """An object in its internal frame, with ``count`` surface points (rounded up to whole runs)."""
     points = model.obstacle_points
     ball = np.array([0.0, 0.0, 0.0, np.linalg.norm(points, axis=1).max()])  # the centre of the bounding box
-    return _solid(_thinned(points, count), ball, SdfGrid(model.sdf, model.sdf_origin, model.sdf_cell))
+    return _solid(_thinned(points, count), ball, model.grid)
 
 
 def _thinned(points: np.ndarray, count: int) -> np.ndarray:

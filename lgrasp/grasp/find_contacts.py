@@ -52,16 +52,18 @@ def find_contacts(
     return out
 
 
-def palmar_runs(hand: HandArrays, side: ContactSurface, place: np.ndarray | None = None) -> PalmarRuns:
+def palmar_runs(hand: HandArrays, side: ContactSurface, at: np.ndarray | None = None) -> PalmarRuns:
     """A palmar side on the device of its hand.
 
     Args:
-        place: contact point of the hand that each point is, (n,); default: none is needed.
+        at: those of the points that are meant, (n,); default: all.
     """
+    at = np.arange(len(side.link)) if at is None else at
+    side = ContactSurface(*(values[at] for values in side))
     first, known = _runs(side.link), {int(x): k for k, x in enumerate(hand.model.grid_link)}
     link = side.link[first[:-1]]
     each = {"body": side.body[first[:-1]], "link": link, "grid": np.array([known.get(int(x), -1) for x in link])}
-    each["place"] = first[:-1] if place is None else place[first[:-1]]
+    each["place"] = at[first[:-1]]
     points = {"points": side.points, "normals": side.normals}
     return upload_struct(PalmarRuns, hand.device, points | {"first": first} | each)
 

@@ -7,7 +7,7 @@ import trimesh
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
-from lgrasp.errors import DecomposeError, HandError
+from lgrasp.errors import DecomposeError, HandError, short_reason
 from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.distance import signed_distance
@@ -58,7 +58,7 @@ def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
             warnings.simplefilter("ignore")
             mesh = trimesh.load_mesh(file, process=True)
     except Exception as error:  # any parser error means the same to the user
-        raise HandError(f"URDF {urdf.path}: mesh {file} cannot be read: {' '.join(str(error).split())[:200]}") from None
+        raise HandError(f"URDF {urdf.path}: mesh {file} cannot be read: {short_reason(error)}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
         raise HandError(f"URDF {urdf.path}: mesh {file} has no usable triangles")
     mesh = thin_mesh(mesh, MOST_FACES)

@@ -19,7 +19,7 @@ from pydantic import (
 
 from lgrasp.choices import Role
 from lgrasp.config import first_problem, load_yaml_file
-from lgrasp.errors import HandError
+from lgrasp.errors import HandError, short_reason
 
 Vec3 = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
@@ -172,8 +172,7 @@ def load_spec(path: Path) -> HandSpec:
     try:
         data = load_yaml_file(path)
     except (OSError, ValueError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise HandError(f"hand file {path} cannot be read as YAML: {reason}") from None
+        raise HandError(f"hand file {path} cannot be read as YAML: {short_reason(error, 300)}") from None
     if not isinstance(data, dict):
         raise HandError(f"hand file {path} must be a YAML mapping with the keys of hand.yaml")
     try:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-from lgrasp.errors import HandError
+from lgrasp.errors import HandError, short_reason
 
 MOVABLE = {"revolute", "prismatic", "continuous"}
 """Types of joints that move."""
@@ -150,7 +150,7 @@ def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
     except (etree.XMLSyntaxError, ValueError) as error:
         tree = _without_prefixed(raw)
         if tree is None:
-            raise HandError(f"URDF {path} is not XML: {' '.join(str(error).split())[:200]}") from None
+            raise HandError(f"URDF {path} is not XML: {short_reason(error)}") from None
         raw = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
     if tree.getroottree().docinfo.doctype:
         raise HandError(f"URDF {path} declares a DOCTYPE; entity declarations are not accepted, remove them")

@@ -1,5 +1,6 @@
 """The hand as a whole-hand grasp sees it: the palmar side of every finger link may touch."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.surface import ContactLink, contact_arrays
 from lgrasp.hand.surface_visibility import visible_surface
-from lgrasp.hand.urdf import read_urdf
+from lgrasp.hand.urdf import Urdf, read_urdf
 
 _LEAST_POINTS = 12  # of a link's samples that the fingertips see
 _MOST_POINTS = 160  # of a finger link
@@ -37,9 +38,7 @@ def whole_hand(source: HandSource, model: HandModel, device: str) -> HandModel:
             rules = np.array([[*-facing, _PALMAR_COSINE]])
             links.append(ContactLink(name, tree.group_of(name), side.points[palmar], side.normals[palmar], rules))
     links = [_thinned(link) if link.group < tree.groups else link for link in links]
-    meshes = {link.link: link_meshes(urdf, tree, link.link) for link in links}
-    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=link_grids(model))
-    return replace(model, **arrays)
+    return replace(model, **surface_arrays(model, urdf, links, device))
 
 
 def _thinned(link: ContactLink) -> ContactLink:
@@ -60,8 +59,10 @@ def listed_links(model: HandModel) -> list[ContactLink]:
     return found
 
 
-def link_grids(model: HandModel) -> dict[str, LinkGrid]:
-    """Distance grids of the hand's own contact links."""
+def surface_arrays(model: HandModel, urdf: Urdf, links: Sequence[ContactLink], device: str) -> dict[str, np.ndarray]:
+    """What a hand has of its contact surface, if these are all links that may touch; known grids are taken over."""
     names, parts = model.tree.link_names, np.split(model.grid_values, model.grid_first[1:-1])
     rows = zip(model.grid_link, parts, model.grid_shape, model.grid_origin, model.grid_cell, strict=True)
-    return {names[k]: LinkGrid(part.reshape(shape), origin, float(cell)) for k, part, shape, origin, cell in rows}
+    known = {names[k]: LinkGrid(part.reshape(shape), origin, float(cell)) for k, part, shape, origin, cell in rows}
+    meshes = {link.link: link_meshes(urdf, model.tree, link.link) for link in links}
+    return contact_arrays(model.tree, links, meshes, np.random.default_rng(0), device, known=known)

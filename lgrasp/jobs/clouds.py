@@ -49,6 +49,11 @@ def cloud_key(cloud: Cloud, name: str, networks: str, params: ObjectParams) -> s
     return content_key("cloud", VERSION, seen=seen, name=name, networks=networks, params=described)
 
 
+def network_key(path: Path) -> str:
+    """Content key of a network's file."""
+    return content_key("network", 1, content=path.read_bytes().hex())
+
+
 def whole_object(cloud: Cloud, name: str, networks: Networks, params: ObjectParams, device: str) -> ObjectModel:
     """The target of a cloud with the sides that nobody saw, as pipelines search it.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lgrasp.config import did_you_mean
-from lgrasp.errors import ConfigError, HandError
+from lgrasp.errors import ConfigError, HandError, short_reason
 from lgrasp.paths import data_dirs
 
 if TYPE_CHECKING:
@@ -161,4 +161,4 @@ def _as_told(path: Path, kind: str) -> Iterator[None]:
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; {by} writes such files") from None
     except Exception as error:  # damaged files make the unpickler raise almost anything
-        raise ConfigError(f"{path}: not a network of {by} ({' '.join(str(error).split())[:160]})") from None
+        raise ConfigError(f"{path}: not a network of {by} ({short_reason(error, 160)})") from None

@@ -76,7 +76,7 @@ def upload_object(model: ObjectModel | SteeredObject, device: str, planes: np.nd
         "obstacles": model.obstacle_points,
         "cluster_sphere": np.column_stack([model.cluster_center, model.cluster_radius]),
         "clusters": len(model.cluster_radius),
-        "radius": float(np.linalg.norm(model.obstacle_points - model.com, axis=1).max()),
+        "radius": model.radius,
     }
     if planes is not None:
         up = planes[:, :3]

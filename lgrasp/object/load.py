@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
 
-from lgrasp.errors import LgraspError, ObjectError
+from lgrasp.errors import LgraspError, ObjectError, short_reason
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.object.edges import open_edges
 from lgrasp.object.find import MESH_SUFFIXES
@@ -131,11 +131,6 @@ def quiet_parsers() -> Iterator[None]:
         log.disabled = before
 
 
-def short_reason(error: Exception) -> str:
-    """What a parser says, in at most 120 characters of one line."""
-    return " ".join(str(error).split())[:120] or type(error).__name__
-
-
 class _Buffers(FilePathResolver):
     """Gives a parser the buffers that were read, and textures, which change no shape, as they are on disk."""
 
@@ -171,7 +166,7 @@ def mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
             scene = trimesh.load_scene(io.BytesIO(files[""]), file_type=kind, process=False, **options)
             meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
     except Exception as error:  # the parsers raise anything on garbage
-        why = f"not a readable .{kind} mesh ({short_reason(error)}); a triangle mesh file is accepted"
+        why = f"not a readable .{kind} mesh ({short_reason(error, 120)}); a triangle mesh file is accepted"
         raise ObjectError(f"{path}: {why}") from error
     if not meshes:
         raise ObjectError(f"{path}: 0 faces; a .{kind} file with a triangle mesh of a solid is accepted")

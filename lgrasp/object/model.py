@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from lgrasp.object.sdf import SdfGrid
 
 _TIDIED = ("merged", "dropped", "turned", "filled")  # how notes on harmless repairs begin
 
@@ -62,6 +65,18 @@ class ObjectModel:
     def warnings(self) -> list[str]:
         """The notes that tell of more than a tidied mesh: parts that were joined, an open surface, ..."""
         return [note for note in self.notes if not note.startswith(_TIDIED)]
+
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance of the surface from the centre of mass [m]."""
+        return float(np.linalg.norm(self.obstacle_points - self.com, axis=1).max())
+
+    @property
+    def grid(self) -> "SdfGrid":
+        """The signed distances."""
+        from lgrasp.object.sdf import SdfGrid  # slow to load
+
+        return SdfGrid(self.sdf, self.sdf_origin, self.sdf_cell)
 
     @cached_property
     def area(self) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.errors import ConfigError
+from lgrasp.errors import ConfigError, short_reason
 from lgrasp.policy.names import policy_file
 
 WIDTH = 32
@@ -96,8 +96,7 @@ def read_policy(path: str | Path) -> PosePolicy:
     except ConfigError:
         raise
     except Exception as error:  # damaged bytes make the readers of zip, npy and JSON raise almost anything
-        words = " ".join(str(error).split())[:120]
-        raise ConfigError(f"place.policy: {path} is no pose policy of lgrasp ({words})") from None
+        raise ConfigError(f"place.policy: {path} is no pose policy of lgrasp ({short_reason(error, 120)})") from None
 
 
 def policy_bytes(policy: PosePolicy) -> bytes:

@@ -6,8 +6,7 @@ from torch.nn.functional import grid_sample
 
 from lgrasp.differentiable.distance import SurfaceNormals
 from lgrasp.object.model import ObjectModel
-from lgrasp.object.sdf import SdfGrid
-from lgrasp.refine.volume import solid_cloud, surface_radius
+from lgrasp.refine.volume import solid_cloud
 
 
 class Target:
@@ -28,7 +27,7 @@ class Target:
     ) -> None:
         self._own = _Volume(model, dtype, device)
         self._other = None if around is None else _Volume(around, dtype, device)
-        self.normals = SurfaceNormals(_grid(model), dtype=dtype, device=device)
+        self.normals = SurfaceNormals(model.grid, dtype=dtype, device=device)
         """Outward unit normals (..., 3) at points (..., 3) [m]: smooth, differentiable."""
         solids = [model] if around is None else [model, around]
         self.model, self.around = model, around
@@ -36,7 +35,7 @@ class Target:
         """Points of the surface of all that the hand is kept out of [m], (n, 3)."""
         self.com = torch.as_tensor(model.com, dtype=dtype, device=device)
         """Centre of mass [m], (3,)."""
-        self.radius = surface_radius(model)
+        self.radius = model.radius
         """Largest distance of the surface from there [m]."""
 
     def nearest(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -59,7 +58,7 @@ class _Volume:
     """Slope and value of a distance grid at its nodes, interpolated trilinearly; no derivatives."""
 
     def __init__(self, model: ObjectModel, dtype: torch.dtype, device: str | torch.device) -> None:
-        grid = _grid(model)
+        grid = model.grid
         nodes = np.stack([*np.gradient(grid.values, grid.cell), grid.values])
         self._nodes = torch.as_tensor(nodes, dtype=dtype, device=device)[None]  # (1, 4, nx, ny, nz)
         low = torch.as_tensor(grid.origin, dtype=dtype, device=device)
@@ -79,7 +78,3 @@ class _Volume:
         far = way.norm(dim=-1)
         out = (beyond != 0).any(-1)
         return torch.where(out, far, d), torch.where(out[..., None], way / far.clamp_min(1e-9)[..., None], n)
-
-
-def _grid(model: ObjectModel) -> SdfGrid:
-    return SdfGrid(model.sdf, model.sdf_origin, float(model.sdf_cell))

@@ -52,7 +52,7 @@ def upload_target(model: ObjectModel, around: ObjectModel | None, device: str) -
         has_around=around is not None,
         cloud=wp.array(cloud, dtype=wp.vec3, device=device),
         com=wp.vec3(*map(float, model.com)),
-        radius=surface_radius(model),
+        radius=model.radius,
         device=device,
     )
 
@@ -61,11 +61,6 @@ def solid_cloud(model: ObjectModel) -> np.ndarray:
     """Some points of an object's surface, evenly spread [m], (n, 3)."""
     count = min(_CLOUD_POINTS, len(model.obstacle_points))
     return model.obstacle_points[((np.arange(count) + 0.5) * len(model.obstacle_points) / count).astype(int)]
-
-
-def surface_radius(model: ObjectModel) -> float:
-    """Largest distance of an object's surface from its centre of mass [m]."""
-    return float(np.linalg.norm(model.obstacle_points - model.com, axis=1).max())
 
 
 def _volume(model: ObjectModel, device: str) -> "Volume":

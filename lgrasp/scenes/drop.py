@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lgrasp.errors import PhysicsError
+from lgrasp.errors import PhysicsError, short_reason
 from lgrasp.geometry.poses import canonical, pose_matrix
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.scenes.params import DropParams
@@ -45,7 +45,7 @@ def drop(solids: Sequence[Solid], table: float, params: DropParams, rng: np.rand
     try:
         model = _model(mujoco, solids, table, params)
     except (ValueError, RuntimeError) as error:
-        raise PhysicsError(f"MuJoCo refuses objects {names}: {' '.join(str(error).split())[:300]}") from None
+        raise PhysicsError(f"MuJoCo refuses objects {names}: {short_reason(error, 300)}") from None
     data = mujoco.MjData(model)
     for number in range(1, params.tries + 1):
         mujoco.mj_resetData(model, data)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lgrasp.errors import PhysicsError
+from lgrasp.errors import PhysicsError, short_reason
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.assemble import OBJECT, TABLE, assemble, welded_joints
 from lgrasp.simulate.protocol import Protocol
@@ -107,9 +107,10 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
             for made in (model, near):  # the solver's tolerance is as without a table
                 made.stat.meaninertia = np.delete(made.dof_M0, _table_of(made).velocity).mean()
     except (ValueError, KeyError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:300]
         names = ", ".join(f"'{solid.name}'" for solid in solids)
-        raise PhysicsError(f"MuJoCo refuses hand '{hand.name}' with object {names}: {reason}") from None
+        raise PhysicsError(
+            f"MuJoCo refuses hand '{hand.name}' with object {names}: {short_reason(error, 300)}"
+        ) from None
     column = {name: k for k, name in enumerate(hand.joint_names)}
     joints = np.flatnonzero(model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
     follows = {

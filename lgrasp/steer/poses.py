@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.errors import ConfigError
+from lgrasp.errors import ConfigError, short_reason
 from lgrasp.geometry.poses import inverse, pose_from_matrix
 
 _UNIT = 1e-3  # of the lengths of quaternions, and of the products of the axes of a matrix
@@ -23,7 +23,7 @@ def read_poses(path: Path) -> np.ndarray:
     try:
         poses, of_hand = _read(path)
     except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"{where} cannot be read: {' '.join(str(error).split())[:200]}") from None
+        raise ConfigError(f"{where} cannot be read: {short_reason(error)}") from None
     if poses.ndim == 3 and poses.shape[1:] == (4, 4):
         poses = poses.reshape(-1, 16)
     if poses.ndim != 2 or poses.shape[1] not in (7, 16) or not len(poses) or poses.dtype.kind not in "fiu":

@@ -7,7 +7,7 @@ import trimesh
 from lgrasp.cloud.model import TRUST, cloud_object, searched_object
 from lgrasp.errors import ObjectError
 from lgrasp.object.params import ObjectParams
-from lgrasp.object.sdf import SdfGrid, sample_sdf
+from lgrasp.object.sdf import sample_sdf
 
 RADIUS = 0.05
 
@@ -18,7 +18,7 @@ def sphere(count: int = 3000) -> np.ndarray:
 
 
 def distance(model, points: np.ndarray) -> np.ndarray:
-    return sample_sdf(SdfGrid(model.sdf, model.sdf_origin, model.sdf_cell), points - model.center)
+    return sample_sdf(model.grid, points - model.center)
 
 
 def test_distances_of_a_sphere():

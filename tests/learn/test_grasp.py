@@ -19,7 +19,7 @@ from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.grasp.predictor import GraspPredictor
 from lgrasp.learn.grasp.views import draw_views, make_view
 from lgrasp.learn.networks import network_bytes, open_network
-from lgrasp.object.sdf import SdfGrid, sample_sdf
+from lgrasp.object.sdf import sample_sdf
 
 SMALL = {"width": 16, "blocks": 1, "shape_points": 12, "held_points": 10, "cloud": 64, "sense_points": 1, "turns": 2}
 PARAMS = GraspParams.model_validate(SMALL | {"nodes": 16, "channels": 2, "completion_steps": 30, "completion_batch": 4})
@@ -83,14 +83,14 @@ def test_what_was_seen_stays_and_the_rest_is_closed(inputs, networks, half):
     seen = cloud_object(*half)
     predictor = GraspPredictor(inputs.hand.model.tree, networks, seen.contact_points, seen.contact_normals)
     whole = predictor.completed(seen)
-    grid = SdfGrid(whole.sdf, whole.sdf_origin, whole.sdf_cell)
+    grid = whole.grid
     depth = sample_sdf(grid, np.array([[0, 0, z] for z in (0.014, -0.01, -0.03)]) - seen.center)
     assert depth[0] == pytest.approx(-0.004, abs=1.5e-3)  # as seen
     assert depth[1] < -0.003  # inside, though nobody saw the foot
     assert depth[2] > 0.005
     assert (np.abs(sample_sdf(grid, whole.contact_points.astype(float))) < 3e-3).mean() > 0.9
     assert whole.contact_points[:, 2].min() + seen.center[2] < -0.01
-    alone = sample_sdf(SdfGrid(seen.sdf, seen.sdf_origin, seen.sdf_cell), np.array([[0, 0, -0.01]]) - seen.center)
+    alone = sample_sdf(seen.grid, np.array([[0, 0, -0.01]]) - seen.center)
     assert alone[0] > 0
 
 

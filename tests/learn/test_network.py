@@ -13,7 +13,7 @@ from lgrasp.learn.examples import Examples, make_examples, palm_point, partial_c
 from lgrasp.learn.network import Coarse, CoarseNet, best_answers, seed_frames
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import Trainer, measure, pose_loss, whole_energy
-from lgrasp.object.sdf import SdfGrid, sample_sdf
+from lgrasp.object.sdf import sample_sdf
 from lgrasp.refine.refiner import Pose
 
 PARAMS = LearnParams.model_validate({"points": 48, "width": 32, "batch": 24, "clouds": 4, "held_out": 3})
@@ -46,7 +46,7 @@ def examples(inputs: Inputs, labels: Labels) -> Examples:
 def test_clouds_lie_on_the_side_that_was_seen(inputs: Inputs):
     model = inputs.object.model
     points, normals = partial_clouds(model, 3, 200, np.random.default_rng(0))
-    grid = SdfGrid(model.sdf, model.sdf_origin, float(model.sdf_cell))
+    grid = model.grid
     away = np.abs(sample_sdf(grid, points.reshape(-1, 3)))
     assert np.median(away) < 0.004  # noise, and 3 mm of calibration
     np.testing.assert_allclose(np.linalg.norm(normals, axis=2), 1, atol=1e-4)

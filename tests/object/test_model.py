@@ -10,7 +10,7 @@ from lgrasp.object.find import find_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
-from lgrasp.object.sdf import SdfGrid, sample_sdf
+from lgrasp.object.sdf import sample_sdf
 
 
 def assert_same(a: ObjectModel, b: ObjectModel) -> None:
@@ -61,7 +61,7 @@ def test_points_lie_on_the_surface(mug):
         assert (
             trimesh.proximity.closest_point(mesh, points)[1].max() < 5e-5
         )  # trimesh is no more exact on mm-sized faces
-    sdf = SdfGrid(mug.sdf, mug.sdf_origin, mug.sdf_cell)
+    sdf = mug.grid
     assert (sample_sdf(sdf, mug.contact_points + 0.002 * mug.contact_normals) > 0.0).all()
     assert mug.com == pytest.approx(mesh.center_mass, abs=1e-6)
 

@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree
 
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.errors import PhysicsError
+from lgrasp.errors import PhysicsError, short_reason
 from lgrasp.object.mass import MassProperties
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.builder import (
@@ -90,8 +90,7 @@ class MjcfScene:
             self._xml = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:
             names = ", ".join(item.code for item in objects)
-            reason = " ".join(str(error).split())[:300]
-            raise PhysicsError(f"MuJoCo refuses the hand with {names}: {reason}") from None
+            raise PhysicsError(f"MuJoCo refuses the hand with {names}: {short_reason(error, 300)}") from None
         self._data = mujoco.MjData(self._model)
 
     def text(self, keyframes: Sequence[Keyframe]) -> str:

@@ -15,6 +15,8 @@ from typing import Any, cast
 
 import numpy as np
 
+from lgrasp.errors import short_reason
+
 DEPTH = 32
 """Lists, dictionaries and arrays inside each other."""
 _NUMBERS = re.compile(r"[?]|[biufc?][0-9]{1,2}|[SU][0-9]{1,4}")  # types of elements that are read
@@ -58,7 +60,7 @@ def load_plain(data: bytes) -> Any:
     try:
         return _Reader(1000 + 8 * len(data)).read(_run(data), 0)
     except Exception as error:  # a damaged program fails in many ways
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = short_reason(error)
         raise UnpickleError(reason if isinstance(error, UnpickleError) else f"damaged: {reason}") from error
 
 

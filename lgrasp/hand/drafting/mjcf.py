@@ -10,7 +10,7 @@ import trimesh
 from lxml import etree
 from scipy.spatial.transform import Rotation
 
-from lgrasp.errors import HandError
+from lgrasp.errors import HandError, short_reason
 from lgrasp.hand.drafting.elements import number_text, set_origin
 from lgrasp.hand.drafting.mjcf_couplings import Follows, couplings, tendon_terms
 from lgrasp.hand.urdf import find_mesh
@@ -65,7 +65,7 @@ def _compiled(path: Path, mesh_dirs: Sequence[Path]) -> Any:
         spec.compiler.fusestatic = spec.compiler.discardvisual = False
         return spec.compile()
     except ValueError as error:
-        raise HandError(f"MJCF {path}: MuJoCo cannot read it: {' '.join(str(error).split())[:300]}") from None
+        raise HandError(f"MJCF {path}: MuJoCo cannot read it: {short_reason(error, 300)}") from None
 
 
 class _Writer:

@@ -3,18 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from lgrasp.errors import HandError
 from lgrasp.hand.find import HandSource
-from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import side_surface
 from lgrasp.hand.params import LinkSide
 from lgrasp.hand.spec import Surface
-from lgrasp.hand.surface import contact_arrays
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.hand.whole_hand import link_grids, listed_links
+from lgrasp.hand.whole_hand import listed_links, surface_arrays
 
 
 def sided_hand(source: HandSource, model: HandModel, sides: Sequence[LinkSide], device: str) -> HandModel:
@@ -26,9 +22,9 @@ def sided_hand(source: HandSource, model: HandModel, sides: Sequence[LinkSide], 
     Raises:
         HandError: a link without surface on its side.
     """
-    urdf, tree = read_urdf(source.urdf), model.tree
+    urdf = read_urdf(source.urdf)
     surfaces = [Surface(links=(side.link,), axis=side.axis, angle=side.angle) for side in sides]
-    found = side_surface(urdf, tree, surfaces, device)
+    found = side_surface(urdf, model.tree, surfaces, device)
     for side in sides:
         if side.link not in {entry.link for entry in found}:
             raise HandError(
@@ -37,6 +33,4 @@ def sided_hand(source: HandSource, model: HandModel, sides: Sequence[LinkSide], 
             )
     named = {side.link for side in sides}
     links = [*(entry for entry in listed_links(model) if entry.link not in named), *found]
-    meshes = {entry.link: link_meshes(urdf, tree, entry.link) for entry in links}
-    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=link_grids(model))
-    return replace(model, **arrays)
+    return replace(model, **surface_arrays(model, urdf, links, device))

@@ -15,10 +15,10 @@ from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.spec import Cone, HandSpec, Surface
 from lgrasp.hand.spec_check import side_links
-from lgrasp.hand.surface import ContactLink, contact_arrays, with_bare_links
+from lgrasp.hand.surface import ContactLink, with_bare_links
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf, read_urdf
-from lgrasp.hand.whole_hand import link_grids
+from lgrasp.hand.whole_hand import surface_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +135,9 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
     Raises:
         HandError: see :func:`space_sides`.
     """
-    urdf, tree = read_urdf(urdf_path), model.tree
-    links = [link for side in space_sides(urdf, spec, tree, name, device) for link in side]
-    meshes = {link.link: link_meshes(urdf, tree, link.link) for link in links}
-    arrays = contact_arrays(tree, links, meshes, np.random.default_rng(0), device, known=link_grids(model))
+    urdf = read_urdf(urdf_path)
+    links = [link for side in space_sides(urdf, spec, model.tree, name, device) for link in side]
+    arrays = surface_arrays(model, urdf, links, device)
     arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
     described = spec.opposition_spaces[name].model_dump(mode="json")
     digest = hashlib.sha256(json.dumps([model.sha256, name, described]).encode()).hexdigest()

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from lgrasp.engine.cache import Cache
-from lgrasp.errors import ConfigError
 from lgrasp.geometry.rotations import inverse_motion, pose_from_motion
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps
@@ -19,6 +18,7 @@ from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.learn.job import energy_numbers, load_predictor, read_examples
 from lgrasp.jobs.requests.shards import refine_params
 from lgrasp.learn.network import Coarse
+from lgrasp.learn.networks import check_network_hand
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import ANSWERS, Trainer, measure
 from lgrasp.object.arrays import upload_object
@@ -50,10 +50,7 @@ def evaluate(
     net, saved = load_predictor(path)
     params = LearnParams.model_validate(saved["params"]).model_copy(update={"clouds": clouds, "seed": seed})
     hand, examples, _ = read_examples(shards, None, params.model_copy(update={"held_out": 1}), cache, alias)
-    if hand.sha256 != saved["hand_sha256"]:
-        raise ConfigError(
-            f"{path} is of hand '{saved['hand']}', the shards are of '{hand.name}' (or another model of it)"
-        )
+    check_network_hand(path, saved["hand"], saved["hand_sha256"], hand.name, hand.sha256)
     trainer, bounds = Trainer(hand, examples, params, device=alias), GraspBounds()
     trainer.net.load_state_dict(net.state_dict())
     start, arrays = time.perf_counter(), upload_hand(hand, alias)

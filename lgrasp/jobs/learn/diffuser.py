@@ -21,6 +21,7 @@ from lgrasp.learn.diffuser.process import PROCESSES
 from lgrasp.learn.diffuser.sampler import draw_steps
 from lgrasp.learn.diffuser.senses import HeldObjects, Senses, sense_points
 from lgrasp.learn.diffuser.training import StepTrainer, mean_loss
+from lgrasp.learn.networks import check_network_hand
 from lgrasp.runtime.device import resolve_device
 
 _MIN_STEPS = 64  # of sequences, to learn from
@@ -90,8 +91,8 @@ def evaluate(
     net, about = load_diffuser(path)
     used, p = resolve_device(device), about.params
     found = read_steps(shards, cache, used, p.cloud)
-    if (found.hand.sha256, found.space_names) != (about.hand_sha256, about.space_names):
-        raise ConfigError(f"{path} is of hand '{about.hand}', the shards are of '{found.hand.name}' (or another model)")
+    digest = found.hand.sha256 if found.space_names == about.space_names else ""
+    check_network_hand(path, about.hand, about.hand_sha256, found.hand.name, digest)
     net = net.to(used.alias).eval()
     examples = StepExamples(found.hand.tree, found.steps, found.clouds, found.grids, net, p, used.alias)
     every, process = torch.arange(len(examples), device=net.mean.device), PROCESSES[p.process]

@@ -22,7 +22,7 @@ from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.surface_visibility import visible_surface
-from lgrasp.jobs.clouds import cloud_record, cloud_to_grasp
+from lgrasp.jobs.clouds import cloud_record, cloud_to_grasp, network_key
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
 from lgrasp.jobs.refine.predicted import predicted_planner
 from lgrasp.jobs.requests.plan import PlanRequest
@@ -146,7 +146,7 @@ class PlanJob(PlanRequest, Job):
     def _model_key(self) -> dict[str, Any]:
         if self.networks() is None:
             return {}
-        return {"network": content_key("network", 1, content=find_network(str(self.model)).read_bytes().hex())}
+        return {"network": network_key(find_network(str(self.model)))}
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``starts``, ``counts`` (what became of the starts), medians of ``epsilon`` and

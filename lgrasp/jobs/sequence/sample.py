@@ -11,11 +11,10 @@ from pydantic import PrivateAttr
 from lgrasp.cloud.read import Cloud
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Part
-from lgrasp.errors import ConfigError
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.model import HandModel
-from lgrasp.jobs.clouds import cloud_key, cloud_record, cloud_to_grasp, whole_object
+from lgrasp.jobs.clouds import cloud_key, cloud_record, cloud_to_grasp, network_key, whole_object
 from lgrasp.jobs.requests.search import SampleRequest
 from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys
 from lgrasp.jobs.sequence.job import SequenceJob
@@ -25,7 +24,7 @@ from lgrasp.learn.diffuser.network import DiffuserNet
 from lgrasp.learn.diffuser.sampler import StepSampler
 from lgrasp.learn.diffuser.senses import coarse_grid, coarse_grid_of_model
 from lgrasp.learn.grasp.file import load_networks
-from lgrasp.learn.networks import find_network
+from lgrasp.learn.networks import check_network_hand, find_network
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.sdf import SdfGrid
 from lgrasp.sequence.size import parse_size
@@ -51,13 +50,10 @@ class SampleJob(SampleRequest, SequenceJob):
         if self._network is None:
             path, source = find_network(self.model), self.keys.source
             net, about = load_diffuser(path)
-            if about.hand_sha256 != hand_digest(source.urdf, source.spec) or about.space_names != tuple(
-                source.spec.opposition_spaces
-            ):
-                raise ConfigError(
-                    f"{self.model} is of hand '{about.hand}', not of '{source.name}' (or of another model of it)"
-                )
-            self._network = net, about, _content(self.model)
+            same_spaces = about.space_names == tuple(source.spec.opposition_spaces)
+            digest = hand_digest(source.urdf, source.spec) if same_spaces else ""
+            check_network_hand(path, about.hand, about.hand_sha256, source.name, digest)
+            self._network = net, about, network_key(path)
         return self._network
 
     @property
@@ -65,7 +61,7 @@ class SampleJob(SampleRequest, SequenceJob):
         if self._keys is None and self.clouds:
             scale = parse_size(self.scale).low
             read = [cloud_to_grasp(self.cache, *target, scale, self.viewpoint) for target in self.targets]
-            how = _content(_COMPLETES), self.pipeline.object
+            how = network_key(find_network(_COMPLETES)), self.pipeline.object
             keys = [cloud_key(cloud, name, *how) for cloud, name in zip(read, self.names, strict=True)]
             self._clouds = dict(zip(keys, read, strict=True))
             about = {"names": self.names, "meshes": self.clouds, "scales": (scale,) * len(read), "objects": tuple(keys)}
@@ -106,11 +102,6 @@ class SampleJob(SampleRequest, SequenceJob):
             return hand, records
         key = dict(zip(inputs.object_ids, inputs.keys.objects, strict=True))
         return hand, [cloud_record(record, self._clouds[key[record.id]]) for record in records]
-
-
-def _content(network: str) -> str:
-    """Key of a network's file."""
-    return content_key("network", 1, content=find_network(network).read_bytes().hex())
 
 
 def _seen(model: ObjectModel, count: int, device: str) -> tuple[np.ndarray, SdfGrid]:

@@ -44,7 +44,7 @@ def coarse_grid(vertices: np.ndarray, faces: np.ndarray, *, closed: bool, device
 def coarse_grid_of_model(model: ObjectModel) -> SdfGrid:
     """The same of an object without faces, about its internal origin: its own distances, and beyond their grid how far
     off that is."""
-    own, origin = SdfGrid(model.sdf, model.sdf_origin, model.sdf_cell), model.sdf_origin.astype(float)
+    own, origin = model.grid, model.sdf_origin.astype(float)
     low, high = model.obstacle_points.min(0) - _PAD, model.obstacle_points.max(0) + _PAD
     cell = float(np.prod(high - low) / _NODES) ** (1 / 3)
     shape = np.ceil((high - low) / cell).astype(int) + 1

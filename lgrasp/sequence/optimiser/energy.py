@@ -11,7 +11,6 @@ from lgrasp.differentiable.kinematics import BodyKinematics
 from lgrasp.differentiable.solids import hand_solids, object_solid
 from lgrasp.hand.model import HandModel
 from lgrasp.object.model import ObjectModel
-from lgrasp.object.sdf import SdfGrid
 from lgrasp.sequence.optimiser.penetration import PenetrationSums
 
 TERMS = ("fc", "dis", "hop", "hsp", "joint", "oop")
@@ -71,11 +70,10 @@ class GraspEnergy:
             device=device,
         )
         self.culling = self._sums.culling
-        grid = SdfGrid(new.sdf, new.sdf_origin, new.sdf_cell)
-        self._grid = DistanceGrids([grid], dtype=dtype, device=device)
-        self.normals = SurfaceNormals(grid, dtype=dtype, device=device)
+        self._grid = DistanceGrids([new.grid], dtype=dtype, device=device)
+        self.normals = SurfaceNormals(new.grid, dtype=dtype, device=device)
         self._com = put(new.com)
-        self._radius = float(np.linalg.norm(new.obstacle_points - new.com, axis=1).max())
+        self._radius = new.radius
         self._by_hand = point_unit / sum(len(s.points) for s in links.solids)
         self._by_object = point_unit / object_points
         self.lower, self.upper = put(hand.tree.joint_lower), put(hand.tree.joint_upper)

@@ -1,15 +1,17 @@
 """filter: contact sets with joint positions -> finished grasps, every claim recomputed."""
 
+import numpy as np
 import warp as wp
 
 from lgrasp.grasp.check import Check
 from lgrasp.grasp.check_kernels import OTHERS, TOUCHING
 from lgrasp.grasp.check_structs import CheckedPostures, Places, device_limits, new_findings
-from lgrasp.grasp.find_contacts import contact_width, touching_links
+from lgrasp.grasp.contact_kernels import PalmarRuns
+from lgrasp.grasp.find_contacts import contact_width, palmar_runs, touching_links
 from lgrasp.grasp.tables import ContactSets, GraspTable, trim_sets
+from lgrasp.hand.contact_surface import contact_surface
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally
-from lgrasp.stages.allowed import allowed_runs
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.params import FilterParams
 from lgrasp.stages.filter.posture_kernels import (
@@ -82,7 +84,7 @@ def _take_all(check: Check, context: Context) -> None:
     """Contacts of further links that touch join those that search combined."""
     d, n, hand = context.device, len(check), context.hand.struct
     pose, q = placed_postures(check)
-    runs = allowed_runs(context)
+    runs = _allowed_runs(context)
     found = touching_links(context.hand, context.object, check.limits, runs, pose, q)
     inputs = [hand, check.limits, check.places, runs, *found]
     wp.launch(take_contacts, n, inputs, [check.at, check.found], device=d)
@@ -101,3 +103,13 @@ def _postures(inputs: ContactSets, width: int, context: Context) -> CheckedPostu
         "chosen": inputs.chosen,
     }
     return empty_struct(CheckedPostures, d, n, model.groups, body=body, contact=contact, surface=surface, **given)
+
+
+def _allowed_runs(context: Context) -> PalmarRuns:
+    """The contact surface of the hand as far as a steering lets it touch; made once for a job."""
+
+    def make() -> PalmarRuns:
+        at = np.flatnonzero(context.steered.touching.points)
+        return palmar_runs(context.hand, contact_surface(context.hand.model), at)
+
+    return context.once("allowed", make, context.steered)

@@ -9,7 +9,7 @@ import warp as wp
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.find_contacts import palmar_runs
 from lgrasp.grasp.tables import CandidateTable
-from lgrasp.hand.contact_surface import ContactSurface, contact_surface
+from lgrasp.hand.contact_surface import contact_surface
 from lgrasp.refine.surface import farthest_points
 from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
@@ -53,6 +53,6 @@ def _probes(context: Context) -> PalmarRuns:
             own = np.flatnonzero(allowed & (side.link == link))
             chosen.append(np.unique(own[farthest_points(side.points[own], _PROBES)]))
         at = np.concatenate(chosen)
-        return palmar_runs(context.hand, ContactSurface(*(values[at] for values in side)), at)
+        return palmar_runs(context.hand, side, at)
 
     return context.once("wrap", make, context.steered)
