@@ -63,7 +63,7 @@ def _run_one(request: "Request", how: How) -> dict[str, Any]:
             return data | {"status": "of other tasks", "error": text, "exit_code": code}
         found, outcome = run_job(job, how)
         data |= found
-        conclude(data, outcome)
+        conclude(outcome, how)
     except LgraspError as error:
         status, text, code = "starved" if error.exit_code == 3 else "failed", str(error), error.exit_code
         typer.echo(f"error: {error}", err=True)

@@ -146,7 +146,7 @@ class How:
         nothing = self.quiet or self.json_path == "-" or (outcome.cancelled and not outcome.paths)
         blocks = () if nothing else [*show(data), *((*profile(data), _used(data)) if self.verbose else ())]
         print_report(data, self.json_path, blocks)
-        conclude(data, outcome)
+        conclude(outcome, how)
 
 
 def working(command: Callable[..., None]) -> Callable[..., None]:
@@ -245,15 +245,25 @@ def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "JobOutcome"]:
     return job_report(outcome), outcome
 
 
-def conclude(data: dict[str, Any], outcome: "JobOutcome") -> None:
+def conclude(outcome: "JobOutcome", how: How) -> None:
     """Leave with the exit code of a job that fell short.
 
     Raises:
         LgraspError: less came out than was asked.
     """
     if outcome.cancelled:
-        files = plural(len(outcome.paths), "finished file")
-        typer.echo(f"interrupted: {files} in {data['out']}. Run the same command again to resume", err=True)
+        typer.echo(f"interrupted: {_left(outcome, how)}", err=True)
         raise typer.Exit(130)
     if error := outcome.job.shortfall(outcome):
         raise error
+
+
+def _left(outcome: "JobOutcome", how: How) -> str:
+    """What an interrupted job leaves, and what the same command makes of it."""
+    job, done, kept = outcome.job, len(outcome.paths), outcome.job.kept_rows(outcome)
+    verdicts = f"verdicts of {kept:,} {job.unit} of the next are kept" if kept else ""
+    files = f"{done:,} of {plural(len(outcome.parts), 'file')} done in {job.folder}"
+    if not (done or kept):
+        return "nothing is finished; the same command begins again"
+    again = "the same command without --overwrite" if how.overwrite and done else "the same command"
+    return "; ".join(filter(None, (files, verdicts, f"{again} makes the rest")))

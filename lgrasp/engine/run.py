@@ -169,6 +169,10 @@ class Job(Request, ABC):
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """The results in numbers, JSON-serialisable; :func:`lgrasp.engine.report.job_report` adds the rest."""
 
+    def kept_rows(self, outcome: JobOutcome) -> int:
+        """Rows of parts that are not done with a verdict that the same job need not find again."""
+        return 0
+
     def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
         """The error for an outcome that falls short of the request, if any."""
         return None

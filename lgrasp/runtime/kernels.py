@@ -43,7 +43,7 @@ def first_time(device: str) -> str:
     """What a user is told before this machine compiles its first kernels for a kind of device; "" if it has some."""
     if has_compiled(Path(wp.config.kernel_cache_dir), cuda=device != "cpu"):
         return ""
-    return "compiling kernels once for this machine (about 20 s)"
+    return "compiling kernels once for this machine (30 to 60 s on two cores)"
 
 
 def load_kernels(device: str, modules: list[str], progress: Callable[[str, float], None] | None = None) -> None:

@@ -56,7 +56,7 @@ def test_interrupted_before_there_is_anything_to_report(generate, cli, monkeypat
     monkeypatch.setattr(JobProgress, "cancelled", lambda self: True)
     done = cli("learn", "fit", "out", "--out", "net.pt", "--device", "cpu")
     assert (done.code, done.out) == (130, "")
-    assert done.err.startswith("interrupted: 0 finished files")
+    assert done.err == "interrupted: nothing is finished; the same command begins again\n"
     assert not Path("net.pt").exists()
 
 

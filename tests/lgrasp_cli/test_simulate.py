@@ -16,6 +16,7 @@ from support.twins import twin_rows, twin_shard
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.events import CancelledError
 from lgrasp.engine.listing import Renewing
 from lgrasp.jobs import kept_verdicts, simulate
 from lgrasp.simulate.protocol import find_protocol
@@ -216,11 +217,13 @@ def test_verdicts_so_far_are_kept(cli, grasps, tmp_path, monkeypatch, shared_cac
     def cut(scene, rows, *more, **options):
         blocks.append(rows.candidate.tolist())
         if len(blocks) == 3:
-            raise MemoryError
+            raise CancelledError
         return run(scene, rows, *more, **options)
 
     monkeypatch.setattr(simulate, "verdicts", cut)
-    assert cli("simulate", path, "--workers", 1).code == 2
+    result = cli("simulate", path, "--workers", 1)
+    assert result.code == 130
+    assert f"interrupted: 0 of 1 file done in {grasps}; verdicts of 4 grasps of the next are kept" in result.err
     result = cli("simulate", path, "--workers", 1, "--json", "-")
     assert result.code == 0, result
     assert blocks == [[0, 1], [2, 3], [4], [4]]
