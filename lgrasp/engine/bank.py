@@ -1,4 +1,5 @@
-"""The bank: the state of a shard, kept so that a later run that requests more rows can continue from it."""
+"""The bank: the state of a shard, kept so that a later run that requests more rows can continue from it, or after an
+interruption any run."""
 
 import json
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ class Account:
     counts: dict[str, dict[str, int]]
     seconds: dict[str, float]  # thread-seconds per stage
     wall: float  # [s]
+    interrupted: bool = False
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,12 @@ class Bank:
             device=self.device.partition(":")[0],
         )
 
-    def load(self, rows: int) -> Account | None:
-        """The account, or None if a shard of ``rows`` rows cannot continue from any; damage is reported."""
+    def load(self, rows: int, *, whole: bool = True) -> Account | None:
+        """The account, or None if a shard of ``rows`` rows cannot continue from any; damage is reported.
+
+        Args:
+            whole: one of a finished shard, too.
+        """
         arrays = self.cache.load("bank", self.key)
         if arrays is None:
             return None
@@ -61,7 +67,7 @@ class Bank:
         except (KeyError, ValueError, TypeError):
             self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; rebuilding it")
             return None
-        return account if account.kept <= rows else None
+        return account if account.kept <= rows and (whole or account.interrupted) else None
 
     def store(self, account: Account) -> None:
         """Keep the account, in place of an earlier one."""
@@ -69,3 +75,7 @@ class Bank:
         self.cache.store(
             "bank", self.key, grasp_arrays(account.grasps) | {_NUMBERS_MEMBER: np.asarray(json.dumps(about))}
         )
+
+    def discard(self) -> None:
+        """Forget the account, if there is one."""
+        self.cache.discard("bank", self.key)

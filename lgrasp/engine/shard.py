@@ -12,6 +12,7 @@ import warp as wp
 from lgrasp.engine.bank import Account, Bank
 from lgrasp.engine.batch import PASS_BLOCK, BatchResult, block_size, run_batch
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import CancelledError
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
@@ -146,6 +147,7 @@ def make_shard(
     execution: Execution,
     *,
     bank_cache: Cache | None = None,
+    banked: bool = True,
     resume: bool = True,
     progress: Callable[[int, ShardResult], None] | None = None,
 ) -> ShardResult:
@@ -154,9 +156,14 @@ def make_shard(
     The rows of the last block of candidates that is needed (:func:`block_size`) are drawn from all that it gives.
 
     Args:
-        bank_cache: keep the shard's bank there.
-        resume: continue from the bank; counts and seconds are then those of all runs together.
+        bank_cache: where the shard's bank is.
+        banked: keep it when the shard is done, too, and not only when it is cancelled.
+        resume: continue from the bank of a shard that was done, too, and not only of one that was cancelled; counts and
+            seconds are then those of all runs together.
         progress: called with (rows so far, running result) after each batch; what it raises ends the shard.
+
+    Raises:
+        CancelledError: ``progress`` did; what was found is in the bank.
     """
     device = inputs.device.alias
     context = shard_context(pipeline, inputs, shard)
@@ -165,7 +172,7 @@ def make_shard(
     block = block_size(pipeline)
     found = _Rows(inputs, RowOrder(pipeline.seed, shard, block), rows, graphs.capturing if graphs else nullcontext())
     result = found.result
-    if bank and resume and (account := bank.load(rows)):
+    if bank and (account := bank.load(rows, whole=resume)):
         found.restore(account)
     earlier, start = result.wall, time.perf_counter()
     fixed, passes = _fixed_batch(context, execution), pipeline.params("search").passes
@@ -203,18 +210,33 @@ def make_shard(
                 if found.count >= rows:
                     break
 
-    limit = shard_effort(pipeline, rows) if found.count < rows else 0
-    some = min(limit, _LEAST_PLACED) if pipeline.steer.asks else limit  # the same whatever the batches are
-    search(some)
-    if found.count < rows and result.counts["place"]["kept"]:
+    def search_all() -> None:
+        limit = shard_effort(pipeline, rows) if found.count < rows else 0
+        some = min(limit, _LEAST_PLACED) if pipeline.steer.asks else limit  # the same whatever the batches are
+        search(some)
+        if found.count >= rows or not result.counts["place"]["kept"]:
+            return
         search(limit)
-        while found.count < rows and not gave_up(pipeline, rows, found.count, result.candidates):
-            search(min(2 * result.candidates, _STREAM))
+        while found.count < rows and not (
+            limit == result.candidates and gave_up(pipeline, rows, found.count, result.candidates)
+        ):
+            limit = min(2 * limit, _STREAM)
+            search(limit)
+
+    try:
+        search_all()
+    except CancelledError:
+        if bank and result.candidates:
+            result.wall = earlier + time.perf_counter() - start
+            bank.store(found.account(interrupted=True))
+        raise
     result.grasps = found.shuffled()
     result.wall = earlier + time.perf_counter() - start
     result.exhausted = found.count < rows
-    if bank:
+    if bank and banked:
         bank.store(found.account())
+    elif bank:
+        bank.discard()
     return result
 
 
@@ -278,8 +300,9 @@ class _Rows:
         result.candidates, result.duplicates = account.candidates, account.duplicates
         self.add(take_rows(table, slice(account.kept, None)))
 
-    def account(self) -> Account:
+    def account(self, *, interrupted: bool = False) -> Account:
         """How far the shard has come."""
         r = self.result
-        table = join_rows([r.grasps, take_rows(*self._aside)] if self._aside else [r.grasps])
-        return Account(table, self.count, r.candidates, r.duplicates, r.counts, r.seconds, r.wall)
+        own = self.shuffled() if interrupted else r.grasps
+        table = join_rows([own, take_rows(*self._aside)] if self._aside else [own])
+        return Account(table, self.count, r.candidates, r.duplicates, r.counts, r.seconds, r.wall, interrupted)

@@ -109,7 +109,8 @@ class GenerateJob(GenerateRequest, SearchJob):
             part.number,
             part.rows,
             Execution(self.threads(), self.batch, self._rate, self._graphs),
-            bank_cache=self.cache if part.rows < self.shard_rows or part.number in self._growing else None,
+            bank_cache=self.cache,
+            banked=part.rows < self.shard_rows or part.number in self._growing,
             resume=part.number in self._growing,
             progress=lambda rows, _: progress(rows),
         )

@@ -8,6 +8,7 @@ import pytest
 
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.batch import run_batch
+from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError
 from lgrasp.engine.shard import Execution, make_shard
 
@@ -114,6 +115,34 @@ def test_goes_on_where_that_promises_the_rows(swift, inputs, monkeypatch):
     assert not shard_module.gave_up(poor, 100, 4, 1024)
     assert shard_module.gave_up(poor, 100, 99, 16 * 1024)
     assert not shard_module.gave_up(poor, 100, 0, 1023)
+
+
+def test_a_cancelled_shard_goes_on_where_it_was(swift, inputs, tmp_path):
+    """The same rows as without the interruption, also when it was asked for nothing but what was cancelled."""
+    cache, tried = Cache(tmp_path), []
+
+    def cancel(rows, running):
+        tried.append(running.candidates)
+        if len(tried) == 3:
+            raise CancelledError
+
+    with pytest.raises(CancelledError):
+        make_shard(
+            swift, inputs, 0, 400, Execution(1, 256), bank_cache=cache, banked=False, resume=False, progress=cancel
+        )
+    again = make_shard(
+        swift, inputs, 0, 400, Execution(1, 256), bank_cache=cache, banked=False, resume=False, progress=cancel
+    )
+    assert tried[:4] == [256, 512, 768, 1024]
+    whole = make_shard(swift, inputs, 0, 400, Execution(2, 512))
+    assert again.candidates == whole.candidates
+    for name in ("index", "slot", "q", "pose"):
+        np.testing.assert_array_equal(getattr(again.grasps, name), getattr(whole.grasps, name))
+    tried.clear()
+    make_shard(
+        swift, inputs, 0, 400, Execution(1, 256), bank_cache=cache, resume=False, progress=lambda *_: tried.append(1)
+    )
+    assert len(tried) * 256 >= whole.candidates  # nothing is left of it
 
 
 def test_rows_of_written_shards_are_let_go(run):
