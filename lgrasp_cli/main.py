@@ -1,9 +1,11 @@
 """The ``lgrasp`` command: mounts the commands and turns every failure into one line and an exit code."""
 
+import functools
 import os
 import re
 import sys
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import typer
 from typer import Option
@@ -80,16 +82,32 @@ def _options(
     """
 
 
+@functools.cache
+def program() -> Any:
+    """All commands, built once."""
+    return typer.main.get_command(app)
+
+
+def options_of(words: Sequence[str]) -> set[str]:
+    """Names of the options of the command that the words of a command line begin with."""
+    command = program()
+    for word in words:
+        if (below := getattr(command, "commands", {}).get(word)) is None:
+            break
+        command = below
+    return {name for parameter in command.params for name in parameter.opts}
+
+
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 bad input or output, 3 too few grasps, 130 interrupted, 141 nobody
     reads what it prints."""
     on_notice(warn)
-    sys.argv[1:] = renew(sys.argv[1:])
+    sys.argv[1:] = renew(sys.argv[1:], options_of(sys.argv[1:]))
     if os.environ.get("LGRASP_DEBUG"):
-        code = app(prog_name="lgrasp", standalone_mode=False)
+        code = program()(prog_name="lgrasp", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     try:
-        code = app(prog_name="lgrasp", standalone_mode=False)
+        code = program()(prog_name="lgrasp", standalone_mode=False)
         sys.stdout.flush()
     except BaseException as error:
         _leave(*_explain(error))

@@ -5,7 +5,8 @@ import json
 import pytest
 from support.urdfs import gripper
 
-from lgrasp_cli.renamed import renew
+from lgrasp_cli.main import options_of, program
+from lgrasp_cli.renamed import NEW, renew
 
 
 @pytest.mark.parametrize(
@@ -23,11 +24,30 @@ from lgrasp_cli.renamed import renew
         ("simulate x --threads 2", "simulate x --workers 2"),
         ("refine x --always --json", "refine x --keep-invalid --json -"),
         ("refine x --json - --quiet", "refine x --json - --quiet"),
+        ("hands check mine --threads 2", "hands check mine --workers 2"),
+        ("simulate x --physics fc", "simulate x --physics fc"),  # it never had that option, nor has the new one
+        ("hands add my.urdf --json", "hands add my.urdf --json"),
         ("", ""),
     ],
 )
 def test_words(old, new):
-    assert renew(old.split()) == new.split()
+    assert renew(old.split(), options_of(old.split())) == new.split()
+
+
+def test_every_entry_names_options_that_commands_have():
+    def options(command):
+        below = getattr(command, "commands", {}).values()
+        return [
+            {name for parameter in command.params for name in parameter.opts},
+            *(o for c in below for o in options(c)),
+        ]
+
+    commands = options(program())
+    for old, names in NEW.items():
+        assert all(any(name.partition("=")[0] in command for command in commands) for name in names)
+        for command in commands:
+            renewed = renew([old], command)
+            assert renewed == [old] or {name.partition("=")[0] for name in renewed} <= command
 
 
 def test_force_of_preparations_is_rebuild(cli, quick):
