@@ -31,10 +31,9 @@ def run(
 
     Example: lgrasp run configs/smoke.yaml
     """
-    from lgrasp.jobs.config import config_devices, load_requests
+    from lgrasp.jobs.config import load_requests
 
     changes = given(rows=rows, out=out, object_dir=object_dir, seed=seed, device=how.device, workers=how.workers)
     changes |= {key: value for key, value in (("objects", objects), ("held_out", held_out)) if value}
-    requests = load_requests(config, changes)
-    how = how if how.device else replace(how, devices=config_devices(config)[0])
-    run_all(requests, how, dry_run=dry_run)
+    asked = load_requests(config, changes)
+    run_all(asked.requests, replace(how, devices=how.devices or asked.devices), dry_run=dry_run)

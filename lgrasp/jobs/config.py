@@ -1,10 +1,10 @@
 """On what and where: default folders and configs/*.yaml."""
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import Field, model_validator
 
@@ -127,42 +127,36 @@ KINDS = {
 """Kind of a job, as key ``job`` of a config names it, and its keys; those of ``generate`` are :class:`JobConfig`."""
 
 
-def config_devices(name: str) -> tuple[str | None, str | None]:
-    """What key ``device`` of a config by name or by path names: see :func:`lgrasp.config.split_devices`.
+class Asked(NamedTuple):
+    """What a config asks for."""
+
+    requests: list[Request]
+    devices: str | None
+    """Several devices, as key ``device`` names them, the requests being for the first; None: one, or another is given."""
+
+
+def load_requests(name: str, changes: dict[str, Any]) -> Asked:
+    """The jobs that a config by name or by path asks for, some keys replaced.
 
     Raises:
-        ConfigError: no such config, or no such device.
+        ConfigError: no such config, kind of job or device, or a wrong key or value.
     """
     path = find_yaml(name, config_files(), "config")
-    return _devices(path, read_yaml(path))
-
-
-def _devices(path: Path, data: Mapping[str, Any]) -> tuple[str | None, str | None]:
-    names = data.get("device")
-    try:
-        return split_devices(names) if isinstance(names, str) else (None, None)
-    except ValueError as error:
-        raise ConfigError(f"config {path}: key 'device' = '{names}': {error}") from None
-
-
-def load_requests(name: str, changes: dict[str, Any]) -> list[Request]:
-    """The jobs that a config by name or by path asks for, some keys replaced; of several devices on the first.
-
-    Raises:
-        ConfigError: no such config or kind of job, or a wrong key or value.
-    """
-    path = find_yaml(name, config_files(), "config")
-    data = read_yaml(path)
-    several, first = _devices(path, data)
-    data |= {"device": first} if several else {}
+    data = read_yaml(path) | changes
+    devices, named_device = None, data.get("device")
+    if isinstance(named_device, str):
+        try:
+            devices, data["device"] = split_devices(named_device)
+        except ValueError as error:
+            raise ConfigError(f"config {path}: key 'device' = '{named_device}': {error}") from None
     kind = data.pop("job", "generate")
     if kind not in ("generate", *KINDS):
         hint = did_you_mean(str(kind), ("generate", *KINDS))
         raise ConfigError(f"config {path}: unknown job '{kind}'; {hint}known: generate, {', '.join(KINDS)}")
     if kind == "generate" or "sequences" in data:
-        return plan_requests(parse_model(JobConfig, data | changes, f"config {path}"))
+        return Asked(plan_requests(parse_model(JobConfig, data, f"config {path}")), devices)
     data.pop("description", None)
-    return [parse_model(named(KINDS[kind]), data | changes, f"config {path}")]
+    return Asked([parse_model(named(KINDS[kind]), data, f"config {path}")], devices)
 
 
 def plan_requests(config: JobConfig) -> list[Request]:

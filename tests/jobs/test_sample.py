@@ -94,7 +94,7 @@ def test_steps_are_those_of_the_rows(shards, cache, inputs):
 def test_a_config_asks_for_a_training(shards, tmp_path):
     path = tmp_path / "job.yaml"
     path.write_text(f"job: diffuser\nshards: [{shards}]\nparams: {{steps: 7, process: flow}}\n")
-    (asked,) = load_requests(str(path), {})
+    (asked,) = load_requests(str(path), {}).requests
     assert isinstance(asked, DiffuserRequest)
     assert (asked.params.steps, asked.params.process, asked.out.name) == (7, "flow", "diffuser.pt")
 
