@@ -132,7 +132,7 @@ class Asked(NamedTuple):
 
     requests: list[Request]
     devices: str | None
-    """Several devices, as key ``device`` names them, the requests being for the first; None: one, or another is given."""
+    """Several devices, as key ``device`` names them; the requests are for the first. None: one."""
 
 
 def load_requests(name: str, changes: dict[str, Any]) -> Asked:
