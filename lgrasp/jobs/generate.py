@@ -27,10 +27,11 @@ from lgrasp.grasp.schema import POSE_BITS
 from lgrasp.grasp.tables import take_grasps
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
-from lgrasp.jobs.hands import for_hand, hand_source
+from lgrasp.jobs.hands import for_hand, hand_source, own_policy
 from lgrasp.jobs.records import object_record
 from lgrasp.jobs.requests.search import GenerateRequest
 from lgrasp.jobs.search import SearchJob
+from lgrasp.policy.names import SHIPPED
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.tally import add_counts
 
@@ -184,6 +185,9 @@ class GenerateJob(GenerateRequest, SearchJob):
         stage, words = starving_stage(counts)
         if stage in ("search", "hold") and self.pipeline.bounds.max_unresisted_load < _LOOSE_LOAD:
             words += f"; grasps that resist less: --set bounds.max_unresisted_load={_LOOSE_LOAD}, or --pipeline swift"
+        untried = self.pipeline.params("place").policy is None and own_policy(self.pipeline, self.keys.source.name)
+        if stage in ("search", "hold") and untried:
+            words += f"; likelier poses: --set place.policy={SHIPPED}"
         return StarvedError(f"{outcome.rows:,} of {self.rows:,} grasps found; stage {stage} is the bottleneck: {words}")
 
 

@@ -41,9 +41,7 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
         return pipeline
     source = hand_source(hand)
     if policy == SHIPPED:
-        # trained where nothing is asked and nothing is in the way
-        free = not (pipeline.steer.asks or pipeline.on_table)
-        shipped = shipped_policy(source.name, pipeline.hand.contact_links) if free else None
+        shipped = own_policy(pipeline, source.name)
         pipeline = pipeline.with_params("place", policy=str(shipped) if shipped else None)
     if not looked_up and policy in (None, SHIPPED):
         return pipeline
@@ -57,6 +55,13 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
     steer = typed(steer, anatomy)
     sides = asked_sides(steer, anatomy)
     return pipeline.model_copy(update={"steer": steer, "hand": pipeline.hand.model_copy(update={"sides": sides})})
+
+
+def own_policy(pipeline: Pipeline, hand: str) -> Path | None:
+    """The pose policy that is shipped with a hand, for pipelines that ask for nothing and have nothing in the way."""
+    if pipeline.steer.asks or pipeline.on_table:
+        return None
+    return shipped_policy(hand, pipeline.hand.contact_links)
 
 
 def _within_reach(pipeline: Pipeline, hand: str) -> Pipeline:
