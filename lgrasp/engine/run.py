@@ -170,7 +170,12 @@ class Job(Request, ABC):
         """The results in numbers, JSON-serialisable; :func:`lgrasp.engine.report.job_report` adds the rest."""
 
     def kept_rows(self, outcome: JobOutcome) -> int:
-        """Rows of parts that are not done with a verdict that the same job need not find again."""
+        """Rows of parts that are not done that the same job need not make again."""
+        missing = [part for part in outcome.parts if part.file not in outcome.paths]
+        return sum(self.kept_of(part) for part in missing[: outcome.lanes])
+
+    def kept_of(self, part: Part) -> int:
+        """The same of one part."""
         return 0
 
     def shortfall(self, outcome: JobOutcome) -> LgraspError | None:

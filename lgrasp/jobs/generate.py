@@ -12,6 +12,7 @@ from pydantic import PrivateAttr, model_validator
 
 from lgrasp.dataset.info import closure_share, stage_counts, survivors
 from lgrasp.dataset.reader import ShardReader
+from lgrasp.engine.bank import Bank
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found
 from lgrasp.engine.graphs import GraphCache
@@ -172,6 +173,11 @@ class GenerateJob(GenerateRequest, SearchJob):
             **({"resting": resting} if resting else {}),
             **sums,
         }
+
+    def kept_of(self, part: Part) -> int:
+        bank = Bank(self.cache, self.pipeline, self.keys, part.number, self.device_used.alias)
+        account = bank.load(part.rows, whole=False)
+        return account.kept if account else 0
 
     def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
         if not outcome.starved:

@@ -109,10 +109,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
         extend_shard(part.source, part.file, **added)
         kept.discard()
 
-    def kept_rows(self, outcome: JobOutcome) -> int:
-        missing = [part for part in outcome.parts if part.file not in outcome.paths]
-        kept = (KeptVerdicts(self.cache, self.part_key(part), self.protocol.name) for part in missing[: outcome.lanes])
-        return sum(found.rows for found in kept)
+    def kept_of(self, part: Part) -> int:
+        return KeptVerdicts(self.cache, self.part_key(part), self.protocol.name).rows
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``protocol``; ``results``: see :func:`summary`; ``seconds_compile``: of models and, on a GPU, kernels, in no
