@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Annotated, Any
 
 import typer
@@ -107,11 +108,26 @@ def main() -> None:
         code = program()(prog_name="lgrasp", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     try:
+        _refuse_empty(["lgrasp", *sys.argv[1:]])
         code = program()(prog_name="lgrasp", standalone_mode=False)
         sys.stdout.flush()
     except BaseException as error:
         _leave(*_explain(error))
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _refuse_empty(words: Sequence[str]) -> None:
+    """Refuse words without anything in them, which paths would take for the current folder.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    from lgrasp.errors import ConfigError
+
+    for before, word in pairwise(words):
+        name, _, value = word.partition("=") if word.startswith("--") and "=" in word else (before, "", word)
+        if not value:
+            raise ConfigError(f"{name} '': empty; a name, a path or a number is accepted (is a variable not set?)")
 
 
 def _explain(error: BaseException) -> tuple[str, int]:

@@ -12,6 +12,8 @@ from lgrasp.object.find import find_object
     [
         (["--hand", "alegro"], "did you mean 'allegro'"),
         (["--hand", "no/such.urdf"], "does not exist"),
+        (["--hand", ""], "--hand '': empty"),
+        (["--out", ""], "--out '': empty"),
         (["--object", "tinny"], "did you mean tiny"),
         (["--object", "no/such.obj"], "neither a mesh file nor"),
         (["--pipeline", "swfit"], "did you mean 'swift'"),
