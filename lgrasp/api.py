@@ -333,11 +333,7 @@ def _asked(
 ) -> dict[str, Any]:
     """What jobs that search have in common; without a folder all rows are in one shard."""
     chosen = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(str(pipeline))
-    if seed is not None:
-        if not 0 <= seed < 2**63:
-            raise ConfigError(f"seed {seed}: need 0 <= seed < 2^63")
-        chosen = chosen.model_copy(update={"seed": seed})
-    what = {"hand": str(hand), "rows": n, "pipeline": chosen, "device": device, "workers": workers}
+    what = {"hand": str(hand), "rows": n, "pipeline": chosen.with_seed(seed), "device": device, "workers": workers}
     return what | ({"shard_rows": max(n, 1)} if out is None else {})
 
 

@@ -143,11 +143,7 @@ def choose_pipeline(
     from lgrasp.engine.pipeline import load_pipeline
     from lgrasp.errors import ConfigError
 
-    pipeline = load_pipeline(name)
-    if seed is not None:
-        if not 0 <= seed < 2**63:
-            raise ConfigError(f"--seed {seed}: need 0 <= seed < 2^63")
-        pipeline = pipeline.model_copy(update={"seed": seed})
+    pipeline = load_pipeline(name).with_seed(seed, "--seed")
     if contacts is not None:
         ends = [part.split(":") for part in split(contacts)]
         ranges = [(int(end[0]), int(end[-1])) for end in ends if len(end) <= 2 and all(map(str.isdecimal, end))]

@@ -53,9 +53,7 @@ def extend_shard(
                 raise ShardError(f"{source}: {name} has shape {values.shape}, must have {n} rows")
         _copy(old, file, {f"grasps/{name}" for name in columns})
         for name, values in sorted(columns.items()):
-            dataset = create_rows(
-                file, name, values.shape, values.dtype, protocol if name.startswith("physics/") else texts.get(name, "")
-            )
+            dataset = create_rows(file, name, values.shape, values.dtype, texts[name])
             if n:
                 dataset[...] = values
         file["statistics"].attrs.update(dict(statistics or {}))

@@ -16,7 +16,7 @@ from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import column_texts, create_rows, finish, write_context
 from lgrasp.errors import OutputError, ShardError
-from lgrasp.grasp.records import GraspRows, HandRecord, Shard, ShardHeader
+from lgrasp.grasp.records import GraspRows, HandRecord, Shard, ShardHeader, padded
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS, TABLE_FIELDS
 from lgrasp.notices import notice
 
@@ -241,12 +241,7 @@ def pad_column(name: str, values: np.ndarray, tail: tuple[int, ...]) -> np.ndarr
 
     Verdicts of a simulator, which may have a number per object, are padded with what means not run: NaN, -1 or false.
     """
-    if values.shape[1:] == tail:
-        return values
-    fill = _FIELDS[name].fill if name in _FIELDS else {"f": np.nan, "i": -1}.get(values.dtype.kind, 0)
-    padded = np.full((len(values), *tail), fill, dtype=values.dtype)
-    padded[tuple(slice(size) for size in values.shape)] = values
-    return padded
+    return padded(values, tail, _FIELDS[name].fill if name in _FIELDS else None)
 
 
 def widest(tails: Iterable[tuple[int, ...]]) -> tuple[int, ...]:

@@ -12,6 +12,7 @@ from lgrasp.dataset.json_file import JsonFile
 from lgrasp.dataset.split import Split
 from lgrasp.dataset.torch_stream import GraspIterableDataset
 from lgrasp.errors import ConfigError
+from lgrasp.geometry.poses import TO_DEVICE, TO_STORED
 from lgrasp.geometry.rotations import (
     inverse_motion,
     matrix_from_sixd,
@@ -22,7 +23,6 @@ from lgrasp.geometry.rotations import (
 
 _ROWS = 65_536  # at a time
 _LEAST = 1e-6  # a number that varies less stays as it is
-_TO_DEVICE, _TO_STORED = [0, 1, 2, 4, 5, 6, 3], [0, 1, 2, 6, 3, 4, 5]  # order of a pose's numbers
 
 
 class Normalisation(JsonFile):
@@ -85,7 +85,7 @@ class Normalisation(JsonFile):
         mean, std = self._scale(vectors)
         vectors = vectors * std + mean
         pose = pose_from_motion(*inverse_motion(matrix_from_sixd(vectors[..., 3:9]), vectors[..., :3]))
-        return pose[..., _TO_STORED], vectors[..., 9:]
+        return pose[..., TO_STORED], vectors[..., 9:]
 
     def _scale(self, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mean, std = (like.new_tensor(numbers) for numbers in (self.mean, self.std))
@@ -100,5 +100,5 @@ def grasp_vectors(object_pose: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         q: joints [rad or m], (B, K).
     """
     pose = object_pose[:, 0] if object_pose.ndim == 3 else object_pose
-    R, t = inverse_motion(*motion_from_pose(pose[:, _TO_DEVICE]))
+    R, t = inverse_motion(*motion_from_pose(pose[:, TO_DEVICE]))
     return torch.cat([t, sixd_from_matrix(R), q], -1)

@@ -145,6 +145,16 @@ class Pipeline(_Head):
         """
         return self if passes is None else self.with_params("search", passes=passes)
 
+    def with_seed(self, seed: int | None, name: str = "seed") -> "Pipeline":
+        """A copy with another base seed, if one is given; ``name`` is what the user calls it.
+
+        Raises:
+            ConfigError: seed out of range.
+        """
+        if seed is not None and not 0 <= seed < 2**63:
+            raise ConfigError(f"{name} {seed}: need 0 <= seed < 2^63")
+        return self if seed is None else self.model_copy(update={"seed": seed})
+
     def with_steering(self, **asked: Any) -> "Pipeline":
         """A copy whose grasps obey more of :class:`~lgrasp.steer.params.Steering`.
 

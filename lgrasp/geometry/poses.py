@@ -12,6 +12,9 @@ import numpy as np
 if TYPE_CHECKING:  # scipy is slow to load
     from scipy.spatial.transform import Rotation
 
+TO_DEVICE, TO_STORED = [0, 1, 2, 4, 5, 6, 3], [0, 1, 2, 6, 3, 4, 5]
+"""Columns of the other kind of pose, in order."""
+
 
 def canonical(quaternion: np.ndarray) -> np.ndarray:
     """The quaternions of unit length with qw >= 0 that mean the same rotations, shape [..., 4]."""
@@ -103,7 +106,7 @@ def device_rotation(pose: np.ndarray) -> "Rotation":
 
 def device_from_stored(pose: np.ndarray) -> np.ndarray:
     """Device poses, shape [n, 7], float32, of stored ones."""
-    return np.ascontiguousarray(np.asarray(pose)[:, [0, 1, 2, 4, 5, 6, 3]], np.float32)
+    return np.ascontiguousarray(np.asarray(pose)[:, TO_DEVICE], np.float32)
 
 
 def device_from_matrix(T: np.ndarray) -> np.ndarray:

@@ -200,3 +200,17 @@ def object_set_sha256(objects: Sequence[ObjectRecord]) -> str:
     """Hash of an object set: the object's own hash if single, else SHA-256 of the sorted hashes joined by newlines."""
     hashes = sorted(o.sha256 for o in objects)
     return hashes[0] if len(hashes) == 1 else hashlib.sha256("\n".join(hashes).encode()).hexdigest()
+
+
+def padded(values: np.ndarray, tail: tuple[int, ...], fill: Any = None) -> np.ndarray:
+    """Values [n, ...] with room at the end of each other axis, [n, *tail]; themselves if there is room enough.
+
+    Args:
+        fill: What is there; None: what means nothing: NaN, -1 or false.
+    """
+    if values.shape[1:] == tail:
+        return values
+    fill = {"f": np.nan, "i": -1}.get(values.dtype.kind, 0) if fill is None else fill
+    out = np.full((len(values), *tail), fill, values.dtype)
+    out[tuple(map(slice, values.shape))] = values
+    return out

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 import warp as wp
 
+from lgrasp.grasp.records import padded
 from lgrasp.grasp.structs import Candidates, Poses, Sets
 from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.structs import empty_arrays, make_struct
@@ -243,12 +244,8 @@ def choose_grasps(old: GraspTable, new: GraspTable, into: np.ndarray, rows: np.n
 
 def widen_grasps(table: GraspTable, width: int) -> GraspTable:
     """The table with room for ``width`` contacts at least."""
-    missing = width - table.contact_links.shape[1]
-    if missing <= 0:
+    if table.contact_links.shape[1] >= width:
         return table
-    out = grasp_arrays(table)
-    for name in ("contact_points", "contact_normals", "contact_links", "contact_forces"):
-        x = out[name]
-        none = -1 if name == "contact_links" else np.nan
-        out[name] = np.pad(x, [(0, 0), (0, missing)] + [(0, 0)] * (x.ndim - 2), constant_values=none)
+    names = ("contact_points", "contact_normals", "contact_links", "contact_forces")
+    out = {name: padded(x, (width, *x.shape[2:])) if name in names else x for name, x in grasp_arrays(table).items()}
     return grasps_from_arrays(out)

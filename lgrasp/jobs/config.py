@@ -250,9 +250,7 @@ def _pipelines(config: JobConfig) -> Iterator[Pipeline]:
         pipeline = load_pipeline(name).with_settings(config.settings)
         if config.steer:
             pipeline = pipeline.with_steering(**config.steer.model_dump(exclude_unset=True))
-        if config.seed is not None:
-            pipeline = pipeline.model_copy(update={"seed": config.seed})
-        yield pipeline
+        yield pipeline.with_seed(config.seed)
 
 
 def _objects(config: JobConfig) -> tuple[str, ...]:

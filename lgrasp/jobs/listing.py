@@ -74,14 +74,14 @@ def list_networks() -> list[dict[str, Any]]:
     found = []
     for name, path in known_networks().items():
         try:
-            card = read_card(path)
+            card: dict[str, Any] = read_card(path)
         except ConfigError as error:
             card = {"kind": f"cannot be used: {error}", "hand": "", "report": {}}
-        found.append({"name": name, "kind": card["kind"], "hand": card["hand"], **_told(path, card["report"])})
+        found.append(_told(path, name, **card))
     for hand in known_hands():
         kinds = {shipped_policy(hand, "all"): "pose, all links", shipped_policy(hand, "listed"): "pose"}
         for path in sorted(path for path in kinds if path):
-            found.append({"name": SHIPPED, "kind": kinds[path], "hand": hand, **_told(path, _about_policy(path)[1])})
+            found.append(_told(path, SHIPPED, **_policy_card(path) | {"kind": kinds[path], "hand": hand}))
     return found
 
 
@@ -92,22 +92,18 @@ def describe_network(name: str) -> dict[str, Any]:
         ConfigError: no such network.
     """
     path = find_network(name)
-    if path.suffix == ".npz":
-        hand, report = _about_policy(path)
-        return {"name": path.stem, "kind": "pose", "hand": hand, **_told(path, report)}
-    card = read_card(path)
-    return {"name": path.stem, "kind": card["kind"], "hand": card["hand"], **_told(path, card["report"])}
+    return _told(path, path.stem, **(_policy_card(path) if path.suffix == ".npz" else read_card(path)))
 
 
-def _about_policy(path: Path) -> tuple[str, dict[str, Any]]:
+def _policy_card(path: Path) -> dict[str, Any]:
     from lgrasp.policy.model import read_policy  # numpy
 
     policy = read_policy(path)
-    return policy.hand, policy.about["report"]
+    return {"kind": "pose", "hand": policy.hand, "report": policy.about["report"]}
 
 
-def _told(path: Path, report: dict[str, Any]) -> dict[str, Any]:
-    return {"file": str(path), "bytes": path.stat().st_size, "report": report}
+def _told(path: Path, name: str, kind: str, hand: str, report: dict[str, Any], **_: Any) -> dict[str, Any]:
+    return {"name": name, "kind": kind, "hand": hand, "file": str(path), "bytes": path.stat().st_size, "report": report}
 
 
 def _meaning(params: BaseModel, key: str) -> str:

@@ -22,22 +22,30 @@ if TYPE_CHECKING:  # torch takes a second to import
     from lgrasp.learn.diffuser.training import StepTrainer
 
 
-class NetworkJob(FitRequest, Job):
-    """A network, trained on the grasps of shards: one file."""
+class FileJob(Job):
+    """What is trained is one file."""
 
     command: ClassVar[str] = "learn fit"
     part: ClassVar[str] = "file"
-    kernels: ClassVar[tuple[str, ...]] = ()
     one_key: ClassVar[bool] = False
+
+    @property
+    def folder(self) -> Path:
+        return self.parts()[0].file.parent
+
+    def write(self, part: Part, contents: Any) -> None:
+        write_file(part.file, contents)
+
+
+class NetworkJob(FitRequest, FileJob):
+    """A network, trained on the grasps of shards: one file."""
+
+    kernels: ClassVar[tuple[str, ...]] = ()
     differs: ClassVar[str] = "other shards or parameters"
     kind: ClassVar[tuple[str, int]]
     """Name and version of what is trained."""
 
     _key: str | None = PrivateAttr(None)
-
-    @property
-    def folder(self) -> Path:
-        return self.out.parent
 
     def key(self) -> str:
         if self._key is None:
@@ -70,9 +78,6 @@ class NetworkJob(FitRequest, Job):
 
     def found(self, part: Part) -> Found:
         return Found(self.about_file(part.file)["run_key"], part.rows)
-
-    def write(self, part: Part, contents: Any) -> None:
-        write_file(part.file, contents)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         return self.about_file(self.out)["report"] | {"out": str(self.out)} if outcome.paths else {}

@@ -2,7 +2,6 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,13 +12,12 @@ from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found
 from lgrasp.engine.inputs import InputKeys, Loader, input_keys, object_key
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.engine.run import Job
 from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays, upload_field
-from lgrasp.files import write_file
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.hands import for_hand, hand_source
 from lgrasp.jobs.learn.examples import PoseExamples, join_examples, make_pose_examples, reach_points
+from lgrasp.jobs.learn.network import FileJob
 from lgrasp.jobs.requests.learn import PolicyRequest
 from lgrasp.learn.policy import fit_network, ranking, rate
 from lgrasp.object.arrays import upload_object
@@ -33,25 +31,18 @@ _VERSION = 1
 _LEAST = 16  # poses that gave a grasp
 
 
-class PolicyJob(PolicyRequest, Job):
+class PolicyJob(PolicyRequest, FileJob):
     """A pose policy of one hand: one file.
 
     The report tells, of objects that were not trained on, how well the networks rank poses: the share of pairs of a
     pose that gave a grasp and one that did not in which the first is rated higher.
     """
 
-    command: ClassVar[str] = "learn fit"
-    part: ClassVar[str] = "file"
-    one_key: ClassVar[bool] = False
     differs: ClassVar[str] = "another hand, other objects or parameters"
 
     _keys: InputKeys | None = PrivateAttr(None)
     _field: FieldArrays | None = PrivateAttr(None)
     _hand: HandArrays | None = PrivateAttr(None)
-
-    @property
-    def folder(self) -> Path:
-        return self.out.parent
 
     @property
     def learned(self) -> Pipeline:
@@ -152,9 +143,6 @@ class PolicyJob(PolicyRequest, Job):
             path, key = object_key(self.objects[number], self.scale, params)
             return Loader(self.cache, alias).object(path, key, self.scale, params)
         return preprocess_object(random_shape(self.params.seed, number), params=params, device=alias)
-
-    def write(self, part: Part, contents: Any) -> None:
-        write_file(part.file, contents)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         if not outcome.paths:

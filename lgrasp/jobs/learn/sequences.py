@@ -15,6 +15,7 @@ from lgrasp.geometry.poses import internal_poses
 from lgrasp.geometry.rotations import motion_from_pose
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.hand.model import HandModel
+from lgrasp.jobs.scenes.shards import check_finite, mesh_objects
 from lgrasp.jobs.shard_inputs import hand_of_shard
 from lgrasp.learn.diffuser.examples import SequenceSteps
 from lgrasp.learn.diffuser.features import mesh_centre, surface_cloud
@@ -88,15 +89,11 @@ def read_steps(paths: Paths, cache: Cache, device: Device, cloud: int) -> ReadSt
 def _read(reader: ShardReader) -> _Part:
     if reader.space_names is None:
         raise ShardError(f"{reader.path}: holds no sequences; shards of lgrasp sequence are accepted")
-    objects = reader.objects()
-    for record in objects:
-        if not len(record.faces):
-            raise ShardError(f"{reader.path}: object '{record.id}' is a point cloud; objects with a mesh are accepted")
+    objects = mesh_objects(reader)
     columns = {name: reader.column(name) for name in _COLUMNS}
     there = columns["object_index"] >= 0
-    for name, values in {"q": columns["q"], "object_pose": columns["object_pose"][there]}.items():
-        if not np.isfinite(values).all():
-            raise ShardError(f"{reader.path}: {name} is not finite; finite grasps are accepted")
+    poses = np.where(there[..., None], columns["object_pose"], 0.0)
+    check_finite(reader.path, {"q": columns["q"], "object_pose": poses})
     return _Part(str(reader.attributes["hand_sha256"]), reader.space_names, objects, columns)
 
 

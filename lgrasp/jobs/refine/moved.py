@@ -12,7 +12,7 @@ from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import Outcome, failed_bounds
-from lgrasp.grasp.records import GraspRows
+from lgrasp.grasp.records import GraspRows, padded
 from lgrasp.grasp.rows import CONTACTS, POSTURES, grasp_rows, press
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.grasp.tables import GraspTable, choose_grasps, join_rows, widen_grasps
@@ -214,7 +214,7 @@ def _kept(old: GraspRows, new: GraspRows, take: np.ndarray, measured: bool) -> G
     for name in (*POSTURES, "object_pose", *CONTACTS):
         x, y = (np.asarray(getattr(rows, name)) for rows in (old, new))
         if name in CONTACTS:
-            x, y = _padded(x, width), _padded(y, width)
+            x, y = (padded(v, (v.shape[1], width, *v.shape[3:])) for v in (x, y))
         changes[name] = _chosen(take, y, x)
     metrics = {
         name: np.where(take, values, old.metrics[name]) if measured and name in {*old.metrics} - _TOLD else values
@@ -227,9 +227,3 @@ def _kept(old: GraspRows, new: GraspRows, take: np.ndarray, measured: bool) -> G
 def _chosen(take: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
     """Rows (N, ...) of ``new`` where ``take`` (N,) says so, else of ``old``."""
     return np.where(take.reshape(-1, *(1,) * (old.ndim - 1)), new, old).astype(old.dtype)
-
-
-def _padded(x: np.ndarray, width: int) -> np.ndarray:
-    none = -1 if x.dtype.kind == "i" else np.nan
-    pad = [(0, 0), (0, 0), (0, width - x.shape[2])] + [(0, 0)] * (x.ndim - 3)
-    return np.pad(x, pad, constant_values=none)

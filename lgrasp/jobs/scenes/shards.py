@@ -72,16 +72,28 @@ def _single(reader: ShardReader) -> tuple[ObjectRecord, dict[str, np.ndarray]]:
     """The object of a shard, and its columns."""
     if reader.space_names is not None or len(reader.object_ids) != 1:
         raise ShardError(f"{reader.path}: holds several objects; grasps of single objects are brought into scenes")
-    (record,) = reader.objects()
-    if not len(record.faces):
-        raise ShardError(f"{reader.path}: object '{record.id}' is a point cloud; objects with a mesh are accepted")
+    (record,) = mesh_objects(reader)
     columns = {name: reader.column(name) for name in _COLUMNS}
     columns["T_hand_object"] = reader.column("object_pose")[:, 0]
-    _check_finite(reader.path, columns)
+    check_finite(reader.path, columns)
     return record, columns
 
 
-def _check_finite(path: Path, columns: dict[str, np.ndarray]) -> None:
+def mesh_objects(reader: ShardReader) -> tuple[ObjectRecord, ...]:
+    """The objects of a shard.
+
+    Raises:
+        ShardError: one is a point cloud.
+    """
+    objects = reader.objects()
+    for record in objects:
+        if not len(record.faces):
+            raise ShardError(f"{reader.path}: object '{record.id}' is a point cloud; objects with a mesh are accepted")
+    return objects
+
+
+def check_finite(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Raises ShardError at numbers that are not finite."""
     for name, values in columns.items():
         bad = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
         if len(bad):

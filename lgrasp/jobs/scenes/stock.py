@@ -87,7 +87,7 @@ def _generated(config: SceneRequest, cache: Cache, events: Events) -> list[Path]
             hand=hand,
             object=name,
             rows=config.stock,
-            pipeline=load_pipeline(config.pipeline).model_copy(update={"seed": config.seed}),
+            pipeline=load_pipeline(config.pipeline).with_seed(config.seed),
             out=config.out / "grasps" / f"{hand_source(hand).name}-{find_object(name).stem}",
             scale=config.scale,
             device=config.device,

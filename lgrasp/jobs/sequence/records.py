@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.grasp.records import GraspRows, ObjectRecord, SequenceRows
+from lgrasp.grasp.records import GraspRows, ObjectRecord, SequenceRows, padded
 from lgrasp.grasp.rows import CONTACTS, METRIC_UNITS, POSTURES, row_numbers, step_columns, used_width
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.jobs.records import object_record
@@ -75,12 +75,4 @@ def _level(table: SequenceTable, inputs: SequenceInputs, slots: int) -> dict[str
         "space": table.space.astype(np.int16),
         "free_joints": np.concatenate([table.free, held, table.free[:, :, tree.coupled_column]], 2),
     }
-    empty = {"f": np.nan, "i": -1, "b": False}
-    return {name: _padded(values, slots, empty[values.dtype.kind]) for name, values in columns.items()}
-
-
-def _padded(values: np.ndarray, slots: int, fill: float) -> np.ndarray:
-    """(N, slots, ...) with the absent slots at the end filled."""
-    out = np.full((len(values), slots, *values.shape[2:]), fill, values.dtype)
-    out[:, : values.shape[1]] = values
-    return out
+    return {name: padded(values, (slots, *values.shape[2:])) for name, values in columns.items()}
