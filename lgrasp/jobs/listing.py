@@ -81,7 +81,7 @@ def list_networks() -> list[dict[str, Any]]:
     for hand in known_hands():
         kinds = {shipped_policy(hand, "all"): "pose, all links", shipped_policy(hand, "listed"): "pose"}
         for path in sorted(path for path in kinds if path):
-            found.append(_told(path, SHIPPED, **_policy_card(path) | {"kind": kinds[path], "hand": hand}))
+            found.append(_told(path, SHIPPED, kinds[path], hand, _policy_card(path)["report"]))
     return found
 
 

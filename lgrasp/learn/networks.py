@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _CARD = "archive/card.json"  # beside what torch writes there
 _MOST_BYTES, _MOST_CARD = 1 << 28, 1 << 22
+SHARDS = "the shards are of"
 
 
 def known_networks() -> dict[str, Path]:
@@ -132,14 +133,14 @@ def check_network(name: str, kind: str, hand: str) -> None:
         check_network_hand(path, card["hand"], card["hand_sha256"], source.name, hand_digest(source.urdf, source.spec))
 
 
-def check_network_hand(path: Path, hand: str, sha256: str, asked: str, digest: str) -> None:
-    """Refuse a network of another hand than the one that is asked for.
+def check_network_hand(path: Path, hand: str, sha256: str, asked: str, digest: str, *, words: str = "not of") -> None:
+    """Refuse a network of another hand than the one that is asked for, or that shards are of, as ``words`` say.
 
     Raises:
         ConfigError: it is.
     """
     if sha256 != digest:
-        raise ConfigError(f"{path} is of hand '{hand}', not of '{asked}' (or of another model of it)")
+        raise ConfigError(f"{path} is of hand '{hand}', {words} '{asked}' (or of another model of it)")
 
 
 def _card(path: Path) -> dict[str, Any]:

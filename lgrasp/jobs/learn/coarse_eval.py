@@ -18,7 +18,7 @@ from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.learn.job import energy_numbers, load_predictor, read_examples
 from lgrasp.jobs.requests.shards import refine_params
 from lgrasp.learn.network import Coarse
-from lgrasp.learn.networks import check_network_hand
+from lgrasp.learn.networks import SHARDS, check_network_hand
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import ANSWERS, Trainer, measure
 from lgrasp.object.arrays import upload_object
@@ -50,7 +50,7 @@ def evaluate(
     net, saved = load_predictor(path)
     params = LearnParams.model_validate(saved["params"]).model_copy(update={"clouds": clouds, "seed": seed})
     hand, examples, _ = read_examples(shards, None, params.model_copy(update={"held_out": 1}), cache, alias)
-    check_network_hand(path, saved["hand"], saved["hand_sha256"], hand.name, hand.sha256)
+    check_network_hand(path, saved["hand"], saved["hand_sha256"], hand.name, hand.sha256, words=SHARDS)
     trainer, bounds = Trainer(hand, examples, params, device=alias), GraspBounds()
     trainer.net.load_state_dict(net.state_dict())
     start, arrays = time.perf_counter(), upload_hand(hand, alias)

@@ -21,7 +21,7 @@ from lgrasp.learn.diffuser.process import PROCESSES
 from lgrasp.learn.diffuser.sampler import draw_steps
 from lgrasp.learn.diffuser.senses import HeldObjects, Senses, sense_points
 from lgrasp.learn.diffuser.training import StepTrainer, mean_loss
-from lgrasp.learn.networks import check_network_hand
+from lgrasp.learn.networks import SHARDS, check_network_hand
 from lgrasp.runtime.device import resolve_device
 
 _MIN_STEPS = 64  # of sequences, to learn from
@@ -92,7 +92,7 @@ def evaluate(
     used, p = resolve_device(device), about.params
     found = read_steps(shards, cache, used, p.cloud)
     digest = found.hand.sha256 if found.space_names == about.space_names else ""
-    check_network_hand(path, about.hand, about.hand_sha256, found.hand.name, digest)
+    check_network_hand(path, about.hand, about.hand_sha256, found.hand.name, digest, words=SHARDS)
     net = net.to(used.alias).eval()
     examples = StepExamples(found.hand.tree, found.steps, found.clouds, found.grids, net, p, used.alias)
     every, process = torch.arange(len(examples), device=net.mean.device), PROCESSES[p.process]

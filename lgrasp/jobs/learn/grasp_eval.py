@@ -30,7 +30,7 @@ from lgrasp.jobs.shard_inputs import hand_of_shard, object_of_shard
 from lgrasp.learn.examples import seen_cloud
 from lgrasp.learn.grasp.file import Networks, load_networks
 from lgrasp.learn.grasp.views import SIDES, camera
-from lgrasp.learn.networks import check_network_hand
+from lgrasp.learn.networks import SHARDS, check_network_hand
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.params import PlanParams, cloud_params
@@ -65,7 +65,7 @@ def evaluate(
     networks, parts = load_networks(path), read_parts(shards)
     first = next(iter(parts.values()))
     source, hand = hand_of_shard(cache, first.hand, first.config, found)
-    check_network_hand(path, networks.hand, networks.hand_sha256, hand.name, hand.sha256)
+    check_network_hand(path, networks.hand, networks.hand_sha256, hand.name, hand.sha256, words=SHARDS)
     palmar = visible_surface(source, hand, found.alias)
     bench = _Bench(networks, source, upload_hand(hand, found.alias), palmar, starts)
     begin = time.perf_counter()
