@@ -121,11 +121,12 @@ class Manifest(_Listed):
         known = [s for r in self.runs if r.run_key == run.run_key for s in r.shards if s.file not in made]
         self._give(run.model_copy(update={"shards": known + list(made.values())}), set(made))
 
-    def renew(self, files: Iterable[Path], *, changing: bool) -> None:
+    def renew(self, files: Iterable[Path], *, changing: bool = False, changed: bool = False) -> None:
         """Take up listed files as they are now, in the runs that they are in.
 
         Args:
             changing: They are going to be replaced: their sizes are not known until they are renewed again.
+            changed: They were replaced: what is listed is of the files before, though they may be as large.
 
         Raises:
             ShardError: One cannot be read.
@@ -138,7 +139,7 @@ class Manifest(_Listed):
                 return shard
             if changing:
                 return shard.model_copy(update={"bytes": None, "sha256": None})
-            same = shard.sha256 and shard.bytes == path.stat().st_size
+            same = not changed and shard.sha256 and shard.bytes == path.stat().st_size
             return shard if same else listed(shard, path, shard.rows)
 
         self.runs = [run.model_copy(update={"shards": list(map(renewed, run.shards))}) for run in self.runs]

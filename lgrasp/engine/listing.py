@@ -219,7 +219,7 @@ class Renewing:
         """List a file as it is now."""
         with self._lock:
             self._changing.discard(part.file)
-        _renew([part.file])
+        _renew([part.file], changed=True)
 
     def close(self) -> None:
         """List files that were not replaced after all."""
@@ -229,10 +229,10 @@ class Renewing:
             _renew(left)
 
 
-def _renew(files: Collection[Path], *, changing: bool = False) -> None:
+def _renew(files: Collection[Path], **how: bool) -> None:
     folders: dict[Path, list[Path]] = defaultdict(list)
     for file in files:
         folders[file.parent].append(file)
     for folder, these in folders.items():
         if (folder / MANIFEST).exists():
-            update_manifest(folder, partial(Manifest.renew, files=these, changing=changing))
+            update_manifest(folder, partial(Manifest.renew, files=these, **how))

@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from lgrasp.errors import OutputError
+from lgrasp.files import check_file
 
 FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP"}
 """Of image files, by suffix."""
@@ -49,13 +50,14 @@ def sheet(
 
 
 def check_image(path: Path) -> None:
-    """Refuse a file that no image can be written to.
+    """Check, before a long job, that an image can be written there.
 
     Raises:
-        OutputError: another suffix than those of :data:`FORMATS`, or a folder.
+        OutputError: another suffix than those of :data:`FORMATS`, a folder, or a place that cannot be written.
     """
     if path.suffix.lower() not in FORMATS or path.is_dir():
         raise OutputError(f"picture {path} cannot be written: name a file that ends in {', '.join(FORMATS)}")
+    check_file(path)
 
 
 def image_bytes(image: Image.Image, suffix: str = ".png") -> bytes:

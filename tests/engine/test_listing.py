@@ -16,6 +16,7 @@ from lgrasp.dataset.manifest import compare, read_manifest, workers
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.events import Events
+from lgrasp.engine.listing import renewing
 from lgrasp.engine.run import run
 from lgrasp.errors import OutputError, ShardError
 
@@ -163,6 +164,19 @@ def test_tasks_that_write_at_once(tmp_path):
         assert [len(job.result().written) for job in jobs] == [6] * 4
     assert (out / "manifest.json").read_bytes() == (whole / "manifest.json").read_bytes()
     assert {path.suffix for path in out.iterdir()} == {".h5", ".json"}
+
+
+def test_two_processes_that_renew_a_file(tmp_path):
+    """What the later one writes is listed, though the earlier one listed a file of the same size."""
+    run(SampleJob(out=tmp_path, rows=2))
+    (part,) = SampleJob(out=tmp_path, rows=2).parts()
+    with renewing([part], {}) as first, renewing([part], {}) as second:
+        for number, process in enumerate((first, second)):
+            data = part.file.read_bytes()
+            part.file.write_bytes(data[:-1] + bytes([number]))
+            process.record(part, 2, written=True)
+    (shard,) = document(tmp_path)["runs"][0]["shards"]
+    assert shard["sha256"] == hashlib.sha256(part.file.read_bytes()).hexdigest()
 
 
 def test_a_working_process_is_seen(tmp_path):
