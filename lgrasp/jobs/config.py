@@ -127,7 +127,7 @@ KINDS = {
 """Kind of a job, as key ``job`` of a config names it, and its keys; those of ``generate`` are :class:`JobConfig`."""
 
 
-class Asked(NamedTuple):
+class ConfigJobs(NamedTuple):
     """What a config asks for."""
 
     requests: list[Request]
@@ -135,7 +135,7 @@ class Asked(NamedTuple):
     """Several devices, as key ``device`` names them; the requests are for the first. None: one."""
 
 
-def load_requests(name: str, changes: dict[str, Any]) -> Asked:
+def load_requests(name: str, changes: dict[str, Any]) -> ConfigJobs:
     """The jobs that a config by name or by path asks for, some keys replaced.
 
     Raises:
@@ -154,9 +154,9 @@ def load_requests(name: str, changes: dict[str, Any]) -> Asked:
         hint = did_you_mean(str(kind), ("generate", *KINDS))
         raise ConfigError(f"config {path}: unknown job '{kind}'; {hint}known: generate, {', '.join(KINDS)}")
     if kind == "generate" or "sequences" in data:
-        return Asked(plan_requests(parse_model(JobConfig, data, f"config {path}")), devices)
+        return ConfigJobs(plan_requests(parse_model(JobConfig, data, f"config {path}")), devices)
     data.pop("description", None)
-    return Asked([parse_model(named(KINDS[kind]), data, f"config {path}")], devices)
+    return ConfigJobs([parse_model(named(KINDS[kind]), data, f"config {path}")], devices)
 
 
 def plan_requests(config: JobConfig) -> list[Request]:
