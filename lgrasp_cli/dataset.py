@@ -10,9 +10,10 @@ import typer
 from typer import Option
 
 from lgrasp.choices import FormatName, MetricName
+from lgrasp.words import number, plural
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Quiet, Shards, old_name, split, warn
-from lgrasp_cli.tables import Answer, Block, TextTable, checked, following, place, plural, reporting, took
+from lgrasp_cli.tables import Answer, Block, TextTable, checked, following, place, reporting, took
 from lgrasp_cli.training import normalisation, split_rows
 from lgrasp_cli.working import How, working
 
@@ -239,13 +240,13 @@ def _metric_table(shards: list[dict[str, Any]]) -> TextTable:
     ends = ("min", "mean", "max")
     rows = [
         (
-            "" if number else name,
+            "" if line else name,
             metric,
             values["unit"].partition(":")[0],
-            *("-" if values[k] is None else f"{values[k]:.4g}" for k in ends),
+            *(number(values[k], ".4g") for k in ends),
         )
         for name, s in zip(_places(shards), shards, strict=True)
-        for number, (metric, values) in enumerate(s["metrics"].items())
+        for line, (metric, values) in enumerate(s["metrics"].items())
     ]
     return TextTable(("shard", "metric", "unit", *ends), rows, right=ends)
 

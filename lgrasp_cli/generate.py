@@ -6,11 +6,12 @@ from typing import Annotated, Any
 from typer import Option
 
 from lgrasp.choices import ProtocolName, ScoreName
+from lgrasp.words import plural
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import HANDS, OBJECTS, one_of
 from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, choose_pipeline, given
 from lgrasp_cli.steer import Above, Approach, Avoid, Fingers, GraspType, Links, Palm, PoseFile, Touch
-from lgrasp_cli.tables import Block, closed, counted, following, held, place, plural, took
+from lgrasp_cli.tables import Block, closed, counted, following, held, place, took
 from lgrasp_cli.working import How, working
 
 _LIKELY = 0.05  # probability of a resting pose that is named when it has no grasps

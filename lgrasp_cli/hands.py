@@ -7,6 +7,7 @@ import typer
 from typer import Argument, Option
 
 from lgrasp.choices import ProtocolName, VariationName
+from lgrasp.words import plural
 from lgrasp_cli.look import view_hand
 from lgrasp_cli.names import HANDS, OBJECTS, PIPELINE, one_of
 from lgrasp_cli.options import (
@@ -20,7 +21,7 @@ from lgrasp_cli.options import (
     choose_pipeline,
     open_cache,
 )
-from lgrasp_cli.tables import Answer, Block, TextTable, plural, reporting
+from lgrasp_cli.tables import Answer, Block, TextTable, reporting
 from lgrasp_cli.working import How, working
 
 if TYPE_CHECKING:

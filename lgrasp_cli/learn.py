@@ -7,9 +7,10 @@ import typer
 from typer import Argument, Option
 
 from lgrasp.choices import NetworkName
+from lgrasp.words import plural
 from lgrasp_cli.names import HAND, NETWORK, OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import CacheDir, Device, Quiet, Shards, choose_pipeline, given, open_cache
-from lgrasp_cli.tables import Answer, Block, TextTable, following, plural, reporting, share, took
+from lgrasp_cli.tables import Answer, Block, TextTable, following, reporting, share, took
 from lgrasp_cli.working import How, working
 
 app = typer.Typer(name="learn", help="Train and measure networks that predict grasps.", no_args_is_help=True)

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option, echo
 
+from lgrasp.words import plural
 from lgrasp_cli.names import HAND_OR_OBJECT
 from lgrasp_cli.options import CacheDir, HandArgument, Quiet, Shards, open_cache
-from lgrasp_cli.tables import Answer, plural, reporting
+from lgrasp_cli.tables import Answer, reporting
 
 if TYPE_CHECKING:
     from viser import ViserServer

@@ -6,6 +6,7 @@ import typer
 from typer import Option
 
 from lgrasp.choices import FieldIndex
+from lgrasp.words import number
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import (
     CacheDir,
@@ -47,7 +48,7 @@ def build_field(
     with Bar() as bar:
         data = prepare_field(cache, hand, params, index=index, device=device, report=bar.share)
     note = f"; {data['note']}" if data["note"] else ""
-    clear = "  ".join("-" if share is None else f"{share:.0%}" for share in data["clear_share"])
+    clear = "  ".join(number(share, ".0%") for share in data["clear_share"])
     pairs = [
         ("hand", f"{data['hand']}: {data['groups']} fingers, {data['joints']} joints{note}"),
         ("patches", f"{data['patches']:,}"),

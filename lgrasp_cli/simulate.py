@@ -6,6 +6,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from lgrasp.choices import EngineName, ProtocolName
+from lgrasp.words import number
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Shards
 from lgrasp_cli.tables import Block, TextTable, following, place, share, took
@@ -55,7 +56,7 @@ def _show(data: dict[str, Any]) -> list[Block]:
             share(entry["held"], entry["rows"]),
             *((f"{entry['share']:.1%}",) if drawn else ()),
             *(share(entry[name], entry["rows"]) for name in stay),
-            "-" if entry["per_s"] is None else f"{entry['per_s']:.1f}",
+            number(entry["per_s"], ".1f"),
         )
         for entry in entries
     ]
@@ -110,5 +111,5 @@ def _ways(entry: dict[str, Any]) -> tuple[str, ...]:
         return tuple(map(share, entry["directions_held"], entry["directions_run"]))
     if entry["on_table"] is None:
         return ()
-    pushed = entry["pushed"]
-    return share(entry["on_table"], entry["rows"]), "-" if pushed is None else f"{1e3 * pushed:.1f} mm"
+    pushed = None if entry["pushed"] is None else 1e3 * entry["pushed"]
+    return share(entry["on_table"], entry["rows"]), number(pushed, ".1f", " mm")

@@ -12,7 +12,8 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from lgrasp_cli.tables import Answer, plural, reporting
+from lgrasp.words import plural
+from lgrasp_cli.tables import Answer, reporting
 
 WORDS = {"allow_interspersed_args": False}
 """Settings of the command: from its first word on, the words are those of the other command."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import typer
 
+from lgrasp.words import number, plural
 from lgrasp_cli.options import JsonPath, check_report, with_options
 
 _LEAST = 6  # characters that every column keeps
@@ -98,11 +99,6 @@ def _wrapped(text: str, width: int) -> list[str]:
     return textwrap.wrap(text, width) if len(text) > width else [text]
 
 
-def plural(n: int, what: str) -> str:
-    """A number of things: ``1 shard``, ``2 shards``."""
-    return f"{n:,} {what}{'' if n == 1 else 's'}"
-
-
 def share(part: int, whole: int) -> str:
     """``12.5%``, or a dash of nothing."""
     return f"{part / whole:.1%}" if whole else "-"
@@ -116,8 +112,7 @@ def counted(data: dict[str, Any], unit: str) -> str:
 
 def closed(data: dict[str, Any]) -> tuple[str, str]:
     """How many grasps have force closure."""
-    share = data["force_closure"]
-    return "force closure", "-" if share is None else f"{share:.1%}"
+    return "force closure", number(data["force_closure"], ".1%")
 
 
 def held(data: dict[str, Any]) -> list[tuple[str, str]]:

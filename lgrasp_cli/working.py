@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
+from lgrasp.words import plural
 from lgrasp_cli.names import DEVICES
 from lgrasp_cli.options import CacheDir, JsonPath, Quiet, check_report, given, open_cache, with_options
-from lgrasp_cli.tables import Block, plural, print_report
+from lgrasp_cli.tables import Block, print_report
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache

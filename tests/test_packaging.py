@@ -17,7 +17,7 @@ HEAVY = ("torch", "warp", "trimesh", "yourdfpy", "h5py", "scipy", "numpy", "coac
 DATA = ("hands", "objects", "pipelines", "configs", "models")
 
 ORDER = (
-    ("errors", "files", "paths", "notices", "choices", "config", "seeding", "signals"),
+    ("errors", "files", "paths", "notices", "choices", "config", "seeding", "signals", "words"),
     ("geometry", "math", "runtime"),
     ("hand", "object"),
     ("cloud", "differentiable", "field"),

@@ -7,7 +7,7 @@ from statistics import fmean
 from typing import Any
 
 import lgrasp
-from lgrasp.bench.page import Page, Published, caveats, number, over, times
+from lgrasp.bench.page import Page, Published, caveats, over, times
 from lgrasp.bench.page import Table as Texts
 from lgrasp.bench.rate import Bench
 from lgrasp.engine.cache import Cache
@@ -15,6 +15,7 @@ from lgrasp.errors import ConfigError, LgraspError, ObjectError
 from lgrasp.jobs.config import JobConfig, in_folder, plan_requests
 from lgrasp.object.find import find_object
 from lgrasp.runtime.device import resolve_device
+from lgrasp.words import number
 
 Table = dict[str, Any]
 Cell = dict[str, Any]

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 from lgrasp.config import Params, parse_model, read_yaml
 from lgrasp.errors import ConfigError
 from lgrasp.paths import data_dirs
+from lgrasp.words import number
 
 
 class Published(Params):
@@ -59,11 +60,6 @@ def caveats(published: dict[str, Any]) -> list[str]:
 def over(a: float | None, b: float | None) -> float | None:
     """a / b, None where one is missing or b is 0."""
     return a / b if a is not None and b else None
-
-
-def number(value: float | None, form: str = ",.0f", unit: str = "") -> str:
-    """A number as text, ``-`` for None."""
-    return "-" if value is None else f"{value:{form}}{unit}"
 
 
 def times(ratio: float | None) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import trimesh
 
-from lgrasp.bench.page import Page, Table, caveats, load_published, number, over
+from lgrasp.bench.page import Page, Table, caveats, load_published, over
 from lgrasp.choices import EngineName
 from lgrasp.cloud.model import cloud_object
 from lgrasp.engine.cache import Cache
@@ -38,6 +38,7 @@ from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.simulate.protocol import Protocol, find_protocol
 from lgrasp.simulate.run import check_installed, verdicts
 from lgrasp.simulate.scene import scene_of
+from lgrasp.words import number
 
 NOISES = (0.0, 0.002, 0.005, 0.01)
 """Standard deviations of the points of clouds, besides meshes [m]."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.bench.page import Page, Table, caveats, load_published, number, over, times
+from lgrasp.bench.page import Page, Table, caveats, load_published, over, times
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts
 from lgrasp.errors import ConfigError
@@ -26,6 +26,7 @@ from lgrasp.jobs.sequence.round import Verdicts, run_round
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
+from lgrasp.words import number, plural
 
 _RATES = ("held_per_s", "strict_per_s")
 _SHARE = ".1f", " %"
@@ -250,7 +251,7 @@ def _percent(part: int, whole: int) -> float | None:
 def sequence_page(result: dict[str, Any]) -> Page:
     """The tables as texts; published figures stand in parentheses beside what is counted as they are."""
     published, count = result["published"]["figures"], len(result["sequences"])
-    head = [f"{result['device']}: {count} sequence{'s' if count > 1 else ''} of objects; protocol {result['simulate']}"]
+    head = [f"{result['device']}: {plural(count, 'sequence')} of objects; protocol {result['simulate']}"]
     tables = []
     for method, found in result["methods"].items():
         title = f"{method}: {found['begun']} attempts started with each sequence"

@@ -16,7 +16,9 @@ from lgrasp.dataset.files import Paths, check_heaps
 from lgrasp.dataset.gather import sound_files
 from lgrasp.dataset.reader import ShardReader, count_rows
 from lgrasp.errors import ConfigError, ShardError
+from lgrasp.grasp.bounds import stored_bounds
 from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.grasp.wrench_space import FRICTION
 from lgrasp.notices import notice
 from lgrasp.picture.draw import draw_scene
 from lgrasp.picture.scene import GraspScene, HandShape, scene_of_row
@@ -25,7 +27,6 @@ from lgrasp.runtime.cores import cores
 from lgrasp.runtime.device import start
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 
-_FRICTION = 0.5  # where a shard does not say
 _KEPT = 16  # hands, and lists of objects, that stay in memory
 
 
@@ -216,7 +217,7 @@ def _contents(path: Path) -> _Contents:
     check_heaps(path)
     with ShardReader(path) as reader:
         try:
-            friction = float(reader.header.config["bounds"]["numbers"]["friction"])
+            friction = stored_bounds(reader.header.config).friction
         except (KeyError, TypeError, ValueError):  # of another writer
-            friction = _FRICTION
+            friction = FRICTION
         return _Contents(reader.hand(), reader.objects(), friction)

@@ -8,6 +8,7 @@ import warp as wp
 from lgrasp.grasp.collision import body_apart, body_depth
 from lgrasp.hand.arrays import Hand, HandArrays
 from lgrasp.math.kinematics import vec_dof
+from lgrasp.math.limits import MAX_DOFS
 from lgrasp.object.arrays import Object, ObjectArrays
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
@@ -64,11 +65,8 @@ def hold(
         any_setting: shared joints may still take any of their values; else they have those of q.
     """
     tree, d = hand.model.tree, hand.device
-    rows, groups = len(q), tree.groups
-    posture, bits = tree.by_group(q.astype(np.float32)), np.zeros((rows, groups), np.int32)
-    for g in range(groups):
-        columns = tree.dof_index[tree.dof_first[g] : tree.dof_first[g + 1]]
-        bits[:, g] = (frozen[:, columns] << np.arange(len(columns))).sum(1)
+    rows, posture = len(q), tree.by_group(q.astype(np.float32))
+    bits = (tree.by_group(frozen) << np.arange(MAX_DOFS)).sum(2).astype(np.int32)
     setting = np.full(rows, -1) if any_setting else _settings(q, tree.settings)
     held = upload_struct(Held, d, {"tries": tries, "posture": posture, "frozen": bits, "setting": setting})
     held.objects = len(objects)

@@ -92,6 +92,11 @@ class HandModel:
         return self.tree.groups
 
     @property
+    def contact_group(self) -> np.ndarray:
+        """Group of each contact point, (C,); the palm's is ``groups``."""
+        return np.repeat(np.arange(self.groups + 1), np.diff(self.contact_first))
+
+    @property
     def patches(self) -> int:
         """Contact patches of fingers and palm; those of group g are consecutive."""
         return int(self.contact_patch.max()) + 1

@@ -77,6 +77,10 @@ class Tree:
         coupled = self.coupled_mult * q[:, self.coupled_column] + self.coupled_offset
         return np.hstack([q, locked, coupled]).astype(q.dtype)
 
+    def own_dofs(self, group: int) -> np.ndarray:
+        """Columns of the joints that a group moves and no other does."""
+        return self.dof_index[self.dof_first[group] : self.dof_first[group] + self.dof_free[group]]
+
     def by_group(self, q: np.ndarray) -> np.ndarray:
         """Actuated joints q, shape [n, K], by group as kernels take them, shape [n, G, MAX_DOFS]."""
         out = np.zeros((len(q), self.groups, MAX_DOFS), q.dtype)

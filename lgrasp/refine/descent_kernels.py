@@ -2,9 +2,10 @@
 
 import warp as wp
 
+from lgrasp.grasp.collision import plane_height
 from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
 from lgrasp.math.limits import MAX_BODIES
-from lgrasp.refine.energy_gradient import Search, beyond, joint_pulls, point_pulls, solid_pulls, wrench_pulls
+from lgrasp.refine.energy_gradient import Search, joint_pulls, point_pulls, solid_pulls, wrench_pulls
 from lgrasp.refine.match_kernels import Correspondences, Points, Solids
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -195,9 +196,9 @@ def penetration(
     deep = float(-1.0e9)
     for i in range(m.block.shape[1]):
         x = wp.transform_point(body[row, points.body[i // points.block]], points.points[i])
-        deep = wp.max(deep, -beyond(m.block[row, i], x))
+        deep = wp.max(deep, -plane_height(m.block[row, i], x))
     each = m.deep.shape[1] // solids.body.shape[0]
     for i in range(m.deep.shape[1]):
         T = wp.transform_inverse(body[row, solids.body[i // each]])
-        deep = wp.max(deep, -beyond(m.deep_plane[row, i], wp.transform_point(T, m.deep[row, i])))
+        deep = wp.max(deep, -plane_height(m.deep_plane[row, i], wp.transform_point(T, m.deep[row, i])))
     penetration_out[row] = deep

@@ -8,6 +8,7 @@ import math
 
 import warp as wp
 
+from lgrasp.grasp.collision import plane_height
 from lgrasp.math.kinematics import Kinematics
 from lgrasp.math.transforms import transforms, vec3s
 from lgrasp.refine.match_kernels import Correspondences, Points, Solids
@@ -70,12 +71,6 @@ def _normal(plane: wp.vec4):
 
 
 @wp.func
-def beyond(plane: wp.vec4, x: wp.vec3):
-    """Signed distance of x from a plane."""
-    return plane[0] * x[0] + plane[1] * x[1] + plane[2] * x[2] - plane[3]
-
-
-@wp.func
 def wrench_pulls(
     points: Points, own: Volume, s: Search, m: Correspondences, row: wp.int32, X: transforms, F: vec3s, M: vec3s
 ):
@@ -113,14 +108,14 @@ def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, X:
             x = R * points.points[i] + t
             wall = m.block[row, i]
             f = wp.vec3()
-            u = beyond(wall, x) / s.margin
+            u = plane_height(wall, x) / s.margin
             if u < 1.0:
                 f = _normal(wall) * (s.barrier * _repulsion(u) / s.margin)
             pull = m.pull[row, i]
             if pull > 0.0:
                 plane = m.plane[row, i]
                 n = _normal(plane)
-                f += n * (2.0 * s.points * pull * beyond(plane, x) / (LENGTH * LENGTH))
+                f += n * (2.0 * s.points * pull * plane_height(plane, x) / (LENGTH * LENGTH))
                 own = R * points.normals[i]
                 moment += wp.cross(own, n) * (2.0 * s.normals * pull * (wp.dot(own, n) + 1.0))
             total += f
@@ -138,7 +133,7 @@ def solid_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, X:
         plane = m.deep_plane[row, i]
         b = solids.body[i // each]
         x = m.deep[row, i]
-        u = beyond(plane, wp.transform_point(wp.transform_inverse(X[b]), x)) / s.margin
+        u = plane_height(plane, wp.transform_point(wp.transform_inverse(X[b]), x)) / s.margin
         if u < 1.0:
             f = wp.transform_vector(X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.margin)
             F[b] = F[b] - f
@@ -151,7 +146,7 @@ def solid_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, X:
             a = solids.body[pair[0]]
             b = solids.body[pair[1]]
             x = wp.transform_point(X[a], m.link_deep[row, i])
-            u = beyond(plane, wp.transform_point(wp.transform_inverse(X[b]), x)) / s.link_margin
+            u = plane_height(plane, wp.transform_point(wp.transform_inverse(X[b]), x)) / s.link_margin
             if u < 1.0:
                 f = wp.transform_vector(X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.link_margin)
                 F[a] = F[a] + f

@@ -77,7 +77,7 @@ def room_left(free: np.ndarray, grasps: GraspTable, row: np.ndarray, context: Co
     tree, d = context.hand.model.tree, context.device
     counts = np.zeros((len(free), tree.groups), np.int32)
     for g in range(tree.groups):
-        own = tree.dof_index[tree.dof_first[g] : tree.dof_first[g] + tree.dof_free[g]]
+        own = tree.own_dofs(g)
         counts[:, g] = free[:, own].all(1) if len(own) else 0
     clear = wp.zeros(len(row), dtype=wp.int32, device=d)
     wp.launch(

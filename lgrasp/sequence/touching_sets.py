@@ -28,7 +28,7 @@ def touching_sets(grasps: TouchingGrasps, free: np.ndarray, context: Context) ->
     known = ((grasps.hand_point >= 0) & (grasps.object_point >= 0)).all(1)
     posture = tree.by_group(grasps.q.astype(np.float32))[:, :, None]
     for side, g in enumerate(context.space.groups):
-        own = tree.dof_index[tree.dof_first[g] : tree.dof_first[g] + tree.dof_free[g]] if g >= 0 else []
+        own = tree.own_dofs(g) if g >= 0 else []
         moves = free[:, own].any(1) if g >= 0 else np.zeros(rows, bool)
         palm_point[~moves] = grasps.hand_point[~moves, side]
         palm_surface[~moves] = grasps.object_point[~moves, side]

@@ -1,6 +1,6 @@
 """Scene and protocol -> a MuJoCo model, with the tables that map rows of a shard to its state."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -113,18 +113,9 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
         ) from None
     column = {name: k for k, name in enumerate(hand.joint_names)}
     joints = np.flatnonzero(model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
-    follows = {
-        int(model.eq_obj1id[e]): (int(model.eq_obj2id[e]), *model.eq_data[e, :2])
-        for e in range(model.neq)
-        if model.eq_type[e] == mujoco.mjtEq.mjEQ_JOINT
-    }
     matrix, offset = np.zeros((len(joints), len(column))), np.zeros(len(joints))
-    for row, joint in enumerate(joints):
-        factor, at = 1.0, int(joint)
-        while at in follows:  # a mimic joint: offset + multiplier x its source
-            source, shift, multiplier = follows[at]
-            offset[row] += factor * shift
-            factor, at = factor * multiplier, source
+    for row, (at, factor, shift) in enumerate(leaders(model, joints)):
+        offset[row] = shift
         if model.joint(at).name in column:
             matrix[row, column[model.joint(at).name]] = factor
     driven = [model.actuator(i).name for i in range(model.nu)]
@@ -150,6 +141,25 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
         table=_table_of(model) if protocol.table else TableBody(-1, np.zeros(0, int), np.zeros(0, int)),
         tables=tuple(solid.tables for solid in solids),
     )
+
+
+def leaders(model: Any, joints: Iterable[int]) -> list[tuple[int, float, float]]:
+    """For each joint of an MjModel the one that it follows, itself if none: position = factor x that one's + offset.
+
+    Returns:
+        Joint, factor and offset [rad or m].
+    """
+    equal = model.eq_type == import_mujoco().mjtEq.mjEQ_JOINT
+    follows = zip(model.eq_obj1id[equal], model.eq_obj2id[equal], model.eq_data[equal, :2].tolist(), strict=True)
+    source = {int(a): (int(b), shift, multiplier) for a, b, (shift, multiplier) in follows}
+    found = []
+    for joint in joints:
+        at, factor, offset = int(joint), 1.0, 0.0
+        while at in source:  # a mimic joint: offset + multiplier x its source
+            at, shift, multiplier = source[at]
+            factor, offset = factor * multiplier, offset + factor * shift
+        found.append((at, factor, offset))
+    return found
 
 
 def _table_of(model: Any) -> TableBody:

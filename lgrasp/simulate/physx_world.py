@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
 from lgrasp.runtime.optional import import_mujoco
-from lgrasp.simulate.model import Model
+from lgrasp.simulate.model import Model, leaders
 from lgrasp.simulate.verdict import WILD, links_touching
 
 CONTACT_OFFSET = 0.002
@@ -349,15 +349,8 @@ class PhysxWorld:
         Tendons of PhysX pass on too little of a torque, and what drives a joint after another one must not press on it.
         """
         m, driven = self._m, {int(j): a for a, j in enumerate(self._m.actuator_trnid[:, 0])}
-        equal = m.eq_type == self._mujoco.mjtEq.mjEQ_JOINT
-        follows = zip(m.eq_obj1id[equal], m.eq_obj2id[equal], m.eq_data[equal, :2], strict=True)
-        source = {int(a): (int(b), float(shift), float(factor)) for a, b, (shift, factor) in follows}
         members: dict[int, list[tuple[int, float, float]]] = {}
-        for joint in row:
-            at, factor, offset = joint, 1.0, 0.0
-            while at in source:
-                at, shift, multiplier = source[at]
-                offset, factor = offset + factor * shift, factor * multiplier
+        for joint, (at, factor, offset) in zip(row, leaders(m, row), strict=True):
             members.setdefault(at, []).append((joint, factor, offset))
         arm = np.where(m.jnt_type == self._mujoco.mjtJoint.mjJNT_SLIDE, self._model.protocol.lever, 1.0)
         for leader, some in members.items():

@@ -41,7 +41,7 @@ def find_touching(steering: Steering, model: HandModel, fingers: Fingers) -> Tou
         ConfigError: the hand has no such finger or link, or too little of it is left to hold anything.
     """
     points, groups = np.ones(len(model.contact_points), bool), np.ones(model.groups, bool)
-    group = np.repeat(np.arange(model.groups + 1), np.diff(model.contact_first))
+    group = model.contact_group
     if steering.links:
         points &= np.isin(model.contact_link, _links(list(steering.sides), model))
     if steering.palm == "no":
@@ -75,7 +75,7 @@ def describe_touching(
     Args:
         poses: T_hand_object that are asked for, (T, 7); told if there are at most MOST_POSES.
     """
-    group = np.repeat(np.arange(model.groups + 1), np.diff(model.contact_first))
+    group = model.contact_group
 
     def links(some: np.ndarray) -> list[str]:
         return [model.tree.link_names[link] for link in np.unique(model.contact_link[some & touching.points])]

@@ -136,8 +136,7 @@ class HandView:
 
     def _patches(self) -> _Nodes:
         model = self._model
-        group = np.searchsorted(model.contact_first, np.arange(len(model.contact_points)), "right") - 1
-        colours = np.array([rgb(colour) for colour in OBJECTS], np.uint8)[group % len(OBJECTS)]
+        colours = np.array([rgb(colour) for colour in OBJECTS], np.uint8)[model.contact_group % len(OBJECTS)]
         return self._points("patches", model.contact_link, model.contact_points, colours)
 
     def _palmar(self) -> _Nodes:

@@ -14,6 +14,7 @@ from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.selection import ExportObject, Selection
 from lgrasp.errors import OutputError
 from lgrasp.files import remove_leftovers, write_file
+from lgrasp.words import listed
 
 
 def check_empty(out: Path, run_key: str = "") -> None:
@@ -43,6 +44,7 @@ HAND, OBJECTS, GRASPS = "hand", "objects", "grasps"
 CSPACE_POSTURES = ("cspace_position", "pregrasp_cspace_position", "squeeze_cspace_position")
 """Names of the joints at the grasp, before it, and as targets, in NVIDIA's formats."""
 INDEX, INDEX_FORMAT = "export.json", "lgrasp-export"
+_FEW = 8  # names in the README
 _UNFINISHED = "unfinished.json"  # what becomes the index
 
 
@@ -174,16 +176,12 @@ def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Seq
     return _TEXT.format(
         rows=selection.rows,
         hand=selection.hand.name,
-        shards=_few([path.name for path in selection.shards]),
+        shards=listed([path.name for path in selection.shards], _FEW),
         chosen=f", only rows with {' and '.join(conditions)}" if conditions else "",
         hand_folder=HAND,
         objects_folder=OBJECTS,
-        objects=_few([f"{item.code} ({count:,})" for item, count in counts]),
+        objects=listed([f"{item.code} ({count:,})" for item, count in counts], _FEW),
         notes=notes.format(root=frames.root, base=frames.base, table=_TABLE if selection.on_table else ""),
         joints="\n".join(f"  {i:3d}  {name:{width}s}  {a:8.4f} to {b:.4f}" for i, (name, a, b) in enumerate(limits)),
         mimics="\n".join(["", heading, *mimics, ""]) if mimics else "",
     )
-
-
-def _few(names: list[str]) -> str:
-    return ", ".join(names[:8]) + (f" and {len(names) - 8:,} more" if len(names) > 8 else "")

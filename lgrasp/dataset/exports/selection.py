@@ -18,6 +18,7 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.schema import CHUNK_ROWS
 from lgrasp.simulate.protocol import HOLDS
+from lgrasp.words import plural
 
 
 class ExportObject(NamedTuple):
@@ -195,7 +196,7 @@ def select_rows(
     assert hand is not None
     if not chosen:
         why = f"none satisfies {' and '.join(map(str, where))}" if where and seen else "there are none"
-        of = f"{len(sources)} shard{'s' * (len(sources) > 1)}, {seen:,} rows"
+        of = f"{plural(len(sources), 'shard')}, {seen:,} rows"
         raise ShardError(f"{source}: no rows to export; {why} ({of})")
     objects = list(known.values())
     counts = np.bincount(np.concatenate([s.index[s.index >= 0] for s in sources]), minlength=len(objects))

@@ -21,13 +21,13 @@ from lgrasp.dataset.report.tables import (
     Block,
     diversity_table,
     held_tables,
-    number,
     physics_table,
     protocol_list,
     run_tables,
     validity_table,
 )
 from lgrasp.dataset.report.verdicts import passed_words
+from lgrasp.words import number, plural
 
 
 def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows], pictures: Sequence[Block] = ()) -> str:
@@ -39,7 +39,7 @@ def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows], pic
     objects = [" + ".join(group["objects"]) for hand in numbers["hands"] for group in hand["objects"]]
     names = [hand["hand"] for hand in numbers["hands"]]
     what = names[0] if len(names) == 1 else f"{len(names)} hands"
-    whole = objects[0] if len(names) == len(objects) == 1 else f"{len(objects)} object{'s' * (len(objects) != 1)}"
+    whole = objects[0] if len(names) == len(objects) == 1 else plural(len(objects), "object")
     title = f"Grasps: {number(numbers['rows'])} of {what} with {whole}"
     blocks = [*_head(numbers), *pictures]
     for data, rows in zip(numbers["hands"], hands.values(), strict=True):

@@ -10,6 +10,7 @@ from lgrasp.dataset.files import Paths, check_heaps
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.grasp.records import ShardHeader
+from lgrasp.words import listed
 
 
 class Head(NamedTuple):
@@ -91,11 +92,7 @@ def _remarks(heads: list[Head]) -> list[str]:
     empty = [head.path.name for head in heads if not head.rows]
     remarks = []
     if twice:
-        remarks.append(f"The same shard of a run is in {_listed(sorted(twice))}: its rows are counted twice.")
+        remarks.append(f"The same shard of a run is in {listed(sorted(twice), 3)}: its rows are counted twice.")
     if empty:
-        remarks.append(f"No rows are in {_listed(empty)}.")
+        remarks.append(f"No rows are in {listed(empty, 3)}.")
     return remarks
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -4,13 +4,10 @@ import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from lgrasp.words import number, plural
+
 Block = dict[str, Any]
 """A part of the page, as page.html takes it."""
-
-
-def number(value: int) -> str:
-    """An integer with separators."""
-    return f"{value:,}"
 
 
 def table(
@@ -59,7 +56,7 @@ def run_tables(data: dict[str, Any]) -> list[Block]:
     """The origin of a hand's rows, and the survivors of each stage."""
     about = [
         ("hand", f"{data['hand']} ({data['sha256'][:12]}…), {len(data['joints'])} joints"),
-        ("rows", f"{number(data['rows'])} in {number(data['shards'])} shard{'s' if data['shards'] != 1 else ''}"),
+        ("rows", f"{number(data['rows'])} in {plural(data['shards'], 'shard')}"),
         ("made", " to ".join(dict.fromkeys(data["created"])) + f", lgrasp {', '.join(data['lgrasp_versions'])}"),
     ]
     if types := data["grasp_types"]:
@@ -74,15 +71,11 @@ def run_tables(data: dict[str, Any]) -> list[Block]:
         for name, left in run["survivors"].items():
             counts = sorted(run["counts"][name].items(), key=lambda c: -c[1])
             told = ", ".join(f"{what} {number(n)}" for what, n in counts)
-            rows.append([name, number(left), _number(run["seconds"].get(name), ",.1f"), told])
+            rows.append([name, number(left), number(run["seconds"].get(name), ",.1f"), told])
         if rows:
             caption = f"Survivors per stage of {run['pipeline']}, all shards together"
             out.append(table(("stage", "survivors", "seconds", "counts"), rows, caption=caption, text=(3,)))
     return [table(("", ""), about, text=(1,)), *out]
-
-
-def _number(value: float | None, style: str) -> str:
-    return "-" if value is None else f"{value:{style}}"
 
 
 def validity_table(data: dict[str, Any]) -> Block:
@@ -152,7 +145,7 @@ def held_tables(data: dict[str, Any]) -> list[Block]:
     holds = [f"hold ({name})" for name in protocols]
 
     def shares(group: dict[str, Any]) -> list[str]:
-        return [_number(group["physics"].get(name, {}).get("share"), ".1%") for name in protocols]
+        return [number(group["physics"].get(name, {}).get("share"), ".1%") for name in protocols]
 
     rows = []
     for n, group in held.items():
@@ -180,11 +173,11 @@ def physics_table(data: dict[str, Any]) -> Block:
     columns = ["object", "protocol", "run", "holds", "mass [g]", *(head for _, head, _, _ in more)]
     for group in data["objects"]:
         for name, found in sorted(group["physics"].items()):
-            cells = [" + ".join(group["objects"]), name, number(found["run"]), _number(found["share"], ".1%")]
+            cells = [" + ".join(group["objects"]), name, number(found["run"]), number(found["share"], ".1%")]
             cells.append(_mass(found["protocols"]))
             for column, _, factor, style in more:
                 mean = found["means"].get(column)
-                cells.append(_number(None if mean is None else factor * mean, style))
+                cells.append(number(None if mean is None else factor * mean, style))
             rows.append(cells)
     caption = "Means over the grasps that were run; links: of the hand, in contact with the object."
     if drawn:

@@ -9,6 +9,7 @@ from lgrasp.dataset.report.tables import Block, table
 from lgrasp.dataset.report.write import pictures
 from lgrasp.files import write_file
 from lgrasp.jobs.compare.measure import MEANS
+from lgrasp.words import number
 
 COLUMNS = (  # number, head, factor, format
     ("rows", "rows", 1, ",.0f"),
@@ -40,7 +41,7 @@ def cells(found: Mapping[str, Any], columns: Sequence[tuple[str, str, float, str
             value = value["mean"]
         elif isinstance(value, Sequence):
             value = value[0]
-        texts.append("-" if value is None else f"{factor * value:{style}}")
+        texts.append(number(None if value is None else factor * value, style))
     return texts
 
 

@@ -165,7 +165,7 @@ def _patches(model: HandModel) -> _Paint:
     def paint(samples: SurfaceSamples, mesh: trimesh.Trimesh) -> _Faces:
         rows = np.flatnonzero(model.contact_link == model.tree.link_names.index(samples.link))
         if len(rows):
-            group = int(np.searchsorted(model.contact_first, rows[0], "right")) - 1
+            group = model.contact_group[rows[0]]
             colour = _PALM if group == model.groups else _COLOURS[group % len(_COLOURS)]
             yield _near_faces(mesh, model.contact_points[rows], model.contact_normals[rows]), colour
 

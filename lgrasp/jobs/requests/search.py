@@ -42,14 +42,11 @@ class SearchRequest(Request):
         if self.shard_rows <= 0:
             raise ConfigError(f"--shard-rows {self.shard_rows}: must be at least 1")
         check_number(self.known_parts, "shards; use larger --shard-rows or several --out")
-        if self.pipeline.on_table and (self.pipeline.sequence is not None or "refine" in self.pipeline.order):
-            raise ConfigError(
-                f"pipeline '{self.pipeline.name}' with place.table: only for one object, and without stage refine"
-            )
-        if self.pipeline.steer.asks and (self.pipeline.sequence is not None or "refine" in self.pipeline.order):
-            raise ConfigError(
-                f"pipeline '{self.pipeline.name}' with steer: only for one object, and without stage refine"
-            )
+        for what, asked in {"place.table": self.pipeline.on_table, "steer": self.pipeline.steer.asks}.items():
+            if asked and (self.pipeline.sequence is not None or "refine" in self.pipeline.order):
+                raise ConfigError(
+                    f"pipeline '{self.pipeline.name}' with {what}: only for one object, and without stage refine"
+                )
         if self.pipeline.steer.above and self.pipeline.params("place").table:
             raise ConfigError(f"pipeline '{self.pipeline.name}': steer.above and place.table are one or the other")
         simulated = "simulate" in self.pipeline.order and find_protocol(self.pipeline.params("simulate").protocol)

@@ -27,6 +27,7 @@ from lgrasp.runtime.kept import Keeper
 from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import verdicts
+from lgrasp.words import plural
 
 
 class SequenceJob(SequenceRequest, SearchJob):
@@ -172,7 +173,7 @@ def _unheld(inputs: SequenceInputs, results: Sequence[SequenceResult]) -> str:
     why = "; ".join(f"{space}: stage {stage}, {words}" for space, (stage, words) in reasons.items())
     return (
         f"object {step + 1} ({path}, {sides} mm) is held by no opposition space of hand '{inputs.hand.name}'"
-        + (f" after {step} other object{'s' if step > 1 else ''}" if step else "")
+        + (f" after {plural(step, 'other object')}" if step else "")
         + f": {why or 'none was left'}; --scale changes its size"
     )
 
