@@ -1,6 +1,7 @@
 """Names that options take: the shell completes them, and a wrong one is told before anything heavy is imported."""
 
 from collections.abc import Callable, Iterable
+from importlib import import_module
 from typing import Any, get_args
 
 import typer
@@ -52,68 +53,30 @@ def one_of(choice: Any, kind: str, what: str) -> dict[str, Any]:
     return named(shown, lambda: names, read) | {"help": what}
 
 
+def _call(place: str, *values: str) -> Any:
+    """What ``module:function`` gives; the module is imported now."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)(*values)
+
+
+def _listed_by(place: str) -> Callable[[], Iterable[str]]:
+    return lambda: _call(place)
+
+
+def _found_by(place: str) -> Callable[[str, str], str]:
+    """Leaves names as they are; ``module:function`` raises where there is none of that name."""
+
+    def read(name: str, flag: str) -> str:
+        _call(place, name)
+        return name
+
+    return read
+
+
 def _hands() -> Iterable[str]:
     from lgrasp.hand.names import PACKAGE_HANDS, known_hands
 
     return (*known_hands(), *PACKAGE_HANDS)
-
-
-def _hand(name: str, flag: str) -> str:
-    from lgrasp.hand.names import hand_path
-
-    hand_path(name)
-    return name
-
-
-def _objects() -> Iterable[str]:
-    from lgrasp.object.find import list_objects
-
-    return list_objects()
-
-
-def _object(name: str, flag: str) -> str:
-    from lgrasp.object.find import find_object
-
-    find_object(name)
-    return name
-
-
-def _pipelines() -> Iterable[str]:
-    from lgrasp.engine.pipeline import pipeline_files
-
-    return pipeline_files()
-
-
-def _networks() -> Iterable[str]:
-    from lgrasp.learn.networks import known_networks
-
-    return known_networks()
-
-
-def _network(name: str, flag: str) -> str:
-    from lgrasp.learn.networks import find_network
-
-    find_network(name)
-    return name
-
-
-def _configs() -> Iterable[str]:
-    from lgrasp.jobs.config import config_files
-
-    return config_files()
-
-
-def _grasp_types() -> Iterable[str]:
-    from lgrasp.steer.grasp_types import type_names
-
-    return type_names()
-
-
-def _grasp_type(name: str, flag: str) -> str:
-    from lgrasp.steer.grasp_types import find_type
-
-    find_type(name)
-    return name
 
 
 def _device(name: str, flag: str) -> str:
@@ -134,14 +97,20 @@ def _as_given(name: str, flag: str) -> str:
     return name
 
 
-HAND = named("HAND", _hands, _hand)
-OBJECT = named("OBJECT", _objects, _object)
-GRASP_TYPE = named("NAME", _grasp_types, _grasp_type)
-NETWORK = named("MODEL", _networks, _network)
+_objects = _listed_by("lgrasp.object.find:list_objects")
+HAND = named("HAND", _hands, _found_by("lgrasp.hand.names:hand_path"))
+OBJECT = named("OBJECT", _objects, _found_by("lgrasp.object.find:find_object"))
+GRASP_TYPE = named(
+    "NAME", _listed_by("lgrasp.steer.grasp_types:type_names"), _found_by("lgrasp.steer.grasp_types:find_type")
+)
+NETWORK = named(
+    "MODEL", _listed_by("lgrasp.learn.networks:known_networks"), _found_by("lgrasp.learn.networks:find_network")
+)
 DEVICE = named("[auto|cpu|cuda:N]", lambda: ("auto", "cpu", "cuda:0"), _device)
 DEVICES = named("[auto|cpu|cuda:N|all]", lambda: ("auto", "cpu", "cuda:0", "all"), _devices)
 # read by the command itself, before it imports anything heavy
 HAND_OR_SHARD, OBJECT_OR_SHARD = named("HAND", _hands, _as_given), named("OBJECT", _objects, _as_given)
 HANDS, OBJECTS = named("HAND", _hands, _as_given), named("OBJECT", _objects, _as_given)
 HAND_OR_OBJECT = named("WHAT", lambda: (*_hands(), *_objects()), _as_given)
-PIPELINE, CONFIG = named("PIPELINE", _pipelines, _as_given), named("CONFIG", _configs, _as_given)
+PIPELINE = named("PIPELINE", _listed_by("lgrasp.engine.pipeline:pipeline_files"), _as_given)
+CONFIG = named("CONFIG", _listed_by("lgrasp.jobs.config:config_files"), _as_given)
