@@ -4,9 +4,11 @@ import ast
 import contextlib
 import importlib
 import io
+import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from support.places import ROOT
@@ -75,3 +77,18 @@ def test_page_of_python_runs(tmp_path, monkeypatch, cache_root):
             exec(compile(code, "python.md", "exec"), names)
         said = out.getvalue()
     assert [path.name for path in tmp_path.iterdir()] == ["best.h5"]
+
+
+def test_notebook_runs(tmp_path, monkeypatch, cache_root):
+    """Its cells one after another, but for the one that installs; the last of them exports."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LGRASP_CACHE_DIR", str(cache_root))
+    notebook = json.loads((ROOT / "docs" / "guides" / "first_grasps.ipynb").read_text(encoding="utf-8"))
+    assert not any(cell.get("outputs") for cell in notebook["cells"])
+    install, *cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert install.startswith("%pip install")
+    names: dict = {}
+    for code in cells:
+        exec(compile(code.replace("n=40", "n=4"), "first_grasps.ipynb", "exec"), names)
+    assert len(names["grasps"]) == 4
+    assert any(Path("mug-isaac").iterdir())
