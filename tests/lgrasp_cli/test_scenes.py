@@ -115,7 +115,7 @@ def test_ctrl_c_leaves_whole_scenes(process, config, cli, tmp_path):
     running.send_signal(signal.SIGINT)
     _, err = running.communicate(timeout=60)
     assert running.returncode == 130, err
-    assert "Run the same command again to resume" in err
+    assert "the same command makes the rest" in err
     assert cli("scenes", "check", *(tmp_path / "out").glob("*.h5")).code == 0
     assert " of 500 shards are missing" in cli("scenes", "check", "out").err
     assert not list((tmp_path / "out").glob("*.tmp"))

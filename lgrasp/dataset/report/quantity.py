@@ -20,7 +20,7 @@ class Quantity:
     factor: float = 1.0
     """From the file's unit to ``unit``."""
     bound: float | None = None
-    """Largest value of a strict-valid grasp, in ``unit``."""
+    """Largest value of a strictly valid grasp, in ``unit``, as the judge has it."""
     highest_is_worst: bool = True
 
 

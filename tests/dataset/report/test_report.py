@@ -1,6 +1,7 @@
 """lgrasp dataset report: the page stands alone, and its numbers are those of the rows."""
 
 import json
+import math
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -23,6 +24,7 @@ from lgrasp.dataset.report.write import read_dataset, report_dataset
 from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.judge import bounds as judge_bounds
 from lgrasp_cli.dataset import app
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}
@@ -284,6 +286,14 @@ def test_sample_of_any_cut(sizes, limit):
     assert len(held) <= limit
     np.testing.assert_array_equal(held, rows[:: sample.step])
     assert sample.step == 1 or 2 * len(held) >= limit
+
+
+def test_bounds_are_those_of_the_judge():
+    shown = {q.name: q.bound / q.factor for q in QUANTITIES if q.bound is not None}
+    names = {"penetration": "PENETRATION", "self_penetration": "SELF_PENETRATION", "gap": "CONTACT_DISTANCE"}
+    judged = {name: getattr(judge_bounds, constant) for name, constant in names.items()}
+    judged |= {"normal_error": math.radians(judge_bounds.NORMAL_DEG), "gswo": judge_bounds.RESIDUAL}
+    assert shown == pytest.approx(judged)
 
 
 def test_quantiles():
