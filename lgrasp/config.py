@@ -66,7 +66,7 @@ DeviceName = Annotated[str, AfterValidator(device_name), Field(description="auto
 Workers = Annotated[int, Field(ge=0, description="Threads or processes; 0: by device.")]
 HandName = Annotated[str, Field(description="Name or path.")]
 HandNames = Annotated[tuple[str, ...], Field(min_length=1, description="Names, paths, folders of hands, or globs.")]
-MeshScale = Annotated[float, Field(gt=0, description="Factor from the meshes' unit to metres.")]
+MeshScale = Annotated[float, Field(gt=0, allow_inf_nan=False, description="Factor from the meshes' unit to metres.")]
 Negatives = Annotated[
     float, Field(ge=0, le=100, description="Failed rows kept for each grasp, with metric valid 0 and failed_bound.")
 ]

@@ -34,7 +34,10 @@ class _Head(Params):
         default=400,
         ge=1,
         le=10**6,
-        description="Candidates tried per requested row before giving up; 16 times as many if that promises the rows.",
+        description="Candidates tried per requested row before giving up.",
+    )
+    patience: int = Field(
+        default=16, ge=1, le=10**4, description="Times its effort that a shard may try while that promises the rows."
     )
 
 

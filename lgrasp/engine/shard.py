@@ -27,7 +27,6 @@ from lgrasp.stages.context import Context
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
 _LEAST_PLACED = 65_536  # candidates of which one must be placed where poses are steered, else a shard ends
 _EFFORT_STEP = 1024  # candidates: what a shard may try is a multiple of it
-_PATIENCE = 16  # times its effort that a shard may try where grasps are rare
 _CPU_BATCH, _CPU_LARGEST = 256, 512  # candidates of a batch; the second with several passes
 _PHYSICS_BATCH = 64  # candidates, when their grasps are simulated on the CPU, which takes long
 _GPU_SMALLEST, _GPU_LARGEST = 2_048, 65_536  # candidates of a batch
@@ -114,10 +113,10 @@ def shard_effort(pipeline: Pipeline, rows: int) -> int:
 def gave_up(pipeline: Pipeline, rows: int, found: int, tried: int) -> bool:
     """Whether a shard that has only ``found`` of its rows ends after some candidates.
 
-    Beyond its effort it goes on while 16 times that promise half of the rows at least.
+    Beyond its effort it goes on while all that it may try promises half of the rows at least.
     """
     effort = shard_effort(pipeline, rows)
-    most = min(_PATIENCE * effort, _STREAM)
+    most = min(pipeline.patience * effort, _STREAM)
     return tried >= most or (tried >= effort and 2 * found * most < rows * tried)
 
 

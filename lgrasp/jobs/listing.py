@@ -121,7 +121,7 @@ def describe_pipeline(name: str) -> dict[str, Any]:
     parts = [*((name, getattr(pipeline, name)) for name in ("bounds", "steer", "object", "field")), *sections]
     rows: list[tuple[str, str, Any, str]] = [
         ("", "seed", pipeline.seed, "Base seed of all stages."),
-        ("", "effort", pipeline.effort, type(pipeline).model_fields["effort"].description or ""),
+        *(("", key, getattr(pipeline, key), _meaning(pipeline, key)) for key in ("effort", "patience")),
     ]
     for part, params in parts:
         for key, value in params.model_dump(mode="json").items():

@@ -154,15 +154,14 @@ class TestStarving:
     @pytest.fixture(autouse=True)
     def _short_effort(self, monkeypatch):
         monkeypatch.setattr(shard_module, "_LEAST_EFFORT", 1024)
-        monkeypatch.setattr(shard_module, "_PATIENCE", 1)
 
     @pytest.fixture
     def poor(self, swift):
-        return swift.model_copy(update={"effort": 1})
+        return swift.model_copy(update={"effort": 1, "patience": 1})
 
     @pytest.fixture
     def hopeless(self, swift):
-        return swift.with_params("search", least_force=0.5).model_copy(update={"effort": 1})
+        return swift.with_params("search", least_force=0.5).model_copy(update={"effort": 1, "patience": 1})
 
     def test_starved_shards_are_present(self, run, poor, raw_grasps, tmp_path):
         first = run(rows=2000, shard_rows=1000, pipeline=poor)
