@@ -115,9 +115,13 @@ def gave_up(pipeline: Pipeline, rows: int, found: int, tried: int) -> bool:
 
     Beyond its effort it goes on while all that it may try promises half of the rows at least.
     """
-    effort = shard_effort(pipeline, rows)
-    most = min(pipeline.patience * effort, _STREAM)
-    return tried >= most or (tried >= effort and 2 * found * most < rows * tried)
+    most = _most_effort(pipeline, rows)
+    return tried >= most or (tried >= shard_effort(pipeline, rows) and 2 * found * most < rows * tried)
+
+
+def _most_effort(pipeline: Pipeline, rows: int) -> int:
+    """Candidates that a shard of ``rows`` rows may try."""
+    return min(pipeline.patience * shard_effort(pipeline, rows), _STREAM)
 
 
 def shard_context(pipeline: Pipeline, inputs: Inputs, shard: int) -> Context:
@@ -171,7 +175,8 @@ def make_shard(
     block = block_size(pipeline)
     found = _Rows(inputs, RowOrder(pipeline.seed, shard, block), rows, graphs.capturing if graphs else nullcontext())
     result = found.result
-    if bank and (account := bank.load(rows, whole=resume)):
+    account = bank.load(rows, whole=resume) if bank else None
+    if account:
         found.restore(account)
     earlier, start = result.wall, time.perf_counter()
     fixed, passes = _fixed_batch(context, execution), pipeline.params("search").passes
@@ -216,10 +221,12 @@ def make_shard(
         if found.count >= rows or not result.counts["place"]["kept"]:
             return
         search(limit)
-        while found.count < rows and not (
-            limit == result.candidates and gave_up(pipeline, rows, found.count, result.candidates)
-        ):
-            limit = min(2 * limit, _STREAM)
+        most = _most_effort(pipeline, rows)
+        while found.count < rows and limit < most:
+            # asked at the same places after an interruption
+            if result.candidates <= limit and gave_up(pipeline, rows, found.count, limit):
+                return
+            limit = min(2 * limit, most)
             search(limit)
 
     try:
@@ -234,7 +241,7 @@ def make_shard(
     result.exhausted = found.count < rows
     if bank and banked:
         bank.store(found.account())
-    elif bank:
+    elif bank and account:
         bank.discard()
     return result
 

@@ -109,6 +109,9 @@ def test_goes_on_where_that_promises_the_rows(swift, inputs, monkeypatch):
     poor = swift.model_copy(update={"effort": 1})
     first, second = (make_shard(poor, inputs, 0, 600, Execution(2, batch)) for batch in (256, 512))
     assert first.candidates > 1024
+    impatient = make_shard(poor.model_copy(update={"patience": 1}), inputs, 0, 600, Execution(2, 256))
+    assert impatient.candidates == 1024
+    assert impatient.exhausted
     assert not first.exhausted
     np.testing.assert_array_equal(first.grasps.index, second.grasps.index)
     assert shard_module.gave_up(poor, 100, 1, 1024)  # 16 times the effort would give 16
