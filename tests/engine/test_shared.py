@@ -30,8 +30,8 @@ def cache(cache_root) -> Cache:
 @pytest.mark.parametrize("name", ["barrett", "schunk_svh"])
 def test_rows_take_the_listed_values_and_are_valid(name, cache, tmp_path):
     pipeline = load_pipeline("swift").model_copy(update={"field": FIELD})
-    outcome = generate(GenerateJob(hand=name, object="sphere", rows=60, pipeline=pipeline, out=tmp_path, cache=cache))
-    assert outcome.rows == 60
+    outcome = generate(GenerateJob(hand=name, object="sphere", rows=36, pipeline=pipeline, out=tmp_path, cache=cache))
+    assert outcome.rows == 36
     shard = read_shard(outcome.paths[0])
     names = list(shard.hand.joint_names)
     shared = find_hand(name).spec.shared
