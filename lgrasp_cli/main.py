@@ -105,15 +105,20 @@ def main() -> None:
     on_notice(warn)
     sys.argv[1:] = renew(sys.argv[1:], options_of(sys.argv[1:]))
     if os.environ.get("LGRASP_DEBUG"):
-        code = program()(prog_name="lgrasp", standalone_mode=False)
-        sys.exit(code if isinstance(code, int) else 0)
+        sys.exit(_exit_code())
     try:
-        _refuse_empty(["lgrasp", *sys.argv[1:]])
-        code = program()(prog_name="lgrasp", standalone_mode=False)
+        code = _exit_code()
         sys.stdout.flush()
     except BaseException as error:
         _leave(*_explain(error))
-    sys.exit(code if isinstance(code, int) else 0)
+    sys.exit(code)
+
+
+def _exit_code() -> int:
+    """Run the command that the words name; its exit code."""
+    _refuse_empty(["lgrasp", *sys.argv[1:]])
+    code = program()(prog_name="lgrasp", standalone_mode=False)
+    return code if isinstance(code, int) else 0
 
 
 def _refuse_empty(words: Sequence[str]) -> None:

@@ -30,12 +30,7 @@ class _Head(Params):
     name: str
     description: str = ""
     seed: Seed = 0
-    effort: int = Field(
-        default=400,
-        ge=1,
-        le=10**6,
-        description="Candidates tried per requested row before giving up.",
-    )
+    effort: int = Field(default=400, ge=1, le=10**6, description="Candidates tried per requested row before giving up.")
     patience: int = Field(
         default=16, ge=1, le=10**4, description="Times its effort that a shard may try while that promises the rows."
     )

@@ -7,6 +7,7 @@ import numpy as np
 from lgrasp.engine.batch import run_stage
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.field.model import ContactField
+from lgrasp.geometry.poses import device_rotation
 from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable, PoseTable, select_poses
 from lgrasp.learn.params import PosePolicyParams
@@ -101,14 +102,8 @@ def _batch(
 def _placed(poses: PoseTable, context: Context) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses (P, 7), the object's centre of mass at each (P, 3) [m], and whether the palm touches (P,)."""
     pose = to_numpy(poses.pose)[: len(poses)]
-    com = _turned(pose, np.broadcast_to(context.object.model.com, (len(pose), 3))) + pose[:, :3]
+    com = device_rotation(pose).apply(context.object.model.com) + pose[:, :3]
     return pose, com, to_numpy(poses.palm_point)[: len(poses)] >= 0
-
-
-def _turned(pose: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vectors (P, 3) of the object in the base frame, one for each pose (P, 7)."""
-    axis, w = pose[:, 3:6], pose[:, 6:]
-    return v + 2 * np.cross(axis, np.cross(axis, v) + w * v)
 
 
 def seen_reach(reach: Reach, com: np.ndarray, palm: np.ndarray) -> Seen:
@@ -136,8 +131,9 @@ def seen_contacts(table: CandidateTable, context: Context) -> Seen:
     i = to_numpy(table.surface)[:n][row, g, m]
     model = context.object.model
     hits = np.zeros((n, mine.shape[1], MOST_HITS, 6), np.float32)
-    p = _turned(pose[row], model.contact_points[i]) + pose[row, :3]
-    hits[row, g, place[row, g, m]] = np.concatenate([p, -_turned(pose[row], model.contact_normals[i])], 1)
+    R = device_rotation(pose[row])
+    p = R.apply(model.contact_points[i]) + pose[row, :3]
+    hits[row, g, place[row, g, m]] = np.concatenate([p, -R.apply(model.contact_normals[i])], 1)
     count = mine.sum(2)
     none = np.zeros((n, 0), np.float32)
     return Seen(hits, np.minimum(count, MOST_HITS), count / np.float32(COUNT_SCALE), com, palm, none)
