@@ -21,10 +21,18 @@ from lgrasp.grasp.check_kernels import (
     pack_rows,
 )
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
+from lgrasp.grasp.collision import depth_parts
 from lgrasp.grasp.control_kernels import control_poses, drop_limp, limit_squeeze, press_shared
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome, failed_squeeze
-from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, open_fingers, open_poses, try_fingers
+from lgrasp.grasp.pregrasp_kernels import (
+    FINGER_TRIES,
+    OPENING_SHARES,
+    open_fingers,
+    open_poses,
+    try_fingers,
+    try_openings,
+)
 from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, drop_light, grasp_epsilon, resist_loads
 from lgrasp.grasp.stability_kernels import find_stable_squeeze
 from lgrasp.grasp.tables import GraspTable, take_rows
@@ -65,8 +73,9 @@ class Check:
 
     def measure(self, part: int, obj: ObjectArrays | None = None) -> None:
         """Measure the penetration of a part of the hands and the object, or another one."""
-        inputs = [self.hand.struct, (obj or self.obj).struct, self.limits, part, self.at]
-        wp.launch(measure_penetration, (self.bodies, len(self)), inputs, [self.found], device=self.hand.device)
+        d, runs = self.hand.device, depth_parts(self.hand.device)
+        inputs = [self.hand.struct, (obj or self.obj).struct, self.limits, part, runs, self.at]
+        wp.launch(measure_penetration, (runs, self.bodies, len(self)), inputs, [self.found], device=d)
 
     def measure_held(self) -> None:
         """The same of the hands, the object and what is held already."""
@@ -173,9 +182,10 @@ class Check:
             wp.launch(press_shared, m, inputs, [packed], device=d)
         wp.launch(find_stable_squeeze, m, inputs, [packed], device=d)
         wp.launch(limit_squeeze, m, [hand, limits, row], [packed], device=d)
-        stuck = wp.zeros(1 + m, dtype=wp.int32, device=d)
+        tried, stuck = wp.zeros(m, dtype=wp.int32, device=d), wp.zeros(1 + m, dtype=wp.int32, device=d)
         inputs = [hand, obj, self.held.struct, limits, at, opened, row]
-        wp.launch(open_poses, m, inputs, [packed, stuck], device=d)
+        wp.launch(try_openings, (OPENING_SHARES, m), inputs, [tried], device=d)
+        wp.launch(open_poses, m, [hand, at, opened, row, tried], [packed, stuck], device=d)
         clear = wp.zeros((m, model.groups), dtype=wp.int32, device=d)
         wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)
         inputs = [hand, self.held.struct, limits, at, opened, row, stuck, clear]

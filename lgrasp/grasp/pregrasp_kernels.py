@@ -14,8 +14,9 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_OPENING_SHARES = wp.constant(5)  # of the way open that are tried
-FINGER_TRIES = wp.constant(2 * _OPENING_SHARES)
+OPENING_SHARES = wp.constant(5)
+"""Shares of the way open that are tried."""
+FINGER_TRIES = wp.constant(2 * OPENING_SHARES)
 """Postures of a finger that is opened by itself."""
 _NOT_TOUCHING = wp.constant(1.0e6)  # opening of a hand no finger of which touches
 
@@ -58,8 +59,14 @@ def put_pregrasp(hand: Hand, g: wp.int32, x: vec_dof, q: vec_dof, i: wp.int32, p
     return moved
 
 
+@wp.func
+def _opened_share(q: vec_dof, opened: vec_dof, t: wp.int32):
+    """A finger on its way from q to ``opened``: all of it at try 0, less at each."""
+    return q + (1.0 - float(t) / float(OPENING_SHARES)) * (opened - q)
+
+
 @wp.kernel
-def open_poses(
+def try_openings(
     hand: Hand,
     obj: Object,
     held: Held,
@@ -67,50 +74,71 @@ def open_poses(
     at: CheckedPostures,
     opened: wp.array2d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
-    packed_out: Packed,
-    stuck_out: wp.array(dtype=wp.int32),
+    clear_out: wp.array(dtype=wp.int32),
 ):
-    """The touching fingers as far open as leaves them apart from the objects and the rest of the hand.
-
-    Shares of the way from q to ``opened`` are tried from all of it down; when none is clear the row is listed.
+    """One thread per (try, row): are the touching fingers, that far open, apart from the objects and the rest of the
+    hand? Rows known to be clear when farther open are left alone.
 
     Args:
         opened: (m, G) [rad or m].
         row: (m,) hand of each row, -1 none.
+        clear_out: (m,) bit t: try t is; of zeros.
+    """
+    t, i = wp.tid()
+    s = row[i]
+    if s < 0 or (clear_out[i] & ((1 << t) - 1)) != 0:
+        return
+    h = at.index[at.of[s]] // held.tries
+    G = hand.kin.groups
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    for g in range(G):
+        x = _opened_share(at.posture[s, g], opened[i, g], t)
+        group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
+        clear = int(1)
+        if at.chosen[s, g] >= 0:
+            clear = finger_clear(hand, obj, held, limits, h, g, at.pose[at.of[s]], at.resting[at.of[s]], X)
+        if clear == 0:
+            return
+    for b in range(G):
+        for a in range(b + 2):
+            moves = at.chosen[s, b] >= 0 or (a > 0 and at.chosen[s, wp.max(a - 1, 0)] >= 0)
+            if moves and not hand_pairs_clear(hand, a, b + 1, X, limits.min_self_distance):
+                return
+    wp.atomic_or(clear_out, i, 1 << t)
+
+
+@wp.kernel
+def open_poses(
+    hand: Hand,
+    at: CheckedPostures,
+    opened: wp.array2d(dtype=vec_dof),
+    row: wp.array(dtype=wp.int32),
+    clear: wp.array(dtype=wp.int32),
+    packed_out: Packed,
+    stuck_out: wp.array(dtype=wp.int32),
+):
+    """The touching fingers as far open as is clear (:func:`try_openings`); rows of which no try is are listed.
+
+    Args:
+        opened: (m, G) [rad or m].
+        row: (m,) hand of each row, -1 none.
+        clear: (m,) bit t: try t is clear.
         stuck_out: (1 + m,) how many rows are listed, and these.
     """
     i = wp.tid()
     s = row[i]
     if s < 0:
         return
-    h = at.index[at.of[s]] // held.tries
-    G = hand.kin.groups
-    T = at.pose[at.of[s]]
-    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    share = float(1.0)
-    for t in range(_OPENING_SHARES):
-        share = 1.0 - float(t) / float(_OPENING_SHARES)
-        clear = int(1)
-        for g in range(G):
-            x = at.posture[s, g] + share * (opened[i, g] - at.posture[s, g])
-            group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
-            if clear == 1 and at.chosen[s, g] >= 0:
-                clear = finger_clear(hand, obj, held, limits, h, g, T, at.resting[at.of[s]], X)
-        for b in range(G):
-            for a in range(b + 2):
-                moves = wp.where(at.chosen[s, b] >= 0 or (a > 0 and at.chosen[s, wp.max(a - 1, 0)] >= 0), 1, 0)
-                if clear * moves == 1 and not hand_pairs_clear(hand, a, b + 1, X, limits.min_self_distance):
-                    clear = 0
-        if clear == 1:
-            break
-        share = 0.0
-    if share == 0.0:
+    if clear[i] == 0:
         stuck_out[1 + wp.atomic_add(stuck_out, 0, 1)] = i
         return
+    t = int(0)
+    while (clear[i] >> t) & 1 == 0:
+        t += 1
     least = float(_NOT_TOUCHING)
     most = float(0.0)
-    for g in range(G):
-        x = at.posture[s, g] + share * (opened[i, g] - at.posture[s, g])
+    for g in range(hand.kin.groups):
+        x = _opened_share(at.posture[s, g], opened[i, g], t)
         moved = put_pregrasp(hand, g, x, at.posture[s, g], i, packed_out)
         most = wp.max(most, moved)
         if at.chosen[s, g] >= 0:
@@ -122,15 +150,13 @@ def open_poses(
 @wp.func
 def opened_finger(hand: Hand, held: Held, h: wp.int32, g: wp.int32, t: wp.int32, q: vec_dof, opened: vec_dof):
     """A finger on its way from q to ``opened``, from all of it down, then on its way to the hand's open posture."""
-    away = opened - q
-    part = 1.0 - float(t) / float(_OPENING_SHARES)
-    if t >= _OPENING_SHARES:
-        away = held.posture[h, g] - q
-        for d in range(hand.kin.dof_first[g + 1] - hand.kin.dof_first[g]):
-            if d >= hand.kin.dof_free[g] or (held.frozen[h, g] >> d) & 1 == 1:
-                away[d] = 0.0
-        part = float(t + 1) / float(_OPENING_SHARES) - 1.0
-    return q + part * away
+    if t < OPENING_SHARES:
+        return _opened_share(q, opened, t)
+    away = held.posture[h, g] - q
+    for d in range(hand.kin.dof_first[g + 1] - hand.kin.dof_first[g]):
+        if d >= hand.kin.dof_free[g] or (held.frozen[h, g] >> d) & 1 == 1:
+            away[d] = 0.0
+    return q + (float(t + 1) / float(OPENING_SHARES) - 1.0) * away
 
 
 @wp.kernel

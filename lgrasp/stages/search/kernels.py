@@ -4,7 +4,7 @@ from enum import IntEnum
 
 import warp as wp
 
-from lgrasp.grasp.collision import body_depth
+from lgrasp.grasp.collision import body_depth_part
 from lgrasp.grasp.structs import FURTHER, Candidates, Sets, further_contacts
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
@@ -51,7 +51,7 @@ def list_usable(obj: Object, state: wp.int32, candidates: Candidates, usable_out
 
 @wp.kernel
 def list_hits(tried: TriedSets, hits_out: Hits):
-    """The starts that found a set, in any order; their number is zero on entry."""
+    """The starts whose set stands, in any order; their number is zero on entry."""
     row, lane = wp.tid()
     if tried.score[row, lane] >= 0.0:
         hits_out.start[wp.atomic_add(hits_out.number, 0, 1)] = row * tried.score.shape[1] + lane
@@ -143,22 +143,19 @@ def check_load(
 
 @wp.kernel
 def check_fingers(hits: Hits, hand: Hand, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
-    """Scores of hits go below 0 when their fingers meet."""
-    row, lane = _hit(hits, tried_out, wp.tid())
-    if row < 0:
+    """One thread per (finger, finger, hit): scores of hits go below 0 when two fingers meet."""
+    g, h, i = wp.tid()
+    if h <= g:
         return
-    G = hand.kin.groups
+    row, lane = _hit(hits, tried_out, i)
+    if row < 0 or tried_out.chosen[row, lane, g] < 0 or tried_out.chosen[row, lane, h] < 0:
+        return
     Xa = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     Xb = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    for g in range(G):
-        if tried_out.chosen[row, lane, g] >= 0:
-            group_forward(hand.kin, g, candidates.q[row, g, tried_out.chosen[row, lane, g]], Xa, 0)
-            for h in range(g + 1, G):
-                if tried_out.chosen[row, lane, h] >= 0:
-                    group_forward(hand.kin, h, candidates.q[row, h, tried_out.chosen[row, lane, h]], Xb, 0)
-                    if not group_pairs_clear(hand, g + 1, h + 1, Xa, 0, Xb, 0, params.min_self_distance):
-                        tried_out.score[row, lane] = -1.0
-                        return
+    group_forward(hand.kin, g, candidates.q[row, g, tried_out.chosen[row, lane, g]], Xa, 0)
+    group_forward(hand.kin, h, candidates.q[row, h, tried_out.chosen[row, lane, h]], Xb, 0)
+    if not group_pairs_clear(hand, g + 1, h + 1, Xa, 0, Xb, 0, params.min_self_distance):
+        tried_out.score[row, lane] = -1.0
 
 
 @wp.kernel
@@ -169,40 +166,45 @@ def find_sunk(
     params: SearchValues,
     candidates: Candidates,
     tried: TriedSets,
+    runs: wp.int32,
     usable_out: Usable,
 ):
-    """One thread per (hit, group): whether the finger sinks into the object at any point, as the filter would find.
+    """One thread per (run, body, hit), so that neighbours do like work: fingers that sink into the object with a body,
+    at any point, as the filter would find.
 
     Scores stay as they are, so that which candidates are looked at does not depend on which thread comes first.
+
+    Args:
+        runs: in how many the points of a body come (:func:`depth_parts`).
     """
-    i, g = wp.tid()
+    r, b, i = wp.tid()
+    g = hand.body_group[b]
     row, lane = _hit(hits, tried, i)
-    if row < 0:
+    if row < 0 or g < 0:
         return
     m = tried.chosen[row, lane, g]
     if m < 0 or usable_out.sunk[row, g, m] != _UNKNOWN:
         return
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     j0 = group_forward(hand.kin, g, candidates.q[row, g, m], X, 0)
-    T_object = wp.transform_inverse(candidates.poses.pose[row])
-    sunk = int(0)
-    for j in range(hand.kin.joint_first[g + 1] - j0):
-        if sunk == 0:
-            depth = body_depth(hand, obj, 1 + j0 + j, T_object * X[j], params.max_penetration)
-            sunk = wp.where(depth > params.max_penetration, 1, 0)
-    usable_out.sunk[row, g, m] = sunk
+    T = wp.transform_inverse(candidates.poses.pose[row]) * X[b - 1 - j0]
+    if body_depth_part(hand, obj, b, T, params.max_penetration, r, runs) > params.max_penetration:
+        usable_out.sunk[row, g, m] = 1
 
 
 @wp.kernel
-def check_depth(hits: Hits, usable: Usable, tried_out: TriedSets):
-    """Scores of hits go below 0 when one of their fingers sinks into the object."""
+def check_depth(hits: Hits, tried_out: TriedSets, usable_out: Usable):
+    """Scores of hits go below 0 when one of their fingers sinks into the object; the others are known to be clear."""
     row, lane = _hit(hits, tried_out, wp.tid())
     if row < 0:
         return
     for g in range(tried_out.chosen.shape[2]):
         m = tried_out.chosen[row, lane, g]
-        if m >= 0 and usable.sunk[row, g, wp.max(m, 0)] == 1:
-            tried_out.score[row, lane] = -1.0
+        if m >= 0:
+            if usable_out.sunk[row, g, m] == 1:
+                tried_out.score[row, lane] = -1.0
+            else:
+                usable_out.sunk[row, g, m] = 0
 
 
 @wp.kernel

@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from lgrasp.errors import ConfigError
+from lgrasp.grasp.collision import depth_parts
 from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.math.constants import LOAD_DIRECTIONS
@@ -32,11 +33,10 @@ from lgrasp.stages.search.params import MAX_KINDS, SearchParams
 from lgrasp.stages.search.sets import FoundSets, Hits, SearchValues, TriedSets, Usable, vec_kinds
 from lgrasp.stages.search.swap_kernels import swap_contacts
 
-VERSION = 9
+VERSION = 10
 
 _CPU_STARTS = 2  # of a pose in one launch
-_GPU_STARTS = 10
-_EXACT_STARTS = 4  # on every device: what is left out of later starts depends on it
+_GPU_STARTS = 10  # and on every device where what is left out of later starts depends on it
 
 
 def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple[ContactSets, Tally]:
@@ -61,13 +61,12 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     given |= {"point": wp.empty((0, 0, 0), dtype=wp.vec3, device=d)} if swap else {}
     given["ranked"] = int(inputs.further.shape[2] > 0)
     usable = empty_struct(Usable, d, n, groups, keep, **given)
-    hand, obj, values = context.hand.struct, context.object.struct, _values(params, context)
+    obj, values = context.object.struct, _values(params, context)
     state = State.REALISED if context.realised else State.DRAWN
     wp.launch(list_usable, (n, groups), [obj, int(state), inputs.struct], [usable], device=d)
     kernel = (swap_contacts if swap else mutate_contacts)[params.score]
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
-    few = _CPU_STARTS if d == "cpu" else _GPU_STARTS
-    few = _EXACT_STARTS if exact else few
+    few = _CPU_STARTS if d == "cpu" and not exact else _GPU_STARTS
     lanes = min(params.restarts, few if params.per_pose < params.restarts else params.restarts)
     tried = empty_struct(TriedSets, d, n, lanes, groups)
     for first in range(0, params.restarts, lanes):
@@ -76,23 +75,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
         asked = [obj, values, context.seed("search", context.salt), first, inputs.struct, usable, found]
         wp.launch(kernel, tried.score.shape, asked, [tried], device=d)
         if swap:
-            # the few that found a set, side by side
-            size = tried.score.size
-            hits = empty_struct(Hits, d, size, number=wp.zeros(1, dtype=wp.int32, device=d))
-            wp.launch(list_hits, tried.score.shape, [tried], [hits], device=d)
-            wp.launch(check_balance, size, [hits, obj, values, inputs.struct], [tried], device=d)
-            if values.max_unresisted_load < 1.0:
-                # most fail in the hardest direction: it comes alone
-                for some, directions in ((0, 1), (1, LOAD_DIRECTIONS - 1)):
-                    asked = [hits, obj, values, some, inputs.struct]
-                    wp.launch(check_load, (size, directions), asked, [tried], device=d)
-            if context.realised:
-                wp.launch(check_fingers, size, [hits, hand, values, inputs.struct], [tried], device=d)
-            if exact:
-                asked = [hits, hand, obj, values, inputs.struct, tried]
-                wp.launch(find_sunk, (size, groups), asked, [usable], device=d)
-                wp.launch(check_depth, size, [hits, usable], [tried], device=d)
-                wp.launch(drop_sunk, (n, groups), [], [usable], device=d)
+            _check_sets(tried, usable, values, inputs, context, exact)
         wp.launch(keep_sets, n, [values, inputs.struct, tried], [found], device=d)
     upto = wp.clone(found.number)
     running_sums(upto)
@@ -101,6 +84,35 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     asked = [upto, inputs.struct, context.salt * params.per_pose, found]
     wp.launch(take_sets, n, asked, [table.struct, tally.device], device=d)
     return table, tally
+
+
+def _check_sets(
+    tried: TriedSets, usable: Usable, values: Any, inputs: CandidateTable, context: Context, exact: bool
+) -> None:
+    """Scores of tried sets go below 0 where a set fails; each check comes side by side for those that are left."""
+    d, size = context.device, tried.score.size
+    hand, obj = context.hand.struct, context.object.struct
+    hits = empty_struct(Hits, d, size, number=wp.zeros(1, dtype=wp.int32, device=d))
+
+    def check(kernel: wp.Kernel, dim: int | tuple[int, ...], asked: list[Any], outputs: list[Any]) -> None:
+        hits.number.zero_()
+        wp.launch(list_hits, tried.score.shape, [tried], [hits], device=d)
+        wp.launch(kernel, dim, [hits, *asked], outputs, device=d)
+
+    sets = [obj, values, inputs.struct]
+    if values.max_unresisted_load < 1.0:
+        # most fail in the hardest direction: it comes alone
+        for some, directions in ((0, 1), (1, LOAD_DIRECTIONS - 1)):
+            check(check_load, (size, directions), [obj, values, some, inputs.struct], [tried])
+    check(check_balance, size, sets, [tried])
+    if context.realised:
+        groups = context.hand.model.groups
+        check(check_fingers, (groups, groups, size), [hand, values, inputs.struct], [tried])
+    if exact:
+        runs, bodies = depth_parts(d), len(context.hand.model.piece_first) - 1
+        check(find_sunk, (runs, bodies, size), [hand, *sets, tried, runs], [usable])
+        wp.launch(check_depth, size, [hits], [tried, usable], device=d)
+        wp.launch(drop_sunk, usable.size.shape, [], [usable], device=d)
 
 
 def _values(params: SearchParams, context: Context) -> Any:
