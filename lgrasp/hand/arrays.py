@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_from_matrix
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.params import ThumbBend
@@ -103,6 +104,9 @@ def upload_hand(model: HandModel, device: str, thumb: ThumbBend | None = None) -
 
     Args:
         thumb: where its thumb has to be; None: anywhere.
+
+    Raises:
+        HandError: that thumb is of another hand.
     """
     start()
     t = model.tree
@@ -144,6 +148,8 @@ def _named(kind: Any, source: object, prefix: str = "") -> dict[str, Any]:
 
 
 def _bend(model: HandModel, thumb: ThumbBend) -> dict[str, Any]:
+    if thumb.link not in model.tree.link_names:
+        raise HandError(f"hand.thumb: hand '{model.name}' has no link '{thumb.link}'")
     k, cosine = model.tree.link_names.index(thumb.link), float(np.cos(np.radians(thumb.angle)))
     axis, normal = model.tree.T_body_link[k, :3, :3] @ thumb.axis, np.array(thumb.normal)
     return {
