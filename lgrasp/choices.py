@@ -18,6 +18,8 @@ Role = Literal["thumb", "index", "middle", "ring", "little"]
 """Human finger that a finger acts as."""
 SideName = Literal["radial", "ulnar", "tip"]
 """Side of a finger's link: where of a row of fingers the index finger stands, the other one, or the end."""
+ThumbPlace = Literal["abducted", "adducted"]
+"""Where a thumb is: across the palm, where it can oppose fingertips, or beside it."""
 ShapeKind = Literal[
     *("mug", "bottle", "bowl", "plate", "box", "can", "ball", "hammer", "screwdriver"),
     *("single", "joined", "cup", "ring", "tool"),

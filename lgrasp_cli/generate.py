@@ -10,7 +10,7 @@ from lgrasp.words import plural
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import HANDS, OBJECTS, one_of
 from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, choose_pipeline, given
-from lgrasp_cli.steer import Above, Approach, Avoid, Fingers, GraspType, Links, Palm, PoseFile, Touch
+from lgrasp_cli.steer import Above, Approach, Avoid, Fingers, GraspType, Links, Palm, PoseFile, Thumb, Touch
 from lgrasp_cli.tables import Block, closed, counted, following, held, place, took
 from lgrasp_cli.working import How, working
 
@@ -70,6 +70,7 @@ def generate(
     fingers: Fingers = None,
     links: Links = None,
     palm: Palm = None,
+    thumb: Thumb = None,
     approach: Approach = None,
     above: Above = None,
     pose: PoseFile = None,
@@ -98,7 +99,7 @@ def generate(
     chosen = chosen.with_simulation(simulate) if simulate else chosen
     chosen = chosen.with_table() if table else chosen
     chosen = chosen.with_steering(
-        **given(grasp_type=grasp_type, fingers=fingers, links=links, palm=palm),
+        **given(grasp_type=grasp_type, fingers=fingers, links=links, palm=palm, thumb=thumb),
         **given(approach=approach, above=above, pose=pose, touch=touch or None, avoid=avoid or None),
     )
     for name in ("fingers", "grasp_type") if contacts is not None else ():

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from typer import Option
 
-from lgrasp.choices import PalmUse
+from lgrasp.choices import PalmUse, ThumbPlace
 from lgrasp_cli.names import GRASP_TYPE, one_of
 
 _PANEL = "Steer"
@@ -36,6 +36,13 @@ Links = Annotated[
 ]
 Palm = Annotated[
     str | None, Option(rich_help_panel=_PANEL, **one_of(PalmUse, "PALM", "Whether the palm may or must touch."))
+]
+Thumb = Annotated[
+    str | None,
+    Option(
+        rich_help_panel=_PANEL,
+        **one_of(ThumbPlace, "PLACE", "Where the thumb is: across the palm or along it."),
+    ),
 ]
 Approach = Annotated[
     str | None,

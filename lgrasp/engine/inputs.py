@@ -105,14 +105,16 @@ def input_keys(
     """
     digest = hand_digest(source.urdf, source.spec)
     hand_key = hand_model_key(digest, hands)
-    field_key = content_key("field", FIELD_VERSION, hand=hand_key, params=fields.model_dump(mode="json"))
+    thumb = {"thumb": hands.thumb.model_dump(mode="json")} if hands.thumb else {}
+    field_key = content_key("field", FIELD_VERSION, hand=hand_key, params=fields.model_dump(mode="json"), **thumb)
     path, key = (None, "") if mesh is None else object_key(mesh, scale, objects)
     return InputKeys(source, path, hand_key, key, field_key, hands)
 
 
 def hand_model_key(digest: str, hands: HandParams = LISTED) -> str:
-    """Content key of the model of a hand, given the :func:`hand_digest` of it."""
-    return content_key("hand", HAND_VERSION, content=digest, **hands.describe())
+    """Content key of the model of a hand, given the :func:`hand_digest` of it; the same wherever its thumb is."""
+    surface = hands.model_copy(update={"thumb": None})
+    return content_key("hand", HAND_VERSION, content=digest, **surface.describe())
 
 
 def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str]:
@@ -240,7 +242,7 @@ def load_inputs(
 
         weights = surface_weights(object_model, steer.touch_regions, steer.avoid_regions, keys.mesh, device=alias)
         left = steer_object(object_model, weights, seed=objects.seed, device=alias)
-    hand = upload_hand(hand_model, alias)
+    hand = upload_hand(hand_model, alias, keys.hands.thumb)
     field_model = load.field(hand, keys.field, fields)
     start = time.perf_counter()
     if steer.asks:

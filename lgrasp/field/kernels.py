@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lgrasp.hand.arrays import Hand
+from lgrasp.hand.arrays import Hand, thumb_placed
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.kinematics import Kinematics, group_forward, vec_dof
 from lgrasp.math.limits import MAX_JOINTS
@@ -49,7 +49,8 @@ def sample_postures(
     posture_out: wp.array2d(dtype=wp.uint8),
     clear_out: wp.array(dtype=wp.int32),
 ):
-    """Uniform postures of one group, and whether it keeps ``margin`` [m] to the static base and to itself.
+    """Uniform postures of one group, and whether it keeps ``margin`` [m] to the static base and to itself, and the
+    thumb is where it has to be.
 
     Args:
         posture_out: 8 bits a joint over its range, (N, D).
@@ -65,6 +66,8 @@ def sample_postures(
     clear = group_pairs_clear(hand, 0, group + 1, X, 0, X, 0, margin)
     if clear:
         clear = group_pairs_clear(hand, group + 1, group + 1, X, 0, X, 0, margin)
+    if clear:
+        clear = thumb_placed(hand, group, X, 0)
     clear_out[i] = int(clear)
 
 

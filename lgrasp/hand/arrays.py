@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_from_matrix
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.params import ThumbBend
 from lgrasp.math.convex import Pieces
 from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
 from lgrasp.math.limits import MAX_JOINTS
@@ -55,6 +57,17 @@ class Overlaps:
 
 
 @wp.struct
+class Bend:
+    """Where the thumb has to be (:class:`~lgrasp.hand.params.ThumbBend`)."""
+
+    body: wp.int32  # that the hinge moves; 0: the thumb may be anywhere
+    axis: wp.vec3  # unit vector of the hinge, body frame
+    normal: wp.vec3  # unit normal of the palm's plane, base frame
+    least: wp.float32  # cosine between both lines
+    most: wp.float32
+
+
+@wp.struct
 class Hand:
     """All of a hand that kernels read."""
 
@@ -71,6 +84,7 @@ class Hand:
     pair_first: wp.array(dtype=wp.int32)  # ((G + 1)^2 + 1,)
     pairs: wp.array(dtype=wp.vec2i)  # (Q,)
     overlaps: Overlaps
+    thumb: Bend
     box_low: wp.vec3
     box_high: wp.vec3
 
@@ -85,8 +99,15 @@ class HandArrays:
     meshes: tuple[wp.Mesh, ...]
 
 
-def upload_hand(model: HandModel, device: str) -> HandArrays:
-    """Copy a hand to a device."""
+def upload_hand(model: HandModel, device: str, thumb: ThumbBend | None = None) -> HandArrays:
+    """Copy a hand to a device.
+
+    Args:
+        thumb: where its thumb has to be; None: anywhere.
+
+    Raises:
+        HandError: that thumb is of another hand.
+    """
     start()
     t = model.tree
     kin = _named(Kinematics, t) | {
@@ -113,6 +134,7 @@ def upload_hand(model: HandModel, device: str) -> HandArrays:
         "body_group": t.body_group,
         "piece_grid": np.array([grid_of.get(int(link), -1) for link in model.piece_link], np.int32),
         "overlaps": upload_struct(Overlaps, device, overlaps),
+        "thumb": upload_struct(Bend, device, _bend(model, thumb) if thumb else {}),
         "box_low": model.canonical_box[0],
         "box_high": model.canonical_box[1],
     }
@@ -123,6 +145,20 @@ def _named(kind: Any, source: object, prefix: str = "") -> dict[str, Any]:
     """What a model calls like the fields of a struct, with a prefix or without."""
     at = {name: next((n for n in (prefix + name, name) if hasattr(source, n)), None) for name in kind.vars}
     return {name: getattr(source, n) for name, n in at.items() if n}
+
+
+def _bend(model: HandModel, thumb: ThumbBend) -> dict[str, Any]:
+    if thumb.link not in model.tree.link_names:
+        raise HandError(f"hand.thumb: hand '{model.name}' has no link '{thumb.link}'")
+    k, cosine = model.tree.link_names.index(thumb.link), float(np.cos(np.radians(thumb.angle)))
+    axis, normal = model.tree.T_body_link[k, :3, :3] @ thumb.axis, np.array(thumb.normal)
+    return {
+        "body": int(model.tree.link_body[k]),
+        "axis": axis / np.linalg.norm(axis),
+        "normal": normal / np.linalg.norm(normal),
+        "least": cosine if thumb.place == "adducted" else 0.0,
+        "most": 2.0 if thumb.place == "adducted" else cosine,
+    }
 
 
 def _link_meshes(model: HandModel, device: str) -> tuple[wp.Mesh, ...]:
@@ -150,6 +186,17 @@ def contact_allowed(c: Contacts, i: wp.int32, normal: wp.vec3):
         if f[0] * normal[0] + f[1] * normal[1] + f[2] * normal[2] > f[3]:
             return False
     return True
+
+
+@wp.func
+def thumb_placed(hand: Hand, g: wp.int32, X: wp.array(dtype=wp.transform), at: wp.int32):
+    """True unless group g is the thumb and is not where it has to be; X holds the bodies of g, from ``at`` on."""
+    bend = hand.thumb
+    if hand.body_group[bend.body] != g:
+        return True
+    axis = wp.transform_vector(X[at + bend.body - 1 - hand.kin.joint_first[g]], bend.axis)
+    cosine = wp.abs(wp.dot(axis, bend.normal))
+    return cosine >= bend.least and cosine <= bend.most
 
 
 @wp.func

@@ -21,7 +21,7 @@ LinkSides = dict[str, dict[SideName, LinkSide]]
 """Links with collision geometry of one finger, from the palm outwards, each with its sides."""
 
 
-class _Hinge(NamedTuple):
+class Hinge(NamedTuple):
     """The last hinge of a finger in the open posture, base frame."""
 
     axis: np.ndarray  # (3,) unit
@@ -36,17 +36,12 @@ def finger_sides(spec: HandSpec, urdf: Urdf, tree: Tree) -> dict[Role, LinkSides
     the finger's last hinge. The tip, of last contact links, looks away from the hinge before in that posture, in which
     fingers are straight.
     """
-    values = tree.listed_values(tree.joint_open[None])
-    poses = link_poses(urdf, tree.base_link, dict(zip(tree.listed_names, values.T, strict=True)))
+    poses = posture_links(urdf, tree, tree.joint_open[None])
     ends: dict[Role, str] = {role: links[-1] for role, (_, links) in finger_roles(spec, tree).items()}
-    hinges: dict[Role, _Hinge] = {}
-    for role, link in ends.items():
-        if not tree.joint_prismatic[tree.body_of(link) - 1]:
-            hinges[role] = _last_hinge(tree, {name: T[0] for name, T in poses.items()}, tree.body_of(link))
-    row: list[Role] = [role for role in hinges if role != "thumb"]
+    hinges = last_hinges(spec, urdf, tree)
     found: dict[Role, LinkSides] = {}
     for role, hinge in hinges.items():
-        radial = _radial(hinges, row, role) if role in row else None
+        radial = radial_way(hinges, role)
         group = tree.group_of(ends[role])
         links = [n for n in tree.link_names if tree.group_of(n) == group and urdf.links[n]]
         links.sort(key=lambda n: (tree.body_of(n), tree.link_names.index(n)))
@@ -61,16 +56,34 @@ def finger_sides(spec: HandSpec, urdf: Urdf, tree: Tree) -> dict[Role, LinkSides
     return found
 
 
+def posture_links(urdf: Urdf, tree: Tree, q: np.ndarray) -> dict[str, np.ndarray]:
+    """Poses of links in postures q, shape [n, K], base frame, shape [n, 4, 4]."""
+    return link_poses(urdf, tree.base_link, dict(zip(tree.listed_names, tree.listed_values(q).T, strict=True)))
+
+
+def last_hinges(spec: HandSpec, urdf: Urdf, tree: Tree) -> dict[Role, Hinge]:
+    """The last joint of every finger that turns there, in the order of roles."""
+    poses = {name: T[0] for name, T in posture_links(urdf, tree, tree.joint_open[None]).items()}
+    ends: dict[Role, int] = {role: tree.body_of(links[-1]) for role, (_, links) in finger_roles(spec, tree).items()}
+    return {role: _last_hinge(tree, poses, body) for role, body in ends.items() if not tree.joint_prismatic[body - 1]}
+
+
 def _side(link: str, side: SideName, axis: np.ndarray) -> LinkSide:
-    x, y, z = (np.round(axis, 4) + 0.0).tolist()
-    return LinkSide(link=link, side=side, axis=(x, y, z), angle=_ANGLE)
+    return LinkSide(link=link, side=side, axis=rounded(axis), angle=_ANGLE)
 
 
-def _radial(hinges: dict[Role, _Hinge], row: list[Role], role: Role) -> np.ndarray | None:
-    """Unit vector (3,) out of a finger's radial side, base frame; None if it stands beside no other."""
-    k = row.index(role)
-    if len(row) < 2:
+def rounded(v: np.ndarray) -> tuple[float, float, float]:
+    """A unit vector (3,) as it is told."""
+    x, y, z = (np.round(v, 4) + 0.0).tolist()
+    return x, y, z
+
+
+def radial_way(hinges: dict[Role, Hinge], role: Role) -> np.ndarray | None:
+    """Unit vector (3,) out of a finger's radial side, base frame; None for a thumb, or if it stands beside no other."""
+    row: list[Role] = [other for other in hinges if other != "thumb"]
+    if role not in row or len(row) < 2:
         return None
+    k = row.index(role)
     hinge, beside = hinges[role], hinges[row[k - 1 if k else 1]]
     way = beside.place - hinge.place if k else hinge.place - beside.place
     cosine = hinge.axis @ way / max(float(np.linalg.norm(way)), 1e-9)
@@ -79,7 +92,7 @@ def _radial(hinges: dict[Role, _Hinge], row: list[Role], role: Role) -> np.ndarr
     return np.sign(cosine) * hinge.axis
 
 
-def _last_hinge(tree: Tree, poses: dict[str, np.ndarray], body: int) -> _Hinge:
+def _last_hinge(tree: Tree, poses: dict[str, np.ndarray], body: int) -> Hinge:
     """The hinge that moves a body.
 
     Args:
@@ -93,5 +106,5 @@ def _last_hinge(tree: Tree, poses: dict[str, np.ndarray], body: int) -> _Hinge:
         way = place - frames[before][:3, 3]
         way = way - axis * (axis @ way)
         if np.linalg.norm(way) > _MIN_LENGTH:
-            return _Hinge(axis, place, way / np.linalg.norm(way))
-    return _Hinge(axis, place, None)
+            return Hinge(axis, place, way / np.linalg.norm(way))
+    return Hinge(axis, place, None)

@@ -11,7 +11,7 @@ from lgrasp.hand.urdf import read_urdf
 from lgrasp.notices import notice
 from lgrasp.policy.model import read_policy
 from lgrasp.policy.names import SHIPPED, shipped_policy
-from lgrasp.steer.typed import Anatomy, asked_sides, made_types, typed
+from lgrasp.steer.typed import Anatomy, asked_sides, asked_thumb, made_types, typed
 
 _TWO = 2  # contacts that any grasp has
 
@@ -26,17 +26,17 @@ def hand_source(name: str) -> HandSource:
 
 
 def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
-    """A pipeline whose grasp type, sides of links and pose policy, if they are asked for, are those of a hand; one line
+    """A pipeline whose grasp type, sides of links, thumb and pose policy, if asked for, are those of a hand; one line
     tells where it asks for more contacts than the hand has fingers and palm, and it then asks for so many.
 
     Raises:
         HandError: no such hand.
-        ConfigError: see :func:`~lgrasp.steer.typed.typed` and :func:`~lgrasp.steer.typed.asked_sides`; a policy that is
-            none, or of another hand.
+        ConfigError: see :func:`~lgrasp.steer.typed.typed`, :func:`~lgrasp.steer.typed.asked_sides` and
+            :func:`~lgrasp.steer.typed.asked_thumb`; a policy that is none, or of another hand.
     """
     pipeline = _within_reach(pipeline, hand)
     policy, steer = pipeline.params("place").policy, pipeline.steer
-    looked_up = steer.grasp_type is not None or any(steer.sides.values())
+    looked_up = steer.grasp_type is not None or steer.thumb is not None or any(steer.sides.values())
     if not looked_up and policy is None:
         return pipeline
     source = hand_source(hand)
@@ -53,8 +53,8 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
         return pipeline
     anatomy = Anatomy(source.spec, urdf, tree)
     steer = typed(steer, anatomy)
-    sides = asked_sides(steer, anatomy)
-    return pipeline.model_copy(update={"steer": steer, "hand": pipeline.hand.model_copy(update={"sides": sides})})
+    asked = {"sides": asked_sides(steer, anatomy), "thumb": asked_thumb(steer, anatomy)}
+    return pipeline.model_copy(update={"steer": steer, "hand": pipeline.hand.model_copy(update=asked)})
 
 
 def own_policy(pipeline: Pipeline, hand: str) -> Path | None:

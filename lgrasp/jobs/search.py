@@ -116,8 +116,8 @@ class SearchJob(SearchRequest, Job):
         if not steer.asks:
             return {}
         told = describe_touching(steer, inputs.steer.touching, inputs.hand.model, inputs.steer.poses)
-        sides = [side.model_dump(mode="json") for side in self.pipeline.hand.sides]
-        return {"steered": told | ({"sides": sides} if sides else {})}
+        hand = self.pipeline.hand.model_dump(mode="json", include={"sides", "thumb"}, exclude_defaults=True)
+        return {"steered": told | hand}
 
     def difference(self, path: Path) -> str:
         with ShardReader(path) as reader:

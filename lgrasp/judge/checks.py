@@ -88,7 +88,7 @@ class RowChecks:
                 self._table(T_links, T_objects[:, 0])
             self._regions()
             if shard.asked:
-                self._steered(shard.asked, T_objects[:, 0])
+                self._steered(shard.asked, T_links, T_objects[:, 0])
             for row in good:
                 self._wrenches(int(row), epsilon)
         if shard.steps:
@@ -195,7 +195,7 @@ class RowChecks:
                 own[rows] = np.fmax(own[rows], value)
                 self._set(check, np.nan_to_num(own))
 
-    def _steered(self, asked: Asked, T_objects: np.ndarray) -> None:
+    def _steered(self, asked: Asked, T_links: np.ndarray, T_objects: np.ndarray) -> None:
         """Rows that do not obey what was asked of them."""
         shard, good, planes = self.shard, self.good, None
         if shard.table:
@@ -203,7 +203,10 @@ class RowChecks:
             planes = np.array([shard.tables[k][pose] for k, pose in pairs])
         links = np.where(self.used[good], np.asarray(self.g["contact_links"])[good], -1).reshape(len(good), -1)
         normals = self.link_normals[good].reshape(*links.shape, -1, 3)
-        self.failed["steered"][good] = disobeys(asked, shard.link_names, links, normals, T_objects, planes)
+        thumb = self.hand.index.get(asked.thumb.link) if asked.thumb else None
+        T_thumb = T_links[:, thumb] if thumb is not None else np.full_like(T_objects, np.nan)
+        found = disobeys(asked, shard.link_names, links, normals, T_thumb, T_objects, planes)
+        self.failed["steered"][good] = found
 
     def _self_penetration(self, T_links: np.ndarray) -> None:
         hand, depth = self.hand, np.zeros(len(self.good))

@@ -1,5 +1,5 @@
-"""Whether rows obey what their shard says was asked of them: which links touch, with which side, where the palm faces,
-which poses."""
+"""Whether rows obey what their shard says was asked of them: which links touch, with which side, where the thumb is and
+the palm faces, which poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +13,8 @@ COSINE_SLACK = 1e-4
 """Of the palm's direction outside its cone."""
 SIDE_SLACK = 15.0
 """Of a link's normal outside the cone of its side [deg]; contacts are found on a smoother surface than the mesh."""
+THUMB_SLACK = 0.1
+"""Of the thumb's hinge to the palm's normal [deg]."""
 PLANE_SLACK = 1e-4
 """Of the numbers of the plane that the hand stays above."""
 
@@ -23,12 +25,24 @@ LEVER = 0.1
 
 
 @dataclass(frozen=True)
+class Thumb:
+    """Where the thumb is: adducted where its last hinge is within an angle of the palm's normal, abducted elsewhere."""
+
+    link: str  # that the hinge moves
+    adducted: bool
+    axis: np.ndarray  # (3,) unit, link frame
+    normal: np.ndarray  # (3,) unit, base frame
+    angle: float  # [deg]
+
+
+@dataclass(frozen=True)
 class Asked:
     """What the config of a shard says was asked, with the names that it has there."""
 
     links: frozenset[str] | None  # that may touch, None: any
     every: tuple[frozenset[str], ...]  # of each set one link touches
     sides: dict[str, tuple[np.ndarray, float]]  # unit axis (3,), link frame, and half angle [deg] of a link's side
+    thumb: Thumb | None
     facing: np.ndarray | None  # (3,) unit vector that the palm faces along, base frame
     approach: np.ndarray | None  # (3,) unit middle of its cone, object's frame
     cosine: float
@@ -53,6 +67,7 @@ def read_asked(config: Any) -> Asked | None:
         links=frozenset(told["links"]) if "links" in told else None,
         every=tuple(frozenset(links) for links in told.get("every", ())),
         sides={side["link"]: (_unit(side["axis"]), float(side["angle"])) for side in told.get("sides", ())},
+        thumb=_thumb(told["thumb"]) if told.get("thumb") else None,
         facing=facing,
         approach=_unit(cone["direction"]) if cone else None,
         cosine=float(np.cos(np.radians(cone["angle"]))) if cone else -1.0,
@@ -66,6 +81,7 @@ def disobeys(
     names: Sequence[str],
     links: np.ndarray,
     normals: np.ndarray,
+    T_thumb: np.ndarray,
     T_objects: np.ndarray,
     planes: np.ndarray | None,
 ) -> np.ndarray:
@@ -75,6 +91,7 @@ def disobeys(
         names: of the shard's links.
         links: in contact, -1 none, indices of ``names``, (n, C).
         normals: admissible ones of the links at the contacts, outward, link frame, (n, C, P, 3).
+        T_thumb: of the link of ``asked.thumb``, base frame, (n, 4, 4); not read without.
         T_objects: of the object, base frame, (n, 4, 4).
         planes: that rows say the hand is above, object's frame, (n, 5); None: they say none.
     """
@@ -89,6 +106,11 @@ def disobeys(
             axis, angle = asked.sides[name]
             inside = normals @ axis >= np.cos(np.radians(min(angle + SIDE_SLACK, 180.0)))  # False where it is NaN
             bad |= ((links == k) & ~inside.any(axis=2)).any(axis=1)
+    if asked.thumb is not None:
+        thumb = asked.thumb
+        lines = np.abs(T_thumb[:, :3, :3] @ thumb.axis @ thumb.normal)
+        angle = np.degrees(np.arccos(np.minimum(lines, 1.0))) - thumb.angle
+        bad |= ~((angle if thumb.adducted else -angle) <= THUMB_SLACK)
     if asked.approach is not None:
         middle = np.einsum("nij,j->ni", T_objects[:, :3, :3], asked.approach)
         bad |= ~(middle @ asked.facing >= asked.cosine - COSINE_SLACK)
@@ -97,6 +119,11 @@ def disobeys(
     if asked.poses is not None:
         bad |= ~(cKDTree(asked.poses).query(_comparable(T_objects))[0] <= POSE_SLACK)
     return bad
+
+
+def _thumb(told: dict[str, Any]) -> Thumb:
+    place = {"adducted": True, "abducted": False}[told["place"]]
+    return Thumb(told["link"], place, _unit(told["axis"]), _unit(told["normal"]), float(told["angle"]))
 
 
 def _matrices(poses: np.ndarray) -> np.ndarray:

@@ -1,10 +1,11 @@
-"""Grasp types by name, as ``configs/grasp_types`` has them: which fingers touch, with which parts, and the palm."""
+"""Grasp types by name, as ``configs/grasp_types`` has them: which fingers touch, with which parts, the palm, and where
+the thumb is."""
 
 from typing import Literal
 
 from pydantic import Field
 
-from lgrasp.choices import PalmUse, Role, SideName
+from lgrasp.choices import PalmUse, Role, SideName, ThumbPlace
 from lgrasp.config import Params, did_you_mean, parse_model, read_yaml, yaml_files
 from lgrasp.errors import ConfigError
 
@@ -18,6 +19,7 @@ class GraspType(Params):
         default_factory=dict, description="Of the fingers, those that touch with a side, and which."
     )
     palm: PalmUse = Field(description="Whether it touches.")
+    thumb: ThumbPlace | None = Field(default=None, description="Where the thumb is, whether it touches or not.")
     may_lack: tuple[Role, ...] = Field(default=(), description="Of the fingers, those that a hand may lack.")
     alike: dict[str, str] = Field(
         default_factory=dict, description="Types with the same contacts: name, and what sets it apart."

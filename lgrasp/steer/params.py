@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self, cast, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from lgrasp.choices import PalmUse, SideName
+from lgrasp.choices import PalmUse, SideName, ThumbPlace
 from lgrasp.config import Numbers, Params, comma_numbers
 from lgrasp.object.region_text import ACCEPTED, Region, describe_region, parse_regions
 from lgrasp.steer.grasp_types import find_type
@@ -16,7 +16,7 @@ from lgrasp.steer.grasp_types import find_type
 if TYPE_CHECKING:
     import numpy as np
 
-STEER_VERSION = 2
+STEER_VERSION = 3
 """Raised whenever the same steering gives other grasps."""
 
 
@@ -46,7 +46,7 @@ class Steering(Params):
     """Where and how a hand is to grasp; as it is by default it asks for nothing."""
 
     grasp_type: str | None = Field(
-        default=None, description="Name of a grasp type, which says fingers, links and palm: tripod."
+        default=None, description="Name of a grasp type, which says fingers, links, palm and thumb: tripod."
     )
     fingers: tuple[str, ...] = Field(
         default=(),
@@ -59,6 +59,12 @@ class Steering(Params):
         "that side; none: any.",
     )
     palm: PalmUse = Field(default="yes", description="Whether the palm touches: yes, it may; no; must.")
+
+    thumb: ThumbPlace | None = Field(
+        default=None,
+        description="Where the thumb is: abducted, in the half of its range where it bends more across the palm, to "
+        "oppose fingertips; adducted, more along it.",
+    )
 
     approach: ApproachCone | None = Field(
         default=None, description="Cone, object's frame, in which the direction lies that the palm faces."

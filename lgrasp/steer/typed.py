@@ -1,14 +1,16 @@
-"""A grasp type in the words of one hand: its fingers, links and palm; and the sides of links that are asked for."""
+"""A grasp type in the words of one hand: its fingers, links, palm and thumb; and the sides of links and the place of
+the thumb that are asked for."""
 
 from typing import NamedTuple
 
-from lgrasp.choices import Role, SideName
+from lgrasp.choices import Role, SideName, ThumbPlace
 from lgrasp.config import parse_model
 from lgrasp.errors import ConfigError
 from lgrasp.hand.fingers import Roles, finger_roles
-from lgrasp.hand.params import LinkSide
+from lgrasp.hand.params import LinkSide, ThumbBend
 from lgrasp.hand.sides import LinkSides, finger_sides
 from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.thumb import thumb_bends
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf
 from lgrasp.steer.grasp_types import GraspType, find_type, read_types
@@ -18,12 +20,13 @@ _SIDED_BODIES = 2  # the last of a finger: sides of its proximal link are at the
 
 
 class Anatomy:
-    """What grasp types ask of a hand: which finger is which, and which sides they have."""
+    """What grasp types ask of a hand: which finger is which, which sides they have, and where the thumb can be."""
 
     def __init__(self, spec: HandSpec, urdf: Urdf, tree: Tree) -> None:
         self.spec, self.tree = spec, tree
         self.roles: Roles = finger_roles(spec, tree)
         self.sides: dict[Role, LinkSides] = finger_sides(spec, urdf, tree)
+        self.thumb: dict[ThumbPlace, ThumbBend] = thumb_bends(spec, urdf, tree)
 
 
 class MadeTypes(NamedTuple):
@@ -36,10 +39,10 @@ class MadeTypes(NamedTuple):
 
 
 def typed(steering: Steering, hand: Anatomy) -> Steering:
-    """A steering whose fingers, links and palm are those of its grasp type on one hand; itself if it has no type.
+    """A steering whose fingers, links, palm and thumb are those of its grasp type on a hand; itself if it has no type.
 
     Raises:
-        ConfigError: the hand lacks a part of the type, or fingers, links or palm are asked for, too.
+        ConfigError: the hand lacks a part of the type, or fingers, links, palm or thumb are asked for, too.
     """
     if steering.grasp_type is None:
         return steering
@@ -53,6 +56,7 @@ def typed(steering: Steering, hand: Anatomy) -> Steering:
         "fingers": tuple(finger for finger, _ in chosen.values()),
         "links": (*links, *(() if kind.palm == "no" else hand.spec.palm.links)) if set(links) != able else (),
         "palm": kind.palm,
+        "thumb": kind.thumb if hand.thumb else None,
     }
     for key, value in asked.items():
         if getattr(steering, key) not in (Steering.model_fields[key].default, value):
@@ -78,6 +82,21 @@ def asked_sides(steering: Steering, hand: Anatomy) -> tuple[LinkSide, ...]:
             )
         found += [] if side is None else [known[link, side]]
     return tuple(found)
+
+
+def asked_thumb(steering: Steering, hand: Anatomy) -> ThumbBend | None:
+    """Where the thumb has to be; None: anywhere.
+
+    Raises:
+        ConfigError: the hand has no such thumb.
+    """
+    if steering.thumb is None:
+        return None
+    if not hand.thumb:
+        raise ConfigError(
+            f"steer.thumb: hand '{hand.spec.name}' has no thumb that is abducted and adducted; leave it out"
+        )
+    return hand.thumb[steering.thumb]
 
 
 def made_types(hand: Anatomy) -> MadeTypes:

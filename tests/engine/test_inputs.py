@@ -3,8 +3,21 @@
 import trimesh
 
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.inputs import Loader, object_key
+from lgrasp.engine.inputs import Loader, input_keys, object_key
+from lgrasp.field.params import FieldParams
+from lgrasp.hand.find import find_hand
+from lgrasp.hand.params import LISTED, HandParams, ThumbBend
 from lgrasp.object.params import ObjectParams
+
+
+def test_where_the_thumb_is_gives_another_field_of_the_same_hand():
+    thumb = ThumbBend(link="link_15.0_tip", place="adducted", axis=(0, 1, 0), normal=(1, 0, 0), angle=50)
+    plain, asked = (
+        input_keys(find_hand("allegro"), None, 1.0, ObjectParams(), FieldParams(), hands)
+        for hands in (LISTED, HandParams(thumb=thumb))
+    )
+    assert plain.hand == asked.hand
+    assert plain.field != asked.field
 
 
 def test_warnings_of_an_object(tmp_path, cache_root, monkeypatch, said):

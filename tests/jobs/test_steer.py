@@ -86,6 +86,32 @@ def test_a_lateral_grasp_touches_with_the_side_of_the_index_finger(steered, link
     assert judge(path).failed["steered"].all()
 
 
+def thumb_angles(shard, link_poses):
+    """Between the plane that Allegro's thumb bends in, across y of its last links, and the palm's, across x [deg]."""
+    thumb = list(shard.hand.link_names).index("link_15.0_tip")
+    return np.degrees(np.arccos(np.minimum(np.abs(link_poses(shard.grasps.q)[:, thumb, 0, 1]), 1.0)))
+
+
+@pytest.mark.parametrize("asked", [{"thumb": "adducted"}, {"thumb": "abducted"}, {"grasp_type": "adduction-grip"}])
+def test_the_thumb_is_where_it_is_asked_to_be(steered, link_poses, tmp_path, asked):
+    """Also where it does not touch, as in an adduction grip; the judge agrees, and finds rows with another thumb."""
+    shard = steered(rows=12, **asked)
+    angles, adducted = thumb_angles(shard, link_poses), asked.get("thumb") == "adducted"
+    middle = shard.header.config["steered"]["thumb"]["angle"]
+    assert 45 < middle < 55  # its range is 15 to 86
+    assert (angles < middle + 0.01).all() if adducted else (angles > middle - 0.01).all()
+    if "grasp_type" in asked:
+        assert not any("link_15.0_tip" in links for links in touching(shard))
+    (path,) = (tmp_path / "steered").glob("*.h5")
+    assert judge(path).valid_share == 1.0
+    config = shard.header.config
+    for change in ({"place": "abducted" if adducted else "adducted"}, {"link": "thumb"}):
+        thumb = config["steered"]["thumb"] | change
+        with h5py.File(path, "r+") as file:
+            file.attrs["config"] = json.dumps(config | {"steered": config["steered"] | {"thumb": thumb}})
+        assert judge(path).failed["steered"].all()
+
+
 def test_a_type_that_the_hand_cannot_make(job, swift):
     with pytest.raises(ConfigError, match="grasp type precision-disk: hand 'allegro' has no little finger"):
         job(pipeline=swift.with_steering(grasp_type="precision-disk"))
@@ -282,6 +308,7 @@ def test_other_poses_are_other_grasps(job, swift, tmp_path):
         ({"fingers": "thumb", "palm": "no"}, "only 1 of its fingers, and no palm"),
         ({"links": "link_3.0_tip,link_15.0_tip", "palm": "must"}, "no palm surface that may touch"),
         ({"palm": "maybe"}, "'yes', 'no' or 'must'"),
+        ({"thumb": "adducting"}, "'abducted' or 'adducted'"),
         ({"approach": "0,0,0:30"}, "must not be zero"),
         ({"approach": "0,0:30"}, "give 3 numbers"),
         ({"approach": "0,0,1:300"}, "less than or equal to 180"),

@@ -9,15 +9,17 @@ import pytest
 import yaml
 from support.places import ROOT
 
+from lgrasp.choices import ThumbPlace
 from lgrasp.errors import ConfigError, HandError
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.fingers import finger_roles
+from lgrasp.hand.sides import posture_links
 from lgrasp.hand.spec import load_spec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.steer.grasp_types import type_names
 from lgrasp.steer.params import Steering
-from lgrasp.steer.typed import Anatomy, asked_sides, made_types, typed
+from lgrasp.steer.typed import Anatomy, asked_sides, asked_thumb, made_types, typed
 
 HANDS = ("allegro", "shadow", "leap", "barrett", "dclaw", "schunk_svh")
 
@@ -103,6 +105,48 @@ def test_tips_look_along_their_fingers(name, links, axis):
     assert [side.axis for side in sides if side.side == "tip"] == links * [axis]
 
 
+@pytest.mark.parametrize(
+    ("name", "joint", "adducted", "abducted"),
+    [
+        ("allegro", "joint_12.0", 0.27, 1.39),
+        ("shadow", "THJ4", 0.0, 1.2),
+        ("leap", "12", 0.0, 1.5),
+    ],
+)
+def test_the_joint_that_opposes_a_thumb_abducts_it(name, joint, adducted, abducted):
+    hand = parts(name)
+    source = find_hand(name)
+    places: dict[ThumbPlace, float] = {"adducted": adducted, "abducted": abducted}
+    for place, value in places.items():
+        bend, q = hand.thumb[place], hand.tree.joint_open[None].copy()
+        q[0, hand.tree.joint_names.index(joint)] = value
+        T = posture_links(read_urdf(source.urdf), hand.tree, q)[bend.link][0]
+        angle = np.degrees(np.arccos(abs(T[:3, :3] @ bend.axis @ bend.normal)))
+        assert (angle < bend.angle) == (place == "adducted")
+
+
+def test_types_ask_for_the_thumb_of_hands_that_abduct_it():
+    for name, kind, thumb in (
+        ("allegro", "adducted-thumb", "adducted"),
+        ("allegro", "medium-wrap", "abducted"),
+        ("leap", "lateral", "adducted"),
+        ("shadow", "adduction-grip", "abducted"),
+        ("barrett", "tripod", None),
+        ("dclaw", "tripod", None),
+    ):
+        found = typed(Steering(grasp_type=kind), parts(name))
+        assert found.thumb == thumb
+        bend = asked_thumb(found, parts(name))
+        assert (bend and bend.place) == thumb
+
+
+@pytest.mark.parametrize("name", ["barrett", "schunk_svh", "dclaw"])
+def test_a_thumb_without_places_is_told(name):
+    """Barrett's always bends across the palm, Schunk's turns by 10 degrees only, DClaw's fingers stand in no row."""
+    with pytest.raises(ConfigError, match=f"steer.thumb: hand '{name}' has no thumb that is abducted and adducted"):
+        asked_thumb(Steering(thumb="abducted"), parts(name))
+
+
 def test_links_without_sides_are_told():
     for name, link, words in (
         ("allegro", "link_15.0_tip", "'allegro' has no side 'radial'; links that have: link_0.0, link_1.0"),
@@ -112,7 +156,9 @@ def test_links_without_sides_are_told():
             asked_sides(Steering(links=(f"{link}:radial",)), parts(name))
 
 
-@pytest.mark.parametrize("asked", [{"fingers": "thumb,ring"}, {"links": "link_3.0_tip"}, {"palm": "must"}])
+@pytest.mark.parametrize(
+    "asked", [{"fingers": "thumb,ring"}, {"links": "link_3.0_tip"}, {"palm": "must"}, {"thumb": "adducted"}]
+)
 def test_what_touches_is_told_once(asked):
     with pytest.raises(ConfigError, match=f"grasp type tripod says what touches: leave out steer.{next(iter(asked))}"):
         typed(Steering(grasp_type="tripod", **asked), parts("allegro"))

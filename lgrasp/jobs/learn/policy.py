@@ -84,7 +84,7 @@ class PolicyJob(PolicyRequest, FileJob):
             assert stage.run  # imported now, so that its kernels are compiled before
         load, alias = Loader(self.cache, self.device_used.alias, events.loading), self.device_used.alias
         model = load.hand(self.keys.source, self.keys.hand, self.pipeline.hand)
-        self._hand = upload_hand(model, alias)
+        self._hand = upload_hand(model, alias, self.pipeline.hand.thumb)
         self._field = upload_field(load.field(self._hand, self.keys.field, self.pipeline.field), model, alias)
 
     def make(self, part: Part, progress: PartProgress) -> Made:

@@ -9,7 +9,7 @@ from lgrasp.grasp.collision import body_clear, body_height, resting_plane
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.grasp.outcomes import CONTACT, KEPT, OBJECT_COLLISION, SELF_COLLISION, UNUSED_FINGER
-from lgrasp.hand.arrays import Hand
+from lgrasp.hand.arrays import Hand, thumb_placed
 from lgrasp.math.kinematics import clamp_dofs, group_forward, vec_dof
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -120,7 +120,8 @@ def fill_unused(
 ):
     """Postures of fingers without contact: random ones of the field, drawn ever closer to the open posture.
 
-    A posture is taken when it is clear of the object, the table, the palm and the fingers placed before.
+    A posture is taken when it is clear of the object, the table, the palm and the fingers placed before, and a thumb is
+    where it has to be.
 
     Args:
         seed: (1,) random seed.
@@ -159,7 +160,7 @@ def fill_unused(
                     x = x + share * (drawn - x)
                 x = with_frozen(hand, held, h, g, x)
                 group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
-                clear = int(1)
+                clear = int(thumb_placed(hand, g, X, hand.kin.joint_first[g]))
                 for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
                     if clear == 1 and not body_clear(hand, obj, 1 + k, T_object * X[k], limits.allowed_penetration):
                         clear = 0

@@ -9,7 +9,7 @@ from lgrasp.field.arrays import Field
 from lgrasp.grasp.collision import body_clear, finger_above, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.grasp.structs import Candidates, Sets, State
-from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid
+from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid, thumb_placed
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.cholesky import solving
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column
@@ -148,6 +148,8 @@ def _realising(size: int) -> Any:
         if wp.abs(gap + params.contact_indentation) > params.gap or dot < params.cosine:
             state = State.MISSED
         if state == State.REALISED and not contact_allowed(hand.contacts, grid, out):
+            state = State.MISSED
+        if state == State.REALISED and not thumb_placed(hand, g, X, 0):
             state = State.MISSED
         if state == State.REALISED and params.check_collision == 1:
             T_object = wp.transform_inverse(T)

@@ -10,7 +10,7 @@ from lgrasp.grasp.collision import body_clear, body_far, finger_above, resting_p
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.grasp.structs import FURTHER, Candidates, State
-from lgrasp.hand.arrays import Hand
+from lgrasp.hand.arrays import Hand, thumb_placed
 from lgrasp.math.cholesky import solving
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
 from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
@@ -93,7 +93,10 @@ def clear_of_all(
     resting: wp.int32,
     X: wp.array(dtype=wp.transform),
 ):
-    """True if a finger is off the object, what is held, and the table; X holds the poses of its bodies."""
+    """True if a finger is off the object, what is held, and the table, and a thumb is where it has to be; X holds the
+    poses of its bodies."""
+    if not thumb_placed(hand, g, X, 0):
+        return False
     j0 = hand.kin.joint_first[g]
     T_object = wp.transform_inverse(pose)
     for j in range(hand.kin.joint_first[g + 1] - j0):

@@ -1,5 +1,7 @@
 """wrap: further links on the object; a case in closed form, and contacts of a hand measured on the URDF's solids."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -16,6 +18,7 @@ from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.build import build_hand
+from lgrasp.hand.params import ThumbBend
 from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.math.limits import MAX_DOFS
 from lgrasp.object.arrays import upload_object
@@ -96,6 +99,16 @@ def test_two_links_become_tangents_of_a_cylinder(gripper):
     for place, angle in zip(places, (START, START + turn), strict=True):
         outward = np.array([0.0, np.cos(angle), np.sin(angle)])
         assert model.contact_normals[place] @ outward > np.cos(np.radians(gripper.bounds.max_normal_angle))
+
+
+def test_a_thumb_that_is_not_where_it_has_to_be_is_blocked(gripper):
+    """Its hinges are along x in every posture."""
+    for normal, state in (((1, 0, 0), State.REALISED), ((0, 1, 0), State.BLOCKED)):
+        thumb = ThumbBend(link="b0", place="adducted", axis=(1, 0, 0), normal=normal, angle=45)
+        context = replace(gripper, hand=upload_hand(gripper.hand.model, gripper.device, thumb))
+        table, counts = run(one_candidate(context, tangent_centre(TANGENT), (START, 0.7)), WrapParams(), context)
+        assert counts["wrapped"] == (state == State.REALISED)
+        assert table.arrays()["state"][0, 0, 0] == state
 
 
 def test_what_cannot_wrap_stays_as_it_was(gripper):
