@@ -142,6 +142,16 @@ def check_load(
 
 
 @wp.kernel
+def give_up(tried: TriedSets, usable_out: Usable):
+    """Poses of which no set stands are left alone by later starts: their (pose, group) has no candidate to combine."""
+    row, g = wp.tid()
+    for lane in range(tried.score.shape[1]):
+        if tried.score[row, lane] >= 0.0:
+            return
+    usable_out.size[row, g] = 0
+
+
+@wp.kernel
 def check_fingers(hits: Hits, hand: Hand, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
     """One thread per (finger, finger, hit): scores of hits go below 0 when two fingers meet."""
     g, h, i = wp.tid()

@@ -23,6 +23,7 @@ from lgrasp.stages.search.kernels import (
     check_load,
     drop_sunk,
     find_sunk,
+    give_up,
     keep_sets,
     list_hits,
     list_usable,
@@ -66,7 +67,8 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     wp.launch(list_usable, (n, groups), [obj, int(state), inputs.struct], [usable], device=d)
     kernel = (swap_contacts if swap else mutate_contacts)[params.score]
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
-    few = _CPU_STARTS if d == "cpu" and not exact else _GPU_STARTS
+    paced = exact or (swap and context.bounds.max_unresisted_load < 1.0)
+    few = _CPU_STARTS if d == "cpu" and not paced else _GPU_STARTS
     lanes = min(params.restarts, few if params.per_pose < params.restarts else params.restarts)
     tried = empty_struct(TriedSets, d, n, lanes, groups)
     for first in range(0, params.restarts, lanes):
@@ -75,7 +77,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
         asked = [obj, values, context.seed("search", context.salt), first, inputs.struct, usable, found]
         wp.launch(kernel, tried.score.shape, asked, [tried], device=d)
         if swap:
-            _check_sets(tried, usable, values, inputs, context, exact)
+            _check_sets(tried, usable, values, inputs, context, exact, first == 0)
         wp.launch(keep_sets, n, [values, inputs.struct, tried], [found], device=d)
     upto = wp.clone(found.number)
     running_sums(upto)
@@ -87,9 +89,13 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
 
 
 def _check_sets(
-    tried: TriedSets, usable: Usable, values: Any, inputs: CandidateTable, context: Context, exact: bool
+    tried: TriedSets, usable: Usable, values: Any, inputs: CandidateTable, context: Context, exact: bool, early: bool
 ) -> None:
-    """Scores of tried sets go below 0 where a set fails; each check comes side by side for those that are left."""
+    """Scores of tried sets go below 0 where a set fails; each check comes side by side for those that are left.
+
+    Args:
+        early: give up poses of which no set resists the hardest pull.
+    """
     d, size = context.device, tried.score.size
     hand, obj = context.hand.struct, context.object.struct
     hits = empty_struct(Hits, d, size, number=wp.zeros(1, dtype=wp.int32, device=d))
@@ -104,6 +110,8 @@ def _check_sets(
         # most fail in the hardest direction: it comes alone
         for some, directions in ((0, 1), (1, LOAD_DIRECTIONS - 1)):
             check(check_load, (size, directions), [obj, values, some, inputs.struct], [tried])
+            if early and some == 0:
+                wp.launch(give_up, usable.size.shape, [tried], [usable], device=d)
     check(check_balance, size, sets, [tried])
     if context.realised:
         groups = context.hand.model.groups
