@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from lgrasp.view.server import View
 
 
+_MOTION = {time / 8: 0.08 if time % 8 else 0.8 for time in (*range(8), *range(8, 17, 2))}
+"""Times of a moving picture (0 pregrasp, 1 grasp, 2 squeeze), and how long each is shown [s]."""
+
+
 class StageName(StrEnum):
     """Stages of a grasp."""
 
@@ -28,10 +32,12 @@ class StageName(StrEnum):
 @reporting
 def render(
     paths: Shards,
-    out: Annotated[Path, Option("--out", "-o", help="File to write: .png, .jpg or .webp.")] = Path("grasps.png"),
+    out: Annotated[Path, Option("--out", "-o", help="File to write: .png, .jpg, .webp, or .gif, which moves.")] = Path(
+        "grasps.png"
+    ),
     count: Annotated[int, Option("-n", min=1, max=400, help="Rows, evenly over all.")] = 16,
     rows: Annotated[str | None, Option(help="Numbers of rows, counted through all shards, such as 0,5,9.")] = None,
-    stage: Annotated[StageName, Option(help="Posture of the hand.")] = StageName.grasp,
+    stage: Annotated[StageName | None, Option(help="Posture of the hand; default: grasp, in a .gif all.")] = None,
     size: Annotated[int, Option(min=32, max=2048, help="Pixels of a side of each picture.")] = 256,
     columns: Annotated[int, Option(min=0, help="Pictures in a line; 0: as many as lines.")] = 0,
     quiet: Quiet = False,
@@ -45,26 +51,28 @@ def render(
     from lgrasp.dataset.files import shards_below
 
     shards_below(paths)
-    from lgrasp.dataset.scenes import SceneRows, draw_rows
+    from lgrasp.dataset.scenes import SceneRows, draw_motion
     from lgrasp.files import write_file
-    from lgrasp.picture.sheet import check_image, image_bytes
+    from lgrasp.picture.scene import STAGES
+    from lgrasp.picture.sheet import check_image, gif_bytes, image_bytes
     from lgrasp_cli.progress import Bar
 
     check_image(out)
+    moving = out.suffix.lower() == ".gif" and stage is None
     found = SceneRows(paths)
     chosen = found.sound(found.spread(count)) if rows is None else _numbers(rows)
     with Bar(quiet=quiet) as bar:
-        image = draw_rows(
+        images = draw_motion(
             found,
             chosen,
-            stage=stage,
+            list(_MOTION) if moving else [list(STAGES).index(stage or "grasp")],
             size=size,
             columns=columns,
             progress=lambda done, total: bar.show("drawn", done, total, "rows"),
             loading=bar.share,
         )
-    write_file(out, image_bytes(image, out.suffix))
-    told = f"{out}: {plural(len(chosen), 'grasp')} of {len(found):,}, {image.width} x {image.height} pixels"
+    write_file(out, gif_bytes(images, list(_MOTION.values())) if moving else image_bytes(images[0], out.suffix))
+    told = f"{out}: {plural(len(chosen), 'grasp')} of {len(found):,}, {images[0].width} x {images[0].height} pixels"
     return Answer({"out": str(out), "rows": chosen, "of": len(found)}, [] if quiet else [told])
 
 

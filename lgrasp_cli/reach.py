@@ -43,12 +43,13 @@ def reach(
 
 
 def _show(data: dict[str, Any]) -> list[Block]:
-    names = ("reached", "no_posture", "no_way", "hits_table")
+    from lgrasp.reach.targets import CODES
+
     rows = [
-        (entry["hand"], entry["object"], f"{entry['rows']:,}", *(share(entry[name], entry["rows"]) for name in names))
+        (entry["hand"], entry["object"], f"{entry['rows']:,}", *(share(entry[name], entry["rows"]) for name in CODES))
         for entry in data["results"]
     ]
-    columns = ("hand", "object", "grasps", *(name.replace("_", " ") for name in names))
+    columns = ("hand", "object", "grasps", *(name.replace("_", " ") for name in CODES))
     pairs = [
         ("arm", f"{data['arm']}, {len(data['joints'])} joints, hand on {data['tip']}"),
         *took(data, "grasps"),

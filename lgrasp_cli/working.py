@@ -262,10 +262,9 @@ def conclude(outcome: "JobOutcome", how: How) -> None:
 def _left(outcome: "JobOutcome", how: How) -> str:
     """What an interrupted job leaves, and what the same command makes of it."""
     job, done, kept = outcome.job, len(outcome.paths), outcome.job.kept_rows(outcome)
-    rows = (
-        f"{'verdicts of ' if job.command == 'simulate' else ''}{kept:,} {job.unit} of the next are kept" if kept else ""
-    )
-    files = f"{done:,} of {plural(len(outcome.parts), 'file')} done in {job.folder}"
+    what = f"{'verdicts of ' if job.command == 'simulate' else ''}{kept:,} {job.unit}{' of the next' if done else ''}"
+    rows = f"{what} are kept" if kept else ""
+    files = f"{done:,} of {plural(len(outcome.parts), 'file')} done in {job.folder}" if done else ""
     if not (done or kept):
         return "nothing is finished; the same command begins again"
     again = "the same command without --overwrite" if how.overwrite and done else "the same command"

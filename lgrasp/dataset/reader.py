@@ -76,7 +76,7 @@ class FileReader:
         """Close the file; closing twice is harmless."""
         self._file.close()
 
-    @property
+    @cached_property
     def attributes(self) -> dict[str, Any]:
         """The root attributes as stored (``config`` is JSON text)."""
         with reading(self.path):
@@ -177,12 +177,15 @@ class ShardReader(FileReader):
         for path in (path for group in ("metrics", "physics") for path in expand(self._file, f"grasps/{group}/*")):
             name = path.removeprefix("grasps/")
             names.append(_RENAMED.get(name, name))
-        return {name: (self._dataset(name).shape, self._dataset(name).dtype) for name in names}
+        found = {name: self._dataset(name) for name in names}
+        return {name: (dataset.shape, dataset.dtype) for name, dataset in found.items()}
 
     @property
     def object_keys(self) -> list[tuple[str, str, float]]:
         """Id, hash and scale of every object, sorted by id."""
-        return [(o.id, o.sha256, o.scale) for o in self.objects()]
+        with reading(self.path):
+            objects = [(name, self._file["objects"][name].attrs) for name in self.object_ids]
+            return [(name, attrs["sha256"], float(attrs["scale"])) for name, attrs in objects]
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows ``start`` to ``stop`` of one dataset by its flat name; names of earlier releases do too.
@@ -245,8 +248,8 @@ class ShardReader(FileReader):
     def _dataset(self, name: str) -> h5py.Dataset:
         with reading(self.path):
             path = GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"
-            old = next((f"grasps/{was}" for was, now in _RENAMED.items() if now == name), path)
-            return self._file[old if old in self._file and path not in self._file else path]
+            old = next((f"grasps/{was}" for was, now in _RENAMED.items() if now == name), None)
+            return self._file[old if old and old in self._file and path not in self._file else path]
 
 
 def count_rows(path: str | os.PathLike[str]) -> int:

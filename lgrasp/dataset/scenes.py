@@ -21,7 +21,7 @@ from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.wrench_space import FRICTION
 from lgrasp.notices import notice
 from lgrasp.picture.draw import draw_scene
-from lgrasp.picture.scene import GraspScene, HandShape, scene_of_row
+from lgrasp.picture.scene import STAGES, GraspScene, HandShape, scene_of_row
 from lgrasp.picture.sheet import sheet
 from lgrasp.runtime.cores import cores
 from lgrasp.runtime.device import start
@@ -183,17 +183,35 @@ def draw_rows(
     stage: str = "grasp",
     size: int,
     columns: int = 0,
-    progress: Callable[[int, int], None] | None = None,
     loading: Callable[[str, float], None] | None = None,
 ) -> Image.Image:
-    """Rows side by side, each with its number.
+    """Rows side by side, each with its number; arguments as those of :func:`draw_motion`.
+
+    Args:
+        stage: pregrasp, grasp or squeeze.
+    """
+    times = [list(STAGES).index(stage)]
+    return draw_motion(rows, chosen, times, size=size, columns=columns, loading=loading)[0]
+
+
+def draw_motion(
+    rows: SceneRows,
+    chosen: Sequence[int],
+    times: Sequence[float],
+    *,
+    size: int,
+    columns: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    loading: Callable[[str, float], None] | None = None,
+) -> list[Image.Image]:
+    """Rows side by side at some times, each with its number.
 
     Args:
         chosen: At least one.
-        stage: pregrasp, grasp or squeeze.
+        times: Rising; 0 pregrasp, 1 grasp, 2 squeeze.
         size: Pixels of a side of each picture.
         columns: 0: about as many as lines.
-        progress: Called with (pictures done, pictures in all).
+        progress: Called with (rows done, rows in all).
         loading: Called with (kernels that are ready, share done).
 
     Raises:
@@ -202,15 +220,16 @@ def draw_rows(
     """
     start()
     load_kernels("cpu", kernel_modules("lgrasp.picture."), loading)
-    pictures: list[np.ndarray] = []
+    pictures: list[list[np.ndarray]] = []
     scenes = [rows.scene(row) for row in chosen]
     known = sorted({scene.objects[0].record.id for scene in scenes})
     with ThreadPoolExecutor(cores()) as pool:
-        for picture in pool.map(lambda s: draw_scene(s, size, stage, known.index(s.objects[0].record.id)), scenes):
-            pictures.append(picture)
+        for own in pool.map(lambda s: list(draw_scene(s, size, times, known.index(s.objects[0].record.id))), scenes):
+            pictures.append(own)
             if progress:
                 progress(len(pictures), len(scenes))
-    return sheet(pictures, [rows.caption(row, chosen) for row in chosen], columns)
+    captions = [rows.caption(row, chosen) for row in chosen]
+    return [sheet(at, captions, columns) for at in zip(*pictures, strict=True)]
 
 
 def _contents(path: Path) -> _Contents:

@@ -3,8 +3,9 @@
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
+from functools import cache
 from typing import Any
 
 import h5py
@@ -41,18 +42,22 @@ def format_problems(file: h5py.File, name: str, form: str, version: str) -> list
 
 def shard_problems(file: h5py.File) -> list[str]:
     """Why a file is no whole shard, or all differences to the schema, one line each; empty when it conforms."""
+    nodes: dict[str, Any] = {"": file}
     return (
         format_problems(file, "grasp shard", FORMAT, FORMAT_VERSION)
-        or foreign_problems(file)
-        or structure_problems(file)
+        or foreign_problems(file, nodes)
+        or structure_problems(file, nodes)
     )
 
 
-def foreign_problems(file: h5py.File) -> list[str]:
+def foreign_problems(file: h5py.File, nodes: dict[str, Any]) -> list[str]:
     """What makes a file more than its own bytes, or larger than them: one line, empty when there is nothing.
 
     Links and datasets that lead to other files, groups inside each other without end, sizes that are only declared, and
     names that could not be those of files.
+
+    Args:
+        nodes: gets the groups and datasets by path.
     """
     todo: list[tuple[str, h5py.Group, int]] = [("", file, 1)]
     while todo:
@@ -61,9 +66,9 @@ def foreign_problems(file: h5py.File) -> list[str]:
             here = f"{path}{name}"
             if name_problem(name):
                 return [f"{here!r}: the name cannot be used: {name_problem(name)}"]
-            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            if group.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
                 return [f"{here}: is a link; a shard holds its own data"]
-            node = group[name]
+            nodes[here] = node = group[name]
             if isinstance(node, h5py.Group):
                 if depth == _MOST_GROUPS:
                     return [f"{here}: more than {_MOST_GROUPS} groups inside each other"]
@@ -82,29 +87,43 @@ def _foreign_data(dataset: h5py.Dataset) -> str:
     return ""
 
 
-def structure_problems(file: h5py.File) -> list[str]:
-    """All differences between a file and the schema of shards, one line each; empty when it conforms."""
+def structure_problems(file: h5py.File, nodes: Mapping[str, Any] | None = None) -> list[str]:
+    """All differences between a file and the schema of shards, one line each; empty when it conforms.
+
+    Args:
+        nodes: as of :func:`schema_problems`.
+    """
     groups = (SEQUENCE_DATASETS, tuple(TABLE_FIELDS.values()))
     found = [spec for group in groups if any(spec.path in file for spec in group) for spec in group]
     return [
         *([] if expand(file, "objects/*") else ["objects: no object"]),
-        *schema_problems(file, (*DATASETS, *found), ATTRIBUTES),
+        *schema_problems(file, (*DATASETS, *found), ATTRIBUTES, nodes),
         *([] if "statistics" in file else ["statistics: missing group"]),
     ]
 
 
-def schema_problems(file: h5py.File, datasets: Sequence[DatasetSpec], attributes: Sequence[AttributeSpec]) -> list[str]:
-    """Differences between a file's datasets and attributes and those of a format, one line each."""
+def schema_problems(
+    file: h5py.File,
+    datasets: Sequence[DatasetSpec],
+    attributes: Sequence[AttributeSpec],
+    nodes: Mapping[str, Any] | None = None,
+) -> list[str]:
+    """Differences between a file's datasets and attributes and those of a format, one line each.
+
+    Args:
+        nodes: all groups and datasets of the file by path, if they are known; to open them is what takes time.
+    """
     problems: list[str] = []
     dims: dict[str, int] = {}
+    node = cache(lambda path: file.get(path or "/")) if nodes is None else nodes.get
     for spec in datasets:
         for path in expand(file, spec.path):
-            if spec.required or path in file:
-                problems += _dataset_problems(file, path, spec, dims)
+            if spec.required or node(path) is not None:
+                problems += _dataset_problems(node(path), path, spec, dims)
     for attribute in attributes:
         for path in expand(file, attribute.path):
-            if attribute.path in ("", *file) or path in file:
-                problems += _attribute_problems(file[path or "/"].attrs, path, attribute)
+            if (owner := node(path)) is not None:
+                problems += _attribute_problems(owner.attrs, path, attribute)
     return problems
 
 
@@ -117,8 +136,7 @@ def expand(file: h5py.File, pattern: str) -> list[str]:
     return [f"{head}{name}{tail}" for name in sorted(group)] if isinstance(group, h5py.Group) else []
 
 
-def _dataset_problems(file: h5py.File, path: str, spec: DatasetSpec, dims: dict[str, int]) -> list[str]:
-    dataset = file.get(path)
+def _dataset_problems(dataset: Any, path: str, spec: DatasetSpec, dims: dict[str, int]) -> list[str]:
     if not isinstance(dataset, h5py.Dataset):
         return [f"{path}: missing dataset"]
     if not _dtype_matches(dataset.dtype, spec.dtype):

@@ -29,7 +29,6 @@ class Source(NamedTuple):
     objects: list[tuple[str, str, float]]
     """Id, hash and scale."""
     space_names: tuple[str, ...] | None
-    failed_bounds: tuple[str, ...]
     columns: dict[str, tuple[tuple[int, ...], np.dtype]]
 
 
@@ -68,7 +67,8 @@ class TorchRows:
         """Id, SHA-256 of the source mesh and scale of every object."""
         self.space_names: tuple[str, ...] | None = first.space_names
         """Opposition spaces of the hand, if the first shard is of sequences."""
-        self.failed_bounds: tuple[str, ...] = first.failed_bounds
+        with self._open(first) as reader:
+            self.failed_bounds: tuple[str, ...] = tuple(reader.rows(0, 0).failed_bounds)
         """Names of the numbers in ``metrics/failed_bound``, if the first shard has it."""
         self.columns: list[str] = self._choose(columns)
         self._tails = {n: widest(source.columns[n][0][1:] for source in self._sources) for n in self.columns}
@@ -122,5 +122,5 @@ class TorchRows:
     def _survey(self, reader: ShardReader) -> Source:
         if self._split:
             reader.take(self._split.holds(self._part, reader))
-        hand, names = str(reader.attributes["hand_sha256"]), tuple(reader.rows(0, 0).failed_bounds)
-        return Source(reader.path, len(reader), hand, reader.object_keys, reader.space_names, names, reader.columns)
+        hand = str(reader.attributes["hand_sha256"])
+        return Source(reader.path, len(reader), hand, reader.object_keys, reader.space_names, reader.columns)

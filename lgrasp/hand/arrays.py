@@ -1,5 +1,6 @@
 """A HandModel on a device, as Warp structs; forward kinematics of whole postures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,8 +9,9 @@ import warp as wp
 
 from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_from_matrix
-from lgrasp.hand.model import HandModel
+from lgrasp.hand.model import HandModel, piece_arrays
 from lgrasp.hand.params import ThumbBend
+from lgrasp.hand.piece import Piece
 from lgrasp.math.convex import Pieces
 from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
 from lgrasp.math.limits import MAX_JOINTS
@@ -139,6 +141,12 @@ def upload_hand(model: HandModel, device: str, thumb: ThumbBend | None = None) -
         "box_high": model.canonical_box[1],
     }
     return HandArrays(model, device, upload_struct(Hand, device, hand), meshes)
+
+
+def upload_pieces(pieces: Sequence[Piece], body: np.ndarray, device: str) -> Pieces:
+    """Convex pieces, each in the frame of its ``body``, (P,); nothing is known of the bodies."""
+    named = {name.removeprefix("piece_"): values for name, values in piece_arrays(pieces).items()}
+    return upload_struct(Pieces, device, named | {"body": np.asarray(body, np.int32)})
 
 
 def _named(kind: Any, source: object, prefix: str = "") -> dict[str, Any]:

@@ -12,7 +12,7 @@ from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.contacts import body_cones, link_points
 from lgrasp.hand.digest import urdf_digest
 from lgrasp.hand.geometry import convex_pieces, geometry_mesh, inner_spheres, surface_samples
-from lgrasp.hand.model import HandModel, csr, stack_rows
+from lgrasp.hand.model import HandModel, csr, piece_arrays, stack_rows
 from lgrasp.hand.overlap import overlap_arrays
 from lgrasp.hand.pairs import with_pairs
 from lgrasp.hand.piece import Piece
@@ -118,12 +118,7 @@ class _Solids:
         return {
             "piece_first": csr([len(own) for own in self._pieces]),
             "body_sphere": np.array([_body_sphere([piece for _, piece in own]) for own in self._pieces], np.float32),
-            "vertex_first": csr([len(p.vertices) for p in pieces]),
-            "vertices": stack_rows([p.vertices for p in pieces], 3),
-            "plane_first": csr([len(p.planes) for p in pieces]),
-            "planes": stack_rows([p.planes for p in pieces], 4),
-            "piece_sphere": stack_rows([p.sphere[None] for p in pieces], 4),
-            "piece_radius": np.array([p.radius for p in pieces], np.float32),
+            **piece_arrays(pieces),
             "piece_body": np.repeat(np.arange(len(runs), dtype=np.int32), [len(own) for own in self._pieces]),
             "piece_link": np.array([index for own in self._pieces for index, _ in own], np.int32),
             "sphere_first": csr([len(own) for own in spheres]),

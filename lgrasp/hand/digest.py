@@ -13,13 +13,14 @@ def hand_digest(urdf_path: Path, spec: HandSpec) -> str:
     return urdf_digest(read_urdf(urdf_path), spec)
 
 
-def urdf_digest(urdf: Urdf, spec: HandSpec) -> str:
-    """:func:`hand_digest` of a URDF that has been read."""
+def urdf_digest(urdf: Urdf, spec: HandSpec | None = None) -> str:
+    """:func:`hand_digest` of a URDF that has been read, perhaps without rules."""
     h = hashlib.sha256(urdf.text.encode())
     for name in sorted(urdf.mesh_files):
         h.update(name.encode())
         for data in mesh_bytes(urdf.mesh_files[name]).values():
             h.update(data)
-    # neither changes a HandModel; views of opposition spaces have digests of their own
-    h.update(spec.model_dump_json(exclude={"opposition_spaces", "stand_off"}).encode())
+    if spec is not None:
+        # neither changes a HandModel; views of opposition spaces have digests of their own
+        h.update(spec.model_dump_json(exclude={"opposition_spaces", "stand_off"}).encode())
     return h.hexdigest()

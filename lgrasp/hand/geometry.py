@@ -186,6 +186,22 @@ def convex_pieces(
     return pieces, note + (f" ({failures[0]})" if failures else "")
 
 
+def link_pieces(
+    urdf: Urdf, link: str, decompose: Decompose | None = None, device: str = "cpu"
+) -> tuple[list[Piece], list[str]]:
+    """Convex pieces of a link in its own frame [m], and in words how they differ from its collision elements.
+
+    Raises:
+        HandError: a mesh that cannot be used.
+    """
+    found, notes = [], []
+    for geometry in urdf.links[link]:
+        pieces, note = convex_pieces(urdf, geometry, geometry_mesh(urdf, geometry), decompose, device)
+        found += [piece.moved(geometry.T_link_geometry) for piece in pieces]
+        notes += [f"link '{link}': {note}"] if note else []
+    return found, notes
+
+
 def is_dented(body: trimesh.Trimesh, device: str = "cpu") -> bool:
     """True if a body differs from its hull by a tenth of its volume, and by 4 mm somewhere.
 

@@ -1,6 +1,7 @@
 """HandModel: everything the stages need to know of a hand, as plain arrays that can be cached."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -22,6 +23,18 @@ def csr(counts: ArrayLike) -> np.ndarray:
 def stack_rows(parts: list[np.ndarray], width: int, dtype: type = np.float32) -> np.ndarray:
     """(n, width): all rows of ``parts``, of which there may be none."""
     return np.vstack(parts).astype(dtype) if parts else np.zeros((0, width), dtype)
+
+
+def piece_arrays(pieces: Sequence[Piece]) -> dict[str, np.ndarray]:
+    """Arrays of a HandModel for its convex pieces."""
+    return {
+        "vertex_first": csr([len(p.vertices) for p in pieces]),
+        "vertices": stack_rows([p.vertices for p in pieces], 3),
+        "plane_first": csr([len(p.planes) for p in pieces]),
+        "planes": stack_rows([p.planes for p in pieces], 4),
+        "piece_sphere": stack_rows([p.sphere[None] for p in pieces], 4),
+        "piece_radius": np.array([p.radius for p in pieces], np.float32),
+    }
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Which pieces of a hand must stay apart: all of non-adjacent links, save pairs that touch in every posture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +20,8 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 ALMOST_ALWAYS = 0.95
 """Links that touch in a larger share of all postures are left to touch."""
-_SAMPLED_POSTURES = 256
+PAIR_POSTURES = 256
+"""Random postures that tell which links touch."""
 _CONFIRMING_POSTURES = 2000  # postures in which a pair must touch to count as touching always
 _UNUSABLE_SHARE = 0.98  # of all postures
 _GRID_ERROR = 5.0e-5  # [m] that distance grids may err
@@ -54,18 +55,42 @@ def pieces_touch(
     model: HandModel, q: np.ndarray, pairs: np.ndarray, margin: float = 0.0, device: str = "cpu"
 ) -> np.ndarray:
     """(N, Q) bool: are piece pairs (Q, 2) within ``margin`` [m] of each other at postures q (N, K)?"""
-    start()
     hand = upload_hand(model, device)
-    pose = wp.array(body_poses(hand, q), dtype=wp.transform, device=device)
-    out = wp.zeros((len(q), len(pairs)), dtype=wp.int32, device=device)
+    return placed_pieces_touch(hand.struct.pieces, body_poses(hand, q), pairs, margin, device)
+
+
+def placed_pieces_touch(
+    pieces: Pieces, pose: np.ndarray, pairs: np.ndarray, margin: float = 0.0, device: str = "cpu"
+) -> np.ndarray:
+    """As :func:`pieces_touch`, of pieces on the device, with their bodies at device poses (N, B, 7)."""
+    start()
+    out = wp.zeros((len(pose), len(pairs)), dtype=wp.int32, device=device)
     inputs = [
-        hand.struct.pieces,
-        pose,
+        pieces,
+        wp.array(pose, dtype=wp.transform, device=device),
         wp.array(np.asarray(pairs, np.int32), dtype=wp.vec2i, device=device),
         float(margin),
     ]
-    wp.launch(mark_touching, dim=(len(q), len(pairs)), inputs=inputs, outputs=[out], device=device)
+    wp.launch(mark_touching, dim=out.shape, inputs=inputs, outputs=[out], device=device)
     return to_numpy(out).astype(bool)
+
+
+def separate_pairs(
+    body: np.ndarray, link: np.ndarray, names: Sequence[str], joined: Iterable[tuple[str, str]]
+) -> np.ndarray:
+    """Piece pairs (Q, 2), i32, of different bodies and of links that no joint joins.
+
+    Args:
+        body, link: of each piece, (P,).
+        names: of links.
+        joined: two links each.
+    """
+    near = np.zeros((len(names), len(names)), bool)
+    for a, b in joined:
+        near[names.index(a), names.index(b)] = near[names.index(b), names.index(a)] = True
+    i, j = np.triu_indices(len(body), 1)
+    free = (body[i] != body[j]) & ~near[link[i], link[j]]
+    return np.column_stack([i, j])[free].astype(np.int32)
 
 
 def with_pairs(
@@ -86,17 +111,12 @@ def with_pairs(
         dented: links with bodies that differ much from their hulls.
     """
     names, group = model.tree.link_names, model.tree.body_group + 1
-    joined = np.zeros((len(names), len(names)), bool)
-    for a, b in adjacent:
-        joined[names.index(a), names.index(b)] = joined[names.index(b), names.index(a)] = True
-    i, j = np.triu_indices(len(model.piece_body), 1)
-    free = (model.piece_body[i] != model.piece_body[j]) & ~joined[model.piece_link[i], model.piece_link[j]]
-    if not free.any():
+    pairs = separate_pairs(model.piece_body, model.piece_link, names, adjacent)
+    if not len(pairs):
         return model
-    pairs = np.column_stack([i, j])[free].astype(np.int32)
     swapped = group[model.piece_body[pairs[:, 0]]] > group[model.piece_body[pairs[:, 1]]]
     pairs[swapped] = pairs[swapped, ::-1]
-    q = model.random_postures(_SAMPLED_POSTURES, 1)
+    q = model.random_postures(PAIR_POSTURES, 1)
     touch = pieces_touch(model, q, pairs, device=device)
     # links, not pieces, are what touches: a link pair is left out when some pieces of it touch in every posture
     links = np.sort(model.piece_link[pairs], axis=1)

@@ -2,7 +2,8 @@
 
 import json
 import time
-from typing import Any, ClassVar
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import PrivateAttr
@@ -11,21 +12,28 @@ from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.errors import ShardError
+from lgrasp.geometry.decompose import decompose
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.grasp.records import HandRecord
 from lgrasp.jobs.requests.shards import ReachRequest
 from lgrasp.jobs.verdicts import VerdictJob
 from lgrasp.reach.arm import Arm, read_arm
 from lgrasp.reach.targets import CODES, hand_targets, placed_objects
 from lgrasp.runtime.cores import threads
 
+if TYPE_CHECKING:
+    from lgrasp.reach.self_collision import ArmSolids
+
 
 class ReachJob(ReachRequest, VerdictJob):
     """Adds joints of an arm to shards, in place or to copies."""
 
     command: ClassVar[str] = "reach"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
+    kernels: ClassVar[tuple[str, ...]] = ("lgrasp.hand.pairs",)
 
     _arm: Arm | None = PrivateAttr(None)
+    _solids: dict[str, "ArmSolids"] = PrivateAttr(default_factory=dict)  # by hand
 
     @property
     def described(self) -> Arm:
@@ -45,7 +53,7 @@ class ReachJob(ReachRequest, VerdictJob):
     def settings(self) -> dict[str, Any]:
         arm = self.described
         where = {name: getattr(self, name).model_dump(mode="json") for name in ("mount", "at")}
-        return {"arm": arm.name, "arm_sha256": arm.sha256, "tip": arm.tip} | where | {"tries": self.tries}
+        return {"arm": arm.urdf.name, "arm_sha256": arm.sha256, "tip": arm.tip} | where | {"tries": self.tries}
 
     def check_source(self, reader: ShardReader) -> None:
         super().check_source(reader)
@@ -64,13 +72,13 @@ class ReachJob(ReachRequest, VerdictJob):
 
         assert part.source is not None
         with ShardReader(part.source) as reader:
-            rows, objects = reader.rows(), reader.objects()
+            rows, objects, hand = reader.rows(), reader.objects(), reader.hand()
         begin = time.perf_counter()
         try:
             placed = placed_objects(self.at, rows, objects)
         except ShardError as error:
             raise ShardError(f"{part.source}: {error}") from None
-        search = ArmSearch(self.described, self.tries)
+        search = ArmSearch(self.described, self._solids_with(hand), self.tries)
         found = search(
             hand_targets(self.at, rows, placed),
             threads(self.workers),
@@ -92,13 +100,21 @@ class ReachJob(ReachRequest, VerdictJob):
         }
         return Made(len(rows), added)
 
+    def _solids_with(self, hand: HandRecord) -> "ArmSolids":
+        from lgrasp.reach.self_collision import ArmSolids, base_pieces
+
+        if hand.sha256 not in self._solids:
+            cut = partial(decompose, store=self.cache)
+            self._solids[hand.sha256] = ArmSolids(self.described, base_pieces(hand, cut), cut)
+        return self._solids[hand.sha256]
+
     def write(self, part: Part, contents: Any) -> None:
         assert part.source is not None
         extend_shard(part.source, part.file, **contents)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``arm``, ``tip``, ``joints``; ``results``: of each hand and object ``rows`` and how many of them are
-        ``reached``, or what they lack (``no_posture``, ``no_way``, ``hits_table``)."""
+        ``reached``, or what they lack (``no_posture``, ``no_way``, ``hits_table``, ``hits_itself``)."""
         results: dict[tuple[str, str], np.ndarray] = {}
         for path in outcome.paths:
             with ShardReader(path, invalid=False) as reader:
@@ -109,7 +125,7 @@ class ReachJob(ReachRequest, VerdictJob):
                     )
                     counts += np.bincount(code[index == number], minlength=len(CODES))
         return {
-            "arm": self.described.name,
+            "arm": self.described.urdf.name,
             "tip": self.described.tip,
             "joints": [joint.name for joint in self.described.moving],
             "results": [

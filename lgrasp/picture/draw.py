@@ -1,6 +1,6 @@
 """Pictures of scenes without a screen: a camera that sees hand, objects and contacts, shaded by rays."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,17 +50,23 @@ class Viewpoint(NamedTuple):
     """T_scene_camera, x y z [m] qw qx qy qz, shape (7,)."""
 
 
-def draw_scene(scene: GraspScene, size: int, stage: str, colour: int) -> np.ndarray:
-    """The last step of a row, with its contacts as dots; sRGB, shape (size, size, 3), uint8.
+def draw_scene(scene: GraspScene, size: int, times: Sequence[float], colour: int) -> Iterator[np.ndarray]:
+    """The last step of a row at some times, by one camera, contacts as dots; sRGB, each (size, size, 3), uint8.
 
     Args:
+        times: rising; 0 pregrasp, 1 grasp, 2 squeeze.
         colour: which of the colours of objects the first one has.
     """
-    links = list(scene.hand.placed(scene.steps[-1].stages[stage]).values())
+    stages = list(scene.steps[-1].stages.values())
+    first, last = int(times[0]), int(np.ceil(times[-1]))
+    links = [mesh for q in stages[first : last + 1] for mesh in scene.hand.placed(q).values()]
     objects = [placed.placed for placed in scene.objects]
-    painted = [Painted(mesh, HAND[i % len(HAND)]) for i, mesh in enumerate(links)]
-    painted += [Painted(mesh, OBJECTS[i % len(OBJECTS)]) for i, mesh in enumerate(objects, colour)]
-    return draw(painted, scene.contacts.points, choose_viewpoint(links, objects, scene.contacts.points, size))
+    view = choose_viewpoint(links, objects, scene.contacts.points, size)
+    still = [Painted(mesh, OBJECTS[i % len(OBJECTS)]) for i, mesh in enumerate(objects, colour)]
+    for time in times:
+        q, _ = scene.at(scene.duration - len(stages) + 1 + time)
+        moving = [Painted(mesh, HAND[i % len(HAND)]) for i, mesh in enumerate(scene.hand.placed(q).values())]
+        yield draw(moving + still, scene.contacts.points, view)
 
 
 def choose_viewpoint(

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from lgrasp.errors import OutputError
 from lgrasp.files import check_file
 
-FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP"}
+FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP", ".gif": "GIF"}
 """Of image files, by suffix."""
 
 _INK = "#3c4650"
@@ -64,4 +64,11 @@ def image_bytes(image: Image.Image, suffix: str = ".png") -> bytes:
     """The contents of an image file."""
     out = io.BytesIO()
     image.save(out, FORMATS[suffix.lower()], optimize=True, quality=90)
+    return out.getvalue()
+
+
+def gif_bytes(images: Sequence[Image.Image], seconds: Sequence[float]) -> bytes:
+    """The contents of a GIF that shows images for so long each [s], over and over."""
+    out, (first, *others) = io.BytesIO(), images
+    first.save(out, "GIF", append_images=others, save_all=True, duration=[1000 * s for s in seconds], loop=0)
     return out.getvalue()

@@ -1,6 +1,5 @@
 """An arm as its URDF describes it: the joints from its base to the hand on its tip, and its links as points."""
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lgrasp.errors import HandError
+from lgrasp.hand.digest import urdf_digest
 from lgrasp.hand.geometry import geometry_mesh, spread_directions
 from lgrasp.hand.urdf import Geometry, Joint, Urdf, check_robot, read_robot
 
@@ -24,7 +24,7 @@ _LEVEL = 1  # joints that move a link before its height can change: the first on
 class Arm:
     """A chain of J joints that move; links are those in the chain."""
 
-    name: str
+    urdf: Urdf
     tip: str
     joints: tuple[Joint, ...]
     """From the root link to the tip, fixed ones too."""
@@ -36,7 +36,12 @@ class Arm:
     note: str
     """Why links are their origins alone; "" where they are not."""
     sha256: str
-    """Of the URDF and the points."""
+    """Of the URDF and the meshes."""
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """From the root link to the tip."""
+        return self.joints[0].parent, *(joint.child for joint in self.joints)
 
     @cached_property
     def moving(self) -> tuple[Joint, ...]:
@@ -99,7 +104,7 @@ def read_arm(path: Path, tip: str | None, T_tip_hand: np.ndarray) -> Arm:
         tree, raw = read_robot(path)
         for element in tree.findall("link/collision"):
             element.getparent().remove(element)
-        urdf, note = check_robot(path, tree, raw), f"links are told by their origins alone: {error}"
+        urdf, note = check_robot(path, tree, raw), f"links are told by their origins alone, and not kept apart: {error}"
     into = {joint.child: joint for joint in urdf.joints}
     joints = []
     while (at := joints[-1].parent if joints else tip or _last(urdf)) in into:
@@ -112,11 +117,7 @@ def read_arm(path: Path, tip: str | None, T_tip_hand: np.ndarray) -> Arm:
             raise HandError(f"URDF {path}: joint '{joint.name}' follows '{joint.mimic[0]}'; joints of an arm must not")
     if not any(joint.movable for joint in chain):
         raise HandError(f"URDF {path}: no joint moves link '{chain[-1].child}'; name another with --tip")
-    points = _points(urdf, chain)
-    digest = hashlib.sha256(urdf.text.encode())
-    for values in points.values():
-        digest.update(values.tobytes())
-    return Arm(urdf.name, chain[-1].child, chain, T_tip_hand, points, note, digest.hexdigest())
+    return Arm(urdf, chain[-1].child, chain, T_tip_hand, _points(urdf, chain), note, urdf_digest(urdf))
 
 
 def _last(urdf: Urdf) -> str:

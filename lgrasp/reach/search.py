@@ -9,6 +9,7 @@ from pytorch_kinematics.ik import PseudoInverseIK
 from pytorch_kinematics.transforms import Transform3d
 
 from lgrasp.reach.arm import Arm
+from lgrasp.reach.self_collision import ArmSolids
 from lgrasp.reach.targets import CODES, Targets
 from lgrasp.runtime.ordered import in_order
 
@@ -19,7 +20,7 @@ STEP = 0.025
 MOST_TURN = 0.5
 """[rad or m] in a step: joints that move farther jump to another posture."""
 
-_REACHED, _POSE, _WAY, _TABLE = range(len(CODES))
+_REACHED, _POSE, _WAY, _TABLE, _ITSELF = range(len(CODES))
 _TOGETHER = 4  # starts of a round; rows that are reached take part in no other
 _ROUGH, _WITHIN, _NEXT = 15, 10, 6  # iterations without limits, within them, and from one step of the way to the next
 _ROWS = 256  # at a time
@@ -42,11 +43,12 @@ class ArmSearch:
     """Searches joints of an arm.
 
     Args:
+        solids: of the arm, with the hand's base.
         tries: starts of each pose, well spread within the limits.
     """
 
-    def __init__(self, arm: Arm, tries: int) -> None:
-        self._arm, self._chain = arm, arm.chain()
+    def __init__(self, arm: Arm, solids: ArmSolids, tries: int) -> None:
+        self._arm, self._solids, self._chain = arm, solids, arm.chain()
         low, high = self._chain.low, self._chain.high
         drawn = torch.quasirandom.SobolEngine(len(arm.moving), scramble=True, seed=0).draw(tries).to(low)
         self._starts = low + drawn * (high - low)
@@ -115,6 +117,7 @@ class ArmSearch:
         row, start = torch.nonzero(found.converged, as_tuple=True)
         q = at = found.solutions[row, start]
         good, height = torch.ones_like(row, dtype=torch.bool), self._height(q, targets.table)
+        passed = [q]
         if targets.way is not None and len(row):
             way = self._put(targets.way)[row]
             steps = round(float(np.linalg.norm(targets.way[0])) / STEP)
@@ -124,7 +127,11 @@ class ArmSearch:
                 before, (at, there) = at, self._follow(at, moved)
                 good &= there & ((at - before).abs() <= MOST_TURN).all(1)
                 height = torch.minimum(height, self._height(at, targets.table))
+                passed.append(at)
         code = torch.where(good, torch.where(height < 0, _TABLE, _REACHED), _WAY)
+        for at in passed:
+            left = code == _REACHED
+            code[left] = torch.where(self._clear(at[left]), _REACHED, _ITSELF)
         J = self._chain.jacobian_tensor(q)
         measure = torch.linalg.det(J @ J.mT).clamp_min(0.0).sqrt()
         return [x.cpu().numpy() for x in (row, code, torch.where(code == _REACHED, measure, -1.0), q, at)]
@@ -147,6 +154,10 @@ class ArmSearch:
             low = ((up[:3] @ R) @ points.T).amin(1) + t @ up[:3] - up[3]
             height = torch.minimum(height, low)
         return height
+
+    def _clear(self, q: torch.Tensor) -> torch.Tensor:
+        """Which postures (n, J) are without self-collision (n,)."""
+        return torch.as_tensor(self._solids.clear(q.double().cpu().numpy()))
 
     def _put(self, values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(values, dtype=self._chain.dtype)

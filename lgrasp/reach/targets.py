@@ -11,9 +11,9 @@ from lgrasp.grasp.approach_kernels import APPROACH_LENGTH
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.reach.placement import Placement
 
-CODES = ("reached", "no_posture", "no_way", "hits_table")
+CODES = ("reached", "no_posture", "no_way", "hits_table", "hits_itself")
 """What a target lacks, by its code: nothing; a posture of the arm at the pose; postures
-all along the way; room above the table."""
+all along the way; room above the table; postures without self-collision."""
 
 
 class Targets(NamedTuple):

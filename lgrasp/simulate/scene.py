@@ -13,7 +13,7 @@ from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.decompose import decompose as cut_mesh
 from lgrasp.grasp.hand_files import write_hand
 from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.hand.geometry import convex_pieces, geometry_mesh
+from lgrasp.hand.geometry import link_pieces
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.simulate.solid import Solid, solid_of_mesh
@@ -71,13 +71,9 @@ def hand_of_record(record: HandRecord, decompose: Decompose, device: str = "cpu"
     pieces, notes = {}, []
     with temporary_folder() as folder:
         urdf = read_urdf(write_hand(record, folder))
-        for link, geometries in urdf.links.items():
-            found = []
-            for geometry in geometries:
-                parts, note = convex_pieces(urdf, geometry, geometry_mesh(urdf, geometry), decompose, device)
-                found += [part.moved(geometry.T_link_geometry) for part in parts]
-                notes += [f"link '{link}': {note}"] if note else []
-            pieces[link] = found
+        for link in urdf.links:
+            pieces[link], said = link_pieces(urdf, link, decompose, device)
+            notes += said
     return HandSolids(
         name=record.name,
         urdf=record.urdf,

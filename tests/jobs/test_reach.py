@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yourdfpy
-from support.shards import sample_on_table, sample_shard
-from support.urdfs import arm
+from support.shards import sample_hand, sample_on_table, sample_shard
+from support.urdfs import ARM_HEIGHTS, arm, gripper
 
 from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.exports.selection import select_rows
@@ -18,9 +18,12 @@ from lgrasp.errors import HandError, OutputError, ShardError
 from lgrasp.geometry.poses import compose, inverse, pose_from_matrix, pose_matrix
 from lgrasp.jobs.reach import ReachJob
 from lgrasp.reach.arm import read_arm
+from lgrasp.reach.placement import Placement
+from lgrasp.reach.self_collision import ArmSolids, base_pieces
 from lgrasp.reach.targets import CODES
 
 AT, MOUNT = "0.4,0.1,0.05:30", "0.01,0,0.02:10,20,30"
+PLACED, MOUNTED = (Placement.model_validate(text).pose for text in (AT, MOUNT))
 
 
 def arm_kinematics(path):
@@ -44,7 +47,8 @@ def job(tmp_path):
     path = arm(tmp_path)
 
     def job(shard, **more):
-        write_shard(tmp_path / "in" / "toy-cup-00000.h5", shard)
+        hand = replace(shard.hand, urdf=gripper(tmp_path, kind="visual").read_text(), base_link="base")
+        write_shard(tmp_path / "in" / "toy-cup-00000.h5", replace(shard, hand=hand))
         given = {"arm": path, "at": AT, "mount": MOUNT, "device": "cpu", "workers": 1, "cache": Cache(tmp_path / "c")}
         return ReachJob.model_validate(given | {"shards": (tmp_path / "in",)} | more)
 
@@ -61,10 +65,9 @@ def test_postures_put_the_hand_where_rows_say(job, tmp_path):
     forward, limits = arm_kinematics(arm(tmp_path))
     rng = np.random.default_rng(3)
     n = 24
-    mount = pose_matrix(job(sample_shard(1)).mount.pose)
-    hand = forward(rng.uniform(0.9 * limits[:, 0], 0.9 * limits[:, 1], (n, 7)))["flange"] @ mount
+    hand = forward(rng.uniform(0.5 * limits[:, 0], 0.5 * limits[:, 1], (n, 7)))["flange"] @ pose_matrix(MOUNTED)
     hand[: n // 3, :3, 3] *= 4.0 / np.linalg.norm(hand[: n // 3, :3, 3], axis=1)[:, None]
-    at = np.broadcast_to(job(sample_shard(1)).at.pose, (n, 7))
+    at = np.tile(PLACED, (n, 1))
     shard = with_poses(sample_shard(n), compose(inverse(pose_from_matrix(hand)), at))
     outcome = run(job(shard, tries=64))
     found = read_shard(outcome.paths[0]).grasps.physics
@@ -74,14 +77,61 @@ def test_postures_put_the_hand_where_rows_say(job, tmp_path):
     q = found["reach_q_arm"]
     assert np.isnan(q[~ok]).all()
     assert ((q[ok] >= limits[:, 0] - 1e-6) & (q[ok] <= limits[:, 1] + 1e-6)).all()
-    reached = forward(q[ok])["flange"] @ mount
+    reached = forward(q[ok])["flange"] @ pose_matrix(MOUNTED)
     assert np.abs(reached[:, :3, 3] - hand[ok, :3, 3]).max() < 2e-4
     assert np.abs(reached[:, :3, :3] - hand[ok, :3, :3]).max() < 2e-3
     assert (found["reach_manipulability"][ok] > 0).all()
     np.testing.assert_allclose(found["reach_object_pose"], at, atol=1e-6)
     assert outcome.job.report(outcome)["results"] == [
-        {"hand": "toy", "object": "cup.obj", "rows": n, "reached": 16, "no_posture": 8, "no_way": 0, "hits_table": 0}
+        {"hand": "toy", "object": "cup.obj", "rows": n, **dict.fromkeys(CODES, 0), "reached": 16, "no_posture": 8}
     ]
+
+
+def gaps(path, q):
+    """Least distance of links that no joint joins at postures (n, 7), negative where they overlap, by Coal."""
+    coal = pytest.importorskip("coal")
+    links, parts = arm_kinematics(path)[0](q), []
+    for i, z in enumerate([*ARM_HEIGHTS[1:], 0.05]):
+        T = links[f"arm_{i}"].copy()
+        T[:, :3, 3] += T[:, :3, 2] * (z or 0.05) / 2
+        parts.append((coal.Cylinder(0.03, z or 0.05), [coal.Transform3s(x[:3, :3], x[:3, 3]) for x in T]))
+
+    def gap(a, b, n):
+        return coal.distance(a[0], a[1][n], b[0], b[1][n], coal.DistanceRequest(), coal.DistanceResult())
+
+    return np.array([min(gap(a, b, n) for i, a in enumerate(parts) for b in parts[i + 2 :]) for n in range(len(q))])
+
+
+def test_links_of_an_arm_are_apart(tmp_path):
+    """As Coal finds; neighbours may touch. The base of a hand on the tip counts as a link."""
+    path = arm(tmp_path, bend=3.0)
+    _, limits = arm_kinematics(path)
+    solids = ArmSolids(read_arm(path, None, np.eye(4)), [])
+    upright, folded = np.zeros(7), np.array([0, 0, 0, 3.0, 0, 0, 0])
+    assert solids.clear(np.stack([upright, folded])).tolist() == [True, False]
+    q = np.random.default_rng(1).uniform(*limits.T, (300, 7))
+    gap = gaps(path, q)
+    sure = np.abs(gap) > 1e-3
+    assert (solids.clear(q) == (gap > 0))[sure].all()
+    assert 10 < (gap[sure] < 0).sum() < 290
+
+    record = replace(sample_hand(), urdf=gripper(tmp_path).read_text(), base_link="base")
+    bent = np.array([0, 0, 0, 0, 0, 2.4, 0])
+    assert solids.clear(bent[None]).all()
+    with_hand = ArmSolids(read_arm(path, None, pose_matrix(np.array([0.06, 0, 0, 1, 0, 0, 0]))), base_pieces(record))
+    assert with_hand.clear(np.stack([upright, bent])).tolist() == [True, False]
+
+
+def test_an_arm_never_folds_into_itself(job, tmp_path):
+    """Poses of all postures: no joints are given that collide, and rows say where others are not found."""
+    path = arm(tmp_path, bend=3.0)
+    forward, limits = arm_kinematics(path)
+    hand = forward(np.random.default_rng(2).uniform(*limits.T, (48, 7)))["flange"] @ pose_matrix(MOUNTED)
+    shard = with_poses(sample_shard(48), compose(inverse(pose_from_matrix(hand)), np.tile(PLACED, (48, 1))))
+    found = read_shard(run(job(shard, arm=path, tries=4)).paths[0]).grasps.physics
+    codes = [CODES[code] for code in found["reach_code"]]
+    assert codes.count("hits_itself") > 0, codes
+    assert gaps(path, found["reach_q_arm"][found["reach_ok"]]).min() > -1e-4
 
 
 def test_objects_on_a_table_are_reached_from_above_it(job, tmp_path):
@@ -99,10 +149,10 @@ def test_objects_on_a_table_are_reached_from_above_it(job, tmp_path):
     codes = np.bincount(found["reach_code"], minlength=len(CODES))
     assert (codes[[0, 3]] > 2).all(), codes
     ok = found["reach_ok"]
-    mount, described = pose_matrix(made.mount.pose), read_arm(path, None, np.eye(4))
+    described = read_arm(path, None, np.eye(4))
     for name, back in (("reach_q_arm", 0.0), ("reach_q_arm_approach", 0.15)):
         links = forward(found[name][ok])
-        hand = links["flange"] @ mount
+        hand = links["flange"] @ pose_matrix(MOUNTED)
         hand[:, :3, 3] += back * (hand[:, :3, :3] @ rows.table["approach"][ok, :, None])[..., 0]
         assert np.abs(hand @ pose_matrix(pose[ok]) - placed[ok]).max() < 2e-3
         low = [links[link] @ np.append(point, 1) for link, points in described.points.items() for point in points]

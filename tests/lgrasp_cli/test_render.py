@@ -24,6 +24,20 @@ def test_stages_differ(cli, tmp_path):
     assert (tmp_path / "pregrasp.png").read_bytes() != (tmp_path / "grasp.png").read_bytes()
 
 
+def test_a_gif_moves_through_the_stages(cli, tmp_path):
+    assert cli("render", SHARD, "--rows", "3,4", "--size", 40, "-o", "grasp.gif").code == 0
+    with Image.open(tmp_path / "grasp.gif") as image:
+        assert image.width == 80
+        frames = []
+        for number in range(getattr(image, "n_frames", 1)):
+            image.seek(number)
+            frames.append(image.convert("RGB").tobytes())
+    assert len(set(frames)) == len(frames) > 10
+    assert cli("render", SHARD, "--rows", "3", "--size", 40, "--stage", "squeeze", "-o", "still.gif").code == 0
+    with Image.open(tmp_path / "still.gif") as image:
+        assert getattr(image, "n_frames", 1) == 1
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

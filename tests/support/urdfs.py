@@ -28,13 +28,13 @@ ARM_JOINT = (
 )
 
 
-def arm(folder: Path, more: str = "") -> Path:
+def arm(folder: Path, more: str = "", bend: float = 2.1) -> Path:
     """An upright arm of seven joints that turn about z and y in turn, 1.25 m long; ``more`` links and joints."""
     links, joints = ['<link name="base"/>'], []
     for i, z in enumerate(ARM_HEIGHTS):
         size = [*ARM_HEIGHTS, 0.05][i + 1] or 0.05
         links.append(ARM_LINK.format(n=f"arm_{i}", half=size / 2, size=size))
-        about = {"axis": "0 1 0", "most": 2.1} if i % 2 else {"axis": "0 0 1", "most": 2.9}
+        about = {"axis": "0 1 0", "most": bend} if i % 2 else {"axis": "0 0 1", "most": 2.9}
         joints.append(ARM_JOINT.format(i=i, p=f"arm_{i - 1}" if i else "base", c=f"arm_{i}", z=z, **about))
     joints.append('<joint name="end" type="fixed"><parent link="arm_6"/><child link="flange"/>')
     joints.append('<origin xyz="0 0 0.05" rpy="0 0 0.5"/></joint><link name="flange"/>')
