@@ -14,8 +14,6 @@ from lgrasp_cli.tables import Answer, reporting
 if TYPE_CHECKING:
     from viser import ViserServer
 
-    from lgrasp.view.server import View
-
 
 _MOTION = {time / 8: 0.08 if time % 8 else 0.8 for time in (*range(8), *range(8, 17, 2))}
 """Times of a moving picture (0 pregrasp, 1 grasp, 2 squeeze), and how long each is shown [s]."""
@@ -103,9 +101,10 @@ def view(
 
     kind_of(what)
     from lgrasp.view.open import open_view
+    from lgrasp.view.server import serve
 
     cache = open_cache(cache_dir)
-    _serve(*open_view(what, cache, host=host, port=port, row=row, where=where or ()))
+    serve(*open_view(what, cache, host=host, port=port, row=row, where=where or (), served=_tell_address))
 
 
 def view_hand(name: HandArgument, host: Host = "localhost", port: Port = 8080, cache_dir: CacheDir = None) -> None:
@@ -114,15 +113,13 @@ def view_hand(name: HandArgument, host: Host = "localhost", port: Port = 8080, c
     Example: lgrasp hands view allegro
     """
     from lgrasp.view.open import open_hand
-
-    _serve(*open_hand(name, open_cache(cache_dir), host=host, port=port))
-
-
-def _serve(server: "ViserServer", view: "View") -> None:
     from lgrasp.view.server import serve
 
+    serve(*open_hand(name, open_cache(cache_dir), host=host, port=port, served=_tell_address))
+
+
+def _tell_address(server: "ViserServer") -> None:
     echo(f"open http://{server.get_host()}:{server.get_port()} in a browser; Ctrl-C ends this")
-    serve(server, view)
 
 
 def _numbers(text: str) -> list[int]:

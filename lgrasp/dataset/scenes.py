@@ -6,26 +6,24 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from PIL import Image
 
-from lgrasp.dataset.conditions import Condition, satisfied
+from lgrasp.dataset.conditions import Condition, parse_condition, satisfied
 from lgrasp.dataset.files import Paths, check_heaps
 from lgrasp.dataset.gather import sound_files
 from lgrasp.dataset.reader import ShardReader, count_rows
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.grasp.bounds import stored_bounds
-from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.grasp.wrench_space import FRICTION
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 from lgrasp.notices import notice
-from lgrasp.picture.draw import draw_scene
-from lgrasp.picture.scene import STAGES, GraspScene, HandShape, scene_of_row
-from lgrasp.picture.sheet import sheet
 from lgrasp.runtime.cores import cores
-from lgrasp.runtime.device import start
-from lgrasp.runtime.kernels import kernel_modules, load_kernels
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+    from lgrasp.picture.scene import GraspScene, HandShape
 
 _KEPT = 16  # hands, and lists of objects, that stay in memory
 
@@ -55,6 +53,7 @@ class SceneRows:
         if not len(self):
             raise ShardError(f"{self.files[0]}: no row to look at (shards: {len(self.files)})")
         self._contents = lru_cache(_KEPT)(_contents)
+        self._chosen = lru_cache(1)(self.chosen)
         self._shapes: dict[tuple[str, tuple[str, ...]], HandShape] = {}
 
     def __len__(self) -> int:
@@ -78,13 +77,19 @@ class SceneRows:
         count = min(count, len(grasps))
         return [int(grasps[(2 * k + 1) * len(grasps) // (2 * count)]) for k in range(count)]
 
-    def sound(self, rows: Iterable[int], most: int | None = None) -> list[int]:
+    def sound(
+        self, rows: Iterable[int], most: int | None = None, look: Callable[[int], object] | None = None
+    ) -> list[int]:
         """The first of some rows that can be read; a shard with one that cannot is left out from there on.
+
+        Args:
+            look: what reads a row, :meth:`scene` or the quicker :meth:`read`.
 
         Raises:
             ShardError: None can be read.
             ConfigError: There is no such row.
         """
+        look = look or self.scene
         sound: list[int] = []
         damaged: dict[Path, ShardError] = {}
         for row in rows:
@@ -92,7 +97,7 @@ class SceneRows:
             if path in damaged:
                 continue
             try:
-                self.scene(row)
+                look(row)
             except ShardError as error:
                 damaged[path] = error
                 continue
@@ -105,23 +110,35 @@ class SceneRows:
             notice(f"{error}; it is left out")
         return sound
 
-    def scene(self, row: int) -> GraspScene:
+    def read(self, row: int) -> tuple[HandRecord, tuple[ObjectRecord, ...], GraspRows]:
+        """A row alone, with the hand and the objects of its shard.
+
+        Raises:
+            ShardError: The shard is damaged.
+            ConfigError: There is no such row.
+        """
+        path, number = self.place(row)
+        hand, objects, _ = self._contents(path)
+        with ShardReader(path) as reader:
+            return hand, objects, reader.rows(number, number + 1)
+
+    def scene(self, row: int) -> "GraspScene":
         """The scene of a row.
 
         Raises:
             ShardError: The shard is damaged, or its hand cannot be used.
             ConfigError: There is no such row.
         """
-        path, number = self.place(row)
-        hand, objects, _ = self._contents(path)
-        with ShardReader(path) as reader:
-            rows = reader.rows(number, number + 1)
+        from lgrasp.picture.scene import HandShape, scene_of_row  # slow to load
+
+        hand, objects, rows = self.read(row)
         key = hand.sha256, tuple(hand.joint_names)
         if key not in self._shapes:
             self._shapes[key] = HandShape.of_record(hand)
         try:
             return scene_of_row(self._shapes[key], objects, rows, 0)
         except ShardError as error:
+            path, number = self.place(row)
             raise ShardError(f"{path}: row {number}: {error}") from None
 
     def columns(self) -> list[str]:
@@ -152,6 +169,21 @@ class SceneRows:
             with ShardReader(path) as reader:
                 good.append(satisfied(reader, where))
         return np.flatnonzero(np.concatenate(good))
+
+    def meeting(self, where: str) -> Sequence[int] | np.ndarray:
+        """Rows that satisfy conditions, separated by commas; without any, all.
+
+        Raises:
+            ConfigError: A condition cannot be read, or no row meets them.
+            ShardError: A shard lacks a column.
+        """
+        conditions = tuple(parse_condition(text) for text in where.split(",") if text.strip())
+        if not conditions:
+            return range(len(self))
+        chosen = self._chosen(conditions)
+        if not len(chosen):
+            raise ConfigError(f"no row of {len(self):,} meets {where}")
+        return chosen
 
     def numbers(self, row: int) -> dict[str, float | list[float]]:
         """Metrics and verdicts of a row by column."""
@@ -184,12 +216,14 @@ def draw_rows(
     size: int,
     columns: int = 0,
     loading: Callable[[str, float], None] | None = None,
-) -> Image.Image:
+) -> "Image.Image":
     """Rows side by side, each with its number; arguments as those of :func:`draw_motion`.
 
     Args:
         stage: pregrasp, grasp or squeeze.
     """
+    from lgrasp.picture.scene import STAGES  # slow to load
+
     times = [list(STAGES).index(stage)]
     return draw_motion(rows, chosen, times, size=size, columns=columns, loading=loading)[0]
 
@@ -203,7 +237,7 @@ def draw_motion(
     columns: int = 0,
     progress: Callable[[int, int], None] | None = None,
     loading: Callable[[str, float], None] | None = None,
-) -> list[Image.Image]:
+) -> "list[Image.Image]":
     """Rows side by side at some times, each with its number.
 
     Args:
@@ -218,6 +252,11 @@ def draw_motion(
         ShardError: A shard is damaged, or its hand cannot be used.
         ConfigError: There is no such row.
     """
+    from lgrasp.picture.draw import draw_scene  # slow to load
+    from lgrasp.picture.sheet import sheet
+    from lgrasp.runtime.device import start
+    from lgrasp.runtime.kernels import kernel_modules, load_kernels
+
     start()
     load_kernels("cpu", kernel_modules("lgrasp.picture."), loading)
     pictures: list[list[np.ndarray]] = []
@@ -238,5 +277,7 @@ def _contents(path: Path) -> _Contents:
         try:
             friction = stored_bounds(reader.header.config).friction
         except (KeyError, TypeError, ValueError):  # of another writer
+            from lgrasp.grasp.wrench_space import FRICTION  # slow to load
+
             friction = FRICTION
         return _Contents(reader.hand(), reader.objects(), friction)

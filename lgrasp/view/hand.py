@@ -16,7 +16,7 @@ from lgrasp.hand.urdf import read_urdf
 from lgrasp.picture.draw import OBJECTS
 from lgrasp.picture.scene import HandShape
 from lgrasp.view.figure import HandFigure, add_mesh, rgb, show_all
-from lgrasp.view.server import Aim, add_saving
+from lgrasp.view.page import Aim, add_saving
 
 if TYPE_CHECKING:
     import viser

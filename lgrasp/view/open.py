@@ -7,29 +7,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from lgrasp.dataset.reader import open_hdf5
 from lgrasp.dataset.scenes import SceneRows
 from lgrasp.engine.cache import Cache
-from lgrasp.jobs.shard_inputs import named_hand, named_object
-from lgrasp.runtime.device import resolve_device
-from lgrasp.scenes.files import read_scene
 from lgrasp.scenes.schema import FORMAT
-from lgrasp.view.hand import HandView
 from lgrasp.view.names import kind_of
-from lgrasp.view.rows import RowsView
 from lgrasp.view.server import View, close_server, open_server
-from lgrasp.view.table import ObjectView, TableView
 
 if TYPE_CHECKING:
     import viser
 
 _Make = Callable[["viser.ViserServer"], View]
+_Served = Callable[["viser.ViserServer"], None]
 
 
 def open_view(
-    what: Sequence[str], cache: Cache, *, host: str, port: int, row: int = 0, where: Sequence[str] = ()
+    what: Sequence[str],
+    cache: Cache,
+    *,
+    host: str,
+    port: int,
+    row: int = 0,
+    where: Sequence[str] = (),
+    served: _Served = lambda _: None,
 ) -> tuple["viser.ViserServer", View]:
     """A server that shows what is named.
 
@@ -37,34 +38,57 @@ def open_view(
         what: shards or folders of them; or one scene file (of a folder the first), hand or object, by name or path.
         row: the first that is shown, counted through all shards.
         where: conditions on rows.
+        served: called once browsers have an answer; what they are to show is made then.
 
     Raises:
         LgraspError: nothing of that name, or it cannot be used; viser is not installed.
     """
-    return _opened(_maker(what, cache, row, where), host, port)
+    return _opened(_maker(what, cache, row, where), host, port, served)
 
 
-def open_hand(name: str, cache: Cache, *, host: str, port: int) -> tuple["viser.ViserServer", View]:
-    """A server that shows a hand, by the user's name for it.
+def open_hand(
+    name: str, cache: Cache, *, host: str, port: int, served: _Served = lambda _: None
+) -> tuple["viser.ViserServer", View]:
+    """A server that shows a hand, by the user's name for it; ``served`` as of :func:`open_view`.
 
     Raises:
         LgraspError: there is no such hand, or it cannot be used; viser is not installed.
     """
-    return _opened(_hand(name, cache), host, port)
+    return _opened(_hand(name, cache), host, port, served)
 
 
-def _opened(make: "_Make", host: str, port: int) -> tuple["viser.ViserServer", View]:
+def _opened(make: "_Make", host: str, port: int, served: _Served) -> tuple["viser.ViserServer", View]:
     server = open_server(host, port, "lgrasp")
     try:
-        return server, make(server)
+        loading = server.gui.add_markdown("loading")
+        served(server)
+        view = make(server)
+        loading.remove()
+        return server, view
     except BaseException:
         close_server(server)
         raise
 
 
 def _hand(name: str, cache: Cache) -> "_Make":
+    from lgrasp.jobs.shard_inputs import named_hand  # slow to load
+    from lgrasp.runtime.device import resolve_device
+    from lgrasp.view.hand import HandView
+
     source, model = named_hand(cache, name, resolve_device("cpu"))
     return partial(HandView, source=source, model=model)
+
+
+def _object(name: str, cache: Cache) -> "_Make":
+    import trimesh  # slow to load
+
+    from lgrasp.jobs.shard_inputs import named_object
+    from lgrasp.runtime.device import resolve_device
+    from lgrasp.view.table import ObjectView
+
+    found = named_object(cache, name, 1.0, resolve_device("cpu"))
+    mesh = trimesh.Trimesh(np.asarray(found.vertices, float), np.asarray(found.faces), process=False)
+    return partial(ObjectView, name=found.name, mesh=mesh, notes=tuple(found.notes))
 
 
 def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) -> "_Make":
@@ -75,13 +99,22 @@ def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) ->
         with open_hdf5(inside[0]) as file:
             is_scene = file.attrs.get("format") == FORMAT
         if is_scene:
+            from lgrasp.scenes.files import read_scene  # slow to load
+            from lgrasp.view.table import TableView
+
             return partial(TableView, scene=read_scene(inside[0]))
     if kind == "hand":
         return _hand(name, cache)
     if kind == "object":
-        found = named_object(cache, name, 1.0, resolve_device("cpu"))
-        mesh = trimesh.Trimesh(np.asarray(found.vertices, float), np.asarray(found.faces), process=False)
-        return partial(ObjectView, name=found.name, mesh=mesh, notes=tuple(found.notes))
-    rows = SceneRows([Path(one).expanduser() for one in what])
-    (first,) = rows.sound(range(row, max(len(rows), row + 1)), most=1)
-    return lambda server: RowsView(server, rows, shlex.join(what), where, first)
+        return _object(name, cache)
+    rows, conditions = SceneRows([Path(one).expanduser() for one in what]), ", ".join(where)
+    (readable,) = rows.sound(range(row, max(len(rows), row + 1)), most=1, look=rows.read)
+    rows.meeting(conditions)
+
+    def make(server: "viser.ViserServer") -> View:
+        from lgrasp.view.rows import RowsView  # slow to load
+
+        (first,) = rows.sound(range(readable, len(rows)), most=1)
+        return RowsView(server, rows, shlex.join(what), conditions, first)
+
+    return make

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import trimesh
 
-from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.scenes import SceneRows
-from lgrasp.errors import ConfigError, LgraspError
+from lgrasp.errors import LgraspError
 from lgrasp.view.figure import STAGE_MARKS, GraspFigure, Marks
-from lgrasp.view.server import Aim, add_saving
+from lgrasp.view.page import Aim, add_saving
 
 if TYPE_CHECKING:
     import viser
@@ -28,16 +27,14 @@ class RowsView:
 
     Args:
         told: the shards as they were named on the command line.
-        where: conditions, such as ``metrics/epsilon > 0.05``.
+        where: conditions, separated by commas, such as ``metrics/epsilon > 0.05``.
         row: the first that is shown, counted through all shards.
 
     Raises:
         LgraspError: no such row, a condition that cannot be read or that no row meets, a damaged shard.
     """
 
-    def __init__(
-        self, server: "viser.ViserServer", rows: SceneRows, told: str, where: Sequence[str] = (), row: int = 0
-    ) -> None:
+    def __init__(self, server: "viser.ViserServer", rows: SceneRows, told: str, where: str = "", row: int = 0) -> None:
         self._server, self._rows, self._told = server, rows, told
         self._lock = threading.RLock()
         self.order: Sequence[int] | np.ndarray = range(len(rows))
@@ -59,9 +56,7 @@ class RowsView:
         self._play = gui.add_checkbox("play", False)
         self._text = gui.add_markdown("")
         with gui.add_folder("choose"):
-            self._where = gui.add_text(
-                "where", ", ".join(where), hint="such as metrics/epsilon > 0.05, physics/fc_holds"
-            )
+            self._where = gui.add_text("where", where, hint="such as metrics/epsilon > 0.05, physics/fc_holds")
             metrics = [name for name in rows.columns() if name != "candidate"]
             self._sort = gui.add_dropdown("sort by", (_AS_STORED, *metrics), initial_value=_AS_STORED)
             self._falling = gui.add_checkbox("largest first", True)
@@ -130,12 +125,7 @@ class RowsView:
         Raises:
             LgraspError: a condition that cannot be read, no such column, no such row; all stays as it is.
         """
-        texts = [text for text in where.split(",") if text.strip()]
-        order: Sequence[int] | np.ndarray = range(len(self._rows))
-        if texts:
-            order = self._rows.chosen([parse_condition(text) for text in texts])
-            if not len(order):
-                raise ConfigError(f"no row of {len(self._rows):,} meets {where}")
+        order = self._rows.meeting(where)
         if sort != _AS_STORED:
             values = self._rows.column(sort)[np.asarray(order)]
             order = np.asarray(order)[np.argsort(-values if falling else values, kind="stable")]

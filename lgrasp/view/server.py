@@ -1,27 +1,21 @@
-"""The server of a viewer: opened on this computer, kept until the user ends it, pictures and GLB files out of it."""
+"""The server of a viewer: opened on this computer, kept until the user ends it.
+
+Light to import: browsers have an answer before what they are to show is made.
+"""
 
 import io
 import socket
 import time
-from collections.abc import Sequence
 from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-import trimesh
-from trimesh.exchange.gltf import export_glb
-
 from lgrasp.errors import ConfigError
-from lgrasp.geometry.poses import pose_matrix
-from lgrasp.picture.draw import ANGLE, choose_viewpoint
-from lgrasp.picture.sheet import image_bytes, sheet
 
 if TYPE_CHECKING:
+    import trimesh
     import viser
 
-_ROOM = 1.25  # times as far away as it must be
 _FRAME = 0.04  # [s] between the pictures of an animation
-_PATIENCE = 20.0  # [s] for a browser to draw a picture
 
 
 class View(Protocol):
@@ -31,7 +25,7 @@ class View(Protocol):
         """Go on by so much time, if something moves."""
         ...
 
-    def meshes(self) -> trimesh.Scene:
+    def meshes(self) -> "trimesh.Scene":
         """All that is shown, as it is now."""
         ...
 
@@ -61,53 +55,6 @@ def open_server(host: str, port: int, title: str) -> "viser.ViserServer":
     server.gui.main_panel.dock_right()
     server.scene.set_up_direction("+z")
     return server
-
-
-class Aim:
-    """Where browsers look from: where links, objects and contacts are seen best.
-
-    Args:
-        contacts: [m], shape (c, 3).
-    """
-
-    def __init__(
-        self, links: Sequence[trimesh.Trimesh], objects: Sequence[trimesh.Trimesh], contacts: np.ndarray
-    ) -> None:
-        pose = choose_viewpoint(links, objects, contacts, 256).pose
-        low, high = trimesh.util.concatenate([*links, *objects]).bounds
-        self._middle, self._way = (low + high) / 2, _ROOM * (pose[:3] - (low + high) / 2)
-        R = pose_matrix(pose)[:3, :3]
-        self.right: np.ndarray = R[:, 0]
-        """On the screen, unit."""
-        self.down: np.ndarray = R[:, 1]
-
-    def apply(self, server: "viser.ViserServer", shift: np.ndarray, factor: float = 1.0) -> None:
-        """Move all cameras; ``shift`` [m] is added to what is looked at, ``factor`` times as far away as needed."""
-        clients = server.get_clients().values()
-        for camera in (server.initial_camera, *(client.camera for client in clients)):
-            camera.position = self._middle + shift + factor * self._way
-            camera.look_at = self._middle + shift
-            camera.fov = float(np.radians(ANGLE))
-
-
-def add_saving(server: "viser.ViserServer", view: View, name: str) -> None:
-    """Buttons that save what is shown."""
-    picture = server.gui.add_button("save picture (PNG)")
-    model = server.gui.add_button("save model (GLB)")
-
-    @picture.on_click
-    def _(event: "viser.GuiEvent") -> None:
-        client = event.client
-        if client is not None:
-            size = client.camera.image_height, client.camera.image_width
-            seen = client.get_render(*size, transport_format="png", timeout=_PATIENCE)
-            client.send_file_download(f"{name}.png", image_bytes(sheet([seen[..., :3]])), save_immediately=True)
-
-    @model.on_click
-    def _(event: "viser.GuiEvent") -> None:
-        if event.client is not None:
-            data = export_glb(view.meshes())
-            event.client.send_file_download(f"{name}.glb", data, save_immediately=True)
 
 
 def serve(server: "viser.ViserServer", view: View) -> None:

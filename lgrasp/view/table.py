@@ -11,7 +11,7 @@ from lgrasp.picture.draw import OBJECTS
 from lgrasp.picture.scene import STAGES, ContactMarks, GraspScene, HandShape, PlacedObject, Step
 from lgrasp.scenes.records import SceneRecord
 from lgrasp.view.figure import STAGE_MARKS, GraspFigure, add_mesh, place, rgb, show_all
-from lgrasp.view.server import Aim, add_saving
+from lgrasp.view.page import Aim, add_saving
 
 if TYPE_CHECKING:
     import viser

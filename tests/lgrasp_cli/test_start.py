@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 import warp as wp
+from support.places import TINY_SHARD
 
 import lgrasp
 from lgrasp_cli.main import app
@@ -108,6 +109,23 @@ def test_generating_from_the_cache_imports_nothing_slow(run, cache_root, tmp_pat
     assert slow == "[]"
     assert set(ast.literal_eval(others)) <= {"lgrasp.refine.params"}
     assert list((tmp_path / "other").glob("*.h5"))
+
+
+def test_a_viewer_answers_before_anything_slow_is_loaded():
+    pytest.importorskip("viser", reason="viser is not installed (extra view)")
+    code = f"""
+import sys
+from lgrasp_cli import look
+def told(server):
+    print([m for m in {(*SLOW, "warp")} if m in sys.modules])
+    raise KeyboardInterrupt
+look._tell_address = told
+sys.argv = ["lgrasp", "view", {str(TINY_SHARD)!r}, "--port", "0"]
+from lgrasp_cli.main import main
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (130, "[]\n"), done.stderr
 
 
 def test_mujoco_looks_for_no_screen():

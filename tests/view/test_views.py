@@ -141,11 +141,12 @@ def test_a_scene(opened, tmp_path):
         ("allegrp", {}, "'allegrp' is no file, folder, hand or object; did you mean 'allegro'"),
         (SHARD, {"row": 10}, "row 10 does not exist; there are 0 to 9"),
         (SHARD, {"where": ["epsilon >"]}, "expected COLUMN or COLUMN OP NUMBER"),
+        (SHARD, {"where": ["metrics/epsilon > 9"]}, "no row of 10 meets"),
     ],
 )
 def test_what_cannot_be_shown_is_said(opened, what, options, message):
     with pytest.raises(ConfigError, match=message):
-        opened(what, **options)
+        opened(what, **options, served=lambda _: pytest.fail("browsers have an answer"))
 
 
 def test_without_viser_the_extra_is_named(opened, monkeypatch):
