@@ -21,7 +21,7 @@ from lgrasp.grasp.check_kernels import (
     pack_rows,
 )
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
-from lgrasp.grasp.collision import depth_parts
+from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.control_kernels import control_poses, drop_limp, limit_squeeze, press_shared
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome, failed_squeeze
@@ -73,9 +73,9 @@ class Check:
 
     def measure(self, part: int, obj: ObjectArrays | None = None) -> None:
         """Measure the penetration of a part of the hands and the object, or another one."""
-        d, runs = self.hand.device, depth_parts(self.hand.device)
-        inputs = [self.hand.struct, (obj or self.obj).struct, self.limits, part, runs, self.at]
-        wp.launch(measure_penetration, (runs, self.bodies, len(self)), inputs, [self.found], device=d)
+        d, slices = self.hand.device, depth_slices(self.hand.device)
+        inputs = [self.hand.struct, (obj or self.obj).struct, self.limits, part, slices, self.at]
+        wp.launch(measure_penetration, (slices, self.bodies, len(self)), inputs, [self.found], device=d)
 
     def measure_held(self) -> None:
         """The same of the hands, the object and what is held already."""

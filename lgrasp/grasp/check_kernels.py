@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
-from lgrasp.grasp.collision import body_depth_part, objects_apart
+from lgrasp.grasp.collision import body_depth_slice, objects_apart
 from lgrasp.grasp.held import Held, body_depth_in_held, group_fixed
 from lgrasp.grasp.outcomes import CONTACT, KEPT, SELF_COLLISION, UNRESISTED_LOAD
 from lgrasp.hand.arrays import Hand
@@ -137,19 +137,19 @@ def measure_penetration(
     obj: Object,
     limits: Limits,
     part: wp.int32,
-    runs: wp.int32,
+    slices: wp.int32,
     at: CheckedPostures,
     found_out: Findings,
 ):
     """Largest penetration [m] of a part of the hand (TOUCHING, OTHERS or ALL) and the object.
 
-    One thread per (run, body, hand), so that neighbours do like work; ``penetration`` grows to the largest, and above
+    One thread per (slice, body, hand), so that neighbours do like work; ``penetration`` grows to the largest, and above
     ``limits.deepest`` is just that.
 
     Args:
-        runs: in how many the points of a body come (:func:`depth_parts`).
+        slices: of the points of a body (:func:`~lgrasp.grasp.collision.depth_slices`).
     """
-    r, b, i = wp.tid()
+    k, b, i = wp.tid()
     if found_out.outcome[i] != KEPT and limits.whole == 0:
         return
     if found_out.penetration[i] > limits.deepest:
@@ -164,7 +164,7 @@ def measure_penetration(
             return
         B = at.body[i, b - 1]
     T = wp.transform_inverse(at.pose[at.of[i]]) * B
-    d = body_depth_part(hand, obj, b, T, limits.deepest, r, runs)
+    d = body_depth_slice(hand, obj, b, T, limits.deepest, k, slices)
     if d > 0.0:
         wp.atomic_max(found_out.penetration, i, d)
 

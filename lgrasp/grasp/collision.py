@@ -12,7 +12,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 wp.set_module_options(KERNEL_OPTIONS)
 
 _FAR_BELOW = wp.constant(1.0e6)  # [m]
-_GPU_DEPTH_PARTS = 8
+_GPU_DEPTH_SLICES = 8
 
 
 @wp.func
@@ -50,25 +50,26 @@ def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin:
     return True
 
 
-def depth_parts(device: str) -> int:
-    """In how many parts :func:`body_depth_part` should come: a GPU has threads for more than there are bodies."""
-    return 1 if device == "cpu" else _GPU_DEPTH_PARTS
+def depth_slices(device: str) -> int:
+    """In how many slices :func:`body_depth_slice` should come: a GPU has threads for more than there are bodies."""
+    return 1 if device == "cpu" else _GPU_DEPTH_SLICES
 
 
 @wp.func
-def body_depth_part(
+def body_depth_slice(
     hand: Hand,
     obj: Object,
     body: wp.int32,
     T: wp.transform,
     limit: wp.float32,
-    part: wp.int32,
-    parts: wp.int32,
+    first_run: wp.int32,
+    slices: wp.int32,
 ):
     """Deepest penetration of body and object [m], 0 when apart; stops early above ``limit``. T = T_object_body.
 
     Both ways: surface samples of the body in the object's distance grid, obstacle points of the object in the body's
-    convex pieces. Balls around runs of points skip what is far. Of ``parts`` parts of these runs only one is looked at.
+    convex pieces. Balls around runs of points skip what is far. Of these runs every ``slices``-th is looked at, from
+    ``first_run`` on.
     """
     depth = float(0.0)
     b = hand.pieces.body_sphere[body]
@@ -77,7 +78,7 @@ def body_depth_part(
     centre = wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))
     if sdf_value(obj.sdf, centre) > b[3]:
         return depth
-    for k in range(hand.cluster_first[body] + part, hand.cluster_first[body + 1], parts):
+    for k in range(hand.cluster_first[body] + first_run, hand.cluster_first[body + 1], slices):
         s = hand.cluster_sphere[k]
         if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3]:
             for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
@@ -87,7 +88,7 @@ def body_depth_part(
     T_body = wp.transform_inverse(T)
     first = hand.pieces.body_first[body]
     end = hand.pieces.body_first[body + 1]
-    for k in range(part, obj.clusters, parts):
+    for k in range(first_run, obj.clusters, slices):
         s = obj.cluster_sphere[k]
         c = wp.vec3(s[0], s[1], s[2])
         d = c - centre
@@ -115,8 +116,8 @@ def body_depth_part(
 
 @wp.func
 def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: wp.float32):
-    """:func:`body_depth_part` of the whole."""
-    return body_depth_part(hand, obj, body, T, limit, 0, 1)
+    """:func:`body_depth_slice` of the whole."""
+    return body_depth_slice(hand, obj, body, T, limit, 0, 1)
 
 
 @wp.func

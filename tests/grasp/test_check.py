@@ -37,6 +37,8 @@ MORE = {("dclaw", "swift-refine"): 300}
 FEW = {("schunk_svh", "lightning"), ("shadow", "lightning")}
 """Where so few candidates give no row."""
 
+ROBUST = load_pipeline("robust")
+
 SAME = {"fswo", "penetration", "self_penetration", "gap", "normal_error"}
 """Metrics without a stopping rule or a random ray: the same to the last bit."""
 
@@ -57,6 +59,21 @@ def hand_inputs(hand, cache_root) -> Inputs:
 def rechecked(context: Context, table, bounds: GraspBounds):
     contacts = known_contacts(table.contact_links, table.contact_points, table.contact_normals, "cpu")
     return check_grasps(context.hand, context.object, table.pose, table.q, contacts, bounds)
+
+
+def test_slices_of_bodies_give_the_same_rows(hand, hand_inputs, monkeypatch):
+    """A GPU looks at the points of a body in several slices."""
+    context = replace(shard_context(ROBUST, hand_inputs, 0), field=replace(hand_inputs.field, boxes=None))
+
+    def made(slices):
+        for module in ("lgrasp.grasp.check", "lgrasp.stages.search.stage"):
+            monkeypatch.setattr(f"{module}.depth_slices", lambda device: slices)
+        return run_stages(ROBUST, context, 0, PIPELINES["robust"], "filter")
+
+    whole, sliced = made(1), made(8)
+    assert len(whole) > 0 or (hand, "robust") in FEW
+    np.testing.assert_array_equal(sliced.q, whole.q)
+    np.testing.assert_array_equal(sliced.metrics["penetration"], whole.metrics["penetration"])
 
 
 @pytest.mark.parametrize("name", PIPELINES)

@@ -4,7 +4,7 @@ from enum import IntEnum
 
 import warp as wp
 
-from lgrasp.grasp.collision import body_depth_part
+from lgrasp.grasp.collision import body_depth_slice
 from lgrasp.grasp.structs import FURTHER, Candidates, Sets, further_contacts
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
@@ -176,18 +176,18 @@ def find_sunk(
     params: SearchValues,
     candidates: Candidates,
     tried: TriedSets,
-    runs: wp.int32,
+    slices: wp.int32,
     usable_out: Usable,
 ):
-    """One thread per (run, body, hit), so that neighbours do like work: fingers that sink into the object with a body,
-    at any point, as the filter would find.
+    """One thread per (slice, body, hit), so that neighbours do like work: fingers that sink into the object with a
+    body, at any point, as the filter would find.
 
     Scores stay as they are, so that which candidates are looked at does not depend on which thread comes first.
 
     Args:
-        runs: in how many the points of a body come (:func:`depth_parts`).
+        slices: of the points of a body (:func:`~lgrasp.grasp.collision.depth_slices`).
     """
-    r, b, i = wp.tid()
+    k, b, i = wp.tid()
     g = hand.body_group[b]
     row, lane = _hit(hits, tried, i)
     if row < 0 or g < 0:
@@ -198,7 +198,7 @@ def find_sunk(
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     j0 = group_forward(hand.kin, g, candidates.q[row, g, m], X, 0)
     T = wp.transform_inverse(candidates.poses.pose[row]) * X[b - 1 - j0]
-    if body_depth_part(hand, obj, b, T, params.max_penetration, r, runs) > params.max_penetration:
+    if body_depth_slice(hand, obj, b, T, params.max_penetration, k, slices) > params.max_penetration:
         usable_out.sunk[row, g, m] = 1
 
 

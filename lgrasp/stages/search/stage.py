@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from lgrasp.errors import ConfigError
-from lgrasp.grasp.collision import depth_parts
+from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.math.constants import LOAD_DIRECTIONS
@@ -117,8 +117,8 @@ def _check_sets(
         groups = context.hand.model.groups
         check(check_fingers, (groups, groups, size), [hand, values, inputs.struct], [tried])
     if exact:
-        runs, bodies = depth_parts(d), len(context.hand.model.piece_first) - 1
-        check(find_sunk, (runs, bodies, size), [hand, *sets, tried, runs], [usable])
+        slices, bodies = depth_slices(d), len(context.hand.model.piece_first) - 1
+        check(find_sunk, (slices, bodies, size), [hand, *sets, tried, slices], [usable])
         wp.launch(check_depth, size, [hits], [tried, usable], device=d)
         wp.launch(drop_sunk, usable.size.shape, [], [usable], device=d)
 
