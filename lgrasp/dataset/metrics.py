@@ -1,12 +1,9 @@
 """Further quality numbers of stored grasps, computed from the shards alone on all cores."""
 
-import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,8 +13,7 @@ from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 from lgrasp.object.mass import mass_properties
-from lgrasp.runtime.processes import follow_parent, start_tracker
-from lgrasp.signals import spared
+from lgrasp.runtime.processes import ProcessPool
 
 METRICS = {"epsilon_exact": "", "volume": ""}
 """Units of the metrics that can be added (docs/reference/metrics.md defines them)."""
@@ -111,16 +107,5 @@ def process_map(workers: int) -> Iterator[_Map]:
     if workers == 1:
         yield map
         return
-    context = multiprocessing.get_context("spawn")
-    start_tracker()
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=follow_parent) as pool:
-
-        def each(*task: Any) -> Iterable[np.ndarray]:
-            with spared():  # it starts processes
-                return pool.map(*task)
-
-        try:
-            yield each
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    with ProcessPool(workers) as pool:
+        yield pool.map

@@ -1,14 +1,14 @@
 """CUDA graphs of batches: launches before the number of survivors is known are combined into one."""
 
-import threading
 from dataclasses import dataclass
 
 import warp as wp
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.grasp.tables import ContactSets
+from lgrasp.grasp.tables import ContactSets, trim_sets
 from lgrasp.runtime.tally import Meter
+from lgrasp.runtime.turn import Turn
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
 
@@ -30,7 +30,7 @@ class _CapturedGraph:
 
 
 class GraphCache:
-    """Place through search of one pipeline, hand and object, for one thread.
+    """Place through search of one pipeline, hand and object.
 
     A size that comes again and again is captured; from then on it is replayed, with the seeds of the shard and the
     first candidate of the batch put where the graph reads them. The tables of a replay are overwritten by the next.
@@ -38,15 +38,15 @@ class GraphCache:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
-        self.capturing = threading.Lock()
-        """Held while a graph is captured: whoever else uses the device must hold it too."""
+        self.turn = Turn()
+        """Held by the thread that runs a batch; whoever else uses the device must hold it too."""
         self._times: dict[int, int] = {}  # by size, the latest last
         self._graphs: dict[int, _CapturedGraph] = {}
 
     def size(self, wanted: int) -> int:
         """Candidates for a batch that should have about ``wanted``: a size that was there before, if one is close."""
         low, high = (wanted * share for share in _SAME_SIZE)
-        return next((n for n in reversed(self._times) if low <= n <= high), wanted)
+        return next((n for n in reversed(tuple(self._times)) if low <= n <= high), wanted)
 
     def run(self, context: Context, first: int, count: int) -> tuple[ContactSets, Meter]:
         """The sets of candidates ``first .. first + count - 1``, and their counts and seconds."""
@@ -63,7 +63,8 @@ class GraphCache:
         for (stage, salt), seed in captured.context.seeds.items():
             seed.fill_(stage_seed(context.base_seed, context.shard, stage, salt))
         wp.capture_launch(captured.graph)
-        return captured.sets, captured.meter.again()
+        meter, (used,) = captured.meter.again([captured.sets.rows])
+        return trim_sets(captured.sets, int(used[0])), meter
 
     def _capture(self, context: Context, count: int) -> _CapturedGraph:
         device = context.device
@@ -72,7 +73,7 @@ class GraphCache:
             own.seed(stage)
         first = wp.zeros(1, dtype=wp.int32, device=device)
         meter = Meter(device)
-        with self.capturing, wp.ScopedCapture(device=device) as capture:
+        with wp.ScopedCapture(device=device) as capture:
             sets = run_stages(self._pipeline, own, first, count, "search", meter)
         assert capture.graph is not None
         return _CapturedGraph(capture.graph, first, own, meter, sets)

@@ -3,7 +3,8 @@
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
@@ -172,7 +173,7 @@ class Job(Request, ABC):
     def kept_rows(self, outcome: JobOutcome) -> int:
         """Rows of parts that are not done that the same job need not make again."""
         missing = [part for part in outcome.parts if part.file not in outcome.paths]
-        return sum(self.kept_of(part) for part in missing[: outcome.lanes])
+        return sum(self.kept_of(part) for part in missing[: outcome.lanes * self.at_once()])
 
     def kept_of(self, part: Part) -> int:
         """The same of one part."""
@@ -183,7 +184,11 @@ class Job(Request, ABC):
         return None
 
     def at_once(self) -> int:
-        """Parts that are made at a time."""
+        """Parts that are made at a time; the first alone where rows may be missing."""
+        return 1
+
+    def writers(self) -> int:
+        """Parts that are written at a time."""
         return 1
 
     def changed(self, **changes: Any) -> Self:
@@ -308,12 +313,13 @@ def own_parts(job: Job, array: Array) -> tuple[Array, list[Part], list[Part]]:
 
 
 def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listing | Renewing) -> None:
-    """Make what is missing, in order; one part is written, on another thread, while the next is made."""
-    writing: list[tuple[Part, Made, Future[None]]] = []
+    """Make what is missing, in order; parts are written, on other threads, while the next are made."""
+    writing: deque[tuple[Part, Made, Future[None]]] = deque()
 
-    def settle() -> None:
-        while writing:
-            part, made, future = writing.pop()
+    def settle(most: int = 0) -> None:
+        """Until at most so many are being written."""
+        while len(writing) > most:
+            part, made, future = writing.popleft()
             future.result()
             outcome.made_parts.append((part, made))
             events.wrote(part, made)
@@ -330,16 +336,24 @@ def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listin
         progress.check()
         return job.make(part, progress)
 
+    def made_in_order() -> Iterator[tuple[Part, Made | None]]:
+        parts = iter(outcome.parts)
+        for part in parts if job.asks else ():
+            yield part, make(part)
+            if part.number not in present:
+                break  # what the first finds, the others go by
+        yield from in_order(make, parts, job.at_once())
+
     present = outcome.on_disk
-    with ThreadPoolExecutor(1) as writer:
+    with ThreadPoolExecutor(job.writers()) as writer:
         try:
-            for part, made in in_order(make, outcome.parts, job.at_once()):
+            for part, made in made_in_order():
                 rows = present[part.number] if made is None else made.rows
                 outcome.starved |= job.asks and rows < part.rows
                 if made is not None:
                     outcome.results.append(made.result)
                     if made.contents is not None:
-                        settle()
+                        settle(job.writers() - 1)
                         writing.append((part, made, writer.submit(write, part, made)))
                     else:
                         manifests.record(part, 0, written=False)

@@ -43,7 +43,7 @@ class Execution:
     workers: int = 1
     batch: int = 0  # candidates per batch; 0: by device
     rate: float = 1.0  # rows expected per candidate, until there are some: sizes the first batch on a GPU
-    graphs: GraphCache | None = None  # replays batches; for one worker
+    graphs: GraphCache | None = None  # replays batches; for one worker a shard
 
 
 @dataclass
@@ -54,6 +54,7 @@ class ShardResult:
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)  # thread-seconds per stage
     wall: float = 0.0  # placement through filter [s]
+    span: tuple[float, float] = (0.0, 0.0)  # from when to when this run took, which ``wall`` includes [s]
     candidates: int = 0
     duplicates: int = 0
     exhausted: bool = False  # the effort bound was reached before the rows were
@@ -173,12 +174,18 @@ def make_shard(
     bank = Bank(bank_cache, pipeline, inputs.keys, shard, device) if bank_cache else None
     graphs = execution.graphs
     block = block_size(pipeline)
-    found = _Rows(inputs, RowOrder(pipeline.seed, shard, block), rows, graphs.capturing if graphs else nullcontext())
+    turn = graphs.turn if graphs else nullcontext()
+    found = _Rows(inputs, RowOrder(pipeline.seed, shard, block), rows, turn)
     result = found.result
     account = bank.load(rows, whole=resume) if bank else None
     if account:
         found.restore(account)
     earlier, start = result.wall, time.perf_counter()
+
+    def stop() -> None:
+        result.span = start, time.perf_counter()
+        result.wall = earlier + result.span[1] - start
+
     fixed, passes = _fixed_batch(context, execution), pipeline.params("search").passes
     most = _GPU_LARGEST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups, pipeline)
 
@@ -192,7 +199,8 @@ def make_shard(
         return -(-wanted // block) * block
 
     def run(part: tuple[int, int]) -> BatchResult:
-        return run_batch(pipeline, context, *part, graphs.run if graphs else None)
+        with turn:
+            return run_batch(pipeline, context, *part, graphs.run if graphs else None)
 
     def search(limit: int) -> None:
         def parts() -> Iterator[tuple[int, int] | None]:
@@ -233,11 +241,11 @@ def make_shard(
         search_all()
     except CancelledError:
         if bank and result.candidates:
-            result.wall = earlier + time.perf_counter() - start
+            stop()
             bank.store(found.account(interrupted=True))
         raise
     result.grasps = found.shuffled()
-    result.wall = earlier + time.perf_counter() - start
+    stop()
     result.exhausted = found.count < rows
     if bank and banked:
         bank.store(found.account())
@@ -256,13 +264,14 @@ def _fixed_batch(context: Context, execution: Execution) -> int:
 class _Rows:
     """Rows of a shard as they come in: near-duplicates are left out, rows beyond those asked are set aside."""
 
-    def __init__(self, inputs: Inputs, order: RowOrder, rows: int, lock: AbstractContextManager[Any]) -> None:
+    def __init__(self, inputs: Inputs, order: RowOrder, rows: int, turn: AbstractContextManager[Any]) -> None:
         self.result = ShardResult(no_grasps())
-        self._kept = KeptRows(inputs.hand.model.dofs, inputs.device.alias)
+        with turn:
+            self._kept = KeptRows(inputs.hand.model.dofs, inputs.device.alias)
         self._center = inputs.object.model.center
         self._order = order
         self._rows = rows
-        self._lock = lock  # held while the device is used
+        self._turn = turn  # held while the device is used
         self._parts: list[tuple[GraspTable, np.ndarray]] = []  # rows of tables, copied at the end
         self._aside: tuple[GraspTable, np.ndarray | slice] | None = None
 
@@ -278,7 +287,7 @@ class _Rows:
         order = self._order.by_blocks(grasps)
         # near-duplicates are defined on poses as they are written
         pose = user_poses(grasps.pose.take(order, axis=0), self._center)
-        with self._lock:
+        with self._turn:
             new, duplicates = self._kept.add(pose, grasps.q.take(order, axis=0), self._rows - self.count)
         self.result.duplicates += duplicates
         self._parts.append((grasps, order[new]))

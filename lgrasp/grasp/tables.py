@@ -32,9 +32,13 @@ class DeviceTable:
         """The table as kernels read it."""
         return make_struct(self.KIND, self, **{n: getattr(self, n).struct for n in self.INNER if n in self.KIND.vars})
 
-    def __len__(self) -> int:
-        """Rows in use; waits for the device."""
+    @cached_property
+    def used(self) -> int:
+        """Rows in use; the first look waits for the device."""
         return int(to_numpy(self.rows)[0])
+
+    def __len__(self) -> int:
+        return self.used
 
     @classmethod
     def names(cls) -> list[str]:
@@ -158,12 +162,14 @@ class GraspTable:
         return len(self.index)
 
 
-def trim_sets(table: ContactSets) -> ContactSets:
-    """Views of the rows in use; waits for the device."""
-    n = len(table)
+def trim_sets(table: ContactSets, used: int | None = None) -> ContactSets:
+    """Views of the rows in use; waits for the device where ``used``, their number, is not given."""
+    n = len(table) if used is None else used
     if n == table.pose.shape[0]:
         return table
-    return replace(table, **{name: getattr(table, name)[:n] for name in table.names()})
+    trimmed = replace(table, **{name: getattr(table, name)[:n] for name in table.names()})
+    trimmed.__dict__["used"] = n
+    return trimmed
 
 
 def select_poses(table: CandidateTable, rows: np.ndarray, device: str) -> CandidateTable:

@@ -12,6 +12,7 @@ from pydantic import PrivateAttr, model_validator
 
 from lgrasp.dataset.info import closure_share, stage_counts, survivors
 from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.bank import Bank
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found
@@ -34,11 +35,15 @@ from lgrasp.jobs.requests.search import GenerateRequest
 from lgrasp.jobs.search import SearchJob
 from lgrasp.policy.names import SHIPPED
 from lgrasp.runtime.array import Array
+from lgrasp.runtime.cores import cores
+from lgrasp.runtime.processes import ProcessPool
 from lgrasp.runtime.tally import add_counts
 
 PUBLISHED_FSWO = 0.15
 """Squared frictionless residual below which the published system counts a grasp."""
 
+_SHARDS_ON_GPU = 4  # at once
+_MOST_WRITERS = 8
 _TALLY_THREADS = 4
 _MOST_COMPARED = 4_000_000
 """Rows of a folder among which near-duplicates are looked for: some 400 MB."""
@@ -54,6 +59,7 @@ class GenerateJob(GenerateRequest, SearchJob):
 
     _graphs: GraphCache | None = PrivateAttr(None)
     _rate: float = PrivateAttr(1.0)
+    _writers: ProcessPool | None = PrivateAttr(None)
 
     @model_validator(mode="after")
     def _for_hand(self) -> Self:
@@ -104,6 +110,26 @@ class GenerateJob(GenerateRequest, SearchJob):
             object_record(inputs.object.model, tables=inputs.object.planes, steered=inputs.object.steered)
         ]
 
+    def at_once(self) -> int:
+        # on the host a GPU's shard is finished while the next are searched
+        alone = self.negatives or self.protocol or self.pipeline.params("search").passes > 1
+        return 1 if alone or not self._graphs else _SHARDS_ON_GPU
+
+    def writers(self) -> int:
+        # one thread writes a tenth of what a GPU finds
+        return min(_MOST_WRITERS, cores(), self.known_parts) if self.at_once() > 1 else 1
+
+    def write(self, part: Part, contents: Any) -> None:
+        if self._writers:
+            self._writers.submit(write_shard, part.file, contents).result()
+        else:
+            super().write(part, contents)
+
+    def close(self) -> None:
+        if self._writers:
+            self._writers.shutdown()
+        self._writers = None
+
     def make(self, part: Part, progress: PartProgress) -> Made:
         result = make_shard(
             self.pipeline,
@@ -116,6 +142,8 @@ class GenerateJob(GenerateRequest, SearchJob):
             resume=part.number in self._growing,
             progress=lambda rows, _: progress(rows),
         )
+        if self._writers is None and self.writers() > 1:  # the first part is made alone
+            self._writers = ProcessPool(self.writers())
         last = ("simulate", "held"), ("hold", "held"), ("filter", "kept")
         kept = next(result.counts[stage][count] for stage, count in last if stage in result.counts)
         self._rate = max(kept / result.candidates, 1e-3)

@@ -19,7 +19,7 @@ from lgrasp.jobs.difference import config_difference
 from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs
 from lgrasp.jobs.requests.search import SearchRequest
 from lgrasp.runtime.device import resolve_device
-from lgrasp.runtime.tally import add_counts, add_seconds
+from lgrasp.runtime.tally import add_counts, add_seconds, covered
 from lgrasp.steer.touch import describe_touching
 
 
@@ -155,17 +155,19 @@ class SearchJob(SearchRequest, Job):
         return protocol_text(self.inputs.scene, find_protocol(self.protocol), device=self.device_used.alias)
 
     def sums(self, outcome: JobOutcome, stages: Sequence[str] = ()) -> dict[str, Any]:
-        """Of the shards that a call made: ``counts`` and ``seconds`` (``wall``, thread-seconds per stage, loading); and
-        ``hits``, ``hand``, ``pipeline``, ``seed``, ``protocol``."""
+        """Of the shards that a call made: ``counts`` and ``seconds`` (``wall``, of shards made side by side once;
+        thread-seconds per stage, loading); and ``hits``, ``hand``, ``pipeline``, ``seed``, ``protocol``."""
         counts: dict[str, dict[str, int]] = {stage: {} for stage in stages}
         seconds = dict.fromkeys(stages, 0.0)
         for result in outcome.results:
             add_counts(counts, result.counts)
             add_seconds(seconds, result.seconds)
+        spans = [result.span for result in outcome.results]
+        earlier = sum(result.wall - (end - begin) for result, (begin, end) in zip(outcome.results, spans, strict=True))
         loading = {name: self.inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field")}
         return {
             "counts": counts,
-            "seconds": seconds | loading | {"wall": sum(result.wall for result in outcome.results) / outcome.lanes},
+            "seconds": seconds | loading | {"wall": earlier + covered(spans)},
             "hits": self.inputs.hits,
             "hand": self.records(self.inputs)[0].name,
             "pipeline": self.pipeline.name,

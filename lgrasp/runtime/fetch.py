@@ -4,42 +4,55 @@ The only way there: Warp's own ``array.numpy()`` puts another stream in the plac
 every thread, so that two at once may leave the device without its own.
 """
 
-import threading
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import numpy as np
 import warp as wp
 
+from lgrasp.runtime.turn import others_turn
+
 _ALIGNMENT = 256  # bytes that places in the staging memory are rounded up to
-_staging: dict[str, wp.array] = {}  # by device
-_lock = threading.Lock()
+_LEAST_STAGING = 1 << 20  # bytes
+_staging: list[wp.array] = []  # what nobody uses just now
 
 
-def fetch(arrays: Sequence[wp.array]) -> list[np.ndarray]:
+def fetch(arrays: Sequence[wp.array], *, keep_turn: bool = False) -> list[np.ndarray]:
     """Copies of contiguous arrays of one device as NumPy arrays of their own.
 
     Args:
         arrays: shape (N, …) each; vector and transform types add a dimension, as ``numpy()`` does.
+        keep_turn: others may not launch while this thread waits (:func:`~lgrasp.runtime.turn.others_turn`).
     """
+    waiting = nullcontext if keep_turn else others_turn
     if not arrays or not arrays[0].device.is_cuda:
-        return [a.numpy().copy() for a in arrays]
+        copies = [a.numpy().copy() for a in arrays]
+        with waiting():
+            return copies
     places = np.cumsum(
         [0, *(-(-a.size * wp.types.type_size_in_bytes(a.dtype) // _ALIGNMENT) * _ALIGNMENT for a in arrays)]
     )
-    device = arrays[0].device
-    with _lock:
-        memory = _staging.get(device.alias)
-        if memory is None or memory.shape[0] < places[-1]:
-            memory = wp.empty(max(2 * int(places[-1]), 1 << 20), dtype=wp.uint8, device="cpu", pinned=True)
-            _staging[device.alias] = memory
-        out = []
-        for a, place in zip(arrays, places, strict=False):
-            host = wp.array(ptr=memory.ptr + int(place), dtype=a.dtype, shape=a.shape, device="cpu", copy=False)
-            if a.size:
-                wp.copy(host, a, stream=device.stream)
-            out.append(host)
-        wp.synchronize_stream(device.stream)
-        return [host.numpy().copy() for host in out]
+    device, memory = arrays[0].device, _take_staging(int(places[-1]))
+    out = []
+    for a, place in zip(arrays, places, strict=False):
+        host = wp.array(ptr=memory.ptr + int(place), dtype=a.dtype, shape=a.shape, device="cpu", copy=False)
+        if a.size:
+            wp.copy(host, a, stream=device.stream)
+        out.append(host)
+    copied = device.stream.record_event(wp.Event(device))
+    with waiting():
+        wp.synchronize_event(copied)
+        copies = [host.numpy().copy() for host in out]
+    _staging.append(memory)
+    return copies
+
+
+def _take_staging(size: int) -> wp.array:
+    """Page-locked memory of ``size`` bytes at least, which nobody else uses."""
+    memory = _staging.pop() if _staging else None
+    if memory is None or memory.shape[0] < size:
+        memory = wp.empty(max(2 * size, _LEAST_STAGING), dtype=wp.uint8, device="cpu", pinned=True)
+    return memory
 
 
 def to_numpy(array: wp.array) -> np.ndarray:

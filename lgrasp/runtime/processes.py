@@ -4,15 +4,18 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from lgrasp.errors import DeviceError
 from lgrasp.files import discard_temporaries
 from lgrasp.signals import spared
+
+T = TypeVar("T")
 
 _PATIENCE = 4.0  # [s] that a process may take to end when it is asked to
 
@@ -103,6 +106,24 @@ class Crew:
                     how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
                     raise DeviceError(f"the process on {self._names[number]} ended {how}") from None
         return found
+
+
+class ProcessPool(ProcessPoolExecutor):
+    """Processes for calls of functions of modules, while the block runs.
+
+    They are spared the signals that ask to stop, and end with the process that started them.
+    """
+
+    def __init__(self, workers: int) -> None:
+        start_tracker()
+        super().__init__(workers, multiprocessing.get_context("spawn"), follow_parent)
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        with spared():  # it starts processes
+            return super().submit(fn, *args, **kwargs)
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.shutdown(cancel_futures=kind is not None)
 
 
 def _work(connection: Connection, work: Callable[..., None], task: tuple[Any, ...]) -> None:

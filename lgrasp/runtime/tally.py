@@ -1,7 +1,7 @@
 """Survivors and seconds of stages, counted on their device and read when somebody asks."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
 
 import numpy as np
@@ -18,8 +18,13 @@ class Tally(Mapping[str, int]):
         self.device = device  # (names,) i32
         self._read: np.ndarray | None = None
 
+    @property
+    def known(self) -> bool:
+        """True if the counts were read."""
+        return self._read is not None
+
     def __getitem__(self, name: str) -> int:
-        if self._read is None:
+        if not self.known:
             read_tallies([self])
         assert self._read is not None
         return int(self._read[self.names.index(name)])
@@ -38,13 +43,15 @@ def empty_tally(names: Sequence[str] | type[IntEnum], device: str) -> Tally:
     return Tally(names, wp.zeros(len(names), dtype=wp.int32, device=device))
 
 
-def read_tallies(tallies: Sequence[Tally], arrays: Sequence[wp.array] = ()) -> list[np.ndarray]:
-    """Read several tallies, and copies of other arrays, of one device with one wait.
+def read_tallies(
+    tallies: Sequence[Tally], arrays: Sequence[wp.array] = (), *, keep_turn: bool = False
+) -> list[np.ndarray]:
+    """Read several tallies, and copies of other arrays, of one device with one wait (:func:`fetch`).
 
     Returns:
         The other arrays.
     """
-    fetched = fetch([*(t.device for t in tallies), *arrays])
+    fetched = fetch([*(t.device for t in tallies), *arrays], keep_turn=keep_turn)
     for tally, values in zip(tallies, fetched, strict=False):
         tally._read = values
     return fetched[len(tallies) :]
@@ -58,7 +65,7 @@ class Meter:
 
     def __init__(self, device: str) -> None:
         self._device = wp.get_device(device)
-        self._parts: list[tuple[str, Mapping[str, int], _Moment | None, _Moment | None]] = []
+        self._parts: list[tuple[str, Mapping[str, int], _Moment, _Moment]] = []
 
     def now(self) -> _Moment:
         """A moment: on a GPU an event in its stream, else seconds."""
@@ -66,23 +73,26 @@ class Meter:
             return time.perf_counter()
         return self._device.stream.record_event(wp.Event(self._device, enable_timing=True))
 
-    def add(
-        self, stage: str, counts: Mapping[str, int], start: _Moment | None = None, end: _Moment | None = None
-    ) -> None:
-        """A stage has been run from ``start`` to ``end``, or its table was read from the bank."""
+    def add(self, stage: str, counts: Mapping[str, int], start: _Moment, end: _Moment) -> None:
+        """A stage has been run from ``start`` to ``end``."""
         self._parts.append((stage, counts, start, end))
 
-    def again(self) -> "Meter":
-        """The same stages once more, recorded and replayed: their counts have not been read."""
+    def again(self, arrays: Sequence[wp.array]) -> tuple["Meter", list[np.ndarray]]:
+        """The same stages once more, recorded and replayed; and copies of other arrays.
+
+        All is read at once: the next replay, of whichever thread, overwrites it.
+        """
+        own = [Tally(c.names, c.device) if isinstance(c, Tally) else c for _, c, _, _ in self._parts]
+        read = read_tallies([counts for counts in own if isinstance(counts, Tally)], arrays, keep_turn=True)
         meter = Meter(self._device.alias)
-        for stage, counts, start, end in self._parts:
-            meter.add(stage, Tally(counts.names, counts.device) if isinstance(counts, Tally) else counts, start, end)
-        return meter
+        for (stage, _, start, end), counts in zip(self._parts, own, strict=True):
+            meter.add(stage, counts, 0.0, _seconds(start, end))
+        return meter, read
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
         """Survivors per stage, passes added up."""
-        read_tallies([counts for _, counts, _, _ in self._parts if isinstance(counts, Tally)])
+        read_tallies([c for _, c, _, _ in self._parts if isinstance(c, Tally) and not c.known])
         total: dict[str, dict[str, int]] = {}
         for stage, counts, _, _ in self._parts:
             add_counts(total, {stage: counts})
@@ -93,14 +103,15 @@ class Meter:
         """Seconds per stage, passes added up."""
         total: dict[str, float] = {}
         for stage, _, start, end in self._parts:
-            if start is None or end is None:
-                continue
-            if isinstance(start, float) and isinstance(end, float):
-                elapsed = end - start
-            else:
-                elapsed = wp.get_event_elapsed_time(start, end) / 1000.0
-            total[stage] = total.get(stage, 0.0) + elapsed
+            total[stage] = total.get(stage, 0.0) + _seconds(start, end)
         return total
+
+
+def _seconds(start: _Moment, end: _Moment) -> float:
+    """Between two moments; waits for the second."""
+    if isinstance(start, float) and isinstance(end, float):
+        return end - start
+    return wp.get_event_elapsed_time(start, end) / 1000.0
 
 
 def add_counts(total: dict[str, dict[str, int]], more: Mapping[str, Mapping[str, int]]) -> None:
@@ -115,3 +126,12 @@ def add_seconds(total: dict[str, float], more: Mapping[str, float]) -> None:
     """Add seconds per stage to a running total."""
     for stage, value in more.items():
         total[stage] = total.get(stage, 0.0) + value
+
+
+def covered(spans: Iterable[tuple[float, float]]) -> float:
+    """Seconds in one span of time, (begin, end), at least."""
+    total, until = 0.0, float("-inf")
+    for begin, end in sorted(spans):
+        total += max(end - max(begin, until), 0.0)
+        until = max(until, end)
+    return total

@@ -2,6 +2,8 @@
 
 import gc
 import weakref
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 
@@ -19,6 +21,22 @@ def test_rows_and_counts_are_the_same(swift, inputs):
         expected, given = grasp_arrays(plain.grasps), grasp_arrays(replayed.grasps)
         for name, values in expected.items():
             np.testing.assert_array_equal(given[name], values, err_msg=name)
+
+
+def test_shards_side_by_side_take_turns(swift, inputs):
+    graphs = GraphCache(swift)
+
+    def shard(number, graphs=None):
+        made = make_shard(swift, inputs, number, 300, Execution(1, 64, graphs=graphs))
+        return made.counts, grasp_arrays(made.grasps)
+
+    with ThreadPoolExecutor(4) as pool:
+        side_by_side = list(pool.map(partial(shard, graphs=graphs), range(6)))
+    for number, (counts, rows) in enumerate(side_by_side):
+        expected, plain = shard(number)
+        assert counts == expected
+        for name, values in plain.items():
+            np.testing.assert_array_equal(rows[name], values, err_msg=name)
 
 
 def test_two_sizes_take_turns(swift, context):

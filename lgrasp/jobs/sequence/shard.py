@@ -26,6 +26,7 @@ class SequenceResult(Round):
 
     reached: list[int] = field(default_factory=list)  # rows of 1, 2 ... objects that were found
     wall: float = 0.0
+    span: tuple[float, float] = (0.0, 0.0)  # from when to when [s]
     rounds: int = 0
     duplicates: int = 0
     exhausted: bool = False
@@ -102,7 +103,8 @@ def make_sequences(
         hopeless = result.rounds >= _EMPTY_ROUNDS and missing
         result.exhausted = kept.count < rows and (hopeless or result.rounds >= most_rounds(pipeline, rows))
     result.levels = _joined(parts)
-    result.wall = time.perf_counter() - start
+    result.span = start, time.perf_counter()
+    result.wall = result.span[1] - start
     return result
 
 

@@ -1,0 +1,38 @@
+"""Threads that share a GPU take turns on its one stream: a graph being captured takes in all that is launched there,
+and the arrays of a graph stay as they are only until it is replayed.
+"""
+
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
+
+_own = threading.local()
+
+
+class Turn:
+    """Held by the one thread that may launch; others wait for it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+        _own.turn = self
+
+    def __exit__(self, *error: object) -> None:
+        _own.turn = None
+        self._lock.release()
+
+
+@contextmanager
+def others_turn() -> Generator[None]:
+    """Others may launch while this thread waits; it goes on when it is its turn again, if it had it."""
+    turn: Turn | None = getattr(_own, "turn", None)
+    if turn is None:
+        yield
+        return
+    turn.__exit__()
+    try:
+        yield
+    finally:
+        turn.__enter__()
