@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,6 +11,8 @@ import numpy as np
 import torch
 
 import lgrasp as lg
+from lgrasp.dataset.reader import ShardReader, read_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.learn.network import CoarseNet
 from lgrasp.learn.networks import network_bytes
 from lgrasp.learn.params import LearnParams
@@ -74,7 +77,10 @@ def test_shards_that_cannot_be_learned_from(generate, cli, tmp_path):
 
     assert generate(rows=3).code == 0
     (path,) = Path("out").glob("*.h5")
-    assert "out: 3 grasps; at least 16 are needed" in refused("out")
+    with ShardReader(path) as reader:
+        none = replace(read_shard(path), grasps=reader.rows(0, 0))
+    write_shard("starved.h5", none)
+    assert ": 3 grasps; at least 16 are needed" in refused("starved.h5", "out")
     with h5py.File(path, "r+") as file:
         file["grasps/q"][1, 2] = np.nan
     assert f"{path}: q is not finite (row 1, 1 rows)" in refused("out")

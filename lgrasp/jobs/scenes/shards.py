@@ -95,7 +95,7 @@ def mesh_objects(reader: ShardReader) -> tuple[ObjectRecord, ...]:
 def check_finite(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     """Raises ShardError at numbers that are not finite."""
     for name, values in columns.items():
-        bad = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
         if len(bad):
             raise ShardError(
                 f"{path}: {name} is not finite (row {bad[0]}, {len(bad)} rows); finite grasps are accepted"
