@@ -2,13 +2,14 @@
 
 import multiprocessing
 import os
+import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Any, Self, TypeVar
 
 from lgrasp.errors import DeviceError
@@ -17,6 +18,7 @@ from lgrasp.signals import spared
 
 T = TypeVar("T")
 
+_starting = threading.Lock()
 _PATIENCE = 4.0  # [s] that a process may take to end when it is asked to
 
 
@@ -119,11 +121,24 @@ class ProcessPool(ProcessPoolExecutor):
         super().__init__(workers, multiprocessing.get_context("spawn"), follow_parent)
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        with spared():  # it starts processes
+        with spared(), _no_main():  # it starts processes
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.shutdown(cancel_futures=kind is not None)
+
+
+@contextmanager
+def _no_main() -> Iterator[None]:
+    """Processes that are started inside the block do not run the program's main file again, which scripts without
+    ``if __name__ == "__main__"`` would not survive."""
+    with _starting:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = main
 
 
 def _work(connection: Connection, work: Callable[..., None], task: tuple[Any, ...]) -> None:

@@ -1,5 +1,8 @@
 """Processes that work side by side."""
 
+import subprocess
+import sys
+
 import pytest
 from support.workers import leave
 
@@ -13,3 +16,11 @@ def test_a_process_that_is_lost_ends_the_others():
             crew.heard(60.0)
         assert crew.working
     assert not any(process.is_alive() for process in crew._processes)
+
+
+def test_a_pool_does_not_run_the_script_again(tmp_path):
+    script = tmp_path / "script.py"
+    pool = "from lgrasp.runtime.processes import ProcessPool\nwith ProcessPool(2) as pool:\n    "
+    script.write_text(f"print('begun')\n{pool}print(*pool.map(abs, [-1, 2]))\n")
+    done = subprocess.run([sys.executable, script], check=True, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("begun\n1 2\n", "")
