@@ -118,7 +118,7 @@ class Check:
         if on_table:
             self._approach(row, packed, tally)
         columns, dropped = _columns(packed, on_table), bounded or self.obj.touch is not None
-        fetched = read_tallies([tally], [*columns.values(), *([row] if dropped else [])])
+        fetched = read_tallies([tally], [*columns.values(), *([row] if dropped else [])], others=True)
         count = sum(tally[reason] for reason in tally.names if reason in ("kept", "approach", "squeeze", "touch"))
         table = _table(dict(zip(columns, fetched, strict=False)), count)
         kept = fetched[-1][:count] >= 0 if dropped else np.ones(count, bool)

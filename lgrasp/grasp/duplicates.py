@@ -95,7 +95,7 @@ class _NearRows:
             number, others = (wp.empty(n, dtype=wp.int32, device=d) for n in (len(asked), room))
             given = [wp.array(a, dtype=wp.int32, device=d) for a in (asked, places)]
             wp.launch(list_near, len(asked), [self._grid.id, x, *given], [number, others], device=d)
-            number, others = fetch([number, others])
+            number, others = fetch([number, others], others=True)
             return number, others
 
         rows = np.arange(first, len(pose))

@@ -17,14 +17,15 @@ _LEAST_STAGING = 1 << 20  # bytes
 _staging: list[wp.array] = []  # what nobody uses just now
 
 
-def fetch(arrays: Sequence[wp.array], *, keep_turn: bool = False) -> list[np.ndarray]:
+def fetch(arrays: Sequence[wp.array], *, others: bool = False) -> list[np.ndarray]:
     """Copies of contiguous arrays of one device as NumPy arrays of their own.
 
     Args:
         arrays: shape (N, …) each; vector and transform types add a dimension, as ``numpy()`` does.
-        keep_turn: others may not launch while this thread waits (:func:`~lgrasp.runtime.turn.others_turn`).
+        others: may launch while this thread waits (:func:`~lgrasp.runtime.turn.others_turn`); not where it holds a lock
+            that they may need.
     """
-    waiting = nullcontext if keep_turn else others_turn
+    waiting = others_turn if others else nullcontext
     if not arrays or not arrays[0].device.is_cuda:
         copies = [a.numpy().copy() for a in arrays]
         with waiting():

@@ -44,14 +44,14 @@ def empty_tally(names: Sequence[str] | type[IntEnum], device: str) -> Tally:
 
 
 def read_tallies(
-    tallies: Sequence[Tally], arrays: Sequence[wp.array] = (), *, keep_turn: bool = False
+    tallies: Sequence[Tally], arrays: Sequence[wp.array] = (), *, others: bool = False
 ) -> list[np.ndarray]:
     """Read several tallies, and copies of other arrays, of one device with one wait (:func:`fetch`).
 
     Returns:
         The other arrays.
     """
-    fetched = fetch([*(t.device for t in tallies), *arrays], keep_turn=keep_turn)
+    fetched = fetch([*(t.device for t in tallies), *arrays], others=others)
     for tally, values in zip(tallies, fetched, strict=False):
         tally._read = values
     return fetched[len(tallies) :]
@@ -83,7 +83,7 @@ class Meter:
         All is read at once: the next replay, of whichever thread, overwrites it.
         """
         own = [Tally(c.names, c.device) if isinstance(c, Tally) else c for _, c, _, _ in self._parts]
-        read = read_tallies([counts for counts in own if isinstance(counts, Tally)], arrays, keep_turn=True)
+        read = read_tallies([counts for counts in own if isinstance(counts, Tally)], arrays)
         meter = Meter(self._device.alias)
         for (stage, _, start, end), counts in zip(self._parts, own, strict=True):
             meter.add(stage, counts, 0.0, _seconds(start, end))
