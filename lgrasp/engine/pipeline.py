@@ -112,6 +112,11 @@ class Pipeline(_Head):
             raise ConfigError(
                 f"pipeline {self.name}: domain.rounds is {rounds}; with search before ik contacts are drawn once"
             )
+        if self.sequence and ("wrap" in self.order or self.params("filter").contacts == "all"):
+            raise ConfigError(
+                f"pipeline {self.name}: an object of a sequence touches the two sides of an opposition space only; "
+                "leave out stage wrap and filter.contacts"
+            )
         if self.bounds.min_hold_probability > 0 and "hold" not in self.order:
             raise ConfigError(
                 f"pipeline {self.name}: bounds.min_hold_probability is {self.bounds.min_hold_probability:g}, which "
