@@ -161,7 +161,7 @@ def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, 
     postures = max(1000, int(1.5 * records / _PER_POSTURE)) if touches else 0
     posture = wp.zeros((postures, int(np.diff(model.tree.dof_first).max())), dtype=wp.uint8, device=device)
     clear = wp.empty(postures, dtype=wp.int32, device=device)
-    seed = params.seed * 1009 + slot
+    seed = params.seed * 1009 + slot % (settings * model.groups)  # every surface meets the same postures
     inputs = [hand.struct, group, setting, seed, _CLEARANCE]
     wp.launch(sample_postures, postures, inputs, [posture, clear], device=device)
     good = np.flatnonzero(to_numpy(clear))
