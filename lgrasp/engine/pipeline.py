@@ -103,10 +103,11 @@ class Pipeline(_Head):
         return self.model_copy(update={"bounds": self.bounds.changed(**changes)}).checked()
 
     def checked(self) -> "Pipeline":
-        """Itself, unless a bound asks for a stage that it lacks, or rounds for contacts that come too late for them.
+        """Itself, unless a bound asks for a stage that it lacks, rounds for contacts that come too late for them, or
+        sequences for contacts outside their opposition spaces.
 
         Raises:
-            ConfigError: such a bound, or such rounds.
+            ConfigError: such a bound, such rounds or contacts.
         """
         if not self.realised and (rounds := self.params("domain").rounds) > 1:
             raise ConfigError(
