@@ -149,6 +149,6 @@ def _profile(data: dict[str, Any]) -> list[Block]:
     rows = []
     for name, spaces in zip(data["objects"], data["spaces"], strict=False):
         for space, counts in spaces.items():
-            tried, held = counts["sequence"]["sequences"], counts["sequence"]["held"]
+            tried, held = counts["sequences"], counts["held"]
             rows.append((name, space, f"{tried:,}", f"{held:,}", share(held, tried)))
     return [pairs, TextTable(columns, rows, right=columns[2:])] if data["spaces"] else [pairs]

@@ -115,20 +115,16 @@ def measure_sequence(job: SequenceJob, device: str) -> dict[str, Any]:
     found = run_round(pipeline, inputs, 0, 0, threads(job.workers), verdicts=watched)
     spaces: dict[str, dict[str, int]] = {}
     for name, counts in ((name, counts) for step in found.spaces for name, counts in step.items()):
-        grown, ran = counts.get("sequence", {}), counts.get("simulate", {})
-        more = {"tried": grown.get("sequences", 0), "found": ran.get("tried", 0), "held": ran.get("held", 0)}
+        more = {"tried": counts["sequences"], "found": counts.get("simulated", 0), "held": counts.get("stable", 0)}
         add_counts(spaces, {name: more})
     attempts, steps = [width, *map(len, found.levels)], []
     for step in range(len(job.objects)):
-        counts = found.spaces[step].values() if step < len(found.spaces) else ()
-        outcomes: Counter[str] = Counter()
-        for one in counts:
-            outcomes.update(one.get("filter", {}))
+        counts = found.steps[step] if step < len(found.steps) else {}
         entry = {
             "attempts": attempts[step] if step < len(attempts) else 0,
             "seconds": sum(found.walls[step : step + 1]),
         }
-        entry |= {"drawn": sum(one.get("place", {}).get("tried", 0) for one in counts), "outcomes": dict(outcomes)}
+        entry |= {"drawn": counts.get("place", {}).get("tried", 0), "outcomes": counts.get("filter", {})}
         tried, held = (some[step] if step < len(some) else None for some in (seen, found.levels))
         steps.append(entry | _rows(tried, held, inputs, bounds))
     return {"begun": width, "device": device, "spaces": spaces, "steps": steps}

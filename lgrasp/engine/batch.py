@@ -90,7 +90,8 @@ def _fitted(stage: str, params: Any, hand: HandModel, steer: SteerArrays) -> Any
     default = asked == SearchParams.model_fields["contacts"].default
     if hand.contacts and default:
         asked = hand.contacts
-    fingers = int(steer.touching.groups[np.diff(hand.contact_first[:-1]) > 0].sum())
+    touching = np.diff(hand.contact_first).reshape(-1, hand.groups + 1)[:, :-1] > 0
+    fingers = int((touching & steer.touching.groups).sum(1).max())
     if not (default or steer.least or steer.touching.groups.all()) and min(asked) > fingers:
         raise ConfigError(
             f"steer.links leaves {fingers} fingers of hand '{hand.name}', and search.contacts asks for {min(asked)} or "

@@ -103,14 +103,20 @@ class Pipeline(_Head):
         return self.model_copy(update={"bounds": self.bounds.changed(**changes)}).checked()
 
     def checked(self) -> "Pipeline":
-        """Itself, unless a bound asks for a stage that it lacks, or rounds for contacts that come too late for them.
+        """Itself, unless a bound asks for a stage that it lacks, rounds for contacts that come too late for them, or
+        sequences for contacts outside their opposition spaces.
 
         Raises:
-            ConfigError: such a bound, or such rounds.
+            ConfigError: such a bound, such rounds or contacts.
         """
         if not self.realised and (rounds := self.params("domain").rounds) > 1:
             raise ConfigError(
                 f"pipeline {self.name}: domain.rounds is {rounds}; with search before ik contacts are drawn once"
+            )
+        if self.sequence and ("wrap" in self.order or self.params("filter").contacts == "all"):
+            raise ConfigError(
+                f"pipeline {self.name}: an object of a sequence touches the two sides of an opposition space only; "
+                "leave out stage wrap and filter.contacts"
             )
         if self.bounds.min_hold_probability > 0 and "hold" not in self.order:
             raise ConfigError(

@@ -75,9 +75,13 @@ def upload_field(model: ContactField, hand: HandModel, device: str) -> FieldArra
         ends = (model.box[a:b], model.box[a:b] + np.float32(model.box_edge))
         trees.append(wp.Bvh(*(wp.array(end, dtype=wp.vec3, device=device) for end in ends)))
         ids.append(trees[-1].id)
-    settings = np.arange(len(hand.tree.settings))[:, None] * hand.patches
+    settings = np.arange(hand.surfaces * len(hand.tree.settings))
+    own = settings // len(hand.tree.settings) * (hand.groups + 1)
     arrays = {name: getattr(model, name) for name in ("patch_first", "leaf_first", "leaf_record")}
-    arrays["slot_first"] = np.append(settings + hand.patch_first[:-2], len(settings) * hand.patches)
+    arrays["slot_first"] = np.append(
+        settings[:, None] * hand.patches + hand.patch_first[own[:, None] + np.arange(hand.groups)],
+        len(settings) * hand.patches,
+    )
     boxes = upload_struct(Boxes, device, arrays | {"tree": np.array(ids, np.uint64)})
     return FieldArrays(model, device, field, boxes, tuple(trees))
 

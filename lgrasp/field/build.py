@@ -69,7 +69,7 @@ def build_field(
         HandError: a group that no posture frees from the palm.
     """
     parts, groups = [], hand.model.groups
-    slots = len(hand.model.tree.settings) * groups
+    slots = hand.model.surfaces * len(hand.model.tree.settings) * groups
     for slot in range(slots):
         if progress:
             progress(f"group {slot + 1} of {slots}", slot / slots)
@@ -141,7 +141,7 @@ def _bounded_cell(positions: list[np.ndarray], params: FieldParams) -> float:
 
 def _check_clear(model: HandModel, clear: np.ndarray) -> None:
     """Raises HandError when a group is clear of the palm in no setting; ``clear`` (V, G) are shares of postures."""
-    for group in np.flatnonzero((clear == 0.0).all(0)):
+    for group in np.flatnonzero((clear == 0.0).any(0) & ~(clear > 0.0).any(0)):
         links = np.array(model.tree.link_names)[model.tree.body_group[model.tree.link_body] == group]
         raise HandError(
             f"hand '{model.name}': no posture of finger ({', '.join(links)}) is clear of the palm and of itself"
@@ -154,13 +154,14 @@ def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, 
     settings = len(model.tree.settings)
     setting, group = divmod(slot, model.groups)
     # vectors may fill half of the memory bound, the table the rest
-    room = int(0.5e6 * params.max_mb / _VECTOR_BYTES / (model.groups * settings))
+    room = int(0.5e6 * params.max_mb / _VECTOR_BYTES / (model.groups * settings * model.surfaces))
     records = params.records if settings == 1 else max(params.records // settings, min(params.records, _LEAST_RECORDS))
-    touches = model.contact_first[group + 1] > model.contact_first[group]
+    run = setting // settings * (model.groups + 1) + group
+    touches = model.contact_first[run + 1] > model.contact_first[run]
     postures = max(1000, int(1.5 * records / _PER_POSTURE)) if touches else 0
     posture = wp.zeros((postures, int(np.diff(model.tree.dof_first).max())), dtype=wp.uint8, device=device)
     clear = wp.empty(postures, dtype=wp.int32, device=device)
-    seed = params.seed * 1009 + slot
+    seed = params.seed * 1009 + slot % (settings * model.groups)  # every surface meets the same postures
     inputs = [hand.struct, group, setting, seed, _CLEARANCE]
     wp.launch(sample_postures, postures, inputs, [posture, clear], device=device)
     good = np.flatnonzero(to_numpy(clear))

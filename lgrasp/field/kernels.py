@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lgrasp.hand.arrays import Hand, thumb_placed
+from lgrasp.hand.arrays import Hand, contact_run, thumb_placed
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.kinematics import Kinematics, group_forward, vec_dof
 from lgrasp.math.limits import MAX_JOINTS
@@ -92,8 +92,9 @@ def contact_vectors(
     q = stored_posture(hand.kin, group, setting, posture, chosen[i])
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     j0 = group_forward(hand.kin, group, q, X, 0)
-    c0 = hand.contacts.first[group]
-    points = hand.contacts.first[group + 1] - c0
+    run = contact_run(hand, setting, group)
+    c0 = hand.contacts.first[run]
+    points = hand.contacts.first[run + 1] - c0
     c = c0 + wp.min(int(wp.randf(state) * float(points)), points - 1)
     T = X[hand.contacts.body[c] - 1 - j0]
     n = wp.transform_vector(T, hand.contacts.normals[c])

@@ -13,8 +13,9 @@ FIELD_VERSION = 5
 class ContactField:
     """Contact vectors of S slots, sorted by (slot, voxel, normal bin).
 
-    Slot ``setting * groups + group`` holds those of a group with the shared joints at one of their settings. The
-    vectors of voxel v (counted over all slots) and normal bin b are rows ``start[v * 64 + b]`` to the next entry.
+    Slot ``setting * groups + group`` holds those of a group with the shared joints at one of their settings; of a hand
+    with several contact surfaces all settings come for each of them. The vectors of voxel v (counted over all slots)
+    and normal bin b are rows ``start[v * 64 + b]`` to the next entry.
     """
 
     hand_sha256: str

@@ -1,5 +1,6 @@
 """The state of a hand that already holds objects: frozen joints and the objects, one row a sequence."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,7 @@ import warp as wp
 
 from lgrasp.grasp.collision import body_apart, body_depth
 from lgrasp.hand.arrays import Hand, HandArrays
+from lgrasp.hand.opposition.spaces import Space
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.math.limits import MAX_DOFS
 from lgrasp.object.arrays import Object, ObjectArrays
@@ -23,7 +25,8 @@ class Held:
     tries: wp.int32
     posture: wp.array2d(dtype=vec_dof)  # (H, G) [rad or m]
     frozen: wp.array2d(dtype=wp.int32)  # (H, G) bit d: dof d of the group must not move
-    setting: wp.array(dtype=wp.int32)  # (H,) setting of the shared joints, -1: any
+    setting: wp.array(dtype=wp.int32)  # (H,) setting of the shared joints and surface of the space, -1: any
+    sides: wp.array(dtype=wp.vec2i)  # (H,) groups of the two sides of the space, -1: static links; () without spaces
     objects: wp.int32  # n held by every row
     object: wp.array(dtype=Object)  # (n,)
     pose: wp.array2d(dtype=wp.transform)  # (H, n) T_hand_object of the internal frames
@@ -34,7 +37,15 @@ class HeldArrays:
     """What is held on one device; keeps the objects alive."""
 
     struct: "Held"
-    objects: tuple[ObjectArrays, ...] = ()
+    objects: tuple[ObjectArrays, ...]
+    free: np.ndarray
+    """Joints that may move, (H, K) bool."""
+    setting: np.ndarray
+    """See :class:`Held`, (H,)."""
+    space: np.ndarray | None
+    """Opposition space in which each row goes on, (H,); None: in none."""
+    sides: np.ndarray | None
+    """Groups of its two sides, -1: static links, (H, 2)."""
 
 
 def hold_nothing(hand: HandArrays) -> HeldArrays:
@@ -52,27 +63,37 @@ def hold(
     pose: np.ndarray,
     *,
     tries: int,
+    spaces: Sequence[Space] = (),
+    space: np.ndarray | None = None,
     any_setting: bool = False,
 ) -> HeldArrays:
     """Put what H sequences hold on the hand's device.
 
     Args:
         q: joint positions [rad or m], (H, K).
-        frozen: joints that must not move, (H, K) bool.
+        frozen: joints that must not move, (H, K) bool; besides, none moves that is not of the row's space.
         objects: the n objects that every row holds.
         pose: their poses in the hand frame, internal frames, device poses (H, n, 7).
         tries: candidates that continue each row.
+        spaces: opposition spaces, each with a contact surface of the hand. space: that of each row, (H,).
         any_setting: shared joints may still take any of their values; else they have those of q.
     """
     tree, d = hand.model.tree, hand.device
     rows, posture = len(q), tree.by_group(q.astype(np.float32))
+    sides = None
+    if space is not None:
+        frozen = frozen | ~np.array([own.joints for own in spaces])[space]
+        sides = np.array([own.groups for own in spaces], np.int32)[space]
     bits = (tree.by_group(frozen) << np.arange(MAX_DOFS)).sum(2).astype(np.int32)
     setting = np.full(rows, -1) if any_setting else _settings(q, tree.settings)
-    held = upload_struct(Held, d, {"tries": tries, "posture": posture, "frozen": bits, "setting": setting})
+    if space is not None:
+        setting += space * len(tree.settings)
+    values = {"tries": tries, "posture": posture, "frozen": bits, "setting": setting}
+    held = upload_struct(Held, d, values | ({} if sides is None else {"sides": sides}))
     held.objects = len(objects)
     held.object = wp.array([o.struct for o in objects], dtype=Object, device=d)
     held.pose = wp.array(np.reshape(pose, (-1, 7)), dtype=wp.transform, device=d).reshape((rows, len(objects)))
-    return HeldArrays(held, objects)
+    return HeldArrays(held, objects, ~frozen, setting, space, sides)
 
 
 def _settings(q: np.ndarray, settings: np.ndarray) -> np.ndarray:

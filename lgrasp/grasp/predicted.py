@@ -6,7 +6,8 @@ import numpy as np
 import warp as wp
 
 from lgrasp.field.model import ContactField
-from lgrasp.hand.arrays import Hand, HandArrays
+from lgrasp.grasp.held import Held, HeldArrays
+from lgrasp.hand.arrays import Hand, HandArrays, contact_run
 from lgrasp.hand.model import HandModel
 from lgrasp.math.kinematics import group_forward, vec_dof
 from lgrasp.math.limits import MAX_JOINTS
@@ -46,11 +47,12 @@ def contact_place(hand: Hand, side: wp.int32, x: vec_dof, c: wp.int32):
 
 
 @wp.func
-def touching_points(hand: Hand, obj: Object, T: wp.transform, side: wp.int32, x: vec_dof):
+def touching_points(hand: Hand, obj: Object, T: wp.transform, setting: wp.int32, side: wp.int32, x: vec_dof):
     """Contact point of a side that touches an object at T best, with the side's joints at x; its place and normal in
     the hand frame; and the object's contact point nearest to it. Points are -1 where the side has none."""
-    first = hand.contacts.first[wp.where(side < 0, hand.kin.groups, side)]
-    end = hand.contacts.first[wp.where(side < 0, hand.kin.groups, side) + 1]
+    run = contact_run(hand, setting, side)
+    first = hand.contacts.first[run]
+    end = hand.contacts.first[run + 1]
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     j0 = int(0)
     if side >= 0:
@@ -92,31 +94,29 @@ def touching_points(hand: Hand, obj: Object, T: wp.transform, side: wp.int32, x:
 
 
 @wp.kernel
-def match_sides(hand: Hand, obj: Object, sides: wp.vec2i, predicted_out: Predicted):
-    """One thread per (candidate, side): the contact points that touch best, see :func:`touching_points`.
-
-    Args:
-        sides: groups of the two sides, -1: static links.
-    """
+def match_sides(hand: Hand, obj: Object, held: Held, predicted_out: Predicted):
+    """One thread per (candidate, side): the contact points that touch best, see :func:`touching_points`."""
     i, side = wp.tid()
+    h = i // held.tries
+    g = held.sides[h][side]
     x = vec_dof()
-    if sides[side] >= 0:
-        x = predicted_out.posture[i, sides[side]]
-    c, _p, _n, surface = touching_points(hand, obj, predicted_out.pose[i], sides[side], x)
+    if g >= 0:
+        x = predicted_out.posture[i, g]
+    c, _p, _n, surface = touching_points(hand, obj, predicted_out.pose[i], held.setting[h], g, x)
     predicted_out.hand_point[i, side] = c
     predicted_out.object_point[i, side] = surface
 
 
 @dataclass(frozen=True)
 class TouchingGrasps:
-    """Grasps of H rows with an opposition space, whether good or not."""
+    """Grasps of H rows with opposition spaces, whether good or not."""
 
     pose: np.ndarray
     """T_hand_object of the new object's internal frame, device poses (H, 7) f32."""
     q: np.ndarray
     """Joints, those that may not move bit by bit as given, (H, K) f32."""
     hand_point: np.ndarray
-    """The point of each side that touches, index in ``contact_points`` of the view of the row's space, (H, 2)."""
+    """The point of each side that touches, index in ``contact_points`` of the hand, (H, 2)."""
     object_point: np.ndarray
     """The object's contact point nearest to each, index in ``contact_points`` of the object, (H, 2)."""
 
@@ -129,12 +129,12 @@ class PredictedArrays:
 
 
 def upload_predicted(
-    hand: HandArrays, obj: ObjectArrays, sides: tuple[int, int], record: np.ndarray, pose: np.ndarray, q: np.ndarray
+    hand: HandArrays, obj: ObjectArrays, held: HeldArrays, record: np.ndarray, pose: np.ndarray, q: np.ndarray
 ) -> PredictedArrays:
     """Put predictions on the hand's device, and find where they touch.
 
     Args:
-        sides: groups of the two sides, -1: static links.
+        held: rows with opposition spaces, which the candidates continue.
         record: see :func:`record_of_points`.
         pose: T_hand_object of the internal frame, device poses (N, 7). q: joints [rad or m], (N, K), frozen as held.
     """
@@ -142,7 +142,7 @@ def upload_predicted(
     values = {"pose": pose, "posture": hand.model.tree.by_group(q), "record": record}
     values |= {"hand_point": points[0], "object_point": points[1]}
     struct = upload_struct(Predicted, hand.device, values)
-    wp.launch(match_sides, (len(q), 2), [hand.struct, obj.struct, wp.vec2i(*sides)], [struct], device=hand.device)
+    wp.launch(match_sides, (len(q), 2), [hand.struct, obj.struct, held.struct], [struct], device=hand.device)
     return PredictedArrays(struct)
 
 

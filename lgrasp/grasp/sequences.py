@@ -91,7 +91,7 @@ def empty_sequences(rows: int, joints: int, contacts: int) -> SequenceTable:
 
 
 def extend(
-    before: SequenceTable, posture: np.ndarray, row: np.ndarray, space: int, free: np.ndarray, grasps: GraspTable
+    before: SequenceTable, posture: np.ndarray, row: np.ndarray, space: np.ndarray, free: np.ndarray, grasps: GraspTable
 ) -> SequenceTable:
     """Sequences that are one step longer: joints that the step may not move stay exactly as they were.
 
@@ -99,14 +99,14 @@ def extend(
         before: the sequences that are continued.
         posture: their :meth:`SequenceTable.posture`, (N, K).
         row: row of ``before`` of each grasp, (M,).
-        space: opposition space of the step.
+        space: opposition space of the step, (M,).
         free: joints that the step may move, (M, K) bool.
         grasps: M grasps of the next object.
     """
     last = posture[row]
     pressing = before.q_squeeze[row, -1] if before.steps else last
     step = {
-        "space": np.full(len(row), space, np.int32),
+        "space": space.astype(np.int32),
         "free": free,
         "q": np.where(free, grasps.q, last),
         "q_pregrasp": np.where(free, grasps.q_pregrasp, last),

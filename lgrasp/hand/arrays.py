@@ -27,7 +27,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 class Contacts:
     """Contact surfaces of a HandModel (same names, same meaning)."""
 
-    first: wp.array(dtype=wp.int32)  # (G + 2,)
+    first: wp.array(dtype=wp.int32)  # (W (G + 1) + 1,), see contact_run
     points: wp.array(dtype=wp.vec3)  # (C,)
     normals: wp.array(dtype=wp.vec3)  # (C,)
     body: wp.array(dtype=wp.int32)  # (C,)
@@ -119,7 +119,7 @@ def upload_hand(model: HandModel, device: str, thumb: ThumbBend | None = None) -
         "column_lower": t.joint_lower,
         "column_upper": t.joint_upper,
         "settings": len(t.settings),
-        "dof_setting": t.settings[:, t.dof_index],
+        "dof_setting": np.tile(t.settings[:, t.dof_index], (model.surfaces, 1)),
     }
     meshes = _link_meshes(model, device)
     contacts = _named(Contacts, model, "contact_") | {
@@ -178,6 +178,13 @@ def _link_meshes(model: HandModel, device: str) -> tuple[wp.Mesh, ...]:
         points = wp.array(np.ascontiguousarray(v), dtype=wp.vec3, device=device)
         meshes.append(wp.Mesh(points, wp.array(np.ascontiguousarray(f.ravel()), dtype=wp.int32, device=device)))
     return tuple(meshes)
+
+
+@wp.func
+def contact_run(hand: Hand, setting: wp.int32, side: wp.int32):
+    """Entry of ``contacts.first`` of a group (-1: static links): the contact surface is that of the setting."""
+    surface = setting // hand.kin.settings
+    return surface * (hand.kin.groups + 1) + wp.where(side < 0, hand.kin.groups, side)
 
 
 @wp.func

@@ -79,8 +79,8 @@ class HandModel:
     overlap_grid_origin: np.ndarray  # (S, 3)
     overlap_grid_cell: np.ndarray  # (S,)
     overlap_grid_values: np.ndarray  # flat
-    # contact surfaces; palm points are those of group G (last)
-    contact_first: np.ndarray  # (G + 2,)
+    # W contact surfaces, one after another: 1, or one for each opposition space; palm points are of group G (last)
+    contact_first: np.ndarray  # (W (G + 1) + 1,)
     contact_points: np.ndarray  # (C, 3)
     contact_normals: np.ndarray  # (C, 3)
     contact_body: np.ndarray  # (C,)
@@ -107,7 +107,12 @@ class HandModel:
     @property
     def contact_group(self) -> np.ndarray:
         """Group of each contact point, (C,); the palm's is ``groups``."""
-        return np.repeat(np.arange(self.groups + 1), np.diff(self.contact_first))
+        return np.repeat(np.tile(np.arange(self.groups + 1), self.surfaces), np.diff(self.contact_first))
+
+    @property
+    def surfaces(self) -> int:
+        """Contact surfaces W."""
+        return (len(self.contact_first) - 1) // (self.groups + 1)
 
     @property
     def patches(self) -> int:
@@ -116,7 +121,7 @@ class HandModel:
 
     @property
     def patch_first(self) -> np.ndarray:
-        """(G + 2,) i32: first patch of each group, palm last."""
+        """(W (G + 1) + 1,) i32: first patch of each group, palm last."""
         parts = np.split(self.contact_patch, self.contact_first[1:-1])
         return np.cumsum([0, *(len(np.unique(part)) for part in parts)]).astype(np.int32)
 

@@ -94,6 +94,22 @@ def contact_arrays(
     }
 
 
+def join_surfaces(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The arrays of a hand with several contact surfaces: the groups of the first, then those of the next.
+
+    Args:
+        parts: as of :func:`contact_arrays`.
+    """
+    out = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    for name in ("contact_first", "grid_first", "rule_first", "mesh_vertex_first", "mesh_face_first"):
+        out[name] = csr(np.concatenate([np.diff(part[name]) for part in parts]))
+    sizes = {"contact_patch": [part["contact_patch"].max() + 1 for part in parts]}
+    sizes["contact_grid"] = [len(part["grid_link"]) for part in parts]
+    for name, size in sizes.items():
+        out[name] += np.repeat(csr(size)[:-1], [len(part[name]) for part in parts])
+    return out
+
+
 def with_bare_links(arrays: Mapping[str, np.ndarray], others: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays with the grids and meshes of further links, which get no contact point.
 

@@ -16,6 +16,8 @@ class Kinematics:
 
     ``joint_parent`` is an index inside the group, -1 for the static base. A joint's coordinate is
     ``mult * q[dof] + offset`` with ``dof`` an index inside the group, so mimic joints need no special case.
+
+    A hand with W contact surfaces has its settings once for each: setting ``s`` is with surface ``s // settings``.
     """
 
     groups: wp.int32
@@ -35,8 +37,8 @@ class Kinematics:
     column_upper: wp.array(dtype=wp.float32)  # (K,)
     column_sliding: wp.array(dtype=wp.int32)  # (K,) 1: the joint slides
     dof_free: wp.array(dtype=wp.int32)  # (groups,) dofs that the group moves itself; shared ones come after
-    settings: wp.int32  # number of combinations of values of the shared joints
-    dof_setting: wp.array2d(dtype=wp.float32)  # (settings, D) open posture with the shared joints in place
+    settings: wp.int32  # V combinations of values of the shared joints
+    dof_setting: wp.array2d(dtype=wp.float32)  # (W V, D) open posture with the shared joints in place
 
 
 @wp.func

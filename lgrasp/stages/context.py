@@ -20,7 +20,6 @@ from lgrasp.seeding import stage_seed
 from lgrasp.steer.arrays import SteerArrays, steer_nothing
 
 if TYPE_CHECKING:
-    from lgrasp.hand.opposition.spaces import Space
     from lgrasp.simulate.scene import Scene
 
 
@@ -39,12 +38,11 @@ class Context:
     """What a grasp must satisfy, and what its measures are measured with: those of the pipeline."""
     scene: "Scene | None" = None
     """What a physics simulation is given; there if the pipeline has one."""
-    space: "Space | None" = None
-    """Opposition space that grasps must use; hand and field are then those of the space."""
     holding: HeldArrays | None = None
-    """What the hand holds already, and what of it may not move; None: nothing."""
+    """What the hand holds already, what of it may not move, and the opposition spaces that grasps must use, which are
+    the contact surfaces of hand and field then; None: nothing."""
     predicted: PredictedArrays | None = None
-    """Poses and postures of the candidates in an opposition space; None: they are drawn."""
+    """Poses and postures of the candidates in opposition spaces; None: they are drawn."""
     steer: SteerArrays | None = None
     """What the user asks of grasps; None: nothing."""
     policy: PolicyArrays | None = None
@@ -63,6 +61,11 @@ class Context:
     def held(self) -> HeldArrays:
         """What the hand holds already, of no rows but one if nothing."""
         return self.holding or hold_nothing(self.hand)
+
+    @property
+    def opposed(self) -> bool:
+        """True if grasps must use opposition spaces."""
+        return self.held.space is not None
 
     @cached_property
     def steered(self) -> SteerArrays:

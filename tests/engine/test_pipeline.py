@@ -48,6 +48,12 @@ def test_a_stage_may_be_written_without_parameters(load_text):
     assert load_text(declared(stages=[{n: None} for n in ORDERS[1]])).order == ORDERS[1]
 
 
+def test_objects_of_sequences_touch_their_opposition_space_only(load_text):
+    for data in (stages(filter={"contacts": "all"}), declared(stages=[{n: None} for n in ORDERS[1]])):
+        with pytest.raises(ConfigError, match=r"opposition space only; leave out stage wrap and filter\.contacts"):
+            load_text(data | {"sequence": {}})
+
+
 @pytest.mark.parametrize(
     ("data", "words"),
     [

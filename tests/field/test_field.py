@@ -16,7 +16,7 @@ from lgrasp.field.params import FieldParams
 from lgrasp.hand.arrays import Hand, body_poses, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.opposition.spaces import space_view
+from lgrasp.hand.opposition.spaces import spaces_view
 from lgrasp.hand.pairs import pieces_touch
 from lgrasp.math.transforms import NORMAL_BINS
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
@@ -324,7 +324,7 @@ def test_field_of_an_opposition_space(name):
     start()
     urdf, spec = hand_source("shipped")
     whole = hand_model("shipped")
-    view = space_view(urdf, spec, whole, name)
+    view = spaces_view(urdf, spec, whole, [name])
     field = build_field(upload_hand(view, "cpu"), PARAMS)
     fingers = set(np.flatnonzero(np.diff(view.contact_first)[:-1]))
     assert set(groups_of(field)) == fingers

@@ -129,44 +129,39 @@ def table(inputs):
     return run_round(small_pipeline(), inputs, 0, 0, 2).levels[0]
 
 
+def in_spaces(inputs, table, posture) -> Context:
+    """Hands in some postures that hold nothing, each with the space of its row."""
+    frozen, nothing = np.zeros(posture.shape, bool), np.zeros((len(table), 0, 7), np.float32)
+    given = {"tries": 1, "spaces": inputs.spaces, "space": table.space[:, 0]}
+    holding = hold(inputs.view.hand, posture, frozen, (), nothing, **given)
+    bounds = small_pipeline().bounds
+    return Context(inputs.view.hand, inputs.objects[0], inputs.view.field, "cpu", 0, 0, bounds, holding=holding)
+
+
 def test_valid_grasps_as_predictions_mostly_stay(inputs, table):
     """Poses and joints of valid grasps: the stages find contacts there again, with the object hardly moved."""
-    moved, pipeline = [], small_pipeline("sample")
-    for number in np.unique(table.space):
-        space, view, own = inputs.spaces[number], inputs.views[number], table.space[:, 0] == number
-        rows = int(own.sum())
-        posture = np.broadcast_to(inputs.hand.tree.joint_open.astype(np.float32), (rows, inputs.hand.dofs))
-        frozen = np.broadcast_to(~space.joints, posture.shape)
-        nothing = hold(view.hand, posture, frozen, (), np.zeros((rows, 0, 7), np.float32), tries=1)
-        given = inputs.objects[0], space.groups, view.records, table.pose[own, 0], table.q[own, 0]
-        predicted = upload_predicted(view.hand, *given)
-        given = {"bounds": pipeline.bounds, "space": space, "holding": nothing, "predicted": predicted}
-        grasps = run_stages(
-            pipeline, Context(view.hand, inputs.objects[0], view.field, "cpu", 0, 0, **given), 0, rows, "filter"
-        )
-        kept, first = np.unique(grasps.index, return_index=True)
-        moved += np.linalg.norm(grasps.pose[first, :3] - table.pose[own, 0][kept][:, :3], axis=1).tolist()
-    assert len(moved) > 0.35 * len(table)  # of candidates drawn by place one in fifty
-    assert np.median(moved) < 0.002
+    pipeline, view, rows = small_pipeline("sample"), inputs.view, len(table)
+    posture = np.broadcast_to(inputs.hand.tree.joint_open.astype(np.float32), (rows, inputs.hand.dofs))
+    context = in_spaces(inputs, table, posture)
+    predicted = upload_predicted(view.hand, context.object, context.held, view.records, table.pose[:, 0], table.q[:, 0])
+    grasps = run_stages(pipeline, context.changed(predicted=predicted), 0, rows, "filter")
+    kept, first = np.unique(grasps.index, return_index=True)
+    assert len(kept) > 0.35 * rows  # of candidates drawn by place one in fifty
+    assert np.median(np.linalg.norm(grasps.pose[first, :3] - table.pose[kept, 0, :3], axis=1)) < 0.002
 
 
 def test_valid_grasps_are_valid_as_they_are(inputs, table):
     """Poses and joints of valid grasps pass the filter unchanged, with the contacts that are found there."""
-    pipeline, kept = small_pipeline(), 0
-    for number in np.unique(table.space):
-        own, view, space = table.space[:, 0] == number, inputs.views[number], inputs.spaces[number]
-        given = view.hand, inputs.objects[0], space.groups, view.records, table.pose[own, 0], table.q[own, 0]
-        there = upload_predicted(*given).struct
-        grasps = TouchingGrasps(*given[-2:], *fetch([there.hand_point, there.object_point]))
-        frozen = ~np.tile(space.joints, (own.sum(), 1))
-        holding = hold(view.hand, table.q[own, 0], frozen, (), np.zeros((own.sum(), 0, 7)), tries=1)
-        given = {"bounds": pipeline.bounds, "space": space, "holding": holding}
-        context = Context(view.hand, inputs.objects[0], view.field, "cpu", 0, 0, **given)
-        found = run_stage("filter", touching_sets(grasps, ~frozen, context), pipeline, context, Meter("cpu"))
-        np.testing.assert_array_equal(found.pose, table.pose[own, 0][found.index])
-        np.testing.assert_array_equal(found.q[:, space.joints], table.q[own, 0][found.index][:, space.joints])
-        kept += len(found)
-    assert kept > 0.8 * len(table)
+    pipeline, view = small_pipeline(), inputs.view
+    pose, q, free = table.pose[:, 0], table.q[:, 0], table.free[:, 0]
+    context = in_spaces(inputs, table, q)
+    there = upload_predicted(view.hand, context.object, context.held, view.records, pose, q).struct
+    grasps = TouchingGrasps(pose, q, *fetch([there.hand_point, there.object_point]))
+    found = run_stage("filter", touching_sets(grasps, context), pipeline, context, Meter("cpu"))
+    at = found.index
+    np.testing.assert_array_equal(found.pose, pose[at])
+    np.testing.assert_array_equal(found.q[free[at]], q[at][free[at]])
+    assert len(found) > 0.8 * len(table)
 
 
 def test_what_is_drawn_becomes_valid_shards(asked, network, tmp_path):

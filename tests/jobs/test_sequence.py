@@ -170,7 +170,7 @@ def test_sets_share_what_is_loaded_of_the_hand(pipeline, cache_root):
     views = []
     for names in (OBJECTS, OBJECTS[::-1]):
         keys = sequence_keys("allegro", names, Size(0.06, 0.08), 0, pipeline.object, pipeline.field)
-        views.append(load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device).views)
+        views.append(load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device).view)
     assert views[0] is views[1]
 
 

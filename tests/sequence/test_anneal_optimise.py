@@ -12,7 +12,8 @@ from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
-from lgrasp.hand.opposition.spaces import hand_spaces, space_view
+from lgrasp.hand.model import HandModel
+from lgrasp.hand.opposition.spaces import hand_spaces, spaces_view
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
 from lgrasp.runtime.streams import uniforms
@@ -45,13 +46,13 @@ def one_thread():
 def case() -> SimpleNamespace:
     """Allegro with three of its spaces, a ball and a bar."""
     source = find_hand("allegro")
-    model = build_hand(source.urdf, source.spec)
+    whole = build_hand(source.urdf, source.spec)
+    model = spaces_view(source.urdf, source.spec, whole, SPACES)
     known = {s.name: s for s in hand_spaces(source.spec, model.tree)}
     params = ObjectParams(sdf_cells=40**3, obstacle_count=1024, contact_count=512)
     shapes = [trimesh.creation.icosphere(3, 0.03), trimesh.creation.box((0.03, 0.02, 0.07))]
     return SimpleNamespace(
         hand=model,
-        views=[space_view(source.urdf, source.spec, model, name) for name in SPACES],
         spaces=[known[name] for name in SPACES],
         objects=[preprocess_object(mesh, params=params) for mesh in shapes],
     )
@@ -76,7 +77,13 @@ def run(case, number: int, space: np.ndarray, before: Optimised | None = None, o
     """Grasp object ``number`` in rows of these spaces that hold what ``before`` grasped."""
     params = OptimiserParams(iterations=40, step_period=8, temperature_period=3, hand_points=512, object_points=256)
     inputs = {name: values[only] for name, values in rows_of(case, number, space, before).items()}
-    return optimise(case.hand, case.views, case.spaces, case.objects[:number], **inputs, **{"params": params} | more)
+    return optimise(case.hand, case.spaces, case.objects[:number], **inputs, **{"params": params} | more)
+
+
+def points_of(hand: HandModel, space: int, group: int) -> np.ndarray:
+    """Contact points of a side of a space."""
+    run = space * (hand.groups + 1) + (group if group >= 0 else hand.groups)
+    return np.arange(*hand.contact_first[run : run + 2])
 
 
 def columns(result: Optimised) -> list[np.ndarray]:
@@ -111,11 +118,10 @@ def test_indices_name_points_of_the_two_sides_and_the_nearest_of_the_object(case
     T_body = T_body.reshape(len(first.q), -1, 4, 4)
     surface = case.objects[0].contact_points
     for row, space in enumerate(np.arange(6) % 2):
-        view = case.views[space]
+        view = case.hand
         for side, group in enumerate(case.spaces[space].groups):
             index = first.hand_point[row, side]
-            group = group if group >= 0 else view.groups
-            assert view.contact_first[group] <= index < view.contact_first[group + 1]
+            assert index in points_of(view, space, group)
             T = T_body[row, view.contact_body[index]]
             p = T[:3, :3] @ view.contact_points[index] + T[:3, 3]
             local = Rotation.from_quat(first.pose[row, 3:]).inv().apply(p - first.pose[row, :3])
@@ -127,12 +133,11 @@ def test_distances_are_those_of_the_contact_points(case, first):
     """dis from the pose, the posture and the indices alone, on a true ball."""
     T_body = device_matrix(body_poses(upload_hand(case.hand, "cpu"), first.q).astype(float).reshape(-1, 7))
     T_body = T_body.reshape(len(first.q), -1, 4, 4)
-    for row, space in enumerate(np.arange(6) % 2):
-        view = case.views[space]
+    for row in range(6):
         gaps = []
         for index in first.hand_point[row]:
-            T = T_body[row, view.contact_body[index]]
-            p = T[:3, :3] @ view.contact_points[index] + T[:3, 3]
+            T = T_body[row, case.hand.contact_body[index]]
+            p = T[:3, :3] @ case.hand.contact_points[index] + T[:3, 3]
             gaps.append(abs(np.linalg.norm(p - first.pose[row, :3]) - 0.03))
         assert first.energies[row, 1] <= sum(gaps) + 1e-3  # far from a grid its distance is a lower bound
 
@@ -153,7 +158,7 @@ def test_touching_points_are_among_the_best_pairs(case):
     result = run(case, 1, np.ones(12, int), params=SHORT.model_copy(update={"w_fc": 5}))
     touching = np.flatnonzero(result.energies[:, 1] < 0.004)
     assert len(touching)
-    view, (first, second) = case.views[1], case.spaces[1].groups
+    view, (first, second) = case.hand, case.spaces[1].groups
     ball = case.objects[0]
     T_body = device_matrix(body_poses(upload_hand(case.hand, "cpu"), result.q).astype(float).reshape(-1, 7))
     T_body = T_body.reshape(len(result.q), -1, 4, 4)
@@ -161,8 +166,7 @@ def test_touching_points_are_among_the_best_pairs(case):
     for row in touching:
         badness, arms, outward, sides = [], [], [], []
         for group in (first, second):
-            group = group if group >= 0 else view.groups
-            own = np.arange(view.contact_first[group], view.contact_first[group + 1])
+            own = points_of(view, 1, group)
             T = T_body[row, view.contact_body[own]]
             p = np.einsum("nij,nj->ni", T[:, :3, :3], view.contact_points[own]) + T[:, :3, 3]
             d = p - result.pose[row, :3]

@@ -15,7 +15,7 @@ from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.spec import Cone, HandSpec, Surface
 from lgrasp.hand.spec_check import side_links
-from lgrasp.hand.surface import ContactLink, with_bare_links
+from lgrasp.hand.surface import ContactLink, join_surfaces, with_bare_links
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 from lgrasp.hand.whole_hand import surface_arrays
@@ -122,8 +122,10 @@ def space_sides(
     return found[0], found[1]
 
 
-def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, device: str = "cpu") -> HandModel:
-    """The same hand with the two sides of an opposition space as its only contact surface.
+def spaces_view(
+    urdf_path: Path, spec: HandSpec, model: HandModel, names: Sequence[str], device: str = "cpu"
+) -> HandModel:
+    """The same hand with the two sides of each of some opposition spaces as its only contact surfaces, in this order.
 
     Fingers' sides are contact rules: all that is outside the side's cone is forbidden. A static side is the palm. A box
     bounds the contact points; a contact that slides on a finger may leave it. The hand's other contact links keep their
@@ -135,12 +137,14 @@ def space_view(urdf_path: Path, spec: HandSpec, model: HandModel, name: str, dev
     Raises:
         HandError: see :func:`space_sides`.
     """
-    urdf = read_urdf(urdf_path)
-    links = [link for side in space_sides(urdf, spec, model.tree, name, device) for link in side]
-    arrays = surface_arrays(model, urdf, links, device)
+    urdf, parts = read_urdf(urdf_path), []
+    for name in names:
+        links = [link for side in space_sides(urdf, spec, model.tree, name, device) for link in side]
+        parts.append(surface_arrays(model, urdf, links, device))
+    arrays = join_surfaces(parts)
     arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
-    described = spec.opposition_spaces[name].model_dump(mode="json")
-    digest = hashlib.sha256(json.dumps([model.sha256, name, described]).encode()).hexdigest()
+    described = [(name, spec.opposition_spaces[name].model_dump(mode="json")) for name in names]
+    digest = hashlib.sha256(json.dumps([model.sha256, described]).encode()).hexdigest()
     return replace(model, sha256=digest, contacts=(), **arrays)
 
 

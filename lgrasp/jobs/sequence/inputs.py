@@ -1,4 +1,4 @@
-"""Inputs of a job of sequences: a hand, the views of its opposition spaces with their fields, the objects."""
+"""Inputs of a job of sequences: a hand, its view by opposition spaces with a field, the objects."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
-from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, space_view
+from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, spaces_view
 from lgrasp.jobs.hands import hand_source
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
@@ -44,8 +44,8 @@ class SequenceKeys:
 
     source: HandSource
     hand: str
-    views: dict[str, str]
-    fields: dict[str, str]
+    view: str
+    field: str
     names: tuple[str, ...]  # one per step
     meshes: tuple[Path, ...]  # files, perhaps of points
     scales: tuple[float, ...]
@@ -53,13 +53,13 @@ class SequenceKeys:
 
     def run_key(self, pipeline: dict[str, Any], shard_rows: int, simulate: str | None) -> str:
         """Content key of a run: everything that decides its rows."""
-        parts = [pipeline, self.hand, self.fields, self.objects, shard_rows, simulate]
+        parts = [pipeline, self.hand, self.field, self.objects, shard_rows, simulate]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
-class SpaceView:
-    """The hand and the contact field of one opposition space on a device."""
+class SpacesView:
+    """The hand with a contact surface for each opposition space, and the contact field of these, on a device."""
 
     hand: HandArrays
     field: FieldArrays
@@ -76,7 +76,7 @@ class SequenceInputs:
 
     hand: HandModel
     spaces: tuple[Space, ...]
-    views: tuple[SpaceView, ...]
+    view: SpacesView
     objects: tuple[ObjectArrays, ...]  # one per step
     keys: SequenceKeys
     device: Device
@@ -117,13 +117,12 @@ def sequence_keys(
     digest = hand_digest(source.urdf, source.spec)
     hand_key = content_key("hand", HAND_VERSION, content=digest)
     names = source.spec.opposition_spaces
-    views = {name: content_key("hand", HAND_VERSION, content=digest, space=name) for name in names}
-    described = fields.model_dump(mode="json")
-    field_keys = {n: content_key("field", FIELD_VERSION, hand=key, params=described) for n, key in views.items()}
+    view = content_key("hand", HAND_VERSION, content=digest, spaces=list(names))
+    field = content_key("field", FIELD_VERSION, hand=view, params=fields.model_dump(mode="json"))
     paths = tuple(find_object(mesh) for mesh in meshes)
     scales = _object_scales(paths, size, seed)
     keys = tuple(object_key(str(p), s, objects)[1] for p, s in zip(paths, scales, strict=True))
-    return SequenceKeys(source, hand_key, views, field_keys, tuple(p.stem for p in paths), paths, scales, keys)
+    return SequenceKeys(source, hand_key, view, field, tuple(p.stem for p in paths), paths, scales, keys)
 
 
 def load_sequence_inputs(
@@ -144,8 +143,8 @@ def load_sequence_inputs(
         ConfigError: more objects than the hand's opposition spaces can take one after another.
     """
     load, alias = Loader(cache, device.alias, report), device.alias
-    key = alias, keys.hand, *keys.views.values(), *keys.fields.values()
-    model, spaces, views = cache.kept.get("spaces", key, lambda: _load_spaces(load, keys, fields))
+    key = alias, keys.hand, keys.view, keys.field
+    model, spaces, view = cache.kept.get("spaces", key, lambda: _load_spaces(load, keys, fields))
     most = longest(spaces, (), np.zeros(model.dofs, bool))
     if len(keys.meshes) > most:
         raise ConfigError(
@@ -162,23 +161,21 @@ def load_sequence_inputs(
             made[key] = upload_object(own, alias)
     steps = tuple(made[key] for key in keys.objects)
     return SequenceInputs(
-        model, spaces, views, steps, keys, device, load.seconds, {"hand": True, "field": True} | load.hits
+        model, spaces, view, steps, keys, device, load.seconds, {"hand": True, "field": True} | load.hits
     )
 
 
 def _load_spaces(
     load: Loader, keys: SequenceKeys, fields: FieldParams
-) -> tuple[HandModel, tuple[Space, ...], tuple[SpaceView, ...]]:
-    """The hand, its opposition spaces and their views, on the device."""
+) -> tuple[HandModel, tuple[Space, ...], SpacesView]:
+    """The hand, its opposition spaces and its view by them, on the device."""
     source, alias = keys.source, load.device
     model = load.hand(source, keys.hand)
-    spaces, views = hand_spaces(source.spec, model.tree), []
-    for name in (space.name for space in spaces):
-        make = partial(space_view, source.urdf, source.spec, model, name, alias)
-        view = load.get("hand", HandModel, keys.views[name], make)
-        hand = upload_hand(view, alias)
-        views.append(SpaceView(hand, upload_field(load.field(hand, keys.fields[name], fields), view, alias)))
-    return model, spaces, tuple(views)
+    spaces = hand_spaces(source.spec, model.tree)
+    make = partial(spaces_view, source.urdf, source.spec, model, [space.name for space in spaces], alias)
+    view = load.get("hand", HandModel, keys.view, make)
+    hand = upload_hand(view, alias)
+    return model, spaces, SpacesView(hand, upload_field(load.field(hand, keys.field, fields), view, alias))
 
 
 def _object_scales(meshes: Sequence[Path], size: Size, seed: int) -> tuple[float, ...]:

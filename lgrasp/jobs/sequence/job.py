@@ -18,7 +18,7 @@ from lgrasp.jobs.requests.search import SequenceRequest
 from lgrasp.jobs.search import SearchJob
 from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.records import object_records, sequence_rows
-from lgrasp.jobs.sequence.round import Verdicts, add_spaces
+from lgrasp.jobs.sequence.round import Steps, Verdicts, add_steps
 from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_rounds
 from lgrasp.jobs.sets import sequence_name
 from lgrasp.object.model import ObjectModel
@@ -109,9 +109,10 @@ class SequenceJob(SequenceRequest, SearchJob):
         """The results in numbers.
 
         Returns:
-            ``sequences`` (whole ones on disk), ``reached`` (rows found by number of objects), ``spaces`` (survivors by
-            step, space and stage), ``penetration`` (median and largest [mm], all rows), ``seconds`` (``wall`` of the
-            sequences, thread-seconds per stage, loading, total), ``per_s`` and what was asked.
+            ``sequences`` (whole ones on disk), ``reached`` (rows found by number of objects), ``steps`` (survivors by
+            step and stage), ``spaces`` (sequences by step and space), ``penetration`` (median and largest [mm], all
+            rows), ``seconds`` (``wall`` of the sequences, thread-seconds per stage, loading, total), ``per_s`` and what
+            was asked.
         """
         inputs, params, sums = self.inputs, self.pipeline.params("sequence"), self.sums(outcome)
         depth = []
@@ -125,7 +126,7 @@ class SequenceJob(SequenceRequest, SearchJob):
             "reached": [
                 sum(r.reached[s] for r in outcome.results if s < len(r.reached)) for s in range(len(inputs.objects))
             ],
-            "spaces": _spaces(inputs, outcome.results),
+            **{name: _steps(inputs, outcome.results, name) for name in ("steps", "spaces")},
             "penetration": [1e3 * float(np.median(depth)), 1e3 * float(depth.max())],
             "per_s": outcome.made / wall if wall else 0.0,
             "objects": list(inputs.object_ids),
@@ -169,18 +170,19 @@ def _unheld(inputs: SequenceInputs, results: Sequence[SequenceResult]) -> str:
     step = min(step, len(inputs.objects) - 1)
     model, path = inputs.objects[step].model, inputs.keys.meshes[step]
     sides = " x ".join(f"{1e3 * side:.0f}" for side in model.extents)
-    reasons = {space: starving_stage(counts) for space, counts in _spaces(inputs, results)[step].items()}
-    why = "; ".join(f"{space}: stage {stage}, {words}" for space, (stage, words) in reasons.items())
+    counts, spaces = (_steps(inputs, results, name)[step] for name in ("steps", "spaces"))
+    stage, words = starving_stage(counts)
+    why = f"stage {stage}, {words}; tried: {', '.join(spaces)}"
     return (
         f"object {step + 1} ({path}, {sides} mm) is held by no opposition space of hand '{inputs.hand.name}'"
         + (f" after {plural(step, 'other object')}" if step else "")
-        + f": {why or 'none was left'}; --scale changes its size"
+        + f": {why if spaces else 'none was left'}; --scale changes its size"
     )
 
 
-def _spaces(inputs: SequenceInputs, results: Sequence[SequenceResult]) -> list[dict[str, dict[str, dict[str, int]]]]:
-    """Survivors by step, space and stage over all shards made."""
-    total: list[dict[str, dict[str, dict[str, int]]]] = [{} for _ in inputs.objects]
+def _steps(inputs: SequenceInputs, results: Sequence[SequenceResult], name: str) -> Steps:
+    """Counts of all shards made, ``steps`` or ``spaces`` of their results."""
+    total: Steps = [{} for _ in inputs.objects]
     for result in results:
-        add_spaces(total, result.spaces)
+        add_steps(total, getattr(result, name))
     return total

@@ -13,7 +13,7 @@ from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.grasp.tables import join_rows, take_rows
 from lgrasp.jobs.sequence.inputs import SequenceInputs
-from lgrasp.jobs.sequence.round import Round, Verdicts, add_spaces, run_round
+from lgrasp.jobs.sequence.round import Round, Verdicts, add_steps, run_round
 from lgrasp.runtime.tally import add_counts, add_seconds
 
 _EMPTY_ROUNDS = 4  # without any row of some length, before nothing more is expected
@@ -40,7 +40,8 @@ class SequenceResult(Round):
         self.rounds += 1
         add_counts(self.counts, found.counts)
         add_seconds(self.seconds, found.seconds)
-        add_spaces(self.spaces, found.spaces)
+        add_steps(self.steps, found.steps)
+        add_steps(self.spaces, found.spaces)
         self.reached = [a + b for a, b in zip_longest(self.reached, map(len, found.levels), fillvalue=0)]
 
 

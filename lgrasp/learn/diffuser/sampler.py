@@ -15,11 +15,12 @@ from lgrasp.learn.diffuser.network import DiffuserNet, Situation, joints_of
 from lgrasp.learn.diffuser.process import PROCESSES, Process
 from lgrasp.learn.diffuser.senses import HeldObjects, Senses
 from lgrasp.object.sdf import SdfGrid
+from lgrasp.runtime.streams import normals, uniforms
 
 Result = TypeVar("Result")
 
 _TURNS = 64  # rotations in which the network sees an object
-_CPU_ROWS, _GPU_ROWS = 256, 16_384  # at a time
+_CPU_ROWS, _GPU_ROWS = 256, 32_768  # at a time
 
 
 class DrawnSteps(NamedTuple):
@@ -29,10 +30,6 @@ class DrawnSteps(NamedTuple):
     """T_hand_object of the next object's centred frame, device poses (N, 7) f32."""
     q: np.ndarray
     """Joints, those that may not move bit by bit as they are, (N, K) f32."""
-
-    def of_hands(self, which: np.ndarray) -> "DrawnSteps":
-        """What was drawn for some of the H hands, (H,) bool, as many for each."""
-        return DrawnSteps(*(x.reshape(len(which), -1, x.shape[1])[which].reshape(-1, x.shape[1]) for x in self))
 
 
 @torch.no_grad()
@@ -141,9 +138,6 @@ class StepSampler:
         """
         rows, joints = hands.q.shape
         number = hands.pose.shape[1]
-        streams = [torch.Generator().manual_seed(seed + hand) for hand in range(rows)]
-        noise = torch.cat([torch.randn(each, 9 + joints, generator=draw) for draw in streams])
-        turn = torch.cat([torch.randint(_TURNS, (each,), generator=draw) for draw in streams])
         start, held = self._put(hands.q), self._held(hands, number)
         situation = Situation(
             self._shape(number)[:1].expand(rows, -1),
@@ -156,10 +150,12 @@ class StepSampler:
         count = rows * each
 
         def work(picked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            row, own = (picked // each).to(self._device), turn[picked].to(self._device)
+            picked = picked.to(self._device)
+            row, own_seed = picked // each, seed * each + picked
+            own = (uniforms(own_seed, 1, 1)[:, 0] * _TURNS).long()
             seen = situation.rows(row)._replace(shape=self._shape(number)[own])
             objects = torch.full_like(row, number), HeldObjects(*(x[row] for x in held))
-            given = noise[picked].to(self._device), self._turns[own]
+            given = normals(own_seed, 0, 9 + joints).float(), self._turns[own]
             R, t, q = draw_steps(self._net, self._process, self._senses, seen, *given, *objects, steps)
             return pose_from_motion(R, t), q
 

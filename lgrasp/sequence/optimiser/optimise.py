@@ -33,7 +33,6 @@ class Optimised(TouchingGrasps):
 
 def optimise(
     hand: HandModel,
-    views: Sequence[HandModel],
     spaces: Sequence[Space],
     objects: Sequence[ObjectModel],
     *,
@@ -53,7 +52,7 @@ def optimise(
     A row's result is a function of its own inputs, on one type of device.
 
     Args:
-        hand: any view of the hand; views: the hand as each of the spaces sees it.
+        hand: with a contact surface for each of the spaces.
         objects: n of them, the new one last.
         space: opposition space of each row, index in ``spaces``, (H,).
         q: posture to start from, (H, K) [rad or m]. free: joints that may move, (H, K) bool.
@@ -70,7 +69,7 @@ def optimise(
         point_unit=params.point_unit,
         device=device,
     )
-    sides = Sides(views, spaces, device=device)
+    sides = Sides(hand, spaces, device=device)
     rows = rows or (_CPU_ROWS if device == "cpu" else _GPU_ROWS)
     blocks = [np.arange(first, min(first + rows, len(q))) for first in range(0, len(q), rows)]
     parts = []

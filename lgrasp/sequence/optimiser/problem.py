@@ -15,53 +15,46 @@ class Sides:
     """Contact points of the two sides of each of S opposition spaces.
 
     Args:
-        views: the hand as each space sees it, whose contact points the indices mean. spaces: the same spaces.
+        hand: with a contact surface for each space, whose contact points the indices mean. spaces: the same spaces.
     """
 
     def __init__(
         self,
-        views: Sequence[HandModel],
+        hand: HandModel,
         spaces: Sequence[Space],
         *,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ) -> None:
         ranges = []
-        for view, space in zip(views, spaces, strict=True):
-            groups = [g if g >= 0 else view.groups for g in space.groups]
-            ranges.append([view.contact_first[g : g + 2] for g in groups])
-        offsets = np.cumsum([0, *(len(v.contact_points) for v in views)])
-
-        def put(parts: list[np.ndarray], dtype: torch.dtype) -> torch.Tensor:
-            return torch.as_tensor(np.concatenate(parts), dtype=dtype, device=device)
-
+        for number, space in enumerate(spaces):
+            runs = [number * (hand.groups + 1) + (g if g >= 0 else hand.groups) for g in space.groups]
+            ranges.append([hand.contact_first[run : run + 2] for run in runs])
         first, end = np.moveaxis(np.array(ranges), 2, 0)  # each (S, 2)
         self._first = torch.as_tensor(first, dtype=torch.int64, device=device)
         self._count = torch.as_tensor(end - first, dtype=torch.int64, device=device)
-        self._offset = torch.as_tensor(offsets[:-1], dtype=torch.int64, device=device)
-        self._point = put([v.contact_points for v in views], dtype)
-        self._normal = put([v.contact_normals for v in views], dtype)
-        self._body = put([v.contact_body for v in views], torch.int64)
+        self._point = torch.as_tensor(hand.contact_points, dtype=dtype, device=device)
+        self._normal = torch.as_tensor(hand.contact_normals, dtype=dtype, device=device)
+        self._body = torch.as_tensor(hand.contact_body, dtype=torch.int64, device=device)
 
     def counts(self, space: torch.Tensor) -> torch.Tensor:
         """Points on the sides of spaces (N,): (N, 2)."""
         return self._count[space]
 
     def index(self, space: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
-        """Index in the view's contact points, (N, 2), of points of sides, numbered from 0, (N, 2)."""
+        """Index in the hand's contact points, (N, 2), of points of sides, numbered from 0, (N, 2)."""
         return self._first[space] + chosen
 
     def contacts(self, space: torch.Tensor, chosen: torch.Tensor) -> HandContacts:
         """Bodies and places of points of sides."""
-        at = self.index(space, chosen) + self._offset[space][:, None]
+        at = self.index(space, chosen)
         return HandContacts(self._body[at], self._point[at])
 
     def points(self, space: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """All points of the sides of spaces (N,), (N, 2, P), and which of them are there: sides differ in size."""
         number = torch.arange(int(self._count.max()), device=space.device)
         listed = number < self._count[space][..., None]
-        at = self._first[space][..., None] + torch.where(listed, number, 0)
-        return at + self._offset[space][:, None, None], listed
+        return self._first[space][..., None] + torch.where(listed, number, 0), listed
 
     def placed(
         self, points: torch.Tensor, bodies: tuple[torch.Tensor, torch.Tensor]

@@ -18,7 +18,6 @@ def add_predicted(
     obj: Object,
     held: Held,
     predicted: Predicted,
-    sides: wp.vec2i,
     keep: wp.int32,
     candidates_out: Candidates,
 ):
@@ -28,13 +27,14 @@ def add_predicted(
     """
     row, g = wp.tid()
     poses = candidates_out.poses
-    if row >= poses.rows[0] or (g != sides[0] and g != sides[1]):
+    if row >= poses.rows[0]:
         return
     h = poses.index[row] // held.tries
-    if group_fixed(hand, held, h, g):
+    sides = held.sides[h]
+    if (g != sides[0] and g != sides[1]) or group_fixed(hand, held, h, g):
         return
     posture = with_frozen(hand, held, h, g, predicted.posture[poses.index[row], g])
-    c, _p, _n, i = touching_points(hand, obj, poses.pose[row], g, posture)
+    c, _p, _n, i = touching_points(hand, obj, poses.pose[row], poses.setting[row], g, posture)
     if i < 0:
         return
     record = predicted.record[c]

@@ -50,12 +50,11 @@ def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Conte
         outputs=[table.struct],
         device=d,
     )
-    if context.space:
+    if context.opposed:
         wp.launch(keep_frozen, table.count.shape, [hand, context.held.struct], [table.struct], device=d)
-    if context.space and context.predicted and context.round == 0:
+    if context.predicted and context.round == 0:
         asked = [context.object.struct, context.held.struct, context.predicted.struct]
-        sides = wp.vec2i(*context.space.groups)
-        wp.launch(add_predicted, table.count.shape, [hand, *asked, sides, params.keep], [table.struct], device=d)
+        wp.launch(add_predicted, table.count.shape, [hand, *asked, params.keep], [table.struct], device=d)
     if context.round == 0:
         wp.launch(drop_poor, table.count.shape[0], [values], [table.struct, tally.device], device=d)
     return table, tally
@@ -63,7 +62,7 @@ def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Conte
 
 def _drop_unlikely(table: CandidateTable, params: DomainParams, context: Context) -> None:
     """Poses lose their contacts that a policy, if there is one, finds unlikely to give a grasp."""
-    if context.policy is None or context.space:
+    if context.policy is None or context.opposed:
         return
     n, groups = table.count.shape
     chance = wp.empty(n, dtype=wp.float32, device=context.device)

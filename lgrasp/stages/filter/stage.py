@@ -38,7 +38,7 @@ def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[Gr
     check = placed_hands(trim_sets(inputs), params, context)
     check.clear_table(OTHERS)
     check.measure(OTHERS)
-    if context.space:
+    if context.opposed:
         check.measure_held()
     if params.contacts == "all":
         _take_all(check, context)

@@ -65,5 +65,5 @@ def _realise(table: CandidateTable, wanted: wp.array, params: IkParams, context:
     asked = [hand, field, obj, held, values, wanted]
     kernel = realise_contacts[context.hand.model.tree.dof_size]
     wp.launch(kernel, table.surface.shape, asked, outputs, device=context.device)
-    if context.space:
+    if context.opposed:
         wp.launch(avoid_held, table.surface.shape, [hand, held, values], outputs, device=context.device)

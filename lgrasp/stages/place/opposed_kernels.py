@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.field.arrays import Field, field_has, field_seed
 from lgrasp.grasp.collision import body_clear, objects_apart
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
-from lgrasp.hand.arrays import Hand
+from lgrasp.hand.arrays import Hand, contact_run
 from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.transforms import rotation_between
@@ -56,8 +56,9 @@ def _between(
         Pose, hand contact point, object point on it and the object point opposite (-1: nothing was found).
     """
     fixed = side_fixed(hand, held, h, side)
-    c0 = hand.contacts.first[wp.where(side < 0, hand.kin.groups, side)]
-    surface = hand.contacts.first[wp.where(side < 0, hand.kin.groups, side) + 1] - c0
+    run = contact_run(hand, setting, side)
+    c0 = hand.contacts.first[run]
+    surface = hand.contacts.first[run + 1] - c0
     T = wp.transform_identity()
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     j0 = int(0)
@@ -135,12 +136,11 @@ def propose_opposed(
     obj: Object,
     held: Held,
     params: PlaceValues,
-    sides: wp.vec2i,
     seed: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
     proposals_out: ProposedPoses,
 ):
-    """One of several poses per candidate between the groups ``sides`` (-1: static links), and its rating.
+    """One of several poses per candidate between the two sides of the space of its row, and its rating.
 
     A side that cannot move (the palm, or a finger that holds another object) takes part with a contact point of its
     own, as the palm does elsewhere.
@@ -154,8 +154,7 @@ def propose_opposed(
     h = (first[0] + row) // held.tries
     no_proposal(proposals_out, row, b)
     setting = held.setting[h]
-    if setting < 0:
-        setting = wp.min(int(wp.randf(state) * float(hand.kin.settings)), hand.kin.settings - 1)
+    sides = held.sides[h]
     proposals_out.setting[row, b] = setting
     fixed_a = side_fixed(hand, held, h, sides[0])
     fixed_b = side_fixed(hand, held, h, sides[1])

@@ -70,12 +70,11 @@ def propose_predicted(
     held: Held,
     predicted: Predicted,
     params: PlaceValues,
-    sides: wp.vec2i,
     seed: wp.array(dtype=wp.int32),
     first: wp.array(dtype=wp.int32),
     proposals_out: ProposedPoses,
 ):
-    """Poses near the predicted one of each candidate, between the groups ``sides`` (-1: static links), and ratings.
+    """Poses near the predicted one of each candidate, between the two sides of the space of its row, and ratings.
 
     The first proposal is the prediction, its object moved and turned until it touches the side that cannot move where
     it was nearest; it counts if the other side is then opposite. The others put some object point nearby on a side (of
@@ -90,7 +89,8 @@ def propose_predicted(
     candidate = first[0] + row
     state = wp.rand_init(seed[0] + b * SEED_STRIDE, candidate)
     h = candidate // held.tries
-    setting = wp.max(held.setting[h], 0)
+    setting = held.setting[h]
+    sides = held.sides[h]
     T = predicted.pose[candidate]
     no_proposal(proposals_out, row, b)
     proposals_out.setting[row, b] = setting
@@ -122,7 +122,7 @@ def propose_predicted(
         if not moves:
             P = _laid(obj, T, nearest, p, n)
         y = with_frozen(hand, held, h, other, predicted.posture[candidate, other])
-        _c2, _p2, _n2, j = touching_points(hand, obj, P, other, y)
+        _c2, _p2, _n2, j = touching_points(hand, obj, P, setting, other, y)
         if j < 0:
             return
         if _opposed(obj, nearest, j, params.max_com_distance):

@@ -39,7 +39,7 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     if not isinstance(first, wp.array):
         first = wp.full(1, first, dtype=wp.int32, device=d)
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
-    rated = context.policy is not None and not context.space
+    rated = context.policy is not None and not context.opposed
     groups, shape = context.hand.model.groups, (count, params.policy_proposals if rated else params.proposals)
     proposals = empty_struct(ProposedPoses, d, *shape, groups)
     regions = context.object.steered
@@ -47,18 +47,13 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     reach = params.max_com_distance + (regions.off_centre if regions else 0.0)
     values = make_struct(PlaceValues, params, context.bounds, **shares, max_com_distance=reach)
     where = [context.seed("place"), first]
-    if context.space is None:
-        kernel, asked = (
-            propose_poses,
-            [hand, field, obj, values, context.steered.struct, context.networks.reach, *where],
-        )
+    if not context.opposed:
+        kernel, asked = propose_poses, [values, context.steered.struct, context.networks.reach]
     elif context.predicted is None:
-        kernel = propose_opposed
-        asked = [hand, field, obj, context.held.struct, values, wp.vec2i(*context.space.groups), *where]
+        kernel, asked = propose_opposed, [context.held.struct, values]
     else:
-        kernel, own = propose_predicted, context.predicted.struct
-        asked = [hand, field, obj, context.held.struct, own, values, wp.vec2i(*context.space.groups), *where]
-    wp.launch(kernel, shape, asked, [proposals], device=d)
+        kernel, asked = propose_predicted, [context.held.struct, context.predicted.struct, values]
+    wp.launch(kernel, shape, [hand, field, obj, *asked, *where], [proposals], device=d)
     chosen, upto = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(2))
     tally = empty_tally(PlaceCount, d)
     wp.launch(choose_poses, count, [hand, obj, values, proposals], [chosen, upto, tally.device], device=d)

@@ -17,7 +17,7 @@ from lgrasp.hand.build import build_hand
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.opposition.spaces import Space, available, consumed, free_joints, hand_spaces, longest, space_view
+from lgrasp.hand.opposition.spaces import Space, available, consumed, free_joints, hand_spaces, longest, spaces_view
 from lgrasp.hand.spec import HandSpec
 
 # index 0-3, middle 4-7, ring 8-11, thumb 12-15
@@ -38,9 +38,9 @@ def allegro_spaces() -> tuple[Space, ...]:
 
 
 @cache
-def view(hand: str, name: str) -> HandModel:
+def view(hand: str, *names: str) -> HandModel:
     urdf, spec = hand_source(hand)
-    return space_view(urdf, spec, hand_model(hand), name)
+    return spaces_view(urdf, spec, hand_model(hand), names)
 
 
 def space(joints: list[bool], name: str = "s") -> Space:
@@ -179,6 +179,22 @@ def test_view_holds_the_surface_of_the_sides_and_no_other(hand, name):
     assert model.tree is whole.tree
 
 
+def test_view_of_several_spaces_has_the_surfaces_of_each_one_after_another():
+    names = ("thumb-index", "index-palm")
+    both, parts = view("shipped", *names), [view("shipped", name) for name in names]
+    assert both.surfaces == 2
+    for key in ("contact_points", "contact_normals", "contact_link", "contact_group"):
+        np.testing.assert_array_equal(getattr(both, key), np.concatenate([getattr(part, key) for part in parts]))
+    np.testing.assert_array_equal(
+        np.diff(both.contact_first), [*np.diff(parts[0].contact_first), *np.diff(parts[1].contact_first)]
+    )
+    np.testing.assert_array_equal(both.grid_link[both.contact_grid], both.contact_link)
+    assert set(both.grid_link) == set(parts[0].grid_link) | set(parts[1].grid_link)
+    rules = [[m.rules[m.rule_first[g] : m.rule_first[g + 1]] for g in m.contact_grid] for m in (both, *parts)]
+    for one, other in zip(rules[0], rules[1] + rules[2], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_grids_of_a_view_are_those_of_its_links():
     """Those that the hand has, and those that it has not, by the same rule: zero at the link's own contact points."""
     model = view("shipped", "index-middle")
@@ -251,13 +267,13 @@ def test_locked_joints_and_unknown_spaces():
     with pytest.raises(HandError, match=r"joint 'joint_1\.0' is locked; driven joints: joint_0\.0, joint_2\.0"):
         build_hand(urdf, locked)
     with pytest.raises(HandError, match="no opposition space 'thumb'; its spaces: index-palm, middle-palm"):
-        space_view(urdf, spec, hand_model("shipped"), "thumb")
+        spaces_view(urdf, spec, hand_model("shipped"), ["thumb"])
     away = PAD | {"axis": [0, 0, -1], "angle": 10}
     empty = HandSpec.model_validate(
         spec.model_dump() | {"opposition_spaces": {"mine": {"joints": ["joint_0.0"], "sides": [PALM, away]}}}
     )
     with pytest.raises(HandError, match=r"'mine': side 2 \(link_3.0_tip\) has no surface within 10 degrees"):
-        space_view(urdf, empty, hand_model("shipped"), "mine")
+        spaces_view(urdf, empty, hand_model("shipped"), ["mine"])
 
 
 def test_a_variant_of_a_known_hand_keeps_the_spaces_that_fit(tmp_path):
