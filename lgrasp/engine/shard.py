@@ -1,6 +1,7 @@
 """One shard: a pure function of (pipeline, hand, object, shard rows, shard index)."""
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field
@@ -58,6 +59,7 @@ class ShardResult:
     candidates: int = 0
     duplicates: int = 0
     exhausted: bool = False  # the effort bound was reached before the rows were
+    tally: Counter[str] = field(default_factory=Counter)  # what the job counts among its rows
 
 
 def flat_statistics(counts: dict[str, dict[str, int]], seconds: Mapping[str, float]) -> dict[str, int | float]:

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Collection
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -10,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import PrivateAttr, model_validator
 
-from lgrasp.dataset.info import closure_share, stage_counts, survivors
+from lgrasp.dataset.info import survivors
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.bank import Bank
@@ -21,30 +20,24 @@ from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run
 from lgrasp.engine.run import run
 from lgrasp.engine.shard import Execution, gave_up, make_shard
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
-from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.rows import grasp_rows
-from lgrasp.grasp.schema import POSE_BITS
 from lgrasp.grasp.tables import take_grasps
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.jobs.hands import for_hand, hand_source, own_policy
 from lgrasp.jobs.records import object_record
 from lgrasp.jobs.requests.search import GenerateRequest
+from lgrasp.jobs.row_counts import count_made, count_written
 from lgrasp.jobs.search import SearchJob
 from lgrasp.policy.names import SHIPPED
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.cores import cores
 from lgrasp.runtime.processes import ProcessPool
-from lgrasp.runtime.tally import add_counts
-
-PUBLISHED_FSWO = 0.15
-"""Squared frictionless residual below which the published system counts a grasp."""
 
 _SHARDS_ON_GPU = 4  # at once
 _MOST_WRITERS = 8
-_TALLY_THREADS = 4
 _MOST_COMPARED = 4_000_000
 """Rows of a folder among which near-duplicates are looked for: some 400 MB."""
 
@@ -157,8 +150,15 @@ class GenerateJob(GenerateRequest, SearchJob):
             told["negatives"] = len(grasps) - len(result.grasps)
         rows = grasp_rows(grasps, tree, center, shard=part.number, protocol=self.protocol_text())
         contents = self.shard(part, result, rows, told)
+        result.tally = count_made(rows, contents.header.config, self._moving)
         # a copy: memory must not grow with the shards
         return Made(len(result.grasps), contents, replace(result, grasps=take_grasps(result.grasps, np.zeros(0, int))))
+
+    @property
+    def _moving(self) -> np.ndarray:
+        """Which links of the hand are moved by a finger, (L,)."""
+        tree = self.inputs.hand.model.tree
+        return tree.body_group[tree.link_body] >= 0
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """The results in numbers; rates are those of the shards that this call made.
@@ -171,10 +171,9 @@ class GenerateJob(GenerateRequest, SearchJob):
             ``force_closure`` (share), what was asked, ``negatives`` if they were, and of objects on a table
             ``resting``: ``probability`` and ``rows`` of each resting pose.
         """
-        inputs, tree = self.inputs, self.inputs.hand.model.tree
-        moving = tree.body_group[tree.link_body] >= 0
-        made, _ = _tally(outcome.written, moving)
-        present, counted = _tally(set(outcome.paths) - set(outcome.written), moving)
+        inputs = self.inputs
+        made = sum((result.tally for result in outcome.results), Counter())
+        present, counted = count_written(set(outcome.paths) - set(outcome.written), self._moving)
         sums = self.sums(outcome, self.pipeline.order)
         if not outcome.results:
             sums["counts"] |= counted
@@ -191,7 +190,7 @@ class GenerateJob(GenerateRequest, SearchJob):
             "grasps": outcome.rows,
             **{name: both[name] for name in counts},
             **({"negatives": both["negatives"]} if self.negatives else {}),
-            "force_closure": closure_share(outcome.paths),
+            "force_closure": both["closed"] / both["rows"] if both["rows"] else None,
             "near_duplicates": _near_duplicates(outcome.paths, inputs.device.alias),
             "profile": self.pipeline.bounds.profile,
             **{f"{name}_per_s": made[of] / wall if wall else 0.0 for name, of in rates.items()},
@@ -225,40 +224,6 @@ class GenerateJob(GenerateRequest, SearchJob):
         return StarvedError(f"{outcome.rows:,} of {self.rows:,} grasps found; stage {stage} is the bottleneck: {words}")
 
 
-def _tally(paths: Collection[Path], moving: np.ndarray) -> tuple[Counter[str], dict[str, dict[str, int]]]:
-    """Counts over shards on disk, a few of them in memory at a time, and survivors as the stages report them.
-
-    Args:
-        moving: which links of the hand are moved by a finger, (L,).
-
-    Raises:
-        ShardError: a file is damaged.
-    """
-
-    def one(path: Path) -> tuple[Counter[str], dict[str, dict[str, int]]]:
-        with ShardReader(path, invalid=False) as reader:
-            links, fswo = reader.column("contact_links"), reader.column("metrics/fswo")
-            fingers = (moving[np.maximum(links, 0)] & (links >= 0)).sum((1, 2))
-            found = Counter(
-                rows=len(reader),
-                strict=strict_rows(reader),
-                published_count=int(((fingers >= 3) & (fswo**2 < PUBLISHED_FSWO)).sum()),
-                negatives=int(reader.statistics.get("negatives", 0)),
-                distinct_poses=len(np.unique(reader.column("candidate") & POSE_BITS)),
-            )
-            if "table/pose" in reader.columns:
-                found.update(Counter(f"pose {k}" for k in reader.column("table/pose").tolist()))
-            return found, stage_counts(reader.statistics)
-
-    whole: Counter[str] = Counter()
-    counts: dict[str, dict[str, int]] = {}
-    with ThreadPoolExecutor(_TALLY_THREADS) as pool:
-        for found, survived in pool.map(one, paths):
-            whole.update(found)
-            add_counts(counts, survived)
-    return whole, counts
-
-
 def _near_duplicates(paths: Collection[Path], device: str) -> int:
     """Rows of all shards together that are near-duplicates of a row before them; of the first _MOST_COMPARED rows."""
     poses, postures, rows = [], [], 0
@@ -272,14 +237,6 @@ def _near_duplicates(paths: Collection[Path], device: str) -> int:
     if not poses:
         return 0
     return len(np.unique(near_pairs(np.concatenate(poses), np.concatenate(postures), device)[:, 1]))
-
-
-def strict_rows(reader: ShardReader) -> int:
-    """Rows within the strict bounds; none where friction was taken to be higher, since forces were balanced with it."""
-    strict = GraspBounds()
-    if stored_bounds(reader.header.config).friction > strict.friction:
-        return 0
-    return int(strict.met_by({name: reader.column(f"metrics/{name}") for name in strict.limits}).sum())
 
 
 def generate(

@@ -11,7 +11,7 @@ from lgrasp.choices import ProtocolName
 from lgrasp.dataset.info import stage_counts, survivors
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.report.write import read_dataset
-from lgrasp.jobs.generate import strict_rows
+from lgrasp.jobs.row_counts import strict_rows
 
 MEANS = {
     "yield": "strict rows per pose tried",
@@ -39,7 +39,7 @@ def measure_cell(path: Path, protocol: ProtocolName | None) -> dict[str, Any]:
     """
     with ShardReader(path, invalid=False) as reader:
         rows, statistics = len(reader), reader.statistics
-        strict = strict_rows(reader)
+        strict = strict_rows(reader.column, reader.header.config)
         counts = survivors(stage_counts(statistics))
         kept = next((counts[stage] for stage in ("simulate", "hold", "filter") if stage in counts), 0)
         wanted = ("metrics/epsilon", "metrics/unresisted_load", "metrics/hold_success")

@@ -1,0 +1,81 @@
+"""What is counted among the rows of shards: in memory as they are made, or in their files."""
+
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lgrasp.dataset.info import stage_counts
+from lgrasp.dataset.reader import ShardReader
+from lgrasp.grasp.bounds import GraspBounds, stored_bounds
+from lgrasp.grasp.records import GraspRows
+from lgrasp.grasp.schema import POSE_BITS
+from lgrasp.runtime.tally import add_counts
+
+PUBLISHED_FSWO = 0.15
+"""Squared frictionless residual below which the published system counts a grasp."""
+
+_THREADS = 4
+_Column = Callable[[str], np.ndarray]
+"""Values of the valid rows by flat name."""
+
+
+def count_made(rows: GraspRows, config: Mapping[str, Any], moving: np.ndarray) -> Counter[str]:
+    """``rows``, ``strict``, ``published_count``, ``closed`` (in force closure), ``distinct_poses``, ``negatives``, and
+    on a table ``pose K`` for each plane K that the object rests on.
+
+    Args:
+        config: of the shard.
+        moving: which links of the hand are moved by a finger, (L,).
+    """
+    columns, valid = rows.columns(), rows.valid
+    found = _count(lambda name: columns[name][valid], columns, config, moving)
+    return found + Counter(negatives=int((~valid).sum()))
+
+
+def count_written(paths: Collection[Path], moving: np.ndarray) -> tuple[Counter[str], dict[str, dict[str, int]]]:
+    """The same of shards on disk, a few of them in memory at a time, and survivors as the stages report them.
+
+    Raises:
+        ShardError: a file is damaged.
+    """
+
+    def one(path: Path) -> tuple[Counter[str], dict[str, dict[str, int]]]:
+        with ShardReader(path, invalid=False) as reader:
+            found = _count(reader.column, reader.columns, reader.header.config, moving)
+            found += Counter(negatives=int(reader.statistics.get("negatives", 0)))
+            return found, stage_counts(reader.statistics)
+
+    whole: Counter[str] = Counter()
+    counts: dict[str, dict[str, int]] = {}
+    with ThreadPoolExecutor(_THREADS) as pool:
+        for found, survived in pool.map(one, paths):
+            whole.update(found)
+            add_counts(counts, survived)
+    return whole, counts
+
+
+def strict_rows(column: _Column, config: Mapping[str, Any]) -> int:
+    """Rows within the strict bounds; none where friction was taken to be higher, since forces were balanced with it."""
+    strict = GraspBounds()
+    if stored_bounds(config).friction > strict.friction:
+        return 0
+    return int(strict.met_by({name: column(f"metrics/{name}") for name in strict.limits}).sum())
+
+
+def _count(column: _Column, names: Collection[str], config: Mapping[str, Any], moving: np.ndarray) -> Counter[str]:
+    links, fswo = column("contact_links"), column("metrics/fswo")
+    fingers = (moving[np.maximum(links, 0)] & (links >= 0)).sum((1, 2))
+    found = Counter(
+        rows=len(fswo),
+        strict=strict_rows(column, config),
+        published_count=int(((fingers >= 3) & (fswo**2 < PUBLISHED_FSWO)).sum()),
+        closed=int((column("metrics/epsilon") > 0).sum()),
+        distinct_poses=len(np.unique(column("candidate") & POSE_BITS)),
+    )
+    if "table/pose" in names:
+        found.update(f"pose {k}" for k in column("table/pose").tolist())
+    return found
