@@ -1,0 +1,58 @@
+"""A GPU's job: its shards are searched side by side and written by several processes; here the CPU replays batches."""
+
+import multiprocessing
+
+import numpy as np
+import pytest
+from support.jobs import StopAfter
+
+from lgrasp.dataset.validate import validate_shard
+from lgrasp.engine.graphs import GraphCache
+from lgrasp.engine.report import job_report
+from lgrasp.engine.run import run as run_job
+from lgrasp.jobs.generate import GenerateJob
+
+_COUNTED = ("grasps", "strict", "distinct_poses", "published_count", "force_closure", "counts", "near_duplicates")
+
+
+@pytest.fixture
+def side_by_side(monkeypatch):
+    load = GenerateJob.load_inputs
+
+    def replaying(self, events):
+        inputs = load(self, events)
+        self._graphs = GraphCache(self.pipeline)
+        return inputs
+
+    monkeypatch.setattr(GenerateJob, "load_inputs", replaying)
+    monkeypatch.setattr("lgrasp.jobs.generate.cores", lambda: 2)
+
+
+@pytest.fixture
+def plain(run, tmp_path):
+    return run(out=tmp_path / "plain", rows=120)
+
+
+def test_rows_and_report_are_those_of_one_at_a_time(plain, side_by_side, run, grasps, tmp_path):
+    outcome = run(rows=120)
+    assert outcome.job.at_once() > 1
+    assert outcome.job.writers() == 2
+    expected = grasps(tmp_path / "plain")
+    for name, values in grasps(tmp_path / "out").items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+    told, before = job_report(outcome), job_report(plain)
+    assert {name: told[name] for name in _COUNTED} == {name: before[name] for name in _COUNTED}
+    assert not multiprocessing.active_children()
+
+
+def test_stopped_it_leaves_whole_shards_and_goes_on(plain, side_by_side, job, grasps, tmp_path):
+    outcome = run_job(job(rows=120), StopAfter(2))
+    assert outcome.cancelled
+    assert not multiprocessing.active_children()
+    paths = sorted((tmp_path / "out").glob("*.h5"))
+    assert 0 < len(paths) < 6
+    assert [validate_shard(path) for path in paths] == [[]] * len(paths)
+    run_job(job(rows=120))
+    expected = grasps(tmp_path / "plain")
+    for name, values in grasps(tmp_path / "out").items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
