@@ -262,7 +262,8 @@ def test_a_plane_is_no_table_to_lift_from(steered, job, swift, tmp_path):
         job(pipeline=lifted.with_steering(above="0,0,1,0.001")).check()
 
 
-def test_poses_out_of_reach_are_told(job, swift, tmp_path):
+def test_poses_out_of_reach_are_told(job, swift, tmp_path, monkeypatch):
+    monkeypatch.setattr("lgrasp.engine.shard._LEAST_PLACED", 1024)
     np.save(tmp_path / "far.npy", [[0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0]])
     far = job(pipeline=swift.with_steering(pose=tmp_path / "far.npy"), rows=20)
     error = far.shortfall(generate(far))

@@ -10,8 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import body_poses, upload_hand
-from lgrasp.hand.build import build_hand
-from lgrasp.hand.find import find_hand
 from lgrasp.hand.opposition.spaces import hand_spaces, space_view
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
@@ -42,10 +40,9 @@ def one_thread():
 
 
 @pytest.fixture(scope="module")
-def case() -> SimpleNamespace:
+def case(inputs) -> SimpleNamespace:
     """Allegro with three of its spaces, a ball and a bar."""
-    source = find_hand("allegro")
-    model = build_hand(source.urdf, source.spec)
+    source, model = inputs.keys.source, inputs.hand.model
     known = {s.name: s for s in hand_spaces(source.spec, model.tree)}
     params = ObjectParams(sdf_cells=40**3, obstacle_count=1024, contact_count=512)
     shapes = [trimesh.creation.icosphere(3, 0.03), trimesh.creation.box((0.03, 0.02, 0.07))]
@@ -74,7 +71,7 @@ def rows_of(case, number: int, space: np.ndarray, before: Optimised | None = Non
 
 def run(case, number: int, space: np.ndarray, before: Optimised | None = None, only=slice(None), **more) -> Optimised:
     """Grasp object ``number`` in rows of these spaces that hold what ``before`` grasped."""
-    params = OptimiserParams(iterations=40, step_period=8, temperature_period=3, hand_points=512, object_points=256)
+    params = OptimiserParams(iterations=24, step_period=8, temperature_period=3, hand_points=512, object_points=256)
     inputs = {name: values[only] for name, values in rows_of(case, number, space, before).items()}
     return optimise(case.hand, case.views, case.spaces, case.objects[:number], **inputs, **{"params": params} | more)
 
