@@ -19,7 +19,7 @@ from lgrasp.sequence.optimiser.params import OptimiserParams
 from lgrasp.sequence.optimiser.start import start_poses
 
 SHORT = OptimiserParams(
-    iterations=300,
+    iterations=200,
     step=0.01,
     step_period=25,
     temperature=8,
@@ -139,8 +139,8 @@ def test_more_steps_lower_the_energy(case):
     space, told = np.zeros(8, int), []
     result = run(case, 1, space, params=SHORT, progress=lambda done, total: told.append((done, total)))
     brief = run(case, 1, space, params=SHORT.model_copy(update={"iterations": 1}))
-    assert told[-1] == (300, 300)
-    assert [done for done, _ in told] == list(range(1, 301))
+    assert told[-1] == (200, 200)
+    assert [done for done, _ in told] == list(range(1, 201))
     assert np.median(result.energies[:, 1]) < 0.5 * np.median(brief.energies[:, 1])
     assert np.median(result.energies[:, 0]) < 0.5 * np.median(brief.energies[:, 0])
 
