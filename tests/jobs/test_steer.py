@@ -30,7 +30,7 @@ FINGERS = find_hand("allegro").spec.fingers
 def steered(run, swift, tmp_path):
     """steered(**asked): a small shard of grasps of the mug that are steered so."""
 
-    def steered(pipeline=swift, rows=30, **asked):
+    def steered(pipeline=swift, rows=16, **asked):
         outcome = run(pipeline=pipeline.with_steering(**asked), rows=rows, shard_rows=rows, out=tmp_path / "steered")
         (path,) = outcome.paths
         shard = read_shard(path)
