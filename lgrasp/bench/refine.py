@@ -22,9 +22,8 @@ from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
-from lgrasp.jobs.shard_inputs import named_hand
+from lgrasp.jobs.shard_inputs import named_hand, palmar_side
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.planning.params import PlanParams, cloud_params
@@ -133,7 +132,7 @@ def _bench_hand(
     progress: Callable[[str], None],
 ) -> dict[str, Any]:
     source, model = named_hand(cache, hand, at)
-    arrays, palmar = upload_hand(model, at.alias), visible_surface(source, model, at.alias)
+    arrays, palmar = upload_hand(model, at.alias), palmar_side(cache, source, model, at)
     record = hand_record(model, mesh_blobs(source.urdf))
     stand_off = source.spec.stand_off or STAND_OFF
     totals = {name: _Total() for name in planners}

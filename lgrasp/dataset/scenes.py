@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from lgrasp.picture.scene import GraspScene, HandShape
 
-_KEPT = 16  # hands, and lists of objects, that stay in memory
+_KEPT = 16  # rows, hands and lists of objects that stay in memory
 
 
 class _Contents(NamedTuple):
@@ -53,6 +53,7 @@ class SceneRows:
         if not len(self):
             raise ShardError(f"{self.files[0]}: no row to look at (shards: {len(self.files)})")
         self._contents = lru_cache(_KEPT)(_contents)
+        self._row = lru_cache(_KEPT)(_row)
         self._chosen = lru_cache(1)(self.chosen)
         self._shapes: dict[tuple[str, tuple[str, ...]], HandShape] = {}
 
@@ -119,8 +120,7 @@ class SceneRows:
         """
         path, number = self.place(row)
         hand, objects, _ = self._contents(path)
-        with ShardReader(path) as reader:
-            return hand, objects, reader.rows(number, number + 1)
+        return hand, objects, self._row(path, number)
 
     def scene(self, row: int) -> "GraspScene":
         """The scene of a row.
@@ -269,6 +269,11 @@ def draw_motion(
                 progress(len(pictures), len(scenes))
     captions = [rows.caption(row, chosen) for row in chosen]
     return [sheet(at, captions, columns) for at in zip(*pictures, strict=True)]
+
+
+def _row(path: Path, number: int) -> GraspRows:
+    with ShardReader(path) as reader:
+        return reader.rows(number, number + 1)
 
 
 def _contents(path: Path) -> _Contents:

@@ -30,9 +30,18 @@ def cluster_order(points: np.ndarray, *, size: int = CLUSTER_SIZE) -> np.ndarray
     return np.concatenate(runs)
 
 
+def cells(points: np.ndarray, size: float) -> np.ndarray:
+    """Number of the cell that each of the points (..., 3) is in, of a grid with edges of ``size`` [m]; int64.
+
+    Cells up to a million from the origin have numbers of their own.
+    """
+    x, y, z = np.moveaxis(np.floor(points / size).astype(np.int64), -1, 0)
+    return (x << 42) + (y << 21) + z
+
+
 def one_per_cell(points: np.ndarray, size: float) -> np.ndarray:
     """Indices, ascending, of the first of the points (n, 3) in each cell of a grid with edges of ``size`` [m]."""
-    return np.sort(np.unique(np.floor(points / size).astype(np.int64), axis=0, return_index=True)[1])
+    return np.sort(np.unique(cells(points, size), return_index=True)[1])
 
 
 def bounding_spheres(points: np.ndarray, *, size: int = CLUSTER_SIZE) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,9 @@ import numpy as np
 
 from lgrasp.hand.model import HandModel
 
+PALMAR_VERSION = 1
+"""Raised whenever the palmar side of a hand changes."""
+
 
 class ContactSurface(NamedTuple):
     """Where a hand may touch: n points of its palmar side, those of one link together."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lgrasp.geometry.clusters import cells
 from lgrasp.geometry.poses import device_rotation
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.model import HandModel
@@ -43,8 +44,8 @@ def measure_workspace(model: HandModel) -> Workspace:
         rows = np.unique(np.linspace(first, end - 1, _POINTS).astype(int)) if end > first else np.zeros(0, int)
         clear = np.flatnonzero(postures.clear[:, group])
         points = postures.place(clear[:, None], model.contact_body[None, rows], model.contact_points[None, rows])
-        reached.append(np.unique(np.floor(points.reshape(-1, 3) / _CELL).astype(int), axis=0))
-    times = np.unique(np.concatenate(reached), axis=0, return_counts=True)[1]
+        reached.append(np.unique(cells(points, _CELL)))
+    times = np.unique(np.concatenate(reached), return_counts=True)[1]
     return Workspace(len(times) * _CELL**3, int((times > 1).sum()) * _CELL**3, _manipulability(model))
 
 

@@ -17,11 +17,13 @@ from lgrasp.errors import HandError, ShardError
 from lgrasp.files import scratch_folder
 from lgrasp.grasp.hand_files import write_hand
 from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.hand.contact_surface import PALMAR_VERSION, ContactSurface
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource, rules_of_known
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.params import LISTED, HandParams
 from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hands import hand_source
@@ -41,6 +43,15 @@ def named_hand(cache: Cache, name: str, device: Device) -> tuple[HandSource, Han
         with ShardReader(Path(name).expanduser()) as reader:
             return hand_of_shard(cache, reader.hand(), reader.header.config, device)
     return _built(cache, hand_source(name), device)
+
+
+def palmar_side(cache: Cache, source: HandSource, hand: HandModel, device: Device) -> ContactSurface:
+    """:func:`~lgrasp.hand.surface_visibility.visible_surface` of a hand; cached."""
+
+    def make() -> dict[str, np.ndarray]:
+        return visible_surface(source, hand, device.alias)._asdict()
+
+    return ContactSurface(**cache.get("palmar", content_key("palmar", PALMAR_VERSION, hand=hand.sha256), make)[0])
 
 
 def hand_of_shard(

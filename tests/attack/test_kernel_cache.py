@@ -24,7 +24,8 @@ start()
 sys.path.insert(0, sys.argv[1])
 from lgrasp.runtime.kernels import load_kernels
 modules = [importlib.import_module(name) for name in sys.argv[2:]]
-load_kernels("cpu", sys.argv[2:])
+for name in sys.argv[2:]:
+    load_kernels("cpu", [name])  # each thread would compile headers of its own
 x = wp.array(np.arange(4.0), dtype=wp.float32, device="cpu")
 for module in modules:
     wp.launch(module.double, 4, [x], device="cpu")

@@ -10,7 +10,7 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.errors import ConfigError
 from lgrasp.judge.run import judge
 
-ROWS = 40
+ROWS = 20
 HANDLE = "box:0.026,-1,-1:1,1,1"
 TOP, LOW = "box:-1,-1,0.06:1,1,1", "box:-1,-1,-1:1,1,0.06"
 

@@ -177,12 +177,12 @@ def test_how_many_passes(swift, several):
 def test_a_folder_that_grows(run, swift, grasps, calls, tmp_path, passes):
     """Twice with more rows asked, and once: the same file; rows that were there stay, and are not made again."""
     common = {"pipeline": swift.with_passes(passes), "shard_rows": 10_000, "batch": 512}
-    run(rows=200, out=tmp_path / "a", **common)
+    run(rows=100, out=tmp_path / "a", **common)
     few = grasps(tmp_path / "a")["q"]
     before = calls["place"]
-    run(rows=600, out=tmp_path / "a", **common)
+    run(rows=300, out=tmp_path / "a", **common)
     grown = calls["place"] - before
-    run(rows=600, out=tmp_path / "b", **common)
+    run(rows=300, out=tmp_path / "b", **common)
     assert grown < calls["place"] - before - grown
     twice, once = grasps(tmp_path / "a"), grasps(tmp_path / "b")
     assert twice.keys() == once.keys()

@@ -30,7 +30,7 @@ FINGERS = find_hand("allegro").spec.fingers
 def steered(run, swift, tmp_path):
     """steered(**asked): a small shard of grasps of the mug that are steered so."""
 
-    def steered(pipeline=swift, rows=30, **asked):
+    def steered(pipeline=swift, rows=16, **asked):
         outcome = run(pipeline=pipeline.with_steering(**asked), rows=rows, shard_rows=rows, out=tmp_path / "steered")
         (path,) = outcome.paths
         shard = read_shard(path)
@@ -262,7 +262,8 @@ def test_a_plane_is_no_table_to_lift_from(steered, job, swift, tmp_path):
         job(pipeline=lifted.with_steering(above="0,0,1,0.001")).check()
 
 
-def test_poses_out_of_reach_are_told(job, swift, tmp_path):
+def test_poses_out_of_reach_are_told(job, swift, tmp_path, monkeypatch):
+    monkeypatch.setattr("lgrasp.engine.shard._LEAST_PLACED", 1024)
     np.save(tmp_path / "far.npy", [[0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0]])
     far = job(pipeline=swift.with_steering(pose=tmp_path / "far.npy"), rows=20)
     error = far.shortfall(generate(far))

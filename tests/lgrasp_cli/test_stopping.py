@@ -39,7 +39,10 @@ print(sorted(os.listdir()), flush=True)
     assert child.stdout is not None
     assert child.stdout.readline().count(".tmp") == 2
     child.send_signal(number)
-    assert child.communicate(timeout=30) == ("", "interrupted\n")
+    try:
+        assert child.communicate(timeout=30) == ("", "interrupted\n")
+    finally:
+        child.kill()
     assert child.returncode == 130
     assert work == "tidying up" or not list(tmp_path.iterdir())
 

@@ -80,7 +80,7 @@ def test_hands_are_taken_out_before_the_search(make, valid, coarse):
     """Coarse hands through the mug's walls come free, by opening where a straight way is not enough; others stay."""
     tiny = {"matching_rounds": 1, "gradient_steps": 1}
     tiny |= {f"max_{kind}_step": 1e-9 for kind in ("translation", "rotation", "joint")}
-    refiner, pose = make(**tiny), coarse(valid)
+    refiner, pose = make(**tiny), some(coarse(valid), slice(100))
     before, moved = refiner.max_penetration(*pose), refiner(*pose).pose
     deep, q = before > 0.002, pose.q.maximum(refiner.lower).minimum(refiner.upper)
     assert deep.float().mean() > 0.3

@@ -10,8 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import body_poses, upload_hand
-from lgrasp.hand.build import build_hand
-from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import hand_spaces, spaces_view
 from lgrasp.object.params import ObjectParams
@@ -22,7 +20,7 @@ from lgrasp.sequence.optimiser.params import OptimiserParams
 from lgrasp.sequence.optimiser.start import start_poses
 
 SHORT = OptimiserParams(
-    iterations=300,
+    iterations=200,
     step=0.01,
     step_period=25,
     temperature=8,
@@ -43,11 +41,10 @@ def one_thread():
 
 
 @pytest.fixture(scope="module")
-def case() -> SimpleNamespace:
+def case(inputs) -> SimpleNamespace:
     """Allegro with three of its spaces, a ball and a bar."""
-    source = find_hand("allegro")
-    whole = build_hand(source.urdf, source.spec)
-    model = spaces_view(source.urdf, source.spec, whole, SPACES)
+    source = inputs.keys.source
+    model = spaces_view(source.urdf, source.spec, inputs.hand.model, SPACES)
     known = {s.name: s for s in hand_spaces(source.spec, model.tree)}
     params = ObjectParams(sdf_cells=40**3, obstacle_count=1024, contact_count=512)
     shapes = [trimesh.creation.icosphere(3, 0.03), trimesh.creation.box((0.03, 0.02, 0.07))]
@@ -75,7 +72,7 @@ def rows_of(case, number: int, space: np.ndarray, before: Optimised | None = Non
 
 def run(case, number: int, space: np.ndarray, before: Optimised | None = None, only=slice(None), **more) -> Optimised:
     """Grasp object ``number`` in rows of these spaces that hold what ``before`` grasped."""
-    params = OptimiserParams(iterations=40, step_period=8, temperature_period=3, hand_points=512, object_points=256)
+    params = OptimiserParams(iterations=24, step_period=8, temperature_period=3, hand_points=512, object_points=256)
     inputs = {name: values[only] for name, values in rows_of(case, number, space, before).items()}
     return optimise(case.hand, case.spaces, case.objects[:number], **inputs, **{"params": params} | more)
 
@@ -147,8 +144,8 @@ def test_more_steps_lower_the_energy(case):
     space, told = np.zeros(8, int), []
     result = run(case, 1, space, params=SHORT, progress=lambda done, total: told.append((done, total)))
     brief = run(case, 1, space, params=SHORT.model_copy(update={"iterations": 1}))
-    assert told[-1] == (300, 300)
-    assert [done for done, _ in told] == list(range(1, 301))
+    assert told[-1] == (200, 200)
+    assert [done for done, _ in told] == list(range(1, 201))
     assert np.median(result.energies[:, 1]) < 0.5 * np.median(brief.energies[:, 1])
     assert np.median(result.energies[:, 0]) < 0.5 * np.median(brief.energies[:, 0])
 

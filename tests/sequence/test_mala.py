@@ -30,7 +30,7 @@ def test_samples_a_known_gaussian(preconditioner):
         d = x - mean
         return 0.5 * ((d @ precision) * d).sum(1, keepdim=True), d @ precision
 
-    x = sample(evaluate, torch.add, torch.zeros(60_000, 3, dtype=torch.float64), preconditioner, T, 150)
+    x = sample(evaluate, torch.add, torch.zeros(20_000, 3, dtype=torch.float64), preconditioner, T, 100)
     spread = covariance.diagonal().sqrt()
     np.testing.assert_allclose(((x.mean(0) - mean) / spread).numpy(), 0, atol=0.03)
     np.testing.assert_allclose(x.T.cov().diagonal() / covariance.diagonal(), 1, atol=0.03)
@@ -72,7 +72,7 @@ def test_samples_rotations_about_their_own_axes():
     def moved(x, motion):
         return (x.reshape(-1, 3, 3) @ so3_exp(motion)).reshape(-1, 9)
 
-    start = torch.eye(3, dtype=torch.float64).reshape(1, 9).expand(40_000, 9)
+    start = torch.eye(3, dtype=torch.float64).reshape(1, 9).expand(20_000, 9)
     x = sample(evaluate, moved, start, [0.4, 0.4, 0.4], 1.0, 80)
     cosine = (torch.einsum("nii->n", x.reshape(-1, 3, 3)).numpy() - 1) / 2
     a = np.linspace(0, np.pi, 20_001)

@@ -22,11 +22,10 @@ from lgrasp.grasp.tables import GraspTable, join_rows
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.find import HandSource
-from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
 from lgrasp.jobs.refine.predicted import predicted_planner
 from lgrasp.jobs.scenes.shards import read_parts
-from lgrasp.jobs.shard_inputs import hand_of_shard, object_of_shard
+from lgrasp.jobs.shard_inputs import hand_of_shard, object_of_shard, palmar_side
 from lgrasp.learn.examples import seen_cloud
 from lgrasp.learn.grasp.file import Networks, load_networks
 from lgrasp.learn.grasp.views import SIDES, camera
@@ -66,7 +65,7 @@ def evaluate(
     first = next(iter(parts.values()))
     source, hand = hand_of_shard(cache, first.hand, first.config, found)
     check_network_hand(path, networks.hand, networks.hand_sha256, hand.name, hand.sha256, words=SHARDS)
-    palmar = visible_surface(source, hand, found.alias)
+    palmar = palmar_side(cache, source, hand, found)
     bench = _Bench(networks, source, upload_hand(hand, found.alias), palmar, starts)
     begin = time.perf_counter()
     kinds: dict[str, Any] = {kind: {} for kind in KINDS}

@@ -21,12 +21,11 @@ from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.clouds import cloud_record, cloud_to_grasp, network_key
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
 from lgrasp.jobs.refine.predicted import predicted_planner
 from lgrasp.jobs.requests.plan import PlanRequest
-from lgrasp.jobs.shard_inputs import mesh_hash, named_hand, named_object
+from lgrasp.jobs.shard_inputs import mesh_hash, named_hand, named_object, palmar_side
 from lgrasp.learn.grasp.file import Networks, load_networks
 from lgrasp.learn.networks import check_network_hand, find_network
 from lgrasp.object.model import ObjectModel
@@ -94,8 +93,8 @@ class PlanJob(PlanRequest, Job):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         source, hand, model, around = self._models()
-        alias = self.device_used.alias
-        palmar, plan, arrays = visible_surface(source, hand, alias), self._params(), upload_hand(hand, alias)
+        palmar = palmar_side(self.cache, source, hand, self.device_used)
+        plan, arrays = self._params(), upload_hand(hand, self.device_used.alias)
         begin, networks = time.perf_counter(), self.networks()
         if networks is None:
             planner = Planner(arrays, model, self._stand_off(), plan, palmar, around)
