@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from lgrasp.grasp.collision import body_apart, body_depth
 from lgrasp.hand.arrays import Hand, HandArrays
-from lgrasp.hand.opposition.spaces import Space
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.math.limits import MAX_DOFS
 from lgrasp.object.arrays import Object, ObjectArrays
@@ -16,6 +16,9 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
+
+if TYPE_CHECKING:
+    from lgrasp.hand.opposition.spaces import Space  # trimesh
 
 
 @wp.struct
@@ -63,7 +66,7 @@ def hold(
     pose: np.ndarray,
     *,
     tries: int,
-    spaces: Sequence[Space] = (),
+    spaces: "Sequence[Space]" = (),
     space: np.ndarray | None = None,
     any_setting: bool = False,
 ) -> HeldArrays:
