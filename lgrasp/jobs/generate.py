@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -19,7 +20,7 @@ from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.run import run
 from lgrasp.engine.shard import Execution, gave_up, make_shard
-from lgrasp.errors import ConfigError, LgraspError, StarvedError
+from lgrasp.errors import ConfigError, LgraspError, OutputError, StarvedError
 from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.rows import grasp_rows
@@ -113,10 +114,13 @@ class GenerateJob(GenerateRequest, SearchJob):
         return min(_MOST_WRITERS, cores(), self.known_parts) if self.at_once() > 1 else 1
 
     def write(self, part: Part, contents: Any) -> None:
-        if self._writers:
-            self._writers.submit(write_shard, part.file, contents).result()
-        else:
+        if self._writers is None:
             super().write(part, contents)
+            return
+        try:
+            self._writers.submit(write_shard, part.file, contents).result()
+        except BrokenProcessPool:
+            raise OutputError(f"{part.file}: a process that writes was killed; the same command goes on") from None
 
     def close(self) -> None:
         if self._writers:

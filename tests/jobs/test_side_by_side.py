@@ -5,11 +5,13 @@ import multiprocessing
 import numpy as np
 import pytest
 from support.jobs import StopAfter
+from support.workers import lost
 
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run as run_job
+from lgrasp.errors import OutputError
 from lgrasp.jobs.generate import GenerateJob
 
 _COUNTED = ("grasps", "strict", "distinct_poses", "published_count", "force_closure", "counts", "near_duplicates")
@@ -56,3 +58,11 @@ def test_stopped_it_leaves_whole_shards_and_goes_on(plain, side_by_side, job, gr
     expected = grasps(tmp_path / "plain")
     for name, values in grasps(tmp_path / "out").items():
         np.testing.assert_array_equal(values, expected[name], err_msg=name)
+
+
+def test_a_writer_that_is_lost_ends_the_job_with_a_line(side_by_side, run, tmp_path, monkeypatch):
+    monkeypatch.setattr("lgrasp.jobs.generate.write_shard", lost)
+    with pytest.raises(OutputError, match=r"allegro-mug-00000\.h5: a process that writes was killed"):
+        run()
+    assert not [*(tmp_path / "out").rglob("*.h5*")]
+    assert not multiprocessing.active_children()

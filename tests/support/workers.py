@@ -12,3 +12,8 @@ def leave(link: Link, code: int) -> None:
         os._exit(code)
     while not link.stopped():
         time.sleep(0.01)
+
+
+def lost(*work: object) -> None:
+    """End without a word."""
+    os._exit(9)
