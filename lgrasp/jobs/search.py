@@ -163,7 +163,7 @@ class SearchJob(SearchRequest, Job):
             add_counts(counts, result.counts)
             add_seconds(seconds, result.seconds)
         spans = [result.span for result in outcome.results]
-        earlier = sum(result.wall - (end - begin) for result, (begin, end) in zip(outcome.results, spans, strict=True))
+        earlier = sum(result.wall for result in outcome.results) - sum(end - begin for begin, end in spans)
         loading = {name: self.inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field")}
         return {
             "counts": counts,

@@ -25,11 +25,15 @@ class SequenceResult(Round):
     """Sequences of a shard and how they came about: the rounds together."""
 
     reached: list[int] = field(default_factory=list)  # rows of 1, 2 ... objects that were found
-    wall: float = 0.0
     span: tuple[float, float] = (0.0, 0.0)  # from when to when [s]
     rounds: int = 0
     duplicates: int = 0
     exhausted: bool = False
+
+    @property
+    def wall(self) -> float:
+        """How long it took [s]."""
+        return self.span[1] - self.span[0]
 
     def __len__(self) -> int:
         """Whole sequences."""
@@ -105,7 +109,6 @@ def make_sequences(
         result.exhausted = kept.count < rows and (hopeless or result.rounds >= most_rounds(pipeline, rows))
     result.levels = _joined(parts)
     result.span = start, time.perf_counter()
-    result.wall = result.span[1] - start
     return result
 
 
