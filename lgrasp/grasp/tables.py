@@ -26,19 +26,16 @@ class DeviceTable:
     KIND: ClassVar[Any]
     INNER: ClassVar[dict[str, type["DeviceTable"]]] = {}
     rows: wp.array  # (1,) i32 how many rows are in use: the first ones
+    used: int | None = None  # the same where the host knows it (trim_sets): never of tables that a graph overwrites
 
     @cached_property
     def struct(self) -> Any:
         """The table as kernels read it."""
         return make_struct(self.KIND, self, **{n: getattr(self, n).struct for n in self.INNER if n in self.KIND.vars})
 
-    @cached_property
-    def used(self) -> int:
-        """Rows in use; the first look waits for the device."""
-        return int(to_numpy(self.rows)[0])
-
     def __len__(self) -> int:
-        return self.used
+        """Rows in use; waits for the device where they are not known."""
+        return int(to_numpy(self.rows)[0]) if self.used is None else self.used
 
     @classmethod
     def names(cls) -> list[str]:

@@ -48,6 +48,7 @@ def test_two_sizes_take_turns(swift, context):
         assert meter.counts == plain.counts
         n = len(expected)
         assert len(sets) == n
+        assert len(sets.candidates) == len(expected.candidates)  # which further passes search again
         np.testing.assert_array_equal(sets.pose.numpy()[:n], expected.pose.numpy()[:n])
         np.testing.assert_array_equal(sets.chosen.numpy()[:n], expected.chosen.numpy()[:n])
 
