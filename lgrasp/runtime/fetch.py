@@ -5,7 +5,7 @@ every thread, so that two at once may leave the device without its own.
 """
 
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 
 import numpy as np
 import warp as wp
@@ -50,7 +50,9 @@ def fetch(arrays: Sequence[wp.array], *, others: bool = False) -> list[np.ndarra
 
 def _take_staging(size: int) -> wp.array:
     """Page-locked memory of ``size`` bytes at least, which nobody else uses."""
-    memory = _staging.pop() if _staging else None
+    memory = None
+    with suppress(IndexError):  # not asked before: another thread may take the last in between
+        memory = _staging.pop()
     if memory is None or memory.shape[0] < size:
         memory = wp.empty(max(2 * size, _LEAST_STAGING), dtype=wp.uint8, device="cpu", pinned=True)
     return memory
