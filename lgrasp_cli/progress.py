@@ -1,6 +1,7 @@
 """While a job runs: one stream of progress on standard error, Ctrl-C to stop after the current batch."""
 
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -137,6 +138,7 @@ class JobProgress(Events):
     def __init__(self, bar: Bar, unit: str) -> None:
         self.stop = self.running = False
         self._bar, self._unit = bar, unit
+        self._lock = threading.Lock()  # held while the bar is changed
         self._rows: dict[int, int] = {}  # done, by part
         self._asked: dict[int, int] = {}
 
@@ -152,12 +154,14 @@ class JobProgress(Events):
         self._show()
 
     def advanced(self, part: "Part", done: int, note: str = "", ahead: float = 0.0) -> None:
-        self._rows[part.number], self._asked[part.number] = done, part.rows
-        self._show(note, ahead)
+        with self._lock:
+            self._rows[part.number], self._asked[part.number] = done, part.rows
+            self._show(note, ahead)
 
     def wrote(self, part: "Part", made: "Made") -> None:
-        self._rows[part.number] = max(made.rows, self._rows.get(part.number, 0))
-        self._show()
+        with self._lock:
+            self._rows[part.number] = max(made.rows, self._rows.get(part.number, 0))
+            self._show()
 
     def _show(self, note: str = "", ahead: float = 0.0) -> None:
         self._bar.show(self._unit, sum(self._rows.values()), sum(self._asked.values()), note, ahead)

@@ -110,7 +110,10 @@ class Events:
         """Inputs are ready; ``present`` are the rows of the parts, by number, that are on disk already."""
 
     def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0) -> None:
-        """``done`` rows of a part are made so far; work on ``ahead`` more is done, as far as can be told."""
+        """``done`` rows of a part are made so far; work on ``ahead`` more is done, as far as can be told.
+
+        Called on a thread of the part's own where parts are made side by side.
+        """
 
     def wrote(self, part: Part, made: Made) -> None:
         """A part is on disk."""

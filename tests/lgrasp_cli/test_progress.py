@@ -3,12 +3,16 @@
 import io
 import re
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from lgrasp.engine.events import Part
 from lgrasp_cli import progress
-from lgrasp_cli.progress import Bar
+from lgrasp_cli.progress import Bar, JobProgress
 from lgrasp_cli.tables import TextTable, print_report
 
 
@@ -72,6 +76,26 @@ def test_work_on_rows_to_come_counts(terminal, clock):
         bar.show("sequences", 0, 100)
         bar.show("sequences", 0, 100, ahead=25)
     assert re.search(r"0/100 .* 0:01:30 left  0.8/s", lines(screen)[-1])
+
+
+def test_parts_made_side_by_side_tell_one_after_another():
+    class Slow(Bar):
+        """Asserts that nobody else shows something meanwhile."""
+
+        shows = shown = 0
+
+        def show(self, *told, **more):
+            self.shows += 1
+            time.sleep(0.002)
+            assert self.shows == 1
+            self.shows -= 1
+            self.shown += 1
+
+    bar = Slow(quiet=True)
+    told = JobProgress(bar, "rows")
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda n: told.advanced(Part(n, Path(), 10), 5), range(20)))
+    assert bar.shown == 20
 
 
 def test_lines_where_there_is_no_terminal(clock, capsys):
