@@ -14,6 +14,8 @@ from lgrasp.engine.run import run
 from lgrasp.errors import OutputError
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.grasp.tables import take_rows
+from lgrasp.hand.find import find_hand
+from lgrasp.hand.spec import HandSpec
 from lgrasp.jobs.sequence import round as round_module
 from lgrasp.jobs.sequence.inputs import load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.job import SequenceJob
@@ -173,6 +175,22 @@ def test_sets_share_what_is_loaded_of_the_hand(pipeline, cache_root):
         keys = sequence_keys("allegro", names, Size(0.06, 0.08), 0, pipeline.object, pipeline.field)
         views.append(load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, device).view)
     assert views[0] is views[1]
+
+
+def test_other_spaces_of_the_same_names_are_made_anew(pipeline, monkeypatch):
+    source = find_hand("allegro")
+    told = source.spec.model_dump()
+    told["opposition_spaces"]["thumb-index"]["sides"][0][0]["angle"] += 5.0
+
+    def keys(spec):
+        monkeypatch.setattr("lgrasp.jobs.sequence.inputs.hand_source", lambda name: replace(source, spec=spec))
+        return sequence_keys("allegro", OBJECTS, Size(0.06, 0.08), 0, pipeline.object, pipeline.field)
+
+    one, other = keys(source.spec), keys(HandSpec.model_validate(told))
+    assert one.hand == other.hand
+    assert one.view != other.view
+    assert one.field != other.field
+    assert one.run_key({}, 8, None) != other.run_key({}, 8, None)
 
 
 @pytest.fixture

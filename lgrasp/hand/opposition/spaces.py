@@ -1,11 +1,12 @@
-"""Opposition spaces: the joints they move, what is left after some are used, the hand as one of them sees it."""
+"""Opposition spaces: the joints they move, what is left after some are used, the hand as some of them see it."""
 
 import hashlib
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -143,9 +144,13 @@ def spaces_view(
         parts.append(surface_arrays(model, urdf, links, device))
     arrays = join_surfaces(parts)
     arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
-    described = [(name, spec.opposition_spaces[name].model_dump(mode="json")) for name in names]
-    digest = hashlib.sha256(json.dumps([model.sha256, described]).encode()).hexdigest()
+    digest = hashlib.sha256(json.dumps([model.sha256, described_spaces(spec, names)]).encode()).hexdigest()
     return replace(model, sha256=digest, contacts=(), **arrays)
+
+
+def described_spaces(spec: HandSpec, names: Iterable[str]) -> list[tuple[str, dict[str, Any]]]:
+    """Names and definitions of some opposition spaces, for content keys: the digest of a hand leaves them out."""
+    return [(name, spec.opposition_spaces[name].model_dump(mode="json")) for name in names]
 
 
 def _outside(surface: Surface) -> tuple[Cone, ...]:

@@ -23,7 +23,7 @@ from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
-from lgrasp.hand.opposition.spaces import Space, hand_spaces, longest, spaces_view
+from lgrasp.hand.opposition.spaces import Space, described_spaces, hand_spaces, longest, spaces_view
 from lgrasp.jobs.hands import hand_source
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
@@ -116,8 +116,8 @@ def sequence_keys(
         )
     digest = hand_digest(source.urdf, source.spec)
     hand_key = content_key("hand", HAND_VERSION, content=digest)
-    names = source.spec.opposition_spaces
-    view = content_key("hand", HAND_VERSION, content=digest, spaces=list(names))
+    spaces = described_spaces(source.spec, source.spec.opposition_spaces)
+    view = content_key("hand", HAND_VERSION, content=digest, spaces=spaces)
     field = content_key("field", FIELD_VERSION, hand=view, params=fields.model_dump(mode="json"))
     paths = tuple(find_object(mesh) for mesh in meshes)
     scales = _object_scales(paths, size, seed)
