@@ -313,7 +313,11 @@ def own_parts(job: Job, array: Array) -> tuple[Array, list[Part], list[Part]]:
 
 
 def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listing | Renewing) -> None:
-    """Make what is missing, in order; parts are written, on other threads, while the next are made."""
+    """Make what is missing, in order; parts are written, on other threads, while the next are made.
+
+    Raises:
+        CancelledError: the job was to stop; whole parts are written, those made beside an unfinished one, too.
+    """
     writing: deque[tuple[Part, Made, Future[None]]] = deque()
 
     def settle(most: int = 0) -> None:
@@ -329,40 +333,46 @@ def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listin
         job.write(part, made.contents)
         manifests.record(part, made.rows, written=True)
 
-    def make(part: Part) -> Made | None:
+    def make(part: Part) -> Made | CancelledError | None:
         if part.number in present:
             return None
         progress = PartProgress(events, part)
-        progress.check()
-        return job.make(part, progress)
+        try:
+            progress.check()
+            return job.make(part, progress)
+        except CancelledError as error:
+            return error
 
-    def made_in_order() -> Iterator[tuple[Part, Made | None]]:
-        parts = iter(outcome.parts)
+    def made_in_order() -> Iterator[tuple[Part, Made | CancelledError | None]]:
+        parts = (part for part in outcome.parts if not stopped)
         for part in parts if job.asks else ():
             yield part, make(part)
             if part.number not in present:
                 break  # what the first finds, the others go by
         yield from in_order(make, parts, job.at_once())
 
-    present = outcome.on_disk
+    present, stopped = outcome.on_disk, None
     with ThreadPoolExecutor(job.writers()) as writer:
-        try:
-            for part, made in made_in_order():
-                rows = present[part.number] if made is None else made.rows
-                outcome.starved |= job.asks and rows < part.rows
-                if made is not None:
-                    outcome.results.append(made.result)
-                    if made.contents is not None:
-                        settle(job.writers() - 1)
-                        writing.append((part, made, writer.submit(write, part, made)))
-                    else:
-                        manifests.record(part, 0, written=False)
-                if job.asks and rows == 0:  # nor will the next parts give any
-                    for other in outcome.parts[outcome.parts.index(part) + 1 :]:
-                        if other.number not in present:
-                            manifests.record(other, 0, written=False)
-                    break
-        except CancelledError:
-            settle()
-            raise
+        for part, made in made_in_order():
+            if isinstance(made, CancelledError):
+                stopped = made
+                continue
+            rows = present[part.number] if made is None else made.rows
+            if stopped and rows < part.rows:  # what becomes of such a part depends on those before it
+                continue
+            outcome.starved |= job.asks and rows < part.rows
+            if made is not None:
+                outcome.results.append(made.result)
+                if made.contents is not None:
+                    settle(job.writers() - 1)
+                    writing.append((part, made, writer.submit(write, part, made)))
+                else:
+                    manifests.record(part, 0, written=False)
+            if job.asks and rows == 0:  # nor will the next parts give any
+                for other in outcome.parts[outcome.parts.index(part) + 1 :]:
+                    if other.number not in present:
+                        manifests.record(other, 0, written=False)
+                break
         settle()
+    if stopped:
+        raise stopped

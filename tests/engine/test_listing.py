@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import shutil
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from support.shards import sample_shard
 from lgrasp.dataset.manifest import compare, read_manifest, workers
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.writer import write_shard
-from lgrasp.engine.events import Events
+from lgrasp.engine.events import CancelledError, Events
 from lgrasp.engine.listing import renewing
 from lgrasp.engine.run import run
 from lgrasp.errors import OutputError, ShardError
@@ -64,6 +65,33 @@ def test_a_cut_run_lists_what_is_missing_and_ends_like_a_whole_one(tmp_path):
     before = cut.stat().st_mtime_ns
     run(SampleJob(out=tmp_path / "cut"))
     assert cut.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("rows", [6, 5])
+def test_whole_parts_made_beside_one_that_is_stopped_stay(tmp_path, rows):
+    """What becomes of one that falls short depends on those before it: it is made again."""
+    made = threading.Event()
+
+    class SideBySide(SampleJob):
+        def at_once(self):
+            return 2
+
+        def make(self, part, progress):
+            if part.number == 1:  # the first is made alone
+                assert made.wait(60)
+                raise CancelledError
+            try:
+                return super().make(part, progress)
+            finally:
+                if part.number == 2:
+                    made.set()
+
+    assert run(SideBySide(out=tmp_path / "cut", most=rows)).cancelled
+    assert entries(tmp_path / "cut") == [(2, 2), (2, None), (2, 2 if rows == 6 else None)]
+    for name in ("whole", "cut"):
+        run(SampleJob(out=tmp_path / name, most=rows))
+    whole, cut = (tmp_path / name / "manifest.json" for name in ("whole", "cut"))
+    assert cut.read_bytes() == whole.read_bytes()
 
 
 def test_nothing_made_leaves_nothing(tmp_path):
