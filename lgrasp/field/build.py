@@ -156,7 +156,7 @@ def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, 
     # vectors may fill half of the memory bound, the table the rest
     room = int(0.5e6 * params.max_mb / _VECTOR_BYTES / (model.groups * settings * model.surfaces))
     records = params.records if settings == 1 else max(params.records // settings, min(params.records, _LEAST_RECORDS))
-    run = setting // settings * (model.groups + 1) + group
+    run = model.contact_run(setting // settings, group)
     touches = model.contact_first[run + 1] > model.contact_first[run]
     postures = max(1000, int(1.5 * records / _PER_POSTURE)) if touches else 0
     posture = wp.zeros((postures, int(np.diff(model.tree.dof_first).max())), dtype=wp.uint8, device=device)

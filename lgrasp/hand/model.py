@@ -114,6 +114,10 @@ class HandModel:
         """Contact surfaces W."""
         return (len(self.contact_first) - 1) // (self.groups + 1)
 
+    def contact_run(self, surface: int, group: int) -> int:
+        """Entry of ``contact_first`` of a group (-1: static links) of a contact surface."""
+        return surface * (self.groups + 1) + (group if group >= 0 else self.groups)
+
     @property
     def patches(self) -> int:
         """Contact patches of fingers and palm; those of group g are consecutive."""

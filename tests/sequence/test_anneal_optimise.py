@@ -79,7 +79,7 @@ def run(case, number: int, space: np.ndarray, before: Optimised | None = None, o
 
 def points_of(hand: HandModel, space: int, group: int) -> np.ndarray:
     """Contact points of a side of a space."""
-    run = space * (hand.groups + 1) + (group if group >= 0 else hand.groups)
+    run = hand.contact_run(space, group)
     return np.arange(*hand.contact_first[run : run + 2])
 
 

@@ -28,7 +28,7 @@ class Sides:
     ) -> None:
         ranges = []
         for number, space in enumerate(spaces):
-            runs = [number * (hand.groups + 1) + (g if g >= 0 else hand.groups) for g in space.groups]
+            runs = [hand.contact_run(number, g) for g in space.groups]
             ranges.append([hand.contact_first[run : run + 2] for run in runs])
         first, end = np.moveaxis(np.array(ranges), 2, 0)  # each (S, 2)
         self._first = torch.as_tensor(first, dtype=torch.int64, device=device)
