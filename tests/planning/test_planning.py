@@ -60,7 +60,7 @@ def test_a_start_does_not_depend_on_the_others(planner, planned):
 def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs):
     def shares(tried):
         params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": tried})
-        table = Planner(inputs.hand, inputs.object.model, 0.12, params).run(6).grasps
+        table = Planner(inputs.hand, inputs.object.model, 0.12, params).run(24).grasps  # of few none may differ
         found = HoldTester(inputs.hand, inputs.object, params.hold).run(ControlPoses.of(table), 0)
         return dict(zip(table.index.tolist(), found["hold_probability"].tolist(), strict=True))
 
