@@ -38,7 +38,7 @@ VERDICTS: dict[str, tuple[ProtocolName, EngineName]] = {
     for protocol in get_args(ProtocolName)
 }
 """How the verdicts of a protocol by a simulator are named."""
-FormatName = Literal["dexgraspnet", "dexgraspbench", "isaac-grasp", "graspgen", "usd", "mjcf"]
+FormatName = Literal["dexgraspnet", "dexgraspbench", "isaac-grasp", "graspgen", "usd", "mjcf", "webdataset"]
 """Formats of other programs (:mod:`lgrasp.dataset.exports.formats`)."""
 GroupName = Literal["object", "hand", "pose"]
 """What a split of a data set keeps in one part: source meshes, hands, or rows made from one object pose."""

@@ -273,6 +273,13 @@ def export(
     only_holding: Annotated[
         bool, Option("--only-holding", help="Only grasps that held in simulation; same as --where physics/fc_holds.")
     ] = False,
+    split_file: Annotated[
+        Path | None,
+        Option("--split", help="File of dataset split; each part gets own files (webdataset)."),
+    ] = None,
+    licence: Annotated[
+        str, Option(metavar="SPDX", help="Add a card with this licence, provenance and checksums.")
+    ] = "",
 ) -> None:
     """Write grasps in the format of another program, with the hand's URDF and all meshes.
 
@@ -283,6 +290,7 @@ def export(
 
     conditions = [*(where or ()), *([HOLDS] if only_holding else ())]
     what = {"shards": shards, "out": out, "to": to, "where": conditions, "limit": limit}
+    what |= {"split": split_file, "licence": licence}
     how.run(how.job(ExportRequest, "export", **what), _show_export)
 
 

@@ -85,7 +85,9 @@ def view(
     row: Annotated[int, Option(min=0, help="First row to show, counted through all shards.")] = 0,
     where: Annotated[
         list[str] | None,
-        Option(help="Only rows that meet a condition: a column, or COLUMN OP NUMBER; repeatable."),
+        Option(
+            help="Only rows that meet a condition: a column, or COLUMN OP NUMBER, such as objects == 1; repeatable."
+        ),
     ] = None,
     host: Host = "localhost",
     port: Port = 8080,

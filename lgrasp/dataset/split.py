@@ -68,6 +68,14 @@ class Split(JsonFile):
                 raise ShardError(f"{reader.path}: {self.by} '{groups[k][0]}' is in no part of the split")
         return np.array([*(of.get(sha256) == part for _, sha256 in groups), False])[place]
 
+    def numbers(self, reader: ShardReader) -> np.ndarray:
+        """The part that each row of a shard is in, counted in ``parts``, shape [N].
+
+        Raises:
+            ShardError: the split does not know an object, or the hand.
+        """
+        return np.argmax([self.holds(part, reader) for part in self.parts], axis=0)
+
 
 class Groups(NamedTuple):
     """What a split keeps together, of one shard: G groups."""

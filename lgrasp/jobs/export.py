@@ -14,6 +14,7 @@ from lgrasp.dataset.exports.formats import export_shards
 from lgrasp.dataset.exports.mjcf import Cut
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.split import Split
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.run import Job
@@ -25,6 +26,8 @@ from lgrasp.jobs.requests.shards import ExportRequest
 from lgrasp.simulate.protocol import HOLDS
 
 _INDEX = "export.json"  # the last file of an export: one without it is not whole
+
+_NUMBERS = ("metrics/", "physics/")
 
 
 class ExportJob(ExportRequest, Job):
@@ -42,10 +45,13 @@ class ExportJob(ExportRequest, Job):
         columns = {parse_condition(text).column for text in self.where} | {HOLDS, "metrics/valid", *TABLE_FIELDS}
 
         def digest(reader: ShardReader) -> str:
-            return rows_digest(reader, sorted(columns & reader.columns.keys()))
+            numbers = {name for name in reader.columns if self.to == "webdataset" and name.startswith(_NUMBERS)}
+            return rows_digest(reader, sorted(columns & reader.columns.keys() | numbers))
 
         rows = [shard.value for shard in gather(self.shards, digest)]
-        return content_key("export", 2, to=self.to, rows=rows, limit=self.limit, where=list(self.where))
+        options = {"limit": self.limit, "where": list(self.where), "licence": self.licence}
+        parts = Split.read(self.split).model_dump(mode="json") if self.split else None
+        return content_key("export", 3, to=self.to, rows=rows, split=parts, **options)
 
     def parts(self) -> list[Part]:
         return [Part(0, self.out / _INDEX)]
@@ -69,6 +75,8 @@ class ExportJob(ExportRequest, Job):
             self.to,
             where=self.where,
             limit=self.limit,
+            split=self.split,
+            licence=self.licence,
             cut=self._cut() if self.to == "mjcf" else None,
             advance=lambda done, total: replace(progress, part=replace(part, rows=total))(done),
             run_key=self.key(),

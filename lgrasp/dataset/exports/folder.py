@@ -26,7 +26,7 @@ def check_empty(out: Path, run_key: str = "") -> None:
     """
     rule = "--out needs an empty folder, or one that does not exist"
     try:
-        remove_leftovers(out, f"{Path(_UNFINISHED).stem}.*.tmp")
+        remove_leftovers(out, f"{Path(UNFINISHED).stem}.*.tmp")
         if run_key and _interrupted(out) == run_key:
             return
         for first in sorted(path.name for path in out.iterdir()):
@@ -44,8 +44,9 @@ HAND, OBJECTS, GRASPS = "hand", "objects", "grasps"
 CSPACE_POSTURES = ("cspace_position", "pregrasp_cspace_position", "squeeze_cspace_position")
 """Names of the joints at the grasp, before it, and as targets, in NVIDIA's formats."""
 INDEX, INDEX_FORMAT = "export.json", "lgrasp-export"
+UNFINISHED = "unfinished.json"
+"""What becomes the index."""
 _FEW = 8  # names in the README
-_UNFINISHED = "unfinished.json"  # what becomes the index
 
 
 def write_assets(out: Path, selection: Selection) -> None:
@@ -79,20 +80,20 @@ def begin(out: Path, run_key: str) -> None:
     Raises:
         OutputError: The folder cannot be written.
     """
-    write_file(out / _UNFINISHED, json.dumps({"run_key": run_key}))
+    write_file(out / UNFINISHED, json.dumps({"run_key": run_key}))
 
 
 def abandon(out: Path) -> None:
     """Remove the folder of an export that failed before its first file."""
-    if [path.name for path in out.iterdir()] == [_UNFINISHED]:
-        (out / _UNFINISHED).unlink()
+    if [path.name for path in out.iterdir()] == [UNFINISHED]:
+        (out / UNFINISHED).unlink()
         out.rmdir()
 
 
 def _interrupted(out: Path) -> str | None:
     """Key of the unfinished export that a folder holds, if it holds one."""
     try:
-        return str(json.loads((out / _UNFINISHED).read_bytes())["run_key"])
+        return str(json.loads((out / UNFINISHED).read_bytes())["run_key"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -138,8 +139,8 @@ def write_index(
         },
     }
     remove_leftovers(out, "**/*.tmp")
-    write_file(out / _UNFINISHED, json.dumps(document, indent=2) + "\n")
-    os.replace(out / _UNFINISHED, out / INDEX)
+    write_file(out / UNFINISHED, json.dumps(document, indent=2) + "\n")
+    os.replace(out / UNFINISHED, out / INDEX)
 
 
 _TEXT = """\

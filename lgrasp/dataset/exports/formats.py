@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lgrasp.dataset.conditions import parse_condition
+from lgrasp.dataset.exports.card import publish
 from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgraspbench, write_dexgraspbench
 from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
 from lgrasp.dataset.exports.folder import abandon, begin, check_empty, readme, write_assets, write_index
@@ -14,10 +15,13 @@ from lgrasp.dataset.exports.graspgen import GRASPGEN_NOTES, read_graspgen, write
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
+from lgrasp.dataset.exports.options import check_options
 from lgrasp.dataset.exports.reading import GraspSet
 from lgrasp.dataset.exports.selection import Selection, select_rows
 from lgrasp.dataset.exports.usd import USD_NOTES, UsdWriter, read_usd
+from lgrasp.dataset.exports.webdataset import WEBDATASET_NOTES, read_webdataset, webdataset_writer
 from lgrasp.dataset.files import Paths
+from lgrasp.dataset.split import Split
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.files import write_file
 
@@ -49,6 +53,7 @@ FORMATS = {
     "graspgen": Format(True, GRASPGEN_NOTES, _plain(write_graspgen), read_graspgen),
     "usd": Format(True, USD_NOTES, UsdWriter, read_usd),
     "mjcf": Format(False, MJCF_NOTES, MjcfWriter, read_mjcf),
+    "webdataset": Format(True, WEBDATASET_NOTES, webdataset_writer, read_webdataset),
 }
 """Formats by the name that ``--to`` takes."""
 
@@ -68,6 +73,8 @@ def export_shards(
     *,
     where: Sequence[str] = (),
     limit: int | None = None,
+    split: str | PathLike[str] | None = None,
+    licence: str = "",
     cut: Cut | None = None,
     advance: Callable[[int, int], None] | None = None,
     run_key: str = "",
@@ -84,13 +91,17 @@ def export_shards(
         where: Conditions on columns that a row must satisfy, all of them, such as ``physics/fc_holds`` or
             ``metrics/epsilon > 0.01``.
         limit: Most rows.
+        split: File of ``lgrasp dataset split``, whose parts become files of their own (webdataset).
+        licence: Of the data set, by its SPDX identifier; with it the folder also has what publishing takes: a card
+            (``README.md``), ``provenance.json`` and ``SHA256SUMS``.
         cut: Convex pieces of an object, for formats that simulate; without it the hull of its mesh collides.
         advance: Called with rows done and rows in all.
         run_key: Of the shards and options, to tell a later run that the export, whole or not, is its own; without it an
             export that was interrupted cannot be gone on with.
 
     Raises:
-        ConfigError: An unknown format, a condition that cannot be read, or a limit below 1.
+        ConfigError: An unknown format, a condition or split that cannot be read, a limit below 1, a licence that is no
+            identifier, or a format without parts and ``split``.
         PhysicsError: MuJoCo is not installed, or refuses the hand or an object (mjcf).
         ShardError: A shard is damaged, of another hand, lacks a column, holds what the format cannot; no row is left.
         OutputError: The folder is not empty or cannot be written.
@@ -99,8 +110,10 @@ def export_shards(
         raise ConfigError(f"--limit {limit}: must be at least 1")
     to = to.replace("_", "-")
     form, conditions, out = _format(to), [parse_condition(text) for text in where], Path(out)
+    check_options(to, split, licence)
     check_empty(out, run_key)
-    selection = select_rows(paths, where=conditions, limit=limit, single=form.single)
+    parts = Split.read(split) if split is not None else None
+    selection = select_rows(paths, where=conditions, limit=limit, single=form.single, split=parts)
     frames = HandFrames(selection.hand.urdf, selection.hand.base_link, selection.hand.joint_names, selection.shards[0])
     write = form.writer(selection, frames, cut)
     chosen = list(map(str, conditions))
@@ -120,6 +133,8 @@ def export_shards(
         raise
     write_file(out / "README.txt", readme(selection, frames, form.notes, chosen))
     write(out, count)
+    if licence:
+        publish(out, selection, licence, chosen)
     write_index(out, selection, frames, to, chosen, run_key)
     return Exported(selection.rows, tuple(item.code for item in selection.objects))
 

@@ -14,11 +14,14 @@ from lgrasp.dataset.exports.hand import free_name
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.split import Split
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.schema import CHUNK_ROWS
 from lgrasp.simulate.protocol import HOLDS
 from lgrasp.words import plural
+
+_NUMBER = re.compile("metrics/|physics/|candidate$")  # columns that tell of a row in one number
 
 
 class ExportObject(NamedTuple):
@@ -56,6 +59,8 @@ class Batch(NamedTuple):
     """Of grasps of an object on a table, else empty; by the names that are written: ``table_plane``, unit normal up and
     height along it [m], shape [n, 4], and ``table_approach``, unit direction in which the open hand comes, shape
     [n, 3]; object's frame, float64."""
+    numbers: Mapping[str, np.ndarray]
+    """Of a selection's ``numbers`` by name, if they were asked for; each shape [n]."""
 
     def tables(self) -> list[dict[str, list[float]]]:
         """``table`` row by row, length n."""
@@ -75,6 +80,7 @@ class _Source(NamedTuple):
     first: int  # running number of the first chosen row
     planes: list[np.ndarray | None]  # that each of the shard's objects rests on
     on_table: bool
+    part: np.ndarray  # (n,) of the chosen rows, in the selection's parts
 
 
 @dataclass(frozen=True)
@@ -89,6 +95,10 @@ class Selection:
     rows: int
     single: bool
     """True if every row holds exactly one object."""
+    parts: tuple[str, ...]
+    """Names of the parts of the split; one, ``train``, without a split."""
+    numbers: tuple[str, ...]
+    """Flat names of the metrics and verdicts with one number per row that all shards have, and ``candidate``."""
     _sources: tuple[_Source, ...]
 
     @property
@@ -101,29 +111,47 @@ class Selection:
         """The shards that rows are taken from."""
         return [source.path for source in self._sources]
 
-    def batches(self, holding: int | None = None, advance: Callable[[int], None] | None = None) -> Iterator[Batch]:
-        """The rows in order, at most 4096 at a time, or only those with one of the objects; ``advance`` is called with
-        the number of rows of each batch when the caller is done with it.
+    @property
+    def sources(self) -> list[tuple[Path, int]]:
+        """The shards, each with how many rows are taken from it."""
+        return [(source.path, len(source.rows)) for source in self._sources]
+
+    def batches(
+        self,
+        holding: int | None = None,
+        advance: Callable[[int], None] | None = None,
+        *,
+        part: int | None = None,
+        numbers: bool = False,
+    ) -> Iterator[Batch]:
+        """The rows in order, at most 4096 at a time, or only those with one of the objects, or of one of the parts;
+        ``advance`` is called with the number of rows of each batch when the caller is done with it.
 
         Raises:
             ShardError: A shard is damaged.
         """
+        names = self.numbers if numbers else ()
         for source in self._sources:
             chosen = np.arange(len(source.rows))
             if holding is not None:
                 chosen = chosen[(source.index == holding).any(1)]
+            if part is not None:
+                chosen = chosen[source.part[chosen] == part]
             if not len(chosen):
                 continue
             with ShardReader(source.path) as reader:
                 for block in np.unique(source.rows[chosen] // CHUNK_ROWS):
                     some = chosen[source.rows[chosen] // CHUNK_ROWS == block]
-                    yield self._read(reader, source, some, int(block) * CHUNK_ROWS)
+                    yield self._read(reader, source, some, int(block) * CHUNK_ROWS, names)
                     if advance:
                         advance(len(some))
 
-    def _read(self, reader: ShardReader, source: _Source, some: np.ndarray, start: int) -> Batch:
+    def _read(self, reader: ShardReader, source: _Source, some: np.ndarray, start: int, names: Sequence[str]) -> Batch:
+        def stored(name: str) -> np.ndarray:
+            return reader.column(name, start, start + CHUNK_ROWS)[source.rows[some] - start]
+
         def read(name: str) -> np.ndarray:
-            return reader.column(name, start, start + CHUNK_ROWS)[source.rows[some] - start].astype(np.float64)
+            return stored(name).astype(np.float64)
 
         pose, index = read("object_pose"), source.index[some]
         if self.single:
@@ -140,11 +168,17 @@ class Selection:
             table["table_plane"] = np.array([_plane(source, int(item), int(plane)) for item, plane in planes])
             turned = Rotation.from_quat(pose[:, 0, 3:], scalar_first=True)
             table["table_approach"] = turned.inv().apply(read("table/approach"))
-        return Batch(source.first + some, q, before, squeeze, pose, index, holds, table)
+        numbers = {name: stored(name) for name in names}
+        return Batch(source.first + some, q, before, squeeze, pose, index, holds, table, numbers)
 
 
 def select_rows(
-    paths: Paths, *, where: Sequence[Condition] = (), limit: int | None = None, single: bool = False
+    paths: Paths,
+    *,
+    where: Sequence[Condition] = (),
+    limit: int | None = None,
+    single: bool = False,
+    split: Split | None = None,
 ) -> Selection:
     """Choose rows; reads only the columns of the conditions.
 
@@ -153,18 +187,21 @@ def select_rows(
         where: Conditions that a row must satisfy, all of them.
         limit: Most rows, counted over all shards in the order given.
         single: Insist on one object in every row.
+        split: Tells which part each row is in.
 
     Raises:
-        ShardError: A shard cannot be read, hands differ, no row is left, or a row holds several objects and ``single``.
+        ShardError: A shard cannot be read, holds what is in no part, hands differ, no row is left, or a row holds
+            several objects and ``single``.
     """
     hand: HandRecord | None = None
     source: Path | None = None
     known: dict[tuple[str, str, float], ExportObject] = {}
     sources: list[_Source] = []
+    numbers: dict[str, None] | None = None
     chosen = seen = 0
 
-    def look(reader: ShardReader) -> tuple[np.ndarray, np.ndarray, int]:
-        """The rows that conditions leave, their ``object_index``, and the number of all rows."""
+    def look(reader: ShardReader) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+        """The rows that conditions leave, their ``object_index`` and parts, and the number of all rows."""
         rows = np.flatnonzero(satisfied(reader, where))
         index = reader.column("object_index")[rows]
         several = np.flatnonzero((index >= 0).sum(1) != 1)
@@ -172,9 +209,10 @@ def select_rows(
             count = int((index[several[0]] >= 0).sum())
             hint = f"choose rows with --where '{OBJECTS_HELD} == 1', or --to mjcf"
             raise ShardError(f"{reader.path}: row {rows[several[0]]} holds {count} objects, this format one; {hint}")
-        return rows, index, len(reader)
+        parts = np.zeros(len(reader), int) if split is None else split.numbers(reader)
+        return rows, index, parts[rows], len(reader)
 
-    for path, _, (rows, index, number) in gather(paths, look):
+    for path, _, (rows, index, part, number) in gather(paths, look):
         with ShardReader(path) as reader:
             this = reader.hand()
             hand, source = hand or this, source or path
@@ -185,11 +223,14 @@ def select_rows(
             columns = [list(this.joint_names).index(name) for name in hand.joint_names]
             records, on_table = reader.objects(), "table/pose" in reader.columns
             places = np.array([*(_place(record, path, known) for record in records), -1])  # -1: absent
+            own = [name for name, (shape, _) in reader.columns.items() if len(shape) == 1 and _NUMBER.match(name)]
         rows = rows[: None if limit is None else limit - chosen]
-        index = index[: len(rows)]
+        index, part = index[: len(rows)], part[: len(rows)]
         seen += number
         planes = [record.tables for record in records]
-        sources.append(_Source(path, rows, places[index], columns, chosen, planes, on_table))
+        sources.append(_Source(path, rows, places[index], columns, chosen, planes, on_table, part))
+        if len(rows):
+            numbers = dict.fromkeys(name for name in own if numbers is None or name in numbers)
         chosen += len(rows)
         if chosen == limit:
             break
@@ -209,6 +250,8 @@ def select_rows(
         counts=tuple(int(counts[i]) for i in order),
         rows=chosen,
         single=single,
+        parts=("train",) if split is None else tuple(split.parts),
+        numbers=tuple(numbers or ()),
         _sources=tuple(s._replace(index=place[s.index]) for s in sources if len(s.rows)),
     )
 

@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from lgrasp.choices import EngineName, FormatName, MetricName
 from lgrasp.config import DeviceName, ShardPaths, apply_settings, parse_model
+from lgrasp.dataset.exports.options import check_options
 from lgrasp.dataset.files import find_shards, shards_below
 from lgrasp.engine.request import Request, ShardRequest
 from lgrasp.errors import ConfigError, HandError, OutputError, ShardError
@@ -216,8 +217,13 @@ class ExportRequest(Request):
     where: tuple[str, ...] = Field(
         default=(), description="Only rows of which these are true, such as 'metrics/epsilon > 0.01'."
     )
+    split: Path | None = Field(default=None, description="File of dataset split; its parts become files (webdataset).")
+    licence: str = Field(default="", description="SPDX identifier; adds a card, provenance and checksums.")
 
     def check(self) -> None:
+        check_options(self.to, self.split, self.licence)
+        if self.split is not None and not self.split.is_file():
+            raise ConfigError(f"--split {self.split}: no such file; lgrasp dataset split writes one")
         shards_below(self.shards)
         check_folder(self.out)
 

@@ -55,6 +55,6 @@ def test_training(folder, make_sequence, capsys):
     torch.set_num_threads(1)  # small matrices: more threads only wait for each other
     exec(examples("training.md"), {})
     torch.set_num_threads(threads)
-    right, moved = capsys.readouterr().out.splitlines()
-    assert float(right.split("%")[0]) > 70
+    right, always, moved = capsys.readouterr().out.splitlines()
+    assert float(right.split("%")[0]) > 70 > float(always.split("%")[0]) > 49
     assert moved == "tensor(0.)"

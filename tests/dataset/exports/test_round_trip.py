@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import tarfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.object.mass import mass_properties
 
-SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp", "graspgen", "usd"]
+SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp", "graspgen", "usd", "webdataset"]
 HANDS = ["allegro", "schunk_svh", "barrett", "shadow"]
 
 
@@ -83,7 +84,18 @@ def raw_usd(out: Path, row: int):
     return np.array(hand.GetAttribute("lgrasp:root").Get(row)).T, "root_link", joints
 
 
-RAW = dict(zip(SINGLE, (raw_dexgraspnet, raw_dexgraspbench, raw_isaac_grasp, raw_graspgen, raw_usd), strict=True))
+def raw_webdataset(out: Path, row: int):
+    with tarfile.open(out / "grasps" / "train-00000.tar") as tar:
+        entry = json.load(tar.extractfile(f"{row:08d}.json"))
+    assert (out / "objects" / f"{entry['object']}.obj").is_file()
+    assert entry["holds"] is True
+    names = json.loads((out / "export.json").read_text())["hand"]["joint_names"]
+    pose = entry["hand_pose"]
+    return matrix(pose[:3], wxyz(pose[3:])), "root_link", dict(zip(names, entry["q"], strict=True))
+
+
+RAW = [raw_dexgraspnet, raw_dexgraspbench, raw_isaac_grasp, raw_graspgen, raw_usd, raw_webdataset]
+RAW = dict(zip(SINGLE, RAW, strict=True))
 
 
 def load(path: Path) -> yourdfpy.URDF:
