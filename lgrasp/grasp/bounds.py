@@ -66,6 +66,9 @@ class GraspBounds(Params):
     max_unresisted_load: float = Field(
         default=1.0, gt=0, le=1, description="Largest part of a unit force that is not resisted; 1 asks for nothing."
     )
+    min_epsilon: float = Field(
+        default=0.0, ge=0, le=1, description="Least Ferrari-Canny quality (metric epsilon); 0 asks for nothing."
+    )
     min_hold_probability: float = Field(
         default=0.0,
         ge=0,

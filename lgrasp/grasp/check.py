@@ -111,7 +111,8 @@ class Check:
         wp.launch(list_kept, len(self), [self.found, upto], [row], device=self.hand.device)
         packed, on_table = self._pack(seed, row), self.obj.planes is not None
         self._share(row, tally)
-        bounded = max(self.limits.min_squeeze_travel, self.limits.min_stable_squeeze) > 0.0
+        least = (self.limits.min_squeeze_travel, self.limits.min_stable_squeeze, self.limits.min_epsilon)
+        bounded = max(least) > 0.0
         bounded |= self.limits.max_closing_travel < ANY_CLOSING
         if bounded:
             wp.launch(drop_limp, len(self), [self.limits, packed], [row, tally.device], device=self.hand.device)

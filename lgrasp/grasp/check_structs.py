@@ -26,6 +26,7 @@ class Limits:
     torque_scale: wp.float32
     max_gswo: wp.float32
     max_unresisted_load: wp.float32
+    min_epsilon: wp.float32
     pregrasp_distance: wp.float32
     min_pregrasp_distance: wp.float32
     min_table_distance: wp.float32

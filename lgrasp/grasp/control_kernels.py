@@ -189,7 +189,7 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
 @wp.kernel
 def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32), counts_out: wp.array(dtype=wp.int32)):
     """Rows that squeeze the object by less than ``min_squeeze_travel``, or cannot stably with ``min_stable_squeeze``,
-    or close by more than ``max_closing_travel``, become none.
+    or close by more than ``max_closing_travel``, or have less than ``min_epsilon``, become none.
 
     Args:
         row_out: (m,) hand of each row, -1 none.
@@ -199,7 +199,7 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     if row_out[i] < 0:
         return
     limp = packed.squeeze_travel[i] < limits.min_squeeze_travel or packed.stable_squeeze[i] < limits.min_stable_squeeze
-    if limp or packed.closing_travel[i] > limits.max_closing_travel:
+    if limp or packed.closing_travel[i] > limits.max_closing_travel or packed.epsilon[i] < limits.min_epsilon:
         row_out[i] = -1
         wp.atomic_sub(counts_out, KEPT, 1)
         wp.atomic_add(counts_out, SQUEEZE, 1)

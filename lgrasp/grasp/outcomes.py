@@ -49,7 +49,7 @@ SHARED = (*REASONS, "touch")
 FAILED_BOUNDS = (
     *("none", "min_contacts", "max_gap", "max_normal_angle", "min_self_distance", "max_penetration", "max_gswo"),
     *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel", "min_stable_squeeze"),
-    "max_closing_travel",
+    *("max_closing_travel", "min_epsilon"),
 )
 """By code, the first bound that a row fails, of :class:`~lgrasp.grasp.bounds.GraspBounds`; ``approach``: no straight
 way of the open hand to the object clears the table."""
@@ -74,7 +74,7 @@ METRICS = (
 """Columns of the metrics table."""
 
 
-_SQUEEZE_BOUNDS = ("min_squeeze_travel", "max_closing_travel", "min_stable_squeeze")
+_SQUEEZE_BOUNDS = ("min_squeeze_travel", "max_closing_travel", "min_stable_squeeze", "min_epsilon")
 
 
 def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
@@ -87,6 +87,7 @@ def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
         table.metrics["squeeze_travel"] < bounds.min_squeeze_travel,
         table.metrics["closing_travel"] > bounds.max_closing_travel,
         table.metrics["stable_squeeze"] < bounds.min_stable_squeeze,
+        table.metrics["epsilon"] < bounds.min_epsilon,
     ]
 
 

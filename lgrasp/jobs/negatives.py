@@ -25,6 +25,7 @@ _LOOSE: dict[str, float] = {
     "allowed_penetration": 0.005,
     "max_gswo": 0.5,
     "max_unresisted_load": 1.0,
+    "min_epsilon": 0.0,
     "min_squeeze_travel": 0.0,
     "min_stable_squeeze": 0.0,
     "max_closing_travel": ANY_CLOSING,
