@@ -1,33 +1,88 @@
-"""README, quickstart and the page on steering run as written, but with fewer rows, in an empty folder."""
+"""README, quickstart and the page on steering run as written, but with fewer rows, in an empty folder; README with
+what a wheel installs."""
 
+import json
+import os
 import re
 import shlex
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+import warp as wp
 from support.places import ROOT
 
 BLOCK = re.compile(r"^(<!-- not run.*?-->\n)?```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 FEWER = {"generate": ("-n", "4"), "render": ("-n", "2")}
 
+SCRIPT = """
+import json, sys
+import lgrasp
+from lgrasp_cli.main import main
+print(lgrasp.__file__)
+for words in json.load(sys.stdin):
+    sys.argv = ["lgrasp", *words]
+    try:
+        main()
+    except SystemExit as leaving:
+        if leaving.code:
+            sys.exit(f"{leaving.code}: {sys.argv}")
+"""
 
-@pytest.mark.parametrize("page", ["README.md", "docs/guides/quickstart.md", "docs/guides/steer.md"])
-def test_a_page_runs_as_written(cli, page, tmp_path):
-    pytest.importorskip("mujoco")
+
+def blocks(page: str) -> Iterator[tuple[str, str]]:
+    """Language and text of what a page says to run."""
     text = (ROOT / page).read_text(encoding="utf-8")
     assert not re.search(r"^```\n(lgrasp|pip|make|python) ", text, re.MULTILINE), "a block of commands says ```bash"
+    return ((language, block) for marker, language, block in BLOCK.findall(text) if not marker)
+
+
+def commands(block: str) -> Iterator[list[str]]:
+    """The words of each line after lgrasp, with fewer rows."""
+    for line in block.splitlines():
+        command, *words = shlex.split(line, comments=True)
+        assert command == "lgrasp"
+        yield [*words, *FEWER.get(words[0], ())]
+
+
+@pytest.mark.parametrize("page", ["docs/guides/quickstart.md", "docs/guides/steer.md"])
+def test_a_page_runs_as_written(cli, page, tmp_path):
+    pytest.importorskip("mujoco")
     ran = 0
-    for marker, language, block in BLOCK.findall(text):
-        if marker:
-            continue
+    for language, block in blocks(page):
         if language == "python":
             exec(block, {})
             continue
-        for line in block.splitlines():
-            command, *words = shlex.split(line, comments=True)
-            assert command == "lgrasp"
-            result = cli(*words, *FEWER.get(words[0], ()))
-            assert result.code == 0, (line, result)
-            assert "warning" not in result.err, (line, result)
+        for words in commands(block):
+            result = cli(*words)
+            assert result.code == 0, (words, result)
+            assert "warning" not in result.err, (words, result)
             ran += 1
     assert ran >= 5
     assert list(tmp_path.glob("grasps/allegro-mug/robust*/*.h5"))
+
+
+def test_readme_runs_with_a_wheel(shared_cache, tmp_path):
+    """Nothing but what the wheel holds is there of the project."""
+    pytest.importorskip("mujoco")
+    builder = pytest.importorskip("hatchling.builders.wheel").WheelBuilder(str(ROOT))
+    (wheel,) = builder.build(directory=str(tmp_path / "dist"), versions=["standard"])
+    installed, empty = tmp_path / "installed", tmp_path / "empty"
+    empty.mkdir()
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(installed)
+    ran = [words for language, block in blocks("README.md") if language == "bash" for words in commands(block)]
+    assert len(ran) >= 5
+    env = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "LGRASP_"))}
+    env |= {"PYTHONPATH": str(installed), "LGRASP_CACHE_DIR": str(shared_cache)}
+    env["WARP_CACHE_PATH"] = str(Path(wp.config.kernel_cache_dir).parent)  # Warp adds its version
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], input=json.dumps(ran), env=env, cwd=empty, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(str(installed))
+    assert "warning" not in done.stderr
+    assert list(empty.glob("grasps/allegro-mug/robust*/*.h5"))
