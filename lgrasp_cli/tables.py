@@ -128,7 +128,7 @@ def held(data: dict[str, Any]) -> list[tuple[str, str]]:
 def took(data: dict[str, Any], unit: str) -> list[tuple[str, str]]:
     """The time of a job, and how fast it was without loading and compiling."""
     seconds, made = data["seconds"], data["made"]
-    rate = f"; {made:,} {unit} in {seconds['parts']:.1f} s, {made / seconds['parts']:,.1f}/s" if made else ""
+    rate = f"; {plural(made, unit[:-1])} in {seconds['parts']:.1f} s, {made / seconds['parts']:,.1f}/s" if made else ""
     return [("time", f"{seconds['total']:.1f} s{rate}")]
 
 

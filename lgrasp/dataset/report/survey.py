@@ -86,13 +86,13 @@ def _remarks(heads: list[Head]) -> list[str]:
     holder: dict[tuple[str, int], Path] = {}
     twice: set[str] = set()
     for head in heads:
-        twice |= {f"{head.path} and {holder[part]}" for part in head.parts if part in holder}
+        twice |= {f"{head.path} repeats the rows of {holder[part]}" for part in head.parts if part in holder}
         for part in head.parts:
             holder.setdefault(part, head.path)
     empty = [head.path.name for head in heads if not head.rows]
     remarks = []
     if twice:
-        remarks.append(f"The same shard of a run is in {listed(sorted(twice), 3)}: its rows are counted twice.")
+        remarks.append(f"{listed(sorted(twice), 3)}; they are counted twice.")
     if empty:
         remarks.append(f"No rows are in {listed(empty, 3)}.")
     return remarks
