@@ -23,6 +23,7 @@ from lgrasp.files import new_file
 
 _ROWS = 10_000  # of a tar file: some 20 MB
 _DECIMALS = 9
+_END = 2 * tarfile.BLOCKSIZE  # zeros, without which a file is cut short
 _POSTURES = ("q", "q_pregrasp", "q_squeeze")
 _TABLE = ("table_plane", "table_approach")
 
@@ -120,6 +121,8 @@ def read_webdataset(path: Path | str, *, joint_names: Sequence[str] | None = Non
         order = folder.order(listed, file)
         wrong = (tarfile.TarError, KeyError, TypeError, ValueError, AttributeError, EOFError, RecursionError)
         with parsing(file, "a WebDataset of grasps", wrong), tarfile.open(file, "r:") as tar:
+            if file.stat().st_size % tarfile.RECORDSIZE or any(file.read_bytes()[-_END:]):
+                raise ValueError("it is cut short")
             for member in tar:
                 entry = json.load(tar.extractfile(member))  # pyright: ignore[reportArgumentType]
                 pose, joints = np.array(entry["hand_pose"], float), np.array([entry[n] for n in _POSTURES], float)

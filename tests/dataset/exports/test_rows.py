@@ -1,6 +1,7 @@
 """Which rows are exported, and what is refused."""
 
 import json
+import tarfile
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,9 @@ def entries(folder, form: str) -> list[dict]:
         hand = stage.GetPrimAtPath("/World/hand")
         names = [a.GetName() for a in hand.GetAttributes() if "table" in a.GetName()]
         return [{n.removeprefix("lgrasp:"): hand.GetAttribute(n).Get(t) for n in names} for t in range(4)]
+    if form == "webdataset":
+        with tarfile.open(folder / "grasps" / "train-00000.tar") as tar:
+            return [json.loads(tar.extractfile(member).read()) for member in tar]
     if form == "dexgraspnet":
         return load_objects(folder / "grasps" / "cup.npy")
     return [load_objects(file)[0] for file in sorted((folder / "grasps" / "cup").iterdir())]
