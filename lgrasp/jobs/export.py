@@ -10,8 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lgrasp.dataset.conditions import parse_condition
-from lgrasp.dataset.exports.formats import export_shards
+from lgrasp.dataset.exports.formats import FORMATS, export_shards
 from lgrasp.dataset.exports.mjcf import Cut
+from lgrasp.dataset.exports.selection import chosen_rows
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.split import Split
@@ -42,9 +43,11 @@ class ExportJob(ExportRequest, Job):
         return self.out
 
     def key(self) -> str:
-        columns = {parse_condition(text).column for text in self.where} | {HOLDS, "metrics/valid", *TABLE_FIELDS}
+        where = [parse_condition(text) for text in self.where]
+        columns = {condition.column for condition in where} | {HOLDS, "metrics/valid", *TABLE_FIELDS}
 
         def digest(reader: ShardReader) -> str:
+            chosen_rows(reader, where, single=FORMATS[self.to].single)  # the files that the export leaves out
             numbers = {name for name in reader.columns if self.to == "webdataset" and name.startswith(_NUMBERS)}
             return rows_digest(reader, sorted(columns & reader.columns.keys() | numbers))
 

@@ -202,13 +202,7 @@ def select_rows(
 
     def look(reader: ShardReader) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         """The rows that conditions leave, their ``object_index`` and parts, and the number of all rows."""
-        rows = np.flatnonzero(satisfied(reader, where))
-        index = reader.column("object_index")[rows]
-        several = np.flatnonzero((index >= 0).sum(1) != 1)
-        if single and len(several):
-            count = int((index[several[0]] >= 0).sum())
-            hint = f"choose rows with --where '{OBJECTS_HELD} == 1', or --to mjcf"
-            raise ShardError(f"{reader.path}: row {rows[several[0]]} holds {count} objects, this format one; {hint}")
+        rows, index = chosen_rows(reader, where, single=single)
         parts = np.zeros(len(reader), int) if split is None else split.numbers(reader)
         return rows, index, parts[rows], len(reader)
 
@@ -254,6 +248,24 @@ def select_rows(
         numbers=tuple(numbers or ()),
         _sources=tuple(s._replace(index=place[s.index]) for s in sources if len(s.rows)),
     )
+
+
+def chosen_rows(
+    reader: ShardReader, where: Sequence[Condition], *, single: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of a shard that conditions leave, and their ``object_index``.
+
+    Raises:
+        ShardError: As of :func:`select_rows`.
+    """
+    rows = np.flatnonzero(satisfied(reader, where))
+    index = reader.column("object_index")[rows]
+    several = np.flatnonzero((index >= 0).sum(1) != 1)
+    if single and len(several):
+        count = int((index[several[0]] >= 0).sum())
+        hint = f"choose rows with --where '{OBJECTS_HELD} == 1', or --to mjcf"
+        raise ShardError(f"{reader.path}: row {rows[several[0]]} holds {count} objects, this format one; {hint}")
+    return rows, index
 
 
 def _plane(source: _Source, item: int, plane: int) -> np.ndarray:

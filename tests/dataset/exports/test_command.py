@@ -166,3 +166,16 @@ def test_scenes_hold_their_grasps(tmp_path):
             mujoco.mj_step(model, data)
         kept += np.linalg.norm(data.body("object_0_tiny").xpos - start) < 0.02
     assert kept >= 9
+
+
+def test_what_is_left_out_is_told_once(cli, tmp_path, shards):
+    (tmp_path / "grasps").mkdir()
+    shards.make(tmp_path / "grasps" / "a.h5", n=3)
+    two = [shards.object(), shards.object("jug", digit="2")]
+    shards.make(tmp_path / "grasps" / "b.h5", objects=two, index=np.array([[0, 1], [1, 0]]), n=2)
+    (tmp_path / "grasps" / "c.h5").write_text("no shard")
+    code, out, err = cli("grasps", "--to", "isaac-grasp", "--out", "made")
+    assert code == 0, err
+    assert "3 of 1 object" in out
+    (line,) = set(err.splitlines())  # each call of main adds one that prints it
+    assert "2 of 3 files are left out" in line
