@@ -12,7 +12,7 @@ from lgrasp_cli.options import CacheDir, HandArgument, Quiet, Shards, open_cache
 from lgrasp_cli.tables import Answer, reporting
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from lgrasp.view.server import Site
 
 
 _MOTION = {time / 8: 0.08 if time % 8 else 0.8 for time in (*range(8), *range(8, 17, 2))}
@@ -120,8 +120,8 @@ def view_hand(name: HandArgument, host: Host = "localhost", port: Port = 8080, c
     serve(*open_hand(name, open_cache(cache_dir), host=host, port=port, served=_tell_address))
 
 
-def _tell_address(server: "ViserServer") -> None:
-    echo(f"open http://{server.get_host()}:{server.get_port()} in a browser; Ctrl-C ends this")
+def _tell_address(site: "Site") -> None:
+    echo(f"open http://{site.front.host}:{site.front.port} in a browser; Ctrl-C ends this")
 
 
 def _numbers(text: str) -> list[int]:

@@ -17,6 +17,7 @@ from lgrasp.picture.draw import OBJECTS
 from lgrasp.picture.scene import HandShape
 from lgrasp.view.figure import HandFigure, add_mesh, rgb, show_all
 from lgrasp.view.page import Aim, add_saving
+from lgrasp.view.server import View
 
 if TYPE_CHECKING:
     import viser
@@ -32,7 +33,7 @@ _Nodes = Sequence["viser.SceneNodeHandle"]
 _Make = Callable[[], _Nodes]
 
 
-class HandView:
+class HandView(View):
     """A hand with a slider for each joint that is driven."""
 
     def __init__(self, server: "viser.ViserServer", source: HandSource, model: HandModel) -> None:
@@ -80,9 +81,6 @@ class HandView:
         ]
         links = list(shape.placed(self._listed()).values())
         Aim(links, [], np.array(touching).reshape(-1, 3)).apply(server, np.zeros(3))
-
-    def tick(self, seconds: float) -> None:
-        """Nothing moves by itself."""
 
     def meshes(self) -> trimesh.Scene:
         """The links as they are."""

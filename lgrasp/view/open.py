@@ -13,13 +13,13 @@ from lgrasp.dataset.scenes import SceneRows
 from lgrasp.engine.cache import Cache
 from lgrasp.scenes.schema import FORMAT
 from lgrasp.view.names import kind_of
-from lgrasp.view.server import View, close_server, open_server
+from lgrasp.view.server import Site, View, close_site, open_site
 
 if TYPE_CHECKING:
     import viser
 
 _Make = Callable[["viser.ViserServer"], View]
-_Served = Callable[["viser.ViserServer"], None]
+_Served = Callable[[Site], None]
 
 
 def open_view(
@@ -31,7 +31,7 @@ def open_view(
     row: int = 0,
     where: Sequence[str] = (),
     served: _Served = lambda _: None,
-) -> tuple["viser.ViserServer", View]:
+) -> tuple[Site, View]:
     """A server that shows what is named.
 
     Args:
@@ -46,9 +46,7 @@ def open_view(
     return _opened(_maker(what, cache, row, where), host, port, served)
 
 
-def open_hand(
-    name: str, cache: Cache, *, host: str, port: int, served: _Served = lambda _: None
-) -> tuple["viser.ViserServer", View]:
+def open_hand(name: str, cache: Cache, *, host: str, port: int, served: _Served = lambda _: None) -> tuple[Site, View]:
     """A server that shows a hand, by the user's name for it; ``served`` as of :func:`open_view`.
 
     Raises:
@@ -57,16 +55,17 @@ def open_hand(
     return _opened(_hand(name, cache), host, port, served)
 
 
-def _opened(make: "_Make", host: str, port: int, served: _Served) -> tuple["viser.ViserServer", View]:
-    server = open_server(host, port, "lgrasp")
+def _opened(make: "_Make", host: str, port: int, served: _Served) -> tuple[Site, View]:
+    site = open_site(host, port, "lgrasp")
     try:
-        loading = server.gui.add_markdown("loading")
-        served(server)
-        view = make(server)
+        loading = site.server.gui.add_markdown("loading")
+        served(site)
+        view = make(site.server)
         loading.remove()
-        return server, view
+        site.front.go = view.go
+        return site, view
     except BaseException:
-        close_server(server)
+        close_site(site)
         raise
 
 

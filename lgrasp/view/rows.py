@@ -10,7 +10,9 @@ import trimesh
 from lgrasp.dataset.scenes import SceneRows
 from lgrasp.errors import LgraspError
 from lgrasp.view.figure import STAGE_MARKS, GraspFigure, Marks
+from lgrasp.view.front import row_link
 from lgrasp.view.page import Aim, add_saving
+from lgrasp.view.server import View
 
 if TYPE_CHECKING:
     import viser
@@ -22,7 +24,7 @@ _PAUSE = 1.0  # stages, at the end
 _AS_STORED = "as stored"
 
 
-class RowsView:
+class RowsView(View):
     """The rows of shards.
 
     Args:
@@ -85,6 +87,17 @@ class RowsView:
             self._time.value = min(self._clock, self._time.max)
         else:
             self._clock = None
+
+    def go(self, row: int) -> None:
+        """Show a row, counted through all shards; of all rows, if it does not meet the conditions."""
+        self._rows.place(row)
+        with self._lock:
+            if row not in self.order:
+                self._where.value = ""
+                self._choose()
+            position = int(np.flatnonzero(np.asarray(self.order) == row)[0])
+            self.show(position, int(self._side.value))
+            self._at.value = position
 
     def meshes(self) -> trimesh.Scene:
         """Hands and objects as they are shown."""
@@ -190,4 +203,4 @@ class RowsView:
         for name, value in self._rows.numbers(chosen[0]).items():
             told = f"{value:.4g}" if isinstance(value, float) else str(value)
             lines.append(f"| {name.partition('/')[2]} | {told} |")
-        return "\n".join([*lines, "", f"`lgrasp view {self._told} --row {chosen[0]}`"])
+        return "\n".join([*lines, "", f"{row_link(chosen[0])}, `lgrasp view {self._told} --row {chosen[0]}`"])

@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import trimesh
 
+from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.draw import OBJECTS
 from lgrasp.picture.scene import STAGES, ContactMarks, GraspScene, HandShape, PlacedObject, Step
 from lgrasp.scenes.records import SceneRecord
 from lgrasp.view.figure import STAGE_MARKS, GraspFigure, add_mesh, place, rgb, show_all
+from lgrasp.view.front import row_link
 from lgrasp.view.page import Aim, add_saving
+from lgrasp.view.server import View
 
 if TYPE_CHECKING:
     import viser
@@ -22,7 +25,7 @@ _POINT = 0.0015  # [m]
 _AWAY = 2.0  # times as far as the objects need, to see hand and table
 
 
-class TableView:
+class TableView(View):
     """A scene: objects, table, cloud and its grasps one at a time."""
 
     def __init__(self, server: "viser.ViserServer", scene: SceneRecord) -> None:
@@ -70,8 +73,10 @@ class TableView:
         add_saving(server, self, f"scene-{scene.index}")
         Aim([], [placed.placed for placed in self._objects], np.zeros((0, 3))).apply(server, np.zeros(3), _AWAY)
 
-    def tick(self, seconds: float) -> None:
-        """Nothing moves by itself."""
+    def go(self, row: int) -> None:
+        if not 0 <= row < len(self._rows):
+            raise ConfigError(f"row {row} does not exist; the scene has {len(self._rows)}")
+        self._at.value = int(np.flatnonzero(self._rows == row)[0])
 
     def meshes(self) -> trimesh.Scene:
         """Objects, and the hand."""
@@ -93,10 +98,10 @@ class TableView:
             self._figure.move(self._time.value)
         target = self._objects[grasps.target[row]].record.id
         free = "free of collision" if grasps.collision_free[row] else "collides"
-        self._text.content = f"row {row:,}: {target}, {free}"
+        self._text.content = f"row {row:,}: {target}, {free}; {row_link(row)}"
 
 
-class ObjectView:
+class ObjectView(View):
     """A mesh with its size."""
 
     def __init__(self, server: "viser.ViserServer", name: str, mesh: trimesh.Trimesh, notes: Sequence[str]) -> None:
@@ -108,9 +113,6 @@ class ObjectView:
         server.gui.add_markdown("\n\n".join(lines))
         add_saving(server, self, name)
         Aim([], [mesh], np.zeros((0, 3))).apply(server, np.zeros(3))
-
-    def tick(self, seconds: float) -> None:
-        """Nothing moves by itself."""
 
     def meshes(self) -> trimesh.Scene:
         """The mesh."""

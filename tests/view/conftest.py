@@ -17,21 +17,21 @@ FLAGS = (
 
 @pytest.fixture(scope="session")
 def opened(cache_root: Path) -> Iterator[Callable[..., Any]]:
-    """opened(*what, **options): a view on a free port of this computer; (server, view)."""
+    """opened(*what, **options): a view on a free port of this computer; (site, view)."""
     pytest.importorskip("viser", reason="viser is not installed (extra view)")
     from lgrasp.view.open import open_view
-    from lgrasp.view.server import close_server
+    from lgrasp.view.server import close_site
 
-    servers = []
+    sites = []
 
     def open_(*what: object, **options: Any) -> Any:
-        server, view = open_view([str(w) for w in what], Cache(cache_root), host="127.0.0.1", port=0, **options)
-        servers.append(server)
-        return server, view
+        site, view = open_view([str(w) for w in what], Cache(cache_root), host="127.0.0.1", port=0, **options)
+        sites.append(site)
+        return site, view
 
     yield open_
-    for server in servers:
-        close_server(server)
+    for site in sites:
+        close_site(site)
 
 
 @pytest.fixture(scope="session")
@@ -47,14 +47,14 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any, request: pytest.FixtureRequest) -> Iterator[Callable[[Any], Any]]:
-    """page(server): the page of a server, its scene drawn; it asks nothing of other computers and meets no error."""
+    """page(site): the page of a viewer, its scene drawn; it asks nothing of other computers and meets no error."""
     pages, wrong = [], []
 
-    def visit(server: Any) -> Any:
+    def visit(site: Any) -> Any:
         page = browser.new_page(viewport={"width": 600, "height": 280})
         pages.append(page)
         page.set_default_timeout(60_000)  # software draws
-        here = f"http://127.0.0.1:{server.get_port()}"
+        here = f"http://127.0.0.1:{site.front.port}"
         page.on("request", lambda r: r.url.startswith((here, "blob:", "data:")) or wrong.append(r.url))
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.goto(here)

@@ -26,10 +26,12 @@ def control(page, label: str):
 
 
 def test_rows_of_a_shard(opened, page):
-    server, view = opened(SHARD)
-    tab = page(server)
+    site, view = opened(SHARD)
+    tab = page(site)
     assert orange(screen(tab)) > 50
     tab.get_by_text("next").click()
+    tab.get_by_text("row 1", exact=True).wait_for()
+    tab.get_by_text("link to this row").click()  # the page is loaded again
     tab.get_by_text("row 1", exact=True).wait_for()
     where = control(tab, "where")
     where.fill("metrics/nothing > 0.1")
@@ -46,11 +48,14 @@ def test_rows_of_a_shard(opened, page):
         tab.get_by_text("save picture (PNG)").click()
     with Image.open(download.value.path()) as picture:
         assert orange(picture) > 50
+    tab.goto(f"{tab.url}row/7")  # which does not meet the condition
+    tab.get_by_text("row 7", exact=True).wait_for()
+    assert control(tab, "where").input_value() == ""
 
 
 def test_a_hand_moves(opened, page):
-    server, _ = opened("allegro")
-    tab = page(server)
+    site, _ = opened("allegro")
+    tab = page(site)
     before = np.asarray(screen(tab).convert("L")).astype(int)
     tab.get_by_text("random posture").click()
     for _ in range(40):

@@ -1,6 +1,7 @@
 """What the viewer shows, by what it holds; no browser."""
 
 import sys
+from http.client import HTTPConnection
 
 import numpy as np
 import pytest
@@ -39,6 +40,47 @@ def test_it_begins_at_the_row_that_was_asked(rows):
     assert list(rows.shown) == [3]
     assert "lgrasp view" in rows.told
     assert "--row 3" in rows.told
+
+
+def asked(site, path: str) -> tuple[int, str, str]:
+    """Status, where it leads, text."""
+    connection = HTTPConnection("127.0.0.1", site.front.port, timeout=20)
+    connection.request("GET", path)
+    answer = connection.getresponse()
+    told = answer.status, answer.getheader("Location", ""), answer.read().decode()
+    connection.close()
+    return told
+
+
+def test_a_link_opens_its_row(opened, epsilon):
+    site, rows = opened(SHARD, where=["metrics/epsilon > 0.05"])
+    for row in (int(np.argmax(epsilon)), int(np.argmin(epsilon))):  # the last does not meet the condition
+        assert asked(site, f"/row/{row}")[:2] == (302, "/")
+        assert list(rows.shown) == [row]
+        assert f"](/row/{row})" in rows.told
+    assert list(rows.order) == list(range(10))
+    assert asked(site, "/row/10") == (404, "", "row 10 does not exist; there are 0 to 9")
+    assert list(rows.shown) == [row]
+
+
+def test_all_else_is_viser(opened):
+    site, _ = opened("tiny")
+    status, _, text = asked(site, "/")
+    assert (status, "<html" in text) == (200, True)
+    assert asked(site, "/row/0")[::2] == (404, "there are no rows here")
+    import viser
+    from websockets.sync.client import connect
+    from websockets.typing import Subprotocol
+
+    version = Subprotocol(f"viser-v{viser.__version__}")
+    with connect(f"ws://127.0.0.1:{site.front.port}", subprotocols=[version], max_size=None) as socket:
+        assert len(socket.recv(timeout=20)) > 1000
+
+
+def test_a_link_waits_until_rows_are_there(opened):
+    told = []
+    opened(SHARD, served=lambda site: told.append(asked(site, "/row/3")))
+    assert told == [(503, "", "loading")]
 
 
 def test_conditions_and_order_choose_rows(rows, epsilon):
@@ -129,10 +171,13 @@ def test_a_scene(opened, tmp_path):
         ),
     )
     write_scene(tmp_path / "scene.h5", scene)
-    shown = opened(tmp_path)[1].meshes()
+    site, view = opened(tmp_path)
+    shown = view.meshes()
     cube, palm = shown.geometry["object0"], shown.graph.get("base")[0]
     np.testing.assert_allclose(cube.bounds.mean(0), [0, 0, 0.02], atol=1e-6)
     assert palm[2, 3] == pytest.approx(0.4)
+    assert asked(site, "/row/0")[:2] == (302, "/")
+    assert view.meshes().graph.get("base")[0][2, 3] == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(
