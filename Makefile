@@ -1,6 +1,7 @@
 # Everything runs in .venv inside this checkout. `make demo` and `make test` set it up first.
 
 VENV := .venv
+comma := ,
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
 # Python compiles what is imported; compiling every file of every package takes long.
@@ -8,7 +9,10 @@ PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-c
 # pip reads the index and unpacks one package at a time: the pinned versions come in two lists beside each other first,
 # half of all bytes in each; then it has little to look up. Python 3.11 keeps the setuptools that it has.
 LARGE := torch warp-lang usd-core pyright sympy numpy matplotlib
-OTHERS := $(filter-out $(LARGE) setuptools,$(shell sed -n 's/==.*//p' constraints.txt))
+# The viewer is tested in chromium, where there is one.
+CHROMIUM := $(shell command -v chromium 2>/dev/null)
+BROWSER := playwright greenlet
+OTHERS := $(filter-out $(LARGE) setuptools $(if $(CHROMIUM),,$(BROWSER)),$(shell sed -n 's/==.*//p' constraints.txt))
 
 # The first of these that is Python 3.11 or 3.12; or say which: make setup PYTHON=/path/to/python
 ifndef PYTHON
@@ -32,7 +36,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "lgrasp needs Python 3.11 or 3.12; give its path: make setup PYTHON=..." >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) --no-deps $(LARGE) & large=$$!; $(PIP) --no-deps $(OTHERS) && wait $$large
-	$(PIP) --no-build-isolation -e ".[dev,sim]"
+	$(PIP) --no-build-isolation -e ".[dev,sim$(if $(CHROMIUM),$(comma)browser)]"
 	@touch $@
 
 demo: setup

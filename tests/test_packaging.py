@@ -190,6 +190,14 @@ def test_command_line_starts_light():
     assert result.stdout.strip() == "[]"
 
 
+@pytest.mark.parametrize("chromium", ["", "/usr/bin/chromium"])
+def test_playwright_is_installed_where_chromium_is(chromium):
+    command = ["make", "--dry-run", "--always-make", "setup", f"CHROMIUM={chromium}"]
+    told = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    for words in ("playwright", "greenlet", "dev,sim,browser"):
+        assert (words in told) is bool(chromium)
+
+
 def test_wheel_carries_the_data(tmp_path):
     wheel_builder = pytest.importorskip("hatchling.builders.wheel").WheelBuilder(str(ROOT))
     (wheel,) = wheel_builder.build(directory=str(tmp_path), versions=["standard"])

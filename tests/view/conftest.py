@@ -1,5 +1,6 @@
 """A browser, where Debian's chromium and playwright are, and views in it."""
 
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,6 @@ import pytest
 
 from lgrasp.engine.cache import Cache
 
-CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = (
     "--no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --no-first-run "
     "--disable-quic --disable-background-networking --disable-component-update --disable-sync"
@@ -36,11 +36,12 @@ def opened(cache_root: Path) -> Iterator[Callable[..., Any]]:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if not CHROMIUM.exists():
+    chromium = shutil.which("chromium")
+    if not chromium:
         pytest.skip("chromium is not installed")
+    api = pytest.importorskip("playwright.sync_api", reason='playwright is not: pip install -e ".[browser]"')
     with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS.split())
         yield browser
         browser.close()
 
