@@ -40,6 +40,7 @@ class Bar:
         self._said = time.monotonic()
         self._went: deque[tuple[float, float]] = deque()  # when, how far: of the last minute
         self._what: Any = None
+        self._begun = False  # something of it was done
         self._bar: Any = None
         self._task: Any = None
 
@@ -65,18 +66,21 @@ class Bar:
         if self._bar:
             self._bar.stop()
 
-    def show(self, what: str, done: int | None = None, total: int = 0, note: str = "", ahead: float = 0.0) -> None:
+    def show(
+        self, what: str, done: int | None = None, total: int = 0, note: str = "", ahead: float = 0.0, kept: int = 0
+    ) -> None:
         """Show the current activity, and how much is done if that is known.
 
         Args:
             ahead: how many more what is being made now is worth.
+            kept: how many were done before this run.
         """
         if done is None:
             self._tell(what, "", None, note)
         elif not total:
             self._tell(what, f"{done:,}", None, note)
         else:
-            speed = self._speed(what, total, done + ahead)
+            speed = self._speed(what, total, done - kept + ahead)
             rate = f"{speed:,.0f}/s" if speed > 9.95 else f"{speed:.1f}/s" if speed > 0.2 else f"{60 * speed:.1f}/min"
             left = f"{_time((total - done - ahead) / speed)} left  {rate}" if speed and done < total else ""
             self._tell(what, f"{done:,}/{total:,}", (done + ahead) / total, "  ".join(filter(None, (left, note))))
@@ -95,14 +99,19 @@ class Bar:
             say(line)
 
     def _speed(self, *at: Any) -> float:
-        """How much is done in a second; 0 if that is not known yet.
+        """How much is done in a second, from the first result on: what is prepared before it takes time only once.
+        0 if that is not known yet.
 
         Args:
-            at: what it is that goes on, and how far it is.
+            at: what it is that goes on, and how much of it was done in this run.
         """
         *what, done = at
-        if what != self._what or (self._went and done < self._went[-1][1]):
-            self._what = what
+        last = self._went[-1][1] if self._went else done
+        if what != self._what:
+            self._what, self._begun = what, False
+            self._went.clear()
+        elif done < last or (done > last and not self._begun):
+            self._begun = self._begun or done > last
             self._went.clear()
         self._went.append((time.monotonic(), done))
         while len(self._went) > 2 and self._went[-1][0] - self._went[1][0] > _LOOK_BACK:
@@ -141,6 +150,7 @@ class JobProgress(Events):
         self._lock = threading.Lock()  # held while the bar is changed
         self._rows: dict[int, int] = {}  # done, by part
         self._asked: dict[int, int] = {}
+        self._kept: dict[int, int] = {}  # done before this run
 
     def said(self, words: str) -> None:
         self._bar.say(words)
@@ -150,12 +160,13 @@ class JobProgress(Events):
 
     def started(self, parts: "Sequence[Part]", present: Mapping[int, int]) -> None:
         self.running = True
-        self._asked, self._rows = {part.number: part.rows for part in parts}, dict(present)
+        self._asked = {part.number: part.rows for part in parts}
+        self._rows, self._kept = dict(present), dict(present)
         self._show()
 
-    def advanced(self, part: "Part", done: int, note: str = "", ahead: float = 0.0) -> None:
+    def advanced(self, part: "Part", done: int, note: str = "", ahead: float = 0.0, kept: int = 0) -> None:
         with self._lock:
-            self._rows[part.number], self._asked[part.number] = done, part.rows
+            self._rows[part.number], self._asked[part.number], self._kept[part.number] = done, part.rows, kept
             self._show(note, ahead)
 
     def wrote(self, part: "Part", made: "Made") -> None:
@@ -164,7 +175,8 @@ class JobProgress(Events):
             self._show()
 
     def _show(self, note: str = "", ahead: float = 0.0) -> None:
-        self._bar.show(self._unit, sum(self._rows.values()), sum(self._asked.values()), note, ahead)
+        done, total, kept = (sum(counts.values()) for counts in (self._rows, self._asked, self._kept))
+        self._bar.show(self._unit, done, total, note, ahead, kept)
 
     def cancelled(self) -> bool:
         return self.stop

@@ -109,8 +109,9 @@ class Events:
     def started(self, parts: Sequence[Part], present: Mapping[int, int]) -> None:
         """Inputs are ready; ``present`` are the rows of the parts, by number, that are on disk already."""
 
-    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0) -> None:
-        """``done`` rows of a part are made so far; work on ``ahead`` more is done, as far as can be told.
+    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0, kept: int = 0) -> None:
+        """``done`` rows of a part are made so far, ``kept`` of them before this run; work on ``ahead`` more is done, as
+        far as can be told.
 
         Called on a thread of the part's own where parts are made side by side.
         """
@@ -130,13 +131,13 @@ class PartProgress:
     events: Events
     part: Part
 
-    def __call__(self, done: int, note: str = "", ahead: float = 0.0) -> None:
+    def __call__(self, done: int, note: str = "", ahead: float = 0.0, kept: int = 0) -> None:
         """Tell the rows done so far; see :meth:`Events.advanced`.
 
         Raises:
             CancelledError: the job is to stop, and rows are missing.
         """
-        self.events.advanced(self.part, done, note, ahead)
+        self.events.advanced(self.part, done, note, ahead, kept)
         if not 0 < self.part.rows <= done:
             self.check()
 

@@ -59,6 +59,7 @@ class ShardResult:
     candidates: int = 0
     duplicates: int = 0
     exhausted: bool = False  # the effort bound was reached before the rows were
+    resumed: int = 0  # rows that an earlier run found
     tally: Counter[str] = field(default_factory=Counter)  # what the job counts among its rows
 
 
@@ -316,6 +317,7 @@ class _Rows:
         result.counts, result.seconds, result.wall = account.counts, account.seconds, account.wall
         result.candidates, result.duplicates = account.candidates, account.duplicates
         self.add(take_rows(table, slice(account.kept, None)))
+        result.resumed = self.count
 
     def account(self, *, interrupted: bool = False) -> Account:
         """How far the shard has come."""

@@ -137,7 +137,7 @@ class GenerateJob(GenerateRequest, SearchJob):
             bank_cache=self.cache,
             banked=part.rows < self.shard_rows or part.number in self._growing,
             resume=part.number in self._growing,
-            progress=lambda rows, _: progress(rows),
+            progress=lambda rows, result: progress(rows, kept=result.resumed),
         )
         if self._writers is None and self.writers() > 1:  # the first part is made alone
             self._writers = ProcessPool(self.writers())

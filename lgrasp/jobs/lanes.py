@@ -116,17 +116,18 @@ class Lanes:
 
 
 class _Far(NamedTuple):
-    """How far a part is; ``rows``: it is on disk, with so many."""
+    """How far a part is, see :meth:`Events.advanced`; ``rows``: it is on disk, with so many."""
 
     part: Part
     done: int
     note: str = ""
     ahead: float = 0.0
+    kept: int = 0
     rows: int | None = None
 
     def tell(self, events: Events) -> None:
         if self.rows is None:
-            events.advanced(self.part, self.done, self.note, self.ahead)
+            events.advanced(self.part, self.done, self.note, self.ahead, self.kept)
         else:
             events.wrote(self.part, Made(self.rows))
 
@@ -139,12 +140,13 @@ class _Telling(Events):
 
     def started(self, parts: Sequence[Part], present: Mapping[int, int]) -> None:
         for part in (part for part in parts if part.number in present):
-            self.wrote(part, Made(present[part.number]))
+            rows = present[part.number]
+            self._link.send((self._number, _Far(part, rows, kept=rows)))
 
-    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0) -> None:
+    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0, kept: int = 0) -> None:
         if time.monotonic() - self._last > _OFTEN:
             self._last = time.monotonic()
-            self._link.send((self._number, _Far(part, done, note, ahead)))
+            self._link.send((self._number, _Far(part, done, note, ahead, kept)))
 
     def wrote(self, part: Part, made: Made) -> None:
         self._link.send((self._number, _Far(part, made.rows, rows=made.rows)))

@@ -75,8 +75,11 @@ class SimulateJob(SimulateRequest, VerdictJob):
                 self.cache, self.part_key(part), name, largest=GPU_BLOCK if self._kind() == "gpu" else None
             )
 
+            before = kept.rows
+
             def told(done: int, held: int) -> None:
-                progress(kept.rows + done, f"{(kept.held + held) / max(kept.rows + done, 1):.0%} hold")
+                note = f"{(kept.held + held) / max(kept.rows + done, 1):.0%} hold"
+                progress(kept.rows + done, note, kept=before)
 
             while (block := kept.next_block(rows, workers)) or not kept.columns:
                 found = verdicts(

@@ -174,7 +174,7 @@ class Shown(Bar):
 
     last = (0, 0)
 
-    def show(self, what, done=None, total=0, note="", ahead=0.0):
+    def show(self, what, done=None, total=0, *more):
         self.last = done, total
 
 

@@ -25,7 +25,7 @@ class Watch(Events):
     def __init__(self) -> None:
         self.seen: list[int] = []
 
-    def advanced(self, part, done, note="", ahead=0.0) -> None:
+    def advanced(self, part, done, *more) -> None:
         self.seen.append(done)
 
 

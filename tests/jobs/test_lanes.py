@@ -33,10 +33,13 @@ class SlowJob(SampleJob):
 
 class Heard(Events):
     def __init__(self) -> None:
-        self.parts, self.rows, self.asked = set(), 0, 0
+        self.parts, self.rows, self.asked, self.kept = set(), 0, 0, {}
 
     def started(self, parts, present):
         self.asked = sum(part.rows for part in parts)
+
+    def advanced(self, part, done, note="", ahead=0.0, kept=0):
+        self.kept[part.number] = kept
 
     def wrote(self, part, made):
         self.parts.add(part.number)
@@ -59,7 +62,8 @@ def test_lanes_share_the_files_of_jobs(tmp_path):
         made = lanes.outcome(0, jobs[0], events)
         assert (made.present, made.made, made.lanes) == (2, 8, 2)
         assert [part.number for part, _ in made.made_parts] == [1, 2, 3, 4]
-        assert (events.parts, events.rows, events.asked) == ({0, 1, 2, 3, 4}, 10, 10)
+        assert (events.parts, events.rows, events.asked) == ({1, 2, 3, 4}, 8, 10)
+        assert sum(events.kept.values()) == events.kept[0] == 2
         for one, other in zip(sorted(single.out.glob("*.h5")), sorted(jobs[0].out.glob("*.h5")), strict=True):
             mine, theirs = read_shard(one), read_shard(other)
             np.testing.assert_array_equal(mine.grasps.q, theirs.grasps.q)

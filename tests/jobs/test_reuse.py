@@ -69,6 +69,8 @@ def test_going_on_gives_the_rows_of_a_run_without_a_break(name, request, load, c
     begun = make_shard(pipeline, source, 0, few, Execution(1, 256), bank_cache=cache)
     before = dict(calls)
     grown = make_shard(pipeline, source, 0, many, Execution(2, 256), bank_cache=cache)
+    assert begun.resumed == 0
+    assert few <= grown.resumed <= many
     assert_same(whole.grasps, grown.grasps)
     assert grown.counts == whole.counts
     assert (grown.candidates, grown.duplicates) == (whole.candidates, whole.duplicates)

@@ -49,14 +49,14 @@ def lines(terminal) -> list[str]:
 
 
 def test_nothing_but_the_bar_is_cut(terminal, clock):
-    clock(0, 0, 10)
+    clock(0, 0, 5, 15)
     screen = terminal()
     with Bar() as bar:
-        bar.show("sequences", 1_000_000, 2_000_000, "612,345 hold")
-        bar.show("sequences", 1_010_000, 2_000_000, "612,345 hold")
+        for done in (1_000_000, 1_000_100, 1_010_100):
+            bar.show("sequences", done, 2_000_000, "612,345 hold")
     found = lines(screen)
     assert max(map(len, found)) <= 80
-    assert re.search(r"^sequences .*1,010,000/2,000,000 .* 0:16:30 left  1,000/s  612,345 hold$", found[-1])
+    assert re.search(r"^sequences .*1,010,100/2,000,000 .* 0:16:30 left  1,000/s  612,345 hold$", found[-1])
 
 
 def test_the_clock_goes_on_when_something_is_full(terminal):
@@ -70,12 +70,32 @@ def test_the_clock_goes_on_when_something_is_full(terminal):
 
 def test_work_on_rows_to_come_counts(terminal, clock):
     """A round of sequences takes long and gives all of them at its end."""
-    clock(0, 0, 30)
+    clock(0, 0, 5, 35)
     screen = terminal()
     with Bar() as bar:
-        bar.show("sequences", 0, 100)
-        bar.show("sequences", 0, 100, ahead=25)
-    assert re.search(r"0/100 .* 0:01:30 left  0.8/s", lines(screen)[-1])
+        for ahead in (0, 1, 25):
+            bar.show("sequences", 0, 100, ahead=ahead)
+    assert re.search(r"0/100 .* 0:01:34 left  0.8/s", lines(screen)[-1])
+
+
+def test_preparation_and_rows_of_an_earlier_run_are_no_speed(clock):
+    """Of 2,000 rows 900 are there, 100 of them in a file that is complete; the object is cut for 100 s."""
+    clock(0, 0, 100, 110, 120)
+    shown = []
+    bar = Bar(quiet=True)
+    bar._tell = lambda what, count, share, tail: shown.append((count, tail))
+    whole, begun, other = (Part(number, Path(), rows) for number, rows in enumerate((100, 1000, 900)))
+    told = JobProgress(bar, "grasps")
+    told.started([whole, begun, other], {0: 100})
+    told.advanced(begun, 801, kept=800)
+    told.advanced(begun, 811, kept=800)
+    told.advanced(other, 510, kept=500)  # begun by the same run, made beside it
+    assert shown == [
+        ("100/2,000", ""),
+        ("901/2,000", ""),
+        ("911/2,000", "0:18:09 left  1.0/s"),
+        ("1,421/2,000", "0:09:39 left  1.0/s"),
+    ]
 
 
 def test_parts_made_side_by_side_tell_one_after_another():
@@ -99,11 +119,11 @@ def test_parts_made_side_by_side_tell_one_after_another():
 
 
 def test_lines_where_there_is_no_terminal(clock, capsys):
-    clock(0, 0, 5, 11, 11, 11, 11)
+    clock(0, 0, 5, 6, 6, 17, 17, 17)
     with Bar() as bar:
-        for done in (0, 10):
+        for done in (0, 1, 11):
             bar.show("rows", done, 100, "7 hold")
-    assert capsys.readouterr().err == "rows  10/100  0:01:39 left  0.9/s  7 hold\n"
+    assert capsys.readouterr().err == "rows  11/100  0:01:38 left  0.9/s  7 hold\n"
 
 
 def test_tables_fit(monkeypatch):

@@ -21,6 +21,7 @@ from lgrasp.engine.listing import Renewing
 from lgrasp.jobs import kept_verdicts, simulate
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.verdict import FREE_LIFT_COLUMNS
+from lgrasp_cli.progress import JobProgress
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -224,8 +225,11 @@ def test_verdicts_so_far_are_kept(cli, grasps, tmp_path, monkeypatch, shared_cac
     result = cli("simulate", path, "--workers", 1)
     assert result.code == 130
     assert "interrupted: verdicts of 4 grasps are kept; the same command makes the rest" in result.err
+    told = []
+    monkeypatch.setattr(JobProgress, "advanced", lambda self, part, done, note, ahead, kept: told.append((done, kept)))
     result = cli("simulate", path, "--workers", 1, "--json", "-")
     assert result.code == 0, result
+    assert told == [(5, 4)]  # those of the run before are no work of this one
     assert blocks == [[0, 1], [2, 3], [4], [4]]
     (entry,) = json.loads(result.out)["results"]
     assert (entry["rows"], entry["held"]) == (5, 2)

@@ -62,7 +62,7 @@ class _Told(Events):
     def said(self, words: str) -> None:
         self._progress.events.said(words)
 
-    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0) -> None:
+    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0, kept: int = 0) -> None:
         # the last row is told when the part is on disk: until then it may be stopped
         self._progress(min(done if self._rows is None else self._rows, self._progress.part.rows - 1), self._what)
 

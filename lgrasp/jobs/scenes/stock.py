@@ -110,7 +110,7 @@ class _OfObject(Events):
     def loading(self, what: str, share: float = 0.0) -> None:
         self._events.loading(what, share)
 
-    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0) -> None:
+    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0, kept: int = 0) -> None:
         self._events.loading(self._what, done / part.rows)
 
 
