@@ -1,5 +1,5 @@
-"""README, quickstart and the page on steering run as written, but with fewer rows, in an empty folder; README with
-what a wheel installs."""
+"""README, quickstart and the page on steering run as written, but with fewer rows, in an empty folder; the first two
+with what a wheel installs."""
 
 import json
 import os
@@ -48,11 +48,10 @@ def commands(block: str) -> Iterator[list[str]]:
         yield [*words, *FEWER.get(words[0], ())]
 
 
-@pytest.mark.parametrize("page", ["docs/guides/quickstart.md", "docs/guides/steer.md"])
-def test_a_page_runs_as_written(cli, page, tmp_path):
+def test_steering_runs_as_written(cli, tmp_path):
     pytest.importorskip("mujoco")
     ran = 0
-    for language, block in blocks(page):
+    for language, block in blocks("docs/guides/steer.md"):
         if language == "python":
             exec(block, {})
             continue
@@ -65,24 +64,30 @@ def test_a_page_runs_as_written(cli, page, tmp_path):
     assert list(tmp_path.glob("grasps/allegro-mug/robust*/*.h5"))
 
 
-def test_readme_runs_with_a_wheel(shared_cache, tmp_path):
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """A folder with what the wheel holds."""
+    builder = pytest.importorskip("hatchling.builders.wheel").WheelBuilder(str(ROOT))
+    folder = tmp_path_factory.mktemp("wheel")
+    (wheel,) = builder.build(directory=str(folder), versions=["standard"])
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "installed")
+    return folder / "installed"
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/guides/quickstart.md"])
+def test_a_page_runs_with_a_wheel(page, installed, shared_cache, tmp_path):
     """Nothing but what the wheel holds is there of the project."""
     pytest.importorskip("mujoco")
-    builder = pytest.importorskip("hatchling.builders.wheel").WheelBuilder(str(ROOT))
-    (wheel,) = builder.build(directory=str(tmp_path / "dist"), versions=["standard"])
-    installed, empty = tmp_path / "installed", tmp_path / "empty"
-    empty.mkdir()
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(installed)
-    ran = [words for language, block in blocks("README.md") if language == "bash" for words in commands(block)]
+    ran = [words for language, block in blocks(page) if language == "bash" for words in commands(block)]
     assert len(ran) >= 5
     env = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "LGRASP_"))}
     env |= {"PYTHONPATH": str(installed), "LGRASP_CACHE_DIR": str(shared_cache)}
     env["WARP_CACHE_PATH"] = str(Path(wp.config.kernel_cache_dir).parent)  # Warp adds its version
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], input=json.dumps(ran), env=env, cwd=empty, capture_output=True, text=True
+        [sys.executable, "-c", SCRIPT], input=json.dumps(ran), env=env, cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(str(installed))
     assert "warning" not in done.stderr
-    assert list(empty.glob("grasps/allegro-mug/robust*/*.h5"))
+    assert list(tmp_path.glob("grasps/allegro-mug/robust*/*.h5"))
