@@ -40,7 +40,7 @@ app = typer.Typer(
 
 _List = Annotated[str | None, Option(help="Names or files, separated by commas.", show_default="the published")]
 _ObjectDir = Annotated[Path | None, Option(help="Folder where the names of objects are looked up first.")]
-_Resume = Annotated[bool, Option("--resume", help="Keep what --json PATH holds.")]
+_Resume = Annotated[bool, Option("--resume", help="Keep the results that --json PATH already holds.")]
 _Repeat = Annotated[int, Option(min=1, help="Runs of each pipeline and object.")]
 
 
@@ -173,11 +173,11 @@ def bench_sequence(
     ] = "seq6",
     scale: Annotated[str, Option(help="Factor to metres, or range of the longest side [m].")] = "0.06:0.10",
     pipeline: Annotated[
-        str, Option("--pipeline", "-p", help="Name of a pipeline with stage sequence, or a YAML file.", **PIPELINE)
+        str, Option("--pipeline", "-p", help="Name of a sequence pipeline, or a YAML file.", **PIPELINE)
     ] = "sequence",
     model: Annotated[
         str | None,
-        Option(help="Also draw with this network, a file or a name of learn list (pipeline sample).", **NETWORK),
+        Option(help="Also draw with this network, a file or a name from learn list (pipeline sample).", **NETWORK),
     ] = None,
     settings: Settings = None,
     seed: Annotated[int, Option(min=0, help="Seed of the sequences and the grasps.")] = 0,
@@ -277,15 +277,15 @@ def bench_refine(
 
 @app.command("soak")
 def bench_soak(
-    rounds: Annotated[int, Option(min=1, help="Times that every command is ended by every signal.")] = 1,
-    hours: Annotated[float, Option(min=0, help="Go on for so long, however many rounds that takes.")] = 0.0,
-    seed: Annotated[int, Option(min=0, help="Seed of the moments.")] = 0,
+    rounds: Annotated[int, Option(min=1, help="How often every command is ended by every signal.")] = 1,
+    hours: Annotated[float, Option(min=0, help="Continue for this long, however many rounds that takes.")] = 0.0,
+    seed: Annotated[int, Option(min=0, help="Seed of the random moments.")] = 0,
     commands: Annotated[str | None, Option(help="Commands, separated by commas.", show_default="all")] = None,
     signals: Annotated[str | None, Option(help="Ways to end them, separated by commas.", show_default="all")] = None,
     json_path: JsonPath = None,
     quiet: Quiet = False,
 ) -> None:
-    """End every command that writes at random moments, run it again, and compare with an uninterrupted run.
+    """Kill each command that writes files at random moments, rerun it, and compare with an uninterrupted run.
 
     Small runs, each a process in a temporary folder. Reported are files that differ or are left over, processes that
     are still there after a minute, and wrong exit codes; exit code 1 if there is any of that. --json PATH is written

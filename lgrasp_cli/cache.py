@@ -26,7 +26,7 @@ def path(cache_dir: CacheDir = None) -> None:
 @app.command("list")
 @reporting
 def list_entries(
-    files: Annotated[bool, Option("--files", help="One line for every file.")] = False, cache_dir: CacheDir = None
+    files: Annotated[bool, Option("--files", help="One line per file.")] = False, cache_dir: CacheDir = None
 ) -> Answer:
     """List what is in the cache, by kind.
 

@@ -57,16 +57,16 @@ def make_objects(
     out: Annotated[Path, Option("--out", help="Folder of the meshes.")],
     count: Annotated[int, Option("-n", min=1, max=100_000, help="Objects.")] = 40,
     kinds: Annotated[
-        list[str] | None, Option("--kind", **one_of(ShapeKind, "KIND", "Repeatable; default all."))
+        list[str] | None, Option("--kind", **one_of(ShapeKind, "KIND", "Kind of object; repeatable; default all."))
     ] = None,
     size: Annotated[
         str | None, Option(help="Range of the longest side [m], such as 0.04:0.12; default: that of the kind.")
     ] = None,
     seed: Annotated[int, Option(min=0, max=2**31 - 1, help="The same seed makes the same objects.")] = 0,
-    overwrite: Annotated[bool, Option("--overwrite", help="Replace files of other contents.")] = False,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace files whose contents differ.")] = False,
     quiet: Quiet = False,
 ) -> Answer:
-    """Make meshes with drawn sizes: KIND-SEED-NUMBER.obj, watertight, in metres. Files that are there stay.
+    """Make meshes of random sizes: KIND-SEED-NUMBER.obj, watertight, in metres. Existing files are kept.
 
     Example: lgrasp objects make -n 40 --kind mug --kind bottle --out meshes
     """

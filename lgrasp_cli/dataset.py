@@ -69,7 +69,7 @@ def merge(
     manifest: Annotated[
         Path | None, Option(help="List of shards to check against; by default manifest.json of a single folder.")
     ] = None,
-    partial: Annotated[bool, Option("--partial", help="Merge what is there, though the list has more.")] = False,
+    partial: Annotated[bool, Option("--partial", help="Merge what is there, even if the list has more.")] = False,
 ) -> None:
     """Put the rows of shards of one hand, object and run into one file.
 
@@ -104,9 +104,10 @@ def metrics(
         ),
     ] = None,
 ) -> None:
-    """Copy shards and add quality metrics to the copies; existing copies are kept. hold tries how grasps hold.
+    """Copy shards and add quality metrics to the copies; existing copies are kept.
 
-    Subfolders are searched and recreated in --out. docs/reference/metrics.md defines the metrics.
+    Metric hold tests how well grasps hold. Subfolders are searched and recreated in --out.
+    docs/reference/metrics.md defines the metrics.
 
     Example: lgrasp dataset metrics grasps/allegro-mug/robust --add volume,epsilon_exact -o grasps/measured
     """
@@ -263,7 +264,7 @@ def export(
     how: How,
     to: Annotated[str, Option(**one_of(FormatName, "FORMAT", "Format to write."))],
     out: Annotated[Path, Option("--out", "-o", help="Folder to write; it must be empty or not exist yet.")],
-    limit: Annotated[int | None, Option(help="Largest number of grasps.")] = None,
+    limit: Annotated[int | None, Option(help="Export at most so many grasps.")] = None,
     where: Annotated[
         list[str] | None,
         Option(
@@ -275,7 +276,7 @@ def export(
     ] = False,
     split_file: Annotated[
         Path | None,
-        Option("--split", help="File of dataset split; each part gets own files (webdataset)."),
+        Option("--split", help="File written by dataset split; each part gets its own files (webdataset)."),
     ] = None,
     licence: Annotated[
         str, Option(metavar="SPDX", help="Add a card with this licence, provenance and checksums.")

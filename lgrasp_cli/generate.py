@@ -42,12 +42,15 @@ def generate(
     settings: Settings = None,
     out: Annotated[
         Path | None,
-        Option(help="Folder of the shards (of several jobs: of HAND-OBJECT/PIPELINE); default: that one, in grasps."),
+        Option(
+            help="Folder of the shards (several jobs: of folders HAND-OBJECT/PIPELINE); "
+            "default: grasps/HAND-OBJECT/PIPELINE."
+        ),
     ] = None,
     seed: Seed = None,
     contacts: Contacts = None,
     scale: Scale = 1.0,
-    batch: Annotated[int, Option(min=0, help="Candidates per batch; 0: by device.")] = 0,
+    batch: Annotated[int, Option(min=0, help="Candidates per batch; 0: as suits the device.")] = 0,
     simulate: Annotated[
         str | None,
         Option(**one_of(ProtocolName, "PROTOCOL", "Keep only rows that hold in a simulation.")),
@@ -60,11 +63,12 @@ def generate(
         Option(
             min=1,
             max=64,
-            help="Searches per successful pose: faster, but fewer poses; default: the pipeline's.",
+            help="Searches per successful pose; more are faster, but give fewer poses; default: the pipeline's.",
         ),
     ] = None,
     score: Annotated[
-        str | None, Option(**one_of(ScoreName, "SCORE", "Residual that the search lowers: without friction, or with."))
+        str | None,
+        Option(**one_of(ScoreName, "SCORE", "Residual that the search minimises, without or with friction.")),
     ] = None,
     grasp_type: GraspType = None,
     fingers: Fingers = None,
@@ -79,7 +83,7 @@ def generate(
     table: Annotated[bool, Option("--table", help="Leave room for the table that the object rests on.")] = False,
     negatives: Annotated[
         float,
-        Option(min=0, max=100, metavar="SHARE", help="Failed rows kept for each grasp, with metric 'valid' 0."),
+        Option(min=0, max=100, metavar="SHARE", help="Failed rows to keep per grasp, with metric 'valid' 0."),
     ] = 0.0,
     dry_run: DryRun = False,
 ) -> None:

@@ -36,7 +36,7 @@ _PRIMITIVE = "primitive approximation"
 @app.command("list")
 @reporting
 def list_hands() -> Answer:
-    """List the hands that can be used by name, and those of packages of PyPI, installed or not.
+    """List the hands that can be used by name, and those in PyPI packages, installed or not.
 
     Example: lgrasp hands list
     """
@@ -107,11 +107,11 @@ def add_hand(
     out: Annotated[Path | None, Option(help="Folder of the hand; default: hands/NAME in your data folder.")] = None,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace the hand of that name.")] = False,
     root: Annotated[
-        str | None, Option(metavar="LINK", help="Of a whole robot, take the hand that this link (or body) carries.")
+        str | None, Option(metavar="LINK", help="Take only the hand that this link (or body) of a whole robot carries.")
     ] = None,
     mesh_dir: Annotated[
         list[Path] | None,
-        Option(exists=True, file_okay=False, help="Folder of meshes that are not below the file's; repeatable."),
+        Option(exists=True, file_okay=False, help="Further folder of meshes; repeatable."),
     ] = None,
 ) -> None:
     """Draft a hand from its URDF or MJCF: fingers, palmar surface, canonical box, open posture.

@@ -56,7 +56,7 @@ def fit(
     """Train a network on grasps.
 
     grasp draws grasps from a cloud, for lgrasp plan --model. coarse predicts them too, trained through unrolled steps
-    of the refiner. diffuser draws the next step of sequences. pose tells which poses to search.
+    of the refiner. diffuser draws the next step of sequences. pose says which poses to search.
 
     Example: lgrasp learn fit grasps --out coarse.pt
 
@@ -96,10 +96,10 @@ def fit(
 @app.command(name="eval")
 @reporting
 def evaluate(
-    predictor: Annotated[str, Argument(help="File written by lgrasp learn fit, or a name of learn list.", **NETWORK)],
+    predictor: Annotated[str, Argument(help="File written by lgrasp learn fit, or a name from learn list.", **NETWORK)],
     shards: Shards,
     clouds: Annotated[int, Option(min=1, help="New clouds per object (grasp: of each kind).")] = 8,
-    starts: Annotated[int, Option("--starts", "-n", min=1, help="Plans of each cloud (grasp).")] = 8,
+    starts: Annotated[int, Option("--starts", "-n", min=1, help="Plans per cloud (grasp).")] = 8,
     seed: Annotated[int, Option(min=0, help="Seed of the clouds.")] = 1,
     out: Annotated[Path | None, Option(help="Folder for the plans, as shards of the true meshes (grasp).")] = None,
     device: Device = "auto",
@@ -108,9 +108,9 @@ def evaluate(
 ) -> Answer:
     """Measure a network on shards.
 
-    coarse: the best four answers for each new cloud: energies by rounds of the refiner; what is valid, before and after
-    refine --coarse. grasp: plans from new clouds of all sides and of one, checked on the true meshes. diffuser: the
-    loss, and penetration of draws as they come.
+    coarse: the best four answers per new cloud, with their energy by rounds of the refiner and how many are valid
+    before and after refine --coarse. grasp: plans from new clouds of all sides and of one side, checked on the true
+    meshes. diffuser: the loss, and the penetration of raw draws.
 
     Example: lgrasp learn eval grasp.pt grasps --out plans
     """
@@ -207,7 +207,7 @@ def list_networks() -> Answer:
 @app.command()
 @reporting
 def show(
-    network: Annotated[str, Argument(help="File written by lgrasp learn fit, or a name of learn list.", **NETWORK)],
+    network: Annotated[str, Argument(help="File written by lgrasp learn fit, or a name from learn list.", **NETWORK)],
     plot: Annotated[Path | None, Option(metavar="FILE.png", help="Also draw the losses along its training.")] = None,
 ) -> Answer:
     """Show the card of a network: what it learnt from, how good it is, the losses along its training.

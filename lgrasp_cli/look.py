@@ -33,11 +33,11 @@ def render(
     out: Annotated[Path, Option("--out", "-o", help="File to write: .png, .jpg, .webp, or .gif, which moves.")] = Path(
         "grasps.png"
     ),
-    count: Annotated[int, Option("-n", min=1, max=400, help="Rows, evenly over all.")] = 16,
+    count: Annotated[int, Option("-n", min=1, max=400, help="Rows to draw, spread evenly over all.")] = 16,
     rows: Annotated[str | None, Option(help="Numbers of rows, counted through all shards, such as 0,5,9.")] = None,
-    stage: Annotated[StageName | None, Option(help="Posture of the hand; default: grasp, in a .gif all.")] = None,
+    stage: Annotated[StageName | None, Option(help="Posture of the hand; default: grasp; a .gif shows all.")] = None,
     size: Annotated[int, Option(min=32, max=2048, help="Pixels of a side of each picture.")] = 256,
-    columns: Annotated[int, Option(min=0, help="Pictures in a line; 0: as many as lines.")] = 0,
+    columns: Annotated[int, Option(min=0, help="Pictures per line; 0: as many as lines.")] = 0,
     quiet: Quiet = False,
 ) -> Answer:
     """Draw grasps side by side: hand, objects, contacts as dots. Needs no screen and no GPU.
@@ -74,8 +74,8 @@ def render(
     return Answer({"out": str(out), "rows": chosen, "of": len(found)}, [] if quiet else [told])
 
 
-Host = Annotated[str, Option(help="Address that the viewer listens on; 0.0.0.0: other computers reach it too.")]
-Port = Annotated[int, Option(min=0, max=65535, help="Port; the next free one is taken.")]
+Host = Annotated[str, Option(help="Address to listen on; 0.0.0.0 lets other computers connect.")]
+Port = Annotated[int, Option(min=0, max=65535, help="Port; if it is taken, the next free one.")]
 
 
 def view(
@@ -93,9 +93,9 @@ def view(
     port: Port = 8080,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Look at grasps, scenes, hands and objects in the browser; Ctrl-C ends it.
+    """Look at grasps, scenes, hands and objects in the browser; Ctrl-C quits.
 
-    Rows are read as they are shown, so that data sets of any size open at once. Needs the extra view (viser).
+    Rows are read as they are shown, so data sets of any size open at once. Needs the extra view (viser).
 
     Example: lgrasp view grasps/allegro-mug --where "metrics/epsilon > 0.05"
     """

@@ -77,7 +77,7 @@ def _options(
 ) -> None:
     """Generate grasps for dexterous hands.
 
-    A hand (URDF or MJCF) and an object (mesh) go in, collision-free grasps whose forces balance come out as HDF5 files.
+    A hand (URDF or MJCF) and an object (mesh) go in; collision-free grasps whose forces balance come out as HDF5 files.
 
     Example: lgrasp generate --object mug -n 10000
     """

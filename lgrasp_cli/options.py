@@ -18,14 +18,14 @@ Hand = Annotated[str, Option(help="Name of a hand, a URDF file, or a folder with
 HandArgument = Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.", **HAND)]
 Mesh = Annotated[str, Option("--object", "-o", help="Mesh file, or the name of an object.", **OBJECT)]
 MeshArgument = Annotated[str, Argument(help="Mesh file, or the name of an object.", **OBJECT)]
-Shards = Annotated[list[Path], Argument(metavar="SHARDS", help="Shard files, or folders of any depth.")]
+Shards = Annotated[list[Path], Argument(metavar="SHARDS", help="Shard files, or folders; subfolders are searched.")]
 PipelineName = Annotated[str, Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.", **PIPELINE)]
 Seed = Annotated[int | None, Option(help="Base seed; default: the pipeline's.")]
 Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
 Device = Annotated[str, Option(help="auto: the first GPU, else the CPU.", **DEVICE)]
-Workers = Annotated[int, Option(min=0, help="Threads or processes; 0: by device.")]
+Workers = Annotated[int, Option(min=0, help="Threads or processes; 0: as suits the device.")]
 CacheDir = Annotated[Path | None, Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.")]
-Contacts = Annotated[str | None, Option(help="Numbers of fingers that touch, drawn evenly, such as 3,4 or 3:5.")]
+Contacts = Annotated[str | None, Option(help="How many fingers touch: numbers to draw from, such as 3,4 or 3:5.")]
 JsonPath = Annotated[
     str | None,
     Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
@@ -41,7 +41,7 @@ Settings = Annotated[
 Viewpoint = Annotated[
     str | None, Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")
 ]
-DryRun = Annotated[bool, Option("--dry-run", help="Show what would be computed without computing it.")]
+DryRun = Annotated[bool, Option("--dry-run", help="Show what would be computed, and compute nothing.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print no progress and no report, only warnings and errors.")]
 
 

@@ -32,7 +32,7 @@ def plan(
     ] = None,
     model: Annotated[
         str | None,
-        Option(help="Draws hands to start from: file of learn fit --model grasp, or a name.", **NETWORK),
+        Option(help="Network that proposes starting hands: file of learn fit --model grasp, or a name.", **NETWORK),
     ] = None,
     starts: Annotated[int, Option("--starts", "-n", help="Points of the surface to start from.")] = 80,
     stand_off: Annotated[
@@ -41,14 +41,14 @@ def plan(
     distal: Annotated[float, Option(help="Weight of the palmar side of the last links.")] = 1.0,
     other: Annotated[float, Option(help="Weight of the rest of the palmar side; a small value gives pinches.")] = 0.2,
     keep_invalid: Annotated[
-        bool, Option("--keep-invalid", help="Keep the best of a start that fails a check, with metric 'valid' 0.")
+        bool, Option("--keep-invalid", help="Where no hand of a start passes, keep the best, with metric 'valid' 0.")
     ] = False,
     settings: Settings = None,
     out: Annotated[Path | None, Option(help="Folder; default: plans/HAND-OBJECT.")] = None,
 ) -> None:
     """Plan grasps by closing an open hand onto a mesh or point cloud with a local search.
 
-    The best hand of a start that passes all checks becomes a row. The exit code is 3 if no start gives one.
+    For each start, the best hand that passes all checks becomes a row. The exit code is 3 if no start gives one.
 
     Example: lgrasp plan --cloud scene.ply --mask labels.npy --label 3 --hand barrett --starts 80
     """

@@ -30,7 +30,9 @@ _Rebuild = Annotated[bool, Option("--rebuild", help="Rebuild it even if it is ca
 @reporting
 def build_field(
     hand: HandArgument,
-    index: Annotated[str | None, Option(**one_of(FieldIndex, "INDEX", "Default: the pipeline's."))] = None,
+    index: Annotated[
+        str | None, Option(**one_of(FieldIndex, "INDEX", "How the field is looked up; default: the pipeline's."))
+    ] = None,
     pipeline: PipelineName = "robust",
     device: Device = "auto",
     cache_dir: CacheDir = None,
@@ -116,13 +118,13 @@ def warm_up(device: Device = "auto", cache_dir: CacheDir = None) -> None:
 
 
 _STAGES = {
-    "place": "Sample poses of the object in front of the palm, without collision.",
+    "place": "Sample collision-free poses of the object in front of the palm.",
     "domain": "Find the contacts that each finger can make at each pose.",
     "ik": "Move fingers to their contacts and keep those that do not collide with the object.",
-    "wrap": "Lay further links of these fingers on the object.",
+    "wrap": "Lay further links of the touching fingers on the object.",
     "search": "Combine contacts into sets that balance.",
     "filter": "Complete the grasps and check them exactly.",
-    "hold": "Try in a fast simulation how finished grasps hold.",
+    "hold": "Test in a fast simulation how well finished grasps hold.",
 }
 
 

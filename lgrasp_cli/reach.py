@@ -19,20 +19,20 @@ def reach(
         str,
         Option(
             metavar="X,Y,Z[:YAW]",
-            help="Place of the object before the arm's root link, metres and degrees; also X,Y,Z:ROLL,PITCH,YAW.",
+            help="Pose of the object in the arm's root frame, metres and degrees; also X,Y,Z:ROLL,PITCH,YAW.",
         ),
     ],
     mount: Annotated[
         str | None,
-        Option(metavar="X,Y,Z[:R,P,Y]", help="Base link of the hand in the frame of the tip."),
+        Option(metavar="X,Y,Z[:R,P,Y]", help="Pose of the hand's base link in the tip's frame."),
     ] = None,
     tip: Annotated[str | None, Option(metavar="LINK", help="Link that carries the hand; default: the last.")] = None,
-    tries: Annotated[int | None, Option(min=1, help="Postures from which each pose is searched.")] = None,
+    tries: Annotated[int | None, Option(min=1, help="Starting postures per pose.")] = None,
     out: Annotated[
-        Path | None, Option(help="Write copies into this folder; by default the shards get the verdicts.")
+        Path | None, Option(help="Write copies into this folder; by default verdicts go into the shards.")
     ] = None,
 ) -> None:
-    """Tell which grasps an arm can make, and add its joints to the shards, as columns physics/reach_...
+    """Find which grasps an arm can make, and add its joints to the shards, as columns physics/reach_...
 
     Example: lgrasp reach grasps/allegro-mug/robust-table --arm arm.urdf --at 0.5,0,0
     """

@@ -29,7 +29,7 @@ def cli_page() -> str:
             common[_flag(names)] = rows[0]
     lines = [
         _MARK,
-        "Commands only name these options. Brackets hold defaults. `--help` tells more of commands for developers.",
+        "Commands only name these options. Defaults are in brackets. `--help` says more about developer commands.",
         "",
     ]
     lines += [f"*Job options* are {_code(_JOB)}.", ""]

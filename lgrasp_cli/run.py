@@ -26,8 +26,8 @@ def run(
 ) -> None:
     """Run the job of a config, or one job for every hand, object and pipeline that it names.
 
-    Key 'job' names the command whose options the other keys are; without it grasps are generated. A job that fails does
-    not stop the others; the exit code is the worst one. Tasks of an array share the files of all jobs.
+    Key 'job' names a command, and the other keys are its options; without it, grasps are generated. A job that fails
+    does not stop the others; the exit code is the worst one. Tasks of an array share the files of all jobs.
 
     Example: lgrasp run configs/smoke.yaml
     """

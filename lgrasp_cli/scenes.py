@@ -35,7 +35,7 @@ def make(
     pipeline: Annotated[
         str | None, Option("--pipeline", "-p", help="Pipeline that generates the grasps; default: robust.", **PIPELINE)
     ] = None,
-    stock: Annotated[int | None, Option(help="Grasps generated of each object; default: 1000.")] = None,
+    stock: Annotated[int | None, Option(help="Grasps to generate per object; default: 1000.")] = None,
     on_table: Annotated[int | None, Option(help="Objects on a table; default: 5.")] = None,
     views: Annotated[int | None, Option(help="Depth cameras; default: 3.")] = None,
     scale: Annotated[float | None, Option(help="Factor from the meshes' unit to metres.")] = None,

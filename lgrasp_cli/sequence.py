@@ -18,13 +18,15 @@ if TYPE_CHECKING:
 
 Objects = Annotated[list[str], Argument(help="Mesh files or names of objects, in the order of grasping.", **OBJECT)]
 Rows = Annotated[int, Option("-n", "--rows", help="Complete sequences requested.")]
-PolicyName = Annotated[str | None, Option(**one_of(Policy, "POLICY", "Default: the pipeline's."))]
+PolicyName = Annotated[
+    str | None, Option(**one_of(Policy, "POLICY", "How opposition spaces are chosen; default: the pipeline's."))
+]
 Size = Annotated[str, Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")]
 Simulate = Annotated[
     str | None, Option(**one_of(ProtocolName, "PROTOCOL", "Keep only rows that hold in a simulation."))
 ]
 PipelineName = Annotated[
-    str, Option("--pipeline", "-p", help="Name of a pipeline with sequence, or a YAML file.", **PIPELINE)
+    str, Option("--pipeline", "-p", help="Name of a sequence pipeline, or a YAML file.", **PIPELINE)
 ]
 Out = Annotated[Path | None, Option(help="Folder of the shards; default: grasps/HAND-OBJECT-OBJECT.../PIPELINE")]
 ShardRows = Annotated[int, Option(help="Sequences per shard. Changing it changes which sequences are generated.")]
@@ -36,7 +38,9 @@ def sequence(
     how: How,
     hand: Hand = "allegro",
     rows: Rows = 256,
-    method: Annotated[str | None, Option(**one_of(Method, "METHOD", "Default: the pipeline's."))] = None,
+    method: Annotated[
+        str | None, Option(**one_of(Method, "METHOD", "How hands are found, by default as the pipeline says."))
+    ] = None,
     policy: PolicyName = None,
     scale: Size = "1",
     simulate: Simulate = None,
@@ -49,7 +53,7 @@ def sequence(
     """Grasp several objects one after another, each with joints that are still free, and write shards.
 
     Each grasp uses one opposition space of the hand (hand.yaml); joints and objects of earlier grasps stay in place.
-    The shards hold the whole sequences and the rows of fewer objects that these continue.
+    The shards hold whole sequences and the shorter ones that they extend.
 
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10
     """
@@ -64,17 +68,17 @@ def sequence(
 @working
 def sample(
     model: Annotated[
-        str, Argument(help="File of lgrasp learn fit --model diffuser, or a name of learn list.", **NETWORK)
+        str, Argument(help="File written by lgrasp learn fit --model diffuser, or a name from learn list.", **NETWORK)
     ],
     how: How,
     objects: Annotated[
         list[str] | None, Argument(help="Mesh files or names of objects, in the order of grasping.", **OBJECT)
     ] = None,
     cloud: Annotated[
-        list[Path] | None, Option(help="Point cloud in place of an object, unseen sides guessed; repeatable.")
+        list[Path] | None, Option(help="Point cloud in place of an object; unseen sides are guessed; repeatable.")
     ] = None,
     mask: Annotated[list[Path] | None, Option(help="Labels of each cloud's points.")] = None,
-    label: Annotated[list[int] | None, Option(help="Label to grasp of each cloud.")] = None,
+    label: Annotated[list[int] | None, Option(help="Label to grasp in each cloud.")] = None,
     viewpoint: Viewpoint = None,
     hand: Annotated[
         str | None,

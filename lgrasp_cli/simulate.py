@@ -22,7 +22,7 @@ def simulate(
     ] = "fc",
     engine: Annotated[str | None, Option(**one_of(EngineName, "ENGINE", "Simulator; default mujoco."))] = None,
     out: Annotated[
-        Path | None, Option(help="Write copies into this folder; by default the shards get the verdicts.")
+        Path | None, Option(help="Write copies into this folder; by default verdicts go into the shards.")
     ] = None,
     all_directions: Annotated[
         bool, Option("--all-directions", help="Continue after the first direction in which an object is lost.")
@@ -30,10 +30,10 @@ def simulate(
 ) -> None:
     """Simulate grasps and add the verdicts to the shards, as columns physics/PROTOCOL_...
 
-    The hand closes on its free objects, which are then pulled in six directions; a grasp holds if they stay.
-    docs/guides/physics.md describes each protocol. A shard that has the verdicts is left as it is.
+    The hand closes on the objects, which move freely and are then pulled in six directions; a grasp holds if they stay.
+    docs/guides/physics.md describes each protocol. Shards with the verdicts stay as they are.
 
-    Contacts are hard in PhysX (needs the extra physx), whose columns are physics/physx_PROTOCOL_....
+    In PhysX (extra physx) contacts are hard; its columns are physics/physx_PROTOCOL_....
 
     Example: lgrasp simulate grasps/allegro-mug/robust --protocol fc
     """

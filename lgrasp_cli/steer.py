@@ -22,7 +22,7 @@ Fingers = Annotated[
     str | None,
     Option(
         metavar="NAMES",
-        help="Fingers that all touch, and no others, such as thumb,index.",
+        help="Fingers that must all touch, and no others, such as thumb,index.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -30,7 +30,7 @@ Links = Annotated[
     str | None,
     Option(
         metavar="NAMES",
-        help="Links that may touch, and no others; LINK:radial, LINK:ulnar or LINK:tip: with that side.",
+        help="The only links that may touch; LINK:radial, LINK:ulnar or LINK:tip: only with that side.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -48,7 +48,7 @@ Approach = Annotated[
     str | None,
     Option(
         metavar="X,Y,Z:DEG",
-        help="Cone, in the object's frame, of directions that the palm faces, such as 0,0,-1:30 from above.",
+        help="Directions that the palm may face, a cone in the object's frame; 0,0,-1:30 is from above.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -56,7 +56,7 @@ Above = Annotated[
     str | None,
     Option(
         metavar="X,Y,Z,D",
-        help="Keep the hand and its way where X x + Y y + Z z >= D, object's frame, metres.",
+        help="Keep the hand and its approach where X x + Y y + Z z >= D (object's frame, metres).",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -73,7 +73,7 @@ Touch = Annotated[
     list[str] | None,
     Option(
         metavar="REGION",
-        help="Region that all contacts are in, or with :0.7 behind it 70 % of the force: box:x0,y0,z0:x1,y1,z1, "
+        help="Region that must contain all contacts (with :0.7 appended, 70 % of the force): box:x0,y0,z0:x1,y1,z1, "
         "sphere:x,y,z:r, group:NAME, color:#rrggbb, a closed mesh, an .npz of weights per vertex; repeatable.",
         rich_help_panel=_PANEL,
     ),

@@ -10,18 +10,18 @@ from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Shards, split
 from lgrasp_cli.tables import Answer, TextTable, reporting
 
-Negatives = Annotated[bool, Option("--negatives", help="Count rows with metric 'valid' 0 too.")]
+Negatives = Annotated[bool, Option("--negatives", help="Include rows whose metric 'valid' is 0.")]
 
 
 @reporting
 def split_rows(
     paths: Shards,
-    by: Annotated[str, Option(**one_of(GroupName, "GROUP", "What is in one part only."))],
+    by: Annotated[str, Option(**one_of(GroupName, "GROUP", "What no two parts share."))],
     out: Annotated[Path, Option("--out", "-o", help="JSON file to write.")] = Path("split.json"),
     shares: Annotated[
         str, Option(metavar="PART=SHARE,...", help="Parts, and their shares of the rows.")
     ] = "train=0.8,val=0.1,test=0.1",
-    seed: Annotated[int, Option(help="Decides which groups a part gets.")] = 0,
+    seed: Annotated[int, Option(help="Decides which groups go to which part.")] = 0,
     negatives: Negatives = False,
 ) -> Answer:
     """Write which objects (or hands, or object poses) are for training, validation and test.
@@ -51,7 +51,7 @@ def normalisation(
     paths: Shards,
     out: Annotated[Path, Option("--out", "-o", help="JSON file to write.")] = Path("normalisation.json"),
     split_file: Annotated[
-        Path | None, Option("--split", help="File of dataset split; only rows of --part are measured.")
+        Path | None, Option("--split", help="File written by dataset split; only rows of --part are measured.")
     ] = None,
     part: Annotated[str, Option(help="Part of the split.")] = "train",
     negatives: Negatives = False,

@@ -163,13 +163,13 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
                 **DEVICES,
             ),
         ] = None,
-        workers: Annotated[int | None, Option(min=0, help="Threads or processes; 0: by device.")] = None,
+        workers: Annotated[int | None, Option(min=0, help="Threads or processes; 0: as suits the device.")] = None,
         array: Annotated[
             str,
             Option(
                 metavar="auto|off|I/N",
-                help="Share the files with other tasks: I/N is task I of N, counted from 0; auto: this task of a SLURM "
-                "job array, if it is one.",
+                help="Share the files with other tasks: I/N is task I of N, counted from 0; auto: as the SLURM job "
+                "array says, if there is one.",
             ),
         ] = "auto",
         shard_index: Annotated[int | None, Option(hidden=True)] = None,
@@ -182,7 +182,8 @@ def working(command: Callable[..., None]) -> Callable[..., None]:
         cache_dir: CacheDir = None,
         quiet: Quiet = False,
         verbose: Annotated[
-            bool, Option("--verbose", "-v", help="Also print what time and memory went into, and what was lost where.")
+            bool,
+            Option("--verbose", "-v", help="Also print where time and memory went, and where candidates were lost."),
         ] = False,
         **options: Any,
     ) -> None:

@@ -45,7 +45,7 @@ class JobConfig(Params):
         (), description="Names, paths, folders of meshes, or globs; none: all meshes of object_dir."
     )
     object_dir: Path | None = Field(None, description="Folder where the names of objects are looked up first.")
-    held_out: tuple[str, ...] = Field((), description="Likewise: objects to leave out, by name and by contents.")
+    held_out: tuple[str, ...] = Field((), description="Objects to leave out, by name and by contents.")
     pipelines: tuple[str, ...] = Field(("robust",), min_length=1, description="Names or paths.")
     rows: int = Field(1000, ge=1, description="Grasps per hand, object and pipeline.")
     settings: tuple[str, ...] = Field((), description="PART.KEY=VALUE of every pipeline, such as bounds.friction=0.8.")
@@ -59,8 +59,8 @@ class JobConfig(Params):
     passes: int | None = Field(None, ge=1, le=64)
     negatives: Negatives = 0.0
     table: bool = Field(False, description="Grasps leave room for the table that the object rests on.")
-    steer: Steering | None = Field(None, description="What is asked of the grasps, beside what the pipelines ask.")
-    sequences: SequenceSets | None = Field(None, description="Objects one after another: how sets are drawn.")
+    steer: Steering | None = Field(None, description="Requirements on the grasps, beyond those of the pipelines.")
+    sequences: SequenceSets | None = Field(None, description="How the objects of sequences are drawn.")
 
     @model_validator(mode="before")
     @classmethod

@@ -13,7 +13,7 @@ _PLAIN_INTERVAL = 10.0  # [s] between lines of progress where standard error is 
 
 def judge(
     shards: Annotated[
-        list[Path], typer.Argument(metavar="SHARDS", help="Shards, or folders that hold some at any depth.")
+        list[Path], typer.Argument(metavar="SHARDS", help="Shard files, or folders; subfolders are searched.")
     ],
     rows: Annotated[int | None, typer.Option(help="Judge this many rows, drawn at random; default: all.")] = None,
     urdf: Annotated[Path | None, typer.Option(help="Original URDF in place of the stored one.")] = None,
@@ -28,9 +28,9 @@ def judge(
 ) -> None:
     """Judge every row of shards by the strict bounds, from the URDF and the meshes alone.
 
-    It shares no code with what makes grasps and trusts no stored number. Rows that a file calls invalid count apart.
+    It shares no code with the generator and trusts no stored number. Rows marked invalid are counted separately.
 
-    Exit code: 0 when every row is strictly valid, 1 when not, 2 for a file that cannot be judged.
+    Exit code: 0 if every row is strictly valid, 1 if not, 2 for a file that cannot be judged.
 
     \b
     Example: lgrasp judge grasps

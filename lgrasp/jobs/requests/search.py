@@ -63,7 +63,7 @@ class GenerateRequest(SearchRequest):
 
     object: str = Field(description="Name or mesh file.")
     scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
-    batch: int = Field(default=0, description="Candidates per batch; 0: by device.")
+    batch: int = Field(default=0, description="Candidates per batch; 0: as suits the device.")
     negatives: Negatives = 0.0
     rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
 

@@ -78,7 +78,7 @@ class ReachRequest(VerdictRequest):
 
     arm: Path = Field(description="URDF of the arm.")
     tip: str | None = Field(default=None, description="Link that carries the hand; default: the arm's last one.")
-    mount: Placement = Field(default=ORIGIN, description="Base link of the hand in the frame of the tip.")
+    mount: Placement = Field(default=ORIGIN, description="Pose of the hand's base link in the tip's frame.")
     at: Placement = Field(
         description="Object's frame, or of grasps on a table the place on it, in the frame of the arm's root link."
     )
