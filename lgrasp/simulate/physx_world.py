@@ -1,6 +1,8 @@
 """The same hand and objects in PhysX (package sapien): hard contacts, no torsional friction."""
 
 import warnings
+from collections.abc import Callable
+from functools import wraps
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,16 +17,18 @@ CONTACT_OFFSET = 0.002
 """Shapes closer than this have contact points, which press when they are closer than 0 [m]."""
 ITERATIONS = (25, 1)
 """Of the solver (TGS), on positions and velocities."""
+DEPENETRATION = 1.0
+"""Largest speed with which bodies that overlap come apart [m/s]."""
 SOLVER = {
     "contact_offset": CONTACT_OFFSET,
     "iterations": ITERATIONS,
+    "depenetration": DEPENETRATION,
     "not_used": ("torsion", "impratio", "noslip", "softness"),
 }
 """What decides a verdict besides the protocol, and the numbers of the protocol that mean nothing here."""
 
 _COUPLING = 5.0  # stiffness with which joints of one drive are held together, over that of the drive
 _AHEAD = 0.8  # of the motion in one step, that coupled joints are expected to go on with
-_AWAY = 10.0  # [m] where objects wait while the contacts of the grasp before are forgotten
 _ROTATE_X_TO_Z = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # w x y z: PhysX's capsules lie along x, MuJoCo's along z
 
 
@@ -62,6 +66,17 @@ class _Coupled(NamedTuple):
     """(2, J) likewise with which each takes its part in the drive."""
 
 
+def _recorded(act: Callable[..., None]) -> Callable[..., None]:
+    """An act that :meth:`PhysxWorld.restore` can repeat."""
+
+    @wraps(act)
+    def recorded(self: "PhysxWorld", *args: Any) -> None:
+        self._past.append((recorded, args))
+        act(self, *args)
+
+    return recorded
+
+
 class PhysxWorld:
     """A PhysX scene made of what MuJoCo compiled: its bodies, inertias, shapes, joints and drives, number by number.
 
@@ -79,52 +94,55 @@ class PhysxWorld:
         self._mujoco = import_mujoco()
         self._model, self._m = model, model.mujoco
         self._ignored = self._ignore_groups()
+        self._past: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
 
+    @_recorded
     def begin(self, q: np.ndarray, poses: np.ndarray) -> None:
         """Hand at q (K,), objects at poses (O, 7) in the base frame, everything at rest."""
+        del self._past[:-1]
         self._make()
         model = self._model
         positions = np.zeros(len(self._joints), np.float32)
         positions[self._column] = model.joint_matrix @ q + model.joint_offset
         self._hand.set_qpos(positions)
         self._hand.set_qvel(np.zeros_like(positions))
-        self.drive(model.controls(q))
+        self._aim(model.controls(q))
         base = self.links[model.base_body].entity.pose
         for component, pose in zip(self._objects, poses.astype(float), strict=True):
             component.entity.pose = base * self._sapien.Pose(pose[:3], pose[3:] / np.linalg.norm(pose[3:]))
             component.set_linear_velocity(np.zeros(3))
             component.set_angular_velocity(np.zeros(3))
 
-    def _forget(self) -> None:
-        """Move the objects away, so that nothing is left of their contacts, which PhysX remembers from step to step."""
-        for k, component in enumerate(self._objects):
-            component.entity.pose = self._sapien.Pose([_AWAY * (k + 1), 0, 0])
-            component.set_linear_velocity(np.zeros(3))
-            component.set_angular_velocity(np.zeros(3))
-        self._system.step()
-
+    @_recorded
     def drive(self, targets: np.ndarray) -> None:
         """Set the targets of the drives (nu,) [rad or m]."""
+        self._aim(targets)
+
+    def _aim(self, targets: np.ndarray) -> None:
         self._targets = targets
         shared = {coupled.drive for coupled in self._coupled}
         for drive, (joint, target) in enumerate(zip(self._driven, targets, strict=True)):
             if drive not in shared:
                 joint.set_drive_target(float(target))
 
+    @_recorded
     def push(self, forces: np.ndarray) -> None:
         """Pull on the objects' centres of mass from now on (O, 3) [N], world frame."""
         self._forces[:] = forces
 
+    @_recorded
     def place_table(self, pose: np.ndarray) -> None:
         """Put the table, whose top is z = 0 of its frame, at a pose (7,) in the world."""
         self._table.entity.pose = self._sapien.Pose(pose[:3], pose[3:])
         self._table_pose = np.array(pose, float)
 
+    @_recorded
     def slide_table(self, by: np.ndarray) -> None:
         """In the next step the table moves by a vector (3,) [m] and nothing else, whatever presses on it."""
         self._table_pose[:3] += by
         self._table.set_kinematic_target(self._sapien.Pose(self._table_pose[:3], self._table_pose[3:]))
 
+    @_recorded
     def step(self, steps: int) -> None:
         """Go on for some steps of the protocol."""
         for _ in range(steps):
@@ -152,17 +170,13 @@ class PhysxWorld:
                 self._joints[place].set_drive_velocity_target(float(velocity))
 
     def state(self) -> Any:
-        """Everything that decides what comes next, as far as PhysX gives it: not the contacts that it remembers."""
-        return self._system.pack(), self._targets, self._forces.copy()
+        """All that was done since :meth:`begin`, which decides what comes next."""
+        return tuple(self._past)
 
     def restore(self, state: Any) -> None:
-        """Inverse of :meth:`state`."""
-        packed, targets, forces = state
-        self._forget()
-        self._system.unpack(packed)
-        self._before = None
-        self.drive(targets)
-        self._forces[:] = forces
+        """Do it again: of the contacts that it remembers from step to step PhysX gives no copy."""
+        for act, args in state:
+            act(self, *args)
 
     def objects(self) -> np.ndarray:
         """Poses of the objects (O, 7)."""
@@ -290,6 +304,7 @@ class PhysxWorld:
                 component.set_cmass_local_pose(sapien.Pose(m.body_ipos[body], m.body_iquat[body]))
             component.set_linear_damping(0.0)
             component.set_angular_damping(0.0)
+            component.set_max_depenetration_velocity(DEPENETRATION)
             entity.add_component(component)
             entities.append(entity)
         for entity in entities:

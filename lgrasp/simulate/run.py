@@ -1,11 +1,14 @@
 """Verdicts of many grasps: on the CPU one thread per grasp at a time, on a GPU all side by side."""
 
+import pickle
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +16,7 @@ import numpy as np
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
+from lgrasp.runtime.processes import ProcessPool
 from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.physx_world import SOLVER, import_physx
@@ -76,6 +80,8 @@ if TYPE_CHECKING:
 Keep = Callable[[str, Hashable, Callable[[], Any]], Any]
 
 _HELD_TOLERANCE = 1.0e-4  # [rad or m]
+_FEW = 8  # rows for which no process is started
+_AT_A_TIME = 4  # rows that a process judges
 
 
 def verdicts(
@@ -103,13 +109,13 @@ def verdicts(
         scene: hand and objects of the rows.
         rows: N grasps of O objects at most; K columns of q and contacts as in a shard.
         protocol: what is simulated.
-        threads: grasps simulated at a time.
+        threads: grasps simulated at a time; those of PhysX, which lets a process simulate one at a time, in processes.
         progress: called on this thread with (rows done, rows held); what it raises ends the simulation.
         all_directions: continue after the first direction in which an object is lost.
         settled_stop: end a direction when the objects have come to rest well inside their bounds.
         device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0); PhysX runs on the CPU.
-        keep: called with (kind, key, make), gives what it made for the key before, or makes it: what a GPU is given
-            then serves further calls.
+        keep: called with (kind, key, make), gives what it made for the key before, or makes it: what a GPU is given,
+            and processes, then serve further calls.
         prepared: called with the seconds that models and, on a GPU, kernels took to be made.
 
     Raises:
@@ -135,10 +141,12 @@ def verdicts(
         worlds = None if on_cpu(device, protocol) else _worlds(model, device, len(group.rows), options, keep)
         if prepared:
             prepared(time.perf_counter() - begin)
-        if worlds is None:
-            some = _on_threads(model, group.rows, threads, advanced, options)
-        else:
+        if worlds:
             some = worlds.run(group.rows, advanced)
+        elif protocol.engine == "physx" and threads > 1 and len(group.rows) > _FEW:
+            some = _in_processes(model, group.rows, threads, advanced, options, keep)
+        else:
+            some = _on_threads(model, group.rows, threads, advanced, options)
         slots[group.index] = group.slots
         found |= zip(group.index.tolist(), some, strict=True)
         before = [before[0] + len(some), before[1] + sum(verdict.holds for verdict in some)]
@@ -186,22 +194,63 @@ def _on_threads(
     """A verdict of every row, each on a thread of the CPU."""
     own = threading.local()
 
-    def judge(i: int) -> Verdict:
+    def judge(i: int) -> list[Verdict]:
         if not hasattr(own, "trial"):
             own.trial = Trial(model, **options)
-        return own.trial.run(rows, i)
+        return [own.trial.run(rows, i)]
 
-    held = 0
     with _silence(), ThreadPoolExecutor(threads) as pool:
-        found = [pool.submit(judge, i) for i in range(len(rows))]
-        try:
-            for done, verdict in enumerate(as_completed(found), 1):
-                held += verdict.result().holds
-                progress(done, held)
-        except BaseException:
+        return _collected([pool.submit(judge, i) for i in range(len(rows))], progress)
+
+
+def _in_processes(
+    model: Model,
+    rows: GraspRows,
+    workers: int,
+    progress: Callable[[int, int], None],
+    options: dict[str, bool],
+    keep: Keep | None,
+) -> list[Verdict]:
+    """The same, some rows at a time in each process."""
+    packed = pickle.dumps((model, rows, options))
+    make = partial(ProcessPool, workers)
+    pool: Executor = keep("processes", workers, make) if keep else make()
+    try:
+        parts = [range(i, min(i + _AT_A_TIME, len(rows))) for i in range(0, len(rows), _AT_A_TIME)]
+        return _collected([pool.submit(_judge_some, packed, part) for part in parts], progress)
+    except BrokenProcessPool:
+        raise PhysicsError("a process that simulates was killed; the same command goes on") from None
+    finally:
+        if not keep:
             pool.shutdown(cancel_futures=True)
-            raise
-    return [verdict.result() for verdict in found]
+
+
+def _judge_some(packed: bytes, which: range) -> list[Verdict]:
+    """Verdicts of some rows, in a process of its own."""
+    trial, rows = _unpacked(packed)
+    with _silence():
+        return [trial.run(rows, i) for i in which]
+
+
+@lru_cache(maxsize=1)
+def _unpacked(packed: bytes) -> tuple[Trial, GraspRows]:
+    model, rows, options = pickle.loads(packed)
+    return Trial(model, **options), rows
+
+
+def _collected(found: Sequence[Future[list[Verdict]]], progress: Callable[[int, int], None]) -> list[Verdict]:
+    """All verdicts in order; what ``progress`` raises cancels those that have not begun."""
+    done = held = 0
+    try:
+        for some in as_completed(found):
+            done += len(some.result())
+            held += sum(verdict.holds for verdict in some.result())
+            progress(done, held)
+    except BaseException:
+        for some in found:
+            some.cancel()
+        raise
+    return [verdict for some in found for verdict in some.result()]
 
 
 @contextmanager

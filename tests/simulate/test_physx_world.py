@@ -44,6 +44,31 @@ def test_the_hand_goes_where_mujoco_puts_it(name: str):
         np.testing.assert_allclose(both[1].objects(), both[0].objects(), atol=1e-5)
 
 
+def test_what_was_tried_leaves_no_trace(jaws):
+    """A gripper that squeezes a cube goes on alike, whether states were restored on the way or not."""
+    shard = jaws.shard()
+    rows, scene = shard.grasps, Scene(hand_of_record(shard.hand, no_cut), (object_of_record(shard.objects[0]),))
+    model = build_model(scene, PROTOCOLS["fc"], rows.q[0])
+    world = PhysxWorld(model)
+    tilted = rows.object_pose[0] + np.array([0, 0.003, 0.002, 0, 0.02, 0.03, 0.01])
+
+    def poses(tries: int) -> np.ndarray:
+        world.begin(rows.q_pregrasp[0], tilted)
+        world.drive(model.controls(rows.q_squeeze[0].astype(float)))
+        world.step(150)
+        before = world.state()
+        for number in range(tries):
+            world.push(np.full((1, 3), 1.0 + number))
+            world.step(30)
+            world.restore(before)
+        assert world.links_touching() == 2
+        world.push(np.array([[0.0, 0.5, 0.0]]))
+        world.step(50)
+        return np.concatenate([world.objects().ravel(), world.hand_joints()])
+
+    np.testing.assert_array_equal(poses(2), poses(0))
+
+
 @pytest.mark.parametrize("name", ["barrett", "schunk_svh"])
 def test_joints_of_one_drive_give_way_together(name: str):
     """Every link of a hand twisted by 0.03 N m: joints turn as the torques on all joints of their drive have it."""
