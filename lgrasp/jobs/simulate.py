@@ -106,6 +106,9 @@ class SimulateJob(SimulateRequest, VerdictJob):
         }
         return Made(rows, (kept, added), (kept.seconds, kept.compiling))
 
+    def close(self) -> None:
+        self._kept.close()
+
     def write(self, part: Part, contents: Any) -> None:
         assert part.source is not None
         kept, added = contents

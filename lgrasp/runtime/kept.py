@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Hashable
+from concurrent.futures import Executor
 from typing import Any
 
 
@@ -19,3 +20,11 @@ class Keeper:
                 self._made.pop(kind, None)  # not both at a time
                 self._made[kind] = key, make()
             return self._made[kind][1]
+
+    def close(self) -> None:
+        """Forget everything; pools end."""
+        with self._lock:
+            for _, made in self._made.values():
+                if isinstance(made, Executor):
+                    made.shutdown(cancel_futures=True)
+            self._made.clear()

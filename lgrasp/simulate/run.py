@@ -81,7 +81,6 @@ Keep = Callable[[str, Hashable, Callable[[], Any]], Any]
 
 _HELD_TOLERANCE = 1.0e-4  # [rad or m]
 _FEW = 8  # rows for which no process is started
-_AT_A_TIME = 4  # rows that a process judges
 
 
 def verdicts(
@@ -194,10 +193,10 @@ def _on_threads(
     """A verdict of every row, each on a thread of the CPU."""
     own = threading.local()
 
-    def judge(i: int) -> list[Verdict]:
+    def judge(i: int) -> Verdict:
         if not hasattr(own, "trial"):
             own.trial = Trial(model, **options)
-        return [own.trial.run(rows, i)]
+        return own.trial.run(rows, i)
 
     with _silence(), ThreadPoolExecutor(threads) as pool:
         return _collected([pool.submit(judge, i) for i in range(len(rows))], progress)
@@ -211,13 +210,12 @@ def _in_processes(
     options: dict[str, bool],
     keep: Keep | None,
 ) -> list[Verdict]:
-    """The same, some rows at a time in each process."""
+    """The same, each in a process."""
     packed = pickle.dumps((model, rows, options))
     make = partial(ProcessPool, workers)
     pool: Executor = keep("processes", workers, make) if keep else make()
     try:
-        parts = [range(i, min(i + _AT_A_TIME, len(rows))) for i in range(0, len(rows), _AT_A_TIME)]
-        return _collected([pool.submit(_judge_some, packed, part) for part in parts], progress)
+        return _collected([pool.submit(_judge, packed, i) for i in range(len(rows))], progress)
     except BrokenProcessPool:
         raise PhysicsError("a process that simulates was killed; the same command goes on") from None
     finally:
@@ -225,11 +223,11 @@ def _in_processes(
             pool.shutdown(cancel_futures=True)
 
 
-def _judge_some(packed: bytes, which: range) -> list[Verdict]:
-    """Verdicts of some rows, in a process of its own."""
+def _judge(packed: bytes, i: int) -> Verdict:
+    """Verdict of row i, in a process of its own."""
     trial, rows = _unpacked(packed)
     with _silence():
-        return [trial.run(rows, i) for i in which]
+        return trial.run(rows, i)
 
 
 @lru_cache(maxsize=1)
@@ -238,19 +236,18 @@ def _unpacked(packed: bytes) -> tuple[Trial, GraspRows]:
     return Trial(model, **options), rows
 
 
-def _collected(found: Sequence[Future[list[Verdict]]], progress: Callable[[int, int], None]) -> list[Verdict]:
+def _collected(found: Sequence[Future[Verdict]], progress: Callable[[int, int], None]) -> list[Verdict]:
     """All verdicts in order; what ``progress`` raises cancels those that have not begun."""
-    done = held = 0
+    held = 0
     try:
-        for some in as_completed(found):
-            done += len(some.result())
-            held += sum(verdict.holds for verdict in some.result())
+        for done, verdict in enumerate(as_completed(found), 1):
+            held += verdict.result().holds
             progress(done, held)
     except BaseException:
-        for some in found:
-            some.cancel()
+        for verdict in found:
+            verdict.cancel()
         raise
-    return [verdict for some in found for verdict in some.result()]
+    return [verdict.result() for verdict in found]
 
 
 @contextmanager

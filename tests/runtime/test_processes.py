@@ -1,5 +1,6 @@
 """Processes that work side by side."""
 
+import multiprocessing
 import subprocess
 import sys
 
@@ -7,7 +8,8 @@ import pytest
 from support.workers import leave
 
 from lgrasp.errors import DeviceError
-from lgrasp.runtime.processes import Crew
+from lgrasp.runtime.kept import Keeper
+from lgrasp.runtime.processes import Crew, ProcessPool
 
 
 def test_a_process_that_is_lost_ends_the_others():
@@ -24,3 +26,14 @@ def test_a_pool_does_not_run_the_script_again(tmp_path):
     script.write_text(f"print('begun')\n{pool}print(*pool.map(abs, [-1, 2]))\n")
     done = subprocess.run([sys.executable, script], check=True, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("begun\n1 2\n", "")
+
+
+def test_a_pool_that_is_kept_ends_when_all_is_forgotten():
+    kept = Keeper()
+    pool = kept.get("pool", 1, lambda: ProcessPool(1))
+    assert kept.get("pool", 1, lambda: ProcessPool(1)) is pool
+    assert pool.submit(abs, -2).result() == 2
+    kept.close()
+    with pytest.raises(RuntimeError, match="shutdown"):
+        pool.submit(abs, -2)
+    assert multiprocessing.active_children() == []
