@@ -94,6 +94,12 @@ class Tree:
         return len(self.joint_first) - 1
 
     @cached_property
+    def dof_shared(self) -> np.ndarray:
+        """(D,) i32: which of the shared joints each dof is, -1 for a group's own."""
+        place = {self.joint_names.index(name): i for i, name in enumerate(self.shared_names)}
+        return np.array([place.get(int(column), -1) for column in self.dof_index], np.int32)
+
+    @cached_property
     def body_group(self) -> np.ndarray:
         """(1 + J,) i32: group of each body, -1 for the base."""
         return np.concatenate([[-1], np.repeat(np.arange(self.groups), np.diff(self.joint_first))]).astype(np.int32)

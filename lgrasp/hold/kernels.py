@@ -184,7 +184,8 @@ def _copy(contacts: wp.array(dtype=Contact), count: wp.int32, out: wp.array(dtyp
 
 @wp.func
 def _scales(hand: Hand, scale: wp.array(dtype=wp.float32)):
-    """Write the stiffness of each joint over that of a revolute one."""
+    """Write the stiffness of each joint over that of a revolute one; copies of a shared joint have it together."""
+    dofs = hand.kin.dof_first[hand.kin.groups]
     for g in range(hand.kin.groups):
         first = hand.kin.dof_first[g]
         for d in range(hand.kin.dof_first[g + 1] - first):
@@ -192,6 +193,12 @@ def _scales(hand: Hand, scale: wp.array(dtype=wp.float32)):
         for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
             if hand.kin.joint_prismatic[j] == 1:
                 scale[first + hand.kin.joint_dof[j]] = 1.0 / (SLIDING_ARM * SLIDING_ARM)
+    for k in range(dofs):
+        copies = float(0.0)
+        for o in range(dofs):
+            if hand.kin.dof_index[o] == hand.kin.dof_index[k]:
+                copies += 1.0
+        scale[k] = scale[k] / copies
 
 
 @wp.func

@@ -103,17 +103,13 @@ class HoldTester:
         }
 
     def _put(self, postures: ControlPoses) -> Any:
-        tree = self._hand.model.tree
-        # every finger has a copy of a joint that fingers share: the torque of one must not press for all
-        shared = np.isin(tree.joint_names, tree.shared_names)
-        squeeze = np.where(shared, postures.grasp, postures.squeeze)
         return upload_struct(
             TriedGrasps,
             self._device,
             {
                 "pregrasp": np.asarray(postures.pregrasp, np.float32),
                 "grasp": np.asarray(postures.grasp, np.float32),
-                "squeeze": np.asarray(squeeze, np.float32),
+                "squeeze": np.asarray(postures.squeeze, np.float32),
                 "pose": np.asarray(postures.pose, np.float32),
                 "number": _fold(postures.number),
             },

@@ -13,7 +13,15 @@ from lgrasp.hold.energy import (
     relative_motion,
     twist_stiffness,
 )
-from lgrasp.hold.system import add_contact, eliminate_finger, solve_finger, solve_object
+from lgrasp.hold.system import (
+    add_contact,
+    clear_rows,
+    eliminate_finger,
+    gather_shared,
+    give_shared,
+    solve_finger,
+    solve_object,
+)
 from lgrasp.math.limits import MAX_DOFS, MAX_GROUPS
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -21,8 +29,9 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 MAX_HAND_DOFS = MAX_GROUPS * MAX_DOFS
 """Most dofs of all groups together."""
-_BLOCKS = MAX_HAND_DOFS * MAX_DOFS
-_COUPLING = MAX_HAND_DOFS * 7
+_ROWS = MAX_HAND_DOFS + MAX_DOFS  # those of the shared joints come last
+_BLOCKS = _ROWS * MAX_DOFS
+_COUPLING = _ROWS * 7
 _ITERATIONS = wp.constant(12)
 _STOP = wp.constant(1.0e-8)  # [J]
 _FORCE_STOP = wp.constant(0.02)  # [N]
@@ -43,14 +52,12 @@ def _add_own(
     B: wp.array(dtype=wp.float32),
 ):
     """Begin a system with the drives and the object by itself; returns C and g of the object."""
+    end = hand.kin.dof_first[hand.kin.groups]
+    clear_rows(0, end + hand.kin.shared, A, B)
     for group in range(hand.kin.groups):
         first = hand.kin.dof_first[group]
         for d in range(hand.kin.dof_first[group + 1] - first):
             k = first + d
-            for e in range(MAX_DOFS):
-                A[k * MAX_DOFS + e] = 0.0
-            for e in range(6):
-                B[k * 7 + e] = 0.0
             stiff = m.drive * scale[k]
             drag = m.drag * scale[k]
             over = beyond_limits(hand, k, q[k] + dq[k])
@@ -180,27 +187,33 @@ def solve_step(
     dx = wp.spatial_vector()
     A = wp.zeros(shape=(_BLOCKS,), dtype=wp.float32)
     B = wp.zeros(shape=(_COUPLING,), dtype=wp.float32)
-    step = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    step = wp.zeros(shape=(_ROWS,), dtype=wp.float32)
     Y = wp.zeros(shape=(MAX_TOUCHES,), dtype=wp.vec4)
     Z = wp.zeros(shape=(MAX_TOUCHES,), dtype=wp.vec4)
     dofs = hand.kin.dof_first[hand.kin.groups]
+    shared = hand.kin.shared
     for k in range(dofs):
         dq[k] = 0.0
     for _it in range(_ITERATIONS):
         C, g = _add_own(hand, m, body, scale, q, target, dq, dx, A, B)
         for c in range(count):
             C, g = add_contact(hand, m, contacts[c], c, Y[c], body.com, column, spin, A, B, C, g)
-        for k in range(dofs):
+        for k in range(dofs + shared):
             step[k] = B[k * 7 + 6]
         h = g
         for group in range(hand.kin.groups):
             first = hand.kin.dof_first[group]
-            C, h = eliminate_finger(first, hand.kin.dof_first[group + 1] - first, A, B, C, h)
+            members = hand.kin.dof_first[group + 1] - first
+            C, h = eliminate_finger(first, hand.kin.dof_free[group], members, A, B, C, h)
+            gather_shared(hand, group, A, B, step)
+        C, h = eliminate_finger(dofs, shared, shared, A, B, C, h)
         move = solve_object(C, h)
-        slope = wp.dot(g, move)
+        slope = wp.dot(g, move) + solve_finger(dofs, shared, shared, A, B, move, step)
         for group in range(hand.kin.groups):
             first = hand.kin.dof_first[group]
-            slope += solve_finger(first, hand.kin.dof_first[group + 1] - first, A, B, move, step)
+            members = hand.kin.dof_first[group + 1] - first
+            give_shared(hand, group, step)
+            slope += solve_finger(first, hand.kin.dof_free[group], members, A, B, move, step)
         for c in range(count):
             Z[c] = relative_motion(hand, contacts[c], c, column, spin, step, move, body.com)
         share = _share_of_step(hand, m, body, contacts, count, Y, Z, scale, q, target, dq, step, dx, move, slope)

@@ -1,7 +1,9 @@
-"""The linear system of a Newton step: fingers couple through the object only, so each is eliminated by itself.
+"""The linear system of a Newton step: fingers couple through the object and through the joints that they share only,
+so each finger's own joints are eliminated by themselves, then the shared ones.
 
 Flat arrays: A (dofs, MAX_DOFS) lower triangles of the fingers' blocks, then their Cholesky factors; B (dofs, 7) the
-blocks between a finger and the object, and the gradient. C (6, 6) and g (6) are the object's.
+blocks between a finger and the object, and the gradient. The rows after those of the fingers are the shared joints'; a
+finger's block has a copy of each that moves it, after its own joints. C (6, 6) and g (6) are the object's.
 """
 
 import warp as wp
@@ -94,35 +96,84 @@ def add_contact(
 
 
 @wp.func
+def clear_rows(first: wp.int32, end: wp.int32, A: wp.array(dtype=wp.float32), B: wp.array(dtype=wp.float32)):
+    """Set some rows of A and B to zero."""
+    for k in range(first, end):
+        for e in range(MAX_DOFS):
+            A[k * MAX_DOFS + e] = 0.0
+        for e in range(7):
+            B[k * 7 + e] = 0.0
+
+
+@wp.func
 def eliminate_finger(
     first: wp.int32,
+    free: wp.int32,
     dofs: wp.int32,
     A: wp.array(dtype=wp.float32),
     B: wp.array(dtype=wp.float32),
     C: wp.spatial_matrix,
     g: wp.spatial_vector,
 ):
-    """Factor the block of a finger and take its part out of the object's; returns C (lower triangle) and g."""
+    """Factor the ``free`` first rows of a block of ``dofs`` and take their part out of the others, which remain, and
+    out of the object's; returns C (lower triangle) and g."""
     for d in range(dofs):
         k = first + d
         for e in range(d + 1):
             s = A[k * MAX_DOFS + e]
-            for o in range(e):
+            for o in range(wp.min(e, free)):
                 s -= A[k * MAX_DOFS + o] * A[(first + e) * MAX_DOFS + o]
-            if e == d:
-                A[k * MAX_DOFS + d] = wp.sqrt(wp.max(s, _LEAST))
-            else:
-                A[k * MAX_DOFS + e] = s / A[(first + e) * MAX_DOFS + e]
+            if e < free:
+                if e == d:
+                    s = wp.sqrt(wp.max(s, _LEAST))
+                else:
+                    s = s / A[(first + e) * MAX_DOFS + e]
+            A[k * MAX_DOFS + e] = s
         for col in range(7):
             s = B[k * 7 + col]
-            for o in range(d):
+            for o in range(wp.min(d, free)):
                 s -= A[k * MAX_DOFS + o] * B[(first + o) * 7 + col]
-            B[k * 7 + col] = s / A[k * MAX_DOFS + d]
-        for a in range(6):
-            g[a] = g[a] - B[k * 7 + a] * B[k * 7 + 6]
-            for b in range(a + 1):
-                C[a, b] -= B[k * 7 + a] * B[k * 7 + b]
+            if d < free:
+                s = s / A[k * MAX_DOFS + d]
+            B[k * 7 + col] = s
+        if d < free:
+            for a in range(6):
+                g[a] = g[a] - B[k * 7 + a] * B[k * 7 + 6]
+                for b in range(a + 1):
+                    C[a, b] -= B[k * 7 + a] * B[k * 7 + b]
     return C, g
+
+
+@wp.func
+def gather_shared(
+    hand: Hand,
+    group: wp.int32,
+    A: wp.array(dtype=wp.float32),
+    B: wp.array(dtype=wp.float32),
+    step: wp.array(dtype=wp.float32),
+):
+    """Add what remains of a finger, and its gradient in ``step``, to the rows of the shared joints."""
+    first = hand.kin.dof_first[group]
+    end = hand.kin.dof_first[hand.kin.groups]
+    for k in range(first + hand.kin.dof_free[group], hand.kin.dof_first[group + 1]):
+        at = end + hand.kin.dof_shared[k]
+        step[at] += step[k]
+        for col in range(7):
+            B[at * 7 + col] += B[k * 7 + col]
+        for o in range(first + hand.kin.dof_free[group], k + 1):
+            other = hand.kin.dof_shared[o]
+            value = A[k * MAX_DOFS + o - first]
+            if other <= at - end:
+                A[at * MAX_DOFS + other] += value
+            else:
+                A[(end + other) * MAX_DOFS + at - end] += value
+
+
+@wp.func
+def give_shared(hand: Hand, group: wp.int32, step: wp.array(dtype=wp.float32)):
+    """Copy the steps of the shared joints to those of a finger."""
+    for k in range(hand.kin.dof_first[group] + hand.kin.dof_free[group], hand.kin.dof_first[group + 1]):
+        step[k] = step[hand.kin.dof_first[hand.kin.groups] + hand.kin.dof_shared[k]]
 
 
 @wp.func
@@ -154,17 +205,18 @@ def solve_object(C: wp.spatial_matrix, g: wp.spatial_vector):
 @wp.func
 def solve_finger(
     first: wp.int32,
+    free: wp.int32,
     dofs: wp.int32,
     A: wp.array(dtype=wp.float32),
     B: wp.array(dtype=wp.float32),
     x: wp.spatial_vector,
     step: wp.array(dtype=wp.float32),
 ):
-    """Replace the gradient in ``step`` by the step of a finger's joints, once the object moves by x; returns their
-    product."""
+    """Replace the gradient in ``step`` by the step of the ``free`` first joints of a block, once the object moves by x
+    and its other joints by theirs; returns the product of both."""
     slope = float(0.0)
-    for back in range(dofs):
-        d = dofs - 1 - back
+    for back in range(free):
+        d = free - 1 - back
         k = first + d
         s = -B[k * 7 + 6]
         for a in range(6):

@@ -37,6 +37,8 @@ class Kinematics:
     column_upper: wp.array(dtype=wp.float32)  # (K,)
     column_sliding: wp.array(dtype=wp.int32)  # (K,) 1: the joint slides
     dof_free: wp.array(dtype=wp.int32)  # (groups,) dofs that the group moves itself; shared ones come after
+    dof_shared: wp.array(dtype=wp.int32)  # (D,) which of the shared joints a dof is, -1 for a group's own
+    shared: wp.int32  # joints that groups share
     settings: wp.int32  # V combinations of values of the shared joints
     dof_setting: wp.array2d(dtype=wp.float32)  # (W V, D) open posture with the shared joints in place
 
