@@ -13,7 +13,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 MAX_TOUCHES = 40
 """Most contacts of a hand and an object."""
-_SPREAD = wp.constant(0.7e-3)  # [m] points so much farther than the deepest belong to the same patch
+_SPREAD = wp.constant(0.5e-3)  # [m] points so much farther than the deepest belong to the same patch
 _APART = wp.constant(1.5e-3)  # [m] least distance of two points of a patch
 _TURN = wp.constant(0.8660254)
 
@@ -27,7 +27,7 @@ class Contact:
     point: wp.vec3  # base frame [m]
     normal: wp.vec3  # of the object, base frame
     gap: wp.float32  # [m]
-    force: wp.float32  # along the normal [N]
+    force: wp.float32  # along the normal, mean of the patch [N]
     slip: wp.vec3  # across the normal that friction holds against, as a spring does [m]
     twist: wp.float32  # the same about the normal [rad]
 

@@ -9,7 +9,7 @@ class HoldTest(Ranges):
     """How often each grasp is tried, and what is drawn for it; the first trial has the numbers of protocol fc."""
 
     draws: int = Field(default=8, ge=0, le=1000, description="Trials of each grasp with random numbers.")
-    torsion: Range = Field(default=(0.0, 0.001), description="Friction against twisting [m].")
+    torsion: Range = Field(default=(0.0, 0.0), description="Friction against twisting [m].")
     contact_stiffness: PositiveRange = Field(
         default=(1.0e4, 1.0e5), description="Of contacts [N/m]; its logarithm is drawn evenly."
     )

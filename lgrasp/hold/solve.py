@@ -138,13 +138,24 @@ def _share_of_step(
 
 @wp.func
 def _press(m: Material, contacts: wp.array(dtype=Contact), count: wp.int32, Y: wp.array(dtype=wp.vec4)):
-    """Set the normal forces, by which friction is bounded, to those at motions Y; returns the largest change [N]."""
+    """Set the normal forces, by which friction is bounded, to those at motions Y; returns the largest change [N].
+
+    The points of a patch share its force evenly.
+    """
     change = float(0.0)
-    for c in range(count):
-        yn = wp.dot(contacts[c].normal, wp.vec3(Y[c][0], Y[c][1], Y[c][2]))
-        force = m.contact * wp.max(-(contacts[c].gap + yn), 0.0)
-        change = wp.max(change, wp.abs(force - contacts[c].force))
-        contacts[c].force = force
+    first = int(0)
+    while first < count:
+        end = first
+        total = float(0.0)
+        while end < count and contacts[end].body == contacts[first].body:
+            yn = wp.dot(contacts[end].normal, wp.vec3(Y[end][0], Y[end][1], Y[end][2]))
+            total += m.contact * wp.max(-(contacts[end].gap + yn), 0.0)
+            end += 1
+        force = total / float(end - first)
+        for c in range(first, end):
+            change = wp.max(change, wp.abs(force - contacts[c].force))
+            contacts[c].force = force
+        first = end
     return change
 
 

@@ -89,6 +89,11 @@ class Problem:
         y = self.motion(z)[0]
         return STIFF * np.maximum(-(self.contacts["gap"] + (y * self.contacts["normal"]).sum(1)), 0)
 
+    def shared(self, z: np.ndarray) -> np.ndarray:
+        """Normal forces, each the mean of its body's contacts."""
+        own, body = self.press(z), self.contacts["body"]
+        return np.array([own[body == b].mean() for b in body])
+
     def energy(self, z: np.ndarray, held: np.ndarray) -> float:
         dq, r = z[:-6], z[-6:] - self.free
         x = self.q + dq
@@ -207,7 +212,7 @@ def test_without_friction_a_step_has_the_least_energy(hand, seed):
     reference = p.least(force)
     assert np.abs(reference).max() > 0.01
     np.testing.assert_allclose(found, reference, atol=3e-5)
-    np.testing.assert_allclose(force, p.press(reference), atol=0.01)
+    np.testing.assert_allclose(force, p.shared(reference), atol=0.01)
 
 
 @pytest.mark.parametrize("torsion", [0.0, 0.002])
@@ -218,7 +223,7 @@ def test_with_friction_a_step_has_the_least_energy_at_its_own_forces(hand, torsi
         p = problem(hand, seed, friction=0.5, torsion=torsion)
         found, force = solved(hand, p)
         assert (force > 0).sum() >= 2
-        np.testing.assert_allclose(force, p.press(found), atol=1e-3)
+        np.testing.assert_allclose(force, p.shared(found), atol=1e-3)
         reference = p.least(force)
         least = p.energy(reference, force)
         excess.append((p.energy(found, force) - least) / (p.energy(0 * found, force) - least))
