@@ -51,7 +51,7 @@ def step_once(
         first = hand.kin.dof_first[g]
         for d in range(hand.kin.dof_first[g + 1] - first):
             v[d] = q[first + d]
-            scale[first + d] = 1.0
+            scale[first + d] = wp.where(hand.kin.dof_shared[first + d] < 0, 1.0, 0.5)
         group_forward(hand.kin, g, v, X, hand.kin.joint_first[g])
     count = given.shape[0]
     for c in range(count):
@@ -123,10 +123,18 @@ def huber(x: np.ndarray, stiffness: float, limit: np.ndarray) -> float:
     return float(np.where(slips, limit * x - limit**2 / (2 * stiffness), stiffness / 2 * x**2).sum())
 
 
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory) -> HandArrays:
+@pytest.fixture(scope="module", params=["free", "shared"])
+def hand(request, tmp_path_factory) -> HandArrays:
+    """Two fingers of two hinges; or both turn by one joint at the base, each its own way."""
     path = fingers(tmp_path_factory.mktemp("fingers"), 2)
-    return upload_hand(build_hand(path, minimal_spec("fingers", ["b0", "b1"])), "cpu")
+    spec = minimal_spec("fingers", ["b0", "b1"])
+    if request.param == "shared":
+        joint = '<joint name="j1" type="revolute">'
+        text = path.read_text()
+        assert joint in text
+        path.write_text(text.replace(joint, f'{joint}<mimic joint="j0" multiplier="-1"/>'))
+        spec = spec.model_copy(update={"shared": {"j0": (0.0,)}})
+    return upload_hand(build_hand(path, spec), "cpu")
 
 
 def spins(hand: HandArrays, q: np.ndarray, body: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -141,8 +149,8 @@ def problem(hand: HandArrays, seed: int, *, friction: float, torsion: float) -> 
     """Fingers that press on an object which a force pulls; the base is in contact too, and a joint beyond its limit."""
     rng = np.random.default_rng(seed)
     tree = hand.model.tree
-    q = rng.uniform(0.1, 1.0, 4)
-    q[seed % 4] = tree.joint_upper[0] + 0.02
+    q = rng.uniform(0.1, 1.0, len(tree.joint_names))
+    q[seed % len(q)] = tree.joint_upper[0] + 0.02
     n, body = 7, np.array([0, 1, 2, 2, 3, 4, 4])
     local = rng.uniform(-0.02, 0.02, (n, 3))
     pose = body_poses(hand, q[None])[0, body]
@@ -168,7 +176,7 @@ def problem(hand: HandArrays, seed: int, *, friction: float, torsion: float) -> 
         J=J,
         w=spins(hand, q, body, normal),
         q=q,
-        target=q + rng.uniform(-0.05, 0.05, 4),
+        target=q + rng.uniform(-0.05, 0.05, len(q)),
         com=com,
         mass=400.0,
         inertia=0.1 * (A @ A.T + np.eye(3)),
@@ -197,7 +205,7 @@ def solved(hand: HandArrays, p: Problem) -> tuple[np.ndarray, np.ndarray]:
         contacts.append(one)
     given = wp.array(contacts, dtype=Contact, device="cpu")
     q, target = (wp.array(x[order].astype("f4"), device="cpu") for x in (p.q, p.target))
-    dq, dx = wp.zeros(len(p.q), dtype=float, device="cpu"), wp.zeros(1, dtype=wp.spatial_vector, device="cpu")
+    dq, dx = wp.zeros(len(order), dtype=float, device="cpu"), wp.zeros(1, dtype=wp.spatial_vector, device="cpu")
     after = wp.zeros(len(contacts), dtype=Contact, device="cpu")
     wp.launch(step_once, 1, [hand.struct, m, body, given, q, target], [dq, dx, after], device="cpu")
     z = np.concatenate([np.zeros(len(p.q)), dx.numpy()[0]])
