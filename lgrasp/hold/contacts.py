@@ -13,7 +13,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 MAX_TOUCHES = 40
 """Most contacts of a hand and an object."""
-_SPREAD = wp.constant(0.5e-3)  # [m] points so much farther than the deepest belong to the same patch
+_SPREAD = wp.constant(0.3e-3)  # [m] points so much farther than the deepest belong to the same patch
 _APART = wp.constant(1.5e-3)  # [m] least distance of two points of a patch
 _TURN = wp.constant(0.8660254)
 

@@ -7,8 +7,8 @@ Over the motion dq of the joints and dx of the object (shift of its centre of ma
 
 with y = J dq - (dx moved to the contact): drives and their damping, the object's inertia over the squared time step and
 its load, contacts that are springs when they close, and friction: a spring that slips at its bound, the coefficient
-times the normal force f_c. f_c is the mean of the points where a link touches, one patch: it is soft and touches between
-them too. E is convex as long as f_c is held.
+times the normal force f_c, which is the mean of the points where a link touches: such a patch is soft and touches
+between them too. E is convex as long as f_c is held.
 """
 
 import warp as wp

@@ -123,11 +123,10 @@ def eliminate_finger(
             s = A[k * MAX_DOFS + e]
             for o in range(wp.min(e, free)):
                 s -= A[k * MAX_DOFS + o] * A[(first + e) * MAX_DOFS + o]
-            if e < free:
-                if e == d:
-                    s = wp.sqrt(wp.max(s, _LEAST))
-                else:
-                    s = s / A[(first + e) * MAX_DOFS + e]
+            if e == d and e < free:
+                s = wp.sqrt(wp.max(s, _LEAST))
+            elif e < free:
+                s = s / A[(first + e) * MAX_DOFS + e]
             A[k * MAX_DOFS + e] = s
         for col in range(7):
             s = B[k * 7 + col]

@@ -17,7 +17,7 @@ from lgrasp.simulate.worlds import Kept, Sighting, Worlds
 
 _SHARES = (4.0, 2.0, 1.0, 0.5, 0.25, 0.0625)
 """Worlds in which closed hands are pulled, over those in which they close: fewer and fewer, as directions end."""
-_WORLD_BYTES = 2.5e5
+_WORLD_BYTES = 3.0e5
 """Of a GPU's memory, that a world takes for each object."""
 _MOST_HANDS, _LEAST_HANDS = 8192, 256
 

@@ -10,6 +10,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.model import Model
+from lgrasp.simulate.noslip import NoSlip
 from lgrasp.simulate.verdict import CHUNK, WILD, moved
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -180,6 +181,7 @@ class Worlds:
             else:
                 made.opt.iterations = min(made.opt.iterations, _MOST_ITERATIONS)
             made.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
+            made.opt.noslip_iterations = 0  # :class:`NoSlip` does it
         with wp.ScopedDevice(self._device):
             self._m, self._near = mujoco_warp.put_model(m), mujoco_warp.put_model(near)
             for placed in (self._m, self._near):
@@ -187,6 +189,7 @@ class Worlds:
             per = {"nconmax": _CONTACTS_PER_OBJECT, "nccdmax": _DEEP_PER_OBJECT, "njmax": _CONSTRAINTS_PER_OBJECT}
             room = {name: number * len(model.object_body) for name, number in per.items()}
             self._d = d = mujoco_warp.make_data(m, nworld=worlds, **room)
+            self._noslip = NoSlip(self._m, d, model.mujoco.opt.noslip_iterations)
             self._targets = t = _Targets()
             t.start, t.end, t.step = (wp.zeros((worlds, n), dtype=wp.float32) for n in (m.nu, m.nu, 1))
             t.ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
@@ -234,7 +237,10 @@ class Worlds:
     def _one_step(self) -> None:
         wp.launch(_drive, self._d.ctrl.shape, [self._targets], [self._d.ctrl])
         wp.launch(_count, self.worlds, [], [self._targets])
-        self._lib.step(self._m, self._d)
+        self._lib.forward(self._m, self._d)
+        self._noslip.run()
+        self._lib.mul_m(self._m, self._d, self._d.efc.Ma, self._d.qacc)  # what the integrator starts from
+        self._lib.implicit(self._m, self._d)
 
     def begin(self, qpos: np.ndarray) -> None:
         """Everything at rest at qpos (W, nq), the drives' targets 0."""

@@ -1,0 +1,248 @@
+"""Friction that does not creep, for MuJoCo Warp: one block of threads a world.
+
+After the solver, whose friction is soft, the friction of each elliptic contact is found again as if it were hard, with
+all else as it is. For the friction f of a contact, which changes the accelerations a of J's rows by A = J M^-1 J^T,
+
+    min  1/2 f^T A f + f^T (a - a_ref - A f_old),   |f / mu| <= normal force
+
+one contact after the other, in some sweeps. This is MuJoCo's ``noslip``; that of MuJoCo Warp has one thread a world,
+which takes as long as all the rest of a step.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import warp as wp
+
+from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.optional import import_mujoco
+from lgrasp.runtime.structs import make_struct
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+_LANES = 32  # threads of a block, and what its rows are filled up to
+_LEAST = wp.constant(1.0e-10)
+_NEWTON = wp.constant(12)  # iterations for the multiplier
+
+
+@wp.struct
+class _Inertia:
+    """The inertia of every world, lower triangle in sparse rows; V degrees of freedom."""
+
+    length: wp.array(dtype=wp.int32)  # (V,) of each row
+    first: wp.array(dtype=wp.int32)  # (V,)
+    column: wp.array(dtype=wp.int32)  # (sum of lengths,)
+    value: wp.array2d(dtype=wp.float32)  # (W, ...)
+
+
+@wp.struct
+class _Rows:
+    """Constraints of W worlds, at most R each, with sparse rows of their Jacobian."""
+
+    elliptic: wp.int32  # the kind that contacts with friction have
+    count: wp.array(dtype=wp.int32)  # (W,)
+    kinds: wp.array2d(dtype=wp.int32)  # (W, R)
+    contact: wp.array2d(dtype=wp.int32)  # (W, R)
+    length: wp.array2d(dtype=wp.int32)  # (W, R)
+    first: wp.array2d(dtype=wp.int32)  # (W, R)
+    column: wp.array3d(dtype=wp.int32)  # (W, 1, ...)
+    value: wp.array3d(dtype=wp.float32)  # (W, 1, ...)
+    aim: wp.array2d(dtype=wp.float32)  # (W, R) accelerations that they ask for
+    force: wp.array2d(dtype=wp.float32)  # (W, R)
+    directions: wp.array(dtype=wp.int32)  # (C,) of each contact: 1 and those of its friction
+    friction: wp.array2d(dtype=wp.float32)  # (C, 5) coefficients
+
+
+@wp.struct
+class _Scratch:
+    """What the rows of contacts do, filled up with zeros to V' columns."""
+
+    factor: wp.array3d(dtype=wp.float32)  # (W, V, V) Cholesky factor of the inertia
+    jacobian: wp.array3d(dtype=wp.float32)  # (W, R, V')
+    answer: wp.array3d(dtype=wp.float32)  # (W, R, V') accelerations that a unit force gives
+
+
+@wp.kernel
+def _factor(inertia: _Inertia, count: wp.array(dtype=wp.int32), scratch_out: _Scratch):
+    """Factor the inertia of each world that has constraints.
+
+    Args:
+        count: (W,) constraints.
+    """
+    w = wp.tid()
+    if count[w] > 0:
+        L = scratch_out.factor[w]
+        n = inertia.first.shape[0]
+        for i in range(n):
+            for j in range(i + 1):
+                L[i, j] = 0.0
+            for k in range(inertia.first[i], inertia.first[i] + inertia.length[i]):
+                L[i, inertia.column[k]] = inertia.value[w, k]
+        for i in range(n):
+            for j in range(i + 1):
+                s = L[i, j]
+                for k in range(j):
+                    s -= L[i, k] * L[j, k]
+                if i == j:
+                    L[i, i] = wp.sqrt(wp.max(s, _LEAST))
+                else:
+                    L[i, j] = s / L[j, j]
+
+
+@wp.kernel
+def _fill(rows: _Rows, scratch_out: _Scratch):
+    """Write the rows of contacts with friction and what they do; (W, R)."""
+    w, r = wp.tid()
+    n = scratch_out.factor.shape[1]
+    if r < rows.count[w] and rows.kinds[w, r] == rows.elliptic:
+        J = scratch_out.jacobian[w, r]
+        Y = scratch_out.answer[w, r]
+        L = scratch_out.factor[w]
+        for i in range(J.shape[0]):
+            J[i] = 0.0
+            Y[i] = 0.0
+        for k in range(rows.first[w, r], rows.first[w, r] + rows.length[w, r]):
+            J[rows.column[w, 0, k]] = rows.value[w, 0, k]
+        for i in range(n):
+            s = J[i]
+            for k in range(i):
+                s -= L[i, k] * Y[k]
+            Y[i] = s / L[i, i]
+        for back in range(n):
+            i = n - 1 - back
+            s = Y[i]
+            for k in range(i + 1, n):
+                s -= L[k, i] * Y[k]
+            Y[i] = s / L[i, i]
+
+
+@wp.func
+def _cheapest(A: wp.mat33, b: wp.vec3, mu: wp.vec3, normal: wp.float32):
+    """The f of least 1/2 f A f + f b within |f / mu| <= normal."""
+    D = wp.diag(mu)
+    S = D * A * D
+    g = D * b
+    x = wp.vec3(0.0)
+    extra = float(0.0)
+    for _it in range(_NEWTON):
+        inverse = wp.inverse(S + wp.identity(n=3, dtype=wp.float32) * extra)
+        x = -(inverse * g)
+        far = wp.length(x)
+        if far <= normal * 1.00001:
+            break
+        # the length falls with the multiplier nearly as 1 / (a + multiplier) does
+        extra += (far / normal - 1.0) * far * far / wp.max(wp.dot(x, inverse * x), _LEAST)
+    far = wp.length(x)
+    if far > normal:
+        x = x * (normal / far)
+    return D * x
+
+
+@lru_cache
+def sweeps_kernel(width: int) -> Any:
+    """The kernel for rows of ``width`` columns."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sweep(rows: _Rows, scratch: _Scratch, iterations: wp.int32, acceleration_out: wp.array2d(dtype=wp.float32)):
+        """Find the friction of every contact of a world afresh; one block of threads a world.
+
+        Args:
+            acceleration_out: (W, V), changed accordingly.
+        """
+        w = wp.tid()
+        end = wp.min(rows.count[w], rows.kinds.shape[1])
+        a = wp.tile_load(acceleration_out[w], shape=width)
+        for _it in range(iterations):
+            r = int(0)
+            while r < end:
+                ahead = int(1)
+                if rows.kinds[w, r] == rows.elliptic:
+                    c = rows.contact[w, r]
+                    ahead = rows.directions[c]
+                    normal = rows.force[w, r]
+                    if ahead >= 3 and r + ahead <= end and normal > 0.0:
+                        last = wp.where(ahead > 3, r + 3, r + 2)
+                        used = wp.where(ahead > 3, 1.0, 0.0)
+                        j0 = wp.tile_load(scratch.jacobian[w, r + 1], shape=width)
+                        j1 = wp.tile_load(scratch.jacobian[w, r + 2], shape=width)
+                        j2 = wp.tile_load(scratch.jacobian[w, last], shape=width) * used
+                        y0 = wp.tile_load(scratch.answer[w, r + 1], shape=width)
+                        y1 = wp.tile_load(scratch.answer[w, r + 2], shape=width)
+                        y2 = wp.tile_load(scratch.answer[w, last], shape=width) * used
+                        A = wp.mat33()
+                        A[0, 0] = wp.max(wp.tile_sum(wp.tile_map(wp.mul, j0, y0))[0], _LEAST)
+                        A[1, 1] = wp.max(wp.tile_sum(wp.tile_map(wp.mul, j1, y1))[0], _LEAST)
+                        A[2, 2] = wp.max(wp.tile_sum(wp.tile_map(wp.mul, j2, y2))[0], _LEAST) + (1.0 - used)
+                        A[0, 1] = wp.tile_sum(wp.tile_map(wp.mul, j0, y1))[0]
+                        A[0, 2] = wp.tile_sum(wp.tile_map(wp.mul, j0, y2))[0]
+                        A[1, 2] = wp.tile_sum(wp.tile_map(wp.mul, j1, y2))[0]
+                        A[1, 0] = A[0, 1]
+                        A[2, 0] = A[0, 2]
+                        A[2, 1] = A[1, 2]
+                        rest = wp.vec3(
+                            wp.tile_sum(wp.tile_map(wp.mul, j0, a))[0] - rows.aim[w, r + 1],
+                            wp.tile_sum(wp.tile_map(wp.mul, j1, a))[0] - rows.aim[w, r + 2],
+                            wp.tile_sum(wp.tile_map(wp.mul, j2, a))[0] - rows.aim[w, last] * used,
+                        )
+                        before = wp.vec3(rows.force[w, r + 1], rows.force[w, r + 2], rows.force[w, last] * used)
+                        twist = wp.where(ahead > 3, rows.friction[c, 2], 1.0)
+                        mu = wp.vec3(rows.friction[c, 0], rows.friction[c, 1], twist)
+                        f = _cheapest(A, rest - A * before, mu, normal)
+                        more = f - before
+                        if wp.dot(more, 0.5 * (A * more) + rest) <= _LEAST:
+                            rows.force[w, r + 1] = f[0]
+                            rows.force[w, r + 2] = f[1]
+                            if ahead > 3:
+                                rows.force[w, last] = f[2]
+                            a += y0 * more[0] + y1 * more[1] + y2 * more[2]
+                r += ahead
+        wp.tile_store(acceleration_out[w], a)
+
+    return sweep
+
+
+class NoSlip:
+    """Takes the creep out of friction, in place.
+
+    Args:
+        m, d: MuJoCo Warp's model and data: sparse Jacobian, elliptic cones, contacts of at most four directions.
+        iterations: sweeps over all contacts.
+    """
+
+    def __init__(self, m: Any, d: Any, iterations: int) -> None:
+        self._d, self._iterations = d, iterations
+        worlds, room, size = d.nworld, d.njmax, m.nv
+        width = -(-size // _LANES) * _LANES
+        self._inertia = make_struct(_Inertia, length=m.M_rownnz, first=m.M_rowadr, column=m.M_colind, value=d.M)
+        e, c = d.efc, d.contact
+        friction = wp.array(ptr=c.friction.ptr, dtype=wp.float32, shape=(len(c.friction), 5), copy=False)
+        self._rows = make_struct(
+            _Rows,
+            elliptic=int(import_mujoco().mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
+            count=d.nefc,
+            kinds=e.type,
+            contact=e.id,
+            length=e.J_rownnz,
+            first=e.J_rowadr,
+            column=e.J_colind,
+            value=e.J,
+            aim=e.aref,
+            force=e.force,
+            directions=c.dim,
+            friction=friction,
+        )
+        self._scratch = make_struct(
+            _Scratch,
+            factor=wp.empty((worlds, size, size), dtype=wp.float32),
+            jacobian=wp.empty((worlds, room, width), dtype=wp.float32),
+            answer=wp.empty((worlds, room, width), dtype=wp.float32),
+        )
+        self._sweep = sweeps_kernel(width)
+
+    def run(self) -> None:
+        """Change the friction that the solver found, and with it the accelerations ``qacc``."""
+        d, scratch = self._d, self._scratch
+        wp.launch(_factor, d.nworld, [self._inertia, d.nefc], [scratch])
+        wp.launch(_fill, (d.nworld, d.njmax), [self._rows], [scratch])
+        inputs = [self._rows, scratch, self._iterations]
+        wp.launch_tiled(self._sweep, dim=[d.nworld], inputs=inputs, outputs=[d.qacc], block_dim=_LANES)
