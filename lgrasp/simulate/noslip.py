@@ -31,8 +31,8 @@ class _Inertia:
 
     length: wp.array(dtype=wp.int32)  # (V,) of each row
     first: wp.array(dtype=wp.int32)  # (V,)
-    column: wp.array(dtype=wp.int32)  # (sum of lengths,)
-    value: wp.array2d(dtype=wp.float32)  # (W, ...)
+    column: wp.array(dtype=wp.int32)  # (Z,) what moves the row's joint, itself last
+    value: wp.array2d(dtype=wp.float32)  # (W, Z)
 
 
 @wp.struct
@@ -49,7 +49,8 @@ class _Rows:
     value: wp.array3d(dtype=wp.float32)  # (W, 1, ...)
     aim: wp.array2d(dtype=wp.float32)  # (W, R) accelerations that they ask for
     force: wp.array2d(dtype=wp.float32)  # (W, R)
-    directions: wp.array(dtype=wp.int32)  # (C,) of each contact: 1 and those of its friction
+    start: wp.array2d(dtype=wp.int32)  # (C, ...) first row of each contact, along its normal
+    directions: wp.array(dtype=wp.int32)  # (C,) its rows
     friction: wp.array2d(dtype=wp.float32)  # (C, 5) coefficients
 
 
@@ -57,7 +58,7 @@ class _Rows:
 class _Scratch:
     """What the rows of contacts do, filled up with zeros to V' columns."""
 
-    factor: wp.array3d(dtype=wp.float32)  # (W, V, V) Cholesky factor of the inertia
+    factor: wp.array2d(dtype=wp.float32)  # (W, Z) of the inertia, L^T D L; D in the place of the ones
     jacobian: wp.array3d(dtype=wp.float32)  # (W, R, V')
     answer: wp.array3d(dtype=wp.float32)  # (W, R, V') accelerations that a unit force gives
 
@@ -72,48 +73,52 @@ def _factor(inertia: _Inertia, count: wp.array(dtype=wp.int32), scratch_out: _Sc
     w = wp.tid()
     if count[w] > 0:
         L = scratch_out.factor[w]
-        n = inertia.first.shape[0]
-        for i in range(n):
-            for j in range(i + 1):
-                L[i, j] = 0.0
-            for k in range(inertia.first[i], inertia.first[i] + inertia.length[i]):
-                L[i, inertia.column[k]] = inertia.value[w, k]
-        for i in range(n):
-            for j in range(i + 1):
-                s = L[i, j]
-                for k in range(j):
-                    s -= L[i, k] * L[j, k]
-                if i == j:
-                    L[i, i] = wp.sqrt(wp.max(s, _LEAST))
-                else:
-                    L[i, j] = s / L[j, j]
+        for k in range(L.shape[0]):
+            L[k] = inertia.value[w, k]
+        rows = inertia.first.shape[0]
+        for back in range(rows):
+            first = inertia.first[rows - 1 - back]
+            last = first + inertia.length[rows - 1 - back] - 1
+            for ahead in range(last - first):
+                k = last - 1 - ahead
+                share = L[k] / L[last]
+                above = inertia.first[inertia.column[k]]
+                for j in range(k - first + 1):
+                    L[above + j] = L[above + j] - share * L[first + j]
+                L[k] = share
 
 
 @wp.kernel
-def _fill(rows: _Rows, scratch_out: _Scratch):
-    """Write the rows of contacts with friction and what they do; (W, R)."""
+def _fill(rows: _Rows, inertia: _Inertia, scratch_out: _Scratch):
+    """Write the rows of friction and what they do; (W, R)."""
     w, r = wp.tid()
-    n = scratch_out.factor.shape[1]
-    if r < rows.count[w] and rows.kinds[w, r] == rows.elliptic:
-        J = scratch_out.jacobian[w, r]
-        Y = scratch_out.answer[w, r]
-        L = scratch_out.factor[w]
-        for i in range(J.shape[0]):
-            J[i] = 0.0
-            Y[i] = 0.0
-        for k in range(rows.first[w, r], rows.first[w, r] + rows.length[w, r]):
-            J[rows.column[w, 0, k]] = rows.value[w, 0, k]
-        for i in range(n):
-            s = J[i]
-            for k in range(i):
-                s -= L[i, k] * Y[k]
-            Y[i] = s / L[i, i]
-        for back in range(n):
-            i = n - 1 - back
-            s = Y[i]
-            for k in range(i + 1, n):
-                s -= L[k, i] * Y[k]
-            Y[i] = s / L[i, i]
+    if r >= rows.count[w] or rows.kinds[w, r] != rows.elliptic:
+        return
+    if rows.start[rows.contact[w, r], 0] == r:
+        return
+    J = scratch_out.jacobian[w, r]
+    Y = scratch_out.answer[w, r]
+    L = scratch_out.factor[w]
+    for i in range(J.shape[0]):
+        J[i] = 0.0
+        Y[i] = 0.0
+    for k in range(rows.first[w, r], rows.first[w, r] + rows.length[w, r]):
+        J[rows.column[w, 0, k]] = rows.value[w, 0, k]
+        Y[rows.column[w, 0, k]] = rows.value[w, 0, k]
+    n = inertia.first.shape[0]
+    for back in range(n):
+        i = n - 1 - back
+        last = inertia.first[i] + inertia.length[i] - 1
+        y = Y[i]
+        if y != 0.0:
+            for k in range(inertia.first[i], last):
+                Y[inertia.column[k]] = Y[inertia.column[k]] - L[k] * y
+            Y[i] = y / L[last]
+    for i in range(n):
+        y = Y[i]
+        for k in range(inertia.first[i], inertia.first[i] + inertia.length[i] - 1):
+            y -= L[k] * Y[inertia.column[k]]
+        Y[i] = y
 
 
 @wp.func
@@ -211,8 +216,8 @@ class NoSlip:
 
     def __init__(self, m: Any, d: Any, iterations: int) -> None:
         self._d, self._iterations = d, iterations
-        worlds, room, size = d.nworld, d.njmax, m.nv
-        width = -(-size // _LANES) * _LANES
+        worlds, room = d.nworld, d.njmax
+        width = -(-m.nv // _LANES) * _LANES
         self._inertia = make_struct(_Inertia, length=m.M_rownnz, first=m.M_rowadr, column=m.M_colind, value=d.M)
         e, c = d.efc, d.contact
         friction = wp.array(ptr=c.friction.ptr, dtype=wp.float32, shape=(len(c.friction), 5), copy=False)
@@ -228,12 +233,13 @@ class NoSlip:
             value=e.J,
             aim=e.aref,
             force=e.force,
+            start=c.efc_address,
             directions=c.dim,
             friction=friction,
         )
         self._scratch = make_struct(
             _Scratch,
-            factor=wp.empty((worlds, size, size), dtype=wp.float32),
+            factor=wp.empty(d.M.shape, dtype=wp.float32),
             jacobian=wp.empty((worlds, room, width), dtype=wp.float32),
             answer=wp.empty((worlds, room, width), dtype=wp.float32),
         )
@@ -243,6 +249,6 @@ class NoSlip:
         """Change the friction that the solver found, and with it the accelerations ``qacc``."""
         d, scratch = self._d, self._scratch
         wp.launch(_factor, d.nworld, [self._inertia, d.nefc], [scratch])
-        wp.launch(_fill, (d.nworld, d.njmax), [self._rows], [scratch])
+        wp.launch(_fill, (d.nworld, d.njmax), [self._rows, self._inertia], [scratch])
         inputs = [self._rows, scratch, self._iterations]
         wp.launch_tiled(self._sweep, dim=[d.nworld], inputs=inputs, outputs=[d.qacc], block_dim=_LANES)

@@ -58,7 +58,9 @@ def one_world(m, d) -> tuple[SimpleNamespace, SimpleNamespace]:
         force=floats(d.efc_force[None]),
     )
     friction = wp.array(d.contact.friction.astype(np.float32), dtype=wp.types.vector(5, wp.float32), device="cpu")
-    contact = SimpleNamespace(dim=ints(d.contact.dim), friction=friction)
+    contact = SimpleNamespace(
+        dim=ints(d.contact.dim), friction=friction, efc_address=ints(d.contact.efc_address[:, None])
+    )
     model = SimpleNamespace(nv=m.nv, M_rownnz=ints(m.M_rownnz), M_rowadr=ints(m.M_rowadr), M_colind=ints(m.M_colind))
     data = SimpleNamespace(
         nworld=1,
