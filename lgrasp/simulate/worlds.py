@@ -166,13 +166,18 @@ class Sighting(NamedTuple):
         return ~(np.abs(self.velocity).max(1) < WILD) | ~np.isfinite(self.qpos).all(1)
 
 
-class Worlds:
-    """W copies of one scene, stepped a chunk at a time; states are kept and taken up again on the device."""
+class Placed(NamedTuple):
+    """A model on a device, which many may share."""
 
-    def __init__(self, model: Model, worlds: int, device: str) -> None:
+    host: Any
+    """MuJoCo's own."""
+    far: Any
+    near: Any
+    """In which hand and objects touch within 1 mm."""
+
+    @classmethod
+    def of(cls, model: Model, device: str) -> "Placed":
         mujoco, mujoco_warp = import_mujoco(), import_mujoco_warp()
-        self._lib: Any = mujoco_warp
-        self._model, self._device, self.worlds = model, wp.get_device(device), worlds
         m, near = copy(model.mujoco), copy(model.mujoco_near)
         for made in (m, near):
             made.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # a contact moves one finger
@@ -182,14 +187,26 @@ class Worlds:
                 made.opt.iterations = min(made.opt.iterations, _MOST_ITERATIONS)
             made.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
             made.opt.noslip_iterations = 0  # :class:`NoSlip` does it
+        with wp.ScopedDevice(device):
+            placed = cls(m, mujoco_warp.put_model(m), mujoco_warp.put_model(near))
+        for one in placed[1:]:
+            one.opt.warn_overflow = 0  # :class:`Sighting` tells
+        return placed
+
+
+class Worlds:
+    """W copies of one scene, stepped a chunk at a time; states are kept and taken up again on the device."""
+
+    def __init__(self, model: Model, placed: Placed, worlds: int, device: str) -> None:
+        mujoco_warp = import_mujoco_warp()
+        self._lib: Any = mujoco_warp
+        self._model, self._device, self.worlds = model, wp.get_device(device), worlds
+        m, self._m, self._near = placed
         with wp.ScopedDevice(self._device):
-            self._m, self._near = mujoco_warp.put_model(m), mujoco_warp.put_model(near)
-            for placed in (self._m, self._near):
-                placed.opt.warn_overflow = 0  # :class:`Sighting` tells
             per = {"nconmax": _CONTACTS_PER_OBJECT, "nccdmax": _DEEP_PER_OBJECT, "njmax": _CONSTRAINTS_PER_OBJECT}
             room = {name: number * len(model.object_body) for name, number in per.items()}
             self._d = d = mujoco_warp.make_data(m, nworld=worlds, **room)
-            self._noslip = NoSlip(self._m, d, model.mujoco.opt.noslip_iterations)
+            self._noslip = NoSlip(self._m, d, model.protocol.noslip)
             self._targets = t = _Targets()
             t.start, t.end, t.step = (wp.zeros((worlds, n), dtype=wp.float32) for n in (m.nu, m.nu, 1))
             t.ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
