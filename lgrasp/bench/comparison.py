@@ -106,7 +106,7 @@ def measure_table(
         ConfigError: see :func:`plan_requests`.
     """
     settings, jobs = table["settings"], [request.job(cache) for request in plan_requests(config)]
-    jobs = [job.changed(pipeline=job.pipeline.model_copy(update={"patience": 1})) for job in jobs]
+    jobs = [job.changed(pipeline=job.pipeline.impatient()) for job in jobs]
     # plan_requests: pipeline, hand, object; here all pipelines of a hand and object go together
     pairs = [(hand, mesh) for hand in table["hands"] for mesh in table["objects"]]
     done = {(cell["hand"], cell["object"]) for cell in table["cells"]}

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -17,6 +18,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Loader, object_key
 from lgrasp.geometry.decompose import decompose
 from lgrasp.geometry.rotations import so3_exp
+from lgrasp.grasp.records import GraspRows
 from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
@@ -34,9 +36,10 @@ from lgrasp.refine.refiner import Pose, Refiner, table_pose
 from lgrasp.refine.surface import hand_surface
 from lgrasp.runtime.cores import cores
 from lgrasp.runtime.device import Device, resolve_device
-from lgrasp.simulate.protocol import Protocol, find_protocol
+from lgrasp.runtime.kept import Keeper
+from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import check_installed, verdicts
-from lgrasp.simulate.scene import scene_of
+from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.words import number
 
 NOISES = (0.0, 0.002, 0.005, 0.01)
@@ -101,7 +104,7 @@ def bench_hands(
     Raises:
         LgraspError: hand, object, device or protocol are unknown, or the simulator is missing.
     """
-    rules, best = find_protocol(protocol).by(engine), params or PlanParams()
+    rules, best, kept = find_protocol(protocol).by(engine), params or PlanParams(), Keeper()
     check_installed("cpu", rules)
     store, at = cache or Cache(), resolve_device(device)
     planners = {
@@ -109,6 +112,13 @@ def bench_hands(
         for noise in (None, *noises)
         for hands, own in (("one", best.model_copy(update=ONE)), ("best", best))
     }
+
+    def judge(scene: Scene, rows: GraspRows) -> np.ndarray:
+        found = verdicts(scene, rows, rules, threads=cores(), keep=kept.get)
+        return found[f"{rules.name}_holds"].astype(bool)
+
+    with closing(kept):
+        found = {hand: _bench_hand(hand, objects, starts, judge, planners, at, store, progress) for hand in hands}
     return {
         "device": at.name,
         "objects": list(objects),
@@ -117,7 +127,7 @@ def bench_hands(
         "best_of": best.rolls,
         "steps": list(STEPS),
         "published": load_published("dipgrasp").model_dump(mode="json"),
-        "hands": {hand: _bench_hand(hand, objects, starts, rules, planners, at, store, progress) for hand in hands},
+        "hands": found,
     }
 
 
@@ -125,7 +135,7 @@ def _bench_hand(
     hand: str,
     objects: Sequence[str],
     starts: int,
-    protocol: Protocol,
+    judge: Callable[[Scene, GraspRows], np.ndarray],
     planners: dict[tuple[str, str], tuple[float | None, PlanParams]],
     at: Device,
     cache: Cache,
@@ -151,9 +161,7 @@ def _bench_hand(
             seconds = time.perf_counter() - begin
             holds = np.zeros(0, bool)
             if len(grasps):
-                rows = grasp_rows(press(grasps), model.tree, target.center)
-                verdict = verdicts(scene, rows, protocol, threads=cores())
-                holds = verdict[f"{protocol.name}_holds"].astype(bool)
+                holds = judge(scene, grasp_rows(press(grasps), model.tree, target.center))
             what = f"{hand}, {name}, {on}, {'one hand' if hands == 'one' else f'best of {params.rolls}'}"
             progress(f"{what}: {int(holds.sum())} of {starts}, {seconds:.1f} s")
             total.starts += counts["starts"]

@@ -13,7 +13,7 @@ from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 from lgrasp.object.mass import mass_properties
-from lgrasp.runtime.processes import ProcessPool
+from lgrasp.runtime.processes import ProcessPool, none_killed
 
 METRICS = {"epsilon_exact": "", "volume": ""}
 """Units of the metrics that can be added (docs/reference/metrics.md defines them)."""
@@ -107,5 +107,5 @@ def process_map(workers: int) -> Iterator[_Map]:
     if workers == 1:
         yield map
         return
-    with ProcessPool(workers) as pool:
+    with none_killed("computes metrics"), ProcessPool(workers) as pool:
         yield pool.map

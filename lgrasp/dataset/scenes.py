@@ -54,7 +54,7 @@ class SceneRows:
             raise ShardError(f"{self.files[0]}: no row to look at (shards: {len(self.files)})")
         self._contents = lru_cache(_KEPT)(_contents)
         self._row = lru_cache(_KEPT)(_row)
-        self._chosen = lru_cache(1)(self.chosen)
+        self._chosen = lru_cache(1)(lambda where, _: self.chosen(where))
         self._shapes: dict[tuple[str, tuple[str, ...]], HandShape] = {}
 
     def __len__(self) -> int:
@@ -120,7 +120,7 @@ class SceneRows:
         """
         path, number = self.place(row)
         hand, objects, _ = self._contents(path)
-        return hand, objects, self._row(path, number)
+        return hand, objects, self._row(path, number, _when(path))
 
     def scene(self, row: int) -> "GraspScene":
         """The scene of a row.
@@ -180,7 +180,7 @@ class SceneRows:
         conditions = tuple(parse_condition(text) for text in where.split(",") if text.strip())
         if not conditions:
             return range(len(self))
-        chosen = self._chosen(conditions)
+        chosen = self._chosen(conditions, tuple(map(_when, self.files)))
         if not len(chosen):
             raise ConfigError(f"no row of {len(self):,} meets {where}")
         return chosen
@@ -271,7 +271,12 @@ def draw_motion(
     return [sheet(at, captions, columns) for at in zip(*pictures, strict=True)]
 
 
-def _row(path: Path, number: int) -> GraspRows:
+def _when(path: Path) -> int:
+    """When a file was written [ns]: verdicts may be added to it while its rows are shown."""
+    return path.stat().st_mtime_ns if path.exists() else 0
+
+
+def _row(path: Path, number: int, _: int) -> GraspRows:
     with ShardReader(path) as reader:
         return reader.rows(number, number + 1)
 

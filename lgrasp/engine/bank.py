@@ -11,7 +11,7 @@ from lgrasp.engine.inputs import InputKeys
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
 
-BANK_VERSION = 4
+BANK_VERSION = 5
 """Raised whenever the arrays of an entry change meaning; the versions of the stages are in the key too."""
 _NUMBERS_MEMBER = "about"  # member with the numbers
 
@@ -26,7 +26,8 @@ class Account:
     duplicates: int
     counts: dict[str, dict[str, int]]
     seconds: dict[str, float]  # thread-seconds per stage
-    wall: float  # [s]
+    spans: list[tuple[float, float]]  # from when to when each run took [s since 1970]
+    waited: float = 0.0  # while other shards used the device [s]
     interrupted: bool = False
 
 
@@ -63,6 +64,7 @@ class Bank:
             return None
         try:
             about = json.loads(str(arrays.pop(_NUMBERS_MEMBER)))
+            about["spans"] = [(begin, end) for begin, end in about["spans"]]
             account = Account(grasps_from_arrays(arrays), **about)
         except (KeyError, ValueError, TypeError):
             self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; rebuilding it")

@@ -159,6 +159,10 @@ class Pipeline(_Head):
             raise ConfigError(f"{name} {seed}: need 0 <= seed < 2^63")
         return self if seed is None else self.model_copy(update={"seed": seed})
 
+    def impatient(self, **changes: Any) -> "Pipeline":
+        """A copy whose shards end after their effort, for runs to which few grasps are a result, too."""
+        return self.model_copy(update={"patience": 1, **changes})
+
     def with_steering(self, **asked: Any) -> "Pipeline":
         """A copy whose grasps obey more of :class:`~lgrasp.steer.params.Steering`.
 

@@ -22,7 +22,8 @@ from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.row_order import RowOrder
 from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_rows
 from lgrasp.runtime.ordered import in_order
-from lgrasp.runtime.tally import add_counts, add_seconds
+from lgrasp.runtime.tally import add_counts, add_seconds, covered
+from lgrasp.runtime.turn import waited
 from lgrasp.stages.context import Context
 
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
@@ -34,6 +35,7 @@ _GPU_SMALLEST, _GPU_LARGEST = 2_048, 65_536  # candidates of a batch
 _GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
 _CONTACT_BYTES = 64  # the same for a contact of its domain
 _SET_BYTES = 32  # the same for a set of contacts
+_BANKED = ("candidates", "duplicates", "counts", "seconds", "spans", "waited")  # fields of results in the bank
 _STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
 
@@ -54,13 +56,18 @@ class ShardResult:
     grasps: GraspTable
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)  # thread-seconds per stage
-    wall: float = 0.0  # placement through filter [s]
-    span: tuple[float, float] = (0.0, 0.0)  # from when to when this run took, which ``wall`` includes [s]
+    spans: list[tuple[float, float]] = field(default_factory=list)  # from when to when each run took [s since 1970]
+    waited: float = 0.0  # while other shards used the device [s]
     candidates: int = 0
     duplicates: int = 0
     exhausted: bool = False  # the effort bound was reached before the rows were
     resumed: int = 0  # rows that an earlier run found
     tally: Counter[str] = field(default_factory=Counter)  # what the job counts among its rows
+
+    @property
+    def wall(self) -> float:
+        """Placement through filter, of all runs, without waiting for shards that are made side by side [s]."""
+        return max(covered(self.spans) - self.waited, 0.0)
 
 
 def flat_statistics(counts: dict[str, dict[str, int]], seconds: Mapping[str, float]) -> dict[str, int | float]:
@@ -183,12 +190,7 @@ def make_shard(
     account = bank.load(rows, whole=resume) if bank else None
     if account:
         found.restore(account)
-    earlier, start = result.wall, time.perf_counter()
-
-    def stop() -> None:
-        result.span = start, time.perf_counter()
-        result.wall = earlier + result.span[1] - start
-
+    start = time.time()
     fixed, passes = _fixed_batch(context, execution), pipeline.params("search").passes
     most = _GPU_LARGEST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups, pipeline)
 
@@ -202,8 +204,11 @@ def make_shard(
         return -(-wanted // block) * block
 
     def run(part: tuple[int, int]) -> BatchResult:
+        before = waited()
         with turn:
-            return run_batch(pipeline, context, *part, graphs.run if graphs else None)
+            found = run_batch(pipeline, context, *part, graphs.run if graphs else None)
+        result.waited += waited() - before
+        return found
 
     def search(limit: int) -> None:
         def parts() -> Iterator[tuple[int, int] | None]:
@@ -244,11 +249,11 @@ def make_shard(
         search_all()
     except CancelledError:
         if bank and result.candidates:
-            stop()
+            result.spans.append((start, time.time()))
             bank.store(found.account(interrupted=True))
         raise
     result.grasps = found.shuffled()
-    stop()
+    result.spans.append((start, time.time()))
     result.exhausted = found.count < rows
     if bank and banked:
         bank.store(found.account())
@@ -314,14 +319,14 @@ class _Rows:
         self._kept.restore(user_poses(table.pose[own], self._center), table.q[own])
         self._parts.append((table, own))
         result = self.result
-        result.counts, result.seconds, result.wall = account.counts, account.seconds, account.wall
-        result.candidates, result.duplicates = account.candidates, account.duplicates
+        for name in _BANKED:
+            setattr(result, name, getattr(account, name))
         self.add(take_rows(table, slice(account.kept, None)))
         result.resumed = self.count
 
     def account(self, *, interrupted: bool = False) -> Account:
         """How far the shard has come."""
-        r = self.result
-        own = self.shuffled() if interrupted else r.grasps
+        own = self.shuffled() if interrupted else self.result.grasps
         table = join_rows([own, take_rows(*self._aside)] if self._aside else [own])
-        return Account(table, self.count, r.candidates, r.duplicates, r.counts, r.seconds, r.wall, interrupted)
+        banked = {name: getattr(self.result, name) for name in _BANKED}
+        return Account(table, self.count, interrupted=interrupted, **banked)

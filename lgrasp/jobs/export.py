@@ -12,7 +12,7 @@ import numpy as np
 from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.exports.formats import FORMATS, export_shards
 from lgrasp.dataset.exports.mjcf import Cut
-from lgrasp.dataset.exports.selection import chosen_rows
+from lgrasp.dataset.exports.selection import chosen_rows, number_columns
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.split import Split
@@ -27,8 +27,6 @@ from lgrasp.jobs.requests.shards import ExportRequest
 from lgrasp.simulate.protocol import HOLDS
 
 _INDEX = "export.json"  # the last file of an export: one without it is not whole
-
-_NUMBERS = ("metrics/", "physics/")
 
 
 class ExportJob(ExportRequest, Job):
@@ -48,8 +46,8 @@ class ExportJob(ExportRequest, Job):
 
         def digest(reader: ShardReader) -> str:
             chosen_rows(reader, where, single=FORMATS[self.to].single)  # the files that the export leaves out
-            numbers = {name for name in reader.columns if self.to == "webdataset" and name.startswith(_NUMBERS)}
-            return rows_digest(reader, sorted(columns & reader.columns.keys() | numbers))
+            numbers = number_columns(reader) if self.to == "webdataset" else ()
+            return rows_digest(reader, sorted(columns & reader.columns.keys() | {*numbers}))
 
         rows = [shard.value for shard in gather(self.shards, digest)]
         options = {"limit": self.limit, "where": list(self.where), "licence": self.licence}

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Collection
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -20,7 +19,7 @@ from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
 from lgrasp.engine.run import run
 from lgrasp.engine.shard import Execution, gave_up, make_shard
-from lgrasp.errors import ConfigError, LgraspError, OutputError, StarvedError
+from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.rows import grasp_rows
@@ -35,7 +34,7 @@ from lgrasp.jobs.search import SearchJob
 from lgrasp.policy.names import SHIPPED
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.cores import cores
-from lgrasp.runtime.processes import ProcessPool
+from lgrasp.runtime.processes import ProcessPool, none_killed
 
 _SHARDS_ON_GPU = 4  # at once
 _MOST_WRITERS = 8
@@ -117,10 +116,8 @@ class GenerateJob(GenerateRequest, SearchJob):
         if self._writers is None:
             super().write(part, contents)
             return
-        try:
+        with none_killed(f"writes {part.file}"):
             self._writers.submit(write_shard, part.file, contents).result()
-        except BrokenProcessPool:
-            raise OutputError(f"{part.file}: a process that writes was killed; the same command goes on") from None
 
     def close(self) -> None:
         if self._writers:

@@ -162,12 +162,11 @@ class SearchJob(SearchRequest, Job):
         for result in outcome.results:
             add_counts(counts, result.counts)
             add_seconds(seconds, result.seconds)
-        spans = [result.span for result in outcome.results]
-        earlier = sum(result.wall for result in outcome.results) - sum(end - begin for begin, end in spans)
+        wall = covered(span for result in outcome.results for span in result.spans)
         loading = {name: self.inputs.seconds.get(name, 0.0) for name in ("hand", "object", "field")}
         return {
             "counts": counts,
-            "seconds": seconds | loading | {"wall": earlier + covered(spans)},
+            "seconds": seconds | loading | {"wall": wall},
             "hits": self.inputs.hits,
             "hand": self.records(self.inputs)[0].name,
             "pipeline": self.pipeline.name,

@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -126,6 +127,22 @@ class ProcessPool(ProcessPoolExecutor):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.shutdown(cancel_futures=kind is not None)
+
+
+@contextmanager
+def none_killed(what: str) -> Iterator[None]:
+    """Calls to a :class:`ProcessPool` and their results, inside the block.
+
+    Args:
+        what: the processes do, such as ``simulates``.
+
+    Raises:
+        DeviceError: one of them was killed.
+    """
+    try:
+        yield
+    except BrokenProcessPool:
+        raise DeviceError(f"a process that {what} was killed; the same command goes on") from None
 
 
 @contextmanager

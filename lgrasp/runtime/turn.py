@@ -3,10 +3,16 @@ and the arrays of a graph stay as they are only until it is replayed.
 """
 
 import threading
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 
 _own = threading.local()
+
+
+def waited() -> float:
+    """How long this thread has waited for its turns so far [s]."""
+    return getattr(_own, "waited", 0.0)
 
 
 class Turn:
@@ -16,8 +22,9 @@ class Turn:
         self._lock = threading.Lock()
 
     def __enter__(self) -> None:
+        begin = time.perf_counter()
         self._lock.acquire()
-        _own.turn = self
+        _own.turn, _own.waited = self, waited() + time.perf_counter() - begin
 
     def __exit__(self, *error: object) -> None:
         _own.turn = None

@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -16,7 +15,7 @@ import numpy as np
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
-from lgrasp.runtime.processes import ProcessPool
+from lgrasp.runtime.processes import ProcessPool, none_killed
 from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.physx_world import SOLVER, import_physx
@@ -215,9 +214,8 @@ def _in_processes(
     make = partial(ProcessPool, workers)
     pool: Executor = keep("processes", workers, make) if keep else make()
     try:
-        return _collected([pool.submit(_judge, packed, i) for i in range(len(rows))], progress)
-    except BrokenProcessPool:
-        raise PhysicsError("a process that simulates was killed; the same command goes on") from None
+        with none_killed("simulates"):
+            return _collected([pool.submit(_judge, packed, i) for i in range(len(rows))], progress)
     finally:
         if not keep:
             pool.shutdown(cancel_futures=True)

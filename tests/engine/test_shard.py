@@ -139,6 +139,9 @@ def test_a_cancelled_shard_goes_on_where_it_was(swift, inputs, tmp_path):
     assert tried[:4] == [256, 512, 768, 1024]
     whole = make_shard(swift, inputs, 0, 400, Execution(2, 512))
     assert again.candidates == whole.candidates
+    (_, stopped), (continued, end) = again.spans
+    assert stopped <= continued
+    assert again.wall <= end - again.spans[0][0]  # the time between the runs does not count
     for name in ("index", "slot", "q", "pose"):
         np.testing.assert_array_equal(getattr(again.grasps, name), getattr(whole.grasps, name))
     tried.clear()

@@ -21,7 +21,7 @@ from lgrasp.grasp.schema import CHUNK_ROWS
 from lgrasp.simulate.protocol import HOLDS
 from lgrasp.words import plural
 
-_NUMBER = re.compile("metrics/|physics/|candidate$")  # columns that tell of a row in one number
+_NUMBER = re.compile("metrics/|physics/|candidate$")
 
 
 class ExportObject(NamedTuple):
@@ -217,7 +217,7 @@ def select_rows(
             columns = [list(this.joint_names).index(name) for name in hand.joint_names]
             records, on_table = reader.objects(), "table/pose" in reader.columns
             places = np.array([*(_place(record, path, known) for record in records), -1])  # -1: absent
-            own = [name for name, (shape, _) in reader.columns.items() if len(shape) == 1 and _NUMBER.match(name)]
+            own = number_columns(reader)
         rows = rows[: None if limit is None else limit - chosen]
         index, part = index[: len(rows)], part[: len(rows)]
         seen += number
@@ -266,6 +266,11 @@ def chosen_rows(
         hint = f"choose rows with --where '{OBJECTS_HELD} == 1', or --to mjcf"
         raise ShardError(f"{reader.path}: row {rows[several[0]]} holds {count} objects, this format one; {hint}")
     return rows, index
+
+
+def number_columns(reader: ShardReader) -> list[str]:
+    """Columns that tell of a row in one number: metrics, verdicts, and ``candidate``."""
+    return [name for name, (shape, _) in reader.columns.items() if len(shape) == 1 and _NUMBER.match(name)]
 
 
 def _plane(source: _Source, item: int, plane: int) -> np.ndarray:

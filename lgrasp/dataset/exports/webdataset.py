@@ -20,11 +20,11 @@ from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.dataset.files import parsing
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.files import new_file
+from lgrasp.grasp.rows import POSTURES
 
 _ROWS = 10_000  # of a tar file: some 20 MB
 _DECIMALS = 9
 _END = 2 * tarfile.BLOCKSIZE  # zeros, without which a file is cut short
-_POSTURES = ("q", "q_pregrasp", "q_squeeze")
 _TABLE = ("table_plane", "table_approach")
 
 WEBDATASET_NOTES = """\
@@ -79,7 +79,7 @@ def _samples(
     """Number and JSON of each row of a part; all have the same keys."""
     for batch in selection.batches(advance=advance, part=part, numbers=True):
         pose = frames.root_in_object(batch.object_pose[:, 0], batch.q)
-        lists = {"hand_pose": pose, **dict(zip(_POSTURES, batch.postures, strict=True)), **batch.table}
+        lists = {"hand_pose": pose, **dict(zip(POSTURES, batch.postures, strict=True)), **batch.table}
         rounded = {name: np.round(values, _DECIMALS).tolist() for name, values in lists.items()}
         if selection.on_table:
             rounded = dict.fromkeys(_TABLE, [None] * len(pose)) | rounded
@@ -106,6 +106,15 @@ def _numbers(batch: Batch) -> dict[str, list[Any]]:
     }
 
 
+def _check_whole(path: Path) -> None:
+    """Raise ValueError unless a tar file ends as it must."""
+    with path.open("rb") as file:
+        size = file.seek(0, io.SEEK_END)
+        file.seek(-min(_END, size), io.SEEK_CUR)
+        if size % tarfile.RECORDSIZE or any(file.read()):
+            raise ValueError("it is cut short")
+
+
 def read_webdataset(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
     """Read an export, a folder of tar files, or one such file, as lgrasp writes them.
 
@@ -121,11 +130,10 @@ def read_webdataset(path: Path | str, *, joint_names: Sequence[str] | None = Non
         order = folder.order(listed, file)
         wrong = (tarfile.TarError, KeyError, TypeError, ValueError, AttributeError, EOFError, RecursionError)
         with parsing(file, "a WebDataset of grasps", wrong), tarfile.open(file, "r:") as tar:
-            if file.stat().st_size % tarfile.RECORDSIZE or any(file.read_bytes()[-_END:]):
-                raise ValueError("it is cut short")
+            _check_whole(file)
             for member in tar:
                 entry = json.load(tar.extractfile(member))  # pyright: ignore[reportArgumentType]
-                pose, joints = np.array(entry["hand_pose"], float), np.array([entry[n] for n in _POSTURES], float)
+                pose, joints = np.array(entry["hand_pose"], float), np.array([entry[n] for n in POSTURES], float)
                 if pose.shape != (7,) or joints.shape != (3, len(listed)) or not pose[3:].any():
                     raise ValueError(f"{member.name} has poses or joints of other lengths")
                 if not (np.isfinite(pose).all() and np.isfinite(joints).all()):

@@ -29,14 +29,16 @@ def make_cell(job: GenerateJob, protocol: ProtocolName | None, key: str, progres
         LgraspError: see the jobs.
     """
     how = {"device": job.device, "workers": job.workers, "cache": job.cache}
+    told = _Told(progress)
     with temporary_folder() as folder:
-        _run(job.changed(out=folder / "grasps"), _Told(progress, ""))
+        _run(job.changed(out=folder / "grasps"), told)
+        told.what = "hold test"
         tried = MetricsJob(shards=(folder / "grasps",), out=folder / "tried", add=(HOLD,), **how)
-        (path,) = _run(tried, _Told(progress, "hold test", job.rows))
+        (path,) = _run(tried, told)
         if protocol is not None:
-            how["device"] = "cpu"
+            told.what, how["device"] = protocol, "cpu"
             simulated = SimulateJob(shards=(path,), protocol=find_protocol(protocol), out=folder / "simulated", **how)
-            (path,) = _run(simulated, _Told(progress, protocol, job.rows))
+            (path,) = _run(simulated, told)
         shard = read_shard(path)
     return replace(shard, statistics={**shard.statistics, MADE_FROM: key})
 
@@ -49,22 +51,22 @@ def _run(job: Job, events: Events) -> Sequence[Path]:
 
 
 class _Told(Events):
-    """What the part of a comparison tells of a job that it runs.
+    """What the part of a comparison tells of the jobs that it runs."""
 
-    Args:
-        what: is being done, once there are rows.
-        rows: that are there; None: those made so far.
-    """
-
-    def __init__(self, progress: PartProgress, what: str, rows: int | None = None) -> None:
-        self._progress, self._what, self._rows = progress, what, rows
+    def __init__(self, progress: PartProgress) -> None:
+        self._progress, self._kept = progress, 0
+        self.what = ""
+        """Is being done with the rows; none: they are being made."""
 
     def said(self, words: str) -> None:
         self._progress.events.said(words)
 
     def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0, kept: int = 0) -> None:
         # the last row is told when the part is on disk: until then it may be stopped
-        self._progress(min(done if self._rows is None else self._rows, self._progress.part.rows - 1), self._what)
+        last = self._progress.part.rows - 1
+        if not self.what:
+            self._kept = min(kept, last)
+        self._progress(last if self.what else min(done, last), self.what, kept=self._kept)
 
     def cancelled(self) -> bool:
         return self._progress.events.cancelled()

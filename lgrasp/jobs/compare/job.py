@@ -54,8 +54,7 @@ class CompareJob(CompareRequest, Job):
     def pairs(self) -> list[tuple[ComparedHand, GenerateJob]]:
         """Each hand with each object, as the job that makes its grasps."""
         if self._pairs is None:
-            pipeline, objects = load_pipeline(self.pipeline).with_seed(self.seed), all_objects(self.objects)
-            pipeline = pipeline.model_copy(update={"patience": 1})  # few grasps are a result, too
+            pipeline, objects = load_pipeline(self.pipeline).with_seed(self.seed).impatient(), all_objects(self.objects)
             how = {"rows": self.rows, "shard_rows": self.rows, "device": self.device, "workers": self.workers}
             sources = [hand.source for hand in self.compared]
             jobs = [r.job(self.cache) for r in pair_requests(sources, objects, pipeline, self.out, **how)]

@@ -102,7 +102,7 @@ def check_hand(
     """
     events = events or Events()
     cache = cache or Cache()
-    bounded = pipeline.model_copy(update={"effort": _CANDIDATES_PER_ROW, "patience": 1})
+    bounded = pipeline.impatient(effort=_CANDIDATES_PER_ROW)
     checks: list[ObjectCheck] = []
     pictures: list[Path] = []
     inputs = None

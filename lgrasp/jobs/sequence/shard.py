@@ -14,7 +14,7 @@ from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.grasp.tables import join_rows, take_rows
 from lgrasp.jobs.sequence.inputs import SequenceInputs
 from lgrasp.jobs.sequence.round import Round, Verdicts, add_steps, run_round
-from lgrasp.runtime.tally import add_counts, add_seconds
+from lgrasp.runtime.tally import add_counts, add_seconds, covered
 
 _EMPTY_ROUNDS = 4  # without any row of some length, before nothing more is expected
 _SPARE = 1.5  # sequences begun for each that is needed, if all go well
@@ -25,7 +25,7 @@ class SequenceResult(Round):
     """Sequences of a shard and how they came about: the rounds together."""
 
     reached: list[int] = field(default_factory=list)  # rows of 1, 2 ... objects that were found
-    span: tuple[float, float] = (0.0, 0.0)  # from when to when [s]
+    spans: list[tuple[float, float]] = field(default_factory=list)  # from when to when [s since 1970]
     rounds: int = 0
     duplicates: int = 0
     exhausted: bool = False
@@ -33,7 +33,7 @@ class SequenceResult(Round):
     @property
     def wall(self) -> float:
         """How long it took [s]."""
-        return self.span[1] - self.span[0]
+        return covered(self.spans)
 
     def __len__(self) -> int:
         """Whole sequences."""
@@ -77,7 +77,7 @@ def make_sequences(
     objects, width = len(inputs.objects), pipeline.params("sequence").width
     kept = KeptRows(inputs.hand.dofs, inputs.device.alias)
     parts: list[list[SequenceTable]] = []
-    start = time.perf_counter()
+    start = time.time()
     while kept.count < rows and not result.exhausted:
         found, begun, ended = Round(), 0, 0
         while begun < width and kept.count < rows:
@@ -108,7 +108,7 @@ def make_sequences(
         hopeless = result.rounds >= _EMPTY_ROUNDS and missing
         result.exhausted = kept.count < rows and (hopeless or result.rounds >= most_rounds(pipeline, rows))
     result.levels = _joined(parts)
-    result.span = start, time.perf_counter()
+    result.spans = [(start, time.time())]
     return result
 
 
